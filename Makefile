@@ -1,0 +1,60 @@
+# SpectralZoom: setup, survey, test, lint, bench, lock.
+#   make survey ARCHIVE=/data/field7    make test PY=python3.12 VENV=/tmp/venv    make test PYTEST_ARGS="-x tests/pipeline"
+PY ?= python3
+VENV ?= .venv
+ARCHIVE ?= archive
+SCENE ?= farm
+PYTEST_ARGS ?=
+BIN := $(VENV)/bin
+
+# The tools beneath are asked to send no analytics.
+export DO_NOT_TRACK = 1
+
+.PHONY: setup survey test lint bench lock
+.DEFAULT_GOAL := setup
+
+setup: $(BIN)/.ok
+
+# Debian without python3-venv has no ensurepip: make the environment bare, then let the system's pip fill it.
+$(BIN)/.ok: pyproject.toml constraints.txt
+	$(PY) -m venv $(VENV) 2>/dev/null || { $(PY) -m venv --without-pip $(VENV) \
+		&& $(PY) -m pip --python $(BIN)/python install -q pip; }
+	$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev,geo]'
+	touch $@
+
+survey: $(BIN)/.ok
+	$(BIN)/spectralzoom survey --scene $(SCENE) --out $(ARCHIVE)
+
+test: $(BIN)/.ok
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q $(PYTEST_ARGS)
+
+lint: $(BIN)/.ok
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+bench: $(BIN)/.ok
+	OMP_NUM_THREADS=1 $(BIN)/spectralzoom tradeoff
+
+# Names and versions only. A machine that is offered a CPU wheel of torch does not resolve the accelerator's packages:
+# their lines are kept as they are.
+lock:
+	$(PY) -m venv $(VENV)-lock 2>/dev/null || { $(PY) -m venv --without-pip $(VENV)-lock \
+		&& $(PY) -m pip --python $(VENV)-lock/bin/python install -q pip; }
+	$(VENV)-lock/bin/python -m pip install -q --dry-run --ignore-installed --report $(VENV)-lock/report.json '.[dev,geo]'
+	$(VENV)-lock/bin/python -c "$$LOCK" $(VENV)-lock/report.json constraints.txt
+	rm -rf $(VENV)-lock
+
+define LOCK
+import json, pathlib, re, sys
+report, target = map(pathlib.Path, sys.argv[1:])
+head, *old = target.read_text().splitlines()
+kept = [line for line in old if re.match(r"nvidia-|cuda-|triton==", line)]
+found = (item["metadata"] for item in json.loads(report.read_text())["install"])
+lines = {line.split("==")[0]: line for line in kept}
+for item in found:
+    name = re.sub(r"[-_.]+", "-", item["name"]).lower()
+    lines[name] = name + "==" + item["version"].split("+")[0]
+lines.pop("spectralzoom", None)
+target.write_text("\n".join([head, *(lines[name] for name in sorted(lines))]) + "\n")
+endef
+export LOCK

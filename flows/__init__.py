@@ -1,0 +1,1 @@
+"""Prefect flows and the command line: settings, survey, train, trade-offs, receipt and report."""

@@ -1,0 +1,58 @@
+"""Figures as people read them: seconds, bytes, counts, percent. What is not known is a dash."""
+
+from __future__ import annotations
+
+import math
+from typing import TypeGuard
+
+DASH = "–"  # noqa: RUF001
+
+
+def format_seconds(seconds: float | None) -> str:
+    """Seconds below ten minutes, then minutes and hours."""
+    if not _known(seconds):
+        return DASH
+    if seconds < 1:
+        return f"{seconds:.2f} s"
+    if seconds < 600:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def format_bytes(count: float | None) -> str:
+    """Bytes in decimal units with three figures."""
+    if not _known(count):
+        return DASH
+    size, units = float(count), ("B", "kB", "MB", "GB", "TB")
+    for unit in units[:-1]:
+        if abs(size) < 999.5:
+            return f"{size:.3g} {unit}"
+        size /= 1000
+    return f"{size:.3g} {units[-1]}"
+
+
+def format_count(count: float | None) -> str:
+    """Whole numbers with thin spaces by thousands up to ten million, then million, billion, 10^12."""
+    if not _known(count):
+        return DASH
+    for size, name in ((1e12, "× 10¹²"), (1e9, "billion"), (1e6, "million")):  # noqa: RUF001
+        if abs(count) >= max(size, 1e7):
+            return f"{count / size:.3g} {name}"
+    return f"{round(count):,}".replace(",", "\u202f")
+
+
+def format_percent(share: float | None) -> str:
+    """A share as percent without decimals, one decimal below 10 %."""
+    if not _known(share):
+        return DASH
+    return f"{100 * share:.1f} %" if abs(share) < 0.0995 else f"{100 * share:.0f} %"
+
+
+def format_points(score: float | None) -> str:
+    """A score of 0..1 as points of 100 with one decimal."""
+    return f"{100 * score:.1f}" if _known(score) else DASH
+
+
+def _known(value: float | None) -> TypeGuard[float]:
+    return value is not None and math.isfinite(value)

@@ -1,0 +1,187 @@
+"""Values of settings: from text or TOML to a checked value, or an error that says the range and guesses the unit."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from pipeline.errors import BudgetError, SettingsError
+
+EFFECTS = ("slit", "smear", "shot", "read")
+LEAST_MEMORY = 256 * 1024**2
+_BYTES = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12,
+          "kib": 2**10, "mib": 2**20, "gib": 2**30, "tib": 2**40}  # fmt: skip
+# unit of a setting -> other units in which people write it, with the factor that makes it right
+_OTHER_UNITS: dict[str, tuple[tuple[str, float], ...]] = {
+    "ms": (("seconds", 1e3), ("microseconds", 1e-3)),
+    "s": (("milliseconds", 1e-3), ("minutes", 60.0)),
+    "um": (("metres", 1e6), ("millimetres", 1e3), ("nanometres", 1e-3)),
+    "mm": (("metres", 1e3), ("micrometres", 1e-3)),
+    "nm": (("micrometres", 1e3), ("metres", 1e9)),
+    "hz": (("kilohertz", 1e3),),
+}
+
+
+@dataclass(frozen=True)
+class Span:
+    """Least and greatest value of a number, both allowed, and its unit ('' for none)."""
+
+    low: float
+    high: float
+    unit: str
+
+    def __str__(self) -> str:
+        return f"a number from {self.low:g} to {self.high:g}" + (f" {self.unit}" if self.unit else "")
+
+
+def parse_number(span: Span) -> Callable[[object, str], float]:
+    """A parser for finite numbers within ``span``."""
+
+    def parse(value: object, place: str) -> float:
+        number = _to_float(value)
+        if number is None or not span.low <= number <= span.high:
+            raise SettingsError(f"{place} must be {span}, got {value!r}{_unit_hint(number, span)}")
+        return number
+
+    return parse
+
+
+def parse_whole(low: int, high: int, *, why: str = "") -> Callable[[object, str], int]:
+    """A parser for whole numbers from ``low`` to ``high``; ``why`` is added to the message."""
+    wanted = f"{low}" if low == high else f"a whole number from {low} to {high}"
+
+    def parse(value: object, place: str) -> int:
+        number = _to_whole(value)
+        if number is None or not low <= number <= high:
+            raise SettingsError(f"{place} must be {wanted}, got {value!r}" + (f"; {why}" if why else ""))
+        return number
+
+    return parse
+
+
+def parse_choice(choices: Sequence[str]) -> Callable[[object, str], str]:
+    """A parser for one word out of ``choices``."""
+
+    def parse(value: object, place: str) -> str:
+        if value not in choices:
+            raise SettingsError(f"{place} must be one of {', '.join(choices)}; got {value!r}")
+        return str(value)
+
+    return parse
+
+
+def parse_text(value: object, place: str) -> str:
+    """Text that is not empty."""
+    if not isinstance(value, str) or not value.strip():
+        raise SettingsError(f"{place} must be text that is not empty, got {value!r}")
+    return value
+
+
+def parse_switch(value: object, place: str) -> bool:
+    """True or false."""
+    if isinstance(value, str) and value.lower() in ("true", "false"):
+        return value.lower() == "true"
+    if not isinstance(value, bool):
+        raise SettingsError(f"{place} must be true or false, got {value!r}")
+    return value
+
+
+def parse_budget(value: object, place: str) -> float:
+    """A share of the full scan's seconds above 0 and at most 1; raises BudgetError."""
+    number = _to_float(value)
+    if number is None or not 0 < number <= 1:
+        hint = f"; for {number:g} % write {number / 100:g}" if number is not None and 1 < number <= 100 else ""
+        raise BudgetError(
+            f"{place} must be a share of the full scan's seconds, above 0 and at most 1, got {value!r}{hint}"
+        )
+    return number
+
+
+def parse_memory(value: object, place: str) -> int:
+    """Bytes, from a whole number or text such as 4GiB or 500 MB."""
+    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?i?b?)\s*", str(value).lower())
+    unit = found[2] if found and (found[2] in _BYTES) else None
+    if isinstance(value, bool) or found is None or unit is None:
+        raise SettingsError(f"{place} must be a number with a unit such as 4GiB or 800MB, got {value!r}")
+    count = int(float(found[1]) * _BYTES[unit])
+    if count < LEAST_MEMORY:
+        raise SettingsError(f"{place} must be at least {LEAST_MEMORY // 2**20}MiB, got {value!r} ({count} bytes)")
+    return count
+
+
+def parse_size(value: object, place: str) -> tuple[int, int]:
+    """(width, height) in px, from text such as 1280x1024 or from two whole numbers."""
+    parts = re.split("[x,]", value.lower()) if isinstance(value, str) else value
+    sides = [_to_whole(part) for part in parts] if isinstance(parts, list | tuple) else []
+    if len(sides) != 2 or any(side is None or not 1 <= side <= 100_000 for side in sides):
+        raise SettingsError(f"{place} must be WIDTHxHEIGHT in px, such as 1280x1024, got {value!r}")
+    return int(sides[0] or 0), int(sides[1] or 0)
+
+
+def parse_effects(value: object, place: str) -> str:
+    """``auto``, ``all``, ``none`` or names of effects with commas between them, in the one fixed order."""
+    names = [name.strip() for name in value.split(",")] if isinstance(value, str) else value
+    if names in (["auto"], ["all"], ["none"]):
+        return str(names[0])
+    if not isinstance(names, list | tuple) or not names or not set(names) <= set(EFFECTS):
+        raise SettingsError(f"{place} must be auto, all, none, or some of {','.join(EFFECTS)}; got {value!r}")
+    return ",".join(name for name in EFFECTS if name in names)
+
+
+def parse_bands(value: object, place: str) -> tuple[int, ...]:
+    """Band numbers counted from 0, none of them twice; a list or text with commas."""
+    bands = [_to_whole(item) for item in _items(value)]
+    if not bands or any(band is None or band < 0 for band in bands):
+        raise SettingsError(f"{place} must list band numbers counted from 0, such as 0,1,2; got {value!r}")
+    if len(set(bands)) != len(bands):
+        raise SettingsError(f"{place} names a band twice: {value!r}; name each once")
+    return tuple(int(band or 0) for band in bands)
+
+
+def parse_wavelengths(value: object, place: str) -> tuple[float, ...]:
+    """Wavelengths in nm, in the order of the bands; a list or text with commas."""
+    span = Span(150, 30_000, "nm")
+    waves = [_to_float(item) for item in _items(value)]
+    if not waves:
+        raise SettingsError(f"{place} must list wavelengths in nm, such as 660,800; got {value!r}")
+    for item, wave in zip(_items(value), waves, strict=True):
+        if wave is None or not span.low <= wave <= span.high:
+            raise SettingsError(f"{place} must each be {span}, got {item!r}{_unit_hint(wave, span)}")
+    return tuple(wave for wave in waves if wave is not None)
+
+
+def _items(value: object) -> list[object]:
+    """A list's items, the parts of text between commas, or the one number itself."""
+    if isinstance(value, str):
+        return [part.strip() for part in value.split(",") if part.strip()]
+    return list(value) if isinstance(value, list | tuple) else [value]
+
+
+def _to_float(value: object) -> float | None:
+    """A finite number, also from text; None for anything else (true and false are no numbers)."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        return None
+    try:
+        number = float(value)
+    except (ValueError, OverflowError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _to_whole(value: object) -> int | None:
+    """A whole number, also from text; None for anything else, 2.0 included."""
+    if isinstance(value, str) and re.fullmatch(r"\s*[+-]?\d{1,20}\s*", value):
+        return int(value)
+    return value if isinstance(value, int) and not isinstance(value, bool) else None
+
+
+def _unit_hint(number: float | None, span: Span) -> str:
+    """A guess at the unit in which the number was written, as the end of a message."""
+    if number is None:
+        return ""
+    for name, factor in _OTHER_UNITS.get(span.unit, ()):
+        if span.low <= number * factor <= span.high:
+            return f"; was it given in {name}? then write {number * factor:g}"
+    return ""

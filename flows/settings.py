@@ -1,0 +1,267 @@
+"""Settings of a survey: one TOML file and flags, every key checked. Flags win over the file, it over the defaults."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Literal, TypeVar, cast
+
+from flows.setting_values import (
+    Span,
+    parse_bands,
+    parse_budget,
+    parse_choice,
+    parse_effects,
+    parse_memory,
+    parse_number,
+    parse_size,
+    parse_switch,
+    parse_text,
+    parse_wavelengths,
+    parse_whole,
+)
+from pipeline.camera import LineCamera
+from pipeline.errors import SettingsError
+from pipeline.scan import CostModel
+
+POLICIES = ("entropy", "sobel", "random", "mask")
+ENGINES = ("prefect", "plain")
+BUILT_IN_SCENES = ("farm",)
+BUILT_IN_SOURCES = ("sim", "rig")
+_PATHS = ("scene", "labels", "source", "out", "mask", "weights")
+
+Parser = Callable[[object, str], object]
+Table = TypeVar("Table", LineCamera, CostModel)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All that one survey needs to know. Make it by `load_settings` or `parse_settings`: they check; this does not."""
+
+    scene: str = "farm"  # built-in name or a file
+    labels: str | None = None
+    bands: tuple[int, ...] | None = None  # of the file, counted from 0
+    wavelengths: tuple[float, ...] | None = None  # [nm]
+    source: str = "sim"
+    out: str = "archive"
+    budget: float = 0.5  # seconds of coarse and fine capture over those of the full scan, 0 < b <= 1
+    policy: str = "entropy"
+    mask: str | None = None
+    weights: str | None = None
+    rounds: int = 1
+    seed: int = 0
+    effects: str = "auto"  # auto, all, none, or names with commas
+    tol: float = 0.1  # [sigma of the noise]
+    controls: bool = True
+    engine: Literal["prefect", "plain"] = "prefect"
+    memory: int = 4 * 1024**3  # [bytes]
+    size: tuple[int, int] | None = None  # (width, height) of the built-in scene [px]
+    camera: LineCamera = field(default_factory=LineCamera)
+    cost: CostModel = field(default_factory=CostModel)
+
+    @property
+    def shape(self) -> tuple[int, int] | None:
+        """(y, x) of the built-in scene [px], None for its default."""
+        return None if self.size is None else (self.size[1], self.size[0])
+
+    def to_dict(self) -> dict[str, object]:
+        """Plain values for the receipt; `parse_settings` reads them back to the same settings."""
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+
+
+def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | None = None) -> Settings:
+    """Read the file, lay the flags over it and check the whole.
+
+    Parameters
+    ----------
+    path
+        TOML file; None for defaults and flags alone. Relative paths in it start at its folder, those of flags at the
+        current folder.
+    flags
+        Keys as in the file, ``camera.exposure_ms`` for one in a table; None means not given.
+
+    Raises
+    ------
+    SettingsError, BudgetError : the first key that cannot be used, with its place and what it should be.
+    """
+    table = {} if path is None else _anchor_paths(_read_toml(Path(path)), Path(path).parent)
+    origin = dict.fromkeys(_flatten(table), str(path))
+    for key, value in _flatten(flags or {}).items():
+        if value is not None:
+            _put(table, key, value)
+            origin[key] = "flag"
+    return parse_settings(table, origin)
+
+
+def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None = None) -> Settings:
+    """Check a table of settings and fill in the defaults.
+
+    Parameters
+    ----------
+    table
+        Keys and values as in the file, ``camera`` and ``cost`` being tables themselves.
+    origin
+        Where each (dotted) key came from, for the messages: a file's name or ``flag``.
+    """
+    origin = origin or {}
+    checked = _check_table({k: v for k, v in table.items() if v is not None}, _SURVEY, "", origin)
+    settings = Settings(**checked)  # type: ignore[arg-type]
+    _check_together(settings, origin)
+    return settings
+
+
+def _check_table(
+    table: Mapping[str, object], parsers: Mapping[str, Parser], prefix: str, origin: Mapping[str, str]
+) -> dict[str, object]:
+    """Every key of one table through its parser; an unknown one is refused with the nearest that exists."""
+    checked: dict[str, object] = {}
+    for key, value in table.items():
+        full = prefix + key
+        if key not in parsers:
+            _refuse_key(full, parsers, prefix, origin.get(full))
+        if prefix == "" and key in _TABLES:
+            checked[key] = _parse_table(key, value, origin)
+        else:
+            checked[key] = parsers[key](value, _place(full, origin.get(full)))
+    return checked
+
+
+def _parse_table(key: str, value: object, origin: Mapping[str, str]) -> object:
+    """One of the tables that stand for a dataclass of the pipeline."""
+    if not isinstance(value, Mapping):
+        place = _place(key, origin.get(key))
+        raise SettingsError(f"{place} must be a table, [{key}] with keys below it; got {value!r}")
+    make, spans = _TABLES[key]
+    return make(**_check_table(value, spans, f"{key}.", origin))
+
+
+def _refuse_key(full: str, known: Mapping[str, Parser], prefix: str, origin: str | None) -> None:
+    """Raise for an unknown key, naming the nearest of its table, or of another table."""
+    everywhere = [*_SURVEY, *(f"{name}.{key}" for name, (_, spans) in _TABLES.items() for key in spans)]
+    short = full.removeprefix(prefix)
+    near = difflib.get_close_matches(short, known, n=1, cutoff=0.5)
+    near = [prefix + key for key in near] or [name for name in everywhere if name.split(".")[-1] == short]
+    hint = f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(prefix + key for key in known)}"
+    raise SettingsError(f"unknown setting {_place(full, origin)}{hint}")
+
+
+def _check_together(settings: Settings, origin: Mapping[str, str]) -> None:
+    """What no key can say alone."""
+    if (settings.policy == "mask") != (settings.mask is not None):
+        wants = "policy 'mask' needs a mask file" if settings.mask is None else "a mask is used by policy 'mask' only"
+        got = f"policy = {settings.policy!r}, mask = {settings.mask!r}"
+        raise SettingsError(f"{wants}: got {got}; give both or neither")
+    bands, wavelengths = settings.bands, settings.wavelengths
+    if bands is not None and wavelengths is not None and len(bands) != len(wavelengths):
+        raise SettingsError(
+            f"{_place('wavelengths', origin.get('wavelengths'))} must have one value for each of the "
+            f"{len(bands)} bands, got {len(wavelengths)}"
+        )
+    if settings.size is not None and settings.scene not in BUILT_IN_SCENES:
+        raise SettingsError(f"size is for built-in scenes ({', '.join(BUILT_IN_SCENES)}); {settings.scene} has its own")
+    if settings.camera.dark_dn >= settings.camera.full_scale_dn:
+        raise SettingsError(
+            f"camera.dark_dn = {settings.camera.dark_dn:g} leaves no room below the {settings.camera.full_scale_dn} DN "
+            f"of {settings.camera.bits} bits; use a smaller dark level"
+        )
+
+
+def _read_toml(path: Path) -> dict[str, object]:
+    """The file's tables; a file that is not there or not TOML is an error with its place."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise SettingsError(f"no settings file {path}; give the path of a survey's TOML file, or none") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise SettingsError(f"cannot read the settings file {path}: {error}; expected TOML in UTF-8") from None
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError(f"{path} is not valid TOML: {error}") from None
+
+
+def _anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
+    """Relative paths of a file's settings, made to start at the file's folder."""
+    named = {*BUILT_IN_SCENES, *BUILT_IN_SOURCES}
+    anchored = dict(table)
+    for key in _PATHS:
+        value = table.get(key)
+        if isinstance(value, str) and value and value not in named and "://" not in value:
+            anchored[key] = str(folder / Path(value).expanduser())
+    return anchored
+
+
+def _flatten(table: Mapping[str, object]) -> dict[str, object]:
+    """Nested tables as dotted keys; what is no table stays."""
+    flat: dict[str, object] = {}
+    for key, value in table.items():
+        if key in _TABLES and isinstance(value, Mapping):
+            flat.update({f"{key}.{inner}": item for inner, item in value.items()})
+        else:
+            flat[key] = value
+    return flat
+
+
+def _put(table: dict[str, object], key: str, value: object) -> None:
+    """Set a dotted key, without changing the inner table that came in."""
+    head, _, tail = key.partition(".")
+    inner = table.get(head, {})
+    table[head] = {**cast("Mapping[str, object]", inner), tail: value} if tail and isinstance(inner, Mapping) else value
+
+
+def _place(key: str, origin: str | None) -> str:
+    """How a message names a setting: as a flag, or in its file."""
+    if origin == "flag":
+        return "--" + key.replace("_", "-")
+    return f"'{key}'" + (f" in {origin}" if origin else "")
+
+
+_CAMERA: dict[str, Parser] = {
+    "samples": parse_whole(16, 65_536),
+    "pitch_um": parse_number(Span(0.5, 200, "um")),
+    "focal_length_mm": parse_number(Span(1, 5000, "mm")),
+    "slit_um": parse_number(Span(0.5, 2000, "um")),
+    "exposure_ms": parse_number(Span(0.5, 10_000, "ms")),
+    "readout_ms": parse_number(Span(0, 1000, "ms")),
+    "max_rate_hz": parse_number(Span(0.1, 100_000, "hz")),
+    "bits": parse_whole(8, 14),  # the sum of four neighbours must fit 16 bits
+    "electrons_per_dn": parse_number(Span(1e-3, 1e4, "")),
+    "read_noise_e": parse_number(Span(0, 1e4, "")),
+    "dark_dn": parse_number(Span(0, 16_383, "")),
+}
+_COST: dict[str, Parser] = {
+    "slew_s": parse_number(Span(0, 10, "s")),
+    "settle_frames": parse_number(Span(0, 1000, "")),
+    "capture_start_s": parse_number(Span(0, 60, "s")),
+    "reload_s": parse_number(Span(0, 60, "s")),
+    "vector_pairs": parse_whole(1, 10_000_000),
+    "provenance": parse_text,
+}
+_TABLES: dict[str, tuple[Callable[..., object], dict[str, Parser]]] = {
+    "camera": (LineCamera, _CAMERA),
+    "cost": (CostModel, _COST),
+}
+_SURVEY: dict[str, Parser] = {
+    "scene": parse_text,
+    "labels": parse_text,
+    "bands": parse_bands,
+    "wavelengths": parse_wavelengths,
+    "source": parse_text,
+    "out": parse_text,
+    "budget": parse_budget,
+    "policy": parse_choice(POLICIES),
+    "mask": parse_text,
+    "weights": parse_text,
+    "rounds": parse_whole(1, 1, why="this version looks twice at most: one coarse look, one round of detail"),
+    "seed": parse_whole(0, 2**63 - 1),
+    "effects": parse_effects,
+    "tol": parse_number(Span(1e-6, 10, "sigma")),
+    "controls": parse_switch,
+    "engine": parse_choice(ENGINES),
+    "memory": parse_memory,
+    "size": parse_size,
+    **dict.fromkeys(_TABLES, parse_text),  # checked by _parse_table
+}

@@ -1,0 +1,193 @@
+"""`spectralzoom train`: labelled scenes in, one file of weights out, with the split and the figures kept in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.training_data import TrainingData, open_training_data, pack_mask, trained_pixels
+from models.controls import Controls, run_controls
+from models.examples import Example, Observation, measured_normalisation, normalised, observe
+from models.inference import glance_of_columns
+from models.metrics import mean_iou
+from models.segmenter import SegmenterConfig
+from models.spectral import SpectralBasis
+from models.training import Progress, TrainingSettings, train
+from models.weights import Weights, save_weights
+from pipeline.camera import LineCamera
+from pipeline.errors import SceneError, SettingsError
+from pipeline.grid import SceneGrid
+from pipeline.simulator.scene import RasterScene
+
+CONTROL_SHARE = 0.35
+
+
+@dataclass(frozen=True)
+class TrainRequest:
+    """What to train on and how; ``patch`` and ``columns`` follow from the data where None."""
+
+    dataset: str
+    out: Path
+    hold_out: tuple[str, ...] = ()
+    validation: int | None = None
+    scenes: int = 24  # of the built-in farm
+    patch: int | None = None
+    factor: int = 4
+    columns: int = 24
+    width: int = 32
+    choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
+    settings: TrainingSettings = field(default_factory=TrainingSettings)
+    camera: LineCamera = field(default_factory=LineCamera)
+    command: str = ""
+
+
+Report = Callable[[str, float, str], None]  # what is done, how far 0..1, a figure
+
+
+def train_weights(request: TrainRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
+    """Train, validate and save; give the record that stands in the file.
+
+    Raises
+    ------
+    SceneError : no labels, one class only, or scenes whose bands or classes differ.
+    SettingsError : a folder to write to that does not exist, or sizes that do not fit.
+    """
+    if not request.out.parent.is_dir():
+        raise SettingsError(f"-o {request.out}: the folder {request.out.parent} does not exist; make it first")
+    data = open_training_data(
+        request.dataset, request.validation, request.scenes, request.camera,
+        hold_out=request.hold_out, **request.choices,
+    )  # fmt: skip
+    seen, about = _observe_all(request, data, data.train, "looking at scenes", report)
+    normalisation = measured_normalisation(seen)
+    reached = np.ones(about.basis.columns, bool)
+    examples = [normalised(observation, normalisation, reached) for observation in seen]
+    config = _config(request, about)
+
+    def progress(now: Progress) -> None:
+        report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
+
+    model, summary = train(config, examples, normalisation.gain_shift, request.settings, progress)
+    weights = Weights(model, about.basis, normalisation, about.names, about.colours)
+    kept, _ = _observe_all(request, data, data.validation, "looking at validation scenes", report, about)
+    rows = [_validate(weights, normalised(one, normalisation, reached), request, report) for one in kept]
+    record = {
+        "command": request.command,
+        "data": data.law,
+        "split": {
+            "train": about.keys,
+            "validation": list(data.validation),
+            "held_out": list(data.held_out),
+            "pixels": about.pixels,
+        },
+        "settings": asdict(request.settings),
+        "camera": asdict(request.camera),
+        "training": summary,
+        "validation": _summary(rows),
+    }
+    save_weights(Weights(model, about.basis, normalisation, about.names, about.colours, record), request.out)
+    return record
+
+
+@dataclass
+class _About:
+    """What all scenes of a data set have in common, and what training saw of each."""
+
+    basis: SpectralBasis
+    names: tuple[str, ...]
+    colours: NDArray[np.uint8]
+    patch: int
+    keys: dict[str, str] = field(default_factory=dict)  # scene -> identity of its light
+    pixels: dict[str, str] = field(default_factory=dict)  # identity -> trained pixels, where not all labelled ones
+
+
+def _observe_all(
+    request: TrainRequest, data: TrainingData, names: tuple[str, ...], what: str, report: Report,
+    about: _About | None = None,
+) -> tuple[list[Observation], _About]:  # fmt: skip
+    seen = []
+    for number, (name, scene) in enumerate(zip(names, data.scenes(names), strict=True)):
+        report(what, number / len(names), name)
+        known = about or _common(request, scene)
+        _check_alike(scene, known)
+        known.keys[name] = scene.key
+        mask = trained_pixels(scene)
+        if request.choices.get("train_mask") is not None:
+            known.pixels[scene.key] = pack_mask(mask)
+        about = known
+        grid = SceneGrid(*scene.shape, known.patch, request.factor)
+        rng = np.random.default_rng([request.settings.seed, 0x0B5, number])
+        seen.append(observe(scene, request.camera, grid, known.basis, rng))
+    if about is None:
+        raise SceneError(f"{request.dataset} has no scene to train on")
+    return seen, about
+
+
+def _common(request: TrainRequest, scene: RasterScene) -> _About:
+    trained_pixels(scene)  # refuses a scene without labels
+    if len(scene.class_names) < 2:
+        raise SceneError(f"scene {scene.name} has {len(scene.class_names)} class; training needs two or more")
+    basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns)
+    patch = request.patch or suggested_patch(scene.shape, built_in=request.dataset == "farm")
+    return _About(basis, scene.class_names, scene.class_colours, patch)
+
+
+def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
+    """Patch size for scenes of this shape: 16 for the farm, 32 for frames, less where a scene would hold few seats."""
+    if built_in:
+        return 16
+    return 32 if min(shape) >= 512 else 16 if min(shape) >= 256 else 8
+
+
+def _check_alike(scene: RasterScene, about: _About) -> None:
+    if scene.class_names != about.names:
+        raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {about.names}")
+
+
+def _config(request: TrainRequest, about: _About) -> SegmenterConfig:
+    try:
+        return SegmenterConfig(
+            classes=len(about.names),
+            columns=about.basis.columns,
+            patch=about.patch,
+            factor=request.factor,
+            width=request.width,
+        )
+    except ValueError as error:
+        raise SettingsError(f"{error}; choose another --patch or --factor") from error
+
+
+def _validate(weights: Weights, example: Example, request: TrainRequest, report: Report) -> Controls:
+    p, columns = weights.config.patch, weights.config.columns
+    grid = SceneGrid(*example.shape, p, weights.config.factor)
+    rows, across = grid.seat_shape
+    cells = example.fine.reshape(rows, p, across, p, columns).transpose(0, 2, 1, 3, 4).reshape(-1, p, p, columns)
+    labels = example.labels[: grid.height, : grid.width]
+    return run_controls(
+        weights, glance_of_columns(weights, example.coarse, grid), cells.astype(np.float32), labels,
+        share=CONTROL_SHARE, seed=request.settings.seed, report=lambda row: report("validating", 0.0, row),
+    )  # fmt: skip
+
+
+def _summary(rows: list[Controls]) -> dict[str, Any] | None:
+    """mIoU over all validation scenes together, at one share of the seats."""
+    if not rows:
+        return None
+    policies = {name: sum(row.policies[name] for row in rows) for name in rows[0].policies}
+    random = [sum(row.random[draw] for row in rows) for draw in range(len(rows[0].random))]
+    whole = Controls(
+        rows[0].share, sum(row.seats for row in rows), sum(row.none for row in rows), sum(row.every for row in rows),
+        policies, random,
+    )  # type: ignore[arg-type]  # fmt: skip
+    return {
+        "scenes": len(rows),
+        "share_of_seats": whole.share,
+        "none": mean_iou(whole.none),
+        "all": mean_iou(whole.every),
+        **whole.as_dict(),
+    }

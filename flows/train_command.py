@@ -1,0 +1,76 @@
+"""What `spectralzoom train` shows: progress with the time left, and the figures at the end."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from flows.train import TrainRequest, train_weights
+from models.training import TrainingSettings
+from pipeline.errors import SettingsError
+
+FRAME_CROP, FARM_CROP = 384, 256
+
+
+def run_train(
+    dataset: str, out: Path, console: Console, *, hold_out: tuple[str, ...], validation: int | None, seed: int,
+    steps: int, minutes: float, scenes: int, patch: int | None, factor: int, columns: int, crop: int | None, batch: int,
+    choices: dict[str, Any],
+) -> dict[str, Any]:  # fmt: skip
+    """Train with a progress bar on ``console``; give the record kept in the weights."""
+    for name, value in {"--steps": steps, "--minutes": minutes, "--scenes": scenes, "--batch": batch}.items():
+        if value <= 0:
+            raise SettingsError(f"{name} must be above 0, got {value}")
+    size = crop or (FARM_CROP if dataset == "farm" else FRAME_CROP)
+    request = TrainRequest(
+        dataset, out, hold_out, validation, scenes, patch, factor, columns, choices=choices,
+        settings=TrainingSettings(steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch),
+        command=_command(),
+    )  # fmt: skip
+    bar = Progress(
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"),
+        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[figure]}"),
+        console=console,
+    )  # fmt: skip
+    tasks: dict[str, Any] = {}
+    with bar:
+
+        def report(what: str, done: float, figure: str) -> None:
+            if what not in tasks:
+                for task in tasks.values():
+                    bar.update(task, completed=1.0)
+                tasks[what] = bar.add_task(what, total=1.0, figure="")
+            bar.update(tasks[what], completed=done, figure=escape(figure))
+
+        record = train_weights(request, report)
+        for task in tasks.values():
+            bar.update(task, completed=1.0)
+    _print_figures(record, out, console)
+    return record
+
+
+def _command() -> str:
+    """The command without folders: a machine's paths do not belong in weights."""
+    words = [Path(word).name if "/" in word else word for word in sys.argv[1:]]
+    return shlex.join(["spectralzoom", *words])
+
+
+def _print_figures(record: dict[str, Any], out: Path, console: Console) -> None:
+    console.print(f"weights: {out} ({out.stat().st_size / 1e6:.1f} MB), {record['training']['steps']} steps")
+    figures = record["validation"]
+    if figures is None:
+        console.print("no scene was kept for validation; survey one that was held out to judge the weights")
+        return
+    table = Table("placement", "mIoU", title=f"{figures['scenes']} validation scenes, K = {figures['share_of_seats']:.0%}")
+    table.add_row("none", f"{figures['none']:.1%}")
+    for policy in ("random", "sobel", "entropy"):
+        table.add_row(policy, f"{figures[policy]['miou']:.1%}")
+    table.add_row("all", f"{figures['all']:.1%}")
+    console.print(table)

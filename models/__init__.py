@@ -1,0 +1,1 @@
+"""The two-scale segmenter in torch: tokens, encoder, decoder, attention policies, training, metrics, weights."""

@@ -1,0 +1,90 @@
+"""Controls: what other placements of the same number of seats would have given, seats free of each other.
+
+None of this belongs to a survey's own cost: it needs labels and the whole scene at full resolution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.inference import Glance, segment
+from models.metrics import confusion, gap_closed, mean_iou
+from models.policies import score_seats
+from models.weights import Weights
+from pipeline.selection import frame_seats
+
+RANDOM_DRAWS = 5
+Counts = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Controls:
+    """Confusion counts of each placement at one share of the seats (mode ``frame``)."""
+
+    share: float
+    seats: int
+    none: Counts
+    every: Counts
+    policies: dict[str, Counts]
+    random: list[Counts]
+
+    def as_dict(self) -> dict[str, object]:
+        """mIoU of every row, the share of the gap that it closes, and mean and spread of the random placements."""
+        none, every = mean_iou(self.none), mean_iou(self.every)
+        random = np.array([mean_iou(counts) for counts in self.random])
+        rows: dict[str, object] = {
+            policy: {"miou": mean_iou(counts), "spread": None, "gap_closed": gap_closed(mean_iou(counts), none, every)}
+            for policy, counts in self.policies.items()
+        }
+        rows["random"] = {
+            "miou": float(random.mean()),
+            "spread": float(random.std(ddof=1)) if len(random) > 1 else None,
+            "gap_closed": gap_closed(float(random.mean()), none, every),
+        }
+        return rows
+
+
+def run_controls(
+    weights: Weights,
+    seen: Glance,
+    fine: NDArray[np.floating],
+    labels: NDArray[np.uint8],
+    *,
+    share: float,
+    seed: int,
+    policies: tuple[str, ...] = ("entropy", "sobel"),
+    report: Callable[[str], None] = lambda row: None,
+) -> Controls:
+    """Segment with no seat, every seat, and ``share`` of the seats placed by each policy and at random.
+
+    Parameters
+    ----------
+    fine
+        (seat, p, p, column) normalised columns of every seat of the padded grid.
+    labels
+        (y, x) class indices, 255 unlabelled.
+    share
+        Of the valid seats.
+    """
+    valid = seen.grid.valid_share().ravel() > 0
+
+    def counts(row: str, seats: NDArray[np.integer]) -> Counts:
+        report(row)
+        drawn = segment(weights, seen, fine[seats], seats)
+        return confusion(labels, drawn.classes, weights.config.classes)
+
+    def placed(policy: str, number: int = 0) -> NDArray[np.integer]:
+        return frame_seats(score_seats(policy, seen, seed=seed + number), share, valid).seats
+
+    return Controls(
+        share,
+        len(placed("random")),
+        counts("none", np.empty(0, np.int64)),
+        counts("all", np.flatnonzero(valid)),
+        {policy: counts(policy, placed(policy)) for policy in policies},
+        [counts("random", placed("random", 1000 * (draw + 1))) for draw in range(RANDOM_DRAWS)],
+    )

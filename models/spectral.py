@@ -1,0 +1,121 @@
+"""The spectral stem: any number of bands, in any order, onto a fixed number of columns by wavelength."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import WavelengthError
+
+REACH = 1.5  # a column is reached by a band within this many column spacings of its centre
+LONGEST_NM, SHORTEST_NM = 3000.0, 200.0
+SPREAD_FLOOR = 1e-3  # least spread of a column, as a share of the median spread
+VARIANCE_FLOOR = 1e-5  # least variance of a direction that whitening brings to 1, as a share of the largest
+
+
+@dataclass(frozen=True)
+class SpectralBasis:
+    """Bumps evenly spread over ``low_nm``..``high_nm``, the wavelengths that the weights are for."""
+
+    low_nm: float
+    high_nm: float
+    columns: int = 24
+
+    @staticmethod
+    def spanning(wavelength_nm: NDArray[np.floating], most_columns: int = 24) -> SpectralBasis:
+        """Give the basis for data of these bands: no more columns than bands."""
+        wavelength = checked_wavelengths(wavelength_nm, len(wavelength_nm))
+        distinct = len(np.unique(wavelength))
+        return SpectralBasis(float(wavelength.min()), float(wavelength.max()), min(most_columns, distinct))
+
+    @property
+    def spacing_nm(self) -> float:
+        """Distance of neighbouring column centres [nm]; one column alone takes everything."""
+        span = self.high_nm - self.low_nm
+        return span / (self.columns - 1) if self.columns > 1 else max(span, LONGEST_NM)
+
+    def matrix(self, wavelength_nm: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Weights from bands to columns, each reached column summing to 1, and which columns are reached.
+
+        A band counts by the stretch of spectrum that it stands for (trapezoid on the sorted wavelengths), so that
+        15 or 270 bands give numbers of one scale, and repeated bands share their weight.
+
+        Returns
+        -------
+        (band, column) float32 and (column,) bool. Columns that no band reaches are all zero.
+
+        Raises
+        ------
+        WavelengthError : not finite, or outside 200-3000 nm (micrometres?).
+        """
+        wavelength = checked_wavelengths(wavelength_nm, len(wavelength_nm))
+        centres = np.linspace(self.low_nm, self.high_nm, self.columns)
+        distance = (wavelength[:, None] - centres[None, :]) / self.spacing_nm
+        bump = np.where(np.abs(distance) <= REACH, np.exp(-0.5 * (distance / 0.5) ** 2), 0.0)
+        weight = bump * band_widths(wavelength)[:, None]
+        total = weight.sum(axis=0)
+        reached = total > 0
+        return (weight / np.where(reached, total, 1.0)).astype(np.float32), reached
+
+
+def checked_wavelengths(wavelength_nm: NDArray[np.floating], bands: int) -> NDArray[np.float64]:
+    """Return the wavelengths as float64 after checking number, finiteness and unit; raises WavelengthError."""
+    wavelength = np.asarray(wavelength_nm, np.float64)
+    if wavelength.shape != (bands,) or bands == 0:
+        raise WavelengthError(f"expected one wavelength for each of {bands} bands, got {wavelength.size}")
+    outside = ~((wavelength >= SHORTEST_NM) & (wavelength <= LONGEST_NM))
+    if outside.any():
+        raise WavelengthError(
+            f"wavelength {wavelength[outside][0]:g} is outside {SHORTEST_NM:g}-{LONGEST_NM:g} nm;"
+            " give nanometres (multiply micrometres by 1000)"
+        )
+    return wavelength
+
+
+def band_widths(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Stretch of spectrum that each band stands for [nm]: half the way to either neighbour; 1 for a single wavelength."""
+    distinct, group, members = np.unique(wavelength_nm, return_inverse=True, return_counts=True)
+    if len(distinct) == 1:
+        return np.full(len(wavelength_nm), 1.0 / members[0])
+    gap = np.diff(distinct)
+    width = np.concatenate([gap[:1], gap[:-1] + gap[1:], gap[-1:]]) / 2
+    return (width / members)[group]
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """Brings columns to one scale and takes their correlation out, as measured on the training data.
+
+    Neighbouring columns nearly repeat each other; what tells two crops apart is a small direction among them, which
+    whitening makes as large as the rest.
+    """
+
+    centre: NDArray[np.float32]  # (column,) median
+    spread: NDArray[np.float32]  # (column,) 1.4826 MAD, floored
+    whitening: NDArray[np.float32]  # (column, column)
+
+    @staticmethod
+    def measured(sample: NDArray[np.floating]) -> Normalisation:
+        """Measure on (pixel, column) values. Constant columns give 0, whatever the order of columns."""
+        exact = sample.astype(np.float64)
+        centre = np.median(exact, axis=0)
+        spread = 1.4826 * np.median(np.abs(exact - centre), axis=0)
+        spread = np.maximum(spread, SPREAD_FLOOR * (float(np.median(spread)) or 1.0))
+        scaled = np.clip((exact - centre) / spread, -10, 10)
+        scaled -= scaled.mean(axis=0)
+        power, axes = np.linalg.eigh(scaled.T @ scaled / max(len(scaled), 1))
+        gain = 1 / np.sqrt(np.maximum(power, VARIANCE_FLOOR * max(float(power[-1]), 1e-12)))
+        whitening = (axes * gain) @ axes.T  # symmetric: no column changes its sign or its place
+        return Normalisation(centre.astype(np.float32), spread.astype(np.float32), whitening.astype(np.float32))
+
+    def apply(self, columns: NDArray[np.floating], reached: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """(..., column) -> the same shape; unreached columns, and values that are not finite, count as the median."""
+        normal = (np.asarray(columns, np.float32) - self.centre) / self.spread
+        return np.where(reached & np.isfinite(normal), normal, np.float32(0)) @ self.whitening
+
+    @property
+    def gain_shift(self) -> NDArray[np.float32]:
+        """What 100 % more light adds to normalised columns beyond doubling them, (column,)."""
+        return np.asarray((self.centre / self.spread) @ self.whitening, np.float32)

@@ -1,0 +1,120 @@
+"""Weights on disk: one safetensors file with the tensors, the spectral basis, the classes and how they were made."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from models.segmenter import Segmenter, SegmenterConfig
+from models.spectral import Normalisation, SpectralBasis
+from pipeline.errors import WeightsError
+
+NORMALISATION = ("centre", "spread", "whitening")
+FORMAT = "spectralzoom-weights/1"
+
+
+@dataclass(frozen=True)
+class Weights:
+    """A segmenter with all it needs to be used: basis, normalisation, classes, and the record of its training."""
+
+    segmenter: Segmenter
+    basis: SpectralBasis
+    normalisation: Normalisation
+    class_names: tuple[str, ...]
+    class_colours: NDArray[np.uint8]  # (class, 3)
+    record: dict[str, Any] = field(default_factory=dict)  # command, seed, data, split, validation, licence
+
+    @property
+    def config(self) -> SegmenterConfig:
+        """Sizes of the segmenter."""
+        return self.segmenter.config
+
+    def columns(self, values: NDArray[np.floating], wavelength_nm: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Normalised spectral columns of pixels, (..., band) -> (..., column) float32.
+
+        Columns that no band reaches, and pixels with a value that is not finite, are 0: the training median.
+        """
+        matrix, reached = self.basis.matrix(wavelength_nm)
+        return self.normalisation.apply(np.asarray(values, np.float32) @ matrix, reached)
+
+
+def save_weights(weights: Weights, path: Path) -> None:
+    """Write the file by a temporary name and a rename, so that it is whole or absent."""
+    tensors = {name: value.detach().cpu().contiguous() for name, value in weights.segmenter.state_dict().items()}
+    for name in NORMALISATION:
+        tensors[f"normalisation.{name}"] = torch.from_numpy(getattr(weights.normalisation, name).copy())
+    tensors["class_colours"] = torch.from_numpy(weights.class_colours.copy())
+    about = {
+        "format": FORMAT,
+        "config": weights.config.as_dict(),
+        "basis": {
+            "low_nm": weights.basis.low_nm,
+            "high_nm": weights.basis.high_nm,
+            "columns": weights.basis.columns,
+        },
+        "class_names": list(weights.class_names),
+        "record": weights.record,
+    }
+    temporary = path.with_name(path.name + ".part")
+    try:
+        temporary.write_bytes(save(tensors, {"about": json.dumps(about, sort_keys=True)}))
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise WeightsError(f"cannot write weights to {path}: {error.strerror}; choose another -o") from error
+
+
+def load_weights(path: Path) -> Weights:
+    """Read a file that ``save_weights`` wrote. No pickle is involved.
+
+    Raises
+    ------
+    WeightsError : missing, damaged, of another format, or a tensor that does not fit its config (named).
+    """
+    if not path.is_file():
+        raise WeightsError(f"no weights at {path}; train some with: spectralzoom train DATASET -o {path.name}")
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = json.loads((file.metadata() or {}).get("about", "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+    except (SafetensorError, OSError, json.JSONDecodeError) as error:
+        raise WeightsError(f"{path} is not a readable safetensors file ({error}); train or copy it again") from error
+    if about.get("format") != FORMAT:
+        raise WeightsError(f"{path} holds {about.get('format', 'no format mark')}, expected {FORMAT}; train it again")
+    return _assemble(path, about, tensors)
+
+
+def _assemble(path: Path, about: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Weights:
+    segmenter = Segmenter(SegmenterConfig(**about["config"]))
+    try:
+        normalisation = Normalisation(*(tensors.pop(f"normalisation.{name}").numpy() for name in NORMALISATION))
+        colours = tensors.pop("class_colours").numpy()
+    except KeyError as error:
+        raise WeightsError(f"{path}: tensor {error.args[0]} is missing; copy or train the file again") from error
+    expected = segmenter.state_dict()
+    for name, tensor in expected.items():
+        came = tuple(tensors[name].shape) if name in tensors else "nothing"
+        if came != tuple(tensor.shape):
+            raise WeightsError(f"{path}: tensor {name} should be {tuple(tensor.shape)}, the file has {came}")
+    segmenter.load_state_dict({name: tensors[name] for name in expected})
+    return Weights(
+        segmenter.eval(),
+        SpectralBasis(**about["basis"]),
+        normalisation,
+        tuple(about["class_names"]),
+        colours,
+        about["record"],
+    )
+
+
+def with_record(weights: Weights, **entries: Any) -> Weights:
+    """Give the same weights with entries added to their record."""
+    return replace(weights, record={**weights.record, **entries})

@@ -1,0 +1,1 @@
+"""Numeric core: arrays (or a device's bytes) in, arrays out; no files, no Prefect."""

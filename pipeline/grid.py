@@ -1,0 +1,75 @@
+"""The scene grid: pixels, seats of the fine pass, pixels of the coarse pass, and how sizes that do not divide are padded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import ShapeError
+
+
+@dataclass(frozen=True)
+class SceneGrid:
+    """A scene of ``height`` x ``width`` px cut into seats of ``patch`` px, coarse pixels of ``factor`` px.
+
+    The padded grid is the smallest multiple of ``patch * factor`` that holds the scene, so that a coarse patch
+    (``patch`` coarse pixels a side) covers ``factor`` x ``factor`` whole seats. Seats are numbered row by row over the
+    padded grid; those without a valid pixel are never bought.
+    """
+
+    height: int
+    width: int
+    patch: int
+    factor: int
+
+    def __post_init__(self) -> None:
+        for name in ("height", "width", "patch", "factor"):
+            if getattr(self, name) < 1:
+                raise ShapeError(f"{name} of the scene grid must be at least 1, got {getattr(self, name)}")
+
+    @property
+    def padded_shape(self) -> tuple[int, int]:
+        """(y, x) of the padded fine grid [px]."""
+        cell = self.patch * self.factor
+        return -(-self.height // cell) * cell, -(-self.width // cell) * cell
+
+    @property
+    def seat_shape(self) -> tuple[int, int]:
+        """(rows, columns) of seats on the padded grid."""
+        y, x = self.padded_shape
+        return y // self.patch, x // self.patch
+
+    @property
+    def coarse_shape(self) -> tuple[int, int]:
+        """(y, x) of the coarse pixels that hold part of the scene."""
+        return -(-self.height // self.factor), -(-self.width // self.factor)
+
+    def valid_share(self) -> NDArray[np.float64]:
+        """Share of each seat's pixels that lie on the scene, (rows, columns) in 0..1."""
+        rows, columns = self.seat_shape
+        down = np.clip(self.height - np.arange(rows) * self.patch, 0, self.patch)
+        across = np.clip(self.width - np.arange(columns) * self.patch, 0, self.patch)
+        return down[:, None] * across[None, :] / self.patch**2
+
+    def valid_seats(self) -> NDArray[np.intp]:
+        """Numbers of the seats that hold a valid pixel, ascending."""
+        return np.flatnonzero(self.valid_share().ravel() > 0)
+
+    def seat_origin(self, seats: NDArray[np.integer]) -> NDArray[np.intp]:
+        """(seat, 2) y and x of the first pixel of each seat."""
+        rows, columns = np.divmod(np.asarray(seats), self.seat_shape[1])
+        return np.stack([rows, columns], axis=-1).astype(np.intp) * self.patch
+
+
+def pad_by_reflection(image: NDArray[np.generic], shape: tuple[int, int]) -> NDArray[np.generic]:
+    """Grow the first two axes to ``shape`` by reflection (by the edge pixel where reflection has nothing to show)."""
+    grown = image
+    for axis, size in enumerate(shape):
+        while grown.shape[axis] < size:
+            have = grown.shape[axis]
+            pad = [(0, 0)] * image.ndim
+            pad[axis] = (0, size - have if have < 2 else min(size - have, have - 1))
+            grown = np.pad(grown, pad, mode="edge" if have < 2 else "reflect")
+    return grown

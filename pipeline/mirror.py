@@ -1,0 +1,203 @@
+"""The two-axis mirror: device position, normal, view direction, and how the line turns. Closed forms, float64.
+
+Camera frame: the chief ray leaves along k = (0, 0, 1) and the undeflected scene direction is (1, 0, 0); y is the normal
+of the plane of incidence. Scene tangents are xi = o_y / o_x (along the line) and eta = o_z / o_x (the scan). The device
+reports the point, in units of tan 50 deg, where a ray falling along the rest normal would go (position (0, 0) is rest).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipeline.errors import PoseError, ShapeError
+
+Floats = NDArray[np.float64]
+
+REST_TANGENT = float(np.tan(np.deg2rad(50.0)))
+RIM_SLACK = 1e-12
+LENGTH_SLACK = 1e-6
+_HALF = float(np.sqrt(0.5))
+# Rows are e1, e2, e3 in the camera frame: the axes of device X, device Y, and the rest normal.
+_DEVICE_AXES = np.array([[-_HALF, 0.0, -_HALF], [0.0, 1.0, 0.0], [_HALF, 0.0, -_HALF]])
+
+
+def position_to_normal(position: ArrayLike) -> Floats:
+    """Give the mirror normal of device positions.
+
+    Parameters
+    ----------
+    position
+        (..., 2) device X and Y, in the closed unit disk.
+
+    Returns
+    -------
+    (..., 3) float64 unit normals in the camera frame.
+
+    Raises
+    ------
+    PoseError : a position is not finite or beyond the rim; the message names the first.
+    """
+    xy = _vectors(position, 2, "mirror position")
+    _refuse(np.hypot(xy[..., 0], xy[..., 1]) > 1 + RIM_SLACK, xy, "lies outside the unit disk that the mirror reaches")
+    half = np.empty((*xy.shape[:-1], 3))
+    half[..., :2] = xy * REST_TANGENT
+    # r + e3 up to a factor, r = (X T, Y T, 1) / |.|: no angle and no difference of near numbers.
+    half[..., 2] = 1 + np.sqrt(1 + half[..., 0] ** 2 + half[..., 1] ** 2)
+    normal: Floats = _unit(half) @ _DEVICE_AXES
+    return normal
+
+
+def normal_to_position(normal: ArrayLike) -> Floats:
+    """Give the device position of mirror normals: the inverse of ``position_to_normal``.
+
+    Parameters
+    ----------
+    normal
+        (..., 3) unit normals in the camera frame.
+
+    Returns
+    -------
+    (..., 2) float64 device X and Y.
+
+    Raises
+    ------
+    PoseError : a normal is not finite, not of length 1, or turned beyond the rim. The disk is checked before anything
+        is divided, since X overflows as the tilt nears 45 deg (erratum E2).
+    """
+    n = _units(normal, "mirror normal")
+    device = n @ _DEVICE_AXES.T
+    c2 = 2 * device[..., 2] ** 2 - 1
+    lateral = 2 * device[..., 2] * np.hypot(device[..., 0], device[..., 1])
+    inside = (device[..., 2] > 0) & (c2 > 0) & (lateral <= REST_TANGENT * c2 * (1 + RIM_SLACK))
+    _refuse(~inside, n, "is turned beyond the rim of the mirror's range (25 deg)")
+    position: Floats = 2 * device[..., 2:] * device[..., :2] / (c2 * REST_TANGENT)[..., None]
+    return position
+
+
+def direction_to_normal(direction: ArrayLike) -> Floats:
+    """Give the normal that sends the chief ray along unit directions, n ~ o - k.
+
+    Stable up to grazing (o_z -> 1, erratum E7): there 1 - o_z is taken as (o_x^2 + o_y^2) / (1 + o_z).
+
+    Parameters
+    ----------
+    direction
+        (..., 3) unit view directions in the camera frame.
+
+    Raises
+    ------
+    PoseError : a direction is not finite, not of length 1, or is the chief ray itself, which no mirror makes.
+    """
+    o = _units(direction, "view direction")
+    n = o.copy()
+    n[..., 2] = -_one_minus_z(o)
+    _refuse(~np.any(n != 0, axis=-1), o, "is the camera's own ray, which no mirror makes")
+    return _unit(n)
+
+
+def reflect(ray: ArrayLike, normal: ArrayLike) -> Floats:
+    """Reflect travelling rays, o = k - 2 (n . k) n, over (..., 3) arrays that broadcast."""
+    k, n = np.asarray(ray, np.float64), np.asarray(normal, np.float64)
+    out: Floats = k - 2 * np.sum(n * k, axis=-1, keepdims=True) * n
+    return out
+
+
+def position_to_direction(position: ArrayLike) -> Floats:
+    """Give the unit direction (..., 3) in which the chief ray looks from device positions (..., 2)."""
+    return reflect((0.0, 0.0, 1.0), position_to_normal(position))
+
+
+def direction_to_position(direction: ArrayLike) -> Floats:
+    """Give the device position (..., 2) that points the chief ray along unit directions (..., 3)."""
+    return normal_to_position(direction_to_normal(direction))
+
+
+def scene_to_direction(tangents: ArrayLike) -> Floats:
+    """Give unit directions (..., 3) of scene tangents (..., 2), xi along the line and eta along the scan."""
+    t = _vectors(tangents, 2, "scene tangent")
+    return _unit(np.concatenate([np.ones((*t.shape[:-1], 1)), t], axis=-1))
+
+
+def direction_to_scene(direction: ArrayLike) -> Floats:
+    """Give scene tangents (..., 2) of directions (..., 3).
+
+    Raises
+    ------
+    PoseError : a direction does not look at the scene plane (o_x <= 0).
+    """
+    o = _vectors(direction, 3, "view direction")
+    _refuse(o[..., 0] <= 0, o, "looks away from the scene plane (its x must be above 0)")
+    tangents: Floats = o[..., 1:] / o[..., :1]
+    return tangents
+
+
+def line_rotation(direction: ArrayLike) -> Floats:
+    """Give the angle by which the image of the slit is turned in the scene tangent plane.
+
+    psi = atan2(o_y, 1 - o_z), a property of the pose and not of the path (erratum E8). The line stays straight: it
+    runs along (cos psi, sin psi) in (xi, eta), exactly.
+
+    Parameters
+    ----------
+    direction
+        (..., 3) unit view directions of the line's centre.
+
+    Returns
+    -------
+    (...) float64, anticlockwise from xi to eta. [rad]
+    """
+    o = _units(direction, "view direction")
+    psi: Floats = np.arctan2(o[..., 1], _one_minus_z(o))
+    return psi
+
+
+def paper_position(normal: ArrayLike) -> Floats:
+    """Give what equation (7) of the paper takes for the position, X = n_x / sin 25 deg.
+
+    For comparison only: it agrees with the device at rest and at the rim, and is up to 6.40 deg wrong between.
+    """
+    device = _vectors(normal, 3, "mirror normal") @ _DEVICE_AXES.T
+    position: Floats = device[..., :2] / np.sin(np.deg2rad(25.0))
+    return position
+
+
+def _one_minus_z(o: Floats) -> Floats:
+    """1 - o_z of unit vectors without cancellation on either side."""
+    z = o[..., 2]
+    across = o[..., 0] ** 2 + o[..., 1] ** 2
+    return np.where(z > 0, across / (1 + np.maximum(z, 0)), 1 - z)
+
+
+def _unit(vectors: Floats) -> Floats:
+    # The largest part is taken out first: near grazing the squares of small vectors would lose digits or vanish.
+    scaled = vectors / np.max(np.abs(vectors), axis=-1, keepdims=True)
+    unit: Floats = scaled / np.sqrt(np.sum(scaled**2, axis=-1, keepdims=True))
+    return unit
+
+
+def _vectors(values: ArrayLike, size: int, name: str) -> Floats:
+    """Read ``values`` as (..., size) finite float64."""
+    array = np.asarray(values, np.float64)
+    if array.ndim == 0 or array.shape[-1] != size:
+        raise ShapeError(f"a {name} needs {size} numbers on the last axis, got shape {array.shape}")
+    _refuse(~np.isfinite(array).all(axis=-1), array, "is not finite")
+    return array
+
+
+def _units(values: ArrayLike, name: str) -> Floats:
+    """Read ``values`` as (..., 3) vectors of length 1."""
+    array = _vectors(values, 3, name)
+    _refuse(np.abs(np.sum(array**2, axis=-1) - 1) > LENGTH_SLACK, array, f"is not of length 1, as a {name} must be")
+    return array
+
+
+def _refuse(bad: NDArray[np.bool_] | np.bool_, values: Floats, reason: str) -> None:
+    """Raise for the first bad vector, saying which one it was."""
+    if not np.any(bad):
+        return
+    first = np.argwhere(bad)[0]
+    where = f" (index {', '.join(map(str, first.tolist()))})" if first.size else ""
+    what = {2: "position or tangent", 3: "direction or normal"}[values.shape[-1]]
+    numbers = ", ".join(f"{value:.15g}" for value in values[tuple(first)])
+    raise PoseError(f"{what} ({numbers}){where} {reason}; keep the field within the mirror's range")

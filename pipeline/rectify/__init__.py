@@ -1,0 +1,1 @@
+"""From raw lines to pixels of the scene grid: calibration, lookup, resampling, mosaic."""

@@ -1,0 +1,128 @@
+"""Scores and a budget in, seats out: stable, nested, and never led by a number that is not one."""
+
+from __future__ import annotations
+
+import operator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import BudgetError, ShapeError
+
+GOLDEN = (5**0.5 - 1) / 2
+
+Scores = NDArray[np.floating]
+Seats = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Seats by rank, best first. ``spread`` says that no score could be ranked and seats were spread evenly instead."""
+
+    seats: Seats
+    spread: bool = False
+
+
+def seat_count(share: float, valid: int) -> int:
+    """Turn a share of the valid seats into a number of seats, halves rounded up.
+
+    Raises
+    ------
+    BudgetError : the share is not a number from 0 to 1.
+    """
+    if not 0 <= share <= 1:  # NaN too
+        raise BudgetError(f"the share of seats to buy must be from 0 to 1, got {share} (of {valid} seats)")
+    return min(int(np.floor(share * valid + 0.5)), valid)
+
+
+def select_seats(score: Scores, count: int, valid: NDArray[np.bool_] | None = None, *, clip: bool = False) -> Selection:
+    """Choose the ``count`` valid seats with the highest scores.
+
+    Equal scores go to the lowest number; +inf comes first, NaN and -inf last. The choice is nested: the first K of a
+    larger choice are the choice of K. When no valid seat has a score to rank (all NaN or -inf), seats are spread evenly
+    over the valid ones, nested too, and the result says so.
+
+    Parameters
+    ----------
+    score
+        (seat,) any float type; ranked as float64.
+    count
+        Seats to choose, from 0 to the number of valid ones.
+    valid
+        (seat,) seats that may be chosen; None allows all.
+    clip
+        Take all valid seats where ``count`` is larger, instead of refusing.
+
+    Raises
+    ------
+    BudgetError : ``count`` is not a whole number, below 0, or above the number of valid seats.
+    """
+    allowed = _allowed(score, valid)
+    wanted = _check_count(count, len(allowed), clip=clip)
+    order, spread = _ranked(np.asarray(score, np.float64)[allowed])
+    return Selection(allowed[order[:wanted]], spread and wanted > 0)
+
+
+def frame_seats(score: Scores, share: float, valid: NDArray[np.bool_] | None = None) -> Selection:
+    """Choose a share of the valid seats as if each could be captured by itself (``frame`` mode: compares policies)."""
+    return select_seats(score, seat_count(share, len(_allowed(score, valid))), valid)
+
+
+def complete_seats(requested: Seats, score: Scores, valid: NDArray[np.bool_] | None = None) -> Seats:
+    """Keep the first of repeated requests and refill with the next best seats, so that the count is conserved.
+
+    Raises
+    ------
+    BudgetError : more seats are requested than there are valid ones.
+    ShapeError : a requested seat does not exist or is not valid.
+    """
+    asked = np.asarray(requested, np.intp)
+    allowed = _allowed(score, valid)
+    strange = asked[~np.isin(asked, allowed)]
+    if len(strange):
+        raise ShapeError(f"seat {strange[0]} is not among the {len(allowed)} valid seats; request valid seats only")
+    _check_count(len(asked), len(allowed), clip=False)
+    unique = asked[np.sort(np.unique(asked, return_index=True)[1])]
+    ranked = allowed[_ranked(np.asarray(score, np.float64)[allowed])[0]]
+    spare = ranked[~np.isin(ranked, unique)]
+    return np.concatenate([unique, spare[: len(asked) - len(unique)]])
+
+
+def valid_gain(score: Scores, share: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Scale scores of partly filled seats by the share of their pixels on the scene; -inf where nothing is.
+
+    For scores that stand for a gain per pixel: a border seat is then ranked by what it can really give.
+    """
+    scores, shares = np.asarray(score, np.float64), np.asarray(share, np.float64)
+    if scores.shape != shares.shape:
+        raise ShapeError(f"expected one share a score, got {shares.shape} shares and {scores.shape} scores")
+    return np.where(shares > 0, scores * np.where(shares > 0, shares, 1), -np.inf)
+
+
+def _allowed(score: Scores, valid: NDArray[np.bool_] | None) -> Seats:
+    """Numbers of the seats that may be chosen, ascending."""
+    shape = np.shape(score)
+    masked = shape if valid is None else np.shape(valid)
+    if len(shape) != 1 or masked != shape:
+        raise ShapeError(f"expected (seat,) scores and a mask of their shape, got {shape} and {masked}")
+    return np.arange(shape[0]) if valid is None else np.flatnonzero(valid)
+
+
+def _check_count(count: int, seats: int, *, clip: bool) -> int:
+    try:
+        wanted = -1 if isinstance(count, bool | np.bool_) else operator.index(count)
+    except TypeError:
+        wanted = -1
+    if wanted < 0 or (wanted > seats and not clip):
+        raise BudgetError(f"expected a whole number of seats to buy from 0 to {seats}, got {count!r}")
+    return min(wanted, seats)
+
+
+def _ranked(score: NDArray[np.float64]) -> tuple[Seats, bool]:
+    """Order of the scores, best first, and whether it is the even spread that stands in for a rank."""
+    worth = np.where(np.isnan(score), -np.inf, score)
+    if len(worth) and np.all(np.isneginf(worth)):
+        # Multiples of the golden ratio leave gaps of at most three sizes, for every count and any row length.
+        return np.argsort((np.arange(len(worth)) * GOLDEN) % 1.0, kind="stable"), True
+    return np.argsort(-worth, kind="stable"), False

@@ -1,0 +1,1 @@
+"""Simulated scenes and the simulated source that looks at them."""

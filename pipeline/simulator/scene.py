@@ -1,0 +1,204 @@
+"""Scenes: what the simulated rig looks at, as a few component planes and the electrons that each gives per band."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.camera import LineCamera
+from pipeline.errors import SceneError, ShapeError
+from pipeline.rectify.resample import gather
+
+DEFAULT_EXPOSURE_MS = 100.0  # the exposure at which Scene.electrons is stated
+WELL_SHARE = 0.6  # of the full well, filled by the bright end of a scene without a radiance law
+BRIGHT_PERCENTILE = 99.9
+UNLABELLED = 255
+
+
+class Scene(Protocol):
+    """A field of light. Light is linear in the components: electrons = components @ ``electrons``."""
+
+    @property
+    def name(self) -> str:
+        """What the receipt calls it."""
+
+    @property
+    def key(self) -> str:
+        """Identity of the content: equal keys give equal light."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(y, x) size [px]."""
+
+    @property
+    def wavelength_nm(self) -> NDArray[np.float64]:
+        """(band,) centre wavelengths [nm]."""
+
+    @property
+    def fwhm_nm(self) -> NDArray[np.float64] | None:
+        """(band,) widths [nm], None where not known."""
+
+    @property
+    def electrons(self) -> NDArray[np.float32]:
+        """(component, band) electrons at the default exposure per unit of component; (band,) means a diagonal."""
+
+    @property
+    def panel(self) -> NDArray[np.float32]:
+        """(band,) scene value of the white panel."""
+
+    @property
+    def panel_electrons(self) -> NDArray[np.float32]:
+        """(band,) electrons that the white panel gives at the default exposure."""
+
+    def sample(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Give the components at points, (n,) rows and columns [px] -> (n, component) float32."""
+
+
+@dataclass(frozen=True)
+class RasterScene:
+    """A scene of pixels, interpolated by Catmull-Rom; outside, the edge pixel is repeated.
+
+    ``planes`` is (y, x, component) float32 and ``electrons`` (component, band), or (band,) where each band has its own
+    plane. Labels are (y, x) uint8 with 255 for unlabelled. ``filled_px`` counts pixels that came without a value.
+    """
+
+    name: str
+    key: str
+    planes: NDArray[np.float32]
+    electrons: NDArray[np.float32]
+    panel: NDArray[np.float32]
+    panel_electrons: NDArray[np.float32]
+    wavelength_nm: NDArray[np.float64]
+    fwhm_nm: NDArray[np.float64] | None = None
+    labels: NDArray[np.uint8] | None = None
+    class_names: tuple[str, ...] = ()
+    class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+    filled_px: int = 0
+
+    def __post_init__(self) -> None:
+        bands = len(self.wavelength_nm)
+        if self.planes.ndim != 3 or 0 in self.planes.shape:
+            raise SceneError(f"scene {self.name} must be (y, x, component) and not empty, got {self.planes.shape}")
+        wanted = {(self.planes.shape[2], bands)} | ({(bands,)} if bands == self.planes.shape[2] else set())
+        if self.electrons.shape not in wanted:
+            raise ShapeError(
+                f"scene {self.name}: electrons {self.electrons.shape} do not map {self.planes.shape[2]} components "
+                f"to {bands} bands"
+            )
+        for what in ("panel", "panel_electrons"):
+            if getattr(self, what).shape != (bands,):
+                raise ShapeError(f"scene {self.name}: {what} {getattr(self, what).shape}, expected ({bands},)")
+        if self.labels is not None and self.labels.shape != self.shape:
+            raise SceneError(f"scene {self.name} is {self.shape} px, its labels {self.labels.shape}; crop or pad one")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(y, x) size [px]."""
+        return self.planes.shape[0], self.planes.shape[1]
+
+    def sample(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Give the components at points, (n,) rows and columns [px] -> (n, component) float32."""
+        return gather(self.planes, y, x)
+
+    def spectra(self) -> NDArray[np.float32]:
+        """Scene value per unit of component, shaped as ``electrons``."""
+        spectra: NDArray[np.float32] = self.electrons * (self.panel / self.panel_electrons).astype(np.float32)
+        return spectra
+
+    def values(self) -> NDArray[np.float32]:
+        """(y, x, band) float32 scene values: what a perfect survey returns. The whole cube, in memory."""
+        return to_bands(self.planes, self.spectra())
+
+
+def to_bands(components: NDArray[np.float32], spectra: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Multiply (..., component) by (component, band), or by the diagonal (band,); gives (..., band) float32."""
+    mixed: NDArray[np.float32] = components * spectra if spectra.ndim == 1 else components @ spectra
+    return mixed
+
+
+def raster_from_values(
+    values: NDArray[np.generic],
+    camera: LineCamera,
+    *,
+    name: str,
+    wavelength_nm: NDArray[np.float64],
+    fwhm_nm: NDArray[np.float64] | None = None,
+    labels: NDArray[np.uint8] | None = None,
+    class_names: tuple[str, ...] = (),
+    class_colours: NDArray[np.uint8] | None = None,
+    key: str | None = None,
+) -> RasterScene:
+    """Turn an image without a radiance law into a scene of relative, linear light.
+
+    The 99.9th percentile of the finite values fills 60 % of the full well at the default exposure; a scene without
+    positive light takes 1 in its place. Pixels with a value that is not finite get the band's median and are counted
+    in ``filled_px``. Negative values give no electrons.
+
+    Parameters
+    ----------
+    values
+        (y, x, band) numbers, any real type.
+    key
+        Identity of the content; by default the hash of the values.
+
+    Raises
+    ------
+    SceneError : not three axes, nothing in it, no finite value, or the labels do not fit.
+    """
+    if values.ndim != 3 or 0 in values.shape:
+        raise SceneError(f"scene {name} must be (y, x, band) and not empty, got {values.shape}")
+    planes = np.ascontiguousarray(values, dtype=np.float32)
+    bright = _bright_value(planes, name)
+    planes, filled = _fill_by_median(planes)
+    bands = planes.shape[2]
+    return RasterScene(
+        name=name,
+        key=key or content_key(planes),
+        planes=planes,
+        electrons=np.full(bands, WELL_SHARE * camera.full_well_e / bright, np.float32),
+        panel=np.full(bands, bright / WELL_SHARE, np.float32),
+        panel_electrons=np.full(bands, camera.full_well_e, np.float32),
+        wavelength_nm=np.asarray(wavelength_nm, np.float64),
+        fwhm_nm=fwhm_nm,
+        labels=labels,
+        class_names=class_names,
+        class_colours=np.zeros((0, 3), np.uint8) if class_colours is None else class_colours,
+        filled_px=filled,
+    )
+
+
+def content_key(planes: NDArray[np.float32]) -> str:
+    """Hash of an array's shape and bytes, 32 hexadecimal digits."""
+    digest = hashlib.blake2b(repr((planes.shape, planes.dtype.str)).encode(), digest_size=16)
+    digest.update(np.ascontiguousarray(planes).data)
+    return digest.hexdigest()
+
+
+def _bright_value(planes: NDArray[np.float32], name: str) -> float:
+    """Bright end of the finite values; 1 where there is no positive light.
+
+    Read on every n-th pixel of scenes above 2^24 values: the rank of so many is known to 1e-5.
+    """
+    pixels = planes.reshape(-1, planes.shape[2])[:: max(1, planes.size >> 24)]
+    finite = pixels[np.isfinite(pixels)]
+    if not finite.size:
+        raise SceneError(f"scene {name} holds no finite value; check its fill value and its bands")
+    bright = float(np.percentile(finite, BRIGHT_PERCENTILE))
+    return bright if bright > 0 else 1.0
+
+
+def _fill_by_median(planes: NDArray[np.float32]) -> tuple[NDArray[np.float32], int]:
+    """Replace what is not finite by the band's median (0 in a band without any), and count such pixels."""
+    missing = ~np.isfinite(planes)
+    if not missing.any():
+        return planes, 0
+    filled = planes.copy()
+    for band in np.flatnonzero(missing.any(axis=(0, 1))):
+        gaps = missing[..., band]
+        known = planes[..., band][~gaps]
+        filled[..., band][gaps] = np.median(known) if known.size else 0.0
+    return filled, int(missing.any(axis=2).sum())

@@ -1,0 +1,64 @@
+"""Source: what the rig, the simulator and an archive have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.camera import LineCamera
+from pipeline.scan import Sweep
+
+
+@dataclass(frozen=True)
+class Line:
+    """One captured line. ``data`` is (sample, band) uint16 DN, a sum over ``Sweep.binning`` neighbours."""
+
+    number: int
+    data: NDArray[np.uint16]
+    mirror_x: float  # measured position at mid exposure, -1..1
+    mirror_y: float
+    time_s: float  # of mid exposure, since the start of the sweep
+    exposure_ms: float
+    valid: bool = True
+
+
+@dataclass(frozen=True)
+class References:
+    """Dark and white frames of one sweep's binning, (sample, band) float32 DN, and the panel's value per band.
+
+    A sample's scene value is ``(raw - dark) / (white - dark) * panel``.
+    """
+
+    dark: NDArray[np.float32]
+    white: NDArray[np.float32]
+    panel: NDArray[np.float32]
+
+
+class Source(Protocol):
+    """Something that can look at a field line by line."""
+
+    @property
+    def name(self) -> str:
+        """What the receipt calls it: ``sim``, ``rig``, or an archive's address."""
+
+    @property
+    def camera(self) -> LineCamera:
+        """The camera that takes the lines."""
+
+    @property
+    def wavelength_nm(self) -> NDArray[np.float64]:
+        """(band,) centre wavelengths [nm]."""
+
+    @property
+    def field_shape(self) -> tuple[int, int]:
+        """(y, x) size of the field to survey [px]."""
+
+    def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
+        """Give the sweep's lines one by one, from line ``first`` on."""
+
+    def references(self, sweep: Sweep) -> References:
+        """Dark and white frames with the sweep's binning."""

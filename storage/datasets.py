@@ -1,0 +1,190 @@
+"""Data sets: scenes in a folder, or one scene with a training mask, loaded one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+from storage.labels import UNLABELLED, load_codes
+from storage.raster_files import SCENE_ENDINGS, split_variable
+from storage.scene_files import SceneFile, load_scene_file, scene_number
+from storage.scene_toml import SETTINGS_NAME, load_scene_settings
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """Named scene files. ``train`` and ``test`` load them one at a time."""
+
+    path: Path
+    files: dict[str, str]  # name -> file (or FILE:VARIABLE)
+    held_out: tuple[str, ...] = ()
+    labels: str | Path | None = None
+    bands: tuple[int, ...] | None = None
+    wavelengths: tuple[float, ...] | None = None
+    train_mask: str | Path | None = None
+    mask_classes: tuple[int, ...] | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Every scene, in the order of the files' names."""
+        return tuple(self.files)
+
+    @property
+    def train_names(self) -> tuple[str, ...]:
+        """Scenes to train on."""
+        return tuple(name for name in self.files if name not in self.held_out)
+
+    def load(self, name: str) -> SceneFile:
+        """Read one scene with all its labels; its ``name`` is the data set's. Errors as load_scene_file."""
+        if name not in self.files:
+            raise SceneError(f"{self.path} has no scene {name}; it has {', '.join(self.files)}")
+        return load_scene_file(self.files[name], labels=self.labels, bands=self.bands, wavelengths=self.wavelengths)
+
+    def train(self) -> Iterator[tuple[str, SceneFile]]:
+        """Scenes to train on, with the labels to train on."""
+        for name in self.train_names:
+            scene = self.load(name)
+            if self.train_mask is not None:
+                train, _ = split_labels(scene, self.train_mask, self.mask_classes)
+                scene = scene.with_labels(train, f"labels only where {self.train_mask} says so: training")
+            yield name, scene
+
+    def test(self) -> Iterator[tuple[str, SceneFile]]:
+        """Scenes held out; with a training mask, the same scene with the labels that training does not see."""
+        for name in self.held_out:
+            yield name, self.load(name)
+        if self.train_mask is not None:
+            for name in self.train_names:
+                scene = self.load(name)
+                _, rest = split_labels(scene, self.train_mask, self.mask_classes)
+                yield name, scene.with_labels(rest, f"labels only where {self.train_mask} does not train: test")
+
+
+def load_data_set(
+    path: str | Path,
+    *,
+    hold_out: Sequence[str] = (),
+    labels: str | Path | None = None,
+    bands: Sequence[int] | None = None,
+    wavelengths: Sequence[float] | None = None,
+    train_mask: str | Path | None = None,
+    mask_classes: Sequence[int] | None = None,
+) -> DataSet:
+    """Name the scenes of a folder (``images/`` in it, or the files themselves) or of one file. Reads none of them yet.
+
+    A scene is named by the first number in its file's name (``images/059_image.png`` is ``059``), or by the whole name
+    where numbers are missing or alike.
+
+    Parameters
+    ----------
+    hold_out
+        Names of scenes to keep from training.
+    train_mask
+        For one scene: where to train. 0 is nowhere; number i is the label file's class ``mask_classes[i - 1]``.
+    mask_classes
+        None takes the mask's numbers as the label file's.
+
+    Raises
+    ------
+    SceneError : there is no scene, a name to hold out does not exist, or a mask is given for several scenes.
+    """
+    files = _scene_files(path, train_mask)
+    unknown = [name for name in hold_out if name not in files]
+    if unknown:
+        raise SceneError(f"{path} has no scene {', '.join(unknown)} to hold out; it has {', '.join(files)}")
+    if len(set(hold_out)) == len(files):
+        raise SceneError(f"{path}: all {len(files)} scenes are held out, which leaves none to train on; hold out fewer")
+    if len(files) > 1 and (train_mask is not None or labels is not None):
+        raise SceneError(f"{path} has {len(files)} scenes; one file of labels or one mask fits a single scene only")
+    if mask_classes is not None and train_mask is None:
+        raise SceneError("mask classes are given without a training mask; give both or neither")
+    return DataSet(
+        path=Path(path),
+        files=files,
+        held_out=tuple(name for name in files if name in set(hold_out)),
+        labels=labels,
+        bands=None if bands is None else tuple(bands),
+        wavelengths=None if wavelengths is None else tuple(wavelengths),
+        train_mask=train_mask,
+        mask_classes=None if mask_classes is None else tuple(mask_classes),
+    )
+
+
+def split_labels(
+    scene: SceneFile, train_mask: str | Path, mask_classes: Sequence[int] | None
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Labels to train on (where the mask's class is the label's) and the labelled rest, each (y, x), 255 elsewhere.
+
+    A mask that disagrees with the labels, or lies where there is none, trains nothing there.
+
+    Raises
+    ------
+    SceneError : the scene has no labels or classes by colour, the mask has another size, or a number that no class has.
+    """
+    if scene.labels is None:
+        raise SceneError(f"{scene.path} has no labels, which a training mask needs; give --labels")
+    mask, _ = load_codes(train_mask, by_number=True)
+    if mask.shape != scene.labels.shape:
+        raise SceneError(f"mask {train_mask} is {_size(mask)} px, the scene is {_size(scene.labels)} px (y x x)")
+    wanted = _mask_to_index(scene, train_mask, int(mask.max(initial=0)), mask_classes)[np.maximum(mask, 0)]
+    trains = (wanted == scene.labels) & (wanted != UNLABELLED)
+    return (
+        np.where(trains, scene.labels, np.uint8(UNLABELLED)),
+        np.where(trains, np.uint8(UNLABELLED), scene.labels),
+    )
+
+
+def _mask_to_index(
+    scene: SceneFile, train_mask: str | Path, highest: int, mask_classes: Sequence[int] | None
+) -> NDArray[np.uint8]:
+    """Class index for each number 0..highest of the mask."""
+    numbers = {value: index for index, value in enumerate(scene.class_values) if isinstance(value, int)}
+    if not numbers:
+        raise SceneError(f"{scene.path} has classes by colour; a training mask needs classes by number")
+    given = list(range(1, highest + 1)) if mask_classes is None else list(mask_classes)
+    if highest > len(given):
+        raise SceneError(f"mask {train_mask} goes up to {highest}, but only {len(given)} mask classes are given")
+    unknown = [number for number in given[:highest] if number not in numbers]
+    if unknown:
+        raise SceneError(
+            f"mask {train_mask}: class {unknown[0]} is none of the labels' {sorted(numbers)}; correct the mask classes"
+        )
+    return np.array([UNLABELLED, *(numbers[number] for number in given[:highest])], np.uint8)
+
+
+def _size(image: NDArray[np.generic]) -> str:
+    return f"{image.shape[0]} x {image.shape[1]}"
+
+
+def _scene_files(path: str | Path, train_mask: str | Path | None) -> dict[str, str]:
+    file, _ = split_variable(path)
+    if not file.is_dir():
+        if not file.is_file():
+            raise SceneError(f"there is no file or folder {file}; check the name (seen from {Path.cwd()})")
+        return {file.stem: str(path)}
+    inner = file / "images"
+    folder = inner if inner.is_dir() else file
+    found = sorted(entry for entry in folder.iterdir() if entry.suffix.lower() in SCENE_ENDINGS and entry.is_file())
+    found = [entry for entry in found if entry.resolve() not in _no_scenes(file, train_mask)]
+    if not found:
+        raise SceneError(
+            f"{folder} holds no scene ({', '.join(SCENE_ENDINGS)}); give a folder with images/ and a {SETTINGS_NAME}"
+        )
+    numbers = [scene_number(entry) or "" for entry in found]
+    by_number = all(numbers) and len(set(numbers)) == len(found)
+    names = numbers if by_number else [entry.stem for entry in found]
+    return dict(zip(names, map(str, found), strict=True))
+
+
+def _no_scenes(folder: Path, train_mask: str | Path | None) -> set[Path]:
+    """Files of the folder that hold labels or the mask."""
+    settings = folder / SETTINGS_NAME
+    labels = load_scene_settings(settings).labels if settings.is_file() else None
+    named = [] if labels is None else [folder / split_variable(labels)[0]]
+    named += [] if train_mask is None else [split_variable(train_mask)[0]]
+    return {path.resolve() for path in named}

@@ -1,0 +1,212 @@
+"""What all stored arrays have in common: Zarr v3 codecs and chunks, bands, CF and GeoZarr attributes, rounding.
+
+Chunks of 32 x 32 px with all bands, in shards of 64 rows, each chunk with its own crc32c: one patch is one range read,
+and a flipped bit is an error instead of a wrong number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
+
+from pipeline.errors import IncompleteStoreError, ShapeError, WavelengthError
+
+CHUNK_PX = 32
+SHARD_ROWS = 64
+SHARD_COLUMNS = 640
+KEPT_BITS = 11
+
+_SPATIAL_CONVENTION = {
+    "uuid": "689b58e2-cf7b-45e0-9fff-9cfc0883d6b4",
+    "name": "spatial",
+    "schema_url": "https://raw.githubusercontent.com/zarr-conventions/spatial/refs/tags/v1/schema.json",
+    "spec_url": "https://github.com/zarr-conventions/spatial/blob/v1/README.md",
+    "description": "Relation of array indices to tangents of the undeflected direction; there is no CRS",
+}
+
+
+@dataclass(frozen=True)
+class AngularGrid:
+    """Where an image's pixels lie: tangents from the undeflected direction, the scene's centre."""
+
+    ifov_rad: float
+    scene_shape: tuple[int, int]  # (y, x) of the fine grid [px]
+    factor: int = 1  # fine px a pixel
+
+    def attributes(self, shape: tuple[int, int]) -> dict[str, Any]:
+        """GeoZarr ``spatial:`` attributes of an image of (y, x) ``shape``; the transform maps pixel corners."""
+        step = self.ifov_rad * self.factor
+        top, left = (-size / 2 * self.ifov_rad for size in self.scene_shape)
+        return {
+            "spatial:dimensions": ["y", "x"],
+            "spatial:shape": list(shape),
+            "spatial:transform_type": "affine",
+            "spatial:transform": [step, 0.0, left, 0.0, step, top],
+            "spatial:bbox": [left, top, left + step * shape[1], top + step * shape[0]],
+            "spatial:registration": "pixel",
+            "zarr_conventions": [_SPATIAL_CONVENTION],
+        }
+
+    def record(self) -> dict[str, Any]:
+        """What is needed to make this grid again."""
+        return {"ifov_rad": self.ifov_rad, "scene_shape": list(self.scene_shape), "factor": self.factor}
+
+
+def grid_of(attributes: Mapping[str, Any]) -> AngularGrid | None:
+    """The grid that a group's attributes record, or None."""
+    record = attributes.get("angular_grid")
+    if not isinstance(record, dict):
+        return None
+    y, x = record["scene_shape"]
+    return AngularGrid(float(record["ifov_rad"]), (int(y), int(x)), int(record["factor"]))
+
+
+def grid_record(grid: AngularGrid | None) -> dict[str, Any]:
+    """Attributes from which :func:`grid_of` makes the grid again."""
+    return {} if grid is None else {"angular_grid": grid.record()}
+
+
+def create_group(path: Path, title: str, attributes: Mapping[str, Any]) -> zarr.Group:
+    """Begin a Zarr v3 store at ``path``, which must not exist."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return zarr.create_group(path, zarr_format=3, attributes={"Conventions": "CF-1.12", "title": title, **attributes})
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """Shape of one stored array. ``chunk`` is the unit of reading, ``shard`` the unit of writing and of files."""
+
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    dtype: str
+    chunk: tuple[int, ...]
+    shard: tuple[int, ...] | None = None
+
+
+def image_spec(dims: Sequence[str], shape: Sequence[int], dtype: str) -> ArraySpec:
+    """Rows and columns first, all bands in one chunk; a shard is 64 rows of at most 640 columns."""
+    rows, columns, *rest = shape
+    chunk = (min(CHUNK_PX, max(rows, 1)), min(CHUNK_PX, max(columns, 1)))
+    shard = (_whole_chunks(min(SHARD_ROWS, rows), chunk[0]), _whole_chunks(min(SHARD_COLUMNS, columns), chunk[1]))
+    return ArraySpec(tuple(dims), tuple(shape), dtype, (*chunk, *rest), (*shard, *rest))
+
+
+def _whole_chunks(size: int, chunk: int) -> int:
+    return -(-size // chunk) * chunk
+
+
+def create_array(group: zarr.Group, name: str, spec: ArraySpec, attributes: Mapping[str, Any]) -> zarr.Array[Any]:
+    """Add an empty array: NaN where floating, 0 or ``_FillValue`` where not."""
+    kind = np.dtype(spec.dtype)
+    fill: Any = np.nan if kind.kind == "f" else attributes.get("_FillValue", 0)
+    return group.create_array(
+        name,
+        shape=spec.shape,
+        dtype=kind,
+        chunks=tuple(max(size, 1) for size in spec.chunk),
+        shards=None if spec.shard is None else tuple(max(size, 1) for size in spec.shard),
+        compressors=(
+            BloscCodec(cname="zstd", clevel=3, shuffle=BloscShuffle.bitshuffle, typesize=kind.itemsize),
+            Crc32cCodec(),
+        ),
+        fill_value=bool(fill) if kind.kind == "b" else fill,
+        dimension_names=spec.dims,
+        attributes=dict(attributes),
+    )
+
+
+def write_small(
+    group: zarr.Group, name: str, dims: Sequence[str], values: NDArray[Any], attributes: Mapping[str, Any]
+) -> None:
+    """Store a small array in one chunk."""
+    spec = ArraySpec(tuple(dims), values.shape, values.dtype.str, values.shape)
+    array = create_array(group, name, spec, attributes)
+    if values.size:
+        array[...] = values
+
+
+def write_image(
+    group: zarr.Group, name: str, dims: Sequence[str], values: NDArray[Any], attributes: Mapping[str, Any]
+) -> None:
+    """Store an image or cube, rows and columns first."""
+    create_array(group, name, image_spec(dims, values.shape, values.dtype.str), attributes)[...] = values
+
+
+def write_bands(group: zarr.Group, wavelength_nm: NDArray[np.float64], fwhm_nm: NDArray[np.float64] | None) -> str:
+    """Store the coordinates of ``band`` and give their names for a ``coordinates`` attribute."""
+    centre = np.asarray(wavelength_nm, np.float64)
+    if centre.ndim != 1 or not centre.size:
+        raise WavelengthError(f"wavelengths have shape {centre.shape}, expected (band,) with at least one band")
+    about = {"standard_name": "radiation_wavelength", "long_name": "wavelength at the band's centre", "units": "nm"}
+    write_small(group, "wavelength", ("band",), centre, about)
+    if fwhm_nm is None:
+        return "wavelength"
+    widths = np.asarray(fwhm_nm, np.float64)
+    if widths.shape != centre.shape:
+        raise ShapeError(f"fwhm has shape {widths.shape}, wavelengths {centre.shape}; give one a band")
+    write_small(group, "fwhm", ("band",), widths, {"long_name": "full width at half maximum", "units": "nm"})
+    return "wavelength fwhm"
+
+
+def open_group(path: Path) -> zarr.Group:
+    """Open a store for reading.
+
+    Raises
+    ------
+    IncompleteStoreError : there is none, or its metadata is damaged.
+    """
+    try:
+        return zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise IncompleteStoreError(f"{path} is no readable Zarr store ({error}); run verify on the archive") from error
+
+
+def read_array(group: zarr.Group, name: str, selection: Any = ...) -> NDArray[Any]:
+    """Read (part of) one array.
+
+    Raises
+    ------
+    IncompleteStoreError : there is no such array, or a checksum says that its bytes have changed.
+    """
+    with damage_named(f"{group.store_path}/{name}"):
+        array = group[name]
+        if not isinstance(array, zarr.Array):
+            raise KeyError(f"{name} is no array")
+        return np.asarray(array[selection])
+
+
+def read_bands(group: zarr.Group) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Wavelengths and widths [nm] of a store."""
+    return read_array(group, "wavelength"), read_array(group, "fwhm") if "fwhm" in group else None
+
+
+@contextmanager
+def damage_named(where: str) -> Iterator[None]:
+    """Turn what decoders raise on damaged bytes into an IncompleteStoreError that names the array."""
+    try:
+        yield
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError, IndexError) as error:
+        raise IncompleteStoreError(f"{where} cannot be read: {error}; run verify on the archive") from error
+
+
+def round_bits(values: NDArray[np.floating], kept: int = KEPT_BITS) -> NDArray[np.float32]:
+    """Round float32 to ``kept`` bits of the mantissa, half to even: the rest is zero and compresses away.
+
+    Relative error at most 2^-(kept + 1), 2.4e-4 at 11 bits; rounding again changes nothing. NaN and infinities stay.
+    """
+    source = np.ascontiguousarray(values, np.float32)
+    bits = source.view(np.uint32)
+    drop = np.uint32(23 - kept)
+    half_less_one = (np.uint32(1) << (drop - np.uint32(1))) - np.uint32(1)
+    rounded = bits + half_less_one + ((bits >> drop) & np.uint32(1))
+    rounded &= ~((np.uint32(1) << drop) - np.uint32(1))
+    as_float = rounded.view(np.float32)
+    return np.where(np.isfinite(source) & np.isfinite(as_float), as_float, source)

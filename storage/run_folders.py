@@ -1,0 +1,53 @@
+"""The folder of one run: receipt, report and pictures, published together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from storage.keys import plain
+from storage.staging import check_name, refusals, remove_tree, rename_into_place, write_manifest
+
+
+class RunDraft:
+    """The folder of one run while it is written. Published as a whole, or abandoned."""
+
+    def __init__(self, run_id: str, folder: Path, root: Path, release: Callable[[], None]) -> None:
+        self.id = run_id
+        self.folder = folder
+        self._root = root
+        self._release = release
+
+    def __enter__(self) -> RunDraft:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
+        try:
+            if kind is None and self.folder.exists():
+                self.publish()
+        finally:
+            self.abandon()
+
+    def write_file(self, name: str, content: str | bytes) -> Path:
+        """Write one file of the run, such as ``receipt.json``, and give its path."""
+        check_name(name)
+        with refusals(self._root, "write to the archive"):
+            path = self.folder / name
+            path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return path
+
+    def publish(self, **facts: Any) -> Path:
+        """Make the run seen under ``runs``; gives its folder. ``facts`` go into the manifest."""
+        final = self.folder.with_name(self.id)
+        with refusals(self._root, "write to the archive"):
+            write_manifest(self.folder, {"run": self.id, **plain(facts)})
+            rename_into_place(self.folder, final)
+        self._release()
+        return final
+
+    def abandon(self) -> None:
+        """Remove what is not published; harmless afterwards."""
+        if self.folder.exists():
+            remove_tree(self.folder)
+            self._release()

@@ -1,0 +1,205 @@
+"""Scene files: an image or cube with its wavelengths and labels, as a simulated rig looks at it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+from storage.labels import UNLABELLED, Labels, load_labels
+from storage.raster_files import SCENE_ENDINGS, load_raster, split_variable
+from storage.scene_toml import ClassValue, SceneSettings, find_scene_settings
+from storage.wavelengths import settle_wavelengths
+
+__all__ = ["SCENE_ENDINGS", "UNLABELLED", "SceneFile", "load_scene_file"]
+
+_READ_AT_ONCE = 1 << 22
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """A scene as its file gives it, on the file's own pixels."""
+
+    name: str
+    path: Path
+    values: NDArray[np.float32]  # (y, x, band), NaN where the file has none
+    wavelength_nm: NDArray[np.float64]  # (band,)
+    fwhm_nm: NDArray[np.float64] | None  # (band,)
+    labels: NDArray[np.uint8] | None  # (y, x) class index, 255 = unlabelled
+    class_names: tuple[str, ...]
+    class_colours: NDArray[np.uint8]  # (class, 3)
+    class_values: tuple[ClassValue, ...]  # what each class is in the label file: a number or a colour
+    content_hash: str  # of everything above
+    light_hash: str  # of values and wavelengths alone: labels do not change what a camera sees
+    provenance: tuple[str, ...]  # one sentence for each thing assumed or left out
+
+    def with_labels(self, labels: NDArray[np.uint8], note: str) -> SceneFile:
+        """The same scene with other labels; hash and provenance say so."""
+        digest = _digest(self.light_hash, self.class_names, self.class_values, _bytes_hash(labels))
+        return replace(self, labels=labels, content_hash=digest, provenance=(*self.provenance, note))
+
+
+def load_scene_file(
+    path: str | Path,
+    *,
+    labels: str | Path | None = None,
+    bands: Sequence[int] | None = None,
+    wavelengths: Sequence[float] | None = None,
+) -> SceneFile:
+    """Read a scene from PNG, JPEG, TIFF, .npy, .npz or .mat; what is given here wins over the ``scene.toml`` beside it.
+
+    Parameters
+    ----------
+    path
+        File, or ``FILE.mat:VARIABLE``. Axes are y, x, band; two axes are one band.
+    labels
+        File of class numbers or colours on the same pixels.
+    bands
+        Bands of the file to use, counted from 0.
+    wavelengths
+        One for each band used, or for each band of the file. [nm]
+
+    Raises
+    ------
+    SceneError : a file is missing, damaged, of a kind or shape that cannot be used, or the labels do not fit.
+    WavelengthError : wavelengths are missing, or their number, unit or range is wrong.
+    """
+    file, variable = split_variable(path)
+    raster = load_raster(path, dims=3)
+    settings = find_scene_settings(file)
+    cube = _three_axes(raster.values, file)
+    chosen = _chosen_bands(bands, settings, cube.shape[2], file)
+    light = settle_wavelengths(
+        file, chosen, cube.shape[2], stated=wavelengths, settings=settings, assumed_nm=raster.assumed_nm
+    )
+    values, notes = _as_float(cube, chosen, raster.nodata, file)
+    found, label_note = _labels(file, (cube.shape[0], cube.shape[1]), labels, settings)
+    light_hash = _digest(_file_hash(file), variable, chosen, light.centre_nm.tolist(), _listed(light.fwhm_nm))
+    return SceneFile(
+        name=file.stem,
+        path=file,
+        values=values,
+        wavelength_nm=light.centre_nm,
+        fwhm_nm=light.fwhm_nm,
+        labels=None if found is None else found.index,
+        class_names=() if found is None else found.names,
+        class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,
+        class_values=() if found is None else found.values,
+        content_hash=light_hash if found is None else _labelled_hash(light_hash, found),
+        light_hash=light_hash,
+        provenance=(*_band_note(chosen, cube.shape[2]), *raster.notes, light.origin, *notes, *label_note),
+    )
+
+
+def _three_axes(values: NDArray[Any], path: Path) -> NDArray[Any]:
+    cube = values[..., None] if values.ndim == 2 else values
+    if cube.ndim != 3:
+        raise SceneError(f"{path} holds shape {values.shape}; expected (y, x, band), or (y, x) for one band")
+    return cube
+
+
+def _chosen_bands(bands: Sequence[int] | None, settings: SceneSettings, count: int, path: Path) -> list[int]:
+    where = "--bands" if bands is not None else f"bands in {settings.path}"
+    chosen = bands if bands is not None else settings.bands
+    if chosen is None:
+        return list(range(count))
+    wrong = [band for band in chosen if not 0 <= band < count]
+    if wrong or not chosen:
+        raise SceneError(
+            f"{where}: {f'band {wrong[0]}' if wrong else 'an empty list'}, but {path} has bands 0..{count - 1} "
+            f"(counted from 0); correct it"
+        )
+    if len(set(chosen)) < len(chosen):
+        raise SceneError(f"{where}: {list(chosen)} names a band twice; name each once")
+    return [int(band) for band in chosen]
+
+
+def _band_note(chosen: list[int], count: int) -> tuple[str, ...]:
+    return () if chosen == list(range(count)) else (f"bands {chosen} of {count}, counted from 0",)
+
+
+def _as_float(
+    cube: NDArray[Any], chosen: list[int], nodata: float | None, path: Path
+) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+    """Chosen bands as float32; the file's no-data value and infinities become NaN, and are counted."""
+    every = chosen == list(range(cube.shape[2]))
+    picked = cube if every else cube[..., chosen]
+    notes: list[str] = []
+    with np.errstate(over="ignore"):
+        values = np.array(picked, np.float32, order="C")
+    if nodata is not None:
+        void = picked == np.asarray(nodata).astype(picked.dtype) if np.isfinite(nodata) else np.isnan(values)
+        values[void] = np.nan
+        notes.append(f"{int(void.sum())} samples have the file's no-data value {nodata:g}")
+    infinite = np.isinf(values)
+    if infinite.any():
+        values[infinite] = np.nan
+        notes.append(f"{int(infinite.sum())} infinite samples count as missing")
+    missing = int(np.isnan(values).sum())
+    if missing == values.size:
+        raise SceneError(f"{path} holds no finite number in the bands used; choose others")
+    if missing:
+        notes.append(f"{missing} of {values.size} samples are missing")
+    return values, tuple(notes)
+
+
+def _labels(
+    scene: Path, shape: tuple[int, int], stated: str | Path | None, settings: SceneSettings
+) -> tuple[Labels | None, tuple[str, ...]]:
+    address = stated
+    if address is None and settings.labels is not None and settings.path is not None:
+        address = settings.path.parent / _fill_number(settings.labels, scene)
+        if "{number}" in settings.labels and not address.is_file():
+            return None, (f"no labels: there is no {address}",)
+    if address is None:
+        return None, ()
+    found = load_labels(address, shape, classes=settings.classes, unlabelled=settings.unlabelled)
+    how = f"classes from {settings.path}" if settings.classes else f"{len(found.names)} classes as found in the file"
+    return found, (f"labels from {address}, {how}",)
+
+
+def scene_number(path: Path) -> str | None:
+    """``059_image.png`` -> ``059``: the first digits of the file's name."""
+    digits = re.search(r"\d+", path.stem)
+    return None if digits is None else digits.group()
+
+
+def _fill_number(template: str, scene: Path) -> str:
+    if "{number}" not in template:
+        return template
+    number = scene_number(scene)
+    if number is None:
+        raise SceneError(f"{scene} has no number in its name, which labels = {template!r} in scene.toml asks for")
+    return template.replace("{number}", number)
+
+
+def _labelled_hash(light_hash: str, labels: Labels) -> str:
+    return _digest(light_hash, labels.names, labels.values, _bytes_hash(labels.index))
+
+
+def _listed(values: NDArray[np.float64] | None) -> list[float] | None:
+    return None if values is None else values.tolist()
+
+
+def _digest(*parts: object) -> str:
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def _bytes_hash(values: NDArray[np.uint8]) -> str:
+    return hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest()
+
+
+def _file_hash(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(_READ_AT_ONCE):
+            digest.update(block)
+    return digest.hexdigest()

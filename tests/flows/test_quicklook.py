@@ -1,0 +1,141 @@
+"""The quicklook: a readable PNG for any size, and the parts that it is made of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from flows.panels import choose_bands, class_palette, class_rgb, grey_of, outline, stretch
+from flows.quicklook import QuicklookData, draw_quicklook
+
+WAVES = np.linspace(400, 1000, 61)
+
+
+def make_data(height: int, width: int, bands: int = 5, *, patch: int = 16) -> QuicklookData:
+    """A small survey of noise with every optional part."""
+    rng = np.random.default_rng(0)
+    rows, columns = -(-height // (4 * patch)) * 4, -(-width // (4 * patch)) * 4
+    return QuicklookData(
+        survey="a field $with_marks$ & <signs>",
+        seed=1,
+        budget=0.5,
+        policy="entropy",
+        raw=(rng.integers(0, 4095, (max(1, height // 4), 10, bands)).astype(np.uint16),) * 2,
+        rectified=rng.random((height, width, bands), np.float32),
+        wavelength_nm=np.linspace(450, 900, bands),
+        score=rng.random((rows, columns)),
+        patch_px=patch,
+        seats=np.array([0, 1], np.intp),
+        blocks=((0, min(patch, height), 0, width),),
+        class_map=rng.integers(0, 3, (height, width)).astype(np.uint8),
+        class_names=("soil", "sugar_beet", r"$\weeds_{$"),
+        truth=rng.integers(0, 3, (height, width)).astype(np.uint8),
+        confidence=rng.random((height, width), np.float32),
+    )
+
+
+@pytest.mark.parametrize(("height", "width"), [(96, 128), (145, 145), (20, 300), (300, 20), (1, 1)])
+def test_picture_has_a_readable_size(tmp_path: Path, height, width):
+    """Any proportions give a page of 800 to 2000 px a side, mostly covered."""
+    draw_quicklook(tmp_path / "q.png", make_data(height, width))
+    with Image.open(tmp_path / "q.png") as image:
+        assert 1200 <= image.width <= 1800
+        assert 600 <= image.height <= 2000
+
+
+def test_parts_that_are_absent_are_left_out(tmp_path: Path):
+    """No truth, no confidence, no seat, no block, nothing scored and nothing seen still make a picture."""
+    data = make_data(64, 64)
+    empty = replace(
+        data,
+        truth=None,
+        confidence=None,
+        seats=np.array([], np.intp),
+        blocks=(),
+        score=np.full_like(data.score, np.nan),
+        rectified=np.full_like(data.rectified, np.nan),
+        class_map=np.full_like(data.class_map, 255),
+    )
+    draw_quicklook(tmp_path / "empty.png", empty)
+    draw_quicklook(tmp_path / "confidence.png", replace(data, truth=None))
+    assert (tmp_path / "empty.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("score", [-np.inf, np.inf, 0.0])
+def test_scores_without_a_range_are_drawn(tmp_path: Path, score):
+    """Scores that are all alike or not finite do not stop the picture."""
+    data = make_data(64, 64)
+    draw_quicklook(tmp_path / "q.png", replace(data, score=np.full_like(data.score, score)))
+    assert (tmp_path / "q.png").exists()
+
+
+def test_same_data_gives_the_same_picture(tmp_path: Path):
+    """Nothing in the picture depends on when it was drawn."""
+    for name in ("one", "two"):
+        draw_quicklook(tmp_path / name, make_data(32, 48))
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+
+
+def test_bands_nearest_to_true_colour():
+    """Sorted or not, the bands nearest 640, 550 and 460 nm are red, green and blue."""
+    assert choose_bands(WAVES)[0] == (24, 15, 6)
+    order = np.random.default_rng(0).permutation(61)
+    assert choose_bands(WAVES[order])[0] == tuple(np.argsort(order)[[24, 15, 6]])
+
+
+@pytest.mark.parametrize(("waves", "bands", "word"), [
+    ([660.0, 800.0], (1, 0, 0), "false colour, 800 / 660 / 660"),
+    ([800.0], (0, 0, 0), "grey, 800"),
+    ([1500.0, 900.0, 1100.0], (0, 2, 1), "false colour"),
+])  # fmt: skip
+def test_fewer_bands_are_false_colour_or_grey(waves, bands, word):
+    """Without red, green and blue the longest band is red and the shortest blue; one band is grey."""
+    chosen, words = choose_bands(np.array(waves))
+    assert chosen == bands
+    assert word in words
+
+
+def test_stretch_ignores_what_is_missing():
+    """The middle 96 % fill 0..1 whatever NaN there is; a flat band is black and a missing one light grey."""
+    image = np.random.default_rng(0).normal(5, 2, (50, 50, 3)).astype(np.float32)
+    image[:10, :, 0], image[..., 1], image[..., 2] = np.nan, 7, np.nan
+    shown = stretch(image)
+    known = shown[10:, :, 0]
+    assert np.mean(known == 0) == pytest.approx(0.02, abs=0.005)
+    assert np.mean(known == 1) == pytest.approx(0.02, abs=0.005)
+    assert (shown[..., 1] == 0).all()
+    np.testing.assert_allclose(shown[..., 2], 0.86)
+    assert np.isfinite(grey_of(image)).all()
+
+
+def test_outline_is_the_border_of_the_seats():
+    """Two neighbours have one common border of six sides, cut off at the scene's edge."""
+    chosen = np.zeros((3, 4), bool)
+    chosen[0, 0] = chosen[0, 1] = True
+    segments = np.array(outline(chosen, 10, (25, 15)))
+    lengths = np.abs(segments[:, 1] - segments[:, 0]).sum(axis=1)
+    assert lengths.sum() == 2 * (15 + 10)
+    assert segments.min() == -0.5
+    assert segments[..., 0].max() == 14.5
+
+
+@pytest.mark.parametrize("count", [1, 16, 17, 60])
+def test_palette_colours_are_all_different(count):
+    """No two classes share a colour, and colours that were given are kept."""
+    palette = class_palette(count)
+    assert len(np.unique(palette, axis=0)) == count
+    assert palette.min() >= 0
+    assert palette.max() <= 1
+    given = np.array([[0, 255, 0]], np.uint8)
+    np.testing.assert_array_equal(class_palette(1, given), [[0, 1, 0]])
+
+
+def test_unlabelled_pixels_are_grey():
+    """255 and numbers without a name get the same light grey."""
+    picture = class_rgb(np.array([[0, 9, 255]], np.uint8), class_palette(2))
+    np.testing.assert_array_equal(picture[0, 1], picture[0, 2])
+    assert (picture[0, 0] != picture[0, 1]).any()

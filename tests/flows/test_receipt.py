@@ -1,0 +1,173 @@
+"""The receipt: complete, in order, fit for JSON, and the same for the same seed."""
+
+from __future__ import annotations
+
+import copy
+import io
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from flows.receipt import (
+    COSTS,
+    Header,
+    Receipt,
+    StageRecord,
+    build_receipt,
+    check_receipt,
+    comparable,
+    headline,
+    print_table,
+    to_json,
+)
+from flows.settings import Settings
+from pipeline.errors import ShapeError
+
+
+def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
+    """A receipt with hand-made figures; every path of the design is in it."""
+    saving = {"done": 50, "full": 100, "ratio": 0.5, "full_is": "predicted"}
+    savings: dict[str, object] = {name: dict(saving) for name in reversed(COSTS)}
+    savings["multiply_adds"] = {**saving, "glance": 20, "score": 1, "encode": 19, "decode": 10}
+    savings["capture_s"] = {"done": 104.0, "full": 209.0, "ratio": 104 / 209, "full_is": "predicted"}
+    savings["segment_wall_s"] = {"done": wall / 2, "full": wall}
+    accuracy = {
+        "miou": np.float32(0.75),
+        "per_class_iou": {"soil": 0.9, "wheat": float("nan")},
+        "none": {"miou": 0.5, "per_class_iou": {"soil": 0.8, "wheat": None}},
+        "all": {"miou": 0.875, "per_class_iou": {"soil": 0.95, "wheat": None}},
+        "gap_closed": 2 / 3,
+        "controls": {"random": {"miou": 0.5625, "spread": 0.0125}, "sobel": {"miou": 0.6, "spread": None}},
+    }
+    effects = [
+        {
+            "name": "shot",
+            "state": "on",
+            "variant": "normal",
+            "bound": None,
+            "measured": None,
+            "cost_s": wall,
+            "why": None,
+        }
+    ]
+    stages = [
+        StageRecord("capture", "ab12", "ran", wall, wall, 10**9, 0, 10**8),
+        StageRecord("rectify", "cd34", "cached"),
+    ]
+    header = Header(
+        "farm", "sim", "farm@1", 7, f"start {wall}", f"end {wall}", {"torch": "2.13.0"}, Settings().to_dict()
+    )
+    return build_receipt(
+        header,
+        stages,
+        savings,
+        {"quicklook": f"runs/{wall}/quicklook.png"},
+        accuracy=accuracy if labels else None,
+        effects=effects,
+    )
+
+
+def test_receipt_has_the_fields_of_the_design_in_order():
+    """The top level and the savings stand in the design's order, whatever order they came in."""
+    receipt = make_receipt()
+    assert list(receipt) == [
+        "survey",
+        "source",
+        "scene",
+        "seed",
+        "started",
+        "finished",
+        "versions",
+        "settings",
+        "stages",
+        "savings",
+        "accuracy",
+        "effects",
+        "products",
+    ]
+    assert list(receipt["savings"]) == [*COSTS, "segment_wall_s"]
+
+
+def test_numbers_that_are_not_finite_become_null():
+    """JSON has no NaN: it is null, and numpy scalars are plain numbers."""
+    text = to_json({"nan": float("nan"), "list": [np.float64("inf"), np.int64(3)], "tuple": (1.5, None, True)})
+    assert json.loads(text) == {"nan": None, "list": [None, 3], "tuple": [1.5, None, True]}
+    assert make_receipt()["accuracy"]["per_class_iou"] == {"soil": 0.9, "wheat": None}
+
+
+def test_json_reads_back_to_the_same_receipt():
+    """What is written is what was built, and it still passes the check."""
+    receipt = make_receipt()
+    assert check_receipt(json.loads(to_json(receipt))) == receipt
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        ("versions",),
+        ("stages", 0, "peak_rss_bytes"),
+        ("savings", "tokens"),
+        ("savings", "lines", "full_is"),
+        ("savings", "multiply_adds", "score"),
+        ("savings", "segment_wall_s", "full"),
+        ("accuracy", "gap_closed"),
+        ("accuracy", "none", "miou"),
+        ("accuracy", "controls", "random", "spread"),
+        ("effects", 0, "why"),
+    ],
+)
+def test_missing_field_is_named(path):
+    """Taking any one field away is found, with its place."""
+    broken: dict = copy.deepcopy(dict(make_receipt()))
+    part = broken
+    for name in path[:-1]:
+        part = part[name]
+    del part[path[-1]]
+    with pytest.raises(ShapeError, match=rf"{path[-1]} is missing"):
+        check_receipt(broken)
+
+
+def test_words_outside_the_design_are_refused():
+    """A stage has one of four states, a full figure one of two origins."""
+    broken: dict = copy.deepcopy(dict(make_receipt()))
+    broken["stages"][1]["state"] = "done"
+    with pytest.raises(ShapeError, match=r"stages\[1\]\.state must be one of ran.*got 'done'"):
+        check_receipt(broken)
+    broken = copy.deepcopy(dict(make_receipt()))
+    broken["savings"]["lines"]["full_is"] = "guessed"
+    with pytest.raises(ShapeError, match="measured or predicted"):
+        check_receipt(broken)
+
+
+def test_accuracy_and_effects_may_be_absent():
+    """Without labels there is no accuracy, and that is complete."""
+    assert "accuracy" not in make_receipt(labels=False)
+
+
+def test_comparable_leaves_times_out_and_nothing_else():
+    """Two runs that differ in times agree; one that differs in a figure or the seed does not."""
+    one, two = make_receipt(wall=1.5), make_receipt(wall=2.5)
+    assert one != two
+    assert comparable(one) == comparable(two)
+    two["savings"]["lines"]["done"] += 1
+    assert comparable(one) != comparable(two)
+    assert comparable(one) != comparable({**one, "seed": 8})
+
+
+def test_table_shows_savings_accuracy_and_stages():
+    """The terminal block holds the figures with their units, 'predicted', the controls and every stage."""
+    console = Console(file=io.StringIO(), width=100)
+    print_table(make_receipt(), console)
+    text = console.file.getvalue()
+    for words in ("104 s", "209 s", "50 %", "predicted", "75.0", "± 1.2", "67 %", "capture", "cached"):
+        assert words in text, words
+
+
+def test_headline_is_one_paragraph_with_the_figures():
+    """The first sentence that a farmer reads says where, how long and how well."""
+    text = headline(make_receipt(), 0.23)
+    assert text.startswith("The camera looked twice at 23 % of the field. Capture took 104 s instead of 209 s")
+    assert "75.0 of 100" in text
+    assert "truth" not in headline(make_receipt(labels=False))

@@ -1,0 +1,210 @@
+"""Settings: defaults, precedence, and every mistake refused with its place and its cure."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flows import setting_values
+from flows import settings as settings_module
+from flows.settings import Settings, load_settings, parse_settings
+from models import policies
+from pipeline.camera import LineCamera
+from pipeline.errors import BudgetError, SettingsError
+from pipeline.scan import CostModel
+from pipeline.simulator.instrument import ALL_EFFECTS
+
+EXAMPLE = Path(__file__).parents[2] / "survey.example.toml"
+
+
+@pytest.fixture
+def toml(tmp_path: Path):
+    """Write text as a survey's file and give its path."""
+
+    def write(text: str) -> Path:
+        path = tmp_path / "survey.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def test_nothing_given_is_the_default():
+    """No file and no flag gives the defaults of the design."""
+    found = load_settings()
+    assert found == Settings()
+    assert (found.scene, found.budget, found.policy, found.memory) == ("farm", 0.5, "entropy", 4 * 2**30)
+
+
+def test_every_field_of_the_dataclasses_can_be_set():
+    """No field of the survey, the camera or the cost model lacks its check."""
+    assert {item.name for item in fields(Settings)} == set(settings_module._SURVEY)
+    for name, (make, spans) in settings_module._TABLES.items():
+        assert {item.name for item in fields(make)} == set(spans), name
+        defaults = getattr(Settings(), name)
+        parse_settings({name: {item.name: getattr(defaults, item.name) for item in fields(make)}})
+
+
+def test_words_are_those_of_the_parts_that_use_them():
+    """Policies and effects that the settings accept are exactly those that exist."""
+    assert settings_module.POLICIES == policies.POLICIES
+    assert set(setting_values.EFFECTS) == ALL_EFFECTS
+
+
+def test_flags_win_over_the_file(toml):
+    """A flag replaces the file's value and leaves the others."""
+    path = toml('budget = 0.4\npolicy = "sobel"\n[camera]\nexposure_ms = 50\nbits = 10\n')
+    found = load_settings(path, {"budget": "0.3", "camera.exposure_ms": 20, "seed": None})
+    assert (found.budget, found.policy, found.seed) == (0.3, "sobel", 0)
+    assert (found.camera.exposure_ms, found.camera.bits) == (20.0, 10)
+
+
+def test_paths_of_a_file_start_at_its_folder(toml):
+    """Relative paths move with the settings file; built-in names and flags stay as they are."""
+    path = toml('scene = "field.npy"\nlabels = "/data/labels.png"\nsource = "sim"\n')
+    found = load_settings(path, {"out": "here"})
+    assert found.scene == str(path.parent / "field.npy")
+    assert (found.labels, found.source, found.out) == ("/data/labels.png", "sim", "here")
+    assert load_settings(toml('scene = "farm"')).scene == "farm"
+
+
+def test_example_in_the_project_is_valid():
+    """The example that the README points to is accepted and says the defaults."""
+    found = load_settings(EXAMPLE)
+    assert replace(found, out=Settings.out) == Settings()
+
+
+@pytest.mark.parametrize(
+    ("line", "near"),
+    [
+        ("budgt = 0.5", "'budget'"),
+        ("waveleghts = [660]", "'wavelengths'"),
+        ("[camera]\nexposure = 100", "'camera.exposure_ms'"),
+        ("[camra]\nbits = 12", "'camera'"),
+        ("exposure_ms = 100", "'camera.exposure_ms'"),
+    ],
+)
+def test_unknown_key_is_refused_with_the_nearest(toml, line, near):
+    """A misspelt key is named together with the file and the key that was probably meant."""
+    with pytest.raises(SettingsError, match=rf"unknown setting.*survey\.toml; did you mean {near}"):
+        load_settings(toml(line))
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"camera": {"exposure_ms": 0.1}}, "from 0.5 to 10000 ms, got 0.1; was it given in seconds.* 100"),
+        ({"camera": {"exposure_ms": 10_001}}, "10000 ms, got 10001; was it given in microseconds"),
+        ({"camera": {"pitch_um": 7.4e-6}}, "um, got 7.4e-06; was it given in metres.* 7.4"),
+        ({"camera": {"focal_length_mm": 0.07}}, "mm, got 0.07; was it given in metres.* 70"),
+        ({"cost": {"slew_s": 50}}, "s, got 50; was it given in milliseconds.* 0.05"),
+        ({"wavelengths": [0.66, 0.8]}, "nm, got 0.66; was it given in micrometres.* 660"),
+        ({"camera": {"exposure_ms": float("nan")}}, "got nan$"),
+    ],
+)
+def test_unit_mistakes_are_refused_with_a_guess(table, words):
+    """A value out of range says the range, and the unit in which it would make sense."""
+    with pytest.raises(SettingsError, match=words):
+        parse_settings(table)
+
+
+@pytest.mark.parametrize("budget", ["abc", 0, "0", -1, 1.5, float("nan"), True, float("inf"), [0.5]])
+def test_budget_out_of_range_is_refused(budget):
+    """A budget is a share above 0 and at most 1; anything else says so and exits with 2."""
+    with pytest.raises(BudgetError, match="above 0 and at most 1, got") as caught:
+        load_settings(flags={"budget": budget})
+    assert caught.value.exit_code == 2
+    assert str(caught.value).startswith("--budget")
+
+
+def test_budget_in_percent_is_guessed():
+    """35 was meant as 0.35, and 1 is the whole scan."""
+    with pytest.raises(BudgetError, match=r"for 35 % write 0\.35"):
+        parse_settings({"budget": 35})
+    assert parse_settings({"budget": 1}).budget == 1.0
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        ("4GiB", 2**32),
+        ("500 MB", 500_000_000),
+        ("1.5gib", 3 * 2**29),
+        (2**30, 2**30),
+    ],
+)
+def test_memory_reads_units(text, count):
+    """Binary and decimal units are told apart."""
+    assert parse_settings({"memory": text}).memory == count
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"memory": "four"}, "such as 4GiB"),
+        ({"memory": "4"}, "at least 256MiB"),
+        ({"rounds": 2}, "rounds' must be 1, got 2; this version"),
+        ({"seed": -1}, "whole number from 0"),
+        ({"seed": 1.0}, "whole number from 0"),
+        ({"policy": "entropi"}, "one of entropy, sobel, random, mask"),
+        ({"policy": "mask"}, "needs a mask file"),
+        ({"mask": "m.png"}, "policy 'mask' only"),
+        ({"effects": "smear,glare"}, "some of slit,smear,shot,read"),
+        ({"bands": [0, 0]}, "names a band twice"),
+        ({"bands": "0;1"}, "counted from 0"),
+        ({"bands": [0, 1], "wavelengths": [660]}, "each of the 2 bands, got 1"),
+        ({"size": "1280"}, "WIDTHxHEIGHT"),
+        ({"size": "64x64", "scene": "a.png"}, "has its own"),
+        ({"controls": "no"}, "true or false"),
+        ({"camera": 3}, "must be a table"),
+        ({"camera": {"dark_dn": 5000}}, "leaves no room"),
+        ({"out": " "}, "text that is not empty"),
+    ],
+)
+def test_wrong_values_are_refused(table, words):
+    """Each wrong value is refused by a message that says what is wanted."""
+    with pytest.raises(SettingsError, match=words):
+        parse_settings(table)
+
+
+def test_file_that_cannot_be_read_is_one_message(toml, tmp_path):
+    """A missing file, a folder and broken TOML are settings errors with the path."""
+    with pytest.raises(SettingsError, match=r"no settings file .*nowhere\.toml"):
+        load_settings(tmp_path / "nowhere.toml")
+    with pytest.raises(SettingsError, match="cannot read the settings file"):
+        load_settings(tmp_path)
+    with pytest.raises(SettingsError, match=r"not valid TOML.*line 1"):
+        load_settings(toml("budget 0.5"))
+
+
+def test_text_and_lists_say_the_same():
+    """What a flag says with commas is what a file says with a list."""
+    one = load_settings(flags={"bands": "0, 2", "wavelengths": "660,800.5", "size": "300x20", "effects": "read,slit"})
+    two = parse_settings({"bands": [0, 2], "wavelengths": [660, 800.5], "size": [300, 20], "effects": ["slit", "read"]})
+    assert one == two
+    assert (one.shape, one.effects) == ((20, 300), "slit,read")
+
+
+@given(
+    budget=st.floats(0, 1, exclude_min=True),
+    seed=st.integers(0, 2**63 - 1),
+    bands=st.none() | st.sets(st.integers(0, 900), min_size=1),
+    memory=st.integers(2**28, 2**40),
+    exposure=st.floats(0.5, 10_000),
+    slew=st.floats(0, 10),
+)
+def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposure, slew):
+    """`parse_settings` undoes `to_dict`, so that a receipt's settings can be run again."""
+    settings = Settings(
+        budget=budget,
+        seed=seed,
+        bands=None if bands is None else tuple(bands),
+        memory=memory,
+        camera=LineCamera(exposure_ms=exposure),
+        cost=CostModel(slew_s=slew),
+    )
+    assert parse_settings(settings.to_dict()) == settings

@@ -1,0 +1,169 @@
+"""The line camera: timing, rays, footprints, noise, saturation, binning and the noise law of the coarse pass."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.polynomial.legendre import leggauss
+from scipy import stats
+
+from pipeline.camera import LineCamera, bin_samples, digitise, footprint_kernel, look
+from pipeline.errors import ShapeError
+from pipeline.scan import capture_options
+
+CAMERA = LineCamera()
+
+
+def test_defaults_describe_the_rig():
+    """7.4 um behind 70 mm is 105.714 urad; a 20 um slit is 2.70 px; 12 bits end at 4095."""
+    assert CAMERA.ifov_rad == pytest.approx(105.714e-6, rel=1e-5)
+    assert CAMERA.slit_px == pytest.approx(2.70, abs=0.005)
+    assert CAMERA.full_scale_dn == 4095
+    assert CAMERA.full_well_e == (4095 - 64) * 5
+
+
+def test_the_papers_worked_case_takes_a_minute_three_ways():
+    """640 x 600 at 100 ms, 640 x 300 at 200 ms and twice the field each take 60 s."""
+    aligned, slow, wide = capture_options(CAMERA, 600)
+    assert [option.seconds for option in (aligned, slow, wide)] == pytest.approx([60, 60, 60])
+    assert (slow.lines, slow.exposure_ms, slow.field_px) == (300, 200, 600)
+    assert (wide.lines, wide.exposure_ms, wide.field_px, wide.line_px) == (600, 100, 1200, 2)
+    assert "coarser along the scan" in slow.gives_up
+    assert "coarser along the scan" in wide.gives_up
+
+
+def test_options_take_equal_time_with_readout_too():
+    """Readout counts in every frame, so a longer exposure fills what it saves."""
+    options = capture_options(replace(CAMERA, readout_ms=3.0), 90, factor=3)
+    assert [option.seconds for option in options] == pytest.approx([90 * 0.103] * 3)
+
+
+@pytest.mark.parametrize(("lines", "factor"), [(0, 2), (601, 2), (10, 0)])
+def test_lines_that_do_not_divide_have_no_options(lines: int, factor: int):
+    """The number of lines must be a positive multiple of the factor."""
+    with pytest.raises(ShapeError, match=f"got {lines}"):
+        capture_options(CAMERA, lines, factor)
+
+
+@given(st.floats(0.01, 500), st.floats(0, 50), st.floats(1, 400))
+def test_frames_are_never_faster_than_the_camera(exposure: float, readout: float, rate: float):
+    """The period is exposure and readout, or that of the highest rate if longer (erratum E13)."""
+    camera = replace(CAMERA, exposure_ms=exposure, readout_ms=readout, max_rate_hz=rate)
+    assert camera.frame_ms == max(exposure + readout, 1000 / rate)
+    assert camera.scan_seconds(7) == pytest.approx(7 * camera.frame_ms / 1000)
+
+
+@pytest.mark.parametrize("binning", [1, 2, 3, 4, 7])
+def test_binned_rays_are_the_middle_of_theirs(binning: int):
+    """A binned sample looks along the mean slope of those it sums; all lie about the axis when none is dropped."""
+    fine = CAMERA.pixel_slopes()
+    count = CAMERA.samples // binning
+    expected = fine[: count * binning].reshape(count, binning).mean(axis=1)
+    assert CAMERA.pixel_slopes(binning) == pytest.approx(expected, abs=1e-16)
+    assert fine.sum() == pytest.approx(0, abs=1e-12)
+    assert np.diff(fine) == pytest.approx(CAMERA.ifov_rad)
+
+
+@given(st.floats(0.2, 9))
+def test_footprint_is_a_box_over_catmull_rom(width: float):
+    """Weights sum to 1, are symmetric, and have the variance of the box: the interpolation adds none."""
+    kernel = footprint_kernel(width)
+    place = np.arange(len(kernel)) - len(kernel) // 2
+    assert kernel.sum() == pytest.approx(1, abs=1e-12)
+    assert kernel == pytest.approx(kernel[::-1], abs=1e-12)
+    assert (kernel * place**2).sum() == pytest.approx(width**2 / 12, abs=1e-9)
+
+
+@pytest.mark.parametrize("width", [1.0, 2.7027027, 5.5])
+def test_footprint_equals_quadrature(width: float):
+    """Each weight is the mean of the Catmull-Rom kernel over the box, integrated piece by piece."""
+    kernel = footprint_kernel(width)
+    nodes, weights = leggauss(4)
+    for place, weight in zip(np.arange(len(kernel)) - len(kernel) // 2, kernel, strict=True):
+        low, high = place - width / 2, place + width / 2
+        cuts = np.unique(np.clip([low, -2, -1, 0, 1, 2, high], low, high))
+        middle, half = (cuts[1:] + cuts[:-1]) / 2, np.diff(cuts) / 2
+        t = np.abs(middle[:, None] + half[:, None] * nodes)
+        inner, outer = 1 - 2.5 * t**2 + 1.5 * t**3, 2 - 4 * t + 2.5 * t**2 - 0.5 * t**3
+        value = np.where(t <= 1, inner, np.where(t <= 2, outer, 0))
+        assert weight == pytest.approx((half[:, None] * weights * value).sum() / width, abs=1e-12)
+
+
+@pytest.mark.parametrize("read_noise", [20.0, 3.0])
+@pytest.mark.parametrize("expected", [0.0, 50.0, 3000.0])
+def test_noise_has_the_moments_of_shot_and_read_noise(read_noise: float, expected: float):
+    """Mean, variance and third moment of either branch are those of Poisson plus normal noise plus rounding."""
+    camera = replace(CAMERA, read_noise_e=read_noise, electrons_per_dn=1.0, bits=16)
+    dn = digitise(np.full((400, 1000), expected, np.float32), camera, np.random.default_rng(3))
+    electrons = dn.astype(np.float64) - camera.dark_dn
+    variance = expected + read_noise**2 + 1 / 12
+    assert electrons.mean() == pytest.approx(expected, abs=5 * np.sqrt(variance / 4e5))
+    assert electrons.var() == pytest.approx(variance, rel=0.015)
+    third = ((electrons - electrons.mean()) ** 3).mean()
+    assert third == pytest.approx(expected, abs=5 * np.sqrt(15 * variance**3 / 4e5))
+
+
+def test_one_draw_noise_is_distributed_like_the_exact_one():
+    """A two-sample test on 1e5 draws at 200 e- does not tell the one-draw branch from Poisson plus normal."""
+    rng = np.random.default_rng(11)
+    camera = replace(CAMERA, electrons_per_dn=0.1, bits=16)
+    drawn = digitise(np.full(100_000, 200.0), camera, rng) * 0.1 - camera.dark_dn * 0.1
+    exact = rng.poisson(200.0, 100_000) + rng.standard_normal(100_000) * camera.read_noise_e
+    assert stats.ks_2samp(drawn, exact).pvalue > 0.01
+
+
+def test_without_noise_rounding_is_to_even_and_ends_clip():
+    """Half DN goes to even, light beyond the full well stays at full scale, negative light at the dark level."""
+    electrons = np.array([2.5, 7.5, 1e9, -50.0, CAMERA.full_well_e])
+    assert digitise(electrons, CAMERA, None).tolist() == [64, 66, 4095, 64, 4095]
+
+
+def test_noise_never_leaves_the_converters_range():
+    """Saturated and dark samples stay within 0 and full scale whatever the draw."""
+    dim = replace(CAMERA, dark_dn=0.0)
+    rng = np.random.default_rng(5)
+    assert digitise(np.full(5000, CAMERA.full_well_e * 2), CAMERA, rng).min() == 4095
+    dark = digitise(np.zeros(5000), dim, rng)
+    assert dark.min() == 0
+    assert dark.max() < 30
+
+
+def test_binning_sums_and_drops_the_remainder():
+    """Seven samples by three give two sums; sixteen full samples still fit 16 bits."""
+    dn = np.arange(7, dtype=np.uint16)[None, :, None]
+    assert bin_samples(dn, 3)[0, :, 0].tolist() == [3, 12]
+    assert bin_samples(np.full((1, 16, 1), 4095, np.uint16), 16).item() == 65520
+    assert bin_samples(dn, 1) is dn
+    with pytest.raises(ShapeError, match="cannot bin 7 samples by 8"):
+        bin_samples(dn, 8)
+
+
+@pytest.mark.parametrize("step", [1, 2, 4, 8])
+def test_a_flat_scene_looks_flat_and_its_noise_falls_by_the_root_of_the_step(step: float):
+    """The coarse pass averages ``step`` samples of one exposure: noise falls by sqrt(step), not by step."""
+    electrons = np.full((256, 256, 2), 5000.0)
+    seen = look(electrons, CAMERA, step=step, rng=np.random.default_rng(2))
+    assert seen.shape == (256 // step, 256 // step, 2)
+    spread = np.sqrt(5000 + 400 + 25 / 12)
+    assert seen.mean() == pytest.approx(5000, abs=5 * spread / np.sqrt(seen.size * step))
+    assert seen.std() == pytest.approx(spread / np.sqrt(step), rel=5 / np.sqrt(2 * seen.size))
+
+
+def test_a_look_is_the_mean_of_footprints_over_the_smear():
+    """Without noise a coarse pixel is the block mean of the fine look, to the rounding of DN."""
+    electrons = np.random.default_rng(0).uniform(100, 15_000, (16, 24, 3))
+    camera = replace(CAMERA, bits=14, electrons_per_dn=1.0)
+    fine = look(electrons, camera, step=1, rng=None)
+    coarse = look(electrons, camera, step=4, rng=None)
+    blocks = fine.reshape(4, 4, 6, 4, 3).mean(axis=(1, 3))
+    assert coarse == pytest.approx(blocks, abs=1.0)
+
+
+def test_a_scene_that_does_not_divide_is_refused():
+    """The message says the size, the step, and to pad first."""
+    with pytest.raises(ShapeError, match="does not divide by the step 4; pad it first"):
+        look(np.zeros((10, 12, 1)), CAMERA, step=4, rng=None)

@@ -1,0 +1,92 @@
+"""Covering sweeps: every pixel is seen with its taps, with the fewest strips and no lines to spare."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.camera import LineCamera
+from pipeline.coverage import cheapest_coarse, cheapest_full, coarse_sweeps, full_sweeps
+from pipeline.errors import PoseError, SettingsError
+from pipeline.grid import SceneGrid
+from pipeline.scan import CostModel, Sweep, scene_to_sweep
+
+CAMERA, COST = LineCamera(), CostModel()
+
+
+def unseen(sweeps: list[Sweep], grid: SceneGrid) -> int:
+    """How many (coarse) pixel centres no sweep holds with its taps along the scan and within its samples."""
+    step = sweeps[0].step
+    across, scan = (grid.width, grid.height) if sweeps[0].along == "x" else (grid.height, grid.width)
+    centres = [np.arange(-(-size // step)) * step + (step - 1) / 2 - (size - 1) / 2 for size in (across, scan)]
+    along = np.broadcast_to(centres[0][:, None], (len(centres[0]), len(centres[1])))
+    seen = np.zeros(along.shape, bool)
+    for sweep in sweeps:
+        at = scene_to_sweep(sweep, CAMERA, along, centres[1][None, :])
+        low, high = np.floor(at[..., 0] + 1e-6) - 1, np.floor(at[..., 0] + 1e-6) + 2
+        inside = (at[..., 1] >= -0.5 - 1e-6) & (at[..., 1] <= CAMERA.samples // step - 0.5 + 1e-6)
+        seen |= inside & (low >= 0) & (high <= sweep.lines - 1)
+    return int(np.count_nonzero(~seen))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 1500), st.integers(1, 300), st.sampled_from(["x", "y"]), st.integers(1, 8))
+def test_every_pixel_is_seen(height: int, width: int, along: str, factor: int):
+    """Both passes hold every pixel of their grid, with resampling taps, for any size and factor."""
+    grid = SceneGrid(height, width, 16, factor)
+    assert unseen(full_sweeps(grid, CAMERA, along), grid) == 0
+    assert unseen(coarse_sweeps(grid, CAMERA, along), grid) == 0
+
+
+@pytest.mark.parametrize(("size", "strips"), [(1, 1), (640, 1), (641, 2), (1280, 2), (1281, 3), (1920, 3)])
+def test_strips_are_the_fewest_that_cover(size: int, strips: int):
+    """A line of 640 samples covers 640 px and a little more away from the axis."""
+    grid = SceneGrid(200, size, 16, 4)
+    sweeps = full_sweeps(grid, CAMERA, "x")
+    assert len(sweeps) == strips
+    assert [sweep.strip_px for sweep in sweeps] == pytest.approx([-sweep.strip_px for sweep in sweeps[::-1]], abs=1e-6)
+
+
+def test_strips_on_the_axis_scan_the_scene_and_its_taps_only():
+    """Without rotation a full scan takes the scene's rows and three lines for taps, standing on the rows."""
+    (sweep,) = full_sweeps(SceneGrid(480, 600, 16, 4), CAMERA, "x")
+    assert sweep.lines == 483
+    assert sweep.start_px == -479 / 2 - 1
+    (coarse,) = coarse_sweeps(SceneGrid(480, 600, 16, 4), CAMERA, "x")
+    assert coarse.lines == 123
+
+
+def test_the_known_fields_have_their_known_lines():
+    """1280 x 1024 takes 2098 lines in full and 528 coarse; 1296 x 966 is cheaper with lines along its short side."""
+    along, sweeps, seconds = cheapest_full(SceneGrid(1024, 1280, 16, 4), CAMERA, COST)
+    assert (along, sum(s.lines for s in sweeps), round(seconds, 1)) == ("x", 2098, 213.9)
+    along, sweeps, _ = cheapest_coarse(SceneGrid(1024, 1280, 16, 4), CAMERA, COST)
+    assert (along, sum(s.lines for s in sweeps)) == ("x", 528)
+    along, sweeps, _ = cheapest_full(SceneGrid(966, 1296, 32, 4), CAMERA, COST)
+    assert (along, len(sweeps)) == ("y", 2)
+
+
+def test_a_longer_line_needs_fewer_strips():
+    """A 1280-sample camera sees 2560 px in two strips: strips move inwards to meet."""
+    camera = replace(CAMERA, samples=1280)
+    assert len(full_sweeps(SceneGrid(100, 2560, 16, 4), camera, "x")) == 2
+
+
+def test_fields_beyond_the_mirror_are_refused():
+    """The error names the sweep, where it would have to look, and what to do."""
+    grid = SceneGrid(23_000, 640, 32, 4)
+    with pytest.raises(PoseError, match=r"sweep full-0 .* beyond the mirror's range.*smaller scene"):
+        full_sweeps(grid, CAMERA, "x")
+    with pytest.raises(PoseError, match="beyond the mirror's range"):
+        cheapest_full(SceneGrid(24_000, 24_000, 32, 4), CAMERA, COST)
+
+
+@pytest.mark.parametrize("factor", [17, 641])
+def test_factors_that_overflow_the_sum_are_refused(factor: int):
+    """Sums of more than 16 samples of 12 bits do not fit 16 bits."""
+    with pytest.raises(SettingsError, match=f"at most 16 .* got {factor}"):
+        coarse_sweeps(SceneGrid(100, 100, 16, factor), CAMERA, "x")

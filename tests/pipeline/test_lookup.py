@@ -1,0 +1,139 @@
+"""Lookup: the inverse of the exact rays, over the mirror's whole disk, for any path that does not turn."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.camera import LineCamera
+from pipeline.errors import PoseError, ShapeError
+from pipeline.mirror import direction_to_position, direction_to_scene, position_to_normal, reflect, scene_to_direction
+from pipeline.rectify.lookup import grid_lookup, lookup
+
+CAMERA = LineCamera()
+
+
+def aim(along_px: np.ndarray | float, scan_px: np.ndarray) -> np.ndarray:
+    """Mirror positions (line, 2) that look at points given in px along the line and the scan."""
+    tangents = np.stack(np.broadcast_arrays(along_px, scan_px), axis=-1) * CAMERA.ifov_rad
+    return direction_to_position(scene_to_direction(tangents))
+
+
+def see(position: np.ndarray, sample: np.ndarray, binning: int = 1) -> np.ndarray:
+    """Scene points (n, 2), y and x in px, that samples see from positions, by reflecting the camera's rays."""
+    slope = ((sample + 0.5) * binning - CAMERA.samples / 2) * CAMERA.ifov_rad
+    ray = np.stack([np.zeros_like(slope), slope, np.ones_like(slope)], axis=-1)
+    return direction_to_scene(reflect(ray, position_to_normal(position)))[:, ::-1] / CAMERA.ifov_rad
+
+
+@given(st.floats(-5000, 5000), st.floats(-5000, 4600), st.sampled_from([1, 2, 4]), st.integers(0, 99))
+@settings(max_examples=60, deadline=None)
+def test_lookup_undoes_the_rays(strip: float, start: float, binning: int, seed: int) -> None:
+    """What a sample between lines saw is found at that line and sample to 1e-7 px, anywhere in the disk."""
+    rng = np.random.default_rng(seed)
+    lines, samples = 60, CAMERA.samples // binning
+    at = np.stack([rng.uniform(0, lines - 1, 30), rng.uniform(0, samples - 1, 30)], axis=-1)
+    points = see(aim(strip, start + at[:, 0]), at[:, 1], binning)
+    found = lookup(aim(strip, start + np.arange(float(lines))), CAMERA, points, along="x", binning=binning)
+    np.testing.assert_allclose(found, at, atol=1e-7)
+
+
+def test_wandering_uneven_path_is_followed() -> None:
+    """Uneven lines on a path that wanders sideways are met at the line centres to 1e-5 px."""
+    rng = np.random.default_rng(1)
+    position = aim(250 + rng.normal(0, 0.3, 80), np.arange(80.0) + rng.uniform(-0.3, 0.3, 80))
+    line, sample = rng.integers(0, 80, 200), rng.uniform(0, 639, 200)
+    found = lookup(position, CAMERA, see(position[line], sample), along="x")
+    np.testing.assert_allclose(found, np.stack([line, sample], axis=-1), atol=1e-5)
+
+
+def test_backward_sweep_counts_from_its_own_start() -> None:
+    """A sweep run the other way gives the same samples and mirrored line numbers."""
+    position = aim(-200.0, np.arange(50.0))
+    points = np.random.default_rng(2).uniform((10, -400), (40, 0), (30, 2))
+    forward, backward = (lookup(p, CAMERA, points, along="x") for p in (position, position[::-1]))
+    np.testing.assert_allclose(backward, [49, 0] + forward * [-1, 1], atol=1e-7)
+
+
+def test_line_along_y_swaps_the_axes() -> None:
+    """Turning the rig by 90 degrees is the same as swapping y and x of the points."""
+    position, points = aim(30.0, np.arange(40.0)), np.random.default_rng(3).uniform(0, 39, (20, 2))
+    turned = lookup(position, CAMERA, points[:, ::-1], along="y")
+    np.testing.assert_array_equal(turned, lookup(position, CAMERA, points, along="x"))
+
+
+def test_grid_is_lookup_of_its_points() -> None:
+    """A regular grid gives what its points give one by one, in (y, x) order; tiles agree with the whole."""
+    position = aim(100.0, np.arange(64.0))
+    on_grid = partial(grid_lookup, position, CAMERA, along="x", binning=2, spacing_px=2.0)
+    whole = on_grid(origin_px=(1.5, -20.5), shape=(30, 40))
+    tile = on_grid(origin_px=(1.5 + 20, -20.5 + 30), shape=(5, 7))
+    point = lookup(position, CAMERA, np.array([1.5 + 2 * 3, -20.5 + 2 * 4]), along="x", binning=2)
+    np.testing.assert_array_equal(whole[10:15, 15:22], tile)
+    np.testing.assert_array_equal(whole[3, 4], point)
+
+
+def test_points_off_the_sweep_are_nan() -> None:
+    """A sweep reaches half a line and half a sample beyond its outermost centres; all else, however far, is NaN."""
+    position = aim(0.0, np.arange(10.0))
+    inside = np.array([[-0.49, 0], [9.49, 0], [4, 319.9], [4, -319.9]])
+    outside = np.array([[-0.6, 0], [9.6, 0], [4, 321], [4, -321], [9000, 9000], [4, 11_000], [-9000, -11_000]])
+    assert np.isfinite(lookup(position, CAMERA, inside, along="x")).all()
+    assert np.isnan(lookup(position, CAMERA, outside, along="x")).all()
+
+
+@given(st.floats(-5000, 5000), st.integers(0, 99))
+@settings(max_examples=30, deadline=None)
+def test_what_is_found_was_seen(strip: float, seed: int) -> None:
+    """No point of a field wider than the mirror's disk is found where its ray did not pass."""
+    scan = np.linspace(-5000, 4500, 300)
+    position = aim(strip, scan)
+    points = np.random.default_rng(seed).uniform(-20_000, 20_000, (20_000, 2))
+    found = lookup(position, CAMERA, points, along="x")
+    hit = np.isfinite(found[:, 0])
+    centre = np.interp(found[hit, 0], np.arange(300), scan)
+    inner = (found[hit, 0] >= 0) & (found[hit, 0] <= 299)
+    seen = see(aim(strip, centre[inner]), found[hit, 1][inner])
+    np.testing.assert_allclose(seen, points[hit][inner], atol=1e-5)
+    assert inner.sum() > 20
+
+
+@pytest.mark.parametrize("binning", [1, 4])
+def test_one_line_sweep_reaches_half_a_line(binning: int) -> None:
+    """One line alone is as wide as its samples: points within half of that are found, others not."""
+    y = np.array([-0.51, -0.49, 0, 0.25, 0.51]) * binning + 12
+    found = lookup(aim(0.0, np.array([12.0])), CAMERA, np.stack([y, 0 * y], axis=-1), along="x", binning=binning)
+    np.testing.assert_allclose(found[:, 0], [np.nan, -0.49, 0, 0.25, np.nan], atol=1e-6)
+    np.testing.assert_allclose(found[1:4, 1], (CAMERA.samples / binning - 1) / 2)
+
+
+def test_sweeps_that_turn_or_dwell_are_refused() -> None:
+    """The message names the line where the sweep stops running one way."""
+    turning = aim(0.0, np.array([0.0, 1, 2, 3, 2, 5]))
+    with pytest.raises(PoseError, match="turns or stands still near line 3"):
+        lookup(turning, CAMERA, np.zeros((1, 2)), along="x")
+    with pytest.raises(PoseError, match="near line 1"):
+        lookup(aim(0.0, np.array([0.0, 1, 1, 2])), CAMERA, np.zeros((1, 2)), along="x")
+
+
+def test_unusable_input_is_refused() -> None:
+    """No lines, points that are not pairs, and positions off the disk raise."""
+    position = aim(0.0, np.arange(3.0))
+    with pytest.raises(ShapeError, match="at least one line"):
+        lookup(position[:0], CAMERA, np.zeros((1, 2)), along="x")
+    with pytest.raises(ShapeError, match=r"\(\.\.\., 2\) of y and x"):
+        lookup(position, CAMERA, np.zeros((1, 3)), along="x")
+    with pytest.raises(PoseError, match="unit disk"):
+        lookup(position + np.array([0, 1.5]), CAMERA, np.zeros((1, 2)), along="x")
+
+
+def test_no_points_give_none() -> None:
+    """An empty list of points and an empty grid pass through."""
+    position = aim(0.0, np.arange(3.0))
+    assert lookup(position, CAMERA, np.zeros((0, 2)), along="x").shape == (0, 2)
+    empty = grid_lookup(position, CAMERA, along="x", binning=1, origin_px=(0, 0), spacing_px=1, shape=(0, 5))
+    assert empty.shape == (0, 5, 2)

@@ -1,0 +1,82 @@
+"""Mosaic: feathering laws, coverage, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import ShapeError
+from pipeline.rectify.mosaic import Part, edge_distance, mosaic
+
+
+def part(seed: int, points: int = 20, bands: int = 4) -> Part:
+    """A sweep of random values with some points not reached, which hold NaN."""
+    rng = np.random.default_rng(seed)
+    values, weight = rng.random((points, bands), np.float32), rng.random(points).astype(np.float32)
+    weight[rng.random(points) < 0.3] = 0
+    values[weight == 0] = np.nan
+    return Part(values, weight, np.where(weight > 0, rng.uniform(0, 300, points), np.nan))
+
+
+def test_one_sweep_comes_back_bit_by_bit() -> None:
+    """The mosaic of one sweep is the sweep."""
+    alone = part(1)
+    values, coverage = mosaic([alone])
+    np.testing.assert_array_equal(values, alone.values)
+    assert (coverage == (alone.weight > 0)).all()
+
+
+@given(st.lists(st.integers(0, 10_000), min_size=1, max_size=4))
+@settings(max_examples=40, deadline=None)
+def test_spectra_are_convex_mixtures(seeds: list[int]) -> None:
+    """Every blended value lies between the values that went in, and NaN marks exactly what no sweep reached."""
+    parts = [part(seed) for seed in seeds]
+    values, coverage = mosaic(parts)
+    assert (np.isnan(values).any(axis=1) == (coverage == 0)).all()
+    seen = np.stack([p.values for p in parts])[:, coverage > 0]
+    assert (values[coverage > 0] <= np.nanmax(seen, axis=0) + 1e-6).all()
+    assert (values[coverage > 0] >= np.nanmin(seen, axis=0) - 1e-6).all()
+
+
+def test_weights_are_linear_in_edge_distance() -> None:
+    """A point 30 px inside one sweep and 10 px inside another is three quarters of the first."""
+    ones, zeros, full = np.ones((1, 2), np.float32), np.zeros((1, 2), np.float32), np.ones(1, np.float32)
+    values, coverage = mosaic([Part(ones, full, np.array([30.0])), Part(zeros, full, np.array([10.0]))])
+    np.testing.assert_allclose(values, 0.75)
+    assert coverage.tolist() == [2]
+
+
+def test_weights_follow_the_resampling() -> None:
+    """At equal distance from the edges a point of which a fifth of the taps was missing counts four fifths."""
+    ones, zeros, edge = np.ones((1, 2), np.float32), np.zeros((1, 2), np.float32), np.array([20.0])
+    values, _ = mosaic([Part(ones, np.array([0.8], np.float32), edge), Part(zeros, np.ones(1, np.float32), edge)])
+    np.testing.assert_allclose(values, 0.8 / 1.8, rtol=1e-6)
+
+
+def test_order_of_sweeps_does_not_matter() -> None:
+    """Feathering is symmetric up to rounding."""
+    parts = [part(seed) for seed in range(3)]
+    np.testing.assert_allclose(mosaic(parts)[0], mosaic(parts[::-1])[0], rtol=1e-5)
+
+
+def test_very_edge_counts_where_nothing_else_reaches() -> None:
+    """A point exactly on a sweep's edge keeps its value."""
+    values, coverage = mosaic([Part(np.full((1, 1), 7, np.float32), np.ones(1, np.float32), np.zeros(1))])
+    assert values[0, 0] == 7
+    assert coverage[0] == 1
+
+
+def test_edge_distance_is_to_the_nearest_border() -> None:
+    """Distances are taken to the outer edge of the outermost pixels; NaN stays NaN."""
+    at = np.array([[0.0, 100], [50, 0], [99, 100], [50, 639.5], [50, 300], [np.nan, np.nan]])
+    np.testing.assert_allclose(edge_distance(at, 100, 640), [0.5, 0.5, 0.5, 0, 49.5, np.nan])
+
+
+def test_nothing_and_misfits_are_refused() -> None:
+    """No sweep at all, and sweeps resampled at different points, raise."""
+    with pytest.raises(ShapeError, match="at least one sweep"):
+        mosaic([])
+    with pytest.raises(ShapeError, match="part 1 has values"):
+        mosaic([part(1), part(2, points=19)])

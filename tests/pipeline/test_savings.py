@@ -1,0 +1,86 @@
+"""Savings: entries, and what a sweep counts for in lines, samples, bytes and seconds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.camera import LineCamera
+from pipeline.coverage import coarse_sweeps, full_sweeps
+from pipeline.grid import SceneGrid
+from pipeline.savings import Entry, capture_savings, count_lines, count_samples, raw_bytes
+from pipeline.scan import CostModel, Sweep
+
+CAMERA, COST = LineCamera(), CostModel()
+
+
+def test_entries_have_a_ratio_unless_full_is_nothing():
+    """Done over full, or None, and the receipt's four keys."""
+    assert Entry(3, 12, "predicted").as_dict() == {"done": 3, "full": 12, "ratio": 0.25, "full_is": "predicted"}
+    assert Entry(3, 0, "measured").ratio is None
+
+
+def test_samples_beside_the_scene_are_not_counted():
+    """A line of 640 samples over a scene 100 px wide counts 100; lines above and below the scene count none."""
+    path = Sweep("a", "fine", "x", 0.0, -32.5, 66)
+    assert count_samples([path], CAMERA, SceneGrid(60, 100, 16, 4)) == 60 * 100
+    assert count_samples([path], CAMERA, SceneGrid(60, 640, 16, 4)) == 60 * 640
+
+
+def test_samples_far_off_the_axis_follow_their_rays():
+    """A strip turned by 15 deg loses samples at the scene's corners only."""
+    path = Sweep("a", "fine", "x", 2300.0, -99.5, 200)
+    wide = count_samples([path], CAMERA, SceneGrid(200, 6000, 16, 4))
+    psi = np.arctan(2300 * CAMERA.ifov_rad)
+    assert 200 * 640 * (1 - np.tan(psi) * 640 / 200 / 4 * 1.2) < wide < 200 * 640
+
+
+@settings(max_examples=40)
+@given(st.integers(1, 90), st.integers(1, 45), st.sampled_from(["x", "y"]))
+def test_a_full_scan_near_the_axis_samples_every_pixel_once(scan: int, half: int, along: str):
+    """One strip through the axis takes as many samples on the scene as it has pixels."""
+    height, width = (scan, 2 * half) if along == "x" else (2 * half, scan)
+    grid = SceneGrid(height, width, 8, 2)
+    assert count_samples(full_sweeps(grid, CAMERA, along), CAMERA, grid) == height * width
+
+
+def test_binned_lines_have_fewer_samples_and_bytes():
+    """A coarse line holds 640 // s samples: 4 x 4 coarser is a sixteenth of the samples and bytes of as much scene."""
+    grid = SceneGrid(400, 640, 16, 4)
+    coarse, full = coarse_sweeps(grid, CAMERA, "x"), full_sweeps(grid, CAMERA, "x")
+    assert count_samples(coarse, CAMERA, grid) * 16 == count_samples(full, CAMERA, grid) == 400 * 640
+    assert raw_bytes(coarse, CAMERA, 270) == count_lines(coarse) * 160 * 270 * 2
+    assert raw_bytes(full, CAMERA, 270) == 403 * 640 * 270 * 2
+
+
+def test_a_line_costs_all_its_bytes_wherever_it_falls():
+    """Bytes count captured samples, not those on the scene."""
+    path = Sweep("a", "fine", "x", 0.0, 5000.0, 3)
+    assert count_samples([path], CAMERA, SceneGrid(60, 100, 16, 4)) == 0
+    assert raw_bytes([path], CAMERA, 10) == 3 * 640 * 10 * 2
+
+
+def test_the_ledger_compares_like_with_like():
+    """The full scan against itself is 1 in every entry; nothing against it is 0."""
+    grid = SceneGrid(100, 700, 16, 4)
+    full = full_sweeps(grid, CAMERA, "x")
+    same = capture_savings(full, full, CAMERA, grid, cost=COST, bands=5)
+    assert list(same) == ["lines", "samples", "bytes_raw", "capture_s"]
+    assert [entry.ratio for entry in same.values()] == [1, 1, 1, 1]
+    none = capture_savings([], full, CAMERA, grid, cost=COST, bands=5, full_is="measured")
+    assert [entry.ratio for entry in none.values()] == [0, 0, 0, 0]
+    assert none["lines"].full_is == "measured"
+
+
+def test_savings_of_parts_add_up():
+    """Lines, samples and bytes of two groups of sweeps are the sums of each; seconds are at most that."""
+    grid = SceneGrid(300, 700, 16, 4)
+    coarse, full = coarse_sweeps(grid, CAMERA, "y"), full_sweeps(grid, CAMERA, "x")
+    both = capture_savings([*coarse, *full], full, CAMERA, grid, cost=COST, bands=3)
+    apart = [capture_savings(part, full, CAMERA, grid, cost=COST, bands=3) for part in (coarse, full)]
+    for name in ("lines", "samples", "bytes_raw"):
+        assert both[name].done == sum(part[name].done for part in apart)
+    total = sum(part["capture_s"].done for part in apart)
+    assert both["capture_s"].done <= total == pytest.approx(both["capture_s"].done, abs=COST.reload_s + 1e-9)

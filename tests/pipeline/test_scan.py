@@ -1,0 +1,107 @@
+"""Scan paths: closed forms against the mirror's own chain, positions and prices."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.camera import LineCamera
+from pipeline.errors import PoseError
+from pipeline.mirror import direction_to_scene, position_to_normal, reflect
+from pipeline.scan import (
+    CostModel,
+    Sweep,
+    line_positions,
+    points_of_scan,
+    scan_of_points,
+    scene_to_sweep,
+    sweep_positions,
+    sweep_to_scene,
+)
+
+CAMERA = LineCamera()
+places = st.floats(-5000, 5000)
+
+
+def sweep(**changes: object) -> Sweep:
+    """A short fine sweep off the axis."""
+    values = {"name": "a", "kind": "fine", "along": "x", "strip_px": 700.0, "start_px": -900.0, "lines": 5}
+    return Sweep(**{**values, **changes})
+
+
+@pytest.mark.parametrize(("strip", "start"), [(0.0, -1200.0), (2500.0, -4000.0), (-4500.0, 3500.0)])
+def test_sample_points_equal_rays_reflected_by_the_mirror(strip: float, start: float):
+    """The closed form of a line's points agrees with position, normal and reflection to 1e-9 px."""
+    path = sweep(strip_px=strip, start_px=start, lines=40)
+    slopes = CAMERA.pixel_slopes()
+    rays = np.stack([np.zeros_like(slopes), slopes, np.ones_like(slopes)], axis=-1)
+    normals = position_to_normal(line_positions(path, CAMERA))
+    seen = direction_to_scene(reflect(rays[None], normals[:, None])) / CAMERA.ifov_rad
+    along, scan = sweep_to_scene(path, CAMERA)
+    assert np.abs(along - seen[..., 0]).max() < 1e-9
+    assert np.abs(scan - seen[..., 1]).max() < 1e-9
+
+
+@given(places, places, st.floats(-0.034, 0.034))
+def test_scene_points_and_line_points_are_inverse(strip: float, scan: float, slope: float):
+    """Any point of any line finds its line and slope again."""
+    along, across = points_of_scan(strip, CAMERA, scan, slope)
+    centre, back = scan_of_points(strip, CAMERA, along, across)
+    assert centre == pytest.approx(scan, abs=1e-8)
+    assert back == pytest.approx(slope, abs=1e-12)
+
+
+@pytest.mark.parametrize(("step", "binning"), [(1, 1), (4, 4), (3, 3), (4, 1)])
+def test_lines_and_samples_are_found_at_whole_numbers(step: int, binning: int):
+    """The points of a sweep have whole line and sample numbers, smeared and binned or not."""
+    path = sweep(step=step, binning=binning)
+    found = scene_to_sweep(path, CAMERA, *sweep_to_scene(path, CAMERA))
+    count = CAMERA.samples // binning
+    assert found[..., 0] == pytest.approx(np.broadcast_to(np.arange(5.0)[:, None], (5, count)), abs=1e-8)
+    assert found[..., 1] == pytest.approx(np.broadcast_to(np.arange(float(count)), (5, count)), abs=1e-8)
+
+
+def test_a_line_through_the_axis_is_straight_and_unturned():
+    """On the strip through the axis points keep their scan coordinate and stretch along the line only."""
+    along, scan = points_of_scan(0.0, CAMERA, np.array([-2000.0, 0.0, 2000.0])[:, None], CAMERA.pixel_slopes())
+    assert scan == pytest.approx(np.broadcast_to([[-2000.0], [0.0], [2000.0]], scan.shape), abs=1e-9)
+    assert along[1] == pytest.approx(np.arange(640) - 319.5, abs=1e-9)
+    assert along[2, -1] > 319.5
+
+
+def test_lines_stand_in_the_middle_of_their_held_positions():
+    """Mid exposure is the mean of the positions held during it, one px apart."""
+    path = sweep(step=4)
+    assert path.line_px() == pytest.approx(path.held_px().mean(axis=1))
+    assert np.diff(path.held_px().ravel()) == pytest.approx(1.0)
+    assert sweep_positions(path, CAMERA).shape == (5, 4, 2)
+    assert line_positions(sweep(), CAMERA) == pytest.approx(sweep_positions(sweep(), CAMERA)[:, 0])
+
+
+def test_the_turned_rig_has_the_same_positions():
+    """``along`` names the scene's axis; the mirror does the same either way."""
+    assert line_positions(sweep(along="y"), CAMERA) == pytest.approx(line_positions(sweep(), CAMERA))
+
+
+def test_sweeps_out_of_reach_are_refused():
+    """A line beyond the mirror's disk raises instead of being clamped to the rim."""
+    with pytest.raises(PoseError, match="beyond the rim"):
+        line_positions(sweep(start_px=12_000.0), CAMERA)
+
+
+def test_price_counts_lines_setups_and_reloads():
+    """Two sweeps of 1000 coarse lines hold 8000 positions: six reloads beside lines and set-ups."""
+    cost = CostModel()
+    path = sweep(lines=1000, step=4)
+    assert cost.setup_seconds(CAMERA) == pytest.approx(0.05 + 0.2 + 0.2)
+    assert cost.seconds([path, path], CAMERA) == pytest.approx(200 + 2 * 0.45 + 6 * 1.6)
+    assert cost.seconds([], CAMERA) == 0
+
+
+@pytest.mark.parametrize(("lines", "reloads"), [(1, 1), (1500, 1), (1501, 2), (3000, 2)])
+def test_reloads_are_due_when_the_memory_is_full(lines: int, reloads: int):
+    """1500 pairs fit one load, exactly."""
+    price = CostModel().seconds([sweep(lines=lines)], CAMERA)
+    assert price == pytest.approx(lines * 0.1 + 0.45 + reloads * 1.6)

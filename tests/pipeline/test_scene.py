@@ -1,0 +1,85 @@
+"""Scenes: what a file without a radiance law becomes, and the linear map from components to bands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.camera import LineCamera
+from pipeline.errors import SceneError, ShapeError
+from pipeline.simulator.scene import RasterScene, raster_from_values
+
+CAMERA = LineCamera()
+WAVELENGTH = np.array([660.0, 800.0])
+
+
+def picture(seed: int = 0, shape: tuple[int, ...] = (20, 30, 2)) -> np.ndarray:
+    """Random values in 0..255."""
+    return (np.random.default_rng(seed).random(shape) * 255).astype(np.uint8)
+
+
+def test_bright_end_fills_the_stated_share_of_the_well() -> None:
+    """The 99.9th percentile gives 60 % of the full well, whatever the unit of the file."""
+    scene = raster_from_values(picture(), CAMERA, name="p", wavelength_nm=WAVELENGTH)
+    bright = np.percentile(picture(), 99.9)
+    np.testing.assert_allclose(bright * scene.electrons, 0.6 * CAMERA.full_well_e, rtol=1e-6)
+    np.testing.assert_allclose(scene.panel * scene.electrons, scene.panel_electrons, rtol=1e-6)
+
+
+def test_values_are_those_of_the_file() -> None:
+    """A scene made of values returns them; a scene of components returns their mixture."""
+    scene = raster_from_values(picture(), CAMERA, name="p", wavelength_nm=WAVELENGTH)
+    np.testing.assert_allclose(scene.values(), picture(), rtol=1e-6)
+    planes, electrons = np.ones((4, 5, 3), np.float32), np.full((3, 2), 100, np.float32)
+    panel, white = np.full(2, 0.5, np.float32), np.full(2, 200, np.float32)
+    mixed = RasterScene("m", "k", planes, electrons, panel, white, WAVELENGTH)
+    np.testing.assert_allclose(mixed.values(), np.full((4, 5, 2), 300 / 200 * 0.5))
+
+
+def test_gaps_are_filled_and_counted() -> None:
+    """Pixels without a value get the band's median; a band without any gets 0."""
+    values = picture().astype(np.float32)
+    values[3, 4, 0], values[5, 6, 0], values[5, 6, 1] = np.nan, np.inf, -np.inf
+    scene = raster_from_values(values, CAMERA, name="gaps", wavelength_nm=WAVELENGTH)
+    assert scene.filled_px == 2
+    known = values[..., 0][np.isfinite(values[..., 0])]
+    assert scene.planes[3, 4, 0] == np.median(known)
+    values[..., 1] = np.nan
+    assert (raster_from_values(values, CAMERA, name="gaps", wavelength_nm=WAVELENGTH).planes[..., 1] == 0).all()
+
+
+def test_black_scene_keeps_scale_one() -> None:
+    """Without positive light the scale is 1 and everything stays finite."""
+    scene = raster_from_values(np.zeros((5, 5, 2)), CAMERA, name="black", wavelength_nm=WAVELENGTH)
+    np.testing.assert_allclose(scene.electrons, 0.6 * CAMERA.full_well_e, rtol=1e-6)
+    assert (scene.values() == 0).all()
+
+
+def test_key_follows_the_content() -> None:
+    """Equal values have equal keys, one changed pixel another."""
+    changed = picture()
+    changed[0, 0, 0] ^= 1
+    keys = [raster_from_values(v, CAMERA, name="p", wavelength_nm=WAVELENGTH).key for v in (picture(), changed)]
+    assert keys[0] != keys[1]
+    assert keys[0] == raster_from_values(picture(), CAMERA, name="q", wavelength_nm=WAVELENGTH).key
+
+
+def test_bright_end_of_a_large_scene_is_sampled() -> None:
+    """Above 2^24 values the percentile is read on a part of the pixels and hardly moves."""
+    row = np.linspace(0, 1, 6_000, dtype=np.float32)
+    values = np.broadcast_to(row[:, None, None], (6_000, 3_000, 2))
+    scene = raster_from_values(values, CAMERA, name="large", wavelength_nm=WAVELENGTH, key="k")
+    np.testing.assert_allclose(scene.panel * 0.6, 0.999, rtol=1e-3)
+
+
+def test_unusable_scenes_are_refused() -> None:
+    """Missing axes, nothing finite, and labels of another size are named."""
+    with pytest.raises(SceneError, match=r"\(y, x, band\)"):
+        raster_from_values(picture(shape=(4, 5)), CAMERA, name="flat", wavelength_nm=WAVELENGTH)
+    with pytest.raises(SceneError, match="no finite value"):
+        raster_from_values(np.full((2, 2, 2), np.nan), CAMERA, name="void", wavelength_nm=WAVELENGTH)
+    labels = np.zeros((3, 3), np.uint8)
+    with pytest.raises(SceneError, match="crop or pad"):
+        raster_from_values(picture(), CAMERA, name="p", wavelength_nm=WAVELENGTH, labels=labels)
+    with pytest.raises(ShapeError, match="2 components to 3 bands"):
+        raster_from_values(picture(), CAMERA, name="p", wavelength_nm=np.arange(3.0))

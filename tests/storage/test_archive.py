@@ -1,0 +1,248 @@
+"""Stores appear whole or not at all, stay as they are, and verification finds every change."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.errors import ArchiveError, IncompleteStoreError
+from storage.archive import Archive, stage_key
+
+
+def _publish(archive: Archive, key: str = "abc", text: str = "content") -> Path:
+    with archive.publish("mosaic", key, version=3, params={"tol": 0.1}, inputs=["k0"]) as staged:
+        (staged.path / "inner").mkdir()
+        (staged.path / "inner" / "a.txt").write_text(text)
+        (staged.path / "b.bin").write_bytes(bytes(range(256)) * 100)
+    return staged.ref.path
+
+
+def test_a_store_is_found_with_its_manifest(tmp_path: Path) -> None:
+    """Before, nothing; afterwards the files, their hashes and the facts."""
+    archive = Archive.open(tmp_path / "archive")
+    assert archive.find("mosaic", "abc") is None
+    path = _publish(archive)
+    ref = archive.find("mosaic", "abc")
+    assert ref is not None
+    assert (ref.uri, ref.path) == ("stages/mosaic/abc", path)
+    manifest = archive.manifest(ref)
+    assert (manifest["version"], manifest["params"], manifest["inputs"]) == (3, {"tol": 0.1}, ["k0"])
+    assert set(manifest["files"]) == {"inner/a.txt", "b.bin"}
+    assert archive.stored_bytes(ref) == 25600 + 7
+    archive.verify(ref)
+    assert archive.refs() == [ref]
+
+
+def test_a_failed_stage_leaves_nothing(tmp_path: Path) -> None:
+    """The error passes, the staged folder goes, the key stays free."""
+    archive = Archive.open(tmp_path)
+
+    def fail(path: Path) -> None:
+        (path / "a").write_text("half")
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        archive.produce("mosaic", fail, version=1, params={})
+    assert archive.refs() == []
+    assert list((tmp_path / "stages" / "mosaic").iterdir()) == []
+    assert list((tmp_path / ".locks").iterdir()) == []
+
+
+def test_a_dead_runs_rest_is_reclaimed(tmp_path: Path) -> None:
+    """A .part folder of a dead process is not seen, and is gone after the next publication or reclaim."""
+    archive = Archive.open(tmp_path)
+    for key in ("abc", "def"):
+        (tmp_path / "stages" / "mosaic" / f"{key}.part").mkdir(parents=True)
+        (tmp_path / "stages" / "mosaic" / f"{key}.part" / "old").write_text("x")
+    assert archive.refs() == []
+    assert not (_publish(archive) / "old").exists()
+    assert archive.reclaim() == ["stages/mosaic/def.part"]
+    assert [ref.key for ref in archive.refs()] == ["abc"]
+
+
+@pytest.mark.parametrize("victim", ["b.bin", "inner/a.txt"])
+def test_one_changed_byte_is_named(tmp_path: Path, victim: str) -> None:
+    """Verification names the file; so does it for a missing, a grown and an extra one."""
+    archive = Archive.open(tmp_path)
+    path = _publish(archive)
+    content = bytearray((path / victim).read_bytes())
+    content[len(content) // 2] ^= 4
+    (path / victim).write_bytes(content)
+    ref = archive.find("mosaic", "abc")
+    assert ref is not None
+    with pytest.raises(IncompleteStoreError, match=rf"{victim} has changed since it was published"):
+        archive.verify(ref)
+    assert [finding.problem is None for finding in archive.verify_all()] == [False]
+
+
+def test_missing_short_and_extra_files_are_named(tmp_path: Path) -> None:
+    """find sees files that are missing or short; verify also those that are too many."""
+    archive = Archive.open(tmp_path)
+    path = _publish(archive)
+    ref = archive.refs()[0]
+    (path / "extra").write_text("x")
+    with pytest.raises(IncompleteStoreError, match="extra is not in the manifest"):
+        archive.verify(ref)
+    (path / "b.bin").write_bytes(b"short")
+    with pytest.raises(IncompleteStoreError, match=r"b\.bin has 5 bytes, expected 25600"):
+        archive.find("mosaic", "abc")
+    (path / "b.bin").unlink()
+    with pytest.raises(IncompleteStoreError, match=r"b\.bin cannot be read"):
+        archive.find("mosaic", "abc")
+    archive.discard(ref)
+    assert archive.find("mosaic", "abc") is None
+
+
+def test_a_torn_manifest_is_an_incomplete_store(tmp_path: Path) -> None:
+    """A manifest that is no JSON is said to be invalid."""
+    archive = Archive.open(tmp_path)
+    (_publish(archive) / "manifest.json").write_text('{"files": ')
+    with pytest.raises(IncompleteStoreError, match=r"no valid manifest\.json"):
+        archive.find("mosaic", "abc")
+
+
+def test_two_same_runs_make_one_store(tmp_path: Path) -> None:
+    """Eight threads ask for one key; one builds, seven find it."""
+    archive = Archive.open(tmp_path)
+    built: list[Path] = []
+    answers: list[bool] = []
+
+    def work() -> None:
+        def build(path: Path) -> None:
+            built.append(path)
+            (path / "a").write_text("x" * 1000)
+
+        answers.append(Archive.open(tmp_path).produce("mosaic", build, version=1, params={"a": 1}, inputs=[])[1])
+
+    threads = [threading.Thread(target=work) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(built) == 1
+    assert sorted(answers) == [False] * 7 + [True]
+    assert archive.find("mosaic", stage_key("mosaic", 1, {"a": 1}, [])) is not None
+
+
+def test_who_ignores_done_harms_nothing(tmp_path: Path) -> None:
+    """Publishing a key again leaves the first store as it was."""
+    archive = Archive.open(tmp_path)
+    path = _publish(archive, text="first")
+    _publish(archive, text="second")
+    assert (path / "inner" / "a.txt").read_text() == "first"
+    archive.verify(archive.refs()[0])
+
+
+def test_what_cannot_be_an_archive(tmp_path: Path) -> None:
+    """A file, a path below a file, a missing one and a folder of other things are told apart."""
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "folder").mkdir()
+    for name, create, words in (
+        ("file", True, "is a file, expected a folder"),
+        ("file/archive", True, "file, expected a folder"),
+        ("none", False, "is not there"),
+        ("folder", False, "no archive"),
+    ):
+        with pytest.raises(ArchiveError, match=words):
+            Archive.open(tmp_path / name, create=create)
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [(errno.EACCES, "permission is denied"), (errno.EROFS, "read-only"), (errno.ENOSPC, "the disk is full: free some")],
+)
+def test_a_refusing_disk_is_told_at_once(
+    tmp_path: Path, number: int, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Opening writes a probe, so that a survey does not begin what it cannot keep."""
+
+    def refuse(path: Path, content: bytes) -> int:
+        raise OSError(number, os.strerror(number), str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", refuse)
+    with pytest.raises(ArchiveError, match=words):
+        Archive.open(tmp_path)
+
+
+@pytest.mark.parametrize("where", ["fsync", "rename", "body"])
+def test_a_full_disk_leaves_the_archive_as_it_was(tmp_path: Path, where: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refused while writing, syncing or renaming: one message, no new store, the old one whole."""
+    archive = Archive.open(tmp_path)
+    _publish(archive, key="old")
+
+    def refuse(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def build(path: Path) -> None:
+        (path / "a").write_text("x")
+        if where == "body":
+            refuse()
+
+    with monkeypatch.context() as patch:
+        if where != "body":
+            patch.setattr(*{"fsync": (os, "fsync"), "rename": (Path, "rename")}[where], refuse)
+        with pytest.raises(ArchiveError, match=f"{tmp_path}.*the disk is full"):
+            archive.produce("mosaic", build, version=1, params={})
+    assert [ref.key for ref in archive.refs()] == ["old"]
+    assert not list(tmp_path.glob("stages/*/*.part"))
+    archive.verify(archive.refs()[0])
+
+
+def test_errors_from_elsewhere_are_not_blamed_on_the_archive(tmp_path: Path) -> None:
+    """A missing scene file inside a stage stays what it is."""
+    archive = Archive.open(tmp_path / "archive")
+    with pytest.raises(FileNotFoundError), archive.publish("mosaic", "abc"):
+        (tmp_path / "scene.png").read_bytes()
+    with pytest.raises(PermissionError), archive.publish("mosaic", "abc"):
+        raise PermissionError(errno.EACCES, "denied", str(tmp_path / "scene.png"))
+
+
+@pytest.mark.parametrize("name", ["", "../up", "a/b", "a.part", ".hidden", "a b"])
+def test_names_that_are_no_names(tmp_path: Path, name: str) -> None:
+    """Stages and keys are single, plain folder names."""
+    with pytest.raises(ArchiveError, match="cannot be a name"):
+        Archive.open(tmp_path).find("mosaic", name)
+
+
+def test_a_run_appears_as_a_whole(tmp_path: Path) -> None:
+    """Nothing under runs before publication; afterwards every file, verified."""
+    archive = Archive.open(tmp_path)
+    with archive.new_run("field 7 / north") as run:
+        run.write_file("receipt.json", json.dumps({"survey": "north"}))
+        run.write_file("quicklook.png", b"\x89PNG")
+        assert archive.runs() == []
+    (folder,) = archive.runs()
+    assert folder.name == run.id
+    assert "field-7-north" in run.id
+    assert json.loads((folder / "receipt.json").read_text()) == {"survey": "north"}
+    assert [(finding.uri, finding.problem) for finding in archive.verify_all()] == [(f"runs/{run.id}", None)]
+
+
+def test_a_broken_run_leaves_nothing_and_a_live_one_is_not_reclaimed(tmp_path: Path) -> None:
+    """reclaim keeps its hands off what a living process writes."""
+    archive = Archive.open(tmp_path)
+
+    def break_off() -> None:
+        with archive.new_run("a") as run:
+            run.write_file("receipt.json", "{}")
+            assert archive.reclaim() == []
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        break_off()
+    assert list((tmp_path / "runs").iterdir()) == []
+
+
+def test_spools_outlive_processes_until_dropped(tmp_path: Path) -> None:
+    """A spool folder is the same each time it is asked for, and goes when dropped."""
+    archive = Archive.open(tmp_path)
+    (archive.spool_folder("k1") / "lines.bil").write_bytes(b"x")
+    assert (archive.spool_folder("k1") / "lines.bil").exists()
+    archive.drop_spool("k1")
+    assert list((tmp_path / "spool").iterdir()) == []

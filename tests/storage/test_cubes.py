@@ -1,0 +1,236 @@
+"""What is stored comes back, opens with plain xarray, and a flipped bit is never a number."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
+from pipeline.scan import Sweep
+from pipeline.source import Line, References
+from storage.archive import Archive
+from storage.attention import Attention, load_attention, write_attention
+from storage.class_maps import ClassMap, load_class_map, write_class_map
+from storage.cubes import RawCubeWriter, SweepHeader, open_raw_cube
+from storage.layout import AngularGrid, round_bits
+from storage.mosaics import Mosaic, MosaicWriter, load_mosaic, write_mosaic
+from storage.patches import Patches, load_patches, write_patches
+
+GRID = AngularGrid(1.057e-4, (100, 70))
+
+
+def _header(lines: int, samples: int, bands: int, started: str | None = None) -> SweepHeader:
+    frame = np.arange(samples * bands, dtype=np.float32).reshape(samples, bands)
+    references = References(frame, frame + 1000, np.full(bands, 0.9, np.float32))
+    sweep = Sweep("fine-0", "fine", "y", 12.5, -40.0, lines)
+    fwhm = np.full(bands, 5.0)
+    return SweepHeader(sweep, references, np.linspace(400, 1000, bands), fwhm, source="sim", started=started)
+
+
+def _lines(header: SweepHeader, seed: int = 0) -> list[Line]:
+    rng = np.random.default_rng(seed)
+    lines, *frame = header.shape
+    data = rng.integers(0, 4096, (lines, *frame), dtype=np.uint16)
+    return [Line(n, data[n], 0.001 * n, -0.5, 0.1 * n, 100.0, n % 7 != 3) for n in range(lines)]
+
+
+@pytest.mark.parametrize("bands", [1, 2, 4, 15, 200, 270, 939])
+def test_raw_cube_round_trip(tmp_path: Path, bands: int) -> None:
+    """Numbers, line facts, references, wavelengths and the sweep come back bit by bit for any band count."""
+    header = _header(70, 9, bands)
+    lines = _lines(header)
+    with RawCubeWriter(tmp_path / "raw.zarr", header) as cube:
+        for first in range(0, 70, 33):
+            cube.write(lines[first : first + 33])
+    found = open_raw_cube(tmp_path / "raw.zarr")
+    np.testing.assert_array_equal(found.read(), np.stack([line.data for line in lines]))
+    np.testing.assert_array_equal(found.read(60, 66), [line.data for line in lines[60:66]])
+    assert (found.sweep, found.shape, found.source) == (header.sweep, header.shape, "sim")
+    assert found.position.tolist() == [[line.mirror_x, line.mirror_y] for line in lines]
+    assert found.valid_line.tolist() == [line.valid for line in lines]
+    np.testing.assert_array_equal(found.references.white, header.references.white)
+    np.testing.assert_array_equal(found.wavelength_nm, header.wavelength_nm)
+
+
+def test_raw_cube_opens_with_plain_xarray(tmp_path: Path) -> None:
+    """Dimensions, coordinates and CF attributes are where any reader looks for them."""
+    header = _header(66, 40, 5, started="2026-05-01T10:00:00")
+    with RawCubeWriter(tmp_path / "raw.zarr", header) as cube:
+        cube.write(_lines(header))
+    with xr.open_zarr(tmp_path / "raw.zarr", consolidated=False) as data:
+        assert data["dn"].dims == ("line", "sample", "band")
+        assert data["dn"].dtype == np.uint16
+        assert {"wavelength", "fwhm", "time", "mirror_x", "mirror_y", "exposure_ms", "valid_line"} <= set(data.coords)
+        assert data["wavelength"].attrs["standard_name"] == "radiation_wavelength"
+        assert data["time"].values[10] == np.datetime64("2026-05-01T10:00:01")
+        assert data.attrs["Conventions"] == "CF-1.12"
+        near = data.swap_dims(band="wavelength").sel(wavelength=690, method="nearest")
+        assert float(near["wavelength"]) == 700.0
+
+
+def test_raw_cube_refuses_what_does_not_fit(tmp_path: Path) -> None:
+    """Lines out of order, of another size, too many or too few are named."""
+    header = _header(3, 4, 2)
+    lines = _lines(header)
+    cube = RawCubeWriter(tmp_path / "raw.zarr", header)
+    with pytest.raises(ShapeError, match="got line 1, expected line 0 of 3"):
+        cube.write(lines[1:])
+    with pytest.raises(ShapeError, match=r"line 0: shape \(3, 2\)"):
+        cube.write([Line(0, lines[0].data[:3], 0, 0, 0, 1)])
+    cube.write(lines[:2])
+    with pytest.raises(IncompleteStoreError, match="2 of 3 lines"):
+        cube.close()
+    with pytest.raises(ShapeError, match="calibrate with the sweep's own binning"):
+        SweepHeader(header.sweep, header.references, np.arange(3.0))
+
+
+def test_layout_is_one_range_read_a_patch(tmp_path: Path) -> None:
+    """Shards of 64 lines, chunks of 32 x 32 x all bands, each with blosc and crc32c inside the shard."""
+    header = _header(130, 100, 6)
+    with RawCubeWriter(tmp_path / "raw.zarr", header) as cube:
+        cube.write(_lines(header))
+    meta = json.loads((tmp_path / "raw.zarr" / "dn" / "zarr.json").read_text())
+    (sharding,) = meta["codecs"]
+    assert meta["chunk_grid"]["configuration"]["chunk_shape"] == [64, 128, 6]
+    assert sharding["configuration"]["chunk_shape"] == [32, 32, 6]
+    assert [codec["name"] for codec in sharding["configuration"]["codecs"]] == ["bytes", "blosc", "crc32c"]
+    assert len([path for path in (tmp_path / "raw.zarr" / "dn" / "c").rglob("*") if path.is_file()]) == 3
+
+
+def _mosaic(bands: int, shape: tuple[int, int] = (100, 70)) -> Mosaic:
+    rng = np.random.default_rng(bands)
+    values = rng.lognormal(size=(*shape, bands)).astype(np.float32)
+    values[:5, 3:8] = np.nan
+    coverage = np.where(np.isnan(values[..., 0]), 0, 1.5).astype(np.float32)
+    return Mosaic(values, coverage, np.linspace(400, 900, bands), None, GRID, np.full((25, 17, 3), 9, np.uint8))
+
+
+@pytest.mark.parametrize("bands", [1, 4, 270])
+def test_mosaic_round_trip(tmp_path: Path, bands: int) -> None:
+    """Values come back rounded to 11 bits, missing ones as NaN, all else exactly; xarray sees the same."""
+    mosaic = _mosaic(bands)
+    write_mosaic(tmp_path / "m.zarr", mosaic)
+    found = load_mosaic(tmp_path / "m.zarr")
+    np.testing.assert_array_equal(found.values, round_bits(mosaic.values))
+    np.testing.assert_allclose(found.values, mosaic.values, rtol=2.5e-4)
+    np.testing.assert_array_equal(found.coverage, mosaic.coverage)
+    assert found.grid == GRID
+    with xr.open_zarr(tmp_path / "m.zarr", consolidated=False) as data:
+        np.testing.assert_array_equal(data["values"].values, found.values)
+        assert data["values"].dims == ("y", "x", "band")
+        assert data["quicklook"].shape == (25, 17, 3)
+
+
+def test_mosaic_says_where_its_pixels_lie(tmp_path: Path) -> None:
+    """The spatial transform maps the centre pixel's corner to the undeflected direction, for coarse grids alike."""
+    coarse = AngularGrid(1.057e-4, (100, 70), factor=4)
+    for grid, shape in ((GRID, (100, 70)), (coarse, (25, 18))):
+        a, _, c, _, e, f = grid.attributes(shape)["spatial:transform"]
+        assert a * 35 / grid.factor + c == pytest.approx(0, abs=1e-12)
+        assert e * 50 / grid.factor + f == pytest.approx(0, abs=1e-12)
+    write_mosaic(tmp_path / "m.zarr", _mosaic(2))
+    with xr.open_zarr(tmp_path / "m.zarr", consolidated=False) as data:
+        assert data.attrs["spatial:dimensions"] == ["y", "x"]
+        assert data.attrs["zarr_conventions"][0]["uuid"].startswith("689b58e2")
+
+
+def test_mosaic_in_blocks_is_the_mosaic(tmp_path: Path) -> None:
+    """Blocks of whole shards give the same store; a block that splits one is refused."""
+    mosaic = _mosaic(3)
+    writer = MosaicWriter(tmp_path / "m.zarr", (100, 70), mosaic.wavelength_nm)
+    writer.write_rows(64, mosaic.values[64:], mosaic.coverage[64:])
+    writer.write_rows(0, mosaic.values[:64], mosaic.coverage[:64])
+    np.testing.assert_array_equal(load_mosaic(tmp_path / "m.zarr").values, round_bits(mosaic.values))
+    with pytest.raises(ChunkError, match=r"rows 10:74 split"):
+        writer.write_rows(10, mosaic.values[:64], mosaic.coverage[:64])
+    with pytest.raises(ShapeError, match=r"rows 64:128"):
+        writer.write_rows(64, mosaic.values[:64], mosaic.coverage[:64])
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 70])
+def test_patches_round_trip(tmp_path: Path, count: int) -> None:
+    """Any number of patches, none included; each is one chunk."""
+    rng = np.random.default_rng(count)
+    patches = Patches(
+        seats=np.arange(count, dtype=np.int64)[::-1].copy(),
+        origin_px=rng.integers(0, 900, (count, 2)),
+        values=rng.random((count, 8, 8, 15)).astype(np.float32),
+        valid=rng.random((count, 8, 8)) > 0.3,
+        wavelength_nm=np.linspace(400, 900, 15),
+        fwhm_nm=np.full(15, 4.0),
+        grid=GRID,
+    )
+    write_patches(tmp_path / "p.zarr", patches)
+    found = load_patches(tmp_path / "p.zarr")
+    np.testing.assert_array_equal(found.values, round_bits(patches.values))
+    for name in ("seats", "origin_px", "valid", "fwhm_nm"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(patches, name))
+    with xr.open_zarr(tmp_path / "p.zarr", consolidated=False) as data:
+        assert data["values"].dims == ("patch", "y", "x", "band")
+        assert {"seat", "seat_y", "seat_x", "wavelength"} <= set(data.coords)
+
+
+def test_attention_round_trip(tmp_path: Path) -> None:
+    """Scores keep NaN and infinity; ranks keep -1 for what was not chosen."""
+    score = np.array([[1.0, np.nan], [np.inf, -np.inf]])
+    attention = Attention(score, np.array([[1, -1], [0, -1]], np.int32), "entropy")
+    write_attention(tmp_path / "a.zarr", attention)
+    found = load_attention(tmp_path / "a.zarr")
+    np.testing.assert_array_equal(found.score, score)
+    np.testing.assert_array_equal(found.rank, attention.rank)
+    assert found.policy == "entropy"
+    with xr.open_zarr(tmp_path / "a.zarr", consolidated=False) as data:
+        np.testing.assert_array_equal(data["score"].values, score)
+
+
+def test_class_map_round_trip(tmp_path: Path) -> None:
+    """Classes, names and colours come back; xarray reads the CF flags and masks what has no class."""
+    classes = np.random.default_rng(0).integers(0, 3, (50, 70), dtype=np.uint8)
+    classes[0, :9] = 255
+    confidence = np.where(classes == 255, np.nan, 0.75).astype(np.float32)
+    colours = np.array([[0, 0, 0], [0, 255, 0], [255, 0, 0]], np.uint8)
+    write_class_map(tmp_path / "c.zarr", ClassMap(classes, confidence, ("bare soil", "crop", "weed"), colours, GRID))
+    found = load_class_map(tmp_path / "c.zarr")
+    np.testing.assert_array_equal(found.classes, classes)
+    np.testing.assert_array_equal(found.colours, colours)
+    assert found.names == ("bare soil", "crop", "weed")
+    with xr.open_zarr(tmp_path / "c.zarr", consolidated=False) as data:
+        assert data["classes"].attrs["flag_meanings"] == "bare_soil crop weed"
+        assert data["classes"].attrs["flag_values"] == [0, 1, 2]
+        assert int(data["classes"].isnull().sum()) == 9
+    with pytest.raises(ShapeError, match="class 2 is in the map, but only 2 classes"):
+        write_class_map(tmp_path / "d.zarr", ClassMap(classes, confidence, ("a", "b"), colours[:2]))
+
+
+def test_a_flipped_bit_is_an_error_and_is_named(tmp_path: Path) -> None:
+    """crc32c stops the reader, here and in plain xarray; verify names the shard."""
+    archive = Archive.open(tmp_path)
+    with archive.publish("mosaic", "k") as staged:
+        write_mosaic(staged.path / "m.zarr", _mosaic(15))
+    ref = archive.refs()[0]
+    shard = ref.path / "m.zarr" / "values" / "c" / "0" / "0" / "0"
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 3] ^= 1
+    shard.write_bytes(content)
+    with pytest.raises(IncompleteStoreError, match=r"values cannot be read.*run verify"):
+        load_mosaic(ref.path / "m.zarr")
+    with (
+        xr.open_zarr(ref.path / "m.zarr", consolidated=False) as data,
+        pytest.raises(ValueError, match="checksum"),
+    ):
+        data["values"].load()
+    with pytest.raises(IncompleteStoreError, match=r"values/c/0/0/0 has changed"):
+        archive.verify(ref)
+
+
+def test_what_is_no_store(tmp_path: Path) -> None:
+    """A missing folder and one without the arrays are incomplete stores."""
+    with pytest.raises(IncompleteStoreError, match="no readable Zarr store"):
+        load_mosaic(tmp_path / "none.zarr")
+    write_attention(tmp_path / "a.zarr", Attention(np.zeros((1, 1)), np.zeros((1, 1), np.int32), "x"))
+    with pytest.raises(IncompleteStoreError, match="wavelength cannot be read"):
+        open_raw_cube(tmp_path / "a.zarr")

@@ -1,0 +1,109 @@
+"""Data sets name their scenes, hold some out, and split one scene by a mask."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+from PIL import Image
+
+from pipeline.errors import SceneError
+from storage.datasets import load_data_set
+
+MASK_TO_CLASS = (2, 3, 5, 6, 8, 10, 11, 12, 14, 1, 4, 7, 9, 13, 15, 16)
+
+
+def _folder(root: Path) -> Path:
+    (root / "images").mkdir()
+    (root / "annotations").mkdir()
+    (root / "scene.toml").write_text(
+        'labels = "annotations/{number}_annotation.png"\n[classes]\nsoil = [0, 0, 0]\ncrop = [0, 255, 0]\n'
+    )
+    for number in ("003", "010", "021"):
+        Image.new("RGB", (6, 5), (int(number), 0, 0)).save(root / "images" / f"{number}_image.png")
+        Image.new("RGB", (6, 5), (0, 255, 0)).save(root / "annotations" / f"{number}_annotation.png")
+    return root
+
+
+def test_scenes_are_named_by_number(tmp_path: Path) -> None:
+    """Each image is a scene with its own labels; those held out are not trained on."""
+    data = load_data_set(_folder(tmp_path), hold_out=["010"])
+    assert data.names == ("003", "010", "021")
+    assert [name for name, _ in data.train()] == ["003", "021"]
+    ((name, scene),) = data.test()
+    assert name == "010"
+    assert scene.labels is not None
+    assert (scene.labels == 1).all()
+    assert scene.values[0, 0, 0] == 10
+
+
+def test_unknown_scenes_to_hold_out_are_listed(tmp_path: Path) -> None:
+    """What there is stands in the message; nor can all be held out."""
+    _folder(tmp_path)
+    with pytest.raises(SceneError, match="no scene 11 to hold out; it has 003, 010, 021"):
+        load_data_set(tmp_path, hold_out=["11"])
+    with pytest.raises(SceneError, match="leaves none to train on"):
+        load_data_set(tmp_path, hold_out=["003", "010", "021"])
+
+
+def test_empty_and_missing_folders(tmp_path: Path) -> None:
+    """A folder without scenes and one that is not there are refused."""
+    with pytest.raises(SceneError, match="holds no scene"):
+        load_data_set(tmp_path)
+    with pytest.raises(SceneError, match="there is no file or folder"):
+        load_data_set(tmp_path / "none")
+
+
+def test_a_mask_splits_the_labels(tmp_path: Path) -> None:
+    """Training and test labels share no pixel, and pixels where mask and labels disagree are not trained on."""
+    np.save(tmp_path / "a.npy", np.ones((2, 3, 1)))
+    np.save(tmp_path / "gt.npy", np.array([[0, 4, 9], [9, 4, 4]]))
+    (tmp_path / "scene.toml").write_text(
+        'wavelengths_nm = [600]\nlabels = "gt.npy"\nunlabelled = 0\n[classes]\na = 4\nb = 9\n'
+    )
+    scipy.io.savemat(tmp_path / "mask.mat", {"m": np.array([[1, 1, 1], [2, 0, 2]], np.uint8)})
+    data = load_data_set(tmp_path / "a.npy", train_mask=tmp_path / "mask.mat", mask_classes=[9, 4])
+    ((_, train),), ((_, test),) = data.train(), data.test()
+    assert train.labels is not None
+    assert test.labels is not None
+    assert train.labels.tolist() == [[255, 255, 1], [255, 255, 0]]
+    assert test.labels.tolist() == [[255, 0, 255], [1, 0, 255]]
+    assert train.content_hash != test.content_hash
+    assert load_data_set(tmp_path, train_mask=tmp_path / "mask.mat").names == ("a",)
+
+
+@pytest.mark.parametrize(
+    ("classes", "words"),
+    [([9], "goes up to 2, but only 1 mask classes"), ([9, 5], r"class 5 is none of the labels' \[4, 9\]")],
+)
+def test_masks_that_do_not_fit(tmp_path: Path, classes: list[int], words: str) -> None:
+    """Too few mask classes and classes that the labels lack are refused."""
+    np.save(tmp_path / "a.npy", np.ones((1, 2, 1)))
+    np.save(tmp_path / "gt.npy", np.array([[4, 9]]))
+    np.save(tmp_path / "mask.npy", np.array([[1, 2]]))
+    (tmp_path / "scene.toml").write_text('wavelengths_nm = [600]\nlabels = "gt.npy"')
+    data = load_data_set(tmp_path / "a.npy", train_mask=tmp_path / "mask.npy", mask_classes=classes)
+    with pytest.raises(SceneError, match=words):
+        list(data.train())
+
+
+def test_indian_pines_disjoint_mask(real_data: Path) -> None:
+    """5,528 pixels train, the labelled rest of 10,249 tests."""
+    folder = real_data / "indian_pines"
+    data = load_data_set(
+        folder / "Indian_pines_corrected.npy",
+        train_mask=folder / "indianpines_disjoint_dset.mat",
+        mask_classes=MASK_TO_CLASS,
+    )
+    ((_, train),), ((_, test),) = data.train(), data.test()
+    assert np.count_nonzero(np.asarray(train.labels) != 255) == 5528
+    assert np.count_nonzero(np.asarray(test.labels) != 255) == 10249 - 5528
+
+
+def test_field_frames_by_number(real_data: Path) -> None:
+    """The frames of the field set are named by their number."""
+    data = load_data_set(real_data / "cwfid", hold_out=["059"])
+    assert len(data.names) == 39
+    assert data.held_out == ("059",)

@@ -1,0 +1,103 @@
+"""Labels come out as class indices whatever they are stored as; what is no class is named and counted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from pipeline.errors import SceneError
+from storage.labels import default_colour, load_labels
+
+COLOURS = {"soil": (0, 0, 0), "crop": (0, 255, 0), "weed": (255, 0, 0)}
+
+
+def test_colours_become_indices(tmp_path: Path) -> None:
+    """Exact colours give the class's place in the table."""
+    index = np.random.default_rng(0).integers(0, 3, (5, 6))
+    Image.fromarray(np.array(list(COLOURS.values()), np.uint8)[index]).save(tmp_path / "a.png")
+    found = load_labels(tmp_path / "a.png", (5, 6), classes=COLOURS)
+    np.testing.assert_array_equal(found.index, index)
+    assert found.names == ("soil", "crop", "weed")
+    assert found.colours.tolist() == [[0, 0, 0], [0, 255, 0], [255, 0, 0]]
+
+
+def test_an_unknown_colour_is_counted(tmp_path: Path) -> None:
+    """A colour that is no class is named with its pixels, unless it means unlabelled."""
+    image = np.zeros((4, 4, 3), np.uint8)
+    image[0, :3] = 9
+    Image.fromarray(image).save(tmp_path / "a.png")
+    with pytest.raises(SceneError, match=r"3 px of colour \[9, 9, 9\], which is no class"):
+        load_labels(tmp_path / "a.png", (4, 4), classes=COLOURS)
+    found = load_labels(tmp_path / "a.png", (4, 4), classes=COLOURS, unlabelled=(9, 9, 9))
+    assert (found.index == 255).sum() == 3
+
+
+@pytest.mark.parametrize("ending", ["npy", "mat", "png"])
+def test_numbers_become_indices(tmp_path: Path, ending: str) -> None:
+    """Numbers of a .npy, .mat or grey PNG give indices; the unlabelled number gives 255."""
+    codes = np.array([[0, 7, 3], [3, 3, 7]], np.uint8)
+    path = tmp_path / f"a.{ending}"
+    if ending == "npy":
+        np.save(path, codes)
+    elif ending == "mat":
+        scipy.io.savemat(path, {"m": codes})
+    else:
+        Image.fromarray(codes).save(path)
+    found = load_labels(path, (2, 3), classes={"seven": 7, "three": 3}, unlabelled=0)
+    assert found.index.tolist() == [[255, 0, 1], [1, 1, 0]]
+
+
+def test_a_palette_is_read_either_way(tmp_path: Path) -> None:
+    """An indexed PNG gives its indices for numbered classes and its colours for coloured ones."""
+    image = Image.new("P", (2, 2))
+    image.putpalette([0, 0, 0, 0, 255, 0, 255, 0, 0])
+    image.putdata([0, 1, 2, 1])
+    image.save(tmp_path / "a.png")
+    for classes in (COLOURS, {"soil": 0, "crop": 1, "weed": 2}):
+        assert load_labels(tmp_path / "a.png", (2, 2), classes=classes).index.tolist() == [[0, 1], [2, 1]]
+
+
+def test_classes_are_found_where_none_are_stated(tmp_path: Path) -> None:
+    """Values become classes named after their number, NaN stays unlabelled."""
+    np.save(tmp_path / "a.npy", np.array([[1.0, 5.0], [np.nan, 5.0]]))
+    found = load_labels(tmp_path / "a.npy", (2, 2), classes={})
+    assert found.names == ("class_1", "class_5")
+    assert found.index.tolist() == [[0, 1], [255, 1]]
+
+
+def test_a_photograph_is_no_label_file(tmp_path: Path) -> None:
+    """More than 64 colours are not taken for classes, and fractions not for numbers."""
+    noise = np.random.default_rng(0).integers(0, 255, (20, 20, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / "a.png")
+    with pytest.raises(SceneError, match="different colours, at most 64"):
+        load_labels(tmp_path / "a.png", (20, 20), classes={})
+    np.save(tmp_path / "a.npy", noise[..., 0] / 3)
+    with pytest.raises(SceneError, match="fractions"):
+        load_labels(tmp_path / "a.npy", (20, 20), classes={})
+
+
+def test_another_size_is_refused_with_both(tmp_path: Path) -> None:
+    """The message holds the labels' and the scene's size."""
+    np.save(tmp_path / "a.npy", np.zeros((3, 4), int))
+    with pytest.raises(SceneError, match="3 x 4 px, the scene is 4 x 3 px"):
+        load_labels(tmp_path / "a.npy", (4, 3), classes={})
+
+
+def test_unlabelled_cannot_be_a_class(tmp_path: Path) -> None:
+    """One number cannot mean a class and no class."""
+    np.save(tmp_path / "a.npy", np.zeros((3, 4), int))
+    with pytest.raises(SceneError, match="value 0 is unlabelled and also class soil"):
+        load_labels(tmp_path / "a.npy", (3, 4), classes={"soil": 0}, unlabelled=0)
+
+
+@given(st.integers(2, 80))
+@settings(max_examples=20, deadline=None)
+def test_default_colours_differ(count: int) -> None:
+    """No two of the first classes share a colour."""
+    assert len({default_colour(index) for index in range(count)}) == count

@@ -1,0 +1,255 @@
+"""Scene files of every kind give the same arrays back, and what cannot be used says why."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipeline.errors import SceneError, WavelengthError
+from storage.scene_files import load_scene_file
+
+NM = [450.0, 550.0, 650.0, 800.0, 900.0]
+
+
+def _save(path: Path, values: NDArray[Any]) -> Path:
+    """Write a cube in the way that the file's ending says."""
+    if path.suffix == ".npy":
+        np.save(path, values)
+    elif path.suffix == ".npz":
+        np.savez(path, cube=values)
+    elif path.name.endswith("73.mat"):
+        with h5py.File(path, "w", userblock_size=512) as file:
+            file["cube"] = values.T
+    elif path.suffix == ".mat":
+        scipy.io.savemat(path, {"cube": values, "count": 3})
+    else:
+        tifffile = pytest.importorskip("tifffile")
+        tifffile.imwrite(path, values, photometric="minisblack", planarconfig="contig")
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.npz", "a.mat", "a73.mat", "a.tif"])
+def test_every_kind_of_cube_file_gives_the_same_values(tmp_path: Path, cube: NDArray[np.uint16], name: str) -> None:
+    """Axes are y, x, band in every kind of file; numbers are exact in float32."""
+    scene = load_scene_file(_save(tmp_path / name, cube), wavelengths=NM)
+    assert scene.values.dtype == np.float32
+    np.testing.assert_array_equal(scene.values, cube)
+    np.testing.assert_array_equal(scene.wavelength_nm, NM)
+
+
+@pytest.mark.parametrize("bands", [1, 2, 4, 15, 200, 270, 939])
+def test_any_number_of_bands(tmp_path: Path, bands: int) -> None:
+    """Nothing depends on how many bands there are."""
+    values = np.random.default_rng(bands).random((4, 5, bands)).astype(np.float32)
+    scene = load_scene_file(_save(tmp_path / "a.npy", values), wavelengths=np.linspace(400, 1000, bands).tolist())
+    np.testing.assert_array_equal(scene.values, values)
+
+
+def test_two_axes_are_one_band(tmp_path: Path) -> None:
+    """A (y, x) array is a scene of one band."""
+    assert load_scene_file(_save(tmp_path / "a.npy", np.ones((3, 4))), wavelengths=[550]).values.shape == (3, 4, 1)
+
+
+def test_bands_and_wavelengths_follow_the_flags(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Wavelengths are stated for the chosen bands or for all; order is kept."""
+    path = _save(tmp_path / "a.npy", cube)
+    for stated in ([800.0, 450.0], NM):
+        scene = load_scene_file(path, bands=[3, 0], wavelengths=stated)
+        np.testing.assert_array_equal(scene.values, cube[..., [3, 0]])
+        assert scene.wavelength_nm.tolist() == [800.0, 450.0]
+
+
+def test_missing_values_stay_missing(tmp_path: Path) -> None:
+    """NaN is kept, an infinity becomes NaN and is told of."""
+    values = np.ones((3, 3, 2))
+    values[0, 0, 0], values[1, 1, 1] = np.nan, np.inf
+    scene = load_scene_file(_save(tmp_path / "a.npy", values), wavelengths=[500, 600])
+    assert np.isnan(scene.values).sum() == 2
+    assert "1 infinite samples count as missing" in scene.provenance
+
+
+@pytest.mark.parametrize(
+    ("mode", "bands", "nm"),
+    [("L", 1, [550]), ("LA", 1, [550]), ("RGB", 3, [640, 550, 460]), ("RGBA", 3, [640, 550, 460])],
+)
+def test_images_have_assumed_wavelengths(tmp_path: Path, mode: str, bands: int, nm: list[float]) -> None:
+    """Grey and colour images get usual wavelengths, said to be assumed; alpha is dropped, and said to be."""
+    Image.new(mode, (6, 4), 77).save(tmp_path / "a.png")
+    scene = load_scene_file(tmp_path / "a.png")
+    assert scene.values.shape == (4, 6, bands)
+    assert scene.wavelength_nm.tolist() == nm
+    assert any("assumed" in note for note in scene.provenance)
+    assert ("alpha channel dropped" in scene.provenance) == mode.endswith("A")
+
+
+def test_deep_colour_png_keeps_its_16_bits(tmp_path: Path) -> None:
+    """A 16-bit colour PNG is not cut to 8 bits."""
+    cv2 = pytest.importorskip("cv2")
+    values = np.random.default_rng(0).integers(0, 65536, (4, 5, 3), dtype=np.uint16)
+    cv2.imwrite(str(tmp_path / "a.png"), values[..., ::-1])
+    np.testing.assert_array_equal(load_scene_file(tmp_path / "a.png").values, values)
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_geotiff_says_its_colours(tmp_path: Path, plain: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A band after red, green and blue that is not alpha is assumed near infrared, with and without rasterio."""
+    tifffile = pytest.importorskip("tifffile")
+    if plain:
+        real = importlib.import_module
+        monkeypatch.setattr(importlib, "import_module", lambda n: _missing(n) if n == "rasterio" else real(n))
+    elif importlib.util.find_spec("rasterio") is None:
+        pytest.skip("rasterio is not installed")
+    values = np.random.default_rng(0).integers(0, 255, (4, 5, 4), dtype=np.uint8)
+    tifffile.imwrite(tmp_path / "n.tif", values, photometric="rgb", extrasamples=["unspecified"])
+    tifffile.imwrite(tmp_path / "a.tif", values, photometric="rgb", extrasamples=["unassalpha"])
+    assert load_scene_file(tmp_path / "n.tif").wavelength_nm.tolist() == [640, 550, 460, 800]
+    assert load_scene_file(tmp_path / "a.tif").wavelength_nm.tolist() == [640, 550, 460]
+    tifffile.imwrite(tmp_path / "p.tif", np.moveaxis(values, -1, 0), photometric="minisblack", planarconfig="separate")
+    np.testing.assert_array_equal(load_scene_file(tmp_path / "p.tif", wavelengths=NM[:4]).values, values)
+
+
+def _missing(name: str) -> None:
+    raise ImportError(name)
+
+
+def test_what_an_optional_library_is_needed_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a reader for TIFF the message says what to install."""
+    (tmp_path / "a.tif").write_bytes(b"II*\0")
+    monkeypatch.setattr(importlib, "import_module", _missing)
+    with pytest.raises(SceneError, match=r"needs rasterio; pip install 'spectralzoom\[geo\]'"):
+        load_scene_file(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize(
+    ("stated", "words"),
+    [
+        ([0.45, 0.55, 0.65, 0.8, 0.9], "look like micrometres; write them in nm: 450"),
+        ([450.0, 550.0], "expected 5 wavelengths, one a band, got 2"),
+        ([450.0, 550, 650, 800, 9000], "9000 lie outside 200-3000 nm"),
+        ([450.0, 550, 650, 800, float("nan")], "must be numbers"),
+        (None, "5 bands and nothing says their wavelengths; give --wavelengths"),
+    ],
+)
+def test_wrong_wavelengths_say_what_to_write(
+    tmp_path: Path, cube: NDArray[np.uint16], stated: list[float] | None, words: str
+) -> None:
+    """Micrometres, a wrong number, a wrong range and none at all each have their own words."""
+    with pytest.raises(WavelengthError, match=words):
+        load_scene_file(_save(tmp_path / "a.npy", cube), wavelengths=stated)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        (np.ones((2, 2), complex), "complex numbers"),
+        (np.array([[None, 1]], object), "Python objects"),
+        (np.zeros((0, 4, 2)), "empty array"),
+        (np.zeros(4), r"shape \(4,\)"),
+        (np.full((2, 2, 2), np.nan), "no finite number"),
+        (np.array([["a"]]), "expected whole or floating numbers"),
+    ],
+)
+def test_arrays_that_are_no_scene(tmp_path: Path, values: NDArray[Any], words: str) -> None:
+    """Objects, complex numbers, emptiness and odd shapes are refused in words."""
+    np.save(tmp_path / "a.npy", values, allow_pickle=True)
+    with pytest.raises(SceneError, match=words):
+        load_scene_file(tmp_path / "a.npy", wavelengths=[500, 600])
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif", "a.npy", "a.npz", "a.mat"])
+def test_a_damaged_file_is_named(tmp_path: Path, name: str) -> None:
+    """Bytes that are no such file give one message with the file's name."""
+    (tmp_path / name).write_bytes(b"\x89PNG not an image at all, whatever it is called" * 9)
+    with pytest.raises(SceneError, match=rf"{name} cannot be read"):
+        load_scene_file(tmp_path / name)
+
+
+def test_a_cut_off_image_is_named(tmp_path: Path) -> None:
+    """A PNG that ends too early is refused, not filled."""
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / "a.png")
+    whole = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "a.png").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(SceneError, match=r"a\.png cannot be read"):
+        load_scene_file(tmp_path / "a.png")
+
+
+def test_missing_folders_and_unknown_endings(tmp_path: Path) -> None:
+    """A file that is not there, a folder, and an ending that is not read are told apart."""
+    (tmp_path / "a.doc").write_text("x")
+    for name, words in (("b.png", "there is no file"), (".", "is a folder"), ("a.doc", r"ends in \.doc.*use \.png")):
+        with pytest.raises(SceneError, match=words):
+            load_scene_file(tmp_path / name)
+
+
+def test_a_mat_file_with_several_cubes_asks_for_one(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """FILE.mat:VARIABLE picks one of several arrays."""
+    path = tmp_path / "a.mat"
+    scipy.io.savemat(path, {"first": cube, "second": cube + 1})
+    with pytest.raises(SceneError, match=r"no single array with 3 axes.*first.*second.*a\.mat:VARIABLE"):
+        load_scene_file(path, wavelengths=NM)
+    np.testing.assert_array_equal(load_scene_file(f"{path}:second", wavelengths=NM).values, cube + 1)
+    with pytest.raises(SceneError, match="has no array third"):
+        load_scene_file(f"{path}:third", wavelengths=NM)
+
+
+@pytest.mark.parametrize(
+    ("bands", "words"), [([0, 5], r"band 5.*bands 0\.\.4"), ([-1], "band -1"), ([1, 1], "twice"), ([], "empty")]
+)
+def test_wrong_bands(tmp_path: Path, cube: NDArray[np.uint16], bands: list[int], words: str) -> None:
+    """Bands out of range, named twice or none at all are refused."""
+    with pytest.raises(SceneError, match=words):
+        load_scene_file(_save(tmp_path / "a.npy", cube), bands=bands, wavelengths=NM)
+
+
+def test_hash_follows_content_and_choices(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Same bytes and choices, same hash wherever the file lies; other bands or labels, another."""
+    one, two = _save(tmp_path / "a.npy", cube), _save(tmp_path / "b.npy", cube)
+    np.save(tmp_path / "labels.npy", np.ones((7, 9), int))
+    plain = load_scene_file(one, wavelengths=NM)
+    labelled = load_scene_file(one, wavelengths=NM, labels=tmp_path / "labels.npy")
+    assert plain.content_hash == load_scene_file(two, wavelengths=NM).content_hash
+    assert plain.content_hash != load_scene_file(one, wavelengths=NM, bands=[0, 1]).content_hash
+    assert plain.content_hash != labelled.content_hash
+    assert plain.light_hash == labelled.light_hash
+
+
+def test_a_scene_cannot_be_changed(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """The dataclass is frozen; other labels make another scene."""
+    scene = load_scene_file(_save(tmp_path / "a.npy", cube), wavelengths=NM)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        scene.name = "b"  # type: ignore[misc]
+    other = scene.with_labels(np.zeros((7, 9), np.uint8), "changed")
+    assert other.content_hash != scene.content_hash
+    assert other.provenance[-1] == "changed"
+
+
+def test_indian_pines(real_data: Path) -> None:
+    """200 bands, out of order, with their widths; 10,249 labelled pixels in 16 classes."""
+    scene = load_scene_file(real_data / "indian_pines" / "Indian_pines_corrected.npy")
+    assert scene.values.shape == (145, 145, 200)
+    assert scene.fwhm_nm is not None
+    assert (scene.fwhm_nm > 8).all()
+    assert (np.diff(scene.wavelength_nm) < 0).any()
+    assert scene.labels is not None
+    assert (scene.labels != 255).sum() == 10249
+    assert len(scene.class_names) == 16
+
+
+def test_field_frames(real_data: Path) -> None:
+    """Two bands of a PNG with exact colours for labels, stated one folder up."""
+    scene = load_scene_file(real_data / "cwfid" / "images" / "059_image.png")
+    assert scene.values.shape == (966, 1296, 2)
+    assert scene.wavelength_nm.tolist() == [660, 800]
+    assert scene.class_names == ("soil", "crop", "weed")
+    assert np.bincount(scene.labels.ravel()).tolist() == [1112027, 15254, 124655]  # type: ignore[union-attr]

@@ -1,0 +1,142 @@
+"""Lines come back as they went in; a torn tail is cut off, a changed line is named, other lines are not continued."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import RigError
+from pipeline.source import Line
+from storage.spool import Spool
+
+HEADER = {"sweep": "fine-0", "seed": 3, "start_px": -40.25}
+
+
+def _line(number: int, samples: int = 6, bands: int = 4) -> Line:
+    data = np.random.default_rng(number).integers(0, 65536, (samples, bands), dtype=np.uint16)
+    return Line(number, data, 0.1 / (number + 1), -0.3, 0.1 * number, 100.0, number != 2)
+
+
+def _fill(folder: Path, count: int) -> None:
+    with Spool.open(folder, 6, 4, header=HEADER) as spool:
+        for number in range(spool.count, count):
+            spool.append(_line(number))
+
+
+def _same(found: list[Line], first: int = 0) -> bool:
+    want = [_line(first + index) for index in range(len(found))]
+    return all(
+        (a.data == b.data).all() and vars(a) | {"data": 0} == vars(b) | {"data": 0}
+        for a, b in zip(found, want, strict=True)
+    )
+
+
+def test_lines_come_back_in_blocks(tmp_path: Path) -> None:
+    """150 lines are blocks of 64, 64 and 22, each line with all its facts."""
+    _fill(tmp_path, 150)
+    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        blocks = list(spool.blocks())
+    assert [len(block) for block in blocks] == [64, 64, 22]
+    assert _same([line for block in blocks for line in block])
+
+
+def test_an_interrupted_capture_goes_on(tmp_path: Path) -> None:
+    """A spool opened again has the count of its lines and takes the next."""
+    _fill(tmp_path, 10)
+    _fill(tmp_path, 12)
+    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        assert spool.count == 12
+        assert _same([line for block in spool.blocks(5) for line in block])
+
+
+def test_the_spool_is_an_envi_file(tmp_path: Path) -> None:
+    """The header describes band-interleaved lines of uint16 that a memory map reads."""
+    _fill(tmp_path, 7)
+    text = (tmp_path / "lines.hdr").read_text()
+    assert text.startswith("ENVI\n")
+    assert "lines = 7\n" in text
+    cube = np.memmap(tmp_path / "lines.bil", "<u2", "r", shape=(7, 4, 6))
+    np.testing.assert_array_equal(cube[3].T, _line(3).data)
+    rasterio = pytest.importorskip("rasterio")
+    with pytest.warns(rasterio.errors.NotGeoreferencedWarning), rasterio.open(tmp_path / "lines.bil") as file:
+        np.testing.assert_array_equal(file.read()[:, 3].T, _line(3).data)
+
+
+@pytest.mark.parametrize("name", ["lines.bil", "lines.index"])
+@pytest.mark.parametrize("cut", [1, 30, 47, 48, 49, 130])
+def test_a_torn_tail_is_cut_off(tmp_path: Path, name: str, cut: int) -> None:
+    """Whatever part of the last lines is lost, the whole lines before it are kept and the capture goes on."""
+    _fill(tmp_path, 8)
+    size = (tmp_path / name).stat().st_size
+    os.truncate(tmp_path / name, size - cut)
+    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        assert 4 < spool.count < 8
+        assert _same([line for block in spool.blocks() for line in block])
+    _fill(tmp_path, 8)
+    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        assert _same(next(spool.blocks()))
+        assert spool.count == 8
+
+
+def test_a_changed_line_is_named(tmp_path: Path) -> None:
+    """Reading compares each line's CRC; opening again goes on before the changed line."""
+    _fill(tmp_path, 6)
+    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        content = bytearray((tmp_path / "lines.bil").read_bytes())
+        content[48 * 4 + 5] ^= 1
+        (tmp_path / "lines.bil").write_bytes(content)
+        with pytest.raises(RigError, match="line 4 has changed"):
+            list(spool.blocks())
+        assert spool.recover() == 4
+
+
+def test_lines_of_another_sweep_are_not_continued(tmp_path: Path) -> None:
+    """A header that differs is refused with what differs; restart begins anew."""
+    _fill(tmp_path, 3)
+    other = {**HEADER, "seed": 4}
+    with pytest.raises(RigError, match="seed is 3, expected 4"):
+        Spool.open(tmp_path, 6, 4, header=other)
+    with pytest.raises(RigError, match="samples is 6, expected 5"):
+        Spool.open(tmp_path, 5, 4, header=HEADER)
+    with Spool.open(tmp_path, 6, 4, header=other, restart=True) as spool:
+        assert spool.count == 0
+        assert list(spool.blocks()) == []
+
+
+def test_lines_come_in_order_and_of_one_size(tmp_path: Path) -> None:
+    """A line with another number or shape is refused."""
+    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        with pytest.raises(RigError, match="got line 1"):
+            spool.append(_line(1))
+        with pytest.raises(RigError, match=r"shape \(5, 4\)"):
+            spool.append(_line(0, samples=5))
+
+
+def test_a_full_disk_keeps_the_lines_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk takes half a line and refuses: the message counts what is kept, and the capture can go on at once."""
+    _fill(tmp_path, 5)
+    real = os.write
+
+    def half(descriptor: int, content: memoryview) -> int:
+        if len(content) < 48:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return real(descriptor, content[:20])
+
+    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "write", half)
+            with pytest.raises(RigError, match=r"cannot write line 5.*No space left.*the 5 lines before it are kept"):
+                spool.append(_line(5))
+        spool.append(_line(5))
+        assert _same(next(spool.blocks()))
+
+
+def test_an_unwritable_folder_is_told(tmp_path: Path) -> None:
+    """A file where the folder should be gives one message."""
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(RigError, match="cannot write line 0"):
+        Spool.open(tmp_path / "file", 6, 4, header=HEADER)
