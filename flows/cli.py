@@ -4,16 +4,160 @@ from __future__ import annotations
 
 import json
 import sys
+import tempfile
+import traceback
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import App, Parameter
 from rich.console import Console
+from rich.markup import escape
 
 from pipeline.errors import PipelineError, SettingsError
 
-app = App(name="spectralzoom", help="Survey a field: a coarse look at everything, a fine look where it changes the map.")
+app = App(name="spectralzoom", help="Survey a field: look coarsely at everything, finely where it changes the map.")
 stderr = Console(stderr=True)
+
+
+@app.command
+def survey(
+    settings: Path | None = None,
+    *,
+    scene: str | None = None,
+    labels: str | None = None,
+    bands: str | None = None,
+    wavelengths: str | None = None,
+    source: str | None = None,
+    out: str | None = None,
+    budget: str | None = None,
+    policy: str | None = None,
+    mask: str | None = None,
+    weights: str | None = None,
+    rounds: str | None = None,
+    seed: str | None = None,
+    effects: str | None = None,
+    tol: str | None = None,
+    controls: bool | None = None,
+    engine: str | None = None,
+    memory: str | None = None,
+    size: str | None = None,
+    exposure_ms: str | None = None,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+) -> int:
+    """Survey a field: a coarse look at everything, then a fine look where it changes the map.
+
+    Parameters
+    ----------
+    settings
+        A survey's TOML file; flags win over it. Without one, flags and defaults alone.
+    scene
+        `farm` (built in), or an image or cube file: PNG, JPEG, GeoTIFF, .npy, .mat.
+    labels
+        File of class colours or numbers on the scene's pixels; accuracy is reported then.
+    bands
+        Bands of the file to use, from 0: 0,1
+    wavelengths
+        Their centre wavelengths [nm]: 660,800
+    source
+        `sim`, the simulated rig.
+    out
+        Archive folder; `archive` by default.
+    budget
+        Seconds of coarse and fine capture over those of the full scan, above 0 and at most 1; 0.5 by default.
+    policy
+        Where to look twice: entropy, sobel, random or mask.
+    mask
+        Image of where to look twice, for the policy mask.
+    weights
+        Model weights (.safetensors); those for `farm` are built in.
+    rounds
+        How often to look again; 1.
+    seed
+        Of the scene `farm` and of all noise.
+    effects
+        auto, all, none, or names with commas: slit,smear,shot,read
+    tol
+        Largest error that leaving out an effect may make [sigma of the noise].
+    controls
+        Also judge other placements of the same number of seats (needs labels).
+    engine
+        `prefect`, or `plain` where no server can start.
+    memory
+        What the survey may take: 4GiB
+    size
+        Of the scene `farm`, width x height: 1280x1024
+    exposure_ms
+        Exposure of a line.
+    as_json
+        Print the receipt as JSON on stdout.
+    """
+    from flows.settings import load_settings
+    from flows.survey_command import run_survey
+
+    flags = {
+        "scene": scene, "labels": labels, "bands": bands, "wavelengths": wavelengths, "source": source, "out": out,
+        "budget": budget, "policy": policy, "mask": mask, "weights": weights, "rounds": rounds, "seed": seed,
+        "effects": effects, "tol": tol, "controls": controls, "engine": engine, "memory": memory, "size": size,
+        "camera.exposure_ms": exposure_ms,
+    }  # fmt: skip
+    published = run_survey(load_settings(settings, flags), stderr)
+    if as_json:
+        from flows.receipt import to_json
+
+        sys.stdout.write(to_json(published.receipt))
+    return 0
+
+
+@app.command
+def tradeoff(
+    stage: str | None = None,
+    *,
+    out: Annotated[Path, Parameter(name=("--out", "-o"))] = Path("tradeoff"),
+    repeats: int = 5,
+    seed: int = 0,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+) -> int:
+    """Measure what accuracy costs in time, for STAGE or for every stage that has a choice.
+
+    Parameters
+    ----------
+    stage
+        resample or plan; all without one.
+    out
+        Folder for tradeoff.json and tradeoff.png.
+    repeats
+        Rounds in which every setting is timed once.
+    seed
+        Of the scenes that are measured on.
+    as_json
+        Print the figures as JSON on stdout.
+    """
+    from flows.tradeoff_command import run_tradeoff
+
+    content = run_tradeoff(stage, out, repeats, seed, stderr)
+    if as_json:
+        print(json.dumps(content, indent=2))
+    return 0
+
+
+@app.command
+def verify(archive: Path) -> int:
+    """Read every byte of an archive again and compare it with what was published.
+
+    Parameters
+    ----------
+    archive
+        The archive's folder.
+    """
+    from storage.archive import Archive
+
+    findings = Archive.open(archive, create=False, write=False).verify_all()
+    for finding in findings:
+        if finding.problem is not None:
+            _say(f"{finding.uri}: {finding.problem}")
+    bad = sum(finding.problem is not None for finding in findings)
+    stderr.print(f"{len(findings) - bad} of {len(findings)} stores and runs are as published", highlight=False)
+    return 1 if bad else 0
 
 
 @app.command
@@ -76,10 +220,10 @@ def train(
         patch=patch, factor=factor, columns=columns, crop=crop, batch=batch,
         choices={
             "labels": labels,
-            "bands": None if bands is None else [_whole(text, "--bands") for text in _split(bands)],
-            "wavelengths": None if wavelengths is None else [_number(text, "--wavelengths") for text in _split(wavelengths)],
+            "bands": _wholes(bands, "--bands"),
+            "wavelengths": _numbers(wavelengths, "--wavelengths"),
             "train_mask": train_mask,
-            "mask_classes": None if mask_classes is None else [_whole(text, "--mask-classes") for text in _split(mask_classes)],
+            "mask_classes": _wholes(mask_classes, "--mask-classes"),
         },
     )  # fmt: skip
     if as_json:
@@ -91,16 +235,16 @@ def _split(text: str | None) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip()) if text else ()
 
 
-def _number(text: str, flag: str) -> float:
+def _numbers(text: str | None, flag: str) -> list[float] | None:
     try:
-        return float(text)
+        return None if text is None else [float(part) for part in _split(text)]
     except ValueError:
         raise SettingsError(f"{flag} expects numbers with commas, got {text!r}") from None
 
 
-def _whole(text: str, flag: str) -> int:
+def _wholes(text: str | None, flag: str) -> list[int] | None:
     try:
-        return int(text)
+        return None if text is None else [int(part) for part in _split(text)]
     except ValueError:
         raise SettingsError(f"{flag} expects whole numbers with commas, got {text!r}") from None
 
@@ -110,12 +254,28 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         code = app(arguments, console=stderr, result_action="return_value")
     except PipelineError as error:
-        stderr.print(f"[bold red]error[/]: {error}", highlight=False, soft_wrap=True)
+        _say(str(error))
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         stderr.print("interrupted; the same command goes on from here", highlight=False)
         sys.exit(130)
+    except BrokenPipeError:
+        sys.exit(1)
+    except Exception as error:
+        _say(f"{type(error).__name__}: {error}; this is a defect of SpectralZoom: please report {_keep_traceback()}")
+        sys.exit(1)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _say(message: str) -> None:
+    stderr.print(f"[bold red]error[/]: {escape(message)}", highlight=False, soft_wrap=True)
+
+
+def _keep_traceback() -> Path:
+    """Write the traceback where it can be sent from, instead of showing it."""
+    with tempfile.NamedTemporaryFile("w", prefix="spectralzoom-", suffix=".log", delete=False) as file:
+        traceback.print_exc(file=file)
+    return Path(file.name)
 
 
 if __name__ == "__main__":

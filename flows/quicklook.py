@@ -30,6 +30,7 @@ from flows.panels import (
     choose_bands,
     class_palette,
     class_rgb,
+    develop,
     draw_scale,
     grey_of,
     outline,
@@ -48,7 +49,7 @@ class QuicklookData:
     seed: int
     budget: float
     policy: str
-    raw: tuple[NDArray[np.generic], ...]  # sweeps as they came, (line, sample, band) each
+    raw: tuple[NDArray[np.generic], ...]  # sweeps as they came, calibrated, (line, sample, band) each
     rectified: NDArray[np.floating]  # (y, x, band), NaN where nothing was captured
     wavelength_nm: NDArray[np.floating]  # (band,) of raw and rectified
     score: NDArray[np.floating]  # (row, column) of the padded grid's seats; NaN or -inf without a score
@@ -152,8 +153,7 @@ def _title_line(data: QuicklookData) -> str:
 
 def _draw_raw(axes: Axes, data: QuicklookData) -> None:
     """Panel 1, first half: the sweeps as they came, stretched to the field's shape."""
-    bands, _ = choose_bands(data.wavelength_nm)
-    image = _side_by_side([stretch(np.asarray(sweep)[..., list(bands)]) for sweep in data.raw])
+    image = _side_by_side([_colours(data, np.asarray(sweep)) for sweep in data.raw])
     _show(axes, image)
     axes.set_aspect("auto")
     lines, count = sum(sweep.shape[0] for sweep in data.raw), len(data.raw)
@@ -162,10 +162,19 @@ def _draw_raw(axes: Axes, data: QuicklookData) -> None:
 
 def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
     """Panel 1, second half: the same bands of the field put straight."""
-    bands, words = choose_bands(data.wavelength_nm)
-    _show(axes, stretch(data.rectified[..., list(bands)]))
+    _, words = choose_bands(data.wavelength_nm)
+    _show(axes, _colours(data, data.rectified))
     draw_scale(axes, data.class_map.shape, data.pixel_mrad)
     _caption(axes, "Rectified", words)
+
+
+def _colours(data: QuicklookData, image: NDArray[np.generic]) -> NDArray[np.float32]:
+    """Three bands of lines or field: true colours on one scale, others stretched band by band."""
+    bands, words = choose_bands(data.wavelength_nm)
+    chosen = list(bands)
+    if words.startswith("true colour"):
+        return develop(image[..., chosen], data.rectified[..., chosen])
+    return stretch(image[..., chosen])
 
 
 def _side_by_side(images: list[NDArray[np.float32]]) -> NDArray[np.float32]:

@@ -61,7 +61,7 @@ class Score(TypedDict):
 
 
 class Control(TypedDict):
-    """mIoU of another placement of as many seats, and its spread over repeats (null where chance has no part)."""
+    """mIoU of another placement of seats, and its spread over repeats (null where chance has no part)."""
 
     miou: float | None
     spread: float | None
@@ -74,6 +74,7 @@ class Accuracy(Score):
     all: Score
     gap_closed: float | None
     controls: dict[str, Control]
+    controls_mode: NotRequired[dict[str, Any]]  # seats of the controls, and their share of samples, lines, seconds
 
 
 class Receipt(TypedDict):
@@ -312,10 +313,16 @@ def _accuracy_table(accuracy: Accuracy) -> Table:
     table.add_row("[bold]this survey[/bold]", f"[bold]{format_points(accuracy['miou'])}[/bold]", "")
     for policy, control in accuracy["controls"].items():
         spread = "" if control["spread"] is None else f"± {format_points(control['spread'])}"
-        table.add_row(f"as many, placed by {escape(policy)}", format_points(control["miou"]), spread)
+        table.add_row(f"{control_seats(accuracy)} placed by {escape(policy)}", format_points(control["miou"]), spread)
     table.add_row("all: detail everywhere", format_points(accuracy["all"]["miou"]), "")
     table.add_row("gap from none to all closed", format_percent(accuracy["gap_closed"]), "")
     return table
+
+
+def control_seats(accuracy: Mapping[str, Any]) -> str:
+    """How the controls' seats are called: their share of all, each free of the others."""
+    share = accuracy.get("controls_mode", {}).get("share_of_seats")
+    return "other seats," if share is None else f"{format_percent(share)} of the seats, free,"
 
 
 def _stages_table(stages: Iterable[Mapping[str, Any]]) -> Table:

@@ -15,7 +15,7 @@ from string import Template
 from typing import Any
 
 from flows.figures import DASH, format_bytes, format_percent, format_points, format_seconds
-from flows.receipt import COST_LABELS, Accuracy, Receipt, Saving, Savings, headline
+from flows.receipt import COST_LABELS, Accuracy, Receipt, Saving, Savings, control_seats, headline
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def _accuracy(accuracy: Accuracy) -> str:
     """The map against the truth, beside no detail, all detail and other placements; then class by class."""
     rows = [_score_row("the coarse look alone (none)", accuracy["none"]["miou"])]
     rows += [
-        _score_row(f"as much detail, placed by {policy}", control["miou"], control["spread"])
+        _score_row(f"{control_seats(accuracy)} placed by {policy}", control["miou"], control["spread"])
         for policy, control in accuracy["controls"].items()
     ]
     rows += [
@@ -130,7 +130,22 @@ def _accuracy(accuracy: Accuracy) -> str:
     gap = accuracy["gap_closed"]
     words = "The score is the mean over classes of overlap / union of map and truth (mIoU), in points of 100."
     closed = "" if gap is None else f" The detail captured closed {format_percent(gap)} of the gap from none to all."
-    return _section("How good the map is", f"<p>{words}{closed}</p>{_table(rows)}{_classes(accuracy)}")
+    return _section(
+        "How good the map is", f"<p>{words}{closed}</p>{_table(rows)}{_control_words(accuracy)}{_classes(accuracy)}"
+    )
+
+
+def _control_words(accuracy: Mapping[str, Any]) -> str:
+    """What the controls' seats stand for in samples, lines and seconds."""
+    mode = accuracy.get("controls_mode")
+    if mode is None:
+        return ""
+    shares = [format_percent(mode[f"share_of_{what}"]) for what in ("samples", "lines", "seconds")]
+    return (
+        f"<p class=note>Controls choose {mode['seats']:,} seats free of each other. Placed by entropy and with the "
+        f"coarse pass these are {shares[0]} of a full scan's samples; the camera would need {shares[1]} of its "
+        f"lines and {shares[2]} of its seconds for them.</p>"
+    )
 
 
 def _score_row(label: str, miou: float | None, spread: float | None = None, *, strong: bool = False) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.training_data import TrainingData, open_training_data, pack_mask, trained_pixels
-from models.controls import Controls, run_controls
+from models.controls import Controls, Counts, run_controls
 from models.examples import Example, Observation, measured_normalisation, normalised, observe
 from models.inference import glance_of_columns
 from models.metrics import mean_iou
@@ -72,6 +72,7 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
     def progress(now: Progress) -> None:
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
 
+    split = _split(about, data)  # before validation scenes are looked at: what was trained on
     model, summary = train(config, examples, normalisation.gain_shift, request.settings, progress)
     weights = Weights(model, about.basis, normalisation, about.names, about.colours)
     kept, _ = _observe_all(request, data, data.validation, "looking at validation scenes", report, about)
@@ -79,12 +80,7 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
     record = {
         "command": request.command,
         "data": data.law,
-        "split": {
-            "train": about.keys,
-            "validation": list(data.validation),
-            "held_out": list(data.held_out),
-            "pixels": about.pixels,
-        },
+        "split": split,
         "settings": asdict(request.settings),
         "camera": asdict(request.camera),
         "training": summary,
@@ -102,8 +98,18 @@ class _About:
     names: tuple[str, ...]
     colours: NDArray[np.uint8]
     patch: int
+    wavelength_nm: NDArray[np.float64]
     keys: dict[str, str] = field(default_factory=dict)  # scene -> identity of its light
     pixels: dict[str, str] = field(default_factory=dict)  # identity -> trained pixels, where not all labelled ones
+
+
+def _split(about: _About, data: TrainingData) -> dict[str, Any]:
+    return {
+        "train": dict(about.keys),
+        "validation": list(data.validation),
+        "held_out": list(data.held_out),
+        "pixels": dict(about.pixels),
+    }
 
 
 def _observe_all(
@@ -134,7 +140,9 @@ def _common(request: TrainRequest, scene: RasterScene) -> _About:
         raise SceneError(f"scene {scene.name} has {len(scene.class_names)} class; training needs two or more")
     basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns)
     patch = request.patch or suggested_patch(scene.shape, built_in=request.dataset == "farm")
-    return _About(basis, scene.class_names, scene.class_colours, patch)
+    about = _About(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
+    _config(request, about)  # refuses sizes that do not fit before the first look
+    return about
 
 
 def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
@@ -147,6 +155,8 @@ def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
 def _check_alike(scene: RasterScene, about: _About) -> None:
     if scene.class_names != about.names:
         raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {about.names}")
+    if not np.array_equal(scene.wavelength_nm, about.wavelength_nm):
+        raise SceneError(f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera")
 
 
 def _config(request: TrainRequest, about: _About) -> SegmenterConfig:
@@ -178,12 +188,14 @@ def _summary(rows: list[Controls]) -> dict[str, Any] | None:
     """mIoU over all validation scenes together, at one share of the seats."""
     if not rows:
         return None
-    policies = {name: sum(row.policies[name] for row in rows) for name in rows[0].policies}
-    random = [sum(row.random[draw] for row in rows) for draw in range(len(rows[0].random))]
     whole = Controls(
-        rows[0].share, sum(row.seats for row in rows), sum(row.none for row in rows), sum(row.every for row in rows),
-        policies, random,
-    )  # type: ignore[arg-type]  # fmt: skip
+        rows[0].share,
+        sum(row.seats for row in rows),
+        _added([row.none for row in rows]),
+        _added([row.every for row in rows]),
+        {name: _added([row.policies[name] for row in rows]) for name in rows[0].policies},
+        [_added([row.random[draw] for row in rows]) for draw in range(len(rows[0].random))],
+    )
     return {
         "scenes": len(rows),
         "share_of_seats": whole.share,
@@ -191,3 +203,8 @@ def _summary(rows: list[Controls]) -> dict[str, Any] | None:
         "all": mean_iou(whole.every),
         **whole.as_dict(),
     }
+
+
+def _added(parts: list[Counts]) -> Counts:
+    counts: Counts = np.sum(parts, axis=0)
+    return counts

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from flows.progress import StageProgress
 from flows.train import TrainRequest, train_weights
 from models.training import TrainingSettings
 from pipeline.errors import SettingsError
@@ -34,24 +33,18 @@ def run_train(
         settings=TrainingSettings(steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch),
         command=_command(),
     )  # fmt: skip
-    bar = Progress(
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"),
-        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[figure]}"),
-        console=console,
-    )  # fmt: skip
-    tasks: dict[str, Any] = {}
-    with bar:
+    last = ""
+    with StageProgress(console) as progress:
 
         def report(what: str, done: float, figure: str) -> None:
-            if what not in tasks:
-                for task in tasks.values():
-                    bar.update(task, completed=1.0)
-                tasks[what] = bar.add_task(what, total=1.0, figure="")
-            bar.update(tasks[what], completed=done, figure=escape(figure))
+            nonlocal last
+            if last not in ("", what):
+                progress.show(last, 1.0, ended=True)
+            last = what
+            progress.show(what, done, figure)
 
         record = train_weights(request, report)
-        for task in tasks.values():
-            bar.update(task, completed=1.0)
+        progress.show(last, 1.0, ended=True)
     _print_figures(record, out, console)
     return record
 
@@ -68,7 +61,8 @@ def _print_figures(record: dict[str, Any], out: Path, console: Console) -> None:
     if figures is None:
         console.print("no scene was kept for validation; survey one that was held out to judge the weights")
         return
-    table = Table("placement", "mIoU", title=f"{figures['scenes']} validation scenes, K = {figures['share_of_seats']:.0%}")
+    title = f"{figures['scenes']} validation scenes, K = {figures['share_of_seats']:.0%}"
+    table = Table("placement", "mIoU", title=title)
     table.add_row("none", f"{figures['none']:.1%}")
     for policy in ("random", "sobel", "entropy"):
         table.add_row(policy, f"{figures[policy]['miou']:.1%}")

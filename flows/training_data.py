@@ -119,4 +119,5 @@ def trained_pixels(scene: RasterScene) -> NDArray[np.bool_]:
     """Pixels whose label training sees."""
     if scene.labels is None:
         raise SceneError(f"scene {scene.name} has no labels; training needs them: give --labels or a scene.toml")
-    return scene.labels != UNLABELLED
+    mask: NDArray[np.bool_] = scene.labels != UNLABELLED
+    return mask

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 from models.patches import BOTTOM, level_widths
 from models.segmenter import SegmenterConfig
@@ -54,14 +55,14 @@ def _stem(config: SegmenterConfig) -> int:
     levels = _levels(config)
     enter = config.columns * levels[0][0] * levels[0][1]
     blocks = sum(9 * width * width * pixels for width, pixels in levels)
-    down = sum(4 * upper * lower * pixels for (upper, _), (lower, pixels) in zip(levels, levels[1:], strict=False))
+    down = sum(4 * upper * lower * pixels for (upper, _), (lower, pixels) in pairwise(levels))
     return enter + blocks + down + levels[-1][0] * BOTTOM**2 * config.dim
 
 
 def _head(config: SegmenterConfig) -> int:
     levels = _levels(config)
     blocks = sum(9 * width * width * pixels for width, pixels in levels[:-1])
-    up = sum(4 * upper * lower * pixels for (upper, _), (lower, pixels) in zip(levels, levels[1:], strict=False))
+    up = sum(4 * upper * lower * pixels for (upper, _), (lower, pixels) in pairwise(levels))
     return blocks + up + levels[-1][0] * BOTTOM**2 * config.dim
 
 

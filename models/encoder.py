@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
+
+from pipeline.errors import ShapeError
 
 
 class Attention(nn.Module):
@@ -15,7 +17,7 @@ class Attention(nn.Module):
     def __init__(self, dim: int, heads: int) -> None:
         super().__init__()
         if dim % heads:
-            raise ValueError(f"width {dim} does not divide by {heads} heads")
+            raise ShapeError(f"tokens of width {dim} do not divide by {heads} heads; choose another number of heads")
         self.heads = heads
         self.qkv = nn.Linear(dim, 3 * dim)
         self.out = nn.Linear(dim, dim)
@@ -28,7 +30,8 @@ class Attention(nn.Module):
         q, k, v = self.qkv(x).view(b, n, 3, self.heads, d // self.heads).permute(2, 0, 3, 1, 4)
         mask = key_bias[:, None, None, :].to(x.dtype).expand(b, 1, n, n)
         mixed = F.scaled_dot_product_attention(self.query_norm(q), self.key_norm(k), v, attn_mask=mask)
-        return self.out(mixed.transpose(1, 2).reshape(b, n, d))
+        joined: Tensor = self.out(mixed.transpose(1, 2).reshape(b, n, d))
+        return joined
 
 
 class Block(nn.Module):
@@ -44,7 +47,8 @@ class Block(nn.Module):
     def forward(self, x: Tensor, key_bias: Tensor) -> Tensor:
         """(B, N, d) -> (B, N, d)."""
         x = x + self.attention(self.norm1(x), key_bias)
-        return x + self.mlp(self.norm2(x))
+        read: Tensor = x + self.mlp(self.norm2(x))
+        return read
 
 
 class Encoder(nn.Module):

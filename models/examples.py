@@ -13,6 +13,7 @@ from torch import Tensor
 from models.metrics import UNLABELLED
 from models.spectral import Normalisation, SpectralBasis
 from pipeline.camera import LineCamera, expose, footprint
+from pipeline.errors import SceneError
 from pipeline.grid import SceneGrid, pad_by_reflection
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
@@ -47,9 +48,15 @@ def observe(
     """Look at a labelled scene with the camera's own operator, fine and coarse, and project onto the basis.
 
     Goes in strips of rows; each strip draws its noise from a stream of its own.
+
+    Raises
+    ------
+    SceneError : the scene has no labels.
     """
+    if scene.labels is None:
+        raise SceneError(f"scene {scene.name} has no labels; training needs them")
     matrix, _ = basis.matrix(scene.wavelength_nm)
-    planes = pad_by_reflection(scene.planes, grid.padded_shape)
+    planes = np.asarray(pad_by_reflection(scene.planes, grid.padded_shape), np.float32)
     labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
     labels[: grid.height, : grid.width] = scene.labels
     rows, width = grid.padded_shape
@@ -67,7 +74,7 @@ def observe(
     return Observation(scene.name, fine, coarse, labels, (grid.height, grid.width))
 
 
-def electrons_of(scene: RasterScene, planes: NDArray[np.generic], camera: LineCamera) -> NDArray[np.float32]:
+def electrons_of(scene: RasterScene, planes: NDArray[np.float32], camera: LineCamera) -> NDArray[np.float32]:
     """Expected electrons of component planes, (y, x, component) -> (y, x, band)."""
     exposure = np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     if scene.electrons.ndim == 1:  # every band has a plane of its own
@@ -107,6 +114,8 @@ class CropSampler:
         self.size = max(cell, min(crop, smallest) // cell * cell)
         self.examples, self.patch, self.factor = examples, config_patch, factor
         areas = np.array([np.count_nonzero(example.labels != UNLABELLED) for example in examples], np.float64)
+        if not areas.any():
+            raise SceneError(f"none of {len(examples)} scenes has a labelled pixel; training needs some")
         self.share = areas / areas.sum()
 
     def draw(self, count: int, rng: np.random.Generator, gain_shift: NDArray[np.float32]) -> Batch:
@@ -125,8 +134,8 @@ class CropSampler:
             if (labels != UNLABELLED).any():
                 break
         gain = np.float32(rng.normal(1.0, 0.04))
-        turn: Callable[[NDArray[np.generic]], NDArray[np.generic]] = _random_turn(rng)
-        coarse = turn(example.coarse[y // s : (y + size) // s, x // s : (x + size) // s]) * gain
+        turn = _random_turn(rng)
+        coarse = turn(example.coarse[y // s : (y + size) // s, x // s : (x + size) // s]).astype(np.float32) * gain
         fine = turn(example.fine[y : y + size, x : x + size]).astype(np.float32) * gain
         shift = (gain - 1) * gain_shift
         channels_first = [np.ascontiguousarray((image + shift).transpose(2, 0, 1)) for image in (coarse, fine)]

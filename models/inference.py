@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -85,10 +85,10 @@ def segment(weights: Weights, seen: Glance, patches: NDArray[np.floating], seats
     """
     grid, p = seen.grid, seen.grid.patch
     numbers = np.asarray(seats, np.int64)
-    if len(np.unique(numbers)) != len(numbers) or (numbers.size and not 0 <= numbers.min() <= numbers.max() < np.prod(grid.seat_shape)):
-        raise ShapeError(f"seats must be distinct numbers below {np.prod(grid.seat_shape)}")
-    if patches.shape[:3] != (len(numbers), p, p):
-        raise ShapeError(f"expected patches of shape ({len(numbers)}, {p}, {p}, column), got {patches.shape}")
+    _check_seats(numbers, grid)
+    expected = (len(numbers), p, p, weights.config.columns)
+    if patches.shape != expected:
+        raise ShapeError(f"expected patches of shape {expected} (seat, y, x, column), got {patches.shape}")
     with torch.inference_mode():
         fine = torch.from_numpy(np.nan_to_num(np.asarray(patches, np.float32), nan=0.0, posinf=0.0, neginf=0.0))
         fine_classes, coarse_logits = _read(weights, seen.columns, fine, numbers)
@@ -96,7 +96,17 @@ def segment(weights: Weights, seen: Glance, patches: NDArray[np.floating], seats
     for (values, confidence), (y, x) in zip(fine_classes, grid.seat_origin(numbers), strict=True):
         drawn.classes[y : y + p, x : x + p] = values
         drawn.confidence[y : y + p, x : x + p] = confidence
-    return ClassMap(drawn.classes[: grid.height, : grid.width].copy(), drawn.confidence[: grid.height, : grid.width].copy())
+    scene = np.s_[: grid.height, : grid.width]
+    return ClassMap(drawn.classes[scene].copy(), drawn.confidence[scene].copy())
+
+
+def _check_seats(seats: NDArray[np.int64], grid: SceneGrid) -> None:
+    count = grid.seat_shape[0] * grid.seat_shape[1]
+    if outside := seats[(seats < 0) | (seats >= count)].tolist():
+        raise ShapeError(f"seat {outside[0]} is none of the {count} seats of the scene, 0..{count - 1}")
+    distinct, times = np.unique(seats, return_counts=True)
+    if repeated := distinct[times > 1].tolist():
+        raise ShapeError(f"seat {repeated[0]} is given more than once; give each seat one patch")
 
 
 def _check_grid(weights: Weights, grid: SceneGrid) -> None:
@@ -115,14 +125,14 @@ def _read(
     model = weights.segmenter.eval()
     view = model.view(torch.from_numpy(columns).permute(2, 0, 1)[None].contiguous())
     numbers = torch.from_numpy(seats)[None]
-    chunks = [] if fine is None else list(fine.permute(0, 3, 1, 2).split(PATCHES_AT_ONCE))
+    chunks = [] if fine is None else list(torch.split(fine.permute(0, 3, 1, 2), PATCHES_AT_ONCE))
     described = [model.stem(chunk.contiguous(), coarse=False) for chunk in chunks]
     empty = torch.zeros(1, 0, model.config.dim)
     tokens = torch.cat([token for _, token in described])[None] if described else empty
     grid = model.encode(view, tokens, numbers)
     canvas = model.coarse_canvas(view, grid)
-    drawn = []
-    for number, (features, _) in zip(numbers.split(PATCHES_AT_ONCE, dim=1), described, strict=False):
+    drawn: list[tuple[NDArray[np.uint8], NDArray[np.float32]]] = []
+    for number, (features, _) in zip(torch.split(numbers, PATCHES_AT_ONCE, dim=1), described, strict=False):
         context = model.seat_context(grid, number)[0]
         logits = model.decode_fine(features, context, model.canvas_windows(canvas, number))
         confidence, classes = logits.softmax(dim=1).max(dim=1)

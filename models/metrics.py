@@ -34,17 +34,17 @@ def iou_per_class(counts: NDArray[np.int64]) -> NDArray[np.float64]:
     """Intersection over union of each class; NaN for a class in neither labels nor predictions."""
     hit = np.diag(counts).astype(np.float64)
     union = counts.sum(axis=0) + counts.sum(axis=1) - np.diag(counts)
-    return np.divide(hit, union, out=np.full(len(hit), np.nan), where=union > 0)
+    iou: NDArray[np.float64] = np.divide(hit, union, out=np.full(len(hit), np.nan), where=union > 0)
+    return iou
 
 
 def mean_iou(counts: NDArray[np.int64]) -> float:
-    """Mean over the classes that occur in the labels; NaN when nothing is labelled.
+    """Mean over the classes that labels or map hold; NaN when nothing is labelled.
 
-    A class that is predicted but occurs nowhere in the labels lowers the others by its false pixels and is not
-    averaged itself: its IoU says nothing about the class.
+    A class that is in neither is left out of the mean, not counted as 0 or 1.
     """
-    present = counts.sum(axis=1) > 0
-    return float(iou_per_class(counts)[present].mean()) if present.any() else float("nan")
+    held = counts.sum(axis=0) + counts.sum(axis=1) > 0
+    return float(iou_per_class(counts)[held].mean()) if held.any() else float("nan")
 
 
 def overall_accuracy(counts: NDArray[np.int64]) -> float:

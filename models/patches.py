@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
+
+from pipeline.errors import ShapeError
 
 BOTTOM = 4  # pixels a side at the lowest level of a patch
 
@@ -12,8 +16,8 @@ BOTTOM = 4  # pixels a side at the lowest level of a patch
 def level_widths(width: int, patch: int) -> list[int]:
     """Channels of each level, from full patch resolution down to ``BOTTOM`` px: width, 2 width, then 3 width."""
     levels = (patch // BOTTOM).bit_length()
-    if patch != BOTTOM << (levels - 1) or patch < BOTTOM:
-        raise ValueError(f"patch must be {BOTTOM} px times a power of two, got {patch}")
+    if patch < BOTTOM or patch != BOTTOM << (levels - 1):
+        raise ShapeError(f"a patch must be {BOTTOM} px times a power of two, got {patch}; choose 8, 16 or 32")
     return [width * min(level + 1, 3) for level in range(levels)]
 
 
@@ -40,7 +44,8 @@ class Residual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(P, c, y, x) -> the same shape."""
-        return x + self.conv(F.gelu(self.norm(x)))
+        mixed: Tensor = x + self.conv(F.gelu(self.norm(x)))
+        return mixed
 
 
 class PatchStem(nn.Module):
@@ -51,8 +56,7 @@ class PatchStem(nn.Module):
         self.enter = nn.Conv2d(columns, widths[0], 1)
         self.scale_shift = nn.Parameter(torch.zeros(2, widths[0]))
         self.blocks = nn.ModuleList(Residual(width) for width in widths)
-        pairs = zip(widths[:-1], widths[1:], strict=True)
-        self.down = nn.ModuleList(nn.Conv2d(upper, lower, 2, stride=2) for upper, lower in pairs)
+        self.down = nn.ModuleList(nn.Conv2d(upper, lower, 2, stride=2) for upper, lower in pairwise(widths))
         self.token = nn.Linear(widths[-1] * BOTTOM**2, dim)
 
     def forward(self, patches: Tensor, *, coarse: bool) -> tuple[list[Tensor], Tensor]:
@@ -74,13 +78,12 @@ class PatchHead(nn.Module):
         super().__init__()
         self.bottom = widths[-1]
         self.context = nn.Linear(dim, widths[-1] * BOTTOM**2)
-        pairs = zip(widths[1:], widths[:-1], strict=True)
-        self.up = nn.ModuleList(nn.Conv2d(lower, 4 * upper, 1) for lower, upper in pairs)
+        self.up = nn.ModuleList(nn.Conv2d(lower, 4 * upper, 1) for upper, lower in pairwise(widths))
         self.blocks = nn.ModuleList(Residual(width) for width in widths[:-1])
 
     def forward(self, features: list[Tensor], context: Tensor) -> Tensor:
         """Features of each level (P, c, y, x) and context (P, dim) -> (P, width, p, p)."""
-        x = features[-1] + self.context(context).view(-1, self.bottom, BOTTOM, BOTTOM)
+        x: Tensor = features[-1] + self.context(context).view(-1, self.bottom, BOTTOM, BOTTOM)
         for level in range(len(features) - 2, -1, -1):
             x = features[level] + F.pixel_shuffle(self.up[level](F.gelu(x)), 2)
             x = self.blocks[level](x)

@@ -10,17 +10,20 @@ import math
 from dataclasses import asdict, dataclass
 
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
 from models.encoder import Encoder
 from models.patches import PatchHead, PatchStem, Residual, level_widths
 from models.tokens import Positions, TokenSet, code_1d, code_2d, paper_numbers
+from pipeline.errors import ShapeError
+
+MOST_CLASSES = 255  # maps are uint8 and 255 stands for unlabelled
 
 
 @dataclass(frozen=True)
 class SegmenterConfig:
-    """Sizes of a segmenter; everything needed to build it again."""
+    """Sizes of a segmenter; everything needed to build it again. Raises ShapeError for sizes that do not fit."""
 
     classes: int
     columns: int = 24
@@ -34,10 +37,16 @@ class SegmenterConfig:
     positions: Positions = "2d"
 
     def __post_init__(self) -> None:
-        if self.classes < 2:
-            raise ValueError(f"a segmenter needs at least 2 classes, got {self.classes}")
+        if not 2 <= self.classes <= MOST_CLASSES:
+            raise ShapeError(f"a segmenter needs 2 to {MOST_CLASSES} classes, got {self.classes}")
+        for name in ("columns", "patch", "factor", "width", "dim", "layers", "heads", "mlp_ratio"):
+            if getattr(self, name) < 1:
+                raise ShapeError(f"{name} of a segmenter must be at least 1, got {getattr(self, name)}")
+        level_widths(self.width, self.patch)  # refuses a patch that cannot be halved down to the lowest level
         if self.patch % self.factor:
-            raise ValueError(f"patch {self.patch} must divide by the factor {self.factor}")
+            raise ShapeError(f"patch {self.patch} must divide by the factor {self.factor}")
+        if self.dim % 4 or self.dim % self.heads:
+            raise ShapeError(f"token width {self.dim} must divide by 4 and by its {self.heads} heads")
 
     def as_dict(self) -> dict[str, int | str]:
         """Plain values for a checkpoint."""
@@ -115,15 +124,16 @@ class Segmenter(nn.Module):
         features, tokens = self.stem(patches, coarse=True)
         cells = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).to(coarse.device).double()
         yx = ((cells + 0.5) * s).expand(b, -1, -1)
-        return CoarseView(features, self._token_set(tokens.view(b, rows * columns, self.config.dim), yx, 0, columns, origin), rows, columns)
+        placed = self._token_set(tokens.view(b, rows * columns, self.config.dim), yx, 0, columns, origin)
+        return CoarseView(features, placed, rows, columns)
 
     def _token_set(self, x: Tensor, yx: Tensor, fine: int, columns: int, origin: Tensor | None) -> TokenSet:
         s = self.config.factor
         level = torch.full(x.shape[:2], 0.0 if fine else math.log2(s), device=x.device)
-        flag = torch.full(x.shape[:2], float(fine), device=x.device)
         placed = yx if origin is None else yx + origin[:, None, :].double()
         if self.config.positions == "paper":
-            code = code_1d(paper_numbers(yx, flag, columns, s), self.config.dim)
+            coarse = torch.full(x.shape[:2], 1.0 - fine, device=x.device)
+            code = code_1d(paper_numbers(yx, coarse, columns, s), self.config.dim)
         else:
             code = code_2d(placed, self.config.dim)
         coded = x + code.to(x.dtype) + self.scale_code[fine]
@@ -140,15 +150,16 @@ class Segmenter(nn.Module):
         tokens = view.tokens.joined(self._token_set(fine, yx, 1, view.columns, origin))
         mixed = self.encoder(tokens.x, tokens.scale, tokens.valid)
         b, count = seats.shape[0], view.rows * view.columns
-        low = mixed[:, :count].transpose(1, 2).reshape(b, -1, view.rows, view.columns)
+        low = mixed[:, :count].transpose(1, 2).reshape(b, self.config.dim, view.rows, view.columns)
         grid = F.interpolate(low, scale_factor=s, mode="bilinear", align_corners=False)
         flat = grid.flatten(2).transpose(1, 2)
         index = seats[..., None].expand(-1, -1, flat.shape[-1])
         here, token = flat.gather(1, index), mixed[:, count:]
         gate = torch.sigmoid(self.token_gate(torch.cat([here, token], dim=-1)))
         flat = flat.scatter(1, index, (here + gate * (token - here)).to(flat.dtype))
-        grid = flat.transpose(1, 2).reshape(b, -1, rows, columns)
-        return grid + self.seat_mix(grid)
+        grid = flat.transpose(1, 2).reshape(b, self.config.dim, rows, columns)
+        mixed_seats: Tensor = grid + self.seat_mix(grid)
+        return mixed_seats
 
     def seat_context(self, grid: Tensor, seats: Tensor) -> Tensor:
         """Read the seat grid at the given seats, (B, K, d)."""
@@ -162,11 +173,13 @@ class Segmenter(nn.Module):
         patches = self.coarse_head(view.features, context)
         b, c = grid.shape[0], patches.shape[1]
         image = patches.view(b, view.rows, view.columns, c, p, p).permute(0, 3, 1, 4, 2, 5)
-        return self.coarse_mix(image.reshape(b, c, view.rows * p, view.columns * p))
+        canvas: Tensor = self.coarse_mix(image.reshape(b, c, view.rows * p, view.columns * p))
+        return canvas
 
     def coarse_logits(self, canvas: Tensor) -> Tensor:
         """Class logits of every coarse pixel."""
-        return self.coarse_classes(F.gelu(canvas))
+        logits: Tensor = self.coarse_classes(F.gelu(canvas))
+        return logits
 
     def canvas_windows(self, canvas: Tensor, seats: Tensor) -> Tensor:
         """The coarse features under each seat, brought up to fine pixels, (B * K, c, p, p).
@@ -189,14 +202,15 @@ class Segmenter(nn.Module):
         """Class logits of fine patches from their own pixels, their context and the coarse features under them."""
         own = self.fine_head(features, context)
         gate = torch.sigmoid(self.pixel_gate(torch.cat([own, under], dim=1)))
-        return self.fine_classes(F.gelu(self.fine_mix(under + gate * (own - under))))
+        logits: Tensor = self.fine_classes(F.gelu(self.fine_mix(under + gate * (own - under))))
+        return logits
 
     def composite(self, coarse_logits: Tensor, fine_logits: Tensor, seats: Tensor) -> Tensor:
-        """Coarse logits brought up to the fine grid, overwritten where a fine patch was captured, (B, classes, H, W)."""
+        """Coarse logits brought up to the fine grid, overwritten where a fine patch is, (B, classes, H, W) float32."""
         p, s = self.config.patch, self.config.factor
         full = F.interpolate(coarse_logits.float(), scale_factor=s, mode="bilinear", align_corners=False)
         b, c, y, x = full.shape
-        cells = full.view(b, c, y // p, p, x // p, p).permute(0, 2, 4, 1, 3, 5).reshape(b, -1, c, p, p)
+        cells = full.view(b, c, y // p, p, x // p, p).permute(0, 2, 4, 1, 3, 5).flatten(1, 2)
         index = seats[:, :, None, None, None].expand(-1, -1, c, p, p)
         cells = cells.scatter(1, index, fine_logits.float())
         return cells.view(b, y // p, x // p, c, p, p).permute(0, 3, 1, 4, 2, 5).reshape(b, c, y, x)

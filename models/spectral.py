@@ -75,7 +75,7 @@ def checked_wavelengths(wavelength_nm: NDArray[np.floating], bands: int) -> NDAr
 
 
 def band_widths(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Stretch of spectrum that each band stands for [nm]: half the way to either neighbour; 1 for a single wavelength."""
+    """Stretch of spectrum that a band stands for [nm]: half the way to either neighbour; 1 for a single wavelength."""
     distinct, group, members = np.unique(wavelength_nm, return_inverse=True, return_counts=True)
     if len(distinct) == 1:
         return np.full(len(wavelength_nm), 1.0 / members[0])

@@ -8,20 +8,22 @@ budget and policy.
 from __future__ import annotations
 
 import copy
-import ctypes
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
 from models.examples import Batch, CropSampler, Example
 from models.metrics import UNLABELLED
+from models.process import keep_freed_memory
 from models.segmenter import Segmenter, SegmenterConfig
+from pipeline.errors import PipelineError
 
 SHARES = ((0.125, 0.25), (0.25, 0.25), (0.35, 0.2), (0.5, 0.2), (1.0, 0.1))  # (share of the seats, how often)
 
@@ -52,7 +54,7 @@ class Progress:
     loss: float
 
 
-class TrainingStopped(RuntimeError):
+class TrainingError(PipelineError, RuntimeError):
     """The loss was not finite three steps in a row."""
 
 
@@ -65,18 +67,24 @@ def train(
 ) -> tuple[Segmenter, dict[str, float | int]]:
     """Train a segmenter and give its averaged weights with a summary (steps, skipped steps, last loss, seconds).
 
-    The same settings, examples and thread count give the same weights as long as ``minutes`` does not end the run.
+    The same settings and examples start from the same weights and draw the same crops and seats. What follows is equal
+    to rounding only: sums differ in their last bit with where memory lies, and ``minutes`` may end the run elsewhere.
+
+    Raises
+    ------
+    TrainingError : the loss or its gradient was not finite three steps in a row.
     """
     keep_freed_memory()
     rng = np.random.default_rng([settings.seed, 0x7EA])
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
-        model = Segmenter(config).to(memory_format=torch.channels_last)
+        model = Segmenter(config)
+    model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     averaged = copy.deepcopy(model).eval()
     optimiser = torch.optim.AdamW(_parameter_groups(model, settings.weight_decay), settings.learning_rate)
     sampler = CropSampler(examples, config.patch, config.factor, settings.crop)
     weight = class_weights(examples, config.classes, settings.weight_cap)
-    started, skipped, in_a_row, smooth, step = time.monotonic(), 0, 0, float("nan"), 0
+    started, taken, skipped, in_a_row, smooth = time.monotonic(), 0, 0, 0, math.nan
     for step in range(1, settings.steps + 1):
         done = max((step - 1) / settings.steps, (time.monotonic() - started) / (60 * settings.minutes))
         if done >= 1:
@@ -86,25 +94,16 @@ def train(
         batch = sampler.draw(settings.batch, rng, gain_shift)
         loss = batch_loss(model, batch, weight, settings, rng, soft_dice=done > 0.3)
         in_a_row = 0 if _step(model, optimiser, loss) else in_a_row + 1
-        skipped += in_a_row > 0
+        taken, skipped = step, skipped + (in_a_row > 0)
         if in_a_row == 3:
-            raise TrainingStopped(f"the loss was not finite in steps {step - 2} to {step}; lower the learning rate")
+            raise TrainingError(f"the loss was not finite in steps {step - 2} to {step}; lower the learning rate")
         _average(averaged, model, min(settings.average, step / (step + 20)))
         value = float(loss.detach())
-        smooth = value if step == 1 else 0.97 * smooth + 0.03 * value
+        if math.isfinite(value):
+            smooth = value if math.isnan(smooth) else 0.97 * smooth + 0.03 * value
         report(Progress(step, settings.steps, done, smooth))
-    seconds = time.monotonic() - started
-    return averaged, {"steps": step, "skipped_steps": skipped, "last_loss": round(smooth, 5), "seconds": round(seconds)}
-
-
-def keep_freed_memory() -> None:
-    """Ask the C library to keep freed memory: halves the time of a step, which otherwise goes into page faults."""
-    try:
-        libc = ctypes.CDLL("libc.so.6")
-        for option, value in ((-3, 2**30), (-1, 2**31 - 1), (-2, 2**28)):  # mmap threshold, trim threshold, top pad
-            libc.mallopt(option, value)
-    except (OSError, AttributeError):
-        return  # another C library: slower, nothing else
+    seconds = round(time.monotonic() - started)
+    return averaged, {"steps": taken, "skipped_steps": skipped, "last_loss": round(smooth, 5), "seconds": seconds}
 
 
 def rate_at(done: float) -> float:
@@ -159,9 +158,12 @@ def draw_seats(glance: Tensor, config: SegmenterConfig, rng: np.random.Generator
 
 
 def map_loss(logits: Tensor, labels: Tensor, weight: Tensor, *, soft_dice: bool) -> Tensor:
-    """Class-weighted cross-entropy over labelled pixels, plus half the soft Dice loss where asked; 0 without a label."""
+    """Class-weighted cross-entropy over labelled pixels, plus half the soft Dice loss where asked.
+
+    0, with a gradient of 0, where no pixel is labelled or every label has weight 0.
+    """
     labelled = labels != UNLABELLED
-    if not labelled.any():
+    if not weight[labels[labelled]].any():
         return logits.sum() * 0.0
     loss = F.cross_entropy(logits, labels, weight, ignore_index=UNLABELLED)
     if not soft_dice:

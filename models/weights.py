@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,9 @@ class Weights:
         Columns that no band reaches, and pixels with a value that is not finite, are 0: the training median.
         """
         matrix, reached = self.basis.matrix(wavelength_nm)
-        return self.normalisation.apply(np.asarray(values, np.float32) @ matrix, reached)
+        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite stays so and is replaced afterwards
+            seen = np.asarray(values, np.float32) @ matrix
+        return self.normalisation.apply(seen, reached)
 
 
 def save_weights(weights: Weights, path: Path) -> None:
@@ -68,7 +71,8 @@ def save_weights(weights: Weights, path: Path) -> None:
         temporary.write_bytes(save(tensors, {"about": json.dumps(about, sort_keys=True)}))
         temporary.replace(path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
         raise WeightsError(f"cannot write weights to {path}: {error.strerror}; choose another -o") from error
 
 
@@ -93,26 +97,33 @@ def load_weights(path: Path) -> Weights:
 
 
 def _assemble(path: Path, about: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Weights:
-    segmenter = Segmenter(SegmenterConfig(**about["config"]))
     try:
-        normalisation = Normalisation(*(tensors.pop(f"normalisation.{name}").numpy() for name in NORMALISATION))
-        colours = tensors.pop("class_colours").numpy()
-    except KeyError as error:
-        raise WeightsError(f"{path}: tensor {error.args[0]} is missing; copy or train the file again") from error
-    expected = segmenter.state_dict()
-    for name, tensor in expected.items():
+        segmenter = Segmenter(SegmenterConfig(**about["config"]))
+        basis, names, record = SpectralBasis(**about["basis"]), tuple(about["class_names"]), dict(about["record"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise WeightsError(f"{path}: its description is damaged ({error}); copy or train the file again") from error
+    if len(names) != segmenter.config.classes:
+        raise WeightsError(f"{path} names {len(names)} classes, its segmenter has {segmenter.config.classes}")
+    parameters = segmenter.state_dict()
+    expected = {name: tuple(value.shape) for name, value in parameters.items()} | _shapes_beside(segmenter.config)
+    for name, shape in expected.items():
         came = tuple(tensors[name].shape) if name in tensors else "nothing"
-        if came != tuple(tensor.shape):
-            raise WeightsError(f"{path}: tensor {name} should be {tuple(tensor.shape)}, the file has {came}")
-    segmenter.load_state_dict({name: tensors[name] for name in expected})
-    return Weights(
-        segmenter.eval(),
-        SpectralBasis(**about["basis"]),
-        normalisation,
-        tuple(about["class_names"]),
-        colours,
-        about["record"],
-    )
+        if came != shape:
+            raise WeightsError(f"{path}: tensor {name} should be {shape}, the file has {came}; train it again")
+    segmenter.load_state_dict({name: tensors[name] for name in parameters})
+    normalisation = Normalisation(*(tensors[f"normalisation.{name}"].numpy() for name in NORMALISATION))
+    return Weights(segmenter.eval(), basis, normalisation, names, tensors["class_colours"].numpy(), record)
+
+
+def _shapes_beside(config: SegmenterConfig) -> dict[str, tuple[int, ...]]:
+    """Shapes of the tensors that are not the segmenter's own."""
+    one, all_pairs = (config.columns,), (config.columns, config.columns)
+    return {
+        "normalisation.centre": one,
+        "normalisation.spread": one,
+        "normalisation.whitening": all_pairs,
+        "class_colours": (config.classes, 3),
+    }
 
 
 def with_record(weights: Weights, **entries: Any) -> Weights:

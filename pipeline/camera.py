@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pipeline.errors import ShapeError
 
 ONE_DRAW_READ_NOISE_E = 10.0
+LARGEST_SUM_DN = 65535
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,8 @@ class LineCamera:
         """Tangent k_y/k_z of each (binned) sample's ray, (sample,) float64."""
         count = self.samples // binning
         centre = (self.samples - 1) / 2
-        return ((np.arange(count) + 0.5) * binning - 0.5 - centre) * self.ifov_rad
+        middle = (np.arange(count, dtype=np.float64) + 0.5) * binning - 0.5
+        return (middle - centre) * self.ifov_rad
 
 
 def footprint_kernel(width_px: float) -> NDArray[np.float64]:
@@ -114,7 +116,8 @@ def digitise(
         one_draw = camera.read_noise_e >= ONE_DRAW_READ_NOISE_E
         signal = _shot_and_read(signal, camera, rng) if one_draw else _poisson_and_read(signal, camera, rng)
     dn = np.rint(signal / np.float32(camera.electrons_per_dn) + np.float32(camera.dark_dn))
-    return np.clip(dn, 0, camera.full_scale_dn).astype(np.uint16)
+    raw: NDArray[np.uint16] = np.clip(dn, 0, camera.full_scale_dn).astype(np.uint16)
+    return raw
 
 
 def _shot_and_read(
@@ -144,14 +147,28 @@ def _poisson_and_read(
 
 
 def bin_samples(dn: NDArray[np.uint16], binning: int) -> NDArray[np.uint16]:
-    """Sum ``binning`` neighbouring samples, (..., sample, band) -> (..., sample // binning, band); a remainder is dropped."""
+    """Sum ``binning`` neighbouring samples, (..., sample, band) -> (..., sample // binning, band).
+
+    A remainder is dropped.
+
+    Raises
+    ------
+    ShapeError : fewer samples than ``binning``, or a sum that 16 bits do not hold.
+    """
     if binning == 1:
         return dn
     count = dn.shape[-2] // binning
     if count == 0:
         raise ShapeError(f"cannot bin {dn.shape[-2]} samples by {binning}; use a smaller factor")
     whole = dn[..., : count * binning, :].reshape(*dn.shape[:-2], count, binning, dn.shape[-1])
-    return whole.sum(axis=-2, dtype=np.uint32).astype(np.uint16)
+    sums = whole.sum(axis=-2, dtype=np.uint32)
+    if (largest := int(sums.max(initial=0))) > LARGEST_SUM_DN:
+        raise ShapeError(
+            f"the sum of {binning} samples reaches {largest} DN, above the {LARGEST_SUM_DN} that 16 bits hold;"
+            " use a smaller factor or fewer bits"
+        )
+    raw: NDArray[np.uint16] = sums.astype(np.uint16)
+    return raw
 
 
 def look(
@@ -170,9 +187,12 @@ def look(
     Returns
     -------
     (y / step, x / step, band) float32 electrons, dark level taken off.
+
+    Raises
+    ------
+    ShapeError : a size does not divide by ``step``, or a binned sum does not fit 16 bits.
     """
-    if electrons.shape[0] % step or electrons.shape[1] % step:
-        raise ShapeError(f"a scene of {electrons.shape[:2]} px does not divide by the step {step}; pad it first")
+    _check_divides(electrons.shape, step)
     return expose(footprint(electrons, camera), camera, step=step, rng=rng)
 
 
@@ -184,11 +204,22 @@ def footprint(light: NDArray[np.floating], camera: LineCamera) -> NDArray[np.flo
 def expose(
     seen: NDArray[np.floating], camera: LineCamera, *, step: int, rng: np.random.Generator | None
 ) -> NDArray[np.float32]:
-    """Second half of ``look``: what one exposure a line gives of light that has passed the footprint."""
+    """Second half of ``look``: what one exposure a line gives of light that has passed the footprint.
+
+    Raises
+    ------
+    ShapeError : a size does not divide by ``step``, or a binned sum does not fit 16 bits.
+    """
+    _check_divides(seen.shape, step)
     y, x, bands = seen.shape
     held = seen.reshape(y // step, step, x, bands).mean(axis=1)
     dn = bin_samples(digitise(held, camera, rng), step).astype(np.float32)
     return (dn / np.float32(step) - np.float32(camera.dark_dn)) * np.float32(camera.electrons_per_dn)
+
+
+def _check_divides(shape: tuple[int, ...], step: int) -> None:
+    if shape[0] % step or shape[1] % step:
+        raise ShapeError(f"a scene of {shape[:2]} px does not divide by the step {step}; pad it first")
 
 
 def _convolve(image: NDArray[np.floating], kernel: NDArray[np.float64], axis: int) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""The scene grid: pixels, seats of the fine pass, pixels of the coarse pass, and how sizes that do not divide are padded."""
+"""The scene grid: its pixels, seats of the fine pass, coarse pixels, and how sizes that do not divide are padded."""
 
 from __future__ import annotations
 

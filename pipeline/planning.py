@@ -236,3 +236,25 @@ def _cut(strip: Sweep, run: tuple[int, int]) -> Sweep:
     first, stop = run
     name = f"{strip.name}-{first:05d}"
     return replace(strip, name=name, start_px=strip.start_px + first, lines=stop - first)
+
+
+def price_seats(
+    grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis, seats: NDArray[np.integer]
+) -> tuple[int, float]:
+    """Lines and seconds that exactly these seats would take on the rig, in even strips; neighbours share their lines.
+
+    What ``frame`` mode leaves out: it buys seats free of each other, the rig pays for the lines beneath them.
+    """
+    worth = np.zeros(int(np.prod(grid.seat_shape)))
+    worth[np.asarray(seats, np.intp)] = 1.0
+    sweeps = []
+    for columns in _layouts(grid, camera, along, worth)[0]:
+        strip = _strip(grid, camera, along, columns)
+        wanted = _wanted(grid, camera, strip, columns, worth)
+        needed = np.zeros(strip.lines + 1, np.int64)
+        np.add.at(needed, wanted.first, 1)
+        np.add.at(needed, wanted.stop, -1)
+        held = np.concatenate([[False], np.cumsum(needed)[:-1] > 0, [False]])
+        starts, stops = np.flatnonzero(held[1:] & ~held[:-1]), np.flatnonzero(held[:-1] & ~held[1:])
+        sweeps += [_cut(strip, run) for run in zip(starts.tolist(), stops.tolist(), strict=True)]
+    return sum(sweep.lines for sweep in sweeps), cost.seconds(sweeps, camera)

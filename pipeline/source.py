@@ -62,3 +62,26 @@ class Source(Protocol):
 
     def references(self, sweep: Sweep) -> References:
         """Dark and white frames with the sweep's binning."""
+
+
+class SweepLines(Protocol):
+    """The lines of one sweep, wherever they are: a stored cube, or a source that gives them when asked."""
+
+    @property
+    def sweep(self) -> Sweep:
+        """The sweep that the lines belong to."""
+
+    @property
+    def references(self) -> References:
+        """Dark and white frames of its binning."""
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """(line, 2) mirror X and Y at mid exposure."""
+
+    @property
+    def valid_line(self) -> NDArray[np.bool_]:
+        """(line,) lines that can be used."""
+
+    def read(self, start: int, stop: int) -> NDArray[np.uint16]:
+        """Raw numbers of the lines ``start`` to ``stop``, (line, sample, band)."""

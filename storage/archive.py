@@ -12,6 +12,7 @@ A folder whose name ends in ``.part`` is not finished: whoever makes the same th
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import secrets
@@ -220,11 +221,17 @@ class Archive:
     def new_run(self, name: str) -> RunDraft:
         """Begin the folder of one run; nothing of it is seen under ``runs`` before :meth:`RunDraft.publish`."""
         clean = re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")[:60] or "run"
-        run_id = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{clean}-{secrets.token_hex(2)}"
-        folder = self.root / "runs" / (run_id + PART_SUFFIX)
+        stem = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{clean}"
         with refusals(self.root, "write to the archive"):
-            release = take_lock(self._lock_path(f"runs-{run_id}"))
-            folder.mkdir(parents=True)
+            for number in itertools.count(1):  # another run of the same second takes the next number
+                run_id = stem if number == 1 else f"{stem}-{number}"
+                folder = self.root / "runs" / (run_id + PART_SUFFIX)
+                release = take_lock(self._lock_path(f"runs-{run_id}"), wait=False)
+                if release is not None and not folder.with_name(run_id).exists():
+                    folder.mkdir(parents=True, exist_ok=True)
+                    break
+                if release is not None:
+                    release()
         return RunDraft(run_id, folder, self.root, release or (lambda: None))
 
     def runs(self) -> list[Path]:

@@ -10,7 +10,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
+from pipeline.errors import ChunkError, ShapeError
 from storage.layout import (
     AngularGrid,
     ArraySpec,
@@ -26,7 +26,7 @@ from storage.layout import (
     write_small,
 )
 
-_PATCHES_A_SHARD = 64
+PATCHES_A_SHARD = 64
 
 
 @dataclass(frozen=True)
@@ -42,43 +42,107 @@ class Patches:
     grid: AngularGrid | None = None
 
 
+class PatchWriter:
+    """Write patches a few at a time, so that they never have to be in memory together."""
+
+    def __init__(
+        self,
+        path: Path,
+        seats: NDArray[np.integer],
+        origin_px: NDArray[np.integer],
+        patch_px: int,
+        wavelength_nm: NDArray[np.float64],
+        *,
+        fwhm_nm: NDArray[np.float64] | None = None,
+        grid: AngularGrid | None = None,
+    ) -> None:
+        count, bands = len(seats), len(wavelength_nm)
+        if seats.shape != (count,) or origin_px.shape != (count, 2):
+            raise ShapeError(f"seats {seats.shape} and origins {origin_px.shape} must be (patch,) and (patch, 2)")
+        group = create_group(path, "fine patches", grid_record(grid))
+        names = write_bands(group, wavelength_nm, fwhm_nm)
+        for name, values, meaning in (
+            ("seat", seats, "number of the seat on the padded grid"),
+            ("seat_y", origin_px[:, 0], "row of the patch's first pixel"),
+            ("seat_x", origin_px[:, 1], "column of the patch's first pixel"),
+        ):
+            write_small(group, name, ("patch",), np.asarray(values, np.int64), {"long_name": meaning, "units": "1"})
+        coordinates = "seat seat_y seat_x"
+        self._count = count
+        shape = (count, patch_px, patch_px)
+        about = {"long_name": "scene value", "units": "1", "coordinates": f"{names} {coordinates}"}
+        self._values = _create_stack(group, "values", ("patch", "y", "x", "band"), (*shape, bands), "<f4", about)
+        about = {"long_name": "pixel was seen and lies on the scene", "coordinates": coordinates}
+        self._valid = _create_stack(group, "valid", ("patch", "y", "x"), shape, "|b1", about)
+
+    def write(self, first: int, values: NDArray[np.floating], valid: NDArray[np.bool_]) -> None:
+        """Store (patch, y, x, band) values and (patch, y, x) validity from patch ``first`` on.
+
+        Raises
+        ------
+        ChunkError : the patches split a shard of 64.
+        ShapeError : they do not fit the store.
+        """
+        last = first + len(values)
+        if values.shape[1:] != self._values.shape[1:] or valid.shape != values.shape[:3] or last > self._count:
+            raise ShapeError(f"patches {first}:{last} are {values.shape} and {valid.shape} in {self._values.shape}")
+        if first % PATCHES_A_SHARD or (last % PATCHES_A_SHARD and last != self._count):
+            raise ChunkError(
+                f"patches {first}:{last} split shards of {PATCHES_A_SHARD}; start and end at their multiples"
+            )
+        if len(values):
+            self._values[first:last] = round_bits(values)
+            self._valid[first:last] = valid
+
+
 def write_patches(path: Path, patches: Patches) -> None:
-    """Store patches, each one chunk. None at all is fine.
+    """Store patches that are in memory together, each one chunk. None at all is fine.
 
     Raises
     ------
     ShapeError : the arrays do not fit each other.
     """
-    count, y, x, bands = patches.values.shape
-    shapes = (patches.seats.shape, patches.origin_px.shape, patches.valid.shape, patches.wavelength_nm.shape)
-    if shapes != ((count,), (count, 2), (count, y, x), (bands,)):
-        raise ShapeError(f"patches {patches.values.shape} do not fit seats, origins, valid, wavelengths {shapes}")
-    group = create_group(path, "fine patches", grid_record(patches.grid))
-    names = write_bands(group, patches.wavelength_nm, patches.fwhm_nm)
-    seats = "seat seat_y seat_x"
-    for name, values, meaning in (
-        ("seat", patches.seats, "number of the seat on the padded grid"),
-        ("seat_y", patches.origin_px[:, 0], "row of the patch's first pixel"),
-        ("seat_x", patches.origin_px[:, 1], "column of the patch's first pixel"),
-    ):
-        write_small(group, name, ("patch",), np.asarray(values, np.int64), {"long_name": meaning, "units": "1"})
-    about = {"long_name": "scene value", "units": "1", "coordinates": f"{names} {seats}"}
-    _write_stack(group, "values", ("patch", "y", "x", "band"), round_bits(patches.values), about)
-    about = {"long_name": "pixel was seen and lies on the scene", "coordinates": seats}
-    _write_stack(group, "valid", ("patch", "y", "x"), patches.valid, about)
-
-
-def _write_stack(
-    group: zarr.Group, name: str, dims: tuple[str, ...], values: NDArray[Any], about: dict[str, Any]
-) -> None:
-    """One chunk an entry of the first axis, 64 of them a file."""
-    rest = values.shape[1:]
-    shard = min(_PATCHES_A_SHARD, max(len(values), 1))
-    array = create_array(
-        group, name, ArraySpec(dims, values.shape, values.dtype.str, (1, *rest), (shard, *rest)), about
+    if patches.values.shape[-1:] != patches.wavelength_nm.shape or len(patches.values) != len(patches.seats):
+        raise ShapeError(
+            f"patches {patches.values.shape} do not fit {len(patches.seats)} seats and"
+            f" {len(patches.wavelength_nm)} wavelengths"
+        )
+    writer = PatchWriter(
+        path,
+        patches.seats,
+        patches.origin_px,
+        patches.values.shape[1],
+        patches.wavelength_nm,
+        fwhm_nm=patches.fwhm_nm,
+        grid=patches.grid,
     )
-    if len(values):
-        array[...] = values
+    writer.write(0, patches.values, patches.valid)
+
+
+def _create_stack(
+    group: zarr.Group, name: str, dims: tuple[str, ...], shape: tuple[int, ...], dtype: str, about: dict[str, Any]
+) -> zarr.Array[Any]:
+    """One chunk an entry of the first axis, 64 of them a file."""
+    shard = min(PATCHES_A_SHARD, max(shape[0], 1))
+    return create_array(group, name, ArraySpec(dims, shape, dtype, (1, *shape[1:]), (shard, *shape[1:])), about)
+
+
+@dataclass(frozen=True)
+class PatchStore:
+    """Stored patches, opened; values are read when asked for."""
+
+    seats: NDArray[np.int64]  # (patch,)
+    group: zarr.Group
+
+    def read(self, start: int, stop: int) -> NDArray[np.float32]:
+        """Values of some patches, (patch, y, x, band) float32."""
+        return read_array(self.group, "values", slice(start, stop))
+
+
+def open_patches(path: Path) -> PatchStore:
+    """Open stored patches. Raises IncompleteStoreError where they are missing or damaged."""
+    group = open_group(path)
+    return PatchStore(read_array(group, "seat"), group)
 
 
 def load_patches(path: Path) -> Patches:

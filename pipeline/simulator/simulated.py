@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,3 +112,31 @@ def _check_binning(sweep: Sweep, camera: LineCamera) -> None:
             f"sweep {sweep.name}: sums of {sweep.binning} samples of {camera.bits} bits do not fit uint16; "
             f"bin at most {np.iinfo(np.uint16).max // camera.full_scale_dn}"
         )
+
+
+@dataclass(frozen=True)
+class SimulatedSweep:
+    """The lines of one simulated sweep, made when they are read and never stored."""
+
+    source: SimulatedSource
+    sweep: Sweep
+
+    @property
+    def references(self) -> References:
+        """Dark and white frames."""
+        return self.source.references(self.sweep)
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """(line, 2) mirror X and Y at mid exposure."""
+        return line_positions(self.sweep, self.source.camera)
+
+    @property
+    def valid_line(self) -> NDArray[np.bool_]:
+        """Every line can be used."""
+        return np.ones(self.sweep.lines, bool)
+
+    def read(self, start: int, stop: int) -> NDArray[np.uint16]:
+        """Make the lines ``start`` to ``stop``, (line, sample, band) uint16."""
+        lines = islice(self.source.lines(self.sweep, first=start), stop - start)
+        return np.stack([line.data for line in lines])

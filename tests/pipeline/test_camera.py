@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.polynomial.legendre import leggauss
 from scipy import stats
 
-from pipeline.camera import LineCamera, bin_samples, digitise, footprint_kernel, look
+from pipeline.camera import LineCamera, bin_samples, digitise, expose, footprint_kernel, look
 from pipeline.errors import ShapeError
 from pipeline.scan import capture_options
 
@@ -142,6 +143,25 @@ def test_binning_sums_and_drops_the_remainder():
         bin_samples(dn, 8)
 
 
+def test_sums_that_16_bits_do_not_hold_are_refused():
+    """A sum never wraps: the largest that fits is kept, one more is refused with the size and what to do."""
+    full = np.full((2, 8, 3), 8191, np.uint16)
+    assert bin_samples(full, 8).max() == 65528
+    full[1, 5, 2] = 8199
+    with pytest.raises(ShapeError, match=r"sum of 8 samples reaches 65536 DN, above the 65535 .* smaller factor"):
+        bin_samples(full, 8)
+    assert bin_samples(full[:0], 8).shape == (0, 1, 3)
+
+
+def test_a_bright_look_of_a_wide_converter_does_not_wrap():
+    """A 14-bit camera near its full well cannot be binned by 8; the look says so and shows no dark scene."""
+    camera = replace(CAMERA, bits=14)
+    electrons = np.full((8, 8, 1), camera.full_well_e)
+    with pytest.raises(ShapeError, match="use a smaller factor or fewer bits"):
+        look(electrons, camera, step=8, rng=None)
+    assert look(electrons, camera, step=4, rng=None) == pytest.approx(camera.full_well_e, rel=1e-3)
+
+
 @pytest.mark.parametrize("step", [1, 2, 4, 8])
 def test_a_flat_scene_looks_flat_and_its_noise_falls_by_the_root_of_the_step(step: float):
     """The coarse pass averages ``step`` samples of one exposure: noise falls by sqrt(step), not by step."""
@@ -163,7 +183,9 @@ def test_a_look_is_the_mean_of_footprints_over_the_smear():
     assert coarse == pytest.approx(blocks, abs=1.0)
 
 
-def test_a_scene_that_does_not_divide_is_refused():
-    """The message says the size, the step, and to pad first."""
-    with pytest.raises(ShapeError, match="does not divide by the step 4; pad it first"):
-        look(np.zeros((10, 12, 1)), CAMERA, step=4, rng=None)
+@pytest.mark.parametrize("operator", [look, expose])
+@pytest.mark.parametrize("shape", [(10, 12, 1), (12, 10, 1)])
+def test_a_scene_that_does_not_divide_is_refused(operator: Callable[..., object], shape: tuple[int, ...]):
+    """The message says the size, the step, and to pad first, before and after the footprint."""
+    with pytest.raises(ShapeError, match=rf"{shape[0]}, {shape[1]}\) px does not divide by the step 4; pad it first"):
+        operator(np.zeros(shape), CAMERA, step=4, rng=None)

@@ -1,0 +1,121 @@
+"""The Prefect engine: one flow a survey, one task a stage, references between them, nothing asked of the network.
+
+No ``from __future__ import annotations`` here: Prefect reads the signatures.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from flows.survey import Products, StageRunner, survey
+from pipeline.errors import PipelineError
+from storage.archive import StageRef
+from storage.staging import take_lock
+
+RETRIES = {"capture_coarse": 2, "capture_fine": 2}  # a device may answer the second time; the spool goes on
+RETRY_DELAY_S = 2.0
+QUIET = {
+    "DO_NOT_TRACK": "1",
+    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+    "PREFECT_SERVER_EPHEMERAL_ENABLED": "true",
+    "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "120",
+    "PREFECT_LOGGING_LEVEL": "ERROR",
+    "PREFECT_SERVER_LOGGING_LEVEL": "ERROR",
+    "PREFECT_LOGGING_TO_API_ENABLED": "false",
+    "PREFECT_CLI_PROMPT": "false",
+}
+
+
+class EngineUnavailable(RuntimeError):
+    """No Prefect server could be started or reached."""
+
+
+def survey_with_prefect(runner: StageRunner) -> Products:
+    """Run the survey as a Prefect flow on an ephemeral server, or on the one that PREFECT_API_URL names.
+
+    Raises
+    ------
+    EngineUnavailable : the server did not start; nothing of the survey has run.
+    PipelineError : from a stage, as with the plain engine.
+    """
+    with _prefect_home(runner.run.archive.root):
+        try:
+            from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+        except ImportError as error:
+            raise EngineUnavailable(f"Prefect cannot be imported ({error})") from error
+        # The heartbeat thread adds a second to every flow and tells nobody anything on an ephemeral server.
+        with temporary_settings(updates={PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
+            return _run_flow(runner)
+
+
+def _run_flow(runner: StageRunner) -> Products:
+    from prefect import flow, task
+    from prefect.cache_policies import NO_CACHE
+
+    started: list[bool] = []
+    left: list[Products] = []
+
+    def stage(name: str, inputs: dict[str, str]) -> dict[str, str] | None:
+        """One stage of the survey: addresses and keys in, an address and a key out."""
+        ref = runner(name, *(_ref(runner, uri) for uri in inputs))
+        return None if ref is None else {"uri": ref.uri, "key": ref.key}
+
+    def step(name: str, /, *inputs: StageRef) -> StageRef | None:
+        one = task(
+            name=name, task_run_name=f"{name}-{runner.run.name}", cache_policy=NO_CACHE, persist_result=False,
+            retries=RETRIES.get(name, 0), retry_delay_seconds=RETRY_DELAY_S, retry_condition_fn=_may_help,
+        )(stage)  # fmt: skip
+        found = one(name, {ref.uri: ref.key for ref in inputs})
+        return None if found is None else _ref(runner, found["uri"])
+
+    @flow(name="survey", flow_run_name=f"survey-{runner.run.name}", persist_result=False, validate_parameters=False)
+    def survey_flow(scene: str, seed: int, budget: float) -> None:
+        """Sweep coarsely, look again where it changes the map, draw the map."""
+        started.append(True)
+        left.append(survey(step))
+
+    settings = runner.run.settings
+    try:
+        survey_flow(settings.scene, settings.seed, settings.budget)
+    except PipelineError:
+        raise
+    except Exception as error:
+        if started:
+            raise
+        raise EngineUnavailable(f"the Prefect server did not start ({error})") from error
+    return left[0]
+
+
+def _may_help(task: Any, run: Any, state: Any) -> bool:
+    """A device or disk may answer the second time; wrong input will not."""
+    error = state.result(raise_on_failure=False)
+    return isinstance(error, OSError)
+
+
+def _ref(runner: StageRunner, uri: str) -> StageRef:
+    _, stage, key = uri.split("/")
+    return StageRef(stage, key, runner.run.archive.root / uri)
+
+
+@contextmanager
+def _prefect_home(archive: Path) -> Iterator[None]:
+    """Keep Prefect's own files in the archive; a second survey of it at the same time takes a home of its own.
+
+    A server that PREFECT_API_URL names, and a PREFECT_HOME of the user's, are left as they are.
+    """
+    home = archive / ".prefect"
+    release = take_lock(archive / ".locks" / "prefect.lock", wait=False)
+    if release is None:
+        home = archive / f".prefect-{os.getpid()}"
+    wanted = {**QUIET, "PREFECT_HOME": str(home)}
+    added = {name: value for name, value in wanted.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for name in added:
+            os.environ.pop(name, None)
+        if release is not None:
+            release()

@@ -1,0 +1,140 @@
+"""Judging a map by labels: its own accuracy, and what no detail, all detail and other placements would have given.
+
+A stage like the others, but outside the survey's savings: it looks at the whole scene in full and needs labels.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.full_look import columns_of_all_seats
+from flows.run import SurveyRun
+from flows.stages import KERNEL, Produce, digest, glance_at, patch_columns, write_json
+from models.controls import Controls, run_controls
+from models.inference import Glance, segment
+from models.metrics import average_accuracy, confusion, gap_closed, iou_per_class, kappa, mean_iou, overall_accuracy
+from models.policies import score_seats
+from pipeline.planning import price_seats
+from pipeline.savings import count_lines
+from pipeline.selection import frame_seats
+from storage.archive import StageRef
+from storage.class_maps import load_class_map
+
+CONTROL_SHARE = 0.35
+
+
+def evaluate(
+    run: SurveyRun, produce: Produce, mosaic: StageRef, patches: StageRef, class_map: StageRef
+) -> StageRef | None:
+    """Judge the map by the labels, and what other placements would have given. Not part of the survey's own cost."""
+    labels = run.labels
+    if labels is None:
+        return None
+
+    def build(path: Path) -> None:
+        classes = load_class_map(class_map.path / "class_map.zarr").classes
+        seen = glance_at(run, mosaic)
+        counts = confusion(labels, classes, run.weights.config.classes)
+        result: dict[str, Any] = _figures(run, counts)
+        empty = np.empty((0, run.grid.patch, run.grid.patch, run.weights.basis.columns), np.float32)
+        none = segment(run.weights, seen, empty, np.empty(0, np.int64))
+        result["none"] = _figures(run, confusion(labels, none.classes, run.weights.config.classes))
+        result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
+        if run.settings.controls:
+            result |= _controls(run, seen, patches, labels, result)
+        write_json(path / "accuracy.json", result)
+
+    params = {
+        "weights": run.weights_key,
+        "labels": digest(labels),
+        "controls": run.settings.controls,
+        **run.source_key(),
+    }
+    return produce("evaluate", build, params, [mosaic, patches, class_map])
+
+
+def _controls(
+    run: SurveyRun, seen: Glance, patches: StageRef, labels: NDArray[np.uint8], result: dict[str, Any]
+) -> dict[str, Any]:
+    """`all`, the other placements, and how long either reading takes."""
+    columns = columns_of_all_seats(
+        run.source, run.plan.full, run.grid, run.weights,
+        memory=run.settings.memory, kernel=KERNEL, report=lambda done: run.report(0.6 * done),
+    )  # fmt: skip
+    rows = 0
+
+    def report(row: str) -> None:
+        nonlocal rows
+        rows += 1
+        run.report(0.6 + 0.035 * rows)
+
+    controls = run_controls(
+        run.weights, seen, columns, labels, share=CONTROL_SHARE, seed=run.settings.seed, report=report
+    )
+    figures = _figures(run, controls.every)
+    return {
+        "all": figures,
+        "gap_closed": gap_closed(result["miou"], result["none"]["miou"], figures["miou"]),
+        "controls": controls.as_dict(),
+        "controls_mode": _controls_mode(run, seen, controls),
+        "segment_wall_s": _segment_seconds(run, seen, patches, columns, controls),
+    }
+
+
+def _controls_mode(run: SurveyRun, seen: Glance, controls: Controls) -> dict[str, Any]:
+    """What the controls' seats are, and what those of entropy would cost the rig: seats are not lines, nor seconds."""
+    grid, valid = run.grid, run.grid.valid_share().ravel() > 0
+    seats = frame_seats(score_seats("entropy", seen), controls.share, valid).seats
+    lines, seconds = price_seats(grid, run.camera, run.settings.cost, run.plan.along, seats)
+    coarse_lines, full_lines = count_lines(run.plan.coarse), count_lines(run.plan.full)
+    return {
+        "mode": "frame",
+        "share_of_seats": controls.share,
+        "seats": controls.seats,
+        "share_of_samples": (len(seats) * grid.patch**2 + np.prod(grid.coarse_shape)) / (grid.height * grid.width),
+        "share_of_lines": (coarse_lines + lines) / full_lines,
+        "share_of_seconds": (run.plan.coarse_s + seconds) / run.plan.full_s,
+    }
+
+
+def _segment_seconds(
+    run: SurveyRun, seen: Glance, patches: StageRef, columns: NDArray[np.float32], controls: Controls
+) -> dict[str, float]:
+    """Wall time of the map as captured and with every seat, on the same path, the better of two each [s]."""
+    seats, own = patch_columns(run, patches)
+    valid = run.grid.valid_seats()
+    return {
+        "done": min(_seconds(lambda: segment(run.weights, seen, own, seats)) for _ in range(2)),
+        "full": min(_seconds(lambda: segment(run.weights, seen, columns[valid], valid)) for _ in range(2)),
+    }
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def _figures(run: SurveyRun, counts: NDArray[np.int64]) -> dict[str, Any]:
+    names = run.weights.class_names
+    return {
+        "miou": mean_iou(counts),
+        "per_class_iou": dict(zip(names, iou_per_class(counts).tolist(), strict=True)),
+        "overall_accuracy": overall_accuracy(counts),
+        "average_accuracy": average_accuracy(counts),
+        "kappa": kappa(counts),
+        "pixels": int(counts.sum()),
+    }
+
+
+def load_accuracy(evaluated: StageRef) -> dict[str, Any]:
+    """Read the figures of an evaluation."""
+    result: dict[str, Any] = json.loads((evaluated.path / "accuracy.json").read_text())
+    return result

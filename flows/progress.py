@@ -1,0 +1,47 @@
+"""Progress of long work: bars on a terminal, a line now and then where the output is a log."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from types import TracebackType
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+LINE_EVERY_S = 30.0
+
+
+class StageProgress:
+    """One bar a stage; use as a context manager around the work."""
+
+    def __init__(self, console: Console, titles: Mapping[str, str] | None = None) -> None:
+        self.console, self.titles = console, titles or {}
+        self._tasks: dict[str, TaskID] = {}
+        self._said: dict[str, float] = {}
+        self._bars = Progress(
+            TextColumn("{task.description:<34}"), BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("left"),
+            TimeRemainingColumn(), TextColumn("{task.fields[words]}"), console=console, disable=not console.is_terminal,
+        )  # fmt: skip
+
+    def __enter__(self) -> StageProgress:
+        self._bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bars.stop()
+
+    def show(self, stage: str, done: float, words: str = "", *, ended: bool = False) -> None:
+        """Say how far a stage is, 0..1, with a word or figure beside it."""
+        title = self.titles.get(stage, stage)
+        if stage not in self._tasks:
+            self._tasks[stage] = self._bars.add_task(title, total=1.0, words="")
+            self._said[stage] = time.monotonic()
+        self._bars.update(self._tasks[stage], completed=1.0 if ended else done, words=escape(words))
+        due = time.monotonic() - self._said[stage] > LINE_EVERY_S
+        if not self.console.is_terminal and (ended or due):
+            self._said[stage] = time.monotonic()
+            self.console.print(f"{title}: {done:.0%} {escape(words)}".rstrip(), highlight=False, soft_wrap=True)

@@ -1,0 +1,216 @@
+"""The end of a survey: receipt, quicklook and report from what the stages left, published as one run folder."""
+
+from __future__ import annotations
+
+import platform
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.evaluation import load_accuracy
+from flows.panels import choose_bands
+from flows.quicklook import QuicklookData, draw_quicklook
+from flows.receipt import Header, Receipt, build_receipt, to_json
+from flows.report import write_report
+from flows.run import SurveyRun, now
+from flows.stages import captured, load_plan
+from flows.survey import Products, StageRunner
+from models.cost import MultiplyAdds, multiply_adds
+from pipeline.planning import FinePlan
+from pipeline.rectify.calibrate import reflectance
+from pipeline.savings import Entry, capture_savings
+from pipeline.scan import Sweep
+from pipeline.simulator.instrument import ALL_EFFECTS
+from pipeline.source import References
+from storage.attention import load_attention
+from storage.class_maps import ClassMap, load_class_map
+from storage.cubes import RawCube
+from storage.mosaics import load_mosaic
+from storage.patches import open_patches
+
+LIBRARIES = ("spectralzoom", "numpy", "torch", "zarr", "xarray", "prefect")
+VARIANTS = {
+    "slit": "box of the slit's width, 4 Gauss nodes",
+    "smear": "mean over the positions held in one exposure",
+    "shot": "one normal draw with the counts' skewness",
+    "read": "normal, in the same draw",
+}
+
+
+@dataclass(frozen=True)
+class Published:
+    """What a survey leaves for people: the receipt and where its folder lies."""
+
+    receipt: Receipt
+    folder: Path
+    looked_twice: float  # share of the field's seats captured in detail
+
+
+def publish_run(runner: StageRunner, products: Products, started: str) -> Published:
+    """Write receipt.json, quicklook.png and report.html into a run folder and publish it as a whole."""
+    run = runner.run
+    plan = load_plan(products.attention)
+    looked_twice = len(plan.seats) / len(run.grid.valid_seats())
+    with run.archive.new_run(run.name) as draft:
+        receipt = make_receipt(runner, products, plan, started, f"runs/{draft.id}")
+        panels = quicklook_data(run, products, plan, receipt)
+        draw_quicklook(draft.folder / "quicklook.png", panels)
+        draft.write_file("receipt.json", to_json(receipt))
+        picture = (draft.folder / "quicklook.png").read_bytes()
+        write_report(draft.folder / "report.html", receipt, picture, looked_twice=looked_twice)
+        folder = draft.publish(survey=receipt["survey"])
+    return Published(receipt, folder, looked_twice)
+
+
+def make_receipt(
+    runner: StageRunner, products: Products, plan: FinePlan, started: str, folder: str
+) -> Receipt:
+    """Put together what the run has to say for itself."""
+    run = runner.run
+    accuracy = None if products.accuracy is None else load_accuracy(products.accuracy)
+    savings = _savings(run, products, plan)
+    if accuracy is not None and "segment_wall_s" in accuracy:
+        savings["segment_wall_s"] = accuracy.pop("segment_wall_s")
+    header = Header(
+        run.name, run.source.name, run.scene.key, run.settings.seed, started, now(),
+        _versions(),
+        {**run.settings.to_dict(), "notes": list(run.notes)},
+    )  # fmt: skip
+    return build_receipt(
+        header, runner.records.values(), savings, _addresses(products, folder),
+        accuracy=accuracy, effects=_effects(run),
+    )  # fmt: skip
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        with suppress(PackageNotFoundError):  # run from a source tree that is not installed
+            found[name] = version(name)
+    return found
+
+
+def _addresses(products: Products, folder: str) -> dict[str, str]:
+    named = {
+        "raw_coarse": products.raw_coarse.uri,
+        "mosaic": f"{products.mosaic.uri}/mosaic.zarr",
+        "attention": f"{products.attention.uri}/attention.zarr",
+        "plan": f"{products.attention.uri}/plan.json",
+        "raw_fine": products.raw_fine.uri,
+        "patches": f"{products.patches.uri}/patches.zarr",
+        "class_map": f"{products.class_map.uri}/class_map.zarr",
+    }
+    if products.accuracy is not None:
+        named["accuracy"] = f"{products.accuracy.uri}/accuracy.json"
+    return named | {name: f"{folder}/{name}" for name in ("receipt.json", "quicklook.png", "report.html")}
+
+
+def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, Any]:
+    """Everything done against the full scan; stored bytes of the full scan are predicted from the ratio seen here."""
+    bands = len(run.scene.wavelength_nm)
+    done = [*run.plan.coarse, *plan.sweeps]
+    entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
+    stored = [run.archive.stored_bytes(ref) for ref in (products.raw_coarse, products.raw_fine)]
+    # Fine lines compress like the full scan's would; without any, the coarse ones have to stand for them.
+    like, kept = ((plan.sweeps, stored[1]) if plan.sweeps else (run.plan.coarse, stored[0]))
+    of_these = capture_savings(like, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
+    full_stored = entries["bytes_raw"].full * kept / of_these["bytes_raw"].done
+    config, valid = run.weights.config, len(run.grid.valid_seats())
+    cells = int(np.prod(run.grid.padded_shape)) // (config.patch * config.factor) ** 2
+    return {
+        **{name: entry.as_dict() for name, entry in entries.items()},
+        "capture_s": Entry(run.plan.coarse_s + plan.seconds, run.plan.full_s, "predicted").as_dict(),
+        "bytes_stored": Entry(sum(stored), round(full_stored), "predicted").as_dict(),
+        "tokens": Entry(cells + len(plan.seats), cells + valid, "predicted").as_dict(),
+        "multiply_adds": _multiply_adds(run, len(plan.seats), valid, bands),
+    }
+
+
+def _multiply_adds(run: SurveyRun, seats: int, valid: int, bands: int) -> dict[str, Any]:
+    done: MultiplyAdds = multiply_adds(run.weights.config, run.grid, seats, bands, run.settings.policy)
+    full = multiply_adds(run.weights.config, run.grid, valid, bands, None)
+    split = {"glance": done.glance, "score": done.score, "encode": done.encode, "decode": done.decode}
+    return {**Entry(done.total, full.total, "predicted").as_dict(), **split}
+
+
+def _effects(run: SurveyRun) -> list[dict[str, Any]]:
+    """Effects that this version simulates, on or off as asked; bounds are not computed yet."""
+    nothing = dict.fromkeys(("bound", "measured", "cost_s", "why"))
+    always = {
+        "rotation": "exact rays through the mirror",
+        "quantisation": f"{run.camera.bits} bits, rounded half to even",
+        "saturation": "clipped at the converter's range",
+    }
+    rows = [{"name": name, "state": "on", "variant": variant, **nothing} for name, variant in always.items()]
+    for name in sorted(ALL_EFFECTS):
+        state = "on" if name in run.source.effects else "off"
+        rows.append({"name": name, "state": state, "variant": VARIANTS[name], **nothing})
+    return rows
+
+
+def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: Receipt) -> QuicklookData:
+    """Gather what the four panels show, three bands of it."""
+    bands, _ = choose_bands(run.scene.wavelength_nm)
+    chosen = list(bands)
+    attention = load_attention(products.attention.path / "attention.zarr")
+    found: ClassMap = load_class_map(products.class_map.path / "class_map.zarr")
+    order = np.argsort(attention.rank.ravel(), kind="stable")
+    accuracy = receipt.get("accuracy")
+    miou = None if accuracy is None else accuracy["miou"]
+    return QuicklookData(
+        survey=run.name,
+        seed=run.settings.seed,
+        budget=run.settings.budget,
+        policy=run.settings.policy,
+        raw=tuple(_calibrated(cube, chosen) for cube in captured(products.raw_coarse)),
+        rectified=_both_scales(run, products, chosen),
+        wavelength_nm=run.scene.wavelength_nm[chosen],
+        score=attention.score,
+        patch_px=run.grid.patch,
+        seats=order[attention.rank.ravel()[order] >= 0],
+        blocks=tuple(block_of(sweep, run) for sweep in plan.sweeps),
+        class_map=found.classes,
+        class_names=found.names,
+        class_colours=found.colours,
+        truth=run.labels,
+        confidence=found.confidence,
+        pixel_mrad=run.camera.ifov_rad * 1e3,
+        note="" if miou is None else f"mIoU {100 * miou:.1f} %",
+    )
+
+
+def _calibrated(cube: RawCube, bands: list[int]) -> NDArray[np.float32]:
+    """Some bands of a sweep's lines in scene values."""
+    frames = cube.references
+    some = References(frames.dark[:, bands], frames.white[:, bands], frames.panel[bands])
+    return reflectance(cube.read()[..., bands], some)
+
+
+def _both_scales(run: SurveyRun, products: Products, bands: list[int]) -> NDArray[np.float32]:
+    """The coarse mosaic at the scene's size with the fine patches laid in, (y, x, 3)."""
+    coarse = load_mosaic(products.mosaic.path / "mosaic.zarr").values[..., bands]
+    s, p = run.grid.factor, run.grid.patch
+    canvas = np.repeat(np.repeat(coarse, s, axis=0), s, axis=1)[: run.grid.height, : run.grid.width].copy()
+    store = open_patches(products.patches.path / "patches.zarr")
+    for first in range(0, len(store.seats), 64):
+        values = store.read(first, first + 64)[..., bands]
+        for patch, (y, x) in zip(values, run.grid.seat_origin(store.seats[first : first + 64]), strict=True):
+            place = canvas[y : y + p, x : x + p]
+            place[...] = patch[: place.shape[0], : place.shape[1]]
+    return canvas
+
+
+def block_of(sweep: Sweep, run: SurveyRun) -> tuple[int, int, int, int]:
+    """Rows and columns (y0, y1, x0, x1) that a fine sweep's line centres and samples span, cut to the scene."""
+    size = (run.grid.width, run.grid.height) if sweep.along == "x" else (run.grid.height, run.grid.width)
+    across = np.array([-0.5, 0.5]) * run.camera.samples + sweep.strip_px + size[0] / 2
+    scan = np.array([0, sweep.lines]) + sweep.start_px + size[1] / 2 - 0.5
+    x0, x1 = np.clip(np.rint(across), 0, size[0]).astype(int).tolist()
+    y0, y1 = np.clip(np.rint(scan), 0, size[1]).astype(int).tolist()
+    return (y0, y1, x0, x1) if sweep.along == "x" else (x0, x1, y0, y1)
+

@@ -1,0 +1,209 @@
+"""One survey's context: scene, source, weights, grid and archive, opened and checked before anything runs."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.settings import BUILT_IN_SCENES, Settings
+from flows.training_data import scene_of_file, unpack_mask
+from models.weights import Weights, load_weights
+from pipeline.camera import LineCamera
+from pipeline.coverage import cheapest_full, coarse_sweeps
+from pipeline.errors import SceneError, SettingsError, WeightsError
+from pipeline.grid import SceneGrid
+from pipeline.planning import check_budget
+from pipeline.scan import Axis, Sweep
+from pipeline.simulator.farm import farm_scene
+from pipeline.simulator.instrument import ALL_EFFECTS
+from pipeline.simulator.scene import UNLABELLED, RasterScene
+from pipeline.simulator.simulated import SimulatedSource
+from storage.archive import Archive
+from storage.layout import AngularGrid
+from storage.raster_files import load_raster
+from storage.scene_files import load_scene_file
+
+SHIPPED = "farm.safetensors"
+
+Report = Callable[[float], None]  # how far a stage is, 0..1
+
+
+@dataclass(frozen=True)
+class CapturePlan:
+    """What every survey of this field has in common: orientation, coarse and full sweeps, and their seconds."""
+
+    along: Axis
+    coarse: list[Sweep]
+    full: list[Sweep]
+    coarse_s: float
+    full_s: float
+    fine_s: float  # left by the budget for the fine pass
+
+
+@dataclass(frozen=True)
+class SurveyRun:
+    """Everything a stage may look at. Made by `open_run`, which refuses what cannot work."""
+
+    settings: Settings
+    archive: Archive
+    source: SimulatedSource
+    scene: RasterScene
+    weights: Weights
+    weights_key: str
+    grid: SceneGrid
+    plan: CapturePlan
+    labels: NDArray[np.uint8] | None  # to judge by: trained pixels taken out
+    notes: tuple[str, ...] = ()
+    report: Report = field(default=lambda done: None)
+
+    @property
+    def camera(self) -> LineCamera:
+        """The camera of the settings."""
+        return self.settings.camera
+
+    @property
+    def name(self) -> str:
+        """What the survey is called: its scene."""
+        return Path(self.scene.name).stem
+
+    @cached_property
+    def mask(self) -> NDArray[np.generic] | None:
+        """The mask of policy ``mask``, (y, x) or (y, x, channel)."""
+        return None if self.settings.mask is None else load_raster(self.settings.mask, dims=2).values
+
+    def angular_grid(self, factor: int = 1) -> AngularGrid:
+        """Where pixels of ``factor`` fine px lie."""
+        return AngularGrid(self.camera.ifov_rad, self.scene.shape, factor)
+
+    def source_key(self) -> dict[str, Any]:
+        """What the captured light depends on, beside the sweeps."""
+        return {
+            "scene": self.scene.key,
+            "seed": self.settings.seed,
+            "effects": sorted(self.source.effects),
+            "camera": asdict(self.camera),
+        }
+
+
+def open_run(settings: Settings) -> SurveyRun:
+    """Open everything that a survey needs; the archive last, so that bad input leaves no trace of itself.
+
+    Raises
+    ------
+    PipelineError : the first thing that cannot be used; see `pipeline.errors` for the kinds.
+    """
+    if settings.source != "sim":
+        raise SettingsError(f"--source {settings.source}: this version has the simulated source only; use --source sim")
+    path = _weights_path(settings)
+    weights = load_weights(path)
+    scene, notes = _open_scene(settings)
+    labels, label_notes = _judged_labels(scene, weights)
+    grid = SceneGrid(*scene.shape, weights.config.patch, weights.config.factor)
+    plan = _plan(settings, grid)
+    _check_bands(scene, weights, path)
+    if settings.mask is not None:
+        _check_mask(settings.mask, scene.shape)
+    effects = parse_effects(settings.effects)
+    source = SimulatedSource(scene, settings.camera, settings.seed, effects)
+    key = hashlib.sha256(path.read_bytes()).hexdigest()[:20]
+    return SurveyRun(
+        settings, Archive.open(settings.out), source, scene, weights, key, grid, plan, labels,
+        (*notes, *label_notes),
+    )  # fmt: skip
+
+
+def parse_effects(text: str) -> frozenset[str]:
+    """Effects to simulate: ``auto`` and ``all`` are those built, ``none``, or names with commas."""
+    if text in ("auto", "all"):
+        return ALL_EFFECTS
+    return frozenset() if text == "none" else frozenset(name.strip() for name in text.split(","))
+
+
+def _open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
+    if settings.scene in BUILT_IN_SCENES:
+        return _open_farm(settings), ()
+    file = load_scene_file(
+        settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths
+    )
+    scene = scene_of_file(file, settings.camera)
+    filled = (f"{scene.filled_px} pixels without a value were given their band's median",) if scene.filled_px else ()
+    return scene, (*file.provenance, *filled)
+
+
+def _open_farm(settings: Settings) -> RasterScene:
+    given = {"labels": settings.labels, "bands": settings.bands, "wavelengths": settings.wavelengths}
+    for name, value in given.items():
+        if value is not None:
+            raise SettingsError(f"--{name} is for scene files; the scene 'farm' brings its own")
+    if settings.shape is None:
+        return farm_scene(settings.seed, camera=settings.camera)
+    return farm_scene(settings.seed, shape=settings.shape, camera=settings.camera)
+
+
+def _weights_path(settings: Settings) -> Path:
+    if settings.weights is not None:
+        return Path(settings.weights)
+    if settings.scene not in BUILT_IN_SCENES:
+        raise SettingsError(
+            f"--weights is missing: the weights that come with SpectralZoom know the scene 'farm' only;"
+            f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
+        )
+    return Path(str(resources.files("models") / "shipped" / SHIPPED))
+
+
+def _check_bands(scene: RasterScene, weights: Weights, path: Path) -> None:
+    _, reached = weights.basis.matrix(scene.wavelength_nm)
+    if not reached.any():
+        low, high = weights.basis.low_nm, weights.basis.high_nm
+        raise WeightsError(
+            f"the weights {path.name} are for {low:.0f}-{high:.0f} nm; the scene's bands lie at"
+            f" {scene.wavelength_nm.min():.0f}-{scene.wavelength_nm.max():.0f} nm: use weights trained on such data"
+        )
+
+
+def _check_mask(mask: str, shape: tuple[int, int]) -> None:
+    values = load_raster(mask, dims=2).values
+    if values.shape[:2] != shape:
+        raise SceneError(f"--mask {mask} is {values.shape[:2]} px (y, x), the scene is {shape}; give one of its size")
+
+
+def _judged_labels(scene: RasterScene, weights: Weights) -> tuple[NDArray[np.uint8] | None, tuple[str, ...]]:
+    """Labels in the order of the weights' classes, without the pixels that the weights were trained on."""
+    if scene.labels is None:
+        return None, ()
+    missing = [name for name in scene.class_names if name not in weights.class_names]
+    if missing:
+        known = ", ".join(weights.class_names)
+        raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; use weights for these")
+    order = np.full(256, UNLABELLED, np.uint8)
+    order[: len(scene.class_names)] = [weights.class_names.index(name) for name in scene.class_names]
+    labels = order[scene.labels]
+    split = weights.record.get("split", {})
+    if scene.key in split.get("pixels", {}):
+        labels[unpack_mask(split["pixels"][scene.key], scene.shape)] = UNLABELLED
+        return labels, ("accuracy is counted on the labelled pixels that the weights were not trained on",)
+    if scene.key in split.get("train", {}).values():
+        return labels, ("the weights were trained on this scene: its accuracy says nothing of other fields",)
+    return labels, ()
+
+
+def _plan(settings: Settings, grid: SceneGrid) -> CapturePlan:
+    camera, cost = settings.camera, settings.cost
+    along, full, full_s = cheapest_full(grid, camera, cost)
+    coarse = coarse_sweeps(grid, camera, along)
+    coarse_s = cost.seconds(coarse, camera)
+    return CapturePlan(along, coarse, full, coarse_s, full_s, check_budget(settings.budget, coarse_s, full_s))
+
+
+def now() -> str:
+    """The time in ISO 8601, UTC."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())

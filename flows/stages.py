@@ -1,0 +1,220 @@
+"""The stages of a survey: references in, one published store out. Arrays stay inside a stage.
+
+Each stage names its version (raise it when what it writes changes), the parameters it uses and the stores it reads;
+the archive makes the key of them, finds the store if it is there, and has it built if it is not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.panels import choose_bands
+from flows.run import SurveyRun
+from models.inference import Glance, glance, segment
+from models.policies import score_seats
+from pipeline.planning import FinePlan, covered_seats, plan_fine
+from pipeline.rectify.region import mosaic_rows, read_seats
+from pipeline.rectify.resample import Kernel
+from pipeline.scan import Sweep
+from pipeline.source import SweepLines
+from storage.archive import StageRef, stage_key
+from storage.attention import Attention, write_attention
+from storage.class_maps import ClassMap, write_class_map
+from storage.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
+from storage.layout import SHARD_ROWS
+from storage.mosaics import MosaicWriter, load_mosaic
+from storage.patches import PatchWriter, open_patches
+from storage.spool import Spool
+
+VERSIONS = {"capture": 1, "rectify": 1, "attend": 1, "patches": 1, "segment": 1, "evaluate": 1}
+KERNEL: Kernel = "catmull-rom"
+SEATS_AT_ONCE = 64
+QUICKLOOK_PX = 512
+
+Build = Callable[[Path], None]
+Produce = Callable[[str, Build, dict[str, Any], Sequence[StageRef]], StageRef]
+
+
+def capture_coarse(run: SurveyRun, produce: Produce) -> StageRef:
+    """Sweep the whole field once, fast."""
+    return _capture(run, produce, run.plan.coarse, [])
+
+
+def capture_fine(run: SurveyRun, produce: Produce, attention: StageRef) -> StageRef:
+    """Go back for the places that the plan chose."""
+    return _capture(run, produce, load_plan(attention).sweeps, [attention])
+
+
+def _capture(run: SurveyRun, produce: Produce, sweeps: list[Sweep], inputs: list[StageRef]) -> StageRef:
+    params = {**run.source_key(), "sweeps": [asdict(sweep) for sweep in sweeps]}
+    key = stage_key("capture", VERSIONS["capture"], params, [ref.key for ref in inputs])
+    total = sum(sweep.lines for sweep in sweeps) or 1
+
+    def build(path: Path) -> None:
+        before = 0
+        for sweep in sweeps:
+            _capture_sweep(run, sweep, path, key, lambda lines, before=before: run.report((before + lines) / total))  # type: ignore[misc]
+            before += sweep.lines
+
+    ref = produce("capture", build, params, inputs)
+    run.archive.drop_spool(key)
+    return ref
+
+
+def _capture_sweep(run: SurveyRun, sweep: Sweep, path: Path, key: str, report: Callable[[int], None]) -> None:
+    """Lines into the spool one by one, from where a broken capture stopped; then 64 at a time into the cube."""
+    references = run.source.references(sweep)
+    header = SweepHeader(sweep, references, run.scene.wavelength_nm, run.scene.fwhm_nm, run.source.name)
+    samples, bands = references.dark.shape
+    about = {"sweep": asdict(sweep), **run.source_key()}
+    with Spool.open(run.archive.spool_folder(key), samples, bands, header=about, name=sweep.name) as spool:
+        for line in run.source.lines(sweep, first=spool.count):
+            spool.append(line)
+            report(spool.count)
+        spool.sync()
+        with RawCubeWriter(path / f"{sweep.name}.zarr", header) as cube:
+            for block in spool.blocks(SHARD_ROWS):
+                cube.write(block)
+
+
+def captured(ref: StageRef) -> list[RawCube]:
+    """Open the sweeps of a capture, in the order of their names."""
+    return [open_raw_cube(path) for path in sorted(ref.path.glob("*.zarr"))]
+
+
+def rectify(run: SurveyRun, produce: Produce, raw: StageRef) -> StageRef:
+    """Bring the coarse sweeps onto the scene grid and blend them into one mosaic."""
+
+    def build(path: Path) -> None:
+        sweeps: Sequence[SweepLines] = captured(raw)
+        shape = run.grid.coarse_shape
+        writer = MosaicWriter(
+            path / "mosaic.zarr", shape, run.scene.wavelength_nm,
+            fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(run.grid.factor),
+        )  # fmt: skip
+        colours, _ = choose_bands(run.scene.wavelength_nm)
+        preview = []
+        for first, values, coverage in mosaic_rows(sweeps, run.camera, run.grid, rows=SHARD_ROWS, kernel=KERNEL):
+            writer.write_rows(first, values, coverage.astype(np.float32))
+            preview.append(values[..., list(colours)])
+            run.report((first + len(values)) / shape[0])
+        writer.write_quicklook(_preview(np.concatenate(preview)))
+
+    params = {"grid": asdict(run.grid), "kernel": KERNEL}
+    return produce("rectify", build, params, [raw])
+
+
+def _preview(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Colours for viewers: 2-98 % of each band, at most 512 px a side, (y, x, 3) uint8."""
+    small = image[:: -(-image.shape[0] // QUICKLOOK_PX), :: -(-image.shape[1] // QUICKLOOK_PX)]
+    seen = np.where(np.isfinite(small).any(axis=(0, 1)), small, 0)
+    low, high = np.nanpercentile(seen, (2, 98), axis=(0, 1))
+    scaled = np.clip((seen - low) / np.where(high > low, high - low, 1), 0, 1)
+    picture: NDArray[np.uint8] = np.nan_to_num(scaled * 255).astype(np.uint8)
+    return picture
+
+
+def glance_at(run: SurveyRun, mosaic: StageRef) -> Glance:
+    return glance(run.weights, load_mosaic(mosaic.path / "mosaic.zarr").values, run.scene.wavelength_nm, run.grid)
+
+
+def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
+    """Score every seat by the coarse mosaic, and plan the sweeps that show the most score in the time left."""
+    settings = run.settings
+
+    def build(path: Path) -> None:
+        scores = score_seats(settings.policy, glance_at(run, mosaic), seed=settings.seed, mask=run.mask)
+        run.report(0.5)
+        plan = plan_fine(run.grid, run.camera, settings.cost, run.plan.along, scores, budget_s=run.plan.fine_s)
+        rank = np.full(scores.shape, -1, np.int32)
+        rank[plan.seats[np.argsort(-scores[plan.seats], kind="stable")]] = np.arange(len(plan.seats))
+        shape = run.grid.seat_shape
+        write_attention(
+            path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), settings.policy)
+        )
+        write_json(path / "plan.json", asdict(plan) | {"seats": plan.seats.tolist()})
+
+    params = {
+        "weights": run.weights_key,
+        "grid": asdict(run.grid),
+        "policy": settings.policy,
+        "seed": settings.seed if settings.policy == "random" else None,
+        "mask": None if run.mask is None else digest(run.mask),
+        "fine_s": run.plan.fine_s,
+        "along": run.plan.along,
+        "camera": asdict(run.camera),
+        "cost": asdict(settings.cost),
+    }
+    return produce("attend", build, params, [mosaic])
+
+
+def load_plan(attention: StageRef) -> FinePlan:
+    """Read the plan of an attention store."""
+    plan = json.loads((attention.path / "plan.json").read_text())
+    return FinePlan(
+        [Sweep(**sweep) for sweep in plan["sweeps"]], np.array(plan["seats"], np.intp), plan["seconds"], plan["worth"]
+    )
+
+
+def cut_patches(run: SurveyRun, produce: Produce, attention: StageRef, raw: StageRef) -> StageRef:
+    """Bring every seat that the fine sweeps saw whole onto the scene grid, one patch a seat."""
+
+    def build(path: Path) -> None:
+        plan = load_plan(attention)
+        writer = PatchWriter(
+            path / "patches.zarr", plan.seats, run.grid.seat_origin(plan.seats), run.grid.patch,
+            run.scene.wavelength_nm, fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(),
+        )  # fmt: skip
+        sweeps = {cube.sweep.name: cube for cube in captured(raw)}
+        shown = {sweep.name: covered_seats(run.grid, run.camera, [sweep]) for sweep in plan.sweeps}
+        for first in range(0, len(plan.seats), SEATS_AT_ONCE):
+            seats = plan.seats[first : first + SEATS_AT_ONCE]
+            near = [sweeps[name] for name, covered in shown.items() if np.isin(seats, covered).any()]
+            writer.write(first, *read_seats(near, run.camera, run.grid, seats, KERNEL))
+            run.report((first + len(seats)) / len(plan.seats))
+
+    params = {"grid": asdict(run.grid), "kernel": KERNEL}
+    return produce("patches", build, params, [attention, raw])
+
+
+def patch_columns(run: SurveyRun, patches: StageRef) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Seats and their normalised spectral columns, (seat, p, p, column), read a few patches at a time."""
+    store = open_patches(patches.path / "patches.zarr")
+    p, count = run.grid.patch, len(store.seats)
+    columns = np.empty((count, p, p, run.weights.basis.columns), np.float32)
+    for first in range(0, count, SEATS_AT_ONCE):
+        values = store.read(first, first + SEATS_AT_ONCE)
+        columns[first : first + len(values)] = run.weights.columns(values, run.scene.wavelength_nm)
+    return store.seats, columns
+
+
+def draw_map(run: SurveyRun, produce: Produce, mosaic: StageRef, patches: StageRef) -> StageRef:
+    """Read coarse and fine patches together and draw the class map."""
+
+    def build(path: Path) -> None:
+        seats, columns = patch_columns(run, patches)
+        run.report(0.4)
+        drawn = segment(run.weights, glance_at(run, mosaic), columns, seats)
+        weights = run.weights
+        found = ClassMap(
+            drawn.classes, drawn.confidence, weights.class_names, weights.class_colours, run.angular_grid()
+        )
+        write_class_map(path / "class_map.zarr", found)
+
+    return produce("segment", build, {"weights": run.weights_key, "grid": asdict(run.grid)}, [mosaic, patches])
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=1, sort_keys=True, default=float) + "\n")
+
+
+def digest(array: NDArray[np.generic]) -> str:
+    return hashlib.sha256(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes()).hexdigest()[:20]

@@ -1,0 +1,142 @@
+"""The survey: from a coarse look to a class map, top to bottom, on whichever engine runs its stages."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from flows import stages
+from flows.evaluation import evaluate
+from flows.receipt import StageRecord, State
+from flows.run import SurveyRun
+from storage.archive import StageRef
+
+STAGES: dict[str, Callable[..., StageRef | None]] = {
+    "capture_coarse": stages.capture_coarse,
+    "rectify": stages.rectify,
+    "attend": stages.attend,
+    "capture_fine": stages.capture_fine,
+    "cut_patches": stages.cut_patches,
+    "draw_map": stages.draw_map,
+    "evaluate": evaluate,
+}
+TITLES = {
+    "capture_coarse": "coarse sweep",
+    "rectify": "mosaic",
+    "attend": "attention and plan",
+    "capture_fine": "fine sweeps",
+    "cut_patches": "fine patches",
+    "draw_map": "class map",
+    "evaluate": "controls (not part of the survey)",
+}
+
+
+class Step(Protocol):
+    """Runs one stage on stores given by reference; an engine decides where and how often it is tried."""
+
+    def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef | None:
+        """Give the stage's store, None where the stage has nothing to do."""
+
+
+@dataclass(frozen=True)
+class Products:
+    """The stores that a survey leaves."""
+
+    raw_coarse: StageRef
+    mosaic: StageRef
+    attention: StageRef
+    raw_fine: StageRef
+    patches: StageRef
+    class_map: StageRef
+    accuracy: StageRef | None
+
+
+def survey(step: Step) -> Products:
+    """Sweep the field coarsely, decide where detail changes the map, look there again, and draw the map."""
+    raw = _needed(step("capture_coarse"))
+    mosaic = _needed(step("rectify", raw))
+    attention = _needed(step("attend", mosaic))
+    fine = _needed(step("capture_fine", attention))
+    patches = _needed(step("cut_patches", attention, fine))
+    class_map = _needed(step("draw_map", mosaic, patches))
+    accuracy = step("evaluate", mosaic, patches, class_map)
+    return Products(raw, mosaic, attention, fine, patches, class_map, accuracy)
+
+
+def _needed(ref: StageRef | None) -> StageRef:
+    assert ref is not None
+    return ref
+
+
+Watch = Callable[[str, str, float], None]  # stage, state (running, ran, cached, skipped, failed), how far
+
+
+@dataclass
+class StageRunner:
+    """Runs stages in this process and keeps a record of each: the plain engine, and what Prefect's tasks call."""
+
+    run: SurveyRun
+    watch: Watch = field(default=lambda stage, state, done: None)
+    records: dict[str, StageRecord] = field(default_factory=dict)
+
+    def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef | None:
+        """Run one of ``STAGES`` by its name."""
+        self.watch(stage, "running", 0.0)
+        meter = _Meter()
+        made: list[bool] = []
+
+        def produce(
+            name: str, build: Callable[[Path], None], params: Mapping[str, Any], refs: Sequence[StageRef]
+        ) -> StageRef:
+            ref, ran = self.run.archive.produce(
+                name, build, version=stages.VERSIONS[name], params=params, inputs=[ref.key for ref in refs]
+            )
+            made.append(ran)
+            return ref
+
+        run = replace(self.run, report=lambda done: self.watch(stage, "running", done))
+        try:
+            ref = STAGES[stage](run, produce, *inputs)
+        except BaseException:
+            self.watch(stage, "failed", 1.0)
+            raise
+        state: State = "skipped" if ref is None else "ran" if made[-1] else "cached"
+        self.records[stage] = self._record(stage, ref, state, meter, inputs)
+        self.watch(stage, state, 1.0)
+        return ref
+
+    def _record(
+        self, stage: str, ref: StageRef | None, state: State, meter: _Meter, inputs: Sequence[StageRef]
+    ) -> StageRecord:
+        size = self.run.archive.stored_bytes
+        wall, cpu, peak = meter.read() if state == "ran" else (None, None, None)
+        bytes_in = sum(size(given) for given in inputs)
+        key, bytes_out = ("", 0) if ref is None else (ref.key, size(ref))
+        return StageRecord(stage, key, state, wall, cpu, peak, bytes_in, bytes_out)
+
+
+class _Meter:
+    """Wall and CPU seconds and the highest memory since it was made."""
+
+    def __init__(self) -> None:
+        with suppress(OSError):  # Linux: start the peak anew
+            Path("/proc/self/clear_refs").write_text("5")
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def read(self) -> tuple[float, float, int]:
+        """Wall seconds, CPU seconds, bytes."""
+        return time.perf_counter() - self._wall, time.process_time() - self._cpu, peak_bytes()
+
+
+def peak_bytes() -> int:
+    """Highest resident memory of this process [bytes]."""
+    with suppress(OSError, ValueError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

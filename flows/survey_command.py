@@ -1,0 +1,52 @@
+"""What `spectralzoom survey` shows: progress, the receipt as a table, and where everything lies."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.markup import escape
+
+from flows.progress import StageProgress
+from flows.publish import Published, publish_run
+from flows.receipt import headline, print_table
+from flows.run import now, open_run
+from flows.settings import Settings
+from flows.survey import TITLES, Products, StageRunner, survey
+from models.process import keep_freed_memory, use_one_thread
+
+
+def run_survey(settings: Settings, console: Console) -> Published:
+    """Survey, publish the run and print its receipt on ``console``."""
+    started = now()
+    use_one_thread()
+    keep_freed_memory()
+    with console.status("opening scene and weights"):
+        run = open_run(settings)
+    for note in run.notes:
+        console.print(f"[dim]note: {escape(note)}[/]", highlight=False)
+    with StageProgress(console, TITLES) as progress:
+
+        def watch(stage: str, state: str, done: float) -> None:
+            running = state == "running"
+            progress.show(stage, done, "" if running else state, ended=not running)
+
+        runner = StageRunner(run, watch)
+        products = _run(runner, settings.engine, console)
+    with console.status("drawing pictures and report"):
+        published = publish_run(runner, products, started)
+    print_table(published.receipt, console)
+    console.print(escape(headline(published.receipt, published.looked_twice)), highlight=False)
+    for name in ("report.html", "quicklook.png", "receipt.json"):
+        console.print(f"  {escape(str(published.folder / name))}", highlight=False, soft_wrap=True)
+    return published
+
+
+def _run(runner: StageRunner, engine: str, console: Console) -> Products:
+    if engine == "plain":
+        return survey(runner)
+    from flows.engine import EngineUnavailable, survey_with_prefect
+
+    try:
+        return survey_with_prefect(runner)
+    except EngineUnavailable as error:
+        console.print(f"[yellow]{escape(str(error))}; going on with --engine plain[/]", highlight=False)
+        return survey(runner)

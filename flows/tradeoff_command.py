@@ -1,0 +1,37 @@
+"""What `spectralzoom tradeoff` shows: a table for each stage, and JSON and a plot in a folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+import flows.tradeoff_budget
+import flows.tradeoff_resample  # noqa: F401 - registers its entry
+from flows.tradeoff import find_tradeoff, measure_tradeoff, registered
+from flows.tradeoff_figures import draw_tradeoffs, print_tradeoff
+from pipeline.errors import ArchiveError, SettingsError
+
+
+def run_tradeoff(stage: str | None, out: Path, repeats: int, seed: int, console: Console) -> dict[str, Any]:
+    """Measure one stage's trade-off, or all; write tradeoff.json and tradeoff.png into ``out`` and print the tables."""
+    if repeats < 1:
+        raise SettingsError(f"--repeats must be at least 1, got {repeats}")
+    wanted = [find_tradeoff(stage)] if stage else list(registered().values())
+    results = []
+    for tradeoff in wanted:
+        with console.status(f"measuring {tradeoff.stage}: {tradeoff.knob}"):
+            result = measure_tradeoff(tradeoff, repeats=repeats, seed=seed)
+        print_tradeoff(result, console)
+        results.append(result)
+    content = {"tradeoffs": [result.to_dict() for result in results]}
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "tradeoff.json").write_text(json.dumps(content, indent=2) + "\n")
+        draw_tradeoffs(out / "tradeoff.png", results)
+    except OSError as error:
+        raise ArchiveError(f"cannot write to {out}: {error.strerror}; choose another --out") from error
+    console.print(f"{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}", highlight=False, soft_wrap=True)
+    return content

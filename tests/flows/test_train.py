@@ -1,0 +1,88 @@
+"""Training as a flow: what is refused before the first look, and what the record says was trained on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from flows import train as flow
+from flows.train import TrainRequest, suggested_patch, train_weights
+from models.training import TrainingSettings
+from models.weights import load_weights
+from pipeline.errors import SceneError, SettingsError
+
+SETTINGS = TrainingSettings(steps=1, batch=1, crop=16)
+
+
+def _folder(root: Path) -> Path:
+    """Four frames of 16 x 16 px with two classes."""
+    rng = np.random.default_rng(0)
+    for folder in ("images", "annotations"):
+        (root / folder).mkdir(parents=True)
+    (root / "scene.toml").write_text(
+        'labels = "annotations/{number}_annotation.png"\n[classes]\nsoil = [0, 0, 0]\ncrop = [0, 255, 0]\n'
+    )
+    for number in ("001", "002", "003", "004"):
+        grown = rng.integers(0, 2, (16, 16), dtype=np.uint8) * 255
+        colours = np.stack([0 * grown, grown, 0 * grown], axis=-1)
+        Image.fromarray(colours).save(root / "annotations" / f"{number}_annotation.png")
+        Image.fromarray(colours // 2 + 40).save(root / "images" / f"{number}_image.png")
+    return root
+
+
+def _request(tmp_path: Path, **choices: Any) -> TrainRequest:
+    sizes = {"patch": 8, "factor": 2, "width": 4, "settings": SETTINGS, **choices}
+    return TrainRequest(str(_folder(tmp_path / "data")), tmp_path / "w.safetensors", **sizes)
+
+
+def test_the_record_tells_what_was_trained_on(tmp_path: Path):
+    """Scenes kept for validation or held out are not among those that the weights were trained on."""
+    record = train_weights(_request(tmp_path, validation=1, hold_out=("003",)))
+    split = record["split"]
+    assert len(split["train"]) == 2
+    assert len(split["validation"]) == 1
+    assert not set(split["train"]) & {*split["validation"], "003"}
+    assert split["held_out"] == ["003"]
+    assert record["training"]["steps"] == 1
+    assert load_weights(tmp_path / "w.safetensors").record["split"] == split
+
+
+@pytest.mark.parametrize("sizes", [{"patch": 24}, {"patch": 8, "factor": 16}, {"factor": 0}])
+def test_sizes_that_do_not_fit_are_refused_before_the_first_look(
+    tmp_path: Path, sizes: dict[str, int], monkeypatch: pytest.MonkeyPatch
+):
+    """No scene is looked at for a segmenter that cannot be built."""
+    monkeypatch.setattr(flow, "observe", lambda *args: pytest.fail("a scene was looked at"))
+    with pytest.raises(SettingsError, match="choose another --patch or --factor"):
+        train_weights(_request(tmp_path, **sizes))
+
+
+def test_a_folder_to_write_to_must_be_there(tmp_path: Path):
+    """The message says so before any scene is read."""
+    with pytest.raises(SettingsError, match="does not exist; make it first"):
+        train_weights(TrainRequest("farm", tmp_path / "none" / "w.safetensors"))
+
+
+def test_scenes_of_other_bands_are_not_mixed(tmp_path: Path):
+    """One camera's scenes make one set of weights: the scene that differs is named."""
+    request = _request(tmp_path)
+    data = flow.open_training_data(request.dataset, 0, 0, request.camera)
+    first, second = data.scenes(data.train[:2])
+    common = flow._common(request, first)
+    flow._check_alike(second, common)
+    with pytest.raises(SceneError, match="scene 002.* has other bands"):
+        flow._check_alike(replace(second, wavelength_nm=second.wavelength_nm + 10), common)
+
+
+@pytest.mark.parametrize(
+    ("shape", "built_in", "patch"),
+    [((512, 640), True, 16), ((1024, 1280), False, 32), ((300, 900), False, 16), ((145, 145), False, 8)],
+)
+def test_patches_follow_the_size_of_scenes(shape: tuple[int, int], built_in: bool, patch: int):
+    """Small scenes get small patches, so that there are seats to choose from."""
+    assert suggested_patch(shape, built_in=built_in) == patch

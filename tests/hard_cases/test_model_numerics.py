@@ -1,0 +1,483 @@
+"""Numerical hard cases of the models; numbers in the names are the rows of the design's table."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from models import training
+from models.encoder import Encoder
+from models.examples import Example
+from models.inference import Glance, glance, glance_of_columns, segment
+from models.metrics import average_accuracy, confusion, iou_per_class, kappa, mean_iou, overall_accuracy
+from models.policies import pixel_entropy, score_seats
+from models.segmenter import Segmenter, SegmenterConfig
+from models.spectral import Normalisation, SpectralBasis
+from models.tokens import code_1d, code_2d
+from models.training import TrainingSettings, class_weights, map_loss, train
+from models.weights import Weights, load_weights, save_weights
+from pipeline.grid import SceneGrid
+from pipeline.selection import complete_seats, frame_seats, select_seats
+
+SIZES: dict[str, Any] = {"classes": 3, "columns": 4, "patch": 8, "factor": 2, "width": 8, "dim": 16, "heads": 2}
+NONE = torch.zeros(1, 0, dtype=torch.int64)
+
+
+def _drawn(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def _model(seed: int = 0, **sizes: Any) -> Segmenter:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = Segmenter(SegmenterConfig(**{**SIZES, "layers": 2, **sizes})).eval()
+        for parameter in model.parameters():
+            if not parameter.any():
+                torch.nn.init.normal_(parameter, std=0.3)
+    return model
+
+
+def _weights(**sizes: Any) -> Weights:
+    model = _model(**sizes)
+    j = model.config.columns
+    normalisation = Normalisation(np.full(j, 0.3, np.float32), np.full(j, 0.1, np.float32), np.eye(j, dtype=np.float32))
+    colours = np.zeros((model.config.classes, 3), np.uint8)
+    names = tuple("abcdefgh"[: model.config.classes])
+    return Weights(model, SpectralBasis(400.0, 1000.0, j), normalisation, names, colours)
+
+
+def _encoder(layers: int = 2) -> Encoder:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(3)
+        return Encoder(16, layers, 2, 2)
+
+
+def _fine(batch: int, seats: int) -> Tensor:
+    return _drawn(batch, seats, 4, 8, 8, seed=1)
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """Give torch its number of threads back."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def test_1_a_query_without_a_key_gives_zero():
+    """Where every token is invalid the result is exactly 0 and every gradient finite."""
+    encoder, x = _encoder(), _drawn(2, 5, 16).requires_grad_()
+    valid = torch.tensor([[False] * 5, [True] * 5])
+    out = encoder(x, torch.zeros(2, 5), valid)
+    assert not out[0].any()
+    assert out[1].isfinite().all()
+    out.square().sum().backward()
+    assert x.grad is not None
+    assert not x.grad[0].any()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in encoder.parameters())
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -1e30])
+def test_2_what_an_invalid_token_holds_does_not_leak(bad: float):
+    """NaN in a token that is left out gives what the others give without it, with finite gradients."""
+    encoder, x = _encoder(), _drawn(1, 7, 16)
+    x[0, [2, 5]] = bad
+    keep = torch.tensor([0, 1, 3, 4, 6])
+    valid = torch.zeros(1, 7, dtype=torch.bool).index_fill(1, keep, True)
+    x.requires_grad_()
+    out = encoder(x, torch.zeros(1, 7), valid)
+    alone = encoder(x.detach()[:, keep], torch.zeros(1, 5), torch.ones(1, 5, dtype=torch.bool))
+    assert (out[:, keep] - alone).abs().max() <= 1e-6
+    assert not out[:, [2, 5]].any()
+    out.square().sum().backward()
+    assert x.grad is not None
+    assert x.grad.isfinite().all()
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize(("batch", "count"), [(0, 5), (2, 0), (0, 0)])
+def test_3_no_tokens_and_no_images_give_nothing(batch: int, count: int):
+    """The encoder gives an empty result of the right shape and type."""
+    out = _encoder()(torch.zeros(batch, count, 16), torch.zeros(batch, count), torch.ones(batch, count).bool())
+    assert out.shape == (batch, count, 16)
+    assert out.dtype == torch.float32
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("seats", [0, 3])
+def test_3_no_images_give_no_maps(seats: int):
+    """The whole segmenter takes a batch of no scene, with and without seats."""
+    model, numbers = _model(), torch.zeros(0, seats, dtype=torch.int64)
+    logits, patches = model(model.view(torch.zeros(0, 4, 16, 24)), torch.zeros(0, seats, 4, 8, 8), numbers)
+    assert logits.shape == (0, 3, 16, 24)
+    assert patches.shape == (0, seats, 3, 8, 8)
+    assert model.composite(logits, patches, numbers).shape == (0, 3, 32, 48)
+
+
+@pytest.mark.parametrize("images", [0, 2])
+@pytest.mark.parametrize("soft_dice", [False, True])
+def test_4_nothing_labelled_is_no_loss(images: int, soft_dice: bool):
+    """Without a labelled pixel, or with weights that are all 0, the loss is 0 and its gradient is 0."""
+    logits = _drawn(images, 3, 4, 4).requires_grad_()
+    for value, weight in ((255, torch.ones(3)), (1, torch.zeros(3)), (1, torch.tensor([1.0, 0.0, 1.0]))):
+        loss = map_loss(logits, torch.full((images, 4, 4), value), weight, soft_dice=soft_dice)
+        assert loss.item() == 0
+        (gradient,) = torch.autograd.grad(loss, logits)
+        assert not gradient.any()
+
+
+def test_4_no_pixels_have_finite_class_weights():
+    """Class weights without any label are 0, and no division by zero."""
+    blank = np.full((8, 8), 255, np.uint8)
+    example = Example("e", np.zeros((8, 8, 1), np.float16), np.zeros((4, 4, 1), np.float32), blank, (8, 8))
+    assert class_weights([example], 3, 5.0).tolist() == [0, 0, 0]
+
+
+@torch.inference_mode()
+def test_5_no_seat_is_the_glance_bit_by_bit():
+    """With K = 0 training's forward, the glance and the survey's map come from one and the same logits."""
+    weights, grid = _weights(), SceneGrid(48, 64, 8, 2)
+    seen = glance_of_columns(weights, _drawn(24, 32, 4).numpy(), grid)
+    coarse = torch.from_numpy(seen.columns).permute(2, 0, 1)[None].contiguous()
+    model = weights.segmenter
+    logits, patches = model(model.view(coarse), _fine(1, 0), NONE)
+    assert (logits[0].softmax(dim=0).permute(1, 2, 0).numpy() == seen.probability).all()
+    drawn = segment(weights, seen, np.empty((0, 8, 8, 4), np.float32), np.empty(0, np.int64))
+    whole = model.composite(logits, patches, NONE)[0].softmax(dim=0).max(dim=0)
+    assert np.abs(drawn.confidence - whole.values.numpy()).max() <= 1e-6
+
+
+@torch.inference_mode()
+def test_6_every_seat_in_any_order_is_one_map():
+    """With K = all the order in which a policy ranked the seats does not show."""
+    model, coarse, fine = _model(), _drawn(1, 4, 16, 24), _fine(1, 24)
+    maps = []
+    for seed in range(3):
+        order = torch.randperm(24, generator=torch.Generator().manual_seed(seed))[None]
+        maps.append(model.composite(*model(model.view(coarse), fine[:, order[0]], order), order))
+    assert max((other - maps[0]).abs().max().item() for other in maps[1:]) <= 1e-5
+    assert maps[0].std() > 0.05
+
+
+def test_6_every_policy_buys_every_seat_once():
+    """A share of 1 buys each valid seat once, whatever the scores."""
+    seen = _flat_glance(37, 53)
+    valid = seen.grid.valid_share().ravel() > 0
+    for policy in ("entropy", "sobel", "random"):
+        seats = frame_seats(score_seats(policy, seen), 1.0, valid).seats
+        assert sorted(seats.tolist()) == seen.grid.valid_seats().tolist()
+
+
+@pytest.mark.parametrize("count", [-1, 25, 2.5, float("nan"), "3"])
+def test_7_numbers_of_seats_that_cannot_be_are_refused(count: Any):
+    """Too many seats, less than none and parts of seats are named together with the seats there are."""
+    with pytest.raises(ValueError, match=rf"from 0 to 24, got {count!r}"):
+        select_seats(np.zeros(24), count)
+    if count == 25:
+        assert len(select_seats(np.zeros(24), count, clip=True).seats) == 24
+
+
+def test_8_ties_go_to_the_lowest_seat():
+    """Equal scores keep the order of the seats, and a larger choice begins with the smaller one."""
+    assert select_seats(np.zeros(256), 5).seats.tolist() == [0, 1, 2, 3, 4]
+    assert select_seats(np.array([3, 2, 3, 2, 1, 3]), 2).seats.tolist() == [0, 2]
+    score = np.random.default_rng(0).integers(0, 4, 60).astype(float)
+    choices = [select_seats(score, count).seats for count in range(61)]
+    assert all((more[:-1] == less).all() for less, more in pairwise(choices))
+
+
+def test_8_training_ranks_ties_by_number():
+    """Where entropy and chance say nothing, training too takes the lowest seats, alike in every scene of a batch."""
+
+    class Even(np.random.Generator):
+        def random(self, *size: Any) -> Any:  # a placement by entropy with equal chances
+            return np.zeros(size[0]) if size else 0.0
+
+    seats = training.draw_seats(torch.zeros(16, 3, 16, 16), _model().config, Even(np.random.PCG64(0)))
+    assert (seats == torch.arange(seats.shape[1])).all()
+
+
+def test_9_a_dead_score_never_wins():
+    """Infinite worth comes first; NaN and minus infinity come last, together, by number."""
+    score = np.array([np.nan, 1.0, -np.inf, np.inf, 2.0, np.nan])
+    assert select_seats(score, 6).seats.tolist() == [3, 4, 1, 0, 2, 5]
+
+
+def test_9_scores_that_are_all_dead_are_spread_and_flagged():
+    """Without one score to rank, seats are spread evenly over the scene and the result says so."""
+    choice = select_seats(np.full(100, np.nan), 10)
+    assert choice.spread
+    assert np.diff(np.sort(choice.seats)).max() <= 20
+    assert not select_seats(np.arange(100.0), 10).spread
+
+
+def test_10_seats_asked_for_twice_are_replaced():
+    """A plan keeps the first of repeated requests and refills with the next best."""
+    assert complete_seats(np.array([4, 4, 1]), np.array([0.0, 1, 2, 9, 4])).tolist() == [4, 1, 3]
+
+
+@torch.inference_mode()
+def test_11_bfloat16_agrees():
+    """Under autocast to bfloat16 the map differs by 2e-2 at most and nearly all classes agree."""
+    model, coarse, fine = _model(), _drawn(1, 4, 32, 32), _fine(1, 20)
+    seats = torch.arange(0, 60, 3)[None]
+    exact = model.composite(*model(model.view(coarse), fine, seats), seats).softmax(dim=1)
+    with warnings.catch_warnings(), torch.autocast("cpu", dtype=torch.bfloat16):
+        warnings.filterwarnings("ignore", "Mismatch dtype between input and weight")  # slower, not less exact
+        rough = model.composite(*model(model.view(coarse), fine, seats), seats).softmax(dim=1)
+    assert (exact - rough).abs().max() <= 2e-2
+    assert (exact.argmax(dim=1) == rough.argmax(dim=1)).float().mean() >= 0.995
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16])
+def test_11_attention_stays_finite_in_half_precision(kind: torch.dtype):
+    """Normalised queries and keys keep the logits of inputs of 300 finite in 16 bits, masked keys included."""
+    encoder, x = _encoder().to(kind), (300 * _drawn(1, 8, 16)).to(kind)
+    valid = torch.tensor([[True] * 6 + [False] * 2])
+    assert encoder(x, torch.ones(1, 8), valid).isfinite().all()
+
+
+@pytest.mark.parametrize("place", [1e4, 1e5, 1e6, 1e7])
+def test_12_places_far_out_keep_their_code(place: float):
+    """Codes of places up to 1e7 are exact to 1e-6, in two dimensions and for the paper's numbers."""
+    yx = np.array([place + 0.5, place - 3.25])
+    periods = np.geomspace(2, 128, 8).astype(np.longdouble)
+    angle = 2 * np.longdouble(math.pi) * np.fmod(yx[:, None].astype(np.longdouble) / periods, 1)
+    expected = np.concatenate([np.sin(angle), np.cos(angle)], axis=1).ravel().astype(float)
+    assert np.abs(code_2d(torch.from_numpy(yx), 32).numpy() - expected).max() < 1e-6
+    rate = np.exp(np.arange(0, 32, 2) * (-math.log(10000.0) / 32)).astype(np.longdouble)
+    paired = np.stack([np.sin(place * rate), np.cos(place * rate)], axis=-1).ravel().astype(float)
+    assert np.abs(code_1d(torch.tensor(place, dtype=torch.float64), 32).numpy() - paired).max() < 1e-6
+
+
+@pytest.mark.parametrize("code", [code_1d, code_2d])
+@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16])
+def test_12_places_in_half_precision_are_refused(code: Any, kind: torch.dtype):
+    """Half precision cannot hold the number of a seat; the message says which kind came."""
+    with pytest.raises(ValueError, match=f"got {kind}"):
+        code(torch.zeros(3, 2, dtype=kind), 16)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.3, 4096.1, 1e-20])
+def test_15_a_constant_band_is_exactly_zero(value: float):
+    """A column without variance is 0 after normalisation, alone or beside others, in any order."""
+    sample = np.random.default_rng(0).normal(0.5, 0.1, (500, 4)).astype(np.float32)
+    sample[:, 1] = value
+    normalisation = Normalisation.measured(sample)
+    normal = normalisation.apply(sample, np.ones(4, bool))
+    assert normal[:, 1] == pytest.approx(0, abs=1e-5)  # whitening mixes in nothing of the others
+    alone = Normalisation.measured(sample[:, [1, 1]])
+    assert not alone.apply(sample[:, [1, 1]], np.ones(2, bool)).any()
+    order = [1, 3, 0, 2]
+    permuted = Normalisation.measured(sample[:, order]).apply(sample[:, order], np.ones(4, bool))
+    assert permuted == pytest.approx(normal[:, order], abs=1e-4)
+
+
+def test_15_a_sample_of_one_pixel_is_finite():
+    """One pixel has no spread and becomes 0."""
+    normalisation = Normalisation.measured(np.array([[0.2, 0.7]]))
+    assert not normalisation.apply(np.array([[0.2, 0.7]], np.float32), np.ones(2, bool)).any()
+
+
+def test_19_what_is_not_there_is_no_number():
+    """A class in neither map is NaN and not averaged; with nothing labelled every figure is NaN, of 0 pixels."""
+    counts = confusion(np.array([0, 0, 1, 255]), np.array([0, 1, 1, 2]), 4)
+    assert np.isnan(iou_per_class(counts)).tolist() == [False, False, True, True]
+    assert mean_iou(counts) == pytest.approx(0.5)
+    none = confusion(np.full(5, 255), np.zeros(5, int), 4)
+    assert none.sum() == 0
+    assert all(np.isnan(figure(none)) for figure in (mean_iou, overall_accuracy, average_accuracy, kappa))
+
+
+def test_20_unlabelled_pixels_are_left_out_before_counting():
+    """Labels of 255 make no class of their own; what is counted is int64 and adds up to the valid pixels."""
+    labels = np.random.default_rng(0).choice(np.array([0, 5, 7, 255], np.uint8), (40, 50))
+    drawn = np.random.default_rng(1).integers(0, 8, (40, 50)).astype(np.uint8)
+    counts = confusion(labels, drawn, 8)
+    assert counts.shape == (8, 8)
+    assert counts.dtype == np.int64
+    assert counts.sum() == (labels != 255).sum()
+    assert (counts == sum(confusion(labels[i : i + 9], drawn[i : i + 9], 8) for i in range(0, 40, 9))).all()
+
+
+@pytest.mark.parametrize(("label", "guess"), [(8, 0), (254, 0), (0, 8), (0, 255)])
+def test_20_numbers_that_are_no_class_are_refused(label: int, guess: int):
+    """A label or prediction outside the classes is an error, not a wrapped index."""
+    with pytest.raises(ValueError, match=r"none of the 8 classes 0\.\.7"):
+        confusion(np.array([label], np.uint8), np.array([guess], np.uint8), 8)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (37, 53), (100, 31)])
+def test_21_any_size_gives_its_own_map(size: tuple[int, int]):
+    """Scenes that do not divide are padded and cropped back, from one pixel on; no seat of the pad is bought."""
+    weights, grid = _weights(factor=4, patch=8), SceneGrid(*size, 8, 4)
+    values = np.random.default_rng(0).uniform(0.1, 0.5, (*grid.coarse_shape, 5))
+    seen = glance(weights, values, np.linspace(450, 950, 5), grid)
+    valid = grid.valid_share().ravel() > 0
+    seats = frame_seats(score_seats("entropy", seen), 0.5, valid).seats
+    assert valid[seats].all()
+    drawn = segment(weights, seen, np.zeros((len(seats), 8, 8, 4), np.float32), seats)
+    assert drawn.classes.shape == size
+
+
+def _flat_glance(height: int, width: int) -> Glance:
+    grid = SceneGrid(height, width, 8, 2)
+    y, x = (side // 2 for side in grid.padded_shape)
+    return Glance(grid, np.full((y, x, 4), 0.3, np.float32), np.full((y, x, 3), 1 / 3, np.float32))
+
+
+def test_22_a_scene_alike_everywhere_scores_alike():
+    """Whole seats score equal to 1e-6, at the border too; partly filled ones rank by their pixels on the scene."""
+    seen = _flat_glance(36, 50)
+    scores = score_seats("entropy", seen)
+    share = seen.grid.valid_share().ravel()
+    assert np.ptp(scores[share == 1]) <= 1e-6
+    ranked = share[select_seats(scores, len(seen.grid.valid_seats()), share > 0).seats]
+    assert (np.diff(ranked) <= 0).all()
+    assert np.ptp(score_seats("sobel", seen)) <= 1e-6
+
+
+@torch.inference_mode()
+def test_23_a_scene_reads_alike_alone_and_in_a_batch():
+    """Batch-mates, the size of the batch and the order of tokens do not show."""
+    model, coarse, fine = _model(), _drawn(8, 4, 16, 16), _fine(8, 5)
+    seats = torch.stack([torch.randperm(16, generator=torch.Generator().manual_seed(i))[:5] for i in range(8)])
+    together = model.composite(*model(model.view(coarse), fine, seats), seats)
+    for i in (0, 3, 7):
+        one = slice(i, i + 1)
+        alone = model.composite(*model(model.view(coarse[one]), fine[one], seats[one]), seats[one])
+        assert (alone - together[one]).abs().max() <= 1e-6
+    turned = seats.flip(1)
+    reordered = model.composite(*model(model.view(coarse), fine.flip(1), turned), turned)
+    assert (reordered - together).abs().max() <= 2e-6
+
+
+@torch.inference_mode()
+def test_23_padded_tokens_equal_packed_ones():
+    """Scenes of different counts in one padded batch read as each by itself."""
+    encoder, x = _encoder(), _drawn(3, 9, 16)
+    counts = [9, 4, 1]
+    valid = torch.arange(9) < torch.tensor(counts)[:, None]
+    scale = torch.arange(9.0).remainder(2).expand(3, -1)
+    padded = encoder(x, scale, valid)
+    for i, count in enumerate(counts):
+        packed = encoder(x[i : i + 1, :count], scale[i : i + 1, :count], torch.ones(1, count).bool())
+        assert (packed[0] - padded[i, :count]).abs().max() <= 2e-6
+
+
+@pytest.mark.parametrize("change", ["reversed", "shuffled", "twice"])
+def test_24_bands_in_any_order_and_number_give_one_glance(change: str):
+    """Descending, unsorted and repeated wavelengths change no probability by more than 1e-5."""
+    weights, grid = _weights(), SceneGrid(32, 32, 8, 2)
+    rng, nm = np.random.default_rng(0), np.linspace(400, 1000, 31)
+    values = rng.uniform(0.1, 0.5, (16, 16, 31))
+    orders = {"reversed": np.arange(31)[::-1], "shuffled": rng.permutation(31), "twice": np.tile(np.arange(31), 2)}
+    order = orders[change]
+    first, second = glance(weights, values, nm, grid), glance(weights, values[..., order], nm[order], grid)
+    assert np.abs(first.probability - second.probability).max() <= 1e-5
+
+
+@pytest.mark.parametrize("nm", [[0.45, 0.65], [450.0, 3001.0], [199.0, 450.0], [np.nan, 450.0]])
+def test_24_wavelengths_in_another_unit_are_refused(nm: list[float]):
+    """Micrometres and numbers outside 200-3000 nm are a ValueError that says so."""
+    with pytest.raises(ValueError, match="outside 200-3000 nm"):
+        glance(_weights(), np.zeros((8, 8, 2)), np.array(nm), SceneGrid(16, 16, 8, 2))
+
+
+def test_25_certainty_has_no_entropy():
+    """A probability of 0 adds 0: no NaN, and never less than 0 in float32."""
+    sure = np.eye(4, dtype=np.float32)
+    tiny = np.array([[1.0, 1e-45, 0, 0]], np.float32)
+    entropy = pixel_entropy(np.concatenate([sure, tiny]))
+    assert np.isfinite(entropy).all()
+    assert entropy.min() >= 0
+
+
+def test_25_a_token_of_one_sample_has_area_one():
+    """With factor 1 the log of the area is 0, not minus infinity."""
+    model = _model(factor=1)
+    assert model.view(torch.zeros(1, 4, 8, 8)).tokens.scale.tolist() == [[0.0]]
+
+
+@pytest.mark.parametrize("gate", [60.0, -60.0])
+def test_27_closed_and_open_gates(gate: float):
+    """An open pixel gate shows the patch alone, a shut one the coarse features alone; both have finite gradients."""
+    model = _model()
+    with torch.no_grad():
+        model.pixel_gate.weight.zero_()
+        model.pixel_gate.bias.fill_(gate)
+    features, _ = model.stem(_drawn(2, 4, 8, 8), coarse=False)
+    under = [_drawn(2, 8, 8, 8, seed=seed).requires_grad_() for seed in (1, 2)]
+    context = [_drawn(2, 16, seed=seed) for seed in (3, 4)]
+    base = model.decode_fine(features, context[0], under[0])
+    same_own, same_under = (
+        model.decode_fine(features, context[0], under[1]),
+        model.decode_fine(features, context[1], under[0]),
+    )
+    kept, lost = (same_own, same_under) if gate > 0 else (same_under, same_own)
+    assert (base - kept).abs().max() <= 1e-5
+    assert (base - lost).abs().max() > 1e-3
+    base.sum().backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_29_bad_steps_are_counted_and_end_a_run(value: float, monkeypatch: pytest.MonkeyPatch):
+    """A loss that is not finite is skipped and counted; three in a row stop the run."""
+    labels = np.zeros((16, 16), np.uint8)
+    example = Example("e", np.zeros((16, 16, 4), np.float16), np.zeros((8, 8, 4), np.float32), labels, (16, 16))
+    config, settings = SegmenterConfig(**SIZES, layers=1), TrainingSettings(steps=4, batch=1, crop=16)
+    honest, calls = training.batch_loss, iter(range(100))
+    monkeypatch.setattr(training, "batch_loss", lambda *a, **k: honest(*a, **k) * (value if next(calls) % 2 else 1))
+    _, summary = train(config, [example], np.zeros(4, np.float32), settings)
+    assert summary["skipped_steps"] == 2
+    monkeypatch.setattr(training, "batch_loss", lambda *a, **k: honest(*a, **k) * value)
+    with pytest.raises(RuntimeError, match="not finite in steps 1 to 3"):
+        train(config, [example], np.zeros(4, np.float32), settings)
+
+
+def test_30_a_checkpoint_reads_other_bands(tmp_path: Path):
+    """Weights come back bit by bit and read any number of bands."""
+    weights, path = _weights(), tmp_path / "w.safetensors"
+    save_weights(weights, path)
+    loaded = load_weights(path)
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(weights.segmenter.parameters(), loaded.segmenter.parameters(), strict=True)
+    )  # fmt: skip
+    for bands in (1, 3, 200):
+        seen = glance(loaded, np.full((8, 8, bands), 0.3), np.linspace(500, 900, bands), SceneGrid(16, 16, 8, 2))
+        assert np.isfinite(seen.probability).all()
+
+
+def test_30_another_number_of_classes_names_the_tensor(tmp_path: Path):
+    """Tensors of three classes under a description of five are refused by the tensor's name."""
+    weights, path = _weights(), tmp_path / "w.safetensors"
+    weights.segmenter.config = replace(weights.config, classes=5)
+    save_weights(replace(weights, class_names=tuple("abcde")), path)
+    with pytest.raises(ValueError, match=r"tensor coarse_classes.weight should be \(5, 8, 1, 1\)"):
+        load_weights(path)
+
+
+def test_31_one_and_two_threads_choose_the_same_seats(threads: None):
+    """The same scene gives the same plan on 1 and 2 threads, and no global stream is touched."""
+    weights, grid = _weights(), SceneGrid(96, 96, 8, 2)
+    columns = _drawn(48, 48, 4).numpy()
+    before, plans = torch.random.get_rng_state(), []
+    for count in (1, 2):
+        torch.set_num_threads(count)
+        seen = glance_of_columns(weights, columns, grid)
+        plans.append([frame_seats(score_seats(policy, seen), 0.3).seats for policy in ("entropy", "sobel", "random")])
+    assert all((one == two).all() for one, two in zip(*plans, strict=True))
+    assert torch.equal(torch.random.get_rng_state(), before)

@@ -1,0 +1,174 @@
+"""A trained segmenter on one scene: sizes, seats, borders, strips and pixels without a value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F  # noqa: N812 - its usual name
+
+from models import inference
+from models.inference import Glance, glance, segment
+from models.weights import Weights
+from pipeline.errors import ShapeError
+from pipeline.grid import SceneGrid
+
+Maker = Callable[..., Weights]
+NM = np.linspace(400, 1000, 9)
+NONE = np.empty(0, np.int64)
+
+
+def _look(weights: Weights, height: int, width: int, seed: int = 0) -> tuple[Glance, np.ndarray]:
+    """The glance at a random scene, and a patch for every seat."""
+    p, s, columns = weights.config.patch, weights.config.factor, weights.config.columns
+    grid, rng = SceneGrid(height, width, p, s), np.random.default_rng(seed)
+    seen = glance(weights, rng.uniform(0.1, 0.5, (*grid.coarse_shape, len(NM))), NM, grid)
+    count = grid.seat_shape[0] * grid.seat_shape[1]
+    return seen, rng.normal(0, 1, (count, p, p, columns)).astype(np.float32)
+
+
+def _blank(weights: Weights) -> np.ndarray:
+    p = weights.config.patch
+    return np.empty((0, p, p, weights.config.columns), np.float32)
+
+
+@pytest.mark.parametrize("size", [(37, 53), (1, 1), (16, 16), (17, 1), (1, 40), (48, 15)])
+@pytest.mark.parametrize("factor", [1, 2, 4])
+def test_maps_have_the_size_of_the_scene(tiny: Maker, size: tuple[int, int], factor: int):
+    """Any size works, with no seat, one seat and every seat, down to a single pixel."""
+    weights = tiny(factor=factor)
+    seen, fine = _look(weights, *size)
+    for seats in (NONE, seen.grid.valid_seats()[-1:], seen.grid.valid_seats()):
+        drawn = segment(weights, seen, fine[seats], seats)
+        assert drawn.classes.shape == drawn.confidence.shape == size
+        assert drawn.classes.dtype == np.uint8
+        assert drawn.classes.max() < 3
+        assert 1 / 3 - 1e-6 <= drawn.confidence.min() <= drawn.confidence.max() <= 1
+
+
+def test_a_glance_is_a_probability_of_each_class(tiny: Maker):
+    """Probabilities of every pixel of the padded coarse grid sum to 1."""
+    seen, _ = _look(tiny(), 37, 53)
+    assert seen.probability.shape == (24, 32, 3)
+    assert seen.columns.shape == (24, 32, 4)
+    assert seen.probability.sum(axis=-1) == pytest.approx(1, abs=1e-6)
+
+
+def test_without_a_seat_the_map_is_the_glance_brought_up(tiny: Maker):
+    """Strips of rows join without a seam: the map is that of the whole image brought up at once."""
+    weights = tiny(factor=4)
+    seen, _ = _look(weights, 90, 70)
+    drawn = segment(weights, seen, _blank(weights), NONE)
+    model = weights.segmenter
+    with torch.inference_mode():
+        view = model.view(torch.from_numpy(seen.columns).permute(2, 0, 1)[None])
+        logits, _ = model(view, torch.zeros(1, 0, 4, 8, 8), torch.zeros(1, 0, dtype=torch.int64))
+        whole = F.interpolate(logits, scale_factor=4, mode="bilinear", align_corners=False)[0].softmax(dim=0)
+    confidence, classes = (array.numpy()[:90, :70] for array in whole.max(dim=0))
+    assert np.abs(drawn.confidence - confidence).max() <= 1e-6
+    assert (drawn.classes == classes).mean() > 0.999  # a tie may fall either way
+
+
+def test_the_survey_draws_what_training_saw(tiny: Maker):
+    """Inference in steps and chunks gives the composite that the loss of training is taken of."""
+    weights = tiny()
+    seen, fine = _look(weights, 32, 48)
+    seats = np.array([5, 0, 17, 23, 9])
+    drawn = segment(weights, seen, fine[seats], seats)
+    model, numbers = weights.segmenter, torch.from_numpy(seats)[None]
+    with torch.inference_mode():
+        patches = torch.from_numpy(fine[seats]).permute(0, 3, 1, 2)[None]
+        view = model.view(torch.from_numpy(seen.columns).permute(2, 0, 1)[None])
+        logits = model.composite(*model(view, patches, numbers), numbers)[0].softmax(dim=0)
+    assert np.abs(drawn.confidence - logits.max(dim=0)[0].numpy()).max() <= 1e-5
+
+
+def test_patches_lie_at_their_seats(tiny: Maker):
+    """Exchanging the patches of two seats changes the map in both, and a seat's map follows its patch's pixels."""
+    weights = tiny(classes=6)
+    seen, fine = _look(weights, 32, 32)
+    drawn = segment(weights, seen, fine[:2], np.array([3, 12]))
+    moved = segment(weights, seen, fine[:2], np.array([12, 3]))
+    changed = np.abs(drawn.confidence - moved.confidence).reshape(4, 8, 4, 8).max(axis=(1, 3))
+    assert sorted(np.argsort(changed, axis=None)[-2:].tolist()) == [3, 12]
+
+
+def test_chunks_of_patches_make_no_difference(tiny: Maker, monkeypatch: pytest.MonkeyPatch):
+    """Patches go through in chunks for the caches; their size does not show."""
+    weights = tiny()
+    seen, fine = _look(weights, 32, 32)
+    whole = segment(weights, seen, fine, np.arange(16))
+    monkeypatch.setattr(inference, "PATCHES_AT_ONCE", 3)
+    pieces = segment(weights, seen, fine, np.arange(16))
+    assert np.abs(whole.confidence - pieces.confidence).max() <= 1e-5
+
+
+def test_pixels_without_a_value_count_as_the_median(tiny: Maker):
+    """A NaN or infinite coarse pixel reads as the training median does, and leaves everything else as it is."""
+    weights, grid = tiny(), SceneGrid(30, 30, 8, 2)
+    values = np.random.default_rng(0).uniform(0.1, 0.5, (15, 15, 9))
+    clean = glance(weights, values, NM, grid)
+    values[3, 4, 2], values[9, 9], values[0, 0, 1] = np.nan, np.nan, np.inf
+    seen = glance(weights, values, NM, grid)
+    bad = np.zeros((15, 15), bool)
+    bad[[3, 9, 0], [4, 9, 0]] = True
+    assert not seen.columns[:15, :15][bad].any()  # the median is 0
+    assert (seen.columns[:15, :15][~bad] == clean.columns[:15, :15][~bad]).all()
+    assert np.isfinite(seen.probability).all()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_bad_pixels_of_a_patch_do_not_spread(tiny: Maker, bad: float):
+    """A patch with a dead pixel, and one all dead, read as patches with the median there."""
+    weights = tiny()
+    seen, fine = _look(weights, 32, 32)
+    fine[1, 2, 3], fine[2] = 0, 0
+    broken = fine.copy()
+    broken[1, 2, 3, 0], broken[1, 2, 3, 1:], broken[2] = bad, 0, bad
+    clean = segment(weights, seen, fine[:4], np.arange(4))
+    drawn = segment(weights, seen, broken[:4], np.arange(4))
+    assert (drawn.classes == clean.classes).all()
+    assert (drawn.confidence == clean.confidence).all()
+
+
+def test_other_bands_than_those_of_training_are_read(tiny: Maker):
+    """Bands in any number and order go in; twice as many of the same light give nearly the same glance."""
+    weights, grid = tiny(), SceneGrid(16, 16, 8, 2)
+    place = np.linspace(0, 3, 64).reshape(8, 8, 1)
+    few, many = (
+        glance(weights, 0.3 + 0.1 * np.sin(nm / 150 + place), nm, grid).probability
+        for nm in (np.linspace(1000, 400, 60), np.linspace(400, 1000, 240))
+    )
+    assert np.abs(few - many).max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("seats", "words"),
+    [([3, 5, 3], "seat 3 is given more than once"), ([2, 16], "seat 16 is none of the 16"), ([-1], "seat -1 is none")],
+)
+def test_seats_that_cannot_be_are_refused(tiny: Maker, seats: list[int], words: str):
+    """A seat given twice or lying off the grid is named."""
+    weights = tiny()
+    seen, fine = _look(weights, 32, 32)
+    with pytest.raises(ShapeError, match=words):
+        segment(weights, seen, fine[: len(seats)], np.array(seats))
+
+
+@pytest.mark.parametrize("shape", [(1, 8, 8, 4), (2, 8, 4, 4), (2, 8, 8, 5), (2, 8, 8)])
+def test_patches_of_another_shape_are_refused(tiny: Maker, shape: tuple[int, ...]):
+    """The message says the shape that two seats need."""
+    weights = tiny()
+    seen, _ = _look(weights, 32, 32)
+    with pytest.raises(ShapeError, match=r"expected patches of shape \(2, 8, 8, 4\)"):
+        segment(weights, seen, np.zeros(shape, np.float32), np.array([0, 1]))
+
+
+def test_mosaics_and_grids_that_do_not_fit_are_refused(tiny: Maker):
+    """The coarse mosaic must have the grid's size, the grid the weights' patches and factor."""
+    weights = tiny()
+    with pytest.raises(ShapeError, match=r"mosaic is \(9, 8\), the scene grid expects \(8, 8\)"):
+        glance(weights, np.zeros((9, 8, 9)), NM, SceneGrid(16, 16, 8, 2))
+    with pytest.raises(ShapeError, match="patches of 8 px at a factor of 2, the grid has 16 px and 4"):
+        glance(weights, np.zeros((4, 4, 9)), NM, SceneGrid(16, 16, 16, 4))

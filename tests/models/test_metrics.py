@@ -1,0 +1,115 @@
+"""Confusion counts and what follows from them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models.metrics import (
+    average_accuracy,
+    confusion,
+    gap_closed,
+    iou_per_class,
+    kappa,
+    mean_iou,
+    overall_accuracy,
+)
+from pipeline.errors import ShapeError
+
+PAIRS = st.lists(st.tuples(st.sampled_from([0, 1, 2, 3, 255]), st.integers(0, 3)), max_size=60)
+
+
+def _maps(pairs: list[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
+    both = np.array(pairs, np.uint8).reshape(-1, 2)
+    return both[:, 0], both[:, 1]
+
+
+@given(PAIRS, st.integers(0, 60))
+def test_counts_of_parts_add_up(pairs: list[tuple[int, int]], cut: int):
+    """The count of a map is that of its parts together, and its sum the number of labelled pixels."""
+    labels, drawn = _maps(pairs)
+    whole = confusion(labels, drawn, 4)
+    parts = confusion(labels[:cut], drawn[:cut], 4) + confusion(labels[cut:], drawn[cut:], 4)
+    assert (whole == parts).all()
+    assert whole.sum() == np.count_nonzero(labels != 255)
+
+
+@given(PAIRS, st.permutations(range(4)))
+def test_names_of_classes_do_not_matter(pairs: list[tuple[int, int]], names: list[int]):
+    """Renumbering the classes permutes the IoU and leaves every mean as it is."""
+    labels, drawn = _maps(pairs)
+    renamed = np.append(names, [255] * 252).astype(np.uint8)
+    before, after = confusion(labels, drawn, 4), confusion(renamed[labels], renamed[drawn], 4)
+    assert iou_per_class(after)[names] == pytest.approx(iou_per_class(before), nan_ok=True)
+    for mean in (mean_iou, overall_accuracy, average_accuracy, kappa):
+        assert mean(after) == pytest.approx(mean(before), nan_ok=True)
+
+
+@given(PAIRS)
+def test_iou_is_that_of_pixel_sets(pairs: list[tuple[int, int]]):
+    """Each class's IoU is the size of its two pixel sets' intersection over that of their union."""
+    labels, drawn = _maps(pairs)
+    labels, drawn = labels[labels != 255], drawn[labels != 255]
+    for number, iou in enumerate(iou_per_class(confusion(labels, drawn, 4))):
+        both, either = ((labels == number) & (drawn == number)).sum(), ((labels == number) | (drawn == number)).sum()
+        assert iou == pytest.approx(both / either if either else np.nan, nan_ok=True)
+
+
+def test_a_worked_case():
+    """Six pixels by hand: 4 right; IoU 2/3, 1/3 and 1/2; half of what chance leaves is agreed."""
+    counts = confusion(np.array([0, 0, 1, 1, 2, 2]), np.array([0, 0, 1, 0, 2, 1]), 3)
+    assert counts.tolist() == [[2, 0, 0], [1, 1, 0], [0, 1, 1]]
+    assert iou_per_class(counts) == pytest.approx([2 / 3, 1 / 3, 1 / 2])
+    assert mean_iou(counts) == pytest.approx(0.5)
+    assert overall_accuracy(counts) == pytest.approx(2 / 3)
+    assert average_accuracy(counts) == pytest.approx(2 / 3)
+    assert kappa(counts) == pytest.approx((2 / 3 - 1 / 3) / (2 / 3))
+
+
+def test_agreement_by_chance_has_no_kappa():
+    """A map drawn without looking has kappa 0, a perfect one 1, and one class alone none at all."""
+    chance = np.outer([30, 70], [40, 60])
+    assert kappa(chance) == pytest.approx(0)
+    assert kappa(np.diag([3, 4])) == 1
+    assert np.isnan(kappa(np.array([[5, 0], [0, 0]])))
+
+
+def test_a_class_predicted_where_none_is_counts_as_missed():
+    """A class in the map alone is averaged as 0; its false pixels also lower the class they were taken from."""
+    counts = confusion(np.array([0, 0, 0, 1]), np.array([0, 0, 2, 1]), 3)
+    assert iou_per_class(counts) == pytest.approx([2 / 3, 1, 0])
+    assert mean_iou(counts) == pytest.approx((2 / 3 + 1 + 0) / 3)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int16, np.int64])
+def test_maps_of_any_integer_type_are_counted(kind: type):
+    """Classes up to 254 do not overflow the type they come in."""
+    labels = np.array([254, 200, 255 if kind is np.uint8 else 3, 254]).astype(kind)
+    assert confusion(labels, np.array([254, 200, 3, 200], np.uint8), 255)[254].sum() == 2
+
+
+@pytest.mark.parametrize(
+    ("labels", "drawn", "words"),
+    [([0, 3], [0, 0], "label 3 is none of the 3"), ([0, 1], [0, 7], "prediction 7"), ([-1, 0], [0, 0], "label -1")],
+)
+def test_classes_that_are_none_are_refused(labels: list[int], drawn: list[int], words: str):
+    """The message names the number and how many classes there are."""
+    with pytest.raises(ShapeError, match=words):
+        confusion(np.array(labels), np.array(drawn), 3)
+
+
+def test_a_map_of_another_size_is_refused():
+    """The message names both sizes."""
+    with pytest.raises(ShapeError, match=r"labels are \(2, 3\), the class map is \(3, 2\)"):
+        confusion(np.zeros((2, 3), int), np.zeros((3, 2), int), 2)
+
+
+def test_a_gap_of_less_than_a_point_is_not_closed():
+    """The share of a way is given only where the way is one point of mIoU or more, either way round."""
+    assert gap_closed(0.6, 0.5, 0.7) == pytest.approx(0.5)
+    assert gap_closed(0.4, 0.5, 0.3) == pytest.approx(0.5)
+    assert gap_closed(0.8, 0.5, 0.7) == pytest.approx(1.5)
+    assert gap_closed(0.505, 0.5, 0.509) is None
+    assert gap_closed(0.5, float("nan"), 0.7) is None

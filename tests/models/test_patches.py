@@ -1,0 +1,72 @@
+"""Patches to features and tokens, and back up to features per pixel."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from models.patches import ChannelNorm, PatchHead, PatchStem, level_widths
+from pipeline.errors import ShapeError
+
+
+@pytest.mark.parametrize(
+    ("patch", "widths"), [(4, [8]), (8, [8, 16]), (16, [8, 16, 24]), (32, [8, 16, 24, 24]), (64, [8, 16, 24, 24, 24])]
+)
+def test_levels_go_down_to_four_pixels(patch: int, widths: list[int]):
+    """Each halving is a level; channels grow to three times the width."""
+    assert level_widths(8, patch) == widths
+
+
+@pytest.mark.parametrize("patch", [0, 1, 2, 6, 12, 24, 40])
+def test_patches_that_cannot_be_halved_to_four_are_refused(patch: int):
+    """The message names the size."""
+    with pytest.raises(ShapeError, match=f"power of two, got {patch};"):
+        level_widths(8, patch)
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("patch", [4, 8, 32])
+def test_a_patch_comes_back_at_its_size(patch: int):
+    """Features of every level, finest first, one token, and the width per pixel again."""
+    widths = level_widths(8, patch)
+    features, token = PatchStem(5, widths, 12)(torch.zeros(3, 5, patch, patch), coarse=False)
+    assert [tuple(level.shape) for level in features] == [
+        (3, width, patch >> i, patch >> i) for i, width in enumerate(widths)
+    ]
+    assert token.shape == (3, 12)
+    assert PatchHead(widths, 12)(features, token).shape == (3, 8, patch, patch)
+
+
+@torch.inference_mode()
+def test_patches_do_not_see_each_other():
+    """A patch reads the same alone and among others."""
+    stem, patches = PatchStem(3, [8, 16], 12), torch.randn(7, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    _, together = stem(patches, coarse=False)
+    alone = torch.cat([stem(patch[None], coarse=False)[1] for patch in patches])
+    assert (together - alone).abs().max() <= 1e-6
+
+
+@torch.inference_mode()
+def test_scales_share_the_stem_until_told_apart():
+    """Both scales read alike at first; the learned shift alone tells them apart."""
+    stem, patch = PatchStem(3, [8], 12), torch.ones(1, 3, 4, 4)
+    assert (stem(patch, coarse=True)[1] == stem(patch, coarse=False)[1]).all()
+    stem.scale_shift[1] += 1.0
+    assert (stem(patch, coarse=True)[1] != stem(patch, coarse=False)[1]).any()
+
+
+def test_an_empty_pixel_has_a_finite_norm_and_gradient():
+    """The norm of zeros is zero, and its gradient stays below 1000."""
+    zero = torch.zeros(1, 8, 2, 2, requires_grad=True)
+    normed = ChannelNorm(8)(zero)
+    normed.sum().backward()
+    assert not normed.any()
+    assert zero.grad is not None
+    assert zero.grad.abs().max() <= 1000.1
+
+
+@torch.inference_mode()
+def test_the_norm_forgets_brightness():
+    """A pixel ten times as bright is normed to the same values."""
+    x = torch.randn(2, 8, 3, 3, generator=torch.Generator().manual_seed(4))
+    assert (ChannelNorm(8)(10 * x) - ChannelNorm(8)(x)).abs().max() <= 1e-4

@@ -1,0 +1,109 @@
+"""Attention policies: what each sees, borders of the scene, and images without contrast."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from models.inference import Glance
+from models.policies import pixel_entropy, score_seats
+from pipeline.errors import SettingsError, ShapeError
+from pipeline.grid import SceneGrid
+
+
+def _glance(height: int = 32, width: int = 48, patch: int = 8, factor: int = 2) -> Glance:
+    """A flat scene of which the glance is equally unsure everywhere."""
+    grid = SceneGrid(height, width, patch, factor)
+    y, x = (size // factor for size in grid.padded_shape)
+    return Glance(grid, np.full((y, x, 3), 0.7, np.float32), np.full((y, x, 4), 0.25, np.float32))
+
+
+@pytest.mark.parametrize("classes", [2, 5, 12])
+def test_entropy_runs_from_none_to_the_log_of_classes(classes: int):
+    """Certainty is 0 without a NaN, equal chances are ln(classes), and order does not count."""
+    sure, even = np.eye(classes)[0], np.full(classes, 1 / classes)
+    assert pixel_entropy(np.stack([sure, even])) == pytest.approx([0, np.log(classes)])
+    drawn = np.random.default_rng(0).dirichlet(np.ones(classes), 20)
+    assert pixel_entropy(drawn[:, ::-1]) == pytest.approx(pixel_entropy(drawn))
+
+
+def test_entropy_looks_where_the_glance_is_unsure():
+    """The seat over unsure pixels scores highest, by the mean over its own pixels."""
+    seen = _glance()
+    seen.probability[...] = [1, 0, 0, 0]
+    seen.probability[4:8, 8:12] = [0.5, 0.5, 0, 0]  # the seat at row 1, column 2
+    scores = score_seats("entropy", seen).reshape(4, 6)
+    assert scores[1, 2] == pytest.approx(np.log(2))
+    scores[1, 2] = 0
+    assert not scores.any()
+
+
+def test_sobel_looks_at_edges():
+    """A step between two columns of seats scores in both and nowhere else."""
+    seen = _glance()
+    seen.columns[:, :8] = 0.1
+    scores = score_seats("sobel", seen).reshape(4, 6)
+    assert (scores[:, [1, 2]] > 0.1).all()
+    assert scores[:, [0, 3, 4, 5]] == pytest.approx(0, abs=1e-12)
+
+
+def test_random_follows_its_seed():
+    """The same seed gives the same scores, another seed others."""
+    first, same, other = (score_seats("random", _glance(), seed=seed) for seed in (1, 1, 2))
+    assert (first == same).all()
+    assert (first != other).all()
+
+
+def test_a_mask_is_averaged_over_each_seat():
+    """A mask of the scene's size, grey or colour, scores seats by its mean over their pixels on the scene."""
+    mask = np.random.default_rng(2).integers(0, 256, (32, 48), dtype=np.uint8)
+    expected = mask.reshape(4, 8, 6, 8).mean(axis=(1, 3)).ravel()
+    assert score_seats("mask", _glance(), mask=mask) == pytest.approx(expected)
+    colour = np.repeat(mask[..., None], 3, axis=-1)
+    assert score_seats("mask", _glance(), mask=colour) == pytest.approx(expected)
+
+
+def test_a_mask_may_hold_numbers_that_are_not_finite():
+    """NaN counts as nothing; infinite worth stays infinite."""
+    mask = np.ones((32, 48))
+    mask[0, 0], mask[0, 20], mask[0, 40] = np.nan, np.inf, -np.inf
+    scores = score_seats("mask", _glance(), mask=mask)
+    assert scores[[0, 2, 5]].tolist() == [63 / 64, np.inf, -np.inf]
+    assert (np.delete(scores, [0, 2, 5]) == 1).all()
+
+
+@pytest.mark.parametrize("policy", ["entropy", "sobel", "mask", "random"])
+@pytest.mark.parametrize("size", [(37, 53), (1, 1), (8, 8), (33, 16)])
+def test_seats_off_the_scene_are_worth_nothing(policy: str, size: tuple[int, int]):
+    """One finite score a seat of the padded grid; what lies wholly off the scene scores 0."""
+    seen = _glance(*size)
+    scores = score_seats(policy, seen, mask=np.ones(size))
+    assert scores.shape == (np.prod(seen.grid.seat_shape),)
+    assert np.isfinite(scores).all()
+    assert not scores[seen.grid.valid_share().ravel() == 0].any()
+
+
+@pytest.mark.parametrize("policy", ["entropy", "mask"])
+@pytest.mark.parametrize("factor", [1, 2, 4])
+def test_a_border_seat_is_worth_its_share(policy: str, factor: int):
+    """On a scene alike everywhere a seat scores in proportion to its pixels on the scene."""
+    seen = _glance(37, 53, factor=factor)
+    scores = score_seats(policy, seen, mask=np.full((37, 53), np.log(4)))
+    assert scores == pytest.approx(np.log(4) * seen.grid.valid_share().ravel(), abs=1e-6)
+
+
+def test_what_lies_off_the_scene_does_not_count():
+    """Unsure pixels beyond the border change no score."""
+    seen, other = _glance(18, 20), _glance(18, 20)
+    other.probability[9:], other.probability[:, 10:] = [1, 0, 0, 0], [1, 0, 0, 0]
+    assert (score_seats("entropy", seen) == score_seats("entropy", other)).all()
+
+
+def test_policies_and_masks_that_do_not_fit_are_refused():
+    """The messages name the policies there are, the flag that is missing, and both sizes."""
+    with pytest.raises(SettingsError, match="unknown policy 'best'; choose one of entropy, sobel"):
+        score_seats("best", _glance())
+    with pytest.raises(SettingsError, match="needs --mask"):
+        score_seats("mask", _glance())
+    with pytest.raises(ShapeError, match=r"mask is \(32, 47\) px, the scene is \(32, 48\)"):
+        score_seats("mask", _glance(), mask=np.ones((32, 47)))

@@ -1,0 +1,188 @@
+"""Training: what is drawn, what is lost, what is skipped, and that equal seeds give equal weights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from models import training
+from models.examples import CropSampler, Example
+from models.segmenter import Segmenter, SegmenterConfig
+from models.training import (
+    Progress,
+    TrainingError,
+    TrainingSettings,
+    batch_loss,
+    class_weights,
+    draw_seats,
+    map_loss,
+    rate_at,
+    train,
+)
+from pipeline.errors import PipelineError
+
+CONFIG = SegmenterConfig(classes=3, columns=2, patch=8, factor=2, width=8, dim=16, layers=1, heads=2)
+SETTINGS = TrainingSettings(steps=6, batch=2, crop=16, learning_rate=3e-3)
+SHIFT = np.zeros(2, np.float32)
+
+
+def _example(share: float = 1.0, size: int = 32) -> Example:
+    """Two classes told apart by the first column, with noise in the second."""
+    rng = np.random.default_rng(4)
+    labels = np.kron(rng.integers(0, 2, (size // 8, size // 8)), np.ones((8, 8))).astype(np.uint8)
+    fine = np.stack([2.0 * labels - 1, rng.normal(0, 1, labels.shape)], axis=-1)
+    coarse = fine.reshape(size // 2, 2, size // 2, 2, 2).mean(axis=(1, 3))
+    labels[rng.random(labels.shape) >= share] = 255
+    return Example("e", fine.astype(np.float16), coarse.astype(np.float32), labels, labels.shape)
+
+
+def test_training_learns():
+    """Forty small steps bring the loss of two easily told classes down to a third."""
+    losses: list[float] = []
+    settings = replace(SETTINGS, steps=40, learning_rate=1e-2)
+    model, summary = train(CONFIG, [_example()], SHIFT, settings, lambda now: losses.append(now.loss))
+    batch = CropSampler([_example()], 8, 2, 16).draw(8, np.random.default_rng(0), SHIFT)
+    weight = class_weights([_example()], 3, 5.0)
+    with torch.no_grad():
+        last = batch_loss(model, batch, weight, SETTINGS, np.random.default_rng(0), soft_dice=False)
+    assert last < losses[0] / 3
+    assert summary["steps"] == 40
+    assert summary["skipped_steps"] == 0
+
+
+def test_equal_seeds_give_equal_weights_and_leave_global_streams_alone():
+    """Weights follow from the settings, to rounding; torch's and numpy's own streams are as they were."""
+    torch_before, numpy_before = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    first, same, other = (train(CONFIG, [_example()], SHIFT, replace(SETTINGS, seed=seed))[0] for seed in (3, 3, 4))
+    assert torch.equal(torch.random.get_rng_state(), torch_before)
+    assert (np.random.get_state()[1] == numpy_before).all()  # noqa: NPY002
+    weights = [torch.cat([value.flatten() for value in model.parameters()]) for model in (first, same, other)]
+    assert (weights[0] - weights[1]).abs().max() < 1e-5  # sums differ in the last bit with where memory lies
+    assert (weights[0] - weights[2]).abs().max() > 1e-2
+    assert not first.training
+
+
+def test_progress_runs_to_the_end():
+    """Every step reports itself and how far the run is, by steps here."""
+    seen: list[Progress] = []
+    train(CONFIG, [_example()], SHIFT, SETTINGS, seen.append)
+    assert [now.step for now in seen] == [1, 2, 3, 4, 5, 6]
+    assert [now.done for now in seen] == pytest.approx([step / 6 for step in range(6)], abs=1e-6)
+    assert all(np.isfinite(now.loss) for now in seen)
+
+
+def test_minutes_end_a_run(monkeypatch: pytest.MonkeyPatch):
+    """A run over its time stops, and the summary counts the steps that were taken."""
+    clock = iter(range(0, 10_000, 30))
+    monkeypatch.setattr(training.time, "monotonic", lambda: next(clock))
+    seen: list[Progress] = []
+    _, summary = train(CONFIG, [_example()], SHIFT, replace(SETTINGS, steps=1000, minutes=2), seen.append)
+    assert len(seen) == summary["steps"] == 3
+    assert seen[-1].done == pytest.approx(0.75)
+
+
+def _spoilt(monkeypatch: pytest.MonkeyPatch, bad: set[int], value: float = float("nan")) -> None:
+    """Let the loss of the numbered steps be a number that is none."""
+    calls = iter(range(1, 1000))
+
+    def spoilt(*args: object, **flags: bool) -> Tensor:
+        loss = batch_loss(*args, **flags)  # type: ignore[arg-type]
+        return loss * value if next(calls) in bad else loss
+
+    monkeypatch.setattr(training, "batch_loss", spoilt)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_steps_without_a_finite_loss_are_skipped(monkeypatch: pytest.MonkeyPatch, value: float):
+    """Two bad steps in a row are counted and leave finite weights and a finite loss to report."""
+    _spoilt(monkeypatch, {1, 3, 4}, value)
+    model, summary = train(CONFIG, [_example()], SHIFT, SETTINGS)
+    assert summary["skipped_steps"] == 3
+    assert np.isfinite(summary["last_loss"])
+    assert all(parameter.isfinite().all() for parameter in model.parameters())
+
+
+def test_three_bad_steps_in_a_row_end_training(monkeypatch: pytest.MonkeyPatch):
+    """The message names the steps and what to do; the command line shows it as any other error."""
+    _spoilt(monkeypatch, {2, 3, 4})
+    with pytest.raises(TrainingError, match="not finite in steps 2 to 4; lower the learning rate"):
+        train(CONFIG, [_example()], SHIFT, SETTINGS)
+    assert issubclass(TrainingError, PipelineError)
+
+
+def test_a_gradient_that_is_none_is_no_step():
+    """A finite loss with an infinite gradient leaves every weight as it was."""
+    model = Segmenter(CONFIG)
+    optimiser = torch.optim.AdamW(model.parameters(), 0.1)
+    before = torch.nn.utils.parameters_to_vector(model.parameters()).clone()
+    zero = model.scale_code.sum() * 0
+    assert not training._step(model, optimiser, zero.abs().sqrt())
+    assert torch.equal(torch.nn.utils.parameters_to_vector(model.parameters()), before)
+    assert training._step(model, optimiser, model.scale_code.square().sum() + model.scale_code.sum())
+
+
+def test_the_rate_warms_up_and_falls():
+    """From 5 % to all of the rate over the first twentieth, then down to 1 %."""
+    assert [rate_at(done) for done in (0.0, 0.025, 0.05, 1.0)] == pytest.approx([0.05, 0.525, 1.0, 0.01])
+    falling = [rate_at(done) for done in np.linspace(0.05, 1, 50)]
+    assert falling == sorted(falling, reverse=True)
+
+
+def test_rare_classes_weigh_more():
+    """Weights go by one over the root of the share, with mean 1 over pixels; a class without a pixel has none."""
+    labels = np.full((10, 10), 255, np.uint8)
+    labels[:8], labels[8:9, :8], labels[9:, :0] = 0, 1, 2
+    weight = class_weights([replace(_example(), labels=labels)], 3, 100.0).numpy()
+    assert weight[1] / weight[0] == pytest.approx(np.sqrt(10))
+    assert (80 * weight[0] + 8 * weight[1]) / 88 == pytest.approx(1)
+    assert weight[2] == 0
+    assert class_weights([replace(_example(), labels=labels)], 3, 2.0).max() == 2
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_drawn_seats_are_distinct(seed: int):
+    """One of the shares is bought in every scene of a batch, no seat twice."""
+    glance = torch.randn(3, 3, 32, 32, generator=torch.Generator().manual_seed(seed))
+    seats = draw_seats(glance, CONFIG, np.random.default_rng(seed))
+    assert seats.shape[1] in {round(64 * share) for share, _ in training.SHARES}
+    assert all(len(row.unique()) == len(row) for row in seats)
+    assert seats.min() >= 0
+    assert seats.max() < 64
+
+
+def test_seats_are_drawn_where_the_glance_is_unsure_or_anywhere():
+    """Half of the draws go by entropy: its seats come first there, and by chance elsewhere."""
+    glance = torch.zeros(1, 3, 32, 32)
+    glance[:, 0] = 30.0
+    glance[:, :, :4, :4] = 0.0  # unsure in seat 0 alone
+    drawn = [draw_seats(glance, CONFIG, np.random.default_rng(seed)) for seed in range(60)]
+    first = np.mean([row[0, 0] == 0 for row in drawn])
+    assert 0.35 < first < 0.7
+    assert any(0 not in row for row in drawn)
+
+
+def test_a_perfect_map_loses_nothing():
+    """Sure and right predictions have no loss, with soft Dice neither; sure and wrong ones a large one."""
+    labels = torch.randint(0, 3, (2, 16, 16), generator=torch.Generator().manual_seed(0))
+    logits = torch.nn.functional.one_hot(labels, 3).permute(0, 3, 1, 2) * 40.0
+    for soft_dice in (False, True):
+        assert map_loss(logits, labels, torch.ones(3), soft_dice=soft_dice) < 0.01
+        assert map_loss(-logits, labels, torch.ones(3), soft_dice=soft_dice) > 5
+
+
+def test_unlabelled_pixels_have_no_say():
+    """What is predicted at unlabelled pixels changes neither the loss nor its gradient elsewhere."""
+    labels = torch.randint(0, 3, (1, 8, 8), generator=torch.Generator().manual_seed(0))
+    labels[:, 2:5] = 255
+    logits = torch.randn(1, 3, 8, 8, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    loss = map_loss(logits, labels, torch.ones(3), soft_dice=True)
+    loss.backward()
+    assert logits.grad is not None
+    assert not logits.grad[:, :, 2:5].any()
+    other = logits.detach().clone()
+    other[:, :, 2:5] += 9
+    assert map_loss(other, labels, torch.ones(3), soft_dice=True).item() == pytest.approx(loss.item(), abs=1e-6)

@@ -1,0 +1,191 @@
+"""Weights on disk: what is written comes back, and what is damaged is named."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from models.inference import glance
+from models.weights import FORMAT, Weights, load_weights, save_weights, with_record
+from pipeline.errors import WeightsError
+from pipeline.grid import SceneGrid
+
+Maker = Callable[..., Weights]
+
+
+def _about(path: Path) -> dict[str, Any]:
+    raw = path.read_bytes()
+    (size,) = struct.unpack("<Q", raw[:8])
+    about: dict[str, Any] = json.loads(json.loads(raw[8 : 8 + size])["__metadata__"]["about"])
+    return about
+
+
+def _rewritten(path: Path, about: dict[str, Any], tensors: dict[str, torch.Tensor] | None = None) -> Path:
+    save_file(load_file(path) if tensors is None else tensors, path, {"about": json.dumps(about)})
+    return path
+
+
+@pytest.fixture
+def saved(tiny: Maker, tmp_path: Path) -> Path:
+    """A file of small weights."""
+    save_weights(tiny(), tmp_path / "w.safetensors")
+    return tmp_path / "w.safetensors"
+
+
+def test_everything_comes_back_bit_by_bit(tiny: Maker, saved: Path):
+    """Parameters, basis, normalisation, classes, colours and record are those that were saved."""
+    before, after = tiny(), load_weights(saved)
+    old, new = before.segmenter.state_dict(), after.segmenter.state_dict()
+    assert list(old) == list(new)
+    assert all(torch.equal(old[name], new[name]) for name in old)
+    assert (after.config, after.basis, after.class_names, after.record) == (
+        before.config, before.basis, before.class_names, before.record,
+    )  # fmt: skip
+    for name in ("centre", "spread", "whitening"):
+        assert (getattr(after.normalisation, name) == getattr(before.normalisation, name)).all()
+    assert (after.class_colours == before.class_colours).all()
+    assert not after.segmenter.training
+
+
+def test_loaded_weights_draw_the_same(tiny: Maker, saved: Path):
+    """A glance through loaded weights equals that through the original ones, bit by bit."""
+    values, nm = np.random.default_rng(0).uniform(0.1, 0.5, (16, 8, 7)), np.linspace(420, 980, 7)
+    first, second = (glance(weights, values, nm, SceneGrid(32, 16, 8, 2)) for weights in (tiny(), load_weights(saved)))
+    assert (first.probability == second.probability).all()
+
+
+def test_saving_twice_gives_equal_files(tiny: Maker, saved: Path, tmp_path: Path):
+    """The same weights give the same bytes, and nothing else is left in the folder."""
+    save_weights(load_weights(saved), tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == saved.read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["again.safetensors", "w.safetensors"]
+
+
+def test_parameters_in_another_memory_order_are_kept(tiny: Maker, tmp_path: Path):
+    """Training keeps kernels channels last; the file holds the same numbers."""
+    weights = tiny()
+    weights.segmenter.to(memory_format=torch.channels_last)
+    save_weights(weights, tmp_path / "w.safetensors")
+    loaded = load_weights(tmp_path / "w.safetensors").segmenter.state_dict()
+    assert all(torch.equal(loaded[name], value) for name, value in tiny().segmenter.state_dict().items())
+
+
+def test_unreached_columns_and_dead_pixels_are_the_median(tiny: Maker):
+    """Bands of half the range leave the other half's columns at 0; a dead pixel is 0 in all."""
+    weights = tiny(columns=6)
+    plain = replace(weights, normalisation=replace(weights.normalisation, whitening=np.eye(6, dtype=np.float32)))
+    columns = plain.columns(np.array([[0.3, 0.4, 0.5], [0.3, np.nan, 0.5]]), np.array([400.0, 450.0, 500.0]))
+    assert columns[0, :3].all()
+    assert not columns[0, 3:].any()
+    assert not columns[1].any()
+
+
+def test_records_grow_without_changing_the_rest(tiny: Maker):
+    """Entries are added to a copy; the weights themselves stay."""
+    weights = tiny()
+    noted = with_record(weights, licence="CC0")
+    assert noted.record == {"seed": 0, "licence": "CC0"}
+    assert weights.record == {"seed": 0}
+    assert noted.segmenter is weights.segmenter
+
+
+def test_a_missing_file_says_how_to_make_one(tmp_path: Path):
+    """The message names the path and the command."""
+    with pytest.raises(WeightsError, match=r"no weights at .*gone.safetensors; train some with: spectralzoom train"):
+        load_weights(tmp_path / "gone.safetensors")
+
+
+@pytest.mark.parametrize("keep", [0, 5, 400, -100])
+def test_a_file_cut_short_is_not_readable(saved: Path, keep: int):
+    """A file that ends early is named, whatever is left of it."""
+    saved.write_bytes(saved.read_bytes()[:keep])
+    with pytest.raises(WeightsError, match="not a readable safetensors file"):
+        load_weights(saved)
+
+
+def test_a_pickle_is_never_opened(saved: Path, tiny: Maker):
+    """A file of torch's own kind is refused without being unpickled."""
+    torch.save(tiny().segmenter.state_dict(), saved)
+    with pytest.raises(WeightsError, match="not a readable safetensors file"):
+        load_weights(saved)
+
+
+def test_another_format_is_named(saved: Path):
+    """A newer format, and tensors without any mark, are told apart."""
+    _rewritten(saved, {**_about(saved), "format": "spectralzoom-weights/9"})
+    with pytest.raises(WeightsError, match=f"holds spectralzoom-weights/9, expected {FORMAT}"):
+        load_weights(saved)
+    save_file({"a": torch.zeros(1)}, saved)
+    with pytest.raises(WeightsError, match="holds no format mark"):
+        load_weights(saved)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"classes": 1}, "description is damaged.*2 to 255 classes, got 1"),
+        ({"depth": 3}, "description is damaged.*depth"),
+        ({"dim": 32}, r"tensor scale_code should be \(2, 32\), the file has \(2, 16\)"),
+        ({"columns": 7}, r"tensor stem.enter.weight should be \(8, 7, 1, 1\)"),
+    ],
+)
+def test_sizes_that_do_not_fit_are_named(saved: Path, changes: dict[str, int], words: str):
+    """A configuration that cannot be built, or that its tensors do not fit, is refused by name."""
+    about = _about(saved)
+    _rewritten(saved, {**about, "config": {**about["config"], **changes}})
+    with pytest.raises(WeightsError, match=words):
+        load_weights(saved)
+
+
+@pytest.mark.parametrize("name", ["normalisation.centre", "class_colours", "fine_classes.bias"])
+def test_a_missing_tensor_is_named(saved: Path, name: str):
+    """Each tensor is wanted: parameters, normalisation and colours."""
+    tensors = load_file(saved)
+    del tensors[name]
+    _rewritten(saved, _about(saved), tensors)
+    with pytest.raises(WeightsError, match=f"tensor {name} should be .*, the file has nothing"):
+        load_weights(saved)
+
+
+def test_a_missing_entry_is_named(saved: Path):
+    """A description without its basis is damaged; so is one with too few names."""
+    about = _about(saved)
+    _rewritten(saved, {key: value for key, value in about.items() if key != "basis"})
+    with pytest.raises(WeightsError, match=r"description is damaged .'basis'"):
+        load_weights(saved)
+    _rewritten(saved, {**about, "class_names": ["soil"]})
+    with pytest.raises(WeightsError, match="names 1 classes, its segmenter has 3"):
+        load_weights(saved)
+
+
+def test_a_folder_that_is_none_cannot_be_written_to(tiny: Maker, tmp_path: Path):
+    """The message names the file and says what to do, when the folder is missing or a file itself."""
+    (tmp_path / "file").touch()
+    for folder in ("missing", "file"):
+        with pytest.raises(WeightsError, match=r"cannot write weights to .*; choose another -o"):
+            save_weights(tiny(), tmp_path / folder / "w.safetensors")
+
+
+def test_a_write_that_fails_leaves_the_old_file(tiny: Maker, saved: Path, monkeypatch: pytest.MonkeyPatch):
+    """A disk that fills up leaves the file that was there, and no part of the new one."""
+    before = saved.read_bytes()
+
+    def fill(path: Path, data: bytes) -> int:
+        path.touch()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", fill)
+    with pytest.raises(WeightsError, match="No space left on device"):
+        save_weights(tiny(1), saved)
+    monkeypatch.undo()
+    assert saved.read_bytes() == before
+    assert [path.name for path in saved.parent.iterdir()] == ["w.safetensors"]
