@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import sys
 import tempfile
@@ -9,13 +10,22 @@ import traceback
 from pathlib import Path
 from typing import Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import App, CycloptsError, Parameter
 from rich.console import Console
 from rich.markup import escape
 
 from pipeline.errors import PipelineError, SettingsError
 
-app = App(name="spectralzoom", help="Survey a field: look coarsely at everything, finely where it changes the map.")
+
+def _version() -> str:
+    return importlib.metadata.version("spectralzoom")
+
+
+app = App(
+    name="spectralzoom",
+    version=_version,
+    help="Survey a field: look coarsely at everything, finely where it changes the map.",
+)
 stderr = Console(stderr=True)
 
 
@@ -252,7 +262,10 @@ def _wholes(text: str | None, flag: str) -> list[int] | None:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with its code; an error that the user should read is one message on stderr."""
     try:
-        code = app(arguments, console=stderr, result_action="return_value")
+        code = app(arguments, result_action="return_value", exit_on_error=False, print_error=False)
+    except CycloptsError as error:
+        _say(f"{str(error).rstrip('.')}; see spectralzoom --help")
+        sys.exit(SettingsError.exit_code)
     except PipelineError as error:
         _say(str(error))
         sys.exit(error.exit_code)

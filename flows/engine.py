@@ -28,7 +28,7 @@ QUIET = {
 }
 
 
-class EngineUnavailable(RuntimeError):
+class EngineUnavailable(RuntimeError):  # noqa: N818 - a state of affairs: the survey goes on without it
     """No Prefect server could be started or reached."""
 
 

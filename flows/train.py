@@ -59,6 +59,8 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
     """
     if not request.out.parent.is_dir():
         raise SettingsError(f"-o {request.out}: the folder {request.out.parent} does not exist; make it first")
+    if request.out.is_dir():
+        raise SettingsError(f"-o {request.out} is a folder, expected a file; name the weights in it")
     data = open_training_data(
         request.dataset, request.validation, request.scenes, request.camera,
         hold_out=request.hold_out, **request.choices,

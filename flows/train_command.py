@@ -24,9 +24,15 @@ def run_train(
     choices: dict[str, Any],
 ) -> dict[str, Any]:  # fmt: skip
     """Train with a progress bar on ``console``; give the record kept in the weights."""
-    for name, value in {"--steps": steps, "--minutes": minutes, "--scenes": scenes, "--batch": batch}.items():
-        if value <= 0:
+    counts = {
+        "--steps": steps, "--minutes": minutes, "--scenes": scenes, "--batch": batch,
+        "--patch": patch, "--factor": factor, "--columns": columns, "--crop": crop,
+    }  # fmt: skip
+    for name, value in counts.items():
+        if value is not None and not value > 0:
             raise SettingsError(f"{name} must be above 0, got {value}")
+    if validation is not None and validation < 0:
+        raise SettingsError(f"--validation must be 0 or more, got {validation}")
     size = crop or (FARM_CROP if dataset == "farm" else FRAME_CROP)
     request = TrainRequest(
         dataset, out, hold_out, validation, scenes, patch, factor, columns, choices=choices,

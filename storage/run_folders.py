@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 from storage.keys import plain
@@ -22,8 +23,13 @@ class RunDraft:
     def __enter__(self) -> RunDraft:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         try:
+            if isinstance(error, OSError):  # of a file that the block wrote by itself
+                with refusals(self._root, "write to the archive"):
+                    raise error
             if kind is None and self.folder.exists():
                 self.publish()
         finally:

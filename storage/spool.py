@@ -95,7 +95,11 @@ class Spool:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        try:
+            self.close()
+        except RigError:
+            if kind is None:  # else what went wrong first is what the user should read
+                raise
 
     def append(self, line: Line) -> None:
         """Write the next line; every 64th call waits until the disk has them.
@@ -161,12 +165,14 @@ class Spool:
 
     def close(self, *, sync: bool = True) -> None:
         """Close the files; what was appended stays."""
-        if sync and self._data is not None:
-            self.sync()
-        for file in (self._data, self._index):
-            if file is not None:
-                file.close()
-        self._data = self._index = None
+        try:
+            if sync and self._data is not None:
+                self.sync()
+        finally:
+            for file in (self._data, self._index):
+                if file is not None:
+                    file.close()
+            self._data = self._index = None
 
     # --- files --------------------------------------------------------------------------------------------------------
 

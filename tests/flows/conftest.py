@@ -1,33 +1,16 @@
-"""Scenes, weights and a command line small enough that a whole survey takes a fraction of a second."""
+"""The command line in this process, and a Prefect that keeps to a folder of its own."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
-import torch
-from numpy.typing import NDArray
-from PIL import Image
-from rich.console import Console
 
 from flows.cli import main
-from flows.publish import Published
-from flows.settings import load_settings
-from flows.survey_command import run_survey
-from models.segmenter import Segmenter, SegmenterConfig
-from models.spectral import Normalisation, SpectralBasis
-from models.weights import Weights, save_weights
-from storage.labels import default_colour
+from flows.engine import QUIET
 
-RGB_NM = (640.0, 550.0, 460.0)
-CLASSES = ("class_0", "class_1", "class_2")  # as a label file of the numbers 0..2 names them
-
-WeightsMaker = Callable[..., Path]
-Survey = Callable[..., Published]
 CommandLine = Callable[..., "Ended"]
 
 
@@ -45,79 +28,6 @@ class Ended:
         return [line.removeprefix("error: ") for line in self.err.splitlines() if line.startswith("error: ")]
 
 
-def random_weights(wavelength_nm: tuple[float, ...], names: tuple[str, ...] = CLASSES, **sizes: Any) -> Weights:
-    """Weights of a tiny segmenter as chance made them, for bands at these wavelengths."""
-    basis = SpectralBasis.spanning(np.array(wavelength_nm), 4)
-    small = {"patch": 8, "factor": 4, "width": 8, "dim": 16, "layers": 1, "heads": 2}
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(5)
-        model = Segmenter(SegmenterConfig(len(names), basis.columns, **{**small, **sizes})).eval()
-        for parameter in model.parameters():
-            if not parameter.any():  # training starts some terms from zero; here nothing is idle
-                torch.nn.init.normal_(parameter, std=0.3)
-        for last in (model.coarse_classes, model.fine_classes):  # light decides, so that maps have every class
-            torch.nn.init.normal_(last.weight, std=2.0)
-            torch.nn.init.zeros_(last.bias)
-    one = np.ones(basis.columns, np.float32)
-    normalisation = Normalisation(110 * one, 40 * one, np.eye(basis.columns, dtype=np.float32))
-    colours = np.array([default_colour(number) for number in range(len(names))], np.uint8)
-    return Weights(model, basis, normalisation, names, colours, {"seed": 5})
-
-
-def patchy_scene(shape: tuple[int, int], bands: int, seed: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Blocks of three classes with a texture: values 0..255 (y, x, band), labels (y, x) 0..2."""
-    rng = np.random.default_rng(seed)
-    small = rng.integers(0, 3, (-(-shape[0] // 11), -(-shape[1] // 11)), dtype=np.uint8)
-    labels = np.repeat(np.repeat(small, 11, axis=0), 11, axis=1)[: shape[0], : shape[1]]
-    colours = rng.uniform(50, 200, (3, bands))
-    values = colours[labels] + rng.normal(0, 12, (*shape, bands))
-    return np.clip(values, 0, 255).astype(np.float32), labels
-
-
-@pytest.fixture(scope="session")
-def make_weights(tmp_path_factory: pytest.TempPathFactory) -> WeightsMaker:
-    """Maker of weight files: ``make_weights(wavelengths, names, factor=...)`` gives the path."""
-    folder = tmp_path_factory.mktemp("weights")
-
-    def make(wavelength_nm: tuple[float, ...] = RGB_NM, names: tuple[str, ...] = CLASSES, **sizes: Any) -> Path:
-        path = folder / f"{len(list(folder.iterdir()))}.safetensors"
-        save_weights(random_weights(wavelength_nm, names, **sizes), path)
-        return path
-
-    return make
-
-
-@pytest.fixture(scope="session")
-def weights(make_weights: WeightsMaker) -> Path:
-    """Tiny weights for red, green and blue."""
-    return make_weights()
-
-
-@pytest.fixture(scope="session")
-def scene_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with scene.png (96 x 128 px), labels.png of its numbers, and cube.npy (40 x 56 px, 6 bands)."""
-    folder = tmp_path_factory.mktemp("scenes")
-    values, labels = patchy_scene((96, 128), 3, seed=1)
-    Image.fromarray(values.astype(np.uint8)).save(folder / "scene.png")
-    Image.fromarray(labels).save(folder / "labels.png")
-    np.save(folder / "cube.npy", patchy_scene((40, 56), 6, seed=2)[0])
-    return folder
-
-
-@pytest.fixture
-def survey_png(scene_files: Path, weights: Path, tmp_path: Path) -> Survey:
-    """Survey scene.png with its labels on the plain engine; flags are added or changed by keywords, None drops one."""
-
-    def survey(console: Console | None = None, **flags: Any) -> Published:
-        given = {
-            "scene": str(scene_files / "scene.png"), "labels": str(scene_files / "labels.png"),
-            "weights": str(weights), "engine": "plain", "out": str(tmp_path / "archive"), "budget": "0.9",
-        }  # fmt: skip
-        return run_survey(load_settings(None, given | flags), console or Console(quiet=True))
-
-    return survey
-
-
 @pytest.fixture
 def command_line(capfd: pytest.CaptureFixture[str]) -> CommandLine:
     """Run ``spectralzoom`` with the given words in this process."""
@@ -133,8 +43,9 @@ def command_line(capfd: pytest.CaptureFixture[str]) -> CommandLine:
 
 @pytest.fixture(scope="session")
 def prefect_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Prefect's files in a folder of their own, set before anything imports it; the engine finds its own settings."""
+    """Prefect's files in a folder of their own. Set before anything imports it, as it reads its settings only then."""
     home = tmp_path_factory.mktemp("prefect")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PREFECT_HOME", str(home))
+        for name, value in {**QUIET, "PREFECT_HOME": str(home)}.items():
+            patch.setenv(name, value)
         yield home

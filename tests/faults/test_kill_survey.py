@@ -1,0 +1,127 @@
+"""A survey killed with SIGKILL at random moments: what was published verifies, the same command ends well."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from storage.archive import Archive
+from storage.class_maps import load_class_map
+
+ROOT = Path(__file__).parents[2]
+KILLS = 6
+MOMENTS = [(number + random.Random(number).random()) / KILLS for number in range(KILLS)]  # of the time it takes
+
+# Imports once, then runs each command in a child of its own and kills it after a while: a start costs seconds.
+NURSERY = """
+import json, os, signal, sys, time
+import flows.engine, flows.publish, flows.survey_command
+from flows.cli import main
+for request in sys.stdin:
+    words, delay = json.loads(request)
+    began = time.monotonic()
+    child = os.fork()
+    if child == 0:
+        silence = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(silence, 1), os.dup2(silence, 2)
+        try:
+            main(words)
+        except SystemExit as end:
+            os._exit(end.code)
+    if delay is not None:
+        time.sleep(delay)
+        os.kill(child, signal.SIGKILL)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    print(json.dumps([code, time.monotonic() - began]), flush=True)
+"""
+
+Runner = Callable[[Path, float | None], tuple[int, float]]
+
+
+@dataclass(frozen=True)
+class Whole:
+    """A survey that nothing disturbed."""
+
+    seconds: float
+    classes: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def run(scene_files: Path, weights: Path) -> Iterator[Runner]:
+    """Survey into a folder and kill it after some seconds (None: never); gives exit code and seconds."""
+    words = ["survey", "--scene", "scene.png", "--labels", "labels.png", "--weights", str(weights), "--engine", "plain"]
+    command, environment = [sys.executable, "-c", NURSERY], {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        command, cwd=scene_files, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as nursery:
+        assert nursery.stdin is not None
+        assert nursery.stdout is not None
+
+        def survey(out: Path, delay: float | None) -> tuple[int, float]:
+            print(json.dumps([[*words, "--budget", "0.8", "--out", str(out)], delay]), file=nursery.stdin, flush=True)
+            code, seconds = json.loads(nursery.stdout.readline())
+            return code, seconds
+
+        yield survey
+        nursery.stdin.close()
+
+
+@pytest.fixture(scope="module")
+def whole(run: Runner, tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    """The same survey, left alone."""
+    out = tmp_path_factory.mktemp("whole")
+    code, seconds = run(out, None)
+    assert code == 0
+    return Whole(seconds, class_map(out))
+
+
+def class_map(out: Path) -> np.ndarray:
+    """The one class map of an archive."""
+    (ref,) = Archive.open(out).refs("segment")
+    return load_class_map(ref.path / "class_map.zarr").classes
+
+
+def problems(out: Path) -> list[str]:
+    """What `verify` finds."""
+    return [finding.problem for finding in Archive.open(out).verify_all() if finding.problem]
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_killed_survey_goes_on(moment: float, run: Runner, whole: Whole, tmp_path: Path) -> None:
+    """Killed at any moment: every store verifies; the same command ends well, with the map of an undisturbed run."""
+    code, _ = run(tmp_path, moment * whole.seconds)
+    assert code in (-signal.SIGKILL, 0)  # a faster run than the first may have ended before
+    before = {ref.uri for ref in Archive.open(tmp_path).refs()}
+    assert problems(tmp_path) == []
+    assert run(tmp_path, None)[0] == 0
+    archive = Archive.open(tmp_path)
+    assert problems(tmp_path) == []
+    assert before <= {ref.uri for ref in archive.refs()}
+    np.testing.assert_array_equal(class_map(tmp_path), whole.classes)
+    archive.reclaim()
+    assert not [*tmp_path.rglob("*.part"), *tmp_path.glob("spool/*")]
+
+
+def test_killed_again_and_again(run: Runner, whole: Whole, tmp_path: Path) -> None:
+    """Runs that all die early still get somewhere: each goes on from what the one before it had published."""
+    published = [0]
+    for _ in range(12):
+        code, _ = run(tmp_path, 0.45 * whole.seconds)
+        assert problems(tmp_path) == []
+        published.append(len(Archive.open(tmp_path).refs()))
+        if code == 0:
+            break
+    assert published == sorted(published)
+    assert published[-1] > 0
+    assert run(tmp_path, None)[0] == 0
+    np.testing.assert_array_equal(class_map(tmp_path), whole.classes)

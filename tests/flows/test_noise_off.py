@@ -1,0 +1,145 @@
+"""Noise off: what a survey stores is the scene convolved with the slit, the pixel and the coarse pass's smear."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.ndimage import convolve1d
+
+from pipeline.camera import LineCamera, footprint_kernel
+
+SLIT_PX = LineCamera().slit_px
+BOUND = 0.005  # of the scene's standard deviation
+FACTOR = 4
+
+
+@dataclass(frozen=True)
+class Waves:
+    """Plane waves around 0.5: two bands, evenly spread periods, heights growing with the period."""
+
+    shape: tuple[int, int]
+    frequency: NDArray[np.float64]  # (wave, 2) of y and x [1/px]
+    phase: NDArray[np.float64]
+    height: NDArray[np.float64]
+
+    def values(self, y: NDArray[np.float64], x: NDArray[np.float64], left: Any = 1.0) -> NDArray[np.float64]:
+        """Values at (y, x) positions, (..., 2), each wave damped to what is ``left`` of it."""
+        turns = np.multiply.outer(y, self.frequency[:, 0]) + np.multiply.outer(x, self.frequency[:, 1])
+        waves = np.cos(2 * np.pi * turns + self.phase) * self.height * left
+        return 0.5 + np.stack([waves[..., ::2].sum(axis=-1), waves[..., 1::2].sum(axis=-1)], axis=-1)
+
+    def raster(self) -> NDArray[np.float64]:
+        """The scene's pixels."""
+        return self.values(*np.mgrid[: self.shape[0], : self.shape[1]].astype(float))
+
+    def seen(self, along: str, factor: int = 1) -> NDArray[np.float64]:
+        """What the footprint leaves of the waves, in closed form, at pixels of ``factor`` scene px."""
+        scan, line = self.frequency.T if along == "x" else self.frequency.T[::-1]
+        held = np.arange(factor) - (factor - 1) / 2
+        smear, binned = (np.cos(2 * np.pi * np.outer(f, held)).mean(axis=1) for f in (scan, line))
+        pixels = np.mgrid[: self.shape[0] // factor, : self.shape[1] // factor]
+        y, x = pixels * factor + (factor - 1) / 2
+        return self.values(y, x, np.sinc(scan * SLIT_PX) * np.sinc(line) * smear * binned)
+
+
+def waves(shape: tuple[int, int], shortest_px: float, longest_px: float) -> Waves:
+    """Twelve waves in seeded directions."""
+    rng = np.random.default_rng(11)
+    period, angle = np.linspace(shortest_px, longest_px, 12), rng.uniform(0, np.pi, 12)
+    frequency = np.stack([np.sin(angle), np.cos(angle)], axis=1) / period[:, None]
+    return Waves(shape, frequency, rng.uniform(0, 2 * np.pi, 12), 0.8 * period / period.sum())
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What the survey left, opened with plain xarray."""
+
+    mosaic: xr.Dataset
+    patches: xr.Dataset
+    along: str
+
+    def fine(self, shape: tuple[int, int]) -> NDArray[np.float64]:
+        """Patches laid out on the scene's pixels, NaN where the camera did not look twice."""
+        values = self.patches["values"].where(self.patches["valid"]).values
+        canvas = np.full((*shape, values.shape[-1]), np.nan)
+        for patch, y, x in zip(values, self.patches["seat_y"].values, self.patches["seat_x"].values, strict=True):
+            canvas[y : y + len(patch), x : x + len(patch)] = patch
+        return canvas
+
+
+@pytest.fixture
+def surveyed(survey_png: Any, make_weights: Any, tmp_path: Path) -> Callable[[Waves], Stored]:
+    """Survey waves from a .npy file, camera's footprint on and noise off, all the time of a full scan."""
+
+    def survey(scene: Waves) -> Stored:
+        np.save(tmp_path / "waves.npy", scene.raster())
+        found = survey_png(
+            tmp_path / "archive", scene=str(tmp_path / "waves.npy"), labels=None, wavelengths="500,700",
+            weights=str(make_weights((500.0, 700.0))), effects="slit,smear", policy="random", budget="1",
+        ).receipt  # fmt: skip
+        mosaic, patches = (
+            xr.open_zarr(tmp_path / "archive" / found["products"][name], consolidated=False)
+            for name in ("mosaic", "patches")
+        )
+        raw = sorted((tmp_path / "archive" / found["products"]["raw_coarse"]).glob("*.zarr"))[0]
+        return Stored(mosaic, patches, xr.open_zarr(raw, consolidated=False).attrs["sweep"]["along"])
+
+    return survey
+
+
+def error_share(got: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
+    """Rms error over the standard deviation of the truth, the worse of the two bands; NaN in ``got`` is left out."""
+    spread = truth.std(axis=(0, 1))
+    return float((np.sqrt(np.nanmean((got - truth) ** 2, axis=(0, 1))) / spread).max())
+
+
+def convolved(scene: Waves, along: str) -> NDArray[np.float64]:
+    """The scene's pixels convolved with the slit across the line and one pixel along it, edge pixels repeated."""
+    scan, line = (0, 1) if along == "x" else (1, 0)
+    blurred = convolve1d(scene.raster(), footprint_kernel(SLIT_PX), axis=scan, mode="nearest")
+    found: NDArray[np.float64] = convolve1d(blurred, footprint_kernel(1.0), axis=line, mode="nearest")
+    return found
+
+
+def coarse_of(fine: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What the coarse pass makes of the convolved scene: the mean over positions held and samples summed."""
+    rows, columns, bands = fine.shape
+    cells = fine.reshape(rows // FACTOR, FACTOR, columns // FACTOR, FACTOR, bands)
+    means: NDArray[np.float64] = cells.mean(axis=(1, 3))
+    return means
+
+
+@pytest.mark.parametrize(("shape", "along"), [((96, 128), "x"), ((160, 96), "y")])
+def test_survey_is_the_scene_through_the_footprint(
+    shape: tuple[int, int], along: str, surveyed: Callable[[Waves], Stored]
+) -> None:
+    """Waves of 4 to 40 px: patches and mosaic equal the convolved pixels, and the waves' own closed form inside."""
+    scene = waves(shape, 4, 40)
+    stored = surveyed(scene)
+    assert stored.along == along
+    patches, mosaic, pixels = stored.fine(shape), stored.mosaic["values"].values, convolved(scene, along)
+    assert np.isfinite(patches).mean() > 0.3
+    assert error_share(patches, pixels) < BOUND
+    assert error_share(mosaic, coarse_of(pixels)) < BOUND
+    inner, inner_coarse = np.s_[8:-8, 8:-8], np.s_[2:-2, 2:-2]  # at its border the scene ends, the waves go on
+    assert error_share(patches[inner], scene.seen(along)[inner]) < BOUND
+    assert error_share(mosaic[inner_coarse], scene.seen(along, FACTOR)[inner_coarse]) < BOUND
+    assert error_share(patches, scene.raster()) > 4 * BOUND  # the bound tells footprints apart
+
+
+@pytest.mark.parametrize("shortest_px", [4, 16])
+def test_survey_of_two_strips(shortest_px: int, surveyed: Callable[[Waves], Stored]) -> None:
+    """Wider than a line: turned lines and a seam. Patches hold waves from 4 px on, the mosaic from 4 px of its own."""
+    scene = waves((32, 720), shortest_px, 10 * shortest_px)
+    stored = surveyed(scene)
+    pixels = convolved(scene, stored.along)
+    assert error_share(stored.fine(scene.shape), pixels) < BOUND
+    if shortest_px >= 4 * FACTOR:
+        assert error_share(stored.mosaic["values"].values, coarse_of(pixels)) < BOUND

@@ -1,0 +1,27 @@
+"""Progress: bars on a terminal, lines in a log."""
+
+from __future__ import annotations
+
+import io
+
+from rich.console import Console
+
+from flows.progress import StageProgress
+
+
+def test_a_log_gets_one_line_when_a_stage_ends() -> None:
+    """Where there is no terminal nothing is drawn over, and each stage says once that it ended."""
+    out = io.StringIO()
+    with StageProgress(Console(file=out), {"rectify": "mosaic"}) as progress:
+        for done in (0.1, 0.5, 0.9):
+            progress.show("rectify", done)
+        progress.show("rectify", 1.0, "ran", ended=True)
+    assert out.getvalue().splitlines() == ["mosaic: 100% ran"]
+
+
+def test_words_of_a_scene_are_not_markup() -> None:
+    """A name in square brackets is shown, not read as a style."""
+    out = io.StringIO()
+    with StageProgress(Console(file=out)) as progress:
+        progress.show("looking", 1.0, "[red]field[/]", ended=True)
+    assert "[red]field[/]" in out.getvalue()

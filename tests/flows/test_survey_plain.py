@@ -1,0 +1,240 @@
+"""The whole survey on the plain engine: receipt, stores as a stranger opens them, report and picture."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+from PIL import Image
+from rich.console import Console
+
+from flows.publish import Published
+from flows.receipt import check_receipt, comparable
+from flows.settings import load_settings
+from flows.survey_command import run_survey
+from models.inference import glance
+from models.weights import load_weights
+from pipeline.camera import LineCamera
+from pipeline.grid import SceneGrid
+from pipeline.scan import Sweep
+from pipeline.simulator.instrument import on_scene
+from storage.archive import Archive
+
+STAGES = ["capture_coarse", "rectify", "attend", "capture_fine", "cut_patches", "draw_map", "evaluate"]
+FARM = (128, 192)
+
+
+@dataclass(frozen=True)
+class Done:
+    """A survey and the archive that it left."""
+
+    published: Published
+    archive: Path
+
+    @property
+    def receipt(self) -> Any:
+        """The receipt."""
+        return self.published.receipt
+
+    def open(self, product: str, inside: str = "") -> xr.Dataset:
+        """A product as a stranger opens it: plain xarray, nothing of this project."""
+        return xr.open_zarr(self.archive / self.receipt["products"][product] / inside, consolidated=False)
+
+    def sweeps(self) -> list[tuple[xr.Dataset, Path]]:
+        """Every stored raw sweep with its folder."""
+        folders = [self.archive / self.receipt["products"][name] for name in ("raw_coarse", "raw_fine")]
+        found = [path for folder in folders for path in sorted(folder.glob("*.zarr"))]
+        return [(xr.open_zarr(path, consolidated=False), path) for path in found]
+
+
+@pytest.fixture(scope="module")
+def farm(tmp_path_factory: pytest.TempPathFactory) -> Done:
+    """The built-in scene, small, with the weights that are shipped and with controls."""
+    out = tmp_path_factory.mktemp("farm")
+    flags = {"size": f"{FARM[1]}x{FARM[0]}", "budget": "0.9", "engine": "plain", "out": str(out), "seed": "1"}
+    return Done(run_survey(load_settings(None, flags), Console(quiet=True)), out)
+
+
+@pytest.fixture(scope="module")
+def picture(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> Done:
+    """A PNG with labels, no controls."""
+    out = tmp_path_factory.mktemp("picture")
+    return Done(survey_png(out), out)
+
+
+def test_receipt_has_every_field(farm: Done) -> None:
+    """The built-in scene's receipt is whole: stages in order, all ran, accuracy with controls, effects."""
+    receipt = check_receipt(farm.receipt)
+    assert [(stage["name"], stage["state"]) for stage in receipt["stages"]] == [(name, "ran") for name in STAGES]
+    assert all(stage["wall_s"] > 0 and stage["peak_rss_bytes"] > 0 for stage in receipt["stages"])
+    assert set(receipt["accuracy"]["controls"]) == {"entropy", "sobel", "random"}
+    assert 0 <= receipt["accuracy"]["miou"] <= 1
+    assert {row["name"] for row in receipt["effects"]} >= {"slit", "smear", "shot", "read", "quantisation"}
+    assert 0 < farm.published.looked_twice < 1
+
+
+def test_savings_add_up(farm: Done) -> None:
+    """Every ratio is done over full, capture stays within the budget, and the split of multiply-adds is its sum."""
+    savings = farm.receipt["savings"]
+    for name, entry in savings.items():
+        if name != "segment_wall_s":
+            assert entry["ratio"] == pytest.approx(entry["done"] / entry["full"]), name
+    assert savings["capture_s"]["ratio"] <= 0.9 + 1e-9
+    work = savings["multiply_adds"]
+    assert work["done"] == sum(work[part] for part in ("glance", "score", "encode", "decode"))
+
+
+@pytest.mark.parametrize("name", ["farm", "picture"])
+def test_savings_agree_with_the_stored_cubes(name: str, request: pytest.FixtureRequest) -> None:
+    """Lines, samples on the scene and bytes of the receipt are those of the raw cubes that lie in the archive."""
+    done: Done = request.getfixturevalue(name)
+    savings, sweeps = done.receipt["savings"], done.sweeps()
+    shape = tuple(done.open("class_map").sizes[axis] for axis in ("y", "x"))
+    seen = [on_scene(shape, LineCamera(), Sweep(**cube.attrs["sweep"])) for cube, _ in sweeps]
+    assert savings["lines"]["done"] == sum(cube.sizes["line"] for cube, _ in sweeps)
+    assert savings["samples"]["done"] == sum(int(inside.sum()) for inside in seen)
+    assert savings["bytes_raw"]["done"] == sum(cube["dn"].nbytes for cube, _ in sweeps)
+    files = [file for _, path in sweeps for file in path.rglob("*") if file.is_file()]
+    assert savings["bytes_stored"]["done"] == sum(file.stat().st_size for file in files)
+
+
+def test_same_seed_gives_the_same_receipt(picture: Done, survey_png: Any, tmp_path: Path) -> None:
+    """In another archive, but for times and memory; another seed gives other light, so other keys."""
+    again = survey_png(tmp_path / "again").receipt
+    other = survey_png(tmp_path / "other", seed="1").receipt
+    assert comparable(again) == comparable(picture.receipt)
+    assert comparable(other) != comparable(picture.receipt)
+    assert not {stage["key"] for stage in other["stages"]} & {stage["key"] for stage in again["stages"]}
+
+
+def test_second_run_is_read_from_the_archive(survey_png: Any, tmp_path: Path) -> None:
+    """The same command again runs no stage, gives the same products, and publishes a run of its own."""
+    first, second = (survey_png(tmp_path).receipt for _ in range(2))
+    assert [stage["state"] for stage in second["stages"]] == ["cached"] * len(STAGES)
+    assert comparable(first) == comparable(second)
+    archive = Archive.open(tmp_path)
+    assert len(archive.runs()) == 2
+    assert [finding.problem for finding in archive.verify_all()] == [None] * (len(STAGES) + 2)
+    assert not list(tmp_path.glob("spool/*"))
+
+
+def test_mosaic_opens_with_plain_xarray(farm: Done) -> None:
+    """(y, x, band) on the coarse grid, every pixel seen, wavelengths in nm, GeoZarr's place."""
+    mosaic = farm.open("mosaic")
+    assert mosaic["values"].dims == ("y", "x", "band")
+    assert (mosaic.sizes["y"], mosaic.sizes["x"]) == (FARM[0] // 4, FARM[1] // 4)
+    assert mosaic["values"].dtype == np.float32
+    assert np.isfinite(mosaic["values"].values).all()
+    assert mosaic["wavelength"].dims == ("band",)
+    assert mosaic["wavelength"].attrs["units"] == "nm"
+    assert mosaic.attrs["spatial:dimensions"] == ["y", "x"]
+    assert "CF" in mosaic.attrs["Conventions"]
+
+
+def test_patches_open_with_plain_xarray(farm: Done) -> None:
+    """(patch, y, x, band), one for each chosen seat, and where each lies."""
+    patches, attention = farm.open("patches"), farm.open("attention")
+    chosen = np.flatnonzero(attention["rank"].values.ravel() >= 0)
+    assert patches["values"].dims == ("patch", "y", "x", "band")
+    assert attention["rank"].dims == ("seat_y", "seat_x")
+    np.testing.assert_array_equal(np.sort(patches["seat"].values), chosen)
+    across = attention.sizes["seat_x"]
+    np.testing.assert_array_equal(patches["seat_y"].values, patches["seat"].values // across * patches.sizes["y"])
+    assert np.isfinite(patches["values"].values[patches["valid"].values]).all()
+
+
+def test_class_map_opens_with_plain_xarray(farm: Done) -> None:
+    """(y, x) on the scene's own pixels, with CF flags and a confidence."""
+    found = farm.open("class_map")
+    names = found.attrs["class_names"]
+    assert found["classes"].dims == ("y", "x")
+    assert (found.sizes["y"], found.sizes["x"]) == FARM
+    assert found["classes"].attrs["flag_meanings"].split() == ["_".join(name.split()) for name in names]
+    assert set(names) == set(farm.receipt["accuracy"]["per_class_iou"])
+    assert ((found["confidence"] >= 0) & (found["confidence"] <= 1)).all()
+
+
+def test_raw_sweeps_open_with_plain_xarray(farm: Done) -> None:
+    """(line, sample, band) uint16 with the mirror's position, time and exposure of every line."""
+    for cube, _ in farm.sweeps():
+        assert cube["dn"].dims == ("line", "sample", "band")
+        assert cube["dn"].dtype == np.uint16
+        for name in ("mirror_x", "mirror_y", "time", "exposure_ms", "valid_line"):
+            assert cube[name].dims == ("line",), name
+        assert (abs(cube["mirror_x"]) <= 1).all()
+        assert cube["exposure_ms"].values.tolist() == [100.0] * cube.sizes["line"]
+
+
+def test_without_a_fine_seat_the_map_is_the_glance(survey_png: Any, weights: Path, tmp_path: Path) -> None:
+    """A budget that pays for the coarse pass alone gives the class of the glance, brought up bilinearly."""
+    done = Done(survey_png(tmp_path, budget="0.45"), tmp_path)
+    assert done.published.looked_twice == 0
+    mosaic, drawn = done.open("mosaic"), done.open("class_map")["classes"].values
+    seen = glance(
+        load_weights(weights), mosaic["values"].values, mosaic["wavelength"].values, SceneGrid(*drawn.shape, 8, 4)
+    )
+    logits = torch.from_numpy(seen.probability).log().permute(2, 0, 1)[None]  # up to a constant a pixel
+    fine = torch.nn.functional.interpolate(logits, scale_factor=4.0, mode="bilinear", align_corners=False)
+    assert (fine.argmax(dim=1)[0].numpy() == drawn).mean() > 0.999
+    assert done.receipt["accuracy"]["miou"] == done.receipt["accuracy"]["none"]["miou"]
+
+
+def test_no_controls_leaves_them_out(picture: Done) -> None:
+    """Neither other placements nor `all` are judged or timed; the map and the coarse look still are."""
+    accuracy = picture.receipt["accuracy"]
+    assert accuracy["controls"] == {}
+    assert accuracy["all"]["miou"] is None
+    assert accuracy["gap_closed"] is None
+    assert accuracy["miou"] is not None
+    assert accuracy["none"]["miou"] is not None
+    assert "segment_wall_s" not in picture.receipt["savings"]
+
+
+def test_without_labels_there_is_no_accuracy(survey_png: Any, scene_files: Path, tmp_path: Path) -> None:
+    """A cube of other bands in any order is surveyed by the same weights; nothing is judged."""
+    nm = "640,460,500,550,620,600"
+    found = survey_png(tmp_path, scene=str(scene_files / "cube.npy"), labels=None, wavelengths=nm, budget="1").receipt
+    assert "accuracy" not in check_receipt(found)
+    assert found["stages"][-1]["state"] == "skipped"
+    stored = Done(Published(found, tmp_path, 0.0), tmp_path).open("mosaic")["wavelength"].values
+    assert stored.tolist() == [float(word) for word in nm.split(",")]
+
+
+def test_report_and_picture_open_from_disk(farm: Done) -> None:
+    """The report asks the network for nothing and the quicklook is a picture of useful size."""
+    folder = farm.archive / farm.receipt["products"]["report.html"]
+    html = folder.read_text(encoding="utf-8")
+    assert not re.search(r"https?://|src=['\"]//|@import", html)
+    assert "data:image/png;base64," in html
+    with Image.open(farm.archive / farm.receipt["products"]["quicklook.png"]) as image:
+        assert image.format == "PNG"
+        assert min(image.size) >= 600
+
+
+def test_products_are_where_the_receipt_says(farm: Done) -> None:
+    """Every address is relative to the archive and there; the stored receipt is the one returned."""
+    for name, address in farm.receipt["products"].items():
+        assert (farm.archive / address).exists(), name
+    assert (farm.published.folder / "receipt.json").read_text().startswith('{\n  "survey": "farm"')
+
+
+@pytest.mark.parametrize("policy", ["sobel", "random", "mask"])
+def test_other_policies_look_at_other_places(picture: Done, survey_png: Any, tmp_path: Path, policy: str) -> None:
+    """The coarse pass is read from the archive; the seats follow the policy."""
+    mask = np.zeros((96, 128), np.uint8)
+    mask[:16] = 200  # the first two rows of seats
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    given = {"mask": str(tmp_path / "mask.png")} if policy == "mask" else {}
+    done = Done(survey_png(picture.archive, policy=policy, budget="0.7", **given), picture.archive)
+    states = {stage["name"]: stage["state"] for stage in done.receipt["stages"]}
+    assert (states["capture_coarse"], states["attend"]) == ("cached", "ran")
+    rank = done.open("attention")["rank"].values
+    assert (rank >= 0).any()
+    if policy == "mask":
+        assert (rank[0] >= 0).all() or (rank[1] >= 0).all()

@@ -1,0 +1,108 @@
+"""The survey as a Prefect flow on an ephemeral server: stores as plain makes them, references, errors as they are."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from flows import engine
+from flows.survey import STAGES
+from pipeline.errors import RigError, SceneError
+
+
+@pytest.fixture
+def passed_on(monkeypatch: pytest.MonkeyPatch, prefect_home: Path) -> list[tuple[str, Any, Any]]:
+    """What every Prefect task of the test was given and gave: name, arguments, result."""
+    import prefect
+
+    seen: list[tuple[str, Any, Any]] = []
+    real = prefect.task
+
+    def recording(**options: Any) -> Any:
+        def wrap(function: Any) -> Any:
+            one = real(**options)(function)
+
+            def call(*given: Any) -> Any:
+                result = one(*given)
+                seen.append((options["name"], given, result))
+                return result
+
+            return call
+
+        return wrap
+
+    monkeypatch.setattr(prefect, "task", recording)
+    return seen
+
+
+def test_prefect_makes_the_stores_that_plain_makes(
+    survey_png: Any, tmp_path: Path, passed_on: list[tuple[str, Any, Any]], prefect_home: Path
+) -> None:
+    """Every stage is a task that takes and gives addresses and keys only; keys and figures are those of plain."""
+    console = io.StringIO()
+    flow = survey_png(tmp_path / "flow", Console(file=console), engine="prefect").receipt
+    plain = survey_png(tmp_path / "plain").receipt
+    assert "going on with --engine plain" not in console.getvalue()
+    assert [stage["key"] for stage in flow["stages"]] == [stage["key"] for stage in plain["stages"]]
+    assert flow["savings"] == plain["savings"]
+    assert flow["accuracy"] == plain["accuracy"]
+    assert [name for name, _, _ in passed_on] == [stage["name"] for stage in flow["stages"]]
+    for _, given, result in passed_on:
+        assert len(json.dumps([given, result])) < 1000
+    assert (prefect_home / "prefect.db").exists()
+    assert not (tmp_path / "flow" / ".prefect").exists()
+
+
+def test_an_error_of_a_stage_comes_through(
+    survey_png: Any, tmp_path: Path, prefect_home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The error that plain would raise, tried once: wrong input does not get better."""
+    tries: list[str] = []
+
+    def refuse(*given: Any) -> None:
+        tries.append("rectify")
+        raise SceneError("no light in the scene; switch it on")
+
+    monkeypatch.setitem(STAGES, "rectify", refuse)
+    with pytest.raises(SceneError, match="switch it on"):
+        survey_png(tmp_path, engine="prefect")
+    assert tries == ["rectify"]
+
+
+def test_a_device_that_answers_the_second_time_is_asked_again(
+    survey_png: Any, tmp_path: Path, prefect_home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A capture that failed for its device is tried again, and the survey ends well."""
+    real, tries = STAGES["capture_coarse"], []
+
+    def shaky(*given: Any) -> Any:
+        tries.append("capture")
+        if len(tries) == 1:
+            raise RigError("no reply from the camera after 2 s; is it on?")
+        return real(*given)
+
+    monkeypatch.setitem(STAGES, "capture_coarse", shaky)
+    monkeypatch.setattr(engine, "RETRY_DELAY_S", 0.0)
+    states = {stage["name"]: stage["state"] for stage in survey_png(tmp_path, engine="prefect").receipt["stages"]}
+    assert tries == ["capture", "capture"]
+    assert set(states.values()) == {"ran"}
+
+
+def test_without_a_server_the_survey_runs_plain(
+    survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A server that cannot start is told of in one line, and the survey goes on without it."""
+
+    def refuse(runner: Any) -> None:
+        raise engine.EngineUnavailable("the Prefect server did not start (no port)")
+
+    monkeypatch.setattr(engine, "survey_with_prefect", refuse)
+    console = io.StringIO()
+    found = survey_png(tmp_path, Console(file=console, width=200), engine="prefect").receipt
+    assert "did not start (no port); going on with --engine plain" in console.getvalue()
+    assert {stage["state"] for stage in found["stages"]} == {"ran"}
