@@ -8,7 +8,7 @@ import sys
 import tempfile
 import traceback
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 from rich.console import Console
@@ -46,7 +46,6 @@ def survey(
     rounds: str | None = None,
     seed: str | None = None,
     effects: str | None = None,
-    tol: str | None = None,
     controls: bool | None = None,
     engine: str | None = None,
     memory: str | None = None,
@@ -65,7 +64,7 @@ def survey(
     labels
         File of class colours or numbers on the scene's pixels; accuracy is reported then.
     bands
-        Bands of the file to use, from 0: 0,1
+        Bands of the file (or of the farm's 270) to use, from 0: 0,1
     wavelengths
         Their centre wavelengths [nm]: 660,800
     source
@@ -86,8 +85,6 @@ def survey(
         Of the scene `farm` and of all noise.
     effects
         auto, all, none, or names with commas: slit,smear,shot,read
-    tol
-        Largest error that leaving out an effect may make [sigma of the noise].
     controls
         Also judge other placements of the same number of seats (needs labels).
     engine
@@ -107,7 +104,7 @@ def survey(
     flags = {
         "scene": scene, "labels": labels, "bands": bands, "wavelengths": wavelengths, "source": source, "out": out,
         "budget": budget, "policy": policy, "mask": mask, "weights": weights, "rounds": rounds, "seed": seed,
-        "effects": effects, "tol": tol, "controls": controls, "engine": engine, "memory": memory, "size": size,
+        "effects": effects, "controls": controls, "engine": engine, "memory": memory, "size": size,
         "camera.exposure_ms": exposure_ms,
     }  # fmt: skip
     published = run_survey(load_settings(settings, flags), stderr)
@@ -184,6 +181,7 @@ def train(
     patch: int | None = None,
     factor: int = 4,
     columns: int = 24,
+    positions: Literal["2d", "paper"] = "2d",
     crop: int | None = None,
     batch: int = 4,
     labels: str | None = None,
@@ -213,6 +211,8 @@ def train(
         How many scenes of the built-in farm.
     patch, factor, columns
         Patch size [px], how many times coarser the coarse pass is, and spectral columns.
+    positions
+        How tokens are told their places: `2d`, or the paper's one-dimensional numbers.
     crop, batch
         Size of the crops [px] and crops a step.
     labels, bands, wavelengths
@@ -222,20 +222,23 @@ def train(
     as_json
         Print the weights' record as JSON on stdout.
     """
+    from flows.train import FARM_CROP, FRAME_CROP, TrainRequest
     from flows.train_command import run_train
+    from models.training import TrainingSettings
 
-    record = run_train(
-        dataset, out, stderr,
-        hold_out=_split(hold_out), validation=validation, seed=seed, steps=steps, minutes=minutes, scenes=scenes,
-        patch=patch, factor=factor, columns=columns, crop=crop, batch=batch,
-        choices={
-            "labels": labels,
-            "bands": _wholes(bands, "--bands"),
-            "wavelengths": _numbers(wavelengths, "--wavelengths"),
-            "train_mask": train_mask,
-            "mask_classes": _wholes(mask_classes, "--mask-classes"),
-        },
+    size = crop if crop is not None else FARM_CROP if dataset == "farm" else FRAME_CROP
+    choices = {
+        "labels": labels,
+        "bands": _wholes(bands, "--bands"),
+        "wavelengths": _numbers(wavelengths, "--wavelengths"),
+        "train_mask": train_mask,
+        "mask_classes": _wholes(mask_classes, "--mask-classes"),
+    }
+    request = TrainRequest(
+        dataset, out, _split(hold_out), validation, scenes, patch, factor, columns, positions=positions,
+        choices=choices, settings=TrainingSettings(steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch),
     )  # fmt: skip
+    record = run_train(request, stderr)
     if as_json:
         print(json.dumps(record, indent=2))
     return 0

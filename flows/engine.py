@@ -4,6 +4,7 @@ No ``from __future__ import annotations`` here: Prefect reads the signatures.
 """
 
 import os
+import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -46,7 +47,7 @@ def survey_with_prefect(runner: StageRunner) -> Products:
         except ImportError as error:
             raise EngineUnavailable(f"Prefect cannot be imported ({error})") from error
         # The heartbeat thread adds a second to every flow and tells nobody anything on an ephemeral server.
-        with temporary_settings(updates={PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
+        with temporary_settings(updates={PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}), _guarded_server():
             return _run_flow(runner)
 
 
@@ -97,6 +98,40 @@ def _may_help(task: Any, run: Any, state: Any) -> bool:
 def _ref(runner: StageRunner, uri: str) -> StageRef:
     _, stage, key = uri.split("/")
     return StageRef(stage, key, runner.run.archive.root / uri)
+
+
+@contextmanager
+def _guarded_server() -> Iterator[None]:
+    """Let a server started meanwhile end with this process, also when it is killed: Prefect ends it at exit alone."""
+    if "PREFECT_API_URL" in os.environ:
+        yield
+        return
+    from prefect.server.api.server import SubprocessASGIServer
+
+    start = getattr(SubprocessASGIServer, "_run_uvicorn_command", None)
+    if start is None:  # another version of Prefect: its server is ended at exit, not after a kill
+        yield
+        return
+
+    def guarded(self: SubprocessASGIServer) -> subprocess.Popen[Any]:
+        process: subprocess.Popen[Any] = start(self)
+        end_with_us(process.pid)
+        return process
+
+    SubprocessASGIServer._run_uvicorn_command = guarded  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        SubprocessASGIServer._run_uvicorn_command = start  # type: ignore[method-assign]
+
+
+def end_with_us(process: int) -> None:
+    """Have a process ended (SIGTERM) when this one is gone, however it went."""
+    reading, writing = os.pipe()  # the system closes the end held here, and the shell's read returns
+    words = ["sh", "-c", 'read -r nothing; kill "$0" 2>/dev/null', str(process)]
+    os.posix_spawn("/bin/sh", words, os.environ, file_actions=[(os.POSIX_SPAWN_DUP2, reading, 0)], setpgroup=0)
+    os.close(reading)
+    os.set_inheritable(writing, False)
 
 
 @contextmanager

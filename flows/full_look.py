@@ -14,7 +14,7 @@ from pipeline.rectify.resample import Kernel
 from pipeline.scan import Sweep
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
-MEMORY_SHARE = 16  # a band of seats may take this part of the memory
+MEMORY_SHARE = 32  # a band of seats may take this part of the memory
 
 
 def columns_of_all_seats(

@@ -25,7 +25,7 @@ from pipeline.planning import FinePlan
 from pipeline.rectify.calibrate import reflectance
 from pipeline.savings import Entry, capture_savings
 from pipeline.scan import Sweep
-from pipeline.simulator.instrument import ALL_EFFECTS
+from pipeline.simulator.instrument import ALL_EFFECTS, on_scene
 from pipeline.source import References
 from storage.attention import load_attention
 from storage.class_maps import ClassMap, load_class_map
@@ -167,7 +167,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         seed=run.settings.seed,
         budget=run.settings.budget,
         policy=run.settings.policy,
-        raw=tuple(_calibrated(cube, chosen) for cube in captured(products.raw_coarse)),
+        raw=tuple(_calibrated(run, cube, chosen) for cube in captured(products.raw_coarse)),
         rectified=_both_scales(run, products, chosen),
         wavelength_nm=run.scene.wavelength_nm[chosen],
         score=attention.score,
@@ -184,11 +184,13 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     )
 
 
-def _calibrated(cube: RawCube, bands: list[int]) -> NDArray[np.float32]:
-    """Some bands of a sweep's lines in scene values."""
+def _calibrated(run: SurveyRun, cube: RawCube, bands: list[int]) -> NDArray[np.float32]:
+    """Some bands of a sweep's lines in scene values; NaN where a sample looked past the scene."""
     frames = cube.references
     some = References(frames.dark[:, bands], frames.white[:, bands], frames.panel[bands])
-    return reflectance(cube.read()[..., bands], some)
+    values = reflectance(cube.read()[..., bands], some)
+    values[~on_scene(run.scene.shape, run.camera, cube.sweep)] = np.nan
+    return values
 
 
 def _both_scales(run: SurveyRun, products: Products, bands: list[int]) -> NDArray[np.float32]:

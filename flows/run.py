@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
@@ -109,7 +109,7 @@ def open_run(settings: Settings) -> SurveyRun:
     labels, label_notes = _judged_labels(scene, weights)
     grid = SceneGrid(*scene.shape, weights.config.patch, weights.config.factor)
     plan = _plan(settings, grid)
-    _check_bands(scene, weights, path)
+    band_notes = _check_bands(scene, weights, path)
     if settings.mask is not None:
         _check_mask(settings.mask, scene.shape)
     effects = parse_effects(settings.effects)
@@ -117,7 +117,7 @@ def open_run(settings: Settings) -> SurveyRun:
     key = hashlib.sha256(path.read_bytes()).hexdigest()[:20]
     return SurveyRun(
         settings, Archive.open(settings.out), source, scene, weights, key, grid, plan, labels,
-        (*notes, *label_notes),
+        (*notes, *band_notes, *label_notes),
     )  # fmt: skip
 
 
@@ -140,13 +140,30 @@ def _open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
 
 
 def _open_farm(settings: Settings) -> RasterScene:
-    given = {"labels": settings.labels, "bands": settings.bands, "wavelengths": settings.wavelengths}
-    for name, value in given.items():
+    for name, value in {"labels": settings.labels, "wavelengths": settings.wavelengths}.items():
         if value is not None:
             raise SettingsError(f"--{name} is for scene files; the scene 'farm' brings its own")
     if settings.shape is None:
-        return farm_scene(settings.seed, camera=settings.camera)
-    return farm_scene(settings.seed, shape=settings.shape, camera=settings.camera)
+        farm = farm_scene(settings.seed, camera=settings.camera)
+    else:
+        farm = farm_scene(settings.seed, shape=settings.shape, camera=settings.camera)
+    return farm if settings.bands is None else _some_bands(farm, settings.bands)
+
+
+def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
+    """The same field seen by a camera with some of the bands."""
+    count, chosen = len(scene.wavelength_nm), list(bands)
+    if not all(0 <= band < count for band in bands):
+        raise SettingsError(f"--bands {bands}: the scene 'farm' has bands 0 to {count - 1}")
+    return replace(
+        scene,
+        key=f"{scene.key}/only={','.join(map(str, bands))}",
+        electrons=scene.electrons[:, chosen],
+        panel=scene.panel[chosen],
+        panel_electrons=scene.panel_electrons[chosen],
+        wavelength_nm=scene.wavelength_nm[chosen],
+        fwhm_nm=None if scene.fwhm_nm is None else scene.fwhm_nm[chosen],
+    )
 
 
 def _weights_path(settings: Settings) -> Path:
@@ -160,7 +177,7 @@ def _weights_path(settings: Settings) -> Path:
     return Path(str(resources.files("models") / "shipped" / SHIPPED))
 
 
-def _check_bands(scene: RasterScene, weights: Weights, path: Path) -> None:
+def _check_bands(scene: RasterScene, weights: Weights, path: Path) -> tuple[str, ...]:
     _, reached = weights.basis.matrix(scene.wavelength_nm)
     if not reached.any():
         low, high = weights.basis.low_nm, weights.basis.high_nm
@@ -168,6 +185,9 @@ def _check_bands(scene: RasterScene, weights: Weights, path: Path) -> None:
             f"the weights {path.name} are for {low:.0f}-{high:.0f} nm; the scene's bands lie at"
             f" {scene.wavelength_nm.min():.0f}-{scene.wavelength_nm.max():.0f} nm: use weights trained on such data"
         )
+    if reached.all():
+        return ()
+    return (f"the bands reach {reached.sum()} of the weights' {len(reached)} spectral columns: expect a poorer map",)
 
 
 def _check_mask(mask: str, shape: tuple[int, int]) -> None:

@@ -54,7 +54,6 @@ class Settings:
     rounds: int = 1
     seed: int = 0
     effects: str = "auto"  # auto, all, none, or names with commas
-    tol: float = 0.1  # [sigma of the noise]
     controls: bool = True
     engine: Literal["prefect", "plain"] = "prefect"
     memory: int = 4 * 1024**3  # [bytes]
@@ -258,7 +257,6 @@ _SURVEY: dict[str, Parser] = {
     "rounds": parse_whole(1, 1, why="this version looks twice at most: one coarse look, one round of detail"),
     "seed": parse_whole(0, 2**63 - 1),
     "effects": parse_effects,
-    "tol": parse_number(Span(1e-6, 10, "sigma")),
     "controls": parse_switch,
     "engine": parse_choice(ENGINES),
     "memory": parse_memory,

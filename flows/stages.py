@@ -213,7 +213,7 @@ def draw_map(run: SurveyRun, produce: Produce, mosaic: StageRef, patches: StageR
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=1, sort_keys=True, default=float) + "\n")
+    path.write_text(json.dumps(content, indent=1, default=float) + "\n")
 
 
 def digest(array: NDArray[np.generic]) -> str:

@@ -21,6 +21,7 @@ def run_survey(settings: Settings, console: Console) -> Published:
     keep_freed_memory()
     with console.status("opening scene and weights"):
         run = open_run(settings)
+        run.archive.reclaim()  # what a killed run left half made
     for note in run.notes:
         console.print(f"[dim]note: {escape(note)}[/]", highlight=False)
     with StageProgress(console, TITLES) as progress:

@@ -21,7 +21,7 @@ from flows.tradeoff import Point, Result
 
 _FRONT: Any = {"marker": "o", "color": "#0072B2", "markersize": 9, "linewidth": 1.4, "label": "no other beats it"}
 _BEATEN: Any = {"marker": "o", "color": MUTED, "markersize": 9, "linewidth": 0, "fillstyle": "none", "label": "beaten"}
-_PLAIN = FuncFormatter(lambda value, _position: f"{value:.2g}")
+_PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
 
 
 def print_tradeoff(result: Result, console: Console) -> None:
@@ -30,7 +30,7 @@ def print_tradeoff(result: Result, console: Console) -> None:
         title=f"{escape(result.stage)}: to be right to ... you pay ...", title_justify="left", title_style="bold",
         header_style="dim", box=SIMPLE_HEAD, caption=_caption(result), caption_justify="left",
     )  # fmt: skip
-    headings = ("", result.knob, "error", f"ns / {result.unit}", "price", "x first", "wall, least", "wall, median")
+    headings = ("", result.knob, "error", f"per {result.unit}", "price", "x first", "wall, least", "wall, median")
     for number, heading in enumerate(headings):
         table.add_column(escape(heading), justify="left" if number < 2 else "right")
     for point in sorted(result.points, key=lambda point: point.error):
@@ -39,10 +39,17 @@ def print_tradeoff(result: Result, console: Console) -> None:
 
 
 def _row(point: Point) -> list[str]:
-    price = format_seconds(point.price_s) if point.price_s >= 1 else f"{1e3 * point.price_s:.3g} ms"
-    walls = (f"{1e3 * seconds:.3g} ms" for seconds in (point.wall_min_s, point.wall_median_s))
-    times = [f"{point.ns_per_unit:.3g}", price, f"{point.ratio:.2f}", *walls]
+    walls = (_short(seconds) for seconds in (point.wall_min_s, point.wall_median_s))
+    times = [_short(point.ns_per_unit * 1e-9), _short(point.price_s), f"{point.ratio:.2f}", *walls]
     return ["●" if point.pareto else "○", escape(str(point.setting)), f"{point.error:.3g}", *times]
+
+
+def _short(seconds: float) -> str:
+    """A time with three figures in the unit that suits it."""
+    for size, unit in ((1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns")):
+        if size <= seconds < 1:
+            return f"{seconds / size:.3g} {unit}"
+    return format_seconds(seconds) if seconds >= 1 else f"{seconds * 1e9:.3g} ns"
 
 
 def _caption(result: Result) -> str:

@@ -17,6 +17,7 @@ from models.inference import glance_of_columns
 from models.metrics import mean_iou
 from models.segmenter import SegmenterConfig
 from models.spectral import SpectralBasis
+from models.tokens import Positions
 from models.training import Progress, TrainingSettings, train
 from models.weights import Weights, save_weights
 from pipeline.camera import LineCamera
@@ -25,6 +26,7 @@ from pipeline.grid import SceneGrid
 from pipeline.simulator.scene import RasterScene
 
 CONTROL_SHARE = 0.35
+FRAME_CROP, FARM_CROP = 384, 256  # px
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,7 @@ class TrainRequest:
     factor: int = 4
     columns: int = 24
     width: int = 32
+    positions: Positions = "2d"
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
     settings: TrainingSettings = field(default_factory=TrainingSettings)
     camera: LineCamera = field(default_factory=LineCamera)
@@ -169,6 +172,7 @@ def _config(request: TrainRequest, about: _About) -> SegmenterConfig:
             patch=about.patch,
             factor=request.factor,
             width=request.width,
+            positions=request.positions,
         )
     except ValueError as error:
         raise SettingsError(f"{error}; choose another --patch or --factor") from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,33 +13,13 @@ from rich.table import Table
 
 from flows.progress import StageProgress
 from flows.train import TrainRequest, train_weights
-from models.training import TrainingSettings
 from pipeline.errors import SettingsError
 
-FRAME_CROP, FARM_CROP = 384, 256
 
-
-def run_train(
-    dataset: str, out: Path, console: Console, *, hold_out: tuple[str, ...], validation: int | None, seed: int,
-    steps: int, minutes: float, scenes: int, patch: int | None, factor: int, columns: int, crop: int | None, batch: int,
-    choices: dict[str, Any],
-) -> dict[str, Any]:  # fmt: skip
+def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
     """Train with a progress bar on ``console``; give the record kept in the weights."""
-    counts = {
-        "--steps": steps, "--minutes": minutes, "--scenes": scenes, "--batch": batch,
-        "--patch": patch, "--factor": factor, "--columns": columns, "--crop": crop,
-    }  # fmt: skip
-    for name, value in counts.items():
-        if value is not None and not value > 0:
-            raise SettingsError(f"{name} must be above 0, got {value}")
-    if validation is not None and validation < 0:
-        raise SettingsError(f"--validation must be 0 or more, got {validation}")
-    size = crop or (FARM_CROP if dataset == "farm" else FRAME_CROP)
-    request = TrainRequest(
-        dataset, out, hold_out, validation, scenes, patch, factor, columns, choices=choices,
-        settings=TrainingSettings(steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch),
-        command=_command(),
-    )  # fmt: skip
+    _check_counts(request)
+    request = replace(request, command=_command())
     last = ""
     with StageProgress(console) as progress:
 
@@ -51,8 +32,21 @@ def run_train(
 
         record = train_weights(request, report)
         progress.show(last, 1.0, ended=True)
-    _print_figures(record, out, console)
+    _print_figures(record, request.out, console)
     return record
+
+
+def _check_counts(request: TrainRequest) -> None:
+    settings = request.settings
+    counts = {
+        "--steps": settings.steps, "--minutes": settings.minutes, "--batch": settings.batch, "--crop": settings.crop,
+        "--scenes": request.scenes, "--patch": request.patch, "--factor": request.factor, "--columns": request.columns,
+    }  # fmt: skip
+    for name, value in counts.items():
+        if value is not None and not value > 0:
+            raise SettingsError(f"{name} must be above 0, got {value}")
+    if request.validation is not None and request.validation < 0:
+        raise SettingsError(f"--validation must be 0 or more, got {request.validation}")
 
 
 def _command() -> str:

@@ -75,7 +75,7 @@ def test_scenes_of_other_bands_are_not_mixed(tmp_path: Path):
     first, second = data.scenes(data.train[:2])
     common = flow._common(request, first)
     flow._check_alike(second, common)
-    with pytest.raises(SceneError, match="scene 002.* has other bands"):
+    with pytest.raises(SceneError, match=r"scene 002.* has other bands"):
         flow._check_alike(replace(second, wavelength_nm=second.wavelength_nm + 10), common)
 
 
