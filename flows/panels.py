@@ -9,9 +9,10 @@ from matplotlib.colors import hsv_to_rgb, to_rgb
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
+from pipeline.grid import UNLABELLED
+
 INK = "#22241f"
 MUTED = "#6a6d64"
-UNLABELLED = 255
 UNLABELLED_COLOUR = (0.86, 0.86, 0.84)
 HALO: list[patheffects.AbstractPathEffect] = [patheffects.withStroke(linewidth=3, foreground="black")]
 _RGB_NM = (640.0, 550.0, 460.0)

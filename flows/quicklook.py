@@ -25,7 +25,6 @@ from flows.panels import (
     HALO,
     INK,
     MUTED,
-    UNLABELLED,
     UNLABELLED_COLOUR,
     choose_bands,
     class_palette,
@@ -37,6 +36,7 @@ from flows.panels import (
     panel_inches,
     stretch,
 )
+from pipeline.grid import UNLABELLED
 
 Box = tuple[int, int, int, int]
 

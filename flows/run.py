@@ -20,12 +20,12 @@ from models.weights import Weights, load_weights
 from pipeline.camera import LineCamera
 from pipeline.coverage import cheapest_full, coarse_sweeps
 from pipeline.errors import SceneError, SettingsError, WeightsError
-from pipeline.grid import SceneGrid
+from pipeline.grid import UNLABELLED, SceneGrid
 from pipeline.planning import check_budget
 from pipeline.scan import Axis, Sweep
 from pipeline.simulator.farm import farm_scene
 from pipeline.simulator.instrument import ALL_EFFECTS
-from pipeline.simulator.scene import UNLABELLED, RasterScene
+from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive import Archive
 from storage.layout import AngularGrid

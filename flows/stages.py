@@ -169,20 +169,27 @@ def cut_patches(run: SurveyRun, produce: Produce, attention: StageRef, raw: Stag
 
     def build(path: Path) -> None:
         plan = load_plan(attention)
+        ordered = _along_scan(run, plan.seats)
         writer = PatchWriter(
-            path / "patches.zarr", plan.seats, run.grid.seat_origin(plan.seats), run.grid.patch,
+            path / "patches.zarr", ordered, run.grid.seat_origin(ordered), run.grid.patch,
             run.scene.wavelength_nm, fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(),
         )  # fmt: skip
         sweeps = {cube.sweep.name: cube for cube in captured(raw)}
         shown = {sweep.name: covered_seats(run.grid, run.camera, [sweep]) for sweep in plan.sweeps}
-        for first in range(0, len(plan.seats), SEATS_AT_ONCE):
-            seats = plan.seats[first : first + SEATS_AT_ONCE]
+        for first in range(0, len(ordered), SEATS_AT_ONCE):
+            seats = ordered[first : first + SEATS_AT_ONCE]
             near = [sweeps[name] for name, covered in shown.items() if np.isin(seats, covered).any()]
             writer.write(first, *read_seats(near, run.camera, run.grid, seats, KERNEL))
-            run.report((first + len(seats)) / len(plan.seats))
+            run.report((first + len(seats)) / len(ordered))
 
     params = {"grid": asdict(run.grid), "kernel": KERNEL}
     return produce("patches", build, params, [attention, raw])
+
+
+def _along_scan(run: SurveyRun, seats: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Seats in the order in which the sweeps pass them, so that a few of them need few lines at a time."""
+    row, column = np.divmod(seats, run.grid.seat_shape[1])
+    return seats[np.lexsort((column, row) if run.plan.along == "x" else (row, column))]
 
 
 def patch_columns(run: SurveyRun, patches: StageRef) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

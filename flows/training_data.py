@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.errors import SceneError
+from pipeline.grid import UNLABELLED
 from pipeline.simulator.farm import FARM_LAW, farm_scene
-from pipeline.simulator.scene import UNLABELLED, RasterScene, raster_from_values
+from pipeline.simulator.scene import RasterScene, raster_from_values
 from storage.datasets import DataSet, load_data_set
 from storage.scene_files import SceneFile
 

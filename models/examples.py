@@ -10,11 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.metrics import UNLABELLED
 from models.spectral import Normalisation, SpectralBasis
 from pipeline.camera import LineCamera, expose, footprint
 from pipeline.errors import SceneError
-from pipeline.grid import SceneGrid, pad_by_reflection
+from pipeline.grid import UNLABELLED, SceneGrid, pad_by_reflection
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 HALO = 8  # rows around a strip that the footprint reaches, a multiple of every factor up to 8

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from models.examples import Batch, CropSampler, Example
-from models.metrics import UNLABELLED
 from models.process import keep_freed_memory
 from models.segmenter import Segmenter, SegmenterConfig
 from pipeline.errors import PipelineError
+from pipeline.grid import UNLABELLED
 
 SHARES = ((0.125, 0.25), (0.25, 0.25), (0.35, 0.2), (0.5, 0.2), (1.0, 0.1))  # (share of the seats, how often)
 

@@ -64,12 +64,21 @@ class LineCamera:
         """Time to take ``lines`` lines in one uninterrupted sweep [s] (the paper's t_img = N t_frame)."""
         return lines * self.frame_ms * 1e-3
 
+    @property
+    def most_binning(self) -> int:
+        """Largest number of samples whose sum always fits 16 bits."""
+        return LARGEST_SUM_DN // self.full_scale_dn
+
     def pixel_slopes(self, binning: int = 1) -> NDArray[np.float64]:
         """Tangent k_y/k_z of each (binned) sample's ray, (sample,) float64."""
         count = self.samples // binning
         centre = (self.samples - 1) / 2
         middle = (np.arange(count, dtype=np.float64) + 0.5) * binning - 0.5
         return (middle - centre) * self.ifov_rad
+
+    def sample_at(self, slopes: NDArray[np.float64], binning: int = 1) -> NDArray[np.float64]:
+        """Continuous (binned) sample that looks along each slope, integers at centres: undoes ``pixel_slopes``."""
+        return (slopes / self.ifov_rad + self.samples / 2) / binning - 0.5
 
 
 def footprint_kernel(width_px: float) -> NDArray[np.float64]:
@@ -120,9 +129,7 @@ def digitise(
     return raw
 
 
-def _shot_and_read(
-    expected: NDArray[np.float32], camera: LineCamera, rng: np.random.Generator
-) -> NDArray[np.float32]:
+def _shot_and_read(expected: NDArray[np.float32], camera: LineCamera, rng: np.random.Generator) -> NDArray[np.float32]:
     """Shot plus read noise from one normal draw z: mean + sqrt(V) z + (k3 / 6V)(z^2 - 1).
 
     The first three cumulants are exact (Cornish and Fisher, 1938, second order). What is left is the excess kurtosis

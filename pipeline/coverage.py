@@ -1,8 +1,8 @@
-"""Sweeps that cover a whole scene: how many strips, where they lie, and how far each has to scan."""
+"""Sweeps that cover a whole scene: how many strips, where they lie, how far each has to scan, and what falls beside."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.errors import PoseError, SettingsError
 from pipeline.grid import SceneGrid
-from pipeline.scan import Axis, CostModel, Sweep, points_of_scan, scan_of_points, sweep_positions
+from pipeline.scan import Axis, CostModel, Sweep, points_of_scan, scan_of_points, sweep_positions, sweep_to_scene
 
 TAPS_BEFORE, TAPS_AFTER = 1, 2  # lines that the resampling kernel reads beside the one at or before a point
 ROUNDING_PX = 1e-6
 _PROBES = 65  # scan positions at which a strip's reach is taken; it changes by 1e-3 px between two
-
-Build = Callable[[SceneGrid, LineCamera, Axis], list[Sweep]]
 
 
 def full_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis) -> list[Sweep]:
@@ -38,7 +36,7 @@ def coarse_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis) -> list[Swee
     SettingsError : the sum of ``grid.factor`` samples does not fit 16 bits, or a line has fewer samples.
     PoseError : the field is beyond the mirror's range.
     """
-    most = min(np.iinfo(np.uint16).max // camera.full_scale_dn, camera.samples)
+    most = min(camera.most_binning, camera.samples)
     if grid.factor > most:
         raise SettingsError(
             f"the coarse factor must be at most {most} for {camera.bits}-bit lines of {camera.samples} samples "
@@ -54,26 +52,12 @@ def cheapest_full(grid: SceneGrid, camera: LineCamera, cost: CostModel) -> tuple
     ------
     PoseError : neither orientation is within the mirror's range.
     """
-    return _cheapest(full_sweeps, grid, camera, cost)
-
-
-def cheapest_coarse(grid: SceneGrid, camera: LineCamera, cost: CostModel) -> tuple[Axis, list[Sweep], float]:
-    """Choose the orientation of the coarse pass that takes the least time: axis of the lines, sweeps, seconds.
-
-    Raises
-    ------
-    PoseError : neither orientation is within the mirror's range.
-    """
-    return _cheapest(coarse_sweeps, grid, camera, cost)
-
-
-def _cheapest(build: Build, grid: SceneGrid, camera: LineCamera, cost: CostModel) -> tuple[Axis, list[Sweep], float]:
     found: list[tuple[Axis, list[Sweep], float]] = []
     refused: PoseError | None = None
     axes: tuple[Axis, Axis] = ("x", "y")
     for along in axes:
         try:
-            sweeps = build(grid, camera, along)
+            sweeps = full_sweeps(grid, camera, along)
         except PoseError as error:
             refused = error
             continue
@@ -82,6 +66,26 @@ def _cheapest(build: Build, grid: SceneGrid, camera: LineCamera, cost: CostModel
         assert refused is not None
         raise refused
     return min(found, key=lambda option: option[2])
+
+
+def on_scene(shape: tuple[int, int], camera: LineCamera, sweep: Sweep) -> NDArray[np.bool_]:
+    """Tell which (binned) samples of a sweep look at a pixel of a (y, x) scene, by their rays at mid exposure.
+
+    Rays are exact: line rotation and stretch included.
+
+    Returns
+    -------
+    (line, sample) bool.
+    """
+    height, width = shape
+    across, scan = (width, height) if sweep.along == "x" else (height, width)
+    along_px, scan_px = sweep_to_scene(sweep, camera)
+    inside = np.ones(along_px.shape, bool)
+    for place, size in ((along_px, across), (scan_px, scan)):
+        # Half open: a sample on the border between two pixels falls into the second, and rounding has no say in it.
+        pixel = np.floor(place + size / 2 + ROUNDING_PX)
+        inside &= (pixel >= 0) & (pixel < size)
+    return inside
 
 
 def field_px(grid: SceneGrid, along: Axis) -> tuple[int, int]:

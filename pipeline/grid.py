@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 
+UNLABELLED = 255  # in (y, x) uint8 images of class indices: this pixel has none
+
 
 @dataclass(frozen=True)
 class SceneGrid:

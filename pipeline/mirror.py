@@ -152,6 +152,44 @@ def line_rotation(direction: ArrayLike) -> Floats:
     return psi
 
 
+def line_centre(along: Floats, scan: Floats, across: ArrayLike) -> Floats:
+    """Give where the line that passes through a point has its centre, as a tangent on the scan axis.
+
+    The ray to a point meets the slit's plane for exactly one tilt of the mirror. With a and b the tangents of the
+    point along the line and on the scan, c that of the line's centre along the line, P = c (c - a) and
+    D = 1 + a^2 - (a - c)^2, the centre lies at ``b + P (b + sqrt(D + b^2)) / D``; nothing cancels within the mirror's
+    reach.
+
+    Parameters
+    ----------
+    along, scan, across
+        a, b and c; arrays that broadcast.
+
+    Returns
+    -------
+    (...) float64, NaN where no line passes: beyond 45 deg to the side.
+    """
+    c = np.asarray(across)
+    gap = along - c
+    reach = 1 + along * along - gap * gap
+    reach = np.where(reach > 0, reach, np.nan)
+    centre: Floats = scan - c * gap * (scan + np.sqrt(reach + scan * scan)) / reach
+    return centre
+
+
+def camera_slope(along: Floats, scan: Floats, across: ArrayLike, centre: Floats) -> Floats:
+    """Give the slope k_y / k_z of the camera ray that the mirror, aimed at (across, centre), sends to each point.
+
+    The reflection of the ray (1, along, scan) in the normal c - k0, written out for the unit vector c to the line's
+    centre. All are tangents; ``centre`` is that of :func:`line_centre`, the point's own line.
+    """
+    c = np.asarray(across)
+    r = np.sqrt(1 + c * c + centre * centre)
+    ahead = 1 + along * c + scan * centre
+    slope: Floats = (along * r - (ahead - scan * r) * c / (r - centre)) / ahead
+    return slope
+
+
 def paper_position(normal: ArrayLike) -> Floats:
     """Give what equation (7) of the paper takes for the position, X = n_x / sin 25 deg.
 

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 
 from pipeline.camera import LineCamera
-from pipeline.coverage import ROUNDING_PX, field_px
+from pipeline.coverage import on_scene
 from pipeline.grid import SceneGrid
-from pipeline.scan import CostModel, Sweep, sweep_to_scene
+from pipeline.scan import CostModel, Sweep
 
 FullIs = Literal["measured", "predicted"]
 
@@ -42,22 +42,9 @@ def count_lines(sweeps: Sequence[Sweep]) -> int:
 
 
 def count_samples(sweeps: Sequence[Sweep], camera: LineCamera, grid: SceneGrid) -> int:
-    """Count the (binned) samples whose ray at mid exposure meets the scene; those beside it cost time and are left out.
-
-    Rays are exact: line rotation and stretch included.
-    """
-    return sum(_on_scene(sweep, camera, grid) for sweep in sweeps)
-
-
-def _on_scene(sweep: Sweep, camera: LineCamera, grid: SceneGrid) -> int:
-    across, scan = field_px(grid, sweep.along)
-    along_px, scan_px = sweep_to_scene(sweep, camera)
-    inside = np.ones(along_px.shape, bool)
-    for place, size in ((along_px, across), (scan_px, scan)):
-        # Half open: a sample on the border between two pixels falls into the second, and rounding has no say in it.
-        pixel = np.floor(place + size / 2 + ROUNDING_PX)
-        inside &= (pixel >= 0) & (pixel < size)
-    return int(np.count_nonzero(inside))
+    """Count the (binned) samples that look at the scene; those beside it cost time and are left out."""
+    shape = (grid.height, grid.width)
+    return sum(int(np.count_nonzero(on_scene(shape, camera, sweep))) for sweep in sweeps)
 
 
 def raw_bytes(sweeps: Sequence[Sweep], camera: LineCamera, bands: int) -> int:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.errors import ShapeError
-from pipeline.mirror import direction_to_position, scene_to_direction
+from pipeline.mirror import camera_slope, direction_to_position, line_centre, scene_to_direction
 
 Axis = Literal["x", "y"]
 Floats = NDArray[np.float64]
@@ -99,9 +99,6 @@ def scan_of_points(
 ) -> tuple[Floats, Floats]:
     """Give the line through scene points and where on it they lie, for line centres on ``strip_px``.
 
-    With xi0 the strip, e the scan tangent of the line's centre, N = sqrt(1 + xi0^2 + e^2) and q = N - e, the line is
-    eta = e + (xi - xi0) xi0 / q (its slope is tan psi). Solved for q this is a quadratic with one positive root.
-
     Parameters
     ----------
     along_px, scan_px
@@ -113,24 +110,20 @@ def scan_of_points(
     """
     xi0 = strip_px * camera.ifov_rad
     xi, eta = np.asarray(along_px, np.float64) * camera.ifov_rad, np.asarray(scan_px, np.float64) * camera.ifov_rad
-    c = 1 + (2 * xi - xi0) * xi0
-    root = np.sqrt(eta**2 + c)
-    q = np.where(eta > 0, c / (root + np.maximum(eta, 0)), root - np.minimum(eta, 0))  # no difference of near numbers
-    d = xi - xi0
-    e = eta - d * xi0 / q
-    slope = d * q / (np.sqrt(1 + xi0**2 + e**2) * q + xi0 * d)
-    return e / camera.ifov_rad, slope
+    centre = line_centre(xi, eta, xi0)
+    return centre / camera.ifov_rad, camera_slope(xi, eta, xi0, centre)
 
 
 def points_of_scan(strip_px: float, camera: LineCamera, scan_px: ArrayLike, slope: ArrayLike) -> tuple[Floats, Floats]:
     """Give the scene points (along, scan) [px] that rays of ``slope`` see from line centres at ``scan_px``.
 
-    The inverse of ``scan_of_points``.
+    The inverse of ``scan_of_points``. With xi0 the strip, e the scan tangent of the line's centre,
+    N = sqrt(1 + xi0^2 + e^2) and q = N - e, the line is eta = e + (xi - xi0) xi0 / q (its slope is tan psi).
     """
     xi0 = strip_px * camera.ifov_rad
     e, u = np.asarray(scan_px, np.float64) * camera.ifov_rad, np.asarray(slope, np.float64)
     size = np.sqrt(1 + xi0**2 + e**2)
-    q = np.where(e > 0, (1 + xi0**2) / (size + np.maximum(e, 0)), size - np.minimum(e, 0))
+    q = np.where(e > 0, (1 + xi0**2) / (size + np.maximum(e, 0)), size - np.minimum(e, 0))  # nothing cancels
     d = u * size * q / (q - u * xi0)
     return (xi0 + d) / camera.ifov_rad, (e + d * xi0 / q) / camera.ifov_rad
 
@@ -139,8 +132,7 @@ def scene_to_sweep(sweep: Sweep, camera: LineCamera, along_px: ArrayLike, scan_p
     """Give continuous (line, sample) of scene points on a sweep as planned, (..., 2) float64; integers are centres."""
     centre, slope = scan_of_points(sweep.strip_px, camera, along_px, scan_px)
     line = (centre - sweep.start_px - (sweep.step - 1) / 2) / sweep.step
-    pixel = slope / camera.ifov_rad + camera.samples / 2
-    return np.stack([line, pixel / sweep.binning - 0.5], axis=-1)
+    return np.stack([line, camera.sample_at(slope, sweep.binning)], axis=-1)
 
 
 def sweep_to_scene(sweep: Sweep, camera: LineCamera) -> tuple[Floats, Floats]:

@@ -89,17 +89,6 @@ def complete_seats(requested: Seats, score: Scores, valid: NDArray[np.bool_] | N
     return np.concatenate([unique, spare[: len(asked) - len(unique)]])
 
 
-def valid_gain(score: Scores, share: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Scale scores of partly filled seats by the share of their pixels on the scene; -inf where nothing is.
-
-    For scores that stand for a gain per pixel: a border seat is then ranked by what it can really give.
-    """
-    scores, shares = np.asarray(score, np.float64), np.asarray(share, np.float64)
-    if scores.shape != shares.shape:
-        raise ShapeError(f"expected one share a score, got {shares.shape} shares and {scores.shape} scores")
-    return np.where(shares > 0, scores * np.where(shares > 0, shares, 1), -np.inf)
-
-
 def _allowed(score: Scores, valid: NDArray[np.bool_] | None) -> Seats:
     """Numbers of the seats that may be chosen, ascending."""
     shape = np.shape(score)

@@ -12,7 +12,6 @@ A folder whose name ends in ``.part`` is not finished: whoever makes the same th
 
 from __future__ import annotations
 
-import itertools
 import os
 import re
 import secrets
@@ -222,17 +221,29 @@ class Archive:
         """Begin the folder of one run; nothing of it is seen under ``runs`` before :meth:`RunDraft.publish`."""
         clean = re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")[:60] or "run"
         stem = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{clean}"
+        run_id, number = stem, 1
         with refusals(self.root, "write to the archive"):
-            for number in itertools.count(1):  # another run of the same second takes the next number
-                run_id = stem if number == 1 else f"{stem}-{number}"
-                folder = self.root / "runs" / (run_id + PART_SUFFIX)
-                release = take_lock(self._lock_path(f"runs-{run_id}"), wait=False)
-                if release is not None and not folder.with_name(run_id).exists():
-                    folder.mkdir(parents=True, exist_ok=True)
-                    break
-                if release is not None:
-                    release()
-        return RunDraft(run_id, folder, self.root, release or (lambda: None))
+            while (draft := self._begin_run(run_id)) is None:  # another run of the same second takes the next number
+                number += 1
+                run_id = f"{stem}-{number}"
+        return draft
+
+    def _begin_run(self, run_id: str) -> RunDraft | None:
+        """Take a run's name and make its folder, empty; None where the name is taken."""
+        folder = self.root / "runs" / (run_id + PART_SUFFIX)
+        release = take_lock(self._lock_path(f"runs-{run_id}"), wait=False)
+        if release is None:
+            return None
+        try:
+            if folder.with_name(run_id).exists():
+                release()
+                return None
+            remove_tree(folder)  # of a run that was killed within this second
+            folder.mkdir(parents=True)
+        except OSError:
+            release()
+            raise
+        return RunDraft(run_id, folder, self.root, release)
 
     def runs(self) -> list[Path]:
         """Folders of the published runs, oldest first."""

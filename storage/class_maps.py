@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
-from storage.labels import UNLABELLED
+from pipeline.grid import UNLABELLED
 from storage.layout import (
     AngularGrid,
     create_group,

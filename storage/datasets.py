@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.labels import UNLABELLED, load_codes
+from pipeline.grid import UNLABELLED
+from storage.labels import load_codes
 from storage.raster_files import SCENE_ENDINGS, split_variable
 from storage.scene_files import SceneFile, load_scene_file, scene_number
 from storage.scene_toml import SETTINGS_NAME, load_scene_settings
@@ -146,13 +147,13 @@ def _mask_to_index(
     numbers = {value: index for index, value in enumerate(scene.class_values) if isinstance(value, int)}
     if not numbers:
         raise SceneError(f"{scene.path} has classes by colour; a training mask needs classes by number")
-    given = list(range(1, highest + 1)) if mask_classes is None else list(mask_classes)
+    given = range(1, highest + 1) if mask_classes is None else mask_classes  # a range: a stray number may be huge
     if highest > len(given):
         raise SceneError(f"mask {train_mask} goes up to {highest}, but only {len(given)} mask classes are given")
-    unknown = [number for number in given[:highest] if number not in numbers]
-    if unknown:
+    unknown = next((number for number in given[:highest] if number not in numbers), None)
+    if unknown is not None:
         raise SceneError(
-            f"mask {train_mask}: class {unknown[0]} is none of the labels' {sorted(numbers)}; correct the mask classes"
+            f"mask {train_mask}: class {unknown} is none of the labels' {sorted(numbers)}; correct the mask classes"
         )
     return np.array([UNLABELLED, *(numbers[number] for number in given[:highest])], np.uint8)
 
@@ -170,7 +171,8 @@ def _scene_files(path: str | Path, train_mask: str | Path | None) -> dict[str, s
     inner = file / "images"
     folder = inner if inner.is_dir() else file
     found = sorted(entry for entry in folder.iterdir() if entry.suffix.lower() in SCENE_ENDINGS and entry.is_file())
-    found = [entry for entry in found if entry.resolve() not in _no_scenes(file, train_mask)]
+    others = _no_scenes(file, found, train_mask)
+    found = [entry for entry in found if entry.resolve() not in others]
     if not found:
         raise SceneError(
             f"{folder} holds no scene ({', '.join(SCENE_ENDINGS)}); give a folder with images/ and a {SETTINGS_NAME}"
@@ -181,10 +183,12 @@ def _scene_files(path: str | Path, train_mask: str | Path | None) -> dict[str, s
     return dict(zip(names, map(str, found), strict=True))
 
 
-def _no_scenes(folder: Path, train_mask: str | Path | None) -> set[Path]:
-    """Files of the folder that hold labels or the mask."""
+def _no_scenes(folder: Path, found: Sequence[Path], train_mask: str | Path | None) -> set[Path]:
+    """Files of the folder that hold the labels of those found, or the mask."""
     settings = folder / SETTINGS_NAME
     labels = load_scene_settings(settings).labels if settings.is_file() else None
-    named = [] if labels is None else [folder / split_variable(labels)[0]]
+    numbers = {scene_number(entry) or "" for entry in found}
+    filled = set() if labels is None else {labels.replace("{number}", number) for number in numbers}
+    named = [folder / split_variable(name)[0] for name in filled]
     named += [] if train_mask is None else [split_variable(train_mask)[0]]
     return {path.resolve() for path in named}

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
+from pipeline.grid import UNLABELLED
 from storage.raster_files import load_raster
 from storage.scene_toml import ClassValue, Colour
 
-UNLABELLED = 255
 MOST_FOUND_CLASSES = 64
 
 # Eight colours that stay apart for most kinds of colour blindness (Okabe and Ito, 2008), in an order for maps.
@@ -56,11 +56,10 @@ def load_labels(
             f"labels {address} are {codes.shape[0]} x {codes.shape[1]} px, the scene is {shape[0]} x {shape[1]} px "
             f"(y x x); give labels on the scene's own pixels"
         )
-    is_colour = is_colour or by_colour
-    if by_colour and codes.max(initial=0) < 256:
+    if by_colour and not is_colour and codes.max(initial=0) < 256:
         codes = np.where(codes < 0, codes, codes * 0x010101)  # a grey value g is the colour (g, g, g)
     none = None if unlabelled is None else _code(unlabelled)
-    stated = dict(classes) or _found_classes(codes, none, is_colour, str(address))
+    stated = dict(classes) or _found_classes(codes, none, is_colour or by_colour, str(address))
     return Labels(
         index=_index(codes, stated, none, str(address)),
         names=tuple(stated),

@@ -28,7 +28,7 @@ from storage.layout import (
 
 @dataclass(frozen=True)
 class Mosaic:
-    """A cube on the scene grid. ``values`` are rounded to 11 bits when stored."""
+    """A stored mosaic, in memory."""
 
     values: NDArray[np.float32]  # (y, x, band), NaN where no line reached
     coverage: NDArray[np.float32]  # (y, x) weight of what was seen, 0 where nothing
@@ -39,7 +39,10 @@ class Mosaic:
 
 
 class MosaicWriter:
-    """Write a mosaic block of rows by block of rows, so that it never has to be in memory as a whole."""
+    """Write a mosaic block of rows by block of rows, so that it never has to be in memory as a whole.
+
+    Values are rounded to 11 bits.
+    """
 
     def __init__(
         self,
@@ -83,15 +86,6 @@ class MosaicWriter:
         """Store a small colour picture, (y, x, 3) uint8, beside the mosaic."""
         about = {"long_name": "picture for viewers, red green blue"}
         write_image(self.group, "quicklook", ("quicklook_y", "quicklook_x", "rgb"), image, about)
-
-
-def write_mosaic(path: Path, mosaic: Mosaic) -> None:
-    """Store a mosaic that is in memory as a whole."""
-    y, x = mosaic.values.shape[:2]
-    writer = MosaicWriter(path, (y, x), mosaic.wavelength_nm, fwhm_nm=mosaic.fwhm_nm, grid=mosaic.grid)
-    writer.write_rows(0, mosaic.values, mosaic.coverage)
-    if mosaic.quicklook is not None:
-        writer.write_quicklook(mosaic.quicklook)
 
 
 def load_mosaic(path: Path) -> Mosaic:

@@ -16,11 +16,9 @@ from storage.layout import (
     ArraySpec,
     create_array,
     create_group,
-    grid_of,
     grid_record,
     open_group,
     read_array,
-    read_bands,
     round_bits,
     write_bands,
     write_small,
@@ -29,21 +27,11 @@ from storage.layout import (
 PATCHES_A_SHARD = 64
 
 
-@dataclass(frozen=True)
-class Patches:
-    """Fine patches, one for each seat bought. ``values`` are rounded to 11 bits when stored."""
-
-    seats: NDArray[np.int64]  # (patch,) numbers on the padded grid
-    origin_px: NDArray[np.int64]  # (patch, 2) y and x of the first pixel
-    values: NDArray[np.float32]  # (patch, y, x, band)
-    valid: NDArray[np.bool_]  # (patch, y, x) pixels that were seen and lie on the scene
-    wavelength_nm: NDArray[np.float64]
-    fwhm_nm: NDArray[np.float64] | None = None
-    grid: AngularGrid | None = None
-
-
 class PatchWriter:
-    """Write patches a few at a time, so that they never have to be in memory together."""
+    """Write patches a few at a time, so that they never have to be in memory together.
+
+    Values are rounded to 11 bits.
+    """
 
     def __init__(
         self,
@@ -95,30 +83,6 @@ class PatchWriter:
             self._valid[first:last] = valid
 
 
-def write_patches(path: Path, patches: Patches) -> None:
-    """Store patches that are in memory together, each one chunk. None at all is fine.
-
-    Raises
-    ------
-    ShapeError : the arrays do not fit each other.
-    """
-    if patches.values.shape[-1:] != patches.wavelength_nm.shape or len(patches.values) != len(patches.seats):
-        raise ShapeError(
-            f"patches {patches.values.shape} do not fit {len(patches.seats)} seats and"
-            f" {len(patches.wavelength_nm)} wavelengths"
-        )
-    writer = PatchWriter(
-        path,
-        patches.seats,
-        patches.origin_px,
-        patches.values.shape[1],
-        patches.wavelength_nm,
-        fwhm_nm=patches.fwhm_nm,
-        grid=patches.grid,
-    )
-    writer.write(0, patches.values, patches.valid)
-
-
 def _create_stack(
     group: zarr.Group, name: str, dims: tuple[str, ...], shape: tuple[int, ...], dtype: str, about: dict[str, Any]
 ) -> zarr.Array[Any]:
@@ -143,18 +107,3 @@ def open_patches(path: Path) -> PatchStore:
     """Open stored patches. Raises IncompleteStoreError where they are missing or damaged."""
     group = open_group(path)
     return PatchStore(read_array(group, "seat"), group)
-
-
-def load_patches(path: Path) -> Patches:
-    """Read all patches. Raises IncompleteStoreError where they are missing or damaged."""
-    group = open_group(path)
-    wavelength, fwhm = read_bands(group)
-    return Patches(
-        seats=read_array(group, "seat"),
-        origin_px=np.stack([read_array(group, "seat_y"), read_array(group, "seat_x")], axis=-1),
-        values=read_array(group, "values"),
-        valid=read_array(group, "valid"),
-        wavelength_nm=wavelength,
-        fwhm_nm=fwhm,
-        grid=grid_of(dict(group.attrs)),
-    )

@@ -54,6 +54,5 @@ class RunDraft:
 
     def abandon(self) -> None:
         """Remove what is not published; harmless afterwards."""
-        if self.folder.exists():
-            remove_tree(self.folder)
-            self._release()
+        remove_tree(self.folder)
+        self._release()

@@ -14,14 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.labels import UNLABELLED, Labels, load_labels
-from storage.raster_files import SCENE_ENDINGS, load_raster, split_variable
+from storage.labels import Labels, load_labels
+from storage.raster_files import load_raster, split_variable
 from storage.scene_toml import ClassValue, SceneSettings, find_scene_settings
+from storage.staging import file_hash
 from storage.wavelengths import settle_wavelengths
-
-__all__ = ["SCENE_ENDINGS", "UNLABELLED", "SceneFile", "load_scene_file"]
-
-_READ_AT_ONCE = 1 << 22
 
 
 @dataclass(frozen=True)
@@ -82,7 +79,7 @@ def load_scene_file(
     )
     values, notes = _as_float(cube, chosen, raster.nodata, file)
     found, label_note = _labels(file, (cube.shape[0], cube.shape[1]), labels, settings)
-    light_hash = _digest(_file_hash(file), variable, chosen, light.centre_nm.tolist(), _listed(light.fwhm_nm))
+    light_hash = _digest(file_hash(file), variable, chosen, light.centre_nm.tolist(), _listed(light.fwhm_nm))
     return SceneFile(
         name=file.stem,
         path=file,
@@ -136,7 +133,9 @@ def _as_float(
     with np.errstate(over="ignore"):
         values = np.array(picked, np.float32, order="C")
     if nodata is not None:
-        void = picked == np.asarray(nodata).astype(picked.dtype) if np.isfinite(nodata) else np.isnan(values)
+        # Compared as numbers: -9999 in the numbers of the file would wrap to 55537 where they are uint16.
+        with np.errstate(over="ignore"):
+            void = picked == nodata if np.isfinite(nodata) else np.isnan(values)
         values[void] = np.nan
         notes.append(f"{int(void.sum())} samples have the file's no-data value {nodata:g}")
     infinite = np.isinf(values)
@@ -195,11 +194,3 @@ def _digest(*parts: object) -> str:
 
 def _bytes_hash(values: NDArray[np.uint8]) -> str:
     return hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest()
-
-
-def _file_hash(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(_READ_AT_ONCE):
-            digest.update(block)
-    return digest.hexdigest()

@@ -59,7 +59,6 @@ class Spool:
         *,
         header: Mapping[str, Any],
         name: str = "lines",
-        restart: bool = False,
     ) -> Spool:
         """Open the spool in ``folder``, or begin it; lines from an earlier, broken capture are kept and counted.
 
@@ -67,8 +66,6 @@ class Spool:
         ----------
         header
             What the lines belong to (the sweep, the source, the seed): lines of anything else are not continued.
-        restart
-            Begin anew where the header differs, instead of raising.
 
         Raises
         ------
@@ -78,12 +75,12 @@ class Spool:
         with _refusals(spool.path, 0):
             folder.mkdir(parents=True, exist_ok=True)
             found = spool._read_head()
-            if found is not None and found != spool._head and not restart:
+            if found is not None and found != spool._head:
                 raise RigError(
                     f"{spool.index_path} holds lines of another sweep ({_difference(found, spool._head)}); "
                     f"finish that capture, or remove the folder to start anew"
                 )
-            if found != spool._head:
+            if found is None:
                 spool._begin()
             spool.recover()
             spool._write_envi_header()

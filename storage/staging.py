@@ -12,7 +12,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -179,18 +179,26 @@ def library_versions() -> dict[str, str]:
 def take_lock(path: Path, *, wait: bool = True) -> Callable[[], None] | None:
     """Hold ``path`` against other processes and threads until the function returned is called, or the process dies.
 
-    None where another holds it and ``wait`` is false. The file goes away with the lock.
+    None where another holds it and ``wait`` is false. The file goes away with the lock; letting go twice is harmless.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        if not _lock(descriptor, path, wait=wait):
-            os.close(descriptor)
-            return None
-        # whoever held it before may have taken the file away: then ours locks nothing
-        if path.exists() and path.stat().st_ino == os.fstat(descriptor).st_ino:
-            return lambda: _release(descriptor, path)
-        os.close(descriptor)
+        with ExitStack() as held:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+            held.callback(os.close, descriptor)
+            if not _lock(descriptor, path, wait=wait):
+                return None
+            if _is_still(descriptor, path):
+                held.callback(path.unlink, missing_ok=True)  # called before the lock is let go
+                return held.pop_all().close
+
+
+def _is_still(descriptor: int, path: Path) -> bool:
+    """Whether an open file has its name yet: whoever held the lock before may have taken it away."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
 
 
 def _lock(descriptor: int, path: Path, *, wait: bool) -> bool:
@@ -202,8 +210,3 @@ def _lock(descriptor: int, path: Path, *, wait: bool) -> bool:
         log.info("waiting for another run that makes %s", path.stem)
         fcntl.flock(descriptor, fcntl.LOCK_EX)
     return True
-
-
-def _release(descriptor: int, path: Path) -> None:
-    path.unlink(missing_ok=True)
-    os.close(descriptor)

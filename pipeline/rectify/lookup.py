@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.errors import PoseError, ShapeError
-from pipeline.mirror import direction_to_scene, position_to_direction
+from pipeline.mirror import camera_slope, direction_to_scene, line_centre, position_to_direction
 from pipeline.scan import Axis
 
 BLOCK_PX = 16384  # some twenty temporaries of this length stay in cache
@@ -32,10 +32,8 @@ def lookup(
 ) -> NDArray[np.float64]:
     """Find the line and sample at which a sweep saw each point.
 
-    The ray to a point meets the slit's plane for exactly one tilt of the mirror. With a = xi and b = eta of the point,
-    xi_c of the line's centre, P = xi_c (xi_c - a) and D = 1 + a^2 - (a - xi_c)^2 that centre lies at
-    ``eta_c = b + P (b + sqrt(D + b^2)) / D``; nothing cancels within the mirror's reach. The sample then follows from
-    the ray reflected back. Along a path that is not straight xi_c depends on eta_c, and the two are iterated.
+    The line's centre and the camera ray to the point are closed forms (:func:`pipeline.mirror.line_centre`). Along a
+    path that is not straight the centre's two tangents depend on each other, and are iterated.
 
     Parameters
     ----------
@@ -127,50 +125,29 @@ def _line_and_sample(
     path: _Path, camera: LineCamera, a: NDArray[np.float64], b: NDArray[np.float64], *, binning: int
 ) -> NDArray[np.float64]:
     """Line and sample at which points of tangents a (along the line) and b (scan) were seen, (n, 2)."""
-    centre, across = _line_centre(path, a, b, SETTLED_PX * camera.ifov_rad)
-    slope = _camera_slope(a, b, across, centre)
+    centre, across = _centre_on_path(path, a, b, SETTLED_PX * camera.ifov_rad)
+    sample = camera.sample_at(camera_slope(a, b, across, centre), binning)
     count = camera.samples // binning
-    sample = (slope / camera.ifov_rad + camera.samples / 2) / binning - 0.5
     line = np.interp(centre, path.scan, path.line, left=np.nan, right=np.nan)
     off = ~((sample >= -0.5) & (sample <= count - 0.5)) | np.isnan(line)
     line[off] = sample[off] = np.nan
     return np.stack([line, sample], axis=-1)
 
 
-def _line_centre(
+def _centre_on_path(
     path: _Path, a: NDArray[np.float64], b: NDArray[np.float64], tolerance: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Tangents (scan, along) of the centre of the line that sees each point; NaN where none does."""
     across = np.full(a.shape, path.across[len(path.across) // 2])
-    centre = _slit_meets(a, b, across)
+    centre = line_centre(a, b, across)
     if path.straight:
         return centre, across
     for _ in range(MOST_ROUNDS):
         across = np.interp(centre, path.scan, path.across)
-        moved = _slit_meets(a, b, across)
+        moved = line_centre(a, b, across)
         change = np.abs(moved - centre)
         centre = moved
         if not (change > tolerance).any():
             return centre, across
     centre[change > tolerance] = np.nan
     return centre, across
-
-
-def _slit_meets(a: NDArray[np.float64], b: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scan tangent of the line centre whose slit plane holds the point; see :func:`lookup`."""
-    gap = a - across
-    reach = 1 + a * a - gap * gap
-    reach[reach <= 0] = np.nan  # beyond 45 deg to the side
-    return b - across * gap * (b + np.sqrt(reach + b * b)) / reach
-
-
-def _camera_slope(
-    a: NDArray[np.float64], b: NDArray[np.float64], across: NDArray[np.float64], scan: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Slope k_y / k_z of the camera ray that the mirror, aimed at (across, scan), sends to the point.
-
-    The reflection of the ray (1, a, b) in the normal c - k0, written out for the unit vector c to the line's centre.
-    """
-    r = np.sqrt(1 + across * across + scan * scan)
-    ahead = 1 + a * across + b * scan
-    return (a * r - (ahead - b * r) * across / (r - scan)) / ahead

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
+from pipeline.coverage import on_scene as on_scene
 from pipeline.mirror import position_to_normal
 from pipeline.scan import Axis, Sweep, line_positions, sweep_positions
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene, to_bands
@@ -49,27 +50,12 @@ def expected_lines(
     return to_bands(light, scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS))
 
 
-def on_scene(shape: tuple[int, int], camera: LineCamera, sweep: Sweep, lines: range | None = None) -> NDArray[np.bool_]:
-    """Tell which samples look at a pixel of the scene, (line, sample) bool, by the ray of the sample at mid exposure.
-
-    Samples are those of the sweep: sums of ``sweep.binning`` neighbours.
-    """
-    normals = position_to_normal(line_positions(sweep, camera)[_slice(lines)])
-    slopes = camera.pixel_slopes(sweep.binning)
-    y, x = _ray_pixels(normals[:, None], 0.0, slopes, shape, along=sweep.along, ifov=camera.ifov_rad)
-    inside: NDArray[np.bool_] = (y >= -0.5) & (y < shape[0] - 0.5) & (x >= -0.5) & (x < shape[1] - 0.5)
-    return inside
-
-
 def _held_normals(camera: LineCamera, sweep: Sweep, lines: range, effects: frozenset[str]) -> NDArray[np.float64]:
     """Mirror normals of the positions held in each line's exposure, (line, step, 3)."""
+    asked = slice(lines.start, lines.stop, lines.step)
     if "smear" in effects:
-        return position_to_normal(sweep_positions(sweep, camera)[_slice(lines)])
-    return position_to_normal(line_positions(sweep, camera)[_slice(lines), None])
-
-
-def _slice(lines: range | None) -> slice:
-    return slice(None) if lines is None else slice(lines.start, lines.stop, lines.step)
+        return position_to_normal(sweep_positions(sweep, camera)[asked])
+    return position_to_normal(line_positions(sweep, camera)[asked, None])
 
 
 def _footprint(camera: LineCamera, effects: frozenset[str]) -> tuple[NDArray[np.float64], ...]:

@@ -16,7 +16,6 @@ from pipeline.rectify.resample import gather
 DEFAULT_EXPOSURE_MS = 100.0  # the exposure at which Scene.electrons is stated
 WELL_SHARE = 0.6  # of the full well, filled by the bright end of a scene without a radiance law
 BRIGHT_PERCENTILE = 99.9
-UNLABELLED = 255
 
 
 class Scene(Protocol):

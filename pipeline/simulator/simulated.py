@@ -107,10 +107,10 @@ def line_stream(seed: int, sweep_name: str, number: int) -> np.random.Generator:
 
 
 def _check_binning(sweep: Sweep, camera: LineCamera) -> None:
-    if sweep.binning * camera.full_scale_dn > np.iinfo(np.uint16).max:
+    if sweep.binning > camera.most_binning:
         raise ShapeError(
             f"sweep {sweep.name}: sums of {sweep.binning} samples of {camera.bits} bits do not fit uint16; "
-            f"bin at most {np.iinfo(np.uint16).max // camera.full_scale_dn}"
+            f"bin at most {camera.most_binning}"
         )
 
 

@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
+from pipeline.coverage import on_scene
 from pipeline.rectify.calibrate import calibrate
 from pipeline.rectify.lookup import grid_lookup
 from pipeline.rectify.mosaic import Part, edge_distance, mosaic
 from pipeline.rectify.resample import Kernel, resample
 from pipeline.scan import Axis, Sweep
-from pipeline.simulator.instrument import on_scene
 from pipeline.simulator.simulated import SimulatedSource
 
 CAMERA = LineCamera(

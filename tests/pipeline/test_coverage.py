@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_coarse, cheapest_full, coarse_sweeps, full_sweeps
+from pipeline.coverage import cheapest_full, coarse_sweeps, full_sweeps, on_scene
 from pipeline.errors import PoseError, SettingsError
 from pipeline.grid import SceneGrid
-from pipeline.scan import CostModel, Sweep, scene_to_sweep
+from pipeline.mirror import direction_to_scene, position_to_normal, reflect
+from pipeline.scan import CostModel, Sweep, line_positions, scene_to_sweep
 
 CAMERA, COST = LineCamera(), CostModel()
 
@@ -64,8 +65,7 @@ def test_the_known_fields_have_their_known_lines():
     """1280 x 1024 takes 2098 lines in full and 528 coarse; 1296 x 966 is cheaper with lines along its short side."""
     along, sweeps, seconds = cheapest_full(SceneGrid(1024, 1280, 16, 4), CAMERA, COST)
     assert (along, sum(s.lines for s in sweeps), round(seconds, 1)) == ("x", 2098, 213.9)
-    along, sweeps, _ = cheapest_coarse(SceneGrid(1024, 1280, 16, 4), CAMERA, COST)
-    assert (along, sum(s.lines for s in sweeps)) == ("x", 528)
+    assert sum(s.lines for s in coarse_sweeps(SceneGrid(1024, 1280, 16, 4), CAMERA, "x")) == 528
     along, sweeps, _ = cheapest_full(SceneGrid(966, 1296, 32, 4), CAMERA, COST)
     assert (along, len(sweeps)) == ("y", 2)
 
@@ -90,3 +90,27 @@ def test_factors_that_overflow_the_sum_are_refused(factor: int):
     """Sums of more than 16 samples of 12 bits do not fit 16 bits."""
     with pytest.raises(SettingsError, match=f"at most 16 .* got {factor}"):
         coarse_sweeps(SceneGrid(100, 100, 16, factor), CAMERA, "x")
+
+
+def test_mask_counts_the_scene_once():
+    """An undeflected sweep at 1 px steps puts exactly one sample on each pixel; binned, one on each block."""
+    fine = Sweep("s", "fine", "x", strip_px=0.0, start_px=-29.5, lines=60)
+    assert on_scene((40, 100), CAMERA, fine).sum() == 40 * 100
+    assert np.flatnonzero(on_scene((40, 100), CAMERA, fine)[30]).tolist() == list(range(270, 370))
+    coarse = replace(fine, kind="coarse", start_px=-31.5, lines=16, step=4, binning=4)
+    assert on_scene((40, 96), CAMERA, coarse).sum() == 10 * 24
+
+
+@pytest.mark.parametrize("along", ["x", "y"])
+@pytest.mark.parametrize("binning", [1, 4])
+def test_mask_follows_the_rays(along: str, binning: int):
+    """Far off the axis the samples on the scene are those whose reflected ray meets one of its pixels."""
+    sweep = Sweep("s", "fine", along, strip_px=2300.3, start_px=-1100.2, lines=90, binning=binning)
+    slopes = CAMERA.pixel_slopes(binning)
+    rays = np.stack([np.zeros_like(slopes), slopes, np.ones_like(slopes)], axis=-1)
+    normals = position_to_normal(line_positions(sweep, CAMERA))
+    place = direction_to_scene(reflect(rays[None], normals[:, None])) / CAMERA.ifov_rad
+    shape = (2100, 4700) if along == "x" else (4700, 2100)
+    met = np.all((place >= [-2350, -1050]) & (place < [2350, 1050]), axis=-1)
+    assert 0 < met.sum() < met.size
+    np.testing.assert_array_equal(on_scene(shape, CAMERA, sweep), met)

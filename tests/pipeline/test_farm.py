@@ -200,9 +200,9 @@ def test_edges_are_mixed_pixels(farms: list[RasterScene]) -> None:
 
 def twin_accuracy(scene: RasterScene, bands: NDArray[np.intp]) -> float:
     """Accuracy of Fisher's discriminant between the twins on one look's pixels, fitted on every other one."""
-    electrons = scene.planes[256:768, 320:960] @ scene.electrons[:, bands]
+    electrons = scene.planes[256:576, 320:960] @ scene.electrons[:, bands]
     seen = look(electrons, LineCamera(), step=1, rng=np.random.default_rng(0)).reshape(-1, len(bands))
-    labels = labels_of(scene)[256:768, 320:960].ravel()
+    labels = labels_of(scene)[256:576, 320:960].ravel()
     twins = [seen[labels == scene.class_names.index(name)] for name in ("wheat_a", "wheat_b")]
     size = min(map(len, twins))
     twins = [pixels[np.linspace(0, len(pixels) - 1, size).astype(int)] for pixels in twins]

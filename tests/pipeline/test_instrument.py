@@ -10,7 +10,7 @@ import pytest
 from pipeline.camera import LineCamera, look
 from pipeline.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.scan import Sweep, line_positions
-from pipeline.simulator.instrument import expected_lines, on_scene
+from pipeline.simulator.instrument import expected_lines
 from pipeline.simulator.scene import RasterScene, raster_from_values
 
 CAMERA = LineCamera()
@@ -94,24 +94,13 @@ def test_turned_rig_sees_the_turned_scene() -> None:
 
 
 def test_samples_off_the_scene_see_its_edge() -> None:
-    """A scene smaller than the line fills it with its edge pixels, and the mask tells which samples are on it."""
+    """A scene smaller than the line fills it with its edge pixels."""
     values = np.ones((40, 100, 1))
     values[:, :50] = 3
     scene = scene_of(values)
     middle = expected_lines(scene, CAMERA, SWEEP, range(20, 21))[0, :, 0] / scene.electrons[0]
     np.testing.assert_allclose(middle[:260], 3, rtol=1e-5)
     np.testing.assert_allclose(middle[380:], 1, rtol=1e-5)
-    mask = on_scene((40, 100), CAMERA, SWEEP)
-    assert np.flatnonzero(mask[20]).tolist() == list(range(270, 370))
-
-
-def test_mask_counts_the_scene_once() -> None:
-    """An undeflected sweep at 1 px steps puts exactly one sample on each pixel; binned, one on each block."""
-    sweep = replace(SWEEP, start_px=-29.5, lines=60)
-    assert on_scene((40, 100), CAMERA, sweep).sum() == 40 * 100
-    coarse = replace(sweep, start_px=-31.5, lines=16, step=4, binning=4)
-    assert on_scene((40, 96), CAMERA, coarse).sum() == 10 * 24
-    assert on_scene((40, 96), CAMERA, coarse, range(3, 5)).sum() == 2 * 24
 
 
 def test_no_lines_give_none() -> None:

@@ -13,8 +13,10 @@ from pipeline.camera import LineCamera
 from pipeline.errors import PoseError, ShapeError
 from pipeline.mirror import direction_to_position, direction_to_scene, position_to_normal, reflect, scene_to_direction
 from pipeline.rectify.lookup import grid_lookup, lookup
+from pipeline.scan import Sweep, line_positions, points_of_scan, scene_to_sweep
 
 CAMERA = LineCamera()
+places = st.floats(-4500, 4500)
 
 
 def aim(along_px: np.ndarray | float, scan_px: np.ndarray) -> np.ndarray:
@@ -40,6 +42,22 @@ def test_lookup_undoes_the_rays(strip: float, start: float, binning: int, seed: 
     points = see(aim(strip, start + at[:, 0]), at[:, 1], binning)
     found = lookup(aim(strip, start + np.arange(float(lines))), CAMERA, points, along="x", binning=binning)
     np.testing.assert_allclose(found, at, atol=1e-7)
+
+
+@given(places, places, st.sampled_from(["x", "y"]), st.sampled_from([1, 4]), st.integers(0, 99))
+@settings(max_examples=40, deadline=None)
+def test_lookup_agrees_with_the_plan(strip: float, start: float, along: str, step: int, seed: int) -> None:
+    """Where a planned sweep expects a point, the lookup finds it from the mirror's positions alone."""
+    sweep = Sweep("a", "coarse", along, strip, start, lines=30, step=step, binning=step)  # type: ignore[arg-type]
+    rng = np.random.default_rng(seed)
+    slopes, centres = rng.uniform(-0.033, 0.033, 40), start + rng.uniform(1, 29 * step, 40)
+    on_line, on_scan = points_of_scan(strip, CAMERA, centres, slopes)
+    planned = scene_to_sweep(sweep, CAMERA, on_line, on_scan)
+    points = np.stack([on_scan, on_line] if along == "x" else [on_line, on_scan], axis=-1)
+    found = lookup(line_positions(sweep, CAMERA), CAMERA, points, along=sweep.along, binning=step)
+    outer = np.abs(planned[:, 0] - 14.5) > 14.5  # beyond the outermost centres the lookup goes on in equal steps
+    np.testing.assert_allclose(found[~outer], planned[~outer], atol=1e-7)
+    np.testing.assert_allclose(found[outer], planned[outer], atol=1e-3)
 
 
 def test_wandering_uneven_path_is_followed() -> None:

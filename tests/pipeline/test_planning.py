@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_coarse, cheapest_full, full_sweeps
+from pipeline.coverage import cheapest_full, coarse_sweeps, full_sweeps
 from pipeline.errors import BudgetError, SettingsError, ShapeError
 from pipeline.grid import SceneGrid
 from pipeline.planning import check_budget, covered_seats, least_budget, plan_fine, seat_lines
@@ -145,7 +145,7 @@ def test_planning_a_farm_is_quick_and_pays():
     rows, columns = np.divmod(np.arange(np.prod(grid.seat_shape)), grid.seat_shape[1])
     scores = sum(np.exp(-((rows - r) ** 2 + (columns - c) ** 2) / 60) for r, c in ((8, 12), (30, 60), (55, 20)))
     _, _, full = cheapest_full(grid, CAMERA, COST)
-    left = check_budget(0.5, cheapest_coarse(grid, CAMERA, COST)[2], full)
+    left = check_budget(0.5, COST.seconds(coarse_sweeps(grid, CAMERA, "x"), CAMERA), full)
     began = time.process_time()
     plan = plan_fine(grid, CAMERA, COST, "x", scores, budget_s=left)
     assert time.process_time() - began < 3.0

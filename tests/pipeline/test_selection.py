@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import BudgetError, ShapeError
-from pipeline.grid import SceneGrid
-from pipeline.selection import complete_seats, frame_seats, seat_count, select_seats, valid_gain
+from pipeline.selection import complete_seats, frame_seats, seat_count, select_seats
 
 scores = st.lists(st.sampled_from([0.0, 1.0, 2.0, -1.0, np.nan, np.inf, -np.inf]), min_size=1, max_size=30)
 
@@ -114,17 +113,3 @@ def test_requests_for_seats_off_the_scene_are_refused():
         complete_seats(np.array([0, 3]), np.zeros(4), np.array([True, True, False, False]))
     with pytest.raises(BudgetError, match="from 0 to 2, got 3"):
         complete_seats(np.array([0, 0, 1]), np.zeros(2))
-
-
-def test_partly_filled_seats_rank_by_what_they_can_give():
-    """With equal gain per pixel a full seat comes before a border seat, and empty seats never."""
-    share = SceneGrid(40, 40, 16, 1).valid_share().ravel()
-    gain = valid_gain(np.ones(9), share)
-    assert select_seats(gain, 9).seats.tolist() == [0, 1, 3, 4, 2, 5, 6, 7, 8]
-    assert np.isneginf(valid_gain(np.array([np.nan, np.inf]), np.zeros(2))).all()
-
-
-def test_shares_must_match_scores():
-    """One share a score."""
-    with pytest.raises(ShapeError, match="one share a score"):
-        valid_gain(np.zeros(3), np.zeros(2))

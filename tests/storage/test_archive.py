@@ -6,13 +6,16 @@ import errno
 import json
 import os
 import threading
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.archive import Archive, stage_key
+from storage.staging import take_lock
 
 
 def _publish(archive: Archive, key: str = "abc", text: str = "content") -> Path:
@@ -237,6 +240,36 @@ def test_a_broken_run_leaves_nothing_and_a_live_one_is_not_reclaimed(tmp_path: P
     with pytest.raises(ZeroDivisionError):
         break_off()
     assert list((tmp_path / "runs").iterdir()) == []
+
+
+def test_a_lock_let_go_twice_leaves_the_next_holder_alone(tmp_path: Path) -> None:
+    """Letting go again neither takes the next holder's file away nor closes a file of another."""
+    path = tmp_path / "a.lock"
+    first = take_lock(path)
+    assert first is not None
+    assert take_lock(path, wait=False) is None
+    first()
+    second = take_lock(path, wait=False)
+    assert second is not None
+    first()
+    assert take_lock(path, wait=False) is None
+    second()
+    assert not path.exists()
+
+
+def test_a_run_begins_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a killed run of the same second and name left is not published with the next."""
+    monkeypatch.setattr("storage.archive.datetime", Mock(now=Mock(return_value=datetime(2026, 5, 1, tzinfo=UTC))))
+    left = tmp_path / "runs" / "20260501T000000-a.part"
+    left.mkdir(parents=True)
+    (left / "torn.bin").write_bytes(b"x")
+    archive = Archive.open(tmp_path)
+    for _ in range(2):
+        with archive.new_run("a") as run:
+            run.write_file("receipt.json", "{}")
+    assert [folder.name for folder in archive.runs()] == ["20260501T000000-a", "20260501T000000-a-2"]
+    assert not (archive.runs()[0] / "torn.bin").exists()
+    assert list((tmp_path / ".locks").iterdir()) == []
 
 
 def test_spools_outlive_processes_until_dropped(tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ from storage.attention import Attention, load_attention, write_attention
 from storage.class_maps import ClassMap, load_class_map, write_class_map
 from storage.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.layout import AngularGrid, round_bits
-from storage.mosaics import Mosaic, MosaicWriter, load_mosaic, write_mosaic
-from storage.patches import Patches, load_patches, write_patches
+from storage.mosaics import Mosaic, MosaicWriter, load_mosaic
+from storage.patches import PatchWriter, open_patches
 
 GRID = AngularGrid(1.057e-4, (100, 70))
 
@@ -109,6 +109,14 @@ def _mosaic(bands: int, shape: tuple[int, int] = (100, 70)) -> Mosaic:
     return Mosaic(values, coverage, np.linspace(400, 900, bands), None, GRID, np.full((25, 17, 3), 9, np.uint8))
 
 
+def write_mosaic(path: Path, mosaic: Mosaic) -> None:
+    """Store a mosaic in one block of rows, with its quicklook."""
+    writer = MosaicWriter(path, mosaic.values.shape[:2], mosaic.wavelength_nm, grid=mosaic.grid)
+    writer.write_rows(0, mosaic.values, mosaic.coverage)
+    assert mosaic.quicklook is not None
+    writer.write_quicklook(mosaic.quicklook)
+
+
 @pytest.mark.parametrize("bands", [1, 4, 270])
 def test_mosaic_round_trip(tmp_path: Path, bands: int) -> None:
     """Values come back rounded to 11 bits, missing ones as NaN, all else exactly; xarray sees the same."""
@@ -153,25 +161,34 @@ def test_mosaic_in_blocks_is_the_mosaic(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 5, 70])
 def test_patches_round_trip(tmp_path: Path, count: int) -> None:
-    """Any number of patches, none included; each is one chunk."""
+    """Any number of patches, none included; each is one chunk, and blocks of 64 give the same store."""
     rng = np.random.default_rng(count)
-    patches = Patches(
-        seats=np.arange(count, dtype=np.int64)[::-1].copy(),
-        origin_px=rng.integers(0, 900, (count, 2)),
-        values=rng.random((count, 8, 8, 15)).astype(np.float32),
-        valid=rng.random((count, 8, 8)) > 0.3,
-        wavelength_nm=np.linspace(400, 900, 15),
-        fwhm_nm=np.full(15, 4.0),
-        grid=GRID,
-    )
-    write_patches(tmp_path / "p.zarr", patches)
-    found = load_patches(tmp_path / "p.zarr")
-    np.testing.assert_array_equal(found.values, round_bits(patches.values))
-    for name in ("seats", "origin_px", "valid", "fwhm_nm"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(patches, name))
+    seats, origin = np.arange(count, dtype=np.int64)[::-1].copy(), rng.integers(0, 900, (count, 2))
+    values, valid = rng.random((count, 8, 8, 15)).astype(np.float32), rng.random((count, 8, 8)) > 0.3
+    writer = PatchWriter(tmp_path / "p.zarr", seats, origin, 8, np.linspace(400, 900, 15), fwhm_nm=np.full(15, 4.0))
+    for first in range(0, max(count, 1), 64):
+        writer.write(first, values[first : first + 64], valid[first : first + 64])
+    found = open_patches(tmp_path / "p.zarr")
+    np.testing.assert_array_equal(found.seats, seats)
+    np.testing.assert_array_equal(found.read(0, count), round_bits(values))
+    np.testing.assert_array_equal(found.read(1, 3), round_bits(values)[1:3])
     with xr.open_zarr(tmp_path / "p.zarr", consolidated=False) as data:
         assert data["values"].dims == ("patch", "y", "x", "band")
-        assert {"seat", "seat_y", "seat_x", "wavelength"} <= set(data.coords)
+        assert {"seat", "seat_y", "seat_x", "wavelength", "fwhm"} <= set(data.coords)
+        np.testing.assert_array_equal(data["valid"].values, valid)
+        np.testing.assert_array_equal(np.stack([data["seat_y"], data["seat_x"]], axis=-1), origin)
+
+
+def test_patches_that_split_a_shard_are_refused(tmp_path: Path) -> None:
+    """A write starts and ends at multiples of 64 patches, or at the end, and has the store's shape."""
+    writer = PatchWriter(tmp_path / "p.zarr", np.arange(70), np.zeros((70, 2), np.int64), 2, np.array([500.0]))
+    values, valid = np.zeros((70, 2, 2, 1), np.float32), np.ones((70, 2, 2), bool)
+    with pytest.raises(ChunkError, match="patches 0:10 split shards of 64"):
+        writer.write(0, values[:10], valid[:10])
+    with pytest.raises(ChunkError, match="patches 60:70 split"):
+        writer.write(60, values[:10], valid[:10])
+    with pytest.raises(ShapeError, match="patches 64:134"):
+        writer.write(64, values, valid)
 
 
 def test_attention_round_trip(tmp_path: Path) -> None:

@@ -39,6 +39,16 @@ def test_scenes_are_named_by_number(tmp_path: Path) -> None:
     assert scene.values[0, 0, 0] == 10
 
 
+def test_labels_beside_their_scenes_are_no_scenes(tmp_path: Path) -> None:
+    """In a folder without images/ the files that the label template names are left out."""
+    (tmp_path / "scene.toml").write_text('labels = "{number}_labels.png"\n[classes]\nsoil = [0, 0, 0]\n')
+    for name in ("001.png", "002.png", "001_labels.png", "002_labels.png"):
+        Image.new("RGB", (6, 5)).save(tmp_path / name)
+    data = load_data_set(tmp_path)
+    assert data.names == ("001", "002")
+    assert (data.load("002").labels == 0).all()
+
+
 def test_unknown_scenes_to_hold_out_are_listed(tmp_path: Path) -> None:
     """What there is stands in the message; nor can all be held out."""
     _folder(tmp_path)
@@ -87,6 +97,16 @@ def test_masks_that_do_not_fit(tmp_path: Path, classes: list[int], words: str) -
     data = load_data_set(tmp_path / "a.npy", train_mask=tmp_path / "mask.npy", mask_classes=classes)
     with pytest.raises(SceneError, match=words):
         list(data.train())
+
+
+def test_a_stray_number_in_a_mask_is_named(tmp_path: Path) -> None:
+    """A mask number far beyond the classes is refused at once, however large."""
+    np.save(tmp_path / "a.npy", np.ones((1, 2, 1)))
+    np.save(tmp_path / "gt.npy", np.array([[1, 2]]))
+    np.save(tmp_path / "mask.npy", np.array([[1, 2**40]]))
+    (tmp_path / "scene.toml").write_text('wavelengths_nm = [600]\nlabels = "gt.npy"')
+    with pytest.raises(SceneError, match=r"class 3 is none of the labels' \[1, 2\]"):
+        list(load_data_set(tmp_path / "a.npy", train_mask=tmp_path / "mask.npy").train())
 
 
 def test_indian_pines_disjoint_mask(real_data: Path) -> None:

@@ -27,6 +27,24 @@ def test_colours_become_indices(tmp_path: Path) -> None:
     assert found.colours.tolist() == [[0, 0, 0], [0, 255, 0], [255, 0, 0]]
 
 
+def test_shades_of_blue_are_not_grey(tmp_path: Path) -> None:
+    """Colours without red and green are themselves, stated or found, not grey values of the same number."""
+    image = np.zeros((2, 3, 3), np.uint8)
+    image[0, :, 2] = 255
+    Image.fromarray(image).save(tmp_path / "a.png")
+    stated = load_labels(tmp_path / "a.png", (2, 3), classes={"water": (0, 0, 255)}, unlabelled=(0, 0, 0))
+    assert stated.index.tolist() == [[0, 0, 0], [255, 255, 255]]
+    found = load_labels(tmp_path / "a.png", (2, 3), classes={}, unlabelled=(0, 0, 0))
+    assert found.colours.tolist() == [[0, 0, 255]]
+
+
+def test_grey_values_stand_for_grey_colours(tmp_path: Path) -> None:
+    """A grey image of two classes stated by colour: the value g is the colour (g, g, g)."""
+    np.save(tmp_path / "a.npy", np.array([[0, 9], [9, 0]], np.uint8))
+    found = load_labels(tmp_path / "a.npy", (2, 2), classes={"a": (9, 9, 9), "b": (0, 0, 0)})
+    assert found.index.tolist() == [[1, 0], [0, 1]]
+
+
 def test_an_unknown_colour_is_counted(tmp_path: Path) -> None:
     """A colour that is no class is named with its pixels, unless it means unlabelled."""
     image = np.zeros((4, 4, 3), np.uint8)

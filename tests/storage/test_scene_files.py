@@ -166,6 +166,19 @@ def test_arrays_that_are_no_scene(tmp_path: Path, values: NDArray[Any], words: s
         load_scene_file(tmp_path / "a.npy", wavelengths=[500, 600])
 
 
+def test_a_void_value_that_the_numbers_cannot_hold_voids_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """-9999 stated for 16-bit numbers is not 55537, which it would wrap to; 7 voids the sevens."""
+    tifffile = pytest.importorskip("tifffile")
+    real = importlib.import_module
+    monkeypatch.setattr(importlib, "import_module", lambda n: _missing(n) if n == "rasterio" else real(n))
+    values = np.array([[1, 55537], [7, 7]], np.uint16)
+    for stated, missing in (("-9999", 0), ("7", 2)):
+        tifffile.imwrite(tmp_path / "a.tif", values, extratags=[(42113, "s", 0, stated, True)])
+        assert np.isnan(load_scene_file(tmp_path / "a.tif", wavelengths=[500.0]).values).sum() == missing
+
+
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif", "a.npy", "a.npz", "a.mat"])
 def test_a_damaged_file_is_named(tmp_path: Path, name: str) -> None:
     """Bytes that are no such file give one message with the file's name."""
