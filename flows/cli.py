@@ -176,7 +176,7 @@ def train(
     validation: int | None = None,
     seed: int = 0,
     steps: int = 2000,
-    minutes: float = 40.0,
+    minutes: float = 36.0,
     scenes: int = 24,
     patch: int | None = None,
     factor: int = 4,
@@ -206,7 +206,7 @@ def train(
     seed
         Of the first weights, crops and noise.
     steps, minutes
-        The run ends with whichever comes first; the learning rate follows.
+        Training ends with whichever comes first; the learning rate follows. Looking and validating come on top.
     scenes
         How many scenes of the built-in farm.
     patch, factor, columns

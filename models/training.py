@@ -37,7 +37,7 @@ class TrainingSettings:
     crop: int = 256
     learning_rate: float = 1.5e-3
     weight_decay: float = 0.02
-    minutes: float = 40.0
+    minutes: float = 36.0
     seed: int = 0
     average: float = 0.998  # decay of the averaged weights
     glance_weight: float = 0.4
