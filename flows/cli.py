@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import os
 import sys
 import tempfile
 import traceback
@@ -25,8 +26,10 @@ app = App(
     name="spectralzoom",
     version=_version,
     help="Survey a field: look coarsely at everything, finely where it changes the map.",
+    suppress_keyboard_interrupt=False,  # main says what an interrupted survey leaves
 )
 stderr = Console(stderr=True)
+GOES_ON = ("survey", "train")  # verbs that keep what they have done when they are interrupted
 
 
 @app.command
@@ -90,7 +93,7 @@ def survey(
     engine
         `prefect`, or `plain` where no server can start.
     memory
-        What the survey may take: 4GiB
+        Sizes the blocks in which the controls scan the whole field: 4GiB by default.
     size
         Of the scene `farm`, width x height: 1280x1024
     exposure_ms
@@ -177,7 +180,7 @@ def train(
     seed: int = 0,
     steps: int = 2000,
     minutes: float = 36.0,
-    scenes: int = 24,
+    scenes: int | None = None,
     patch: int | None = None,
     factor: int = 4,
     columns: int = 24,
@@ -208,7 +211,7 @@ def train(
     steps, minutes
         Training ends with whichever comes first; the learning rate follows. Looking and validating come on top.
     scenes
-        How many scenes of the built-in farm.
+        How many scenes of the built-in farm; 24 by default.
     patch, factor, columns
         Patch size [px], how many times coarser the coarse pass is, and spectral columns.
     positions
@@ -264,6 +267,9 @@ def _wholes(text: str | None, flag: str) -> list[int] | None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with its code; an error that the user should read is one message on stderr."""
+    # Read when numpy is first imported, which the verbs do. Split among threads, sums are rounded otherwise: the raw
+    # light behind one key, and so the receipt of one seed, would differ with the number of cores.
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
     try:
         code = app(arguments, result_action="return_value", exit_on_error=False, print_error=False)
     except CycloptsError as error:
@@ -273,7 +279,9 @@ def main(arguments: list[str] | None = None) -> None:
         _say(str(error))
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
-        stderr.print("interrupted; the same command goes on from here", highlight=False)
+        verb = next(iter(sys.argv[1:] if arguments is None else arguments), "")
+        goes_on = "; the same command goes on from here" if verb in GOES_ON else ""
+        stderr.print(f"interrupted{goes_on}", highlight=False)
         sys.exit(130)
     except BrokenPipeError:
         sys.exit(1)

@@ -3,6 +3,7 @@
 No ``from __future__ import annotations`` here: Prefect reads the signatures.
 """
 
+import atexit
 import os
 import subprocess
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from typing import Any
 from flows.survey import Products, StageRunner, survey
 from pipeline.errors import PipelineError
 from storage.archive import StageRef
-from storage.staging import take_lock
+from storage.staging import remove_tree, take_lock
 
 RETRIES = {"capture_coarse": 2, "capture_fine": 2}  # a device may answer the second time; the spool goes on
 RETRY_DELAY_S = 2.0
@@ -144,6 +145,7 @@ def _prefect_home(archive: Path) -> Iterator[None]:
     release = take_lock(archive / ".locks" / "prefect.lock", wait=False)
     if release is None:
         home = archive / f".prefect-{os.getpid()}"
+        atexit.register(remove_tree, home)  # asked before Prefect asks for its server's end, so called after it
     wanted = {**QUIET, "PREFECT_HOME": str(home)}
     added = {name: value for name, value in wanted.items() if name not in os.environ}
     os.environ.update(added)

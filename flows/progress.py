@@ -35,12 +35,12 @@ class StageProgress:
         self._bars.stop()
 
     def show(self, stage: str, done: float, words: str = "", *, ended: bool = False) -> None:
-        """Say how far a stage is, 0..1, with a word or figure beside it."""
+        """Say how far a stage is, 0..1, with a word or figure beside it; ``ended`` also where it failed half-way."""
         title = self.titles.get(stage, stage)
         if stage not in self._tasks:
             self._tasks[stage] = self._bars.add_task(title, total=1.0, words="")
             self._said[stage] = time.monotonic()
-        self._bars.update(self._tasks[stage], completed=1.0 if ended else done, words=escape(words))
+        self._bars.update(self._tasks[stage], completed=done, words=escape(words))
         due = time.monotonic() - self._said[stage] > LINE_EVERY_S
         if not self.console.is_terminal and (ended or due):
             self._said[stage] = time.monotonic()

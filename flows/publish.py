@@ -167,7 +167,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         seed=run.settings.seed,
         budget=run.settings.budget,
         policy=run.settings.policy,
-        raw=tuple(_calibrated(run, cube, chosen) for cube in captured(products.raw_coarse)),
+        raw=tuple(_calibrated(run, cube, chosen) for cube in _by_strip(captured(products.raw_coarse))),
         rectified=_both_scales(run, products, chosen),
         wavelength_nm=run.scene.wavelength_nm[chosen],
         score=attention.score,
@@ -180,8 +180,14 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         truth=run.labels,
         confidence=found.confidence,
         pixel_mrad=run.camera.ifov_rad * 1e3,
+        along=run.plan.along,
         note="" if miou is None else f"mIoU {100 * miou:.1f} %",
     )
+
+
+def _by_strip(cubes: list[RawCube]) -> list[RawCube]:
+    """Sweeps in the order in which they lie side by side on the field: of their names, coarse-10 precedes coarse-2."""
+    return sorted(cubes, key=lambda cube: cube.sweep.strip_px)
 
 
 def _calibrated(run: SurveyRun, cube: RawCube, bands: list[int]) -> NDArray[np.float32]:

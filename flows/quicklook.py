@@ -37,6 +37,7 @@ from flows.panels import (
     stretch,
 )
 from pipeline.grid import UNLABELLED
+from pipeline.scan import Axis
 
 Box = tuple[int, int, int, int]
 
@@ -49,7 +50,7 @@ class QuicklookData:
     seed: int
     budget: float
     policy: str
-    raw: tuple[NDArray[np.generic], ...]  # sweeps as they came, calibrated, (line, sample, band) each
+    raw: tuple[NDArray[np.generic], ...]  # sweeps as they came, calibrated, (line, sample, band) each, by strip
     rectified: NDArray[np.floating]  # (y, x, band), NaN where nothing was captured
     wavelength_nm: NDArray[np.floating]  # (band,) of raw and rectified
     score: NDArray[np.floating]  # (row, column) of the padded grid's seats; NaN or -inf without a score
@@ -62,6 +63,7 @@ class QuicklookData:
     truth: NDArray[np.integer] | None = None  # (y, x), 255 unlabelled
     confidence: NDArray[np.floating] | None = None  # (y, x) 0..1, shown where there is no truth
     pixel_mrad: float = 0.105714
+    along: Axis = "x"  # of the scene along which the raw lines lie
     note: str = ""  # at the end of the title line, such as the accuracy
 
 
@@ -152,9 +154,9 @@ def _title_line(data: QuicklookData) -> str:
 
 
 def _draw_raw(axes: Axes, data: QuicklookData) -> None:
-    """Panel 1, first half: the sweeps as they came, stretched to the field's shape."""
+    """Panel 1, first half: the sweeps as they came, lying as they looked at the field, stretched to its shape."""
     image = _side_by_side([_colours(data, np.asarray(sweep)) for sweep in data.raw])
-    _show(axes, image)
+    _show(axes, image if data.along == "x" else image.swapaxes(0, 1))
     axes.set_aspect("auto")
     lines, count = sum(sweep.shape[0] for sweep in data.raw), len(data.raw)
     _caption(axes, "1  Raw lines", f"{count} coarse sweep{'s' if count != 1 else ''}, {lines} lines as they came")

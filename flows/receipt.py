@@ -262,9 +262,11 @@ def headline(receipt: Receipt, looked_twice: float | None = None) -> str:
     accuracy = receipt.get("accuracy")
     if accuracy is None:
         return text
+    every = accuracy["all"]["miou"]
+    detail = "" if every is None else f", detail everywhere {format_points(every)}"
     return (
         f"{text} The map scores {format_points(accuracy['miou'])} of 100 against the truth; the coarse look alone "
-        f"gives {format_points(accuracy['none']['miou'])}, detail everywhere {format_points(accuracy['all']['miou'])}."
+        f"gives {format_points(accuracy['none']['miou'])}{detail}."
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
@@ -33,6 +34,7 @@ from storage.raster_files import load_raster
 from storage.scene_files import load_scene_file
 
 SHIPPED = "farm.safetensors"
+FARM_BYTES_PER_PX = 570  # peak of a survey of 2560 x 2560 px without controls, 3.76 GB
 
 Report = Callable[[float], None]  # how far a stage is, 0..1
 
@@ -112,7 +114,7 @@ def open_run(settings: Settings) -> SurveyRun:
     band_notes = _check_bands(scene, weights, path)
     if settings.mask is not None:
         _check_mask(settings.mask, scene.shape)
-    effects = parse_effects(settings.effects)
+    effects = _chosen_effects(settings.effects)
     source = SimulatedSource(scene, settings.camera, settings.seed, effects)
     key = hashlib.sha256(path.read_bytes()).hexdigest()[:20]
     return SurveyRun(
@@ -121,7 +123,7 @@ def open_run(settings: Settings) -> SurveyRun:
     )  # fmt: skip
 
 
-def parse_effects(text: str) -> frozenset[str]:
+def _chosen_effects(text: str) -> frozenset[str]:
     """Effects to simulate: ``auto`` and ``all`` are those built, ``none``, or names with commas."""
     if text in ("auto", "all"):
         return ALL_EFFECTS
@@ -146,8 +148,20 @@ def _open_farm(settings: Settings) -> RasterScene:
     if settings.shape is None:
         farm = farm_scene(settings.seed, camera=settings.camera)
     else:
+        _check_memory(settings.shape)
         farm = farm_scene(settings.seed, shape=settings.shape, camera=settings.camera)
     return farm if settings.bands is None else _some_bands(farm, settings.bands)
+
+
+def _check_memory(shape: tuple[int, int]) -> None:
+    """Refuse a farm that this machine cannot hold, before it tries."""
+    needed = shape[0] * shape[1] * FARM_BYTES_PER_PX
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > there:
+        raise SettingsError(
+            f"--size {shape[1]}x{shape[0]}: a survey of such a farm takes about {needed / 1e9:.0f} GB of memory,"
+            f" this machine has {there / 1e9:.0f}; take a smaller one"
+        )
 
 
 def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:

@@ -212,9 +212,9 @@ def _put(table: dict[str, object], key: str, value: object) -> None:
 
 
 def _place(key: str, origin: str | None) -> str:
-    """How a message names a setting: as a flag, or in its file."""
+    """How a message names a setting: as a flag (without the table that holds it), or in its file."""
     if origin == "flag":
-        return "--" + key.replace("_", "-")
+        return "--" + key.rpartition(".")[2].replace("_", "-")
     return f"'{key}'" + (f" in {origin}" if origin else "")
 
 

@@ -34,7 +34,7 @@ from storage.mosaics import MosaicWriter, load_mosaic
 from storage.patches import PatchWriter, open_patches
 from storage.spool import Spool
 
-VERSIONS = {"capture": 1, "rectify": 1, "attend": 1, "patches": 1, "segment": 1, "evaluate": 1}
+VERSIONS = {"capture": 1, "rectify": 1, "attend": 2, "patches": 1, "segment": 2, "evaluate": 2}
 KERNEL: Kernel = "catmull-rom"
 SEATS_AT_ONCE = 64
 QUICKLOOK_PX = 512

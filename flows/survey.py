@@ -99,11 +99,17 @@ class StageRunner:
             made.append(ran)
             return ref
 
-        run = replace(self.run, report=lambda done: self.watch(stage, "running", done))
+        reached = 0.0
+
+        def report(done: float) -> None:
+            nonlocal reached
+            reached = done
+            self.watch(stage, "running", done)
+
         try:
-            ref = STAGES[stage](run, produce, *inputs)
+            ref = STAGES[stage](replace(self.run, report=report), produce, *inputs)
         except BaseException:
-            self.watch(stage, "failed", 1.0)
+            self.watch(stage, "failed", reached)
             raise
         state: State = "skipped" if ref is None else "ran" if made[-1] else "cached"
         self.records[stage] = self._record(stage, ref, state, meter, inputs)

@@ -19,6 +19,8 @@ def run_tradeoff(stage: str | None, out: Path, repeats: int, seed: int, console:
     """Measure one stage's trade-off, or all; write tradeoff.json and tradeoff.png into ``out`` and print the tables."""
     if repeats < 1:
         raise SettingsError(f"--repeats must be at least 1, got {repeats}")
+    if seed < 0:
+        raise SettingsError(f"--seed must be 0 or more, got {seed}")
     wanted = [find_tradeoff(stage)] if stage else list(registered().values())
     results = []
     for tradeoff in wanted:

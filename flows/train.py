@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.training_data import TrainingData, open_training_data, pack_mask, trained_pixels
-from models.controls import Controls, Counts, run_controls
+from models.controls import CONTROL_SHARE, Controls, Counts, run_controls
 from models.examples import Example, Observation, measured_normalisation, normalised, observe
 from models.inference import glance_of_columns
 from models.metrics import mean_iou
@@ -19,13 +19,12 @@ from models.segmenter import SegmenterConfig
 from models.spectral import SpectralBasis
 from models.tokens import Positions
 from models.training import Progress, TrainingSettings, train
-from models.weights import Weights, save_weights
+from models.weights import Weights, save_weights, with_record
 from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, SettingsError
 from pipeline.grid import SceneGrid
 from pipeline.simulator.scene import RasterScene
 
-CONTROL_SHARE = 0.35
 FRAME_CROP, FARM_CROP = 384, 256  # px
 
 
@@ -37,7 +36,7 @@ class TrainRequest:
     out: Path
     hold_out: tuple[str, ...] = ()
     validation: int | None = None
-    scenes: int = 24  # of the built-in farm
+    scenes: int | None = None  # of the built-in farm; 24 where None
     patch: int | None = None
     factor: int = 4
     columns: int = 24
@@ -78,7 +77,10 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
 
     split = _split(about, data)  # before validation scenes are looked at: what was trained on
-    model, summary = train(config, examples, normalisation.gain_shift, request.settings, progress)
+    checkpoint = request.out.with_name(request.out.name + ".checkpoint")
+    model, summary = train(
+        config, examples, normalisation.gain_shift, request.settings, progress, checkpoint=checkpoint
+    )
     weights = Weights(model, about.basis, normalisation, about.names, about.colours)
     kept, _ = _observe_all(request, data, data.validation, "looking at validation scenes", report, about)
     rows = [_validate(weights, normalised(one, normalisation, reached), request, report) for one in kept]
@@ -91,7 +93,8 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
         "training": summary,
         "validation": _summary(rows),
     }
-    save_weights(Weights(model, about.basis, normalisation, about.names, about.colours, record), request.out)
+    save_weights(with_record(weights, **record), request.out)
+    checkpoint.unlink(missing_ok=True)
     return record
 
 

@@ -45,8 +45,9 @@ def _check_counts(request: TrainRequest) -> None:
     for name, value in counts.items():
         if value is not None and not value > 0:
             raise SettingsError(f"{name} must be above 0, got {value}")
-    if request.validation is not None and request.validation < 0:
-        raise SettingsError(f"--validation must be 0 or more, got {request.validation}")
+    for name, number in {"--validation": request.validation, "--seed": settings.seed}.items():
+        if number is not None and number < 0:
+            raise SettingsError(f"{name} must be 0 or more, got {number}")
 
 
 def _command() -> str:

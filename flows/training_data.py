@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
-from pipeline.errors import SceneError
+from pipeline.errors import SceneError, SettingsError
 from pipeline.grid import UNLABELLED
 from pipeline.simulator.farm import FARM_LAW, farm_scene
 from pipeline.simulator.scene import RasterScene, raster_from_values
 from storage.datasets import DataSet, load_data_set
 from storage.scene_files import SceneFile
 
+FARM_SCENES, FARM_VALIDATION = 24, 3
 FARM_SHAPE = (512, 640)  # of a training scene [px]
 FARM_TRAIN_SEED, FARM_VALIDATION_SEED = 100_000, 200_000  # surveys are shown on small seeds
 
@@ -92,17 +93,32 @@ def file_data(files: DataSet, validation: int, camera: LineCamera) -> TrainingDa
 
 
 def open_training_data(
-    dataset: str, validation: int | None, scenes: int, camera: LineCamera, **choices: object
+    dataset: str, validation: int | None, scenes: int | None, camera: LineCamera, **choices: object
 ) -> TrainingData:
     """Name the data: ``farm``, or a path with the choices of `load_data_set`.
 
     Without a number, one scene in eight (4 at most) goes to validation; a data set of one scene has none.
+
+    Raises
+    ------
+    SettingsError : a choice that is for files was made for ``farm``, or the other way round.
     """
     if dataset == "farm":
-        return farm_data(scenes, 3 if validation is None else validation, camera)
+        _refuse_choices(choices)
+        count = FARM_SCENES if scenes is None else scenes
+        return farm_data(count, FARM_VALIDATION if validation is None else validation, camera)
+    if scenes is not None:
+        raise SettingsError(f"--scenes is for the built-in farm; {dataset} has its own scenes")
     files = load_data_set(Path(dataset), **choices)  # type: ignore[arg-type]
     share = min(4, len(files.train_names) // 8)
     return file_data(files, share if validation is None else validation, camera)
+
+
+def _refuse_choices(choices: Mapping[str, object]) -> None:
+    for name, value in choices.items():
+        if value not in (None, ()):
+            flag = "--" + name.replace("_", "-")
+            raise SettingsError(f"{flag} is for scene files; the farm's scenes are drawn by seed and bring their own")
 
 
 def pack_mask(mask: NDArray[np.bool_]) -> str:

@@ -18,6 +18,7 @@ from models.weights import Weights
 from pipeline.selection import frame_seats
 
 RANDOM_DRAWS = 5
+CONTROL_SHARE = 0.35  # of the valid seats: K = 35 % of surveys' receipts and of the weights' records
 Counts = NDArray[np.int64]
 
 

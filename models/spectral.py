@@ -111,9 +111,23 @@ class Normalisation:
         return Normalisation(centre.astype(np.float32), spread.astype(np.float32), whitening.astype(np.float32))
 
     def apply(self, columns: NDArray[np.floating], reached: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """(..., column) -> the same shape; unreached columns, and values that are not finite, count as the median."""
+        """(..., column) -> the same shape; values that are not finite count as the median.
+
+        Unreached columns take what the reached ones let expect. Left at the median they would stand out among
+        neighbours that they nearly repeat, and whitening would make that larger than everything else.
+        """
         normal = (np.asarray(columns, np.float32) - self.centre) / self.spread
-        return np.where(reached & np.isfinite(normal), normal, np.float32(0)) @ self.whitening
+        known = np.where(reached & np.isfinite(normal), normal, np.float32(0))
+        if reached.any() and not reached.all():
+            known[..., ~reached] = known[..., reached] @ self._expectation(reached)
+        return known @ self.whitening
+
+    def _expectation(self, reached: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """(reached, unreached): the conditional mean of a normal law whose inverse covariance is whitening squared."""
+        whitening = self.whitening.astype(np.float64)
+        inverse = whitening @ whitening
+        rest = ~reached
+        return np.asarray(-np.linalg.solve(inverse[np.ix_(rest, rest)], inverse[np.ix_(rest, reached)]).T, np.float32)
 
     @property
     def gain_shift(self) -> NDArray[np.float32]:

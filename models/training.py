@@ -8,10 +8,13 @@ budget and policy.
 from __future__ import annotations
 
 import copy
+import hashlib
+import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,12 +22,14 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
+from models.checkpoint import load_checkpoint, save_checkpoint
 from models.examples import Batch, CropSampler, Example
 from models.process import keep_freed_memory
 from models.segmenter import Segmenter, SegmenterConfig
 from pipeline.errors import PipelineError
 from pipeline.grid import UNLABELLED
 
+KEEP_EVERY_S = 120.0  # between checkpoints
 SHARES = ((0.125, 0.25), (0.25, 0.25), (0.35, 0.2), (0.5, 0.2), (1.0, 0.1))  # (share of the seats, how often)
 
 
@@ -58,52 +63,162 @@ class TrainingError(PipelineError, RuntimeError):
     """The loss was not finite three steps in a row."""
 
 
+@dataclass
+class Course:
+    """How far a run has come; plain numbers, kept in its checkpoint."""
+
+    step: int = 0
+    seconds: float = 0.0  # of earlier processes, up to the last checkpoint
+    skipped: int = 0
+    in_a_row: int = 0
+    loss: float = math.nan  # smoothed
+
+
+class Trainer:
+    """A training run: where it stands, and one step further at a time."""
+
+    def __init__(
+        self,
+        config: SegmenterConfig,
+        examples: list[Example],
+        gain_shift: NDArray[np.float32],
+        settings: TrainingSettings,
+    ) -> None:
+        self.settings, self.gain_shift = settings, gain_shift
+        self.rng = np.random.default_rng([settings.seed, 0x7EA])
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(settings.seed)
+            self.model = Segmenter(config)
+        self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.averaged = copy.deepcopy(self.model).eval()
+        groups = _parameter_groups(self.model, settings.weight_decay)
+        self.optimiser = torch.optim.AdamW(groups, settings.learning_rate)
+        self.sampler = CropSampler(examples, config.patch, config.factor, settings.crop)
+        self.weight = class_weights(examples, config.classes, settings.weight_cap)
+        self.course = Course()
+        self._started = time.monotonic()
+
+    @property
+    def done(self) -> float:
+        """How far the run is, 0..1, by steps or by time, whichever is further."""
+        seconds = self.course.seconds + time.monotonic() - self._started
+        return max(self.course.step / self.settings.steps, seconds / (60 * self.settings.minutes))
+
+    def step(self, done: float) -> None:
+        """Take one step of a run that is ``done`` so far (0..1): the learning rate follows from it.
+
+        Raises
+        ------
+        TrainingError : the loss or its gradient was not finite three steps in a row.
+        """
+        course = self.course
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.settings.learning_rate * rate_at(done)
+        batch = self.sampler.draw(self.settings.batch, self.rng, self.gain_shift)
+        loss = batch_loss(self.model, batch, self.weight, self.settings, self.rng, soft_dice=done > 0.3)
+        course.step += 1
+        course.in_a_row = 0 if _step(self.model, self.optimiser, loss) else course.in_a_row + 1
+        course.skipped += course.in_a_row > 0
+        if course.in_a_row == 3:
+            last = course.step
+            raise TrainingError(f"the loss was not finite in steps {last - 2} to {last}; lower the learning rate")
+        _average(self.averaged, self.model, min(self.settings.average, course.step / (course.step + 20)))
+        value = float(loss.detach())
+        if math.isfinite(value):
+            course.loss = value if math.isnan(course.loss) else 0.97 * course.loss + 0.03 * value
+
+    def keep(self, path: Path, identity: str) -> None:
+        """Write a checkpoint."""
+        now = time.monotonic()
+        self.course.seconds, self._started = self.course.seconds + now - self._started, now
+        tensors = {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
+        tensors |= {f"averaged.{name}": tensor for name, tensor in self.averaged.state_dict().items()}
+        for number, moments in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"optimiser.{number}.{name}": tensor for name, tensor in moments.items()}
+        save_checkpoint(path, identity, {"course": asdict(self.course), "rng": self.rng.bit_generator.state}, tensors)
+
+    def go_on(self, path: Path, identity: str) -> bool:
+        """Go on from a checkpoint of the same run; False where there is none."""
+        found = load_checkpoint(path, identity)
+        if found is None:
+            return False
+        about, tensors = found
+        state: dict[int, dict[str, Tensor]] = {}
+        parts: dict[str, dict[str, Tensor]] = {"model": {}, "averaged": {}}
+        for name, tensor in tensors.items():
+            part, _, rest = name.partition(".")
+            if part == "optimiser":
+                number, _, moment = rest.partition(".")
+                state.setdefault(int(number), {})[moment] = tensor
+            else:
+                parts[part][rest] = tensor
+        self.model.load_state_dict(parts["model"])
+        self.averaged.load_state_dict(parts["averaged"])
+        groups = self.optimiser.state_dict()["param_groups"]
+        self.optimiser.load_state_dict({"state": state, "param_groups": groups})
+        self.rng.bit_generator.state = about["rng"]
+        self.course, self._started = Course(**about["course"]), time.monotonic()
+        return True
+
+    def summary(self) -> dict[str, float | int]:
+        """Steps, skipped steps, the last smoothed loss and seconds."""
+        course = self.course
+        seconds = round(course.seconds + time.monotonic() - self._started)
+        return {
+            "steps": course.step,
+            "skipped_steps": course.skipped,
+            "last_loss": round(course.loss, 5),
+            "seconds": seconds,
+        }
+
+
 def train(
     config: SegmenterConfig,
     examples: list[Example],
     gain_shift: NDArray[np.float32],
     settings: TrainingSettings,
     report: Callable[[Progress], None] = lambda progress: None,
+    *,
+    checkpoint: Path | None = None,
+    keep_every_s: float = KEEP_EVERY_S,
 ) -> tuple[Segmenter, dict[str, float | int]]:
     """Train a segmenter and give its averaged weights with a summary (steps, skipped steps, last loss, seconds).
 
     The same settings and examples start from the same weights and draw the same crops and seats. What follows is equal
     to rounding only: sums differ in their last bit with where memory lies, and ``minutes`` may end the run elsewhere.
 
+    Parameters
+    ----------
+    checkpoint
+        File that the state is kept in; a killed run of the same settings and examples goes on from it.
+
     Raises
     ------
     TrainingError : the loss or its gradient was not finite three steps in a row.
     """
     keep_freed_memory()
-    rng = np.random.default_rng([settings.seed, 0x7EA])
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(settings.seed)
-        model = Segmenter(config)
-    model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    averaged = copy.deepcopy(model).eval()
-    optimiser = torch.optim.AdamW(_parameter_groups(model, settings.weight_decay), settings.learning_rate)
-    sampler = CropSampler(examples, config.patch, config.factor, settings.crop)
-    weight = class_weights(examples, config.classes, settings.weight_cap)
-    started, taken, skipped, in_a_row, smooth = time.monotonic(), 0, 0, 0, math.nan
-    for step in range(1, settings.steps + 1):
-        done = max((step - 1) / settings.steps, (time.monotonic() - started) / (60 * settings.minutes))
-        if done >= 1:
-            break
-        for group in optimiser.param_groups:
-            group["lr"] = settings.learning_rate * rate_at(done)
-        batch = sampler.draw(settings.batch, rng, gain_shift)
-        loss = batch_loss(model, batch, weight, settings, rng, soft_dice=done > 0.3)
-        in_a_row = 0 if _step(model, optimiser, loss) else in_a_row + 1
-        taken, skipped = step, skipped + (in_a_row > 0)
-        if in_a_row == 3:
-            raise TrainingError(f"the loss was not finite in steps {step - 2} to {step}; lower the learning rate")
-        _average(averaged, model, min(settings.average, step / (step + 20)))
-        value = float(loss.detach())
-        if math.isfinite(value):
-            smooth = value if math.isnan(smooth) else 0.97 * smooth + 0.03 * value
-        report(Progress(step, settings.steps, done, smooth))
-    seconds = round(time.monotonic() - started)
-    return averaged, {"steps": taken, "skipped_steps": skipped, "last_loss": round(smooth, 5), "seconds": seconds}
+    trainer = Trainer(config, examples, gain_shift, settings)
+    identity = run_identity(config, examples, settings)
+    if checkpoint is not None:
+        trainer.go_on(checkpoint, identity)
+    kept = time.monotonic()
+    while (done := trainer.done) < 1:
+        trainer.step(done)
+        report(Progress(trainer.course.step, settings.steps, done, trainer.course.loss))
+        if checkpoint is not None and time.monotonic() - kept >= keep_every_s:
+            trainer.keep(checkpoint, identity)
+            kept = time.monotonic()
+    return trainer.averaged, trainer.summary()
+
+
+def run_identity(config: SegmenterConfig, examples: list[Example], settings: TrainingSettings) -> str:
+    """Hash of all that makes a run what it is: a checkpoint of another run is not gone on from."""
+    digest = hashlib.sha256(json.dumps([config.as_dict(), asdict(settings)], sort_keys=True).encode())
+    for example in examples:
+        digest.update(example.name.encode())
+        digest.update(np.ascontiguousarray(example.coarse).tobytes())
+        digest.update(np.ascontiguousarray(example.labels).tobytes())
+    return digest.hexdigest()[:20]
 
 
 def rate_at(done: float) -> float:

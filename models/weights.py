@@ -41,7 +41,8 @@ class Weights:
     def columns(self, values: NDArray[np.floating], wavelength_nm: NDArray[np.floating]) -> NDArray[np.float32]:
         """Normalised spectral columns of pixels, (..., band) -> (..., column) float32.
 
-        Columns that no band reaches, and pixels with a value that is not finite, are 0: the training median.
+        Columns that no band reaches take what the others let expect; pixels with a value that is not finite count as
+        the training median.
         """
         matrix, reached = self.basis.matrix(wavelength_nm)
         with np.errstate(invalid="ignore", over="ignore"):  # what is not finite stays so and is replaced afterwards

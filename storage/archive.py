@@ -87,7 +87,7 @@ class Archive:
         ArchiveError : the path is a file, is not there, or does not let itself be written to (``write``).
         """
         path = Path(root).absolute()
-        with refusals(path, "use the archive"):
+        with _any_refusal(path), refusals(path, "use the archive"):
             if path.exists() and not path.is_dir():
                 raise ArchiveError(f"{path} is a file, expected a folder for the archive; choose another --out")
             if not create and not (path / "stages").is_dir():
@@ -279,6 +279,17 @@ class Archive:
         finally:
             if release is not None:
                 release()
+
+
+@contextmanager
+def _any_refusal(path: Path) -> Iterator[None]:
+    """At the door whatever the system answers means that this is no place for an archive."""
+    try:
+        yield
+    except ArchiveError:
+        raise
+    except OSError as error:
+        raise ArchiveError(f"cannot use {path} as an archive: {error.strerror}; choose another --out") from error
 
 
 def _make_and_probe(path: Path, *, create: bool, write: bool) -> None:

@@ -110,7 +110,10 @@ def _colour(code: int) -> Colour:
 
 
 def _found_classes(codes: NDArray[np.int64], none: int | None, is_colour: bool, where: str) -> dict[str, ClassValue]:
-    """One class for each value in the file, ascending: ``class_N`` after the number; colours are counted from 0."""
+    """One class for each value in the file, ascending: ``class_N`` after a number, ``colour_RRGGBB`` after a colour.
+
+    A name follows from the value alone: a file without some of the classes names the others as before.
+    """
     found = [int(code) for code in np.unique(codes) if code != none and code >= 0]
     if len(found) > MOST_FOUND_CLASSES:
         what = "colours" if is_colour else "numbers"
@@ -119,7 +122,7 @@ def _found_classes(codes: NDArray[np.int64], none: int | None, is_colour: bool, 
             f"state [classes] in a scene.toml"
         )
     if is_colour:
-        return {f"class_{index}": _colour(code) for index, code in enumerate(found)}
+        return {f"colour_{code:06x}": _colour(code) for code in found}
     return {f"class_{code}": code for code in found}
 
 

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from flows.survey import STAGES
 from storage.archive import Archive
 from storage.class_maps import load_class_map
 
@@ -89,6 +90,8 @@ REFUSED = {
     "policy mask without one": (2, "--policy mask", "needs a mask file"),
     "unknown flag": (2, "--budgets 1", "Unknown option"),
     "unknown source": (2, "--source rig", "use --source sim"),
+    "exposure in seconds": (2, "--exposure-ms 0.1", "--exposure-ms must be a number from 0.5.*then write 100"),
+    "farm beyond memory": (2, "--scene farm --size 60000x60000", "takes about .* GB of memory, this machine has"),
     "unknown effect": (2, "--effects slit,fog", "some of slit,smear,shot,read; got 'slit,fog'"),
 }
 
@@ -165,10 +168,32 @@ def test_out_that_is_a_file(out: str, folder: Path, command_line: Any, monkeypat
     assert (folder / "a_file").read_text() == "no folder"
 
 
+def test_interrupted_survey_says_how_to_go_on(
+    folder: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Ctrl-C in a stage ends with 130 and one line; the same command goes on with what was captured."""
+    real = STAGES["attend"]
+
+    def interrupted(*given: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(folder)
+    monkeypatch.setitem(STAGES, "attend", interrupted)
+    words = survey_words("--budget 0.7", str(tmp_path / "archive"))
+    ended = command_line(*words)
+    assert (ended.code, ended.out) == (130, "")
+    assert "interrupted; the same command goes on from here" in ended.err
+    monkeypatch.setitem(STAGES, "attend", real)
+    ended = command_line(*words)
+    assert ended.code == 0
+    assert "coarse sweep: 100% cached" in ended.err
+
+
 TRAINING = {
     "labels missing": (1, "scene.png -o new.safetensors", "scene has no labels; training needs them: give --labels"),
     "unknown hold-out": (1, "scene.png -o new.safetensors --hold-out 99", "no scene 99 to hold out; it has scene"),
     "folder missing": (2, "scene.png -o none/w.safetensors --labels labels.png", "folder none does not exist"),
+    "scenes of files": (2, "scene.png -o new.safetensors --scenes 3", "--scenes is for the built-in farm"),
     "-o is a folder": (2, "scene.png -o archive --labels labels.png", "archive is a folder, expected a file"),
     "nothing there": (1, "none -o new.safetensors", "no file or folder none"),
     "no steps": (2, "scene.png -o new.safetensors --steps 0", "--steps must be above 0, got 0"),
@@ -176,7 +201,10 @@ TRAINING = {
     "sizes do not fit": (2, "scene.png -o new.safetensors --labels labels.png --factor 3", "divide by the factor 3"),
     "too many for validation": (1, "scene.png -o new.safetensors --validation 3", "leave none of 1 to train on"),
     "band that is no number": (2, "scene.png -o new.safetensors --bands a", "whole numbers with commas, got 'a'"),
+    "negative seed": (2, "scene.png -o new.safetensors --seed -1", "--seed must be 0 or more, got -1"),
     "no -o": (2, "scene.png", "--out requires an argument"),
+    "hold-out of the farm": (2, "farm -o new.safetensors --hold-out 100000", "--hold-out is for scene files"),
+    "bands of the farm": (2, "farm -o new.safetensors --bands 0,1", "--bands is for scene files"),
 }
 
 

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from flows.panels import choose_bands, class_palette, class_rgb, grey_of, outline, stretch
-from flows.quicklook import QuicklookData, draw_quicklook
+from flows.quicklook import QuicklookData, _draw_raw, draw_quicklook
 
 WAVES = np.linspace(400, 1000, 61)
 
@@ -63,6 +64,20 @@ def test_parts_that_are_absent_are_left_out(tmp_path: Path):
     draw_quicklook(tmp_path / "empty.png", empty)
     draw_quicklook(tmp_path / "confidence.png", replace(data, truth=None))
     assert (tmp_path / "empty.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("along", ["x", "y"])
+def test_raw_lines_lie_as_they_looked_at_the_field(along):
+    """What is bright at the scene's top stands at the top of the raw lines, in either orientation; strips abut."""
+    data, field = make_data(40, 60), np.zeros((40, 60, 5), np.float32)
+    field[:20] = 1
+    turned = field if along == "x" else field.swapaxes(0, 1)
+    sweeps = tuple(np.array_split(turned, 2, axis=1))
+    axes = Figure(figsize=(8, 6)).add_subplot()
+    _draw_raw(axes, replace(data, raw=sweeps, rectified=field, along=along))
+    shown = np.asarray(axes.images[0].get_array())
+    assert shown[:15].mean() > 0.9
+    assert shown[25:].mean() < 0.1
 
 
 @pytest.mark.parametrize("score", [-np.inf, np.inf, 0.0])

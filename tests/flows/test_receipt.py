@@ -171,3 +171,10 @@ def test_headline_is_one_paragraph_with_the_figures():
     assert text.startswith("The camera looked twice at 23 % of the field. Capture took 104 s instead of 209 s")
     assert "75.0 of 100" in text
     assert "truth" not in headline(make_receipt(labels=False))
+
+
+def test_headline_without_controls_says_nothing_of_detail_everywhere():
+    """What was not judged is not mentioned."""
+    receipt = make_receipt()
+    receipt["accuracy"]["all"]["miou"] = None
+    assert headline(receipt).endswith("the coarse look alone gives 50.0.")

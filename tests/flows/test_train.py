@@ -71,7 +71,7 @@ def test_a_folder_to_write_to_must_be_there(tmp_path: Path):
 def test_scenes_of_other_bands_are_not_mixed(tmp_path: Path):
     """One camera's scenes make one set of weights: the scene that differs is named."""
     request = _request(tmp_path)
-    data = flow.open_training_data(request.dataset, 0, 0, request.camera)
+    data = flow.open_training_data(request.dataset, 0, None, request.camera)
     first, second = data.scenes(data.train[:2])
     common = flow._common(request, first)
     flow._check_alike(second, common)

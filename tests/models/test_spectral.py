@@ -138,11 +138,30 @@ def test_more_light_is_a_gain_and_a_shift():
 
 
 def test_what_is_missing_counts_as_the_median():
-    """Unreached columns and values that are not finite enter as the training median."""
+    """Values that are not finite enter as the training median."""
     normalisation = Normalisation.measured(_sample())
     pixel = np.where([True, True, False, False, True], 0.5, normalisation.centre)
     broken = np.where([True, True, False, False, True], 0.5, np.nan)
     expected = normalisation.apply(pixel, np.ones(5, bool))
     assert (normalisation.apply(broken, np.ones(5, bool)) == expected).all()
-    unreached = np.array([True, True, False, False, True])
-    assert (normalisation.apply(np.full(5, 0.5), unreached) == expected).all()
+
+
+def test_unreached_columns_are_what_the_others_let_expect():
+    """A column that nearly repeats its neighbours is told by them: left out, the result is nearly what it was."""
+    sample, reached = _sample(), np.array([True, True, False, True, True])
+    normalisation = Normalisation.measured(sample)
+    normal = (sample - normalisation.centre) / normalisation.spread
+    fitted, *_ = np.linalg.lstsq(normal[:, reached], normal[:, 2], rcond=None)
+    told = normalisation.apply(sample, reached) @ np.linalg.inv(normalisation.whitening)
+    off = np.std(told[:, 2] - normal[:, 2])
+    assert off == pytest.approx(np.std(normal[:, reached] @ fitted - normal[:, 2]), rel=0.02)
+    assert off < 0.4 * np.std(normal[:, 2])
+    assert told[:, reached] == pytest.approx(normal[:, reached], abs=1e-3)
+
+
+def test_what_unreached_columns_hold_does_not_matter():
+    """Whatever number stands where no band reaches, the result is the same; without any column it is the median's."""
+    normalisation, reached = Normalisation.measured(_sample()), np.array([True, True, False, False, True])
+    one, other = (np.where(reached, 0.5, hidden) for hidden in (0.0, 99.0))
+    assert (normalisation.apply(one, reached) == normalisation.apply(other, reached)).all()
+    assert not normalisation.apply(one, np.zeros(5, bool)).any()

@@ -80,9 +80,9 @@ def test_minutes_end_a_run(monkeypatch: pytest.MonkeyPatch):
     clock = iter(range(0, 10_000, 30))
     monkeypatch.setattr(training.time, "monotonic", lambda: next(clock))
     seen: list[Progress] = []
-    _, summary = train(CONFIG, [_example()], SHIFT, replace(SETTINGS, steps=1000, minutes=2), seen.append)
+    _, summary = train(CONFIG, [_example()], SHIFT, replace(SETTINGS, steps=1000, minutes=2.5), seen.append)
     assert len(seen) == summary["steps"] == 3
-    assert seen[-1].done == pytest.approx(0.75)
+    assert seen[-1].done == pytest.approx(0.8)
 
 
 def _spoilt(monkeypatch: pytest.MonkeyPatch, bad: set[int], value: float = float("nan")) -> None:

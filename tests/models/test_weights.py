@@ -80,7 +80,7 @@ def test_parameters_in_another_memory_order_are_kept(tiny: Maker, tmp_path: Path
 
 
 def test_unreached_columns_and_dead_pixels_are_the_median(tiny: Maker):
-    """Bands of half the range leave the other half's columns at 0; a dead pixel is 0 in all."""
+    """Without correlation, bands of half the range leave the other half's columns at 0; a dead pixel is 0 in all."""
     weights = tiny(columns=6)
     plain = replace(weights, normalisation=replace(weights.normalisation, whitening=np.eye(6, dtype=np.float32)))
     columns = plain.columns(np.array([[0.3, 0.4, 0.5], [0.3, np.nan, 0.5]]), np.array([400.0, 450.0, 500.0]))

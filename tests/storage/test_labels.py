@@ -38,6 +38,15 @@ def test_shades_of_blue_are_not_grey(tmp_path: Path) -> None:
     assert found.colours.tolist() == [[0, 0, 255]]
 
 
+def test_found_colours_name_their_classes(tmp_path: Path) -> None:
+    """A class found by its colour has one name in every file, whatever other colours the file holds."""
+    names = []
+    for number, colours in enumerate([[(200, 0, 0), (0, 200, 0), (0, 0, 200)], [(200, 0, 0), (0, 200, 0)]]):
+        Image.fromarray(np.array([colours], np.uint8)).save(tmp_path / f"{number}.png")
+        names.append(load_labels(tmp_path / f"{number}.png", (1, len(colours)), classes={}).names)
+    assert names == [("colour_0000c8", "colour_00c800", "colour_c80000"), ("colour_00c800", "colour_c80000")]
+
+
 def test_grey_values_stand_for_grey_colours(tmp_path: Path) -> None:
     """A grey image of two classes stated by colour: the value g is the colour (g, g, g)."""
     np.save(tmp_path / "a.npy", np.array([[0, 9], [9, 0]], np.uint8))

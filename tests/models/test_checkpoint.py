@@ -1,0 +1,87 @@
+"""Training that was killed goes on: what a checkpoint holds, and whose it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from models.checkpoint import load_checkpoint, save_checkpoint
+from models.examples import Example
+from models.segmenter import SegmenterConfig
+from models.training import Progress, TrainingSettings, run_identity, train
+from pipeline.errors import WeightsError
+
+CONFIG = SegmenterConfig(classes=2, columns=2, patch=8, factor=2, width=8, dim=16, layers=1, heads=2)
+SETTINGS = TrainingSettings(steps=6, batch=2, crop=16)
+SHIFT = np.zeros(2, np.float32)
+
+
+def example(seed: int = 1) -> Example:
+    """A small scene of noise with labels by its sign."""
+    fine = np.random.default_rng(seed).normal(0, 1, (32, 32, 2))
+    coarse = fine.reshape(16, 2, 16, 2, 2).mean(axis=(1, 3)).astype(np.float32)
+    return Example("e", fine.astype(np.float16), coarse, (fine[..., 0] > 0).astype(np.uint8), (32, 32))
+
+
+def killed_after(step: int):
+    """A report that ends the process, as far as training can tell, after some steps."""
+
+    def report(now: Progress) -> None:
+        if now.step == step:
+            raise KeyboardInterrupt
+
+    return report
+
+
+def test_a_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
+    """Killed after step 4 and started again, training takes the steps that are left and ends where it would have."""
+    file, steps = tmp_path / "c", []
+    undisturbed, _ = train(CONFIG, [example()], SHIFT, SETTINGS)
+    with pytest.raises(KeyboardInterrupt):
+        train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(5), checkpoint=file, keep_every_s=0)
+    again, summary = train(
+        CONFIG, [example()], SHIFT, SETTINGS, lambda now: steps.append(now.step), checkpoint=file, keep_every_s=99
+    )
+    assert steps == [5, 6]
+    assert summary["steps"] == 6
+    for name, tensor in undisturbed.state_dict().items():
+        torch.testing.assert_close(again.state_dict()[name], tensor, atol=1e-4, rtol=1e-3, msg=name)
+
+
+def test_another_run_starts_from_the_beginning(tmp_path: Path) -> None:
+    """A checkpoint of other settings, or of other scenes, is not gone on from."""
+    file = tmp_path / "c"
+    with pytest.raises(KeyboardInterrupt):
+        train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(4), checkpoint=file, keep_every_s=0)
+    for settings, scene in ((replace(SETTINGS, seed=7), example()), (SETTINGS, example(2))):
+        steps: list[int] = []
+        train(CONFIG, [scene], SHIFT, settings, lambda now, s=steps: s.append(now.step), checkpoint=file)
+        assert steps[0] == 1
+
+
+def test_time_spent_counts_after_a_restart(tmp_path: Path) -> None:
+    """The minutes of a run are those of all its processes together."""
+    file, identity = tmp_path / "c", run_identity(CONFIG, [example()], SETTINGS)
+    with pytest.raises(KeyboardInterrupt):
+        train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(4), checkpoint=file, keep_every_s=0)
+    found = load_checkpoint(file, identity)
+    assert found is not None
+    about, tensors = found
+    about["course"]["seconds"] = 60 * SETTINGS.minutes
+    save_checkpoint(file, identity, about, tensors)
+    _, summary = train(CONFIG, [example()], SHIFT, SETTINGS, checkpoint=file)
+    assert summary["steps"] == 3
+
+
+def test_a_damaged_checkpoint_is_no_checkpoint(tmp_path: Path) -> None:
+    """A file cut short or of another kind counts as none; one that cannot be written is an error with its place."""
+    file = tmp_path / "c"
+    save_checkpoint(file, "x", {}, {"a": torch.ones(100)})
+    file.write_bytes(file.read_bytes()[:60])
+    assert load_checkpoint(file, "x") is None
+    with pytest.raises(WeightsError, match="cannot keep the state of training"):
+        save_checkpoint(tmp_path / "none" / "c", "x", {}, {"a": torch.ones(1)})
