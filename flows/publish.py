@@ -18,7 +18,7 @@ from flows.quicklook import QuicklookData, draw_quicklook
 from flows.receipt import Header, Receipt, build_receipt, to_json
 from flows.report import write_report
 from flows.run import SurveyRun, now
-from flows.stages import captured, load_plan
+from flows.stages import SEATS_AT_ONCE, captured, load_plan
 from flows.survey import Products, StageRunner
 from models.cost import MultiplyAdds, multiply_adds
 from pipeline.planning import FinePlan
@@ -205,9 +205,9 @@ def _both_scales(run: SurveyRun, products: Products, bands: list[int]) -> NDArra
     s, p = run.grid.factor, run.grid.patch
     canvas = np.repeat(np.repeat(coarse, s, axis=0), s, axis=1)[: run.grid.height, : run.grid.width].copy()
     store = open_patches(products.patches.path / "patches.zarr")
-    for first in range(0, len(store.seats), 64):
-        values = store.read(first, first + 64)[..., bands]
-        for patch, (y, x) in zip(values, run.grid.seat_origin(store.seats[first : first + 64]), strict=True):
+    for first in range(0, len(store.seats), SEATS_AT_ONCE):
+        values = store.read(first, first + SEATS_AT_ONCE)[..., bands]
+        for patch, (y, x) in zip(values, run.grid.seat_origin(store.seats[first : first + len(values)]), strict=True):
             place = canvas[y : y + p, x : x + p]
             place[...] = patch[: place.shape[0], : place.shape[1]]
     return canvas

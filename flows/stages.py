@@ -123,6 +123,7 @@ def _preview(image: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def glance_at(run: SurveyRun, mosaic: StageRef) -> Glance:
+    """What the model says of a stored coarse mosaic alone."""
     return glance(run.weights, load_mosaic(mosaic.path / "mosaic.zarr").values, run.scene.wavelength_nm, run.grid)
 
 
@@ -220,8 +221,10 @@ def draw_map(run: SurveyRun, produce: Produce, mosaic: StageRef, patches: StageR
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write plain values in their own order; numpy's numbers become floats."""
     path.write_text(json.dumps(content, indent=1, default=float) + "\n")
 
 
 def digest(array: NDArray[np.generic]) -> str:
+    """Hash of an array's shape and values, for stage keys."""
     return hashlib.sha256(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes()).hexdigest()[:20]

@@ -10,7 +10,7 @@ KEPT = ((-3, 2**30), (-1, 2**31 - 1), (-2, 2**26))  # mallopt: mmap threshold, t
 
 
 def use_one_thread() -> None:
-    """Hold torch to one thread: on a shared machine two wait for each other (measured: 5 times slower under load)."""
+    """Hold torch to one thread: on a shared machine two spend their time waiting for each other."""
     torch.set_num_threads(1)
 
 

@@ -25,3 +25,11 @@ def test_words_of_a_scene_are_not_markup() -> None:
     with StageProgress(Console(file=out)) as progress:
         progress.show("looking", 1.0, "[red]field[/]", ended=True)
     assert "[red]field[/]" in out.getvalue()
+
+
+def test_words_on_a_bar_are_not_markup() -> None:
+    """On a terminal too a name in square brackets is shown as it is."""
+    out = io.StringIO()
+    with StageProgress(Console(file=out, force_terminal=True, width=160, color_system=None)) as progress:
+        progress.show("looking", 0.5, "[red]field[/]")
+    assert "[red]field[/]" in out.getvalue()

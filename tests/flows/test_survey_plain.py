@@ -22,7 +22,7 @@ from models.inference import glance
 from models.weights import load_weights
 from pipeline.camera import LineCamera
 from pipeline.grid import SceneGrid
-from pipeline.scan import Sweep
+from pipeline.scan import CostModel, Sweep
 from pipeline.simulator.instrument import on_scene
 from storage.archive import Archive
 
@@ -102,6 +102,28 @@ def test_savings_agree_with_the_stored_cubes(name: str, request: pytest.FixtureR
     assert savings["bytes_raw"]["done"] == sum(cube["dn"].nbytes for cube, _ in sweeps)
     files = [file for _, path in sweeps for file in path.rglob("*") if file.is_file()]
     assert savings["bytes_stored"]["done"] == sum(file.stat().st_size for file in files)
+
+
+@pytest.mark.parametrize("name", ["farm", "picture"])
+def test_seconds_are_those_of_the_stored_sweeps(name: str, request: pytest.FixtureRequest) -> None:
+    """Capture time is the price of the coarse pass and of the fine pass, each by the cost model, lines as stored."""
+    done: Done = request.getfixturevalue(name)
+    sweeps = [Sweep(**cube.attrs["sweep"]) for cube, _ in done.sweeps()]
+    passes = [[sweep for sweep in sweeps if sweep.kind == kind] for kind in ("coarse", "fine")]
+    assert all(passes)
+    seconds = sum(CostModel().seconds(part, LineCamera()) for part in passes)
+    assert done.receipt["savings"]["capture_s"]["done"] == pytest.approx(seconds)
+
+
+def test_ranks_follow_the_scores(farm: Done) -> None:
+    """Of the seats that were captured the best score has rank 0 and scores fall with the rank; the others have none."""
+    attention, patches = farm.open("attention"), farm.open("patches")
+    score, rank = attention["score"].values.ravel(), attention["rank"].values.ravel()
+    chosen = np.flatnonzero(rank >= 0)
+    assert set(chosen) == set(patches["seat"].values.tolist())
+    ordered = chosen[np.argsort(rank[chosen])]
+    assert (np.sort(rank[chosen]) == np.arange(len(chosen))).all()
+    assert (np.diff(score[ordered]) <= 0).all()
 
 
 def test_same_seed_gives_the_same_receipt(picture: Done, survey_png: Any, tmp_path: Path) -> None:

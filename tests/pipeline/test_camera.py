@@ -189,3 +189,12 @@ def test_a_scene_that_does_not_divide_is_refused(operator: Callable[..., object]
     """The message says the size, the step, and to pad first, before and after the footprint."""
     with pytest.raises(ShapeError, match=rf"{shape[0]}, {shape[1]}\) px does not divide by the step 4; pad it first"):
         operator(np.zeros(shape), CAMERA, step=4, rng=None)
+
+
+@pytest.mark.parametrize("read_noise_e", [10.0, 9.9])
+def test_noise_has_the_skewness_of_counts(read_noise_e: float):
+    """One draw or exact Poisson: 200 electrons and the read noise have the skewness 200 / (200 + read^2)^1.5."""
+    camera = replace(CAMERA, read_noise_e=read_noise_e, electrons_per_dn=1.0, dark_dn=500.0)
+    dn = digitise(np.full((1_000_000, 1), 200.0), camera, np.random.default_rng(8))
+    expected = 200 / (200 + read_noise_e**2) ** 1.5
+    assert stats.skew(dn.ravel().astype(np.float64)) == pytest.approx(expected, abs=0.01)  # 4 standard errors

@@ -13,7 +13,7 @@ from pipeline.camera import LineCamera
 from pipeline.coverage import cheapest_full, coarse_sweeps, full_sweeps
 from pipeline.errors import BudgetError, SettingsError, ShapeError
 from pipeline.grid import SceneGrid
-from pipeline.planning import check_budget, covered_seats, least_budget, plan_fine, seat_lines
+from pipeline.planning import check_budget, covered_seats, least_budget, plan_fine, price_seats, seat_lines
 from pipeline.scan import CostModel, Sweep, scene_to_sweep
 
 CAMERA, COST = LineCamera(), CostModel()
@@ -181,3 +181,29 @@ def test_a_coarse_pass_dearer_than_the_full_scan_is_refused():
     """Without a saving to be had the message says to scan in full."""
     with pytest.raises(BudgetError, match="scan in full"):
         check_budget(1.0, 210.0, 200.0)
+
+
+def test_a_seat_alone_costs_its_own_lines():
+    """On a strip through the axis lines are not turned: a seat takes its rows, three for the kernel, and one set-up."""
+    grid = SceneGrid(100, 150, 16, 4)
+    lines, seconds = price_seats(grid, CAMERA, COST, "x", np.array([24]))
+    assert lines == 16 + 3
+    assert seconds == pytest.approx(lines * 0.1 + COST.setup_seconds(CAMERA) + COST.reload_s)
+    assert price_seats(grid, CAMERA, COST, "x", np.array([], np.intp)) == (0, 0.0)
+
+
+@given(st.sets(st.integers(0, 55), min_size=2, max_size=20))
+def test_neighbours_share_their_lines(seats: set[int]):
+    """Seats bought together take at most the lines of each by itself, and no fewer than the dearest of them."""
+    grid = SceneGrid(100, 250, 16, 2)  # 8 x 16 seats with the padding; those of the first rows lie on the scene
+    valid = [seat for seat in seats if grid.valid_share().ravel()[seat] > 0]
+    alone = [price_seats(grid, CAMERA, COST, "y", np.array([seat]))[0] for seat in valid]
+    together, _ = price_seats(grid, CAMERA, COST, "y", np.array(valid, np.intp))
+    assert max(alone, default=0) <= together <= sum(alone)
+
+
+def test_seats_of_one_row_cost_one_run():
+    """A whole row of seats on one strip takes the lines of a single seat."""
+    grid = SceneGrid(100, 150, 16, 4)
+    row = np.arange(12, 12 + 9)
+    assert price_seats(grid, CAMERA, COST, "x", row) == price_seats(grid, CAMERA, COST, "x", row[:1])

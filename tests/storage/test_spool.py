@@ -44,6 +44,17 @@ def test_lines_come_back_in_blocks(tmp_path: Path) -> None:
     assert _same([line for block in blocks for line in block])
 
 
+def test_every_64th_line_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numbers and index are both synced at lines 64 and 128: a power cut loses fewer than 64 lines."""
+    synced_at: list[int] = []
+    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        real = os.fdatasync
+        monkeypatch.setattr(os, "fdatasync", lambda file: (synced_at.append(spool.count), real(file))[1])
+        for number in range(130):
+            spool.append(_line(number))
+        assert synced_at == [64, 64, 128, 128]
+
+
 def test_an_interrupted_capture_goes_on(tmp_path: Path) -> None:
     """A spool opened again has the count of its lines and takes the next."""
     _fill(tmp_path, 10)
