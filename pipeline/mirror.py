@@ -1,25 +1,54 @@
-"""The two-axis mirror: device position, normal, view direction, and how the line turns. Closed forms, float64.
+"""The two-axis mirror: device position, normal, view direction, and how the line turns. Closed forms, no trigonometry.
 
 Camera frame: the chief ray leaves along k = (0, 0, 1) and the undeflected scene direction is (1, 0, 0); y is the normal
 of the plane of incidence. Scene tangents are xi = o_y / o_x (along the line) and eta = o_z / o_x (the scan). The device
 reports the point, in units of tan 50 deg, where a ray falling along the rest normal would go (position (0, 0) is rest).
+
+float32 arrays stay float32, as devices keep them; everything else is worked out in float64. What the paper prints
+instead is in :mod:`pipeline.paper`, and the errata E1 to E18 are told in ERRATA.md.
 """
 
 from __future__ import annotations
+
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import PoseError, ShapeError
 
-Floats = NDArray[np.float64]
+Floats = NDArray[Any]  # float64, or float32 where that came in
+Slit = Literal["across", "in-plane"]
 
 REST_TANGENT = float(np.tan(np.deg2rad(50.0)))
-RIM_SLACK = 1e-12
-LENGTH_SLACK = 1e-6
+# How far beyond the rim, and off length 1, a vector may lie by rounding, by the precision that it came in.
+RIM_SLACK = {"float64": 1e-12, "float32": 1e-6}
+LENGTH_SLACK = {"float64": 1e-6, "float32": 1e-5}
 _HALF = float(np.sqrt(0.5))
 # Rows are e1, e2, e3 in the camera frame: the axes of device X, device Y, and the rest normal.
 _DEVICE_AXES = np.array([[-_HALF, 0.0, -_HALF], [0.0, 1.0, 0.0], [_HALF, 0.0, -_HALF]])
+
+
+def check_reach(position: ArrayLike) -> Floats:
+    """Refuse device positions beyond the unit disk, before a device clamps them to its rim unasked (erratum E3).
+
+    Parameters
+    ----------
+    position
+        (..., 2) device X and Y.
+
+    Returns
+    -------
+    The positions as (..., 2) floats.
+
+    Raises
+    ------
+    PoseError : a position is not finite or beyond the rim; the message names the first.
+    """
+    xy = _vectors(position, 2, "mirror position")
+    beyond = np.hypot(xy[..., 0], xy[..., 1]) > 1 + RIM_SLACK[xy.dtype.name]
+    _refuse(beyond, xy, "lies outside the unit disk that the mirror reaches")
+    return xy
 
 
 def position_to_normal(position: ArrayLike) -> Floats:
@@ -32,19 +61,18 @@ def position_to_normal(position: ArrayLike) -> Floats:
 
     Returns
     -------
-    (..., 3) float64 unit normals in the camera frame.
+    (..., 3) unit normals in the camera frame.
 
     Raises
     ------
     PoseError : a position is not finite or beyond the rim; the message names the first.
     """
-    xy = _vectors(position, 2, "mirror position")
-    _refuse(np.hypot(xy[..., 0], xy[..., 1]) > 1 + RIM_SLACK, xy, "lies outside the unit disk that the mirror reaches")
-    half = np.empty((*xy.shape[:-1], 3))
+    xy = check_reach(position)
+    half = np.empty((*xy.shape[:-1], 3), xy.dtype)
     half[..., :2] = xy * REST_TANGENT
     # r + e3 up to a factor, r = (X T, Y T, 1) / |.|: no angle and no difference of near numbers.
     half[..., 2] = 1 + np.sqrt(1 + half[..., 0] ** 2 + half[..., 1] ** 2)
-    normal: Floats = _unit(half) @ _DEVICE_AXES
+    normal: Floats = _unit(half) @ _DEVICE_AXES.astype(xy.dtype)
     return normal
 
 
@@ -58,7 +86,7 @@ def normal_to_position(normal: ArrayLike) -> Floats:
 
     Returns
     -------
-    (..., 2) float64 device X and Y.
+    (..., 2) device X and Y.
 
     Raises
     ------
@@ -66,13 +94,21 @@ def normal_to_position(normal: ArrayLike) -> Floats:
         is divided, since X overflows as the tilt nears 45 deg (erratum E2).
     """
     n = _units(normal, "mirror normal")
-    device = n @ _DEVICE_AXES.T
-    c2 = 2 * device[..., 2] ** 2 - 1
+    device = normal_to_device(n)
+    # cos 2 alpha as n_z^2 - (n_x^2 + n_y^2): half the rounding of 2 n_z^2 - 1, and an error of length cancels.
+    c2 = device[..., 2] ** 2 - (device[..., 0] ** 2 + device[..., 1] ** 2)
     lateral = 2 * device[..., 2] * np.hypot(device[..., 0], device[..., 1])
-    inside = (device[..., 2] > 0) & (c2 > 0) & (lateral <= REST_TANGENT * c2 * (1 + RIM_SLACK))
+    inside = (device[..., 2] > 0) & (c2 > 0) & (lateral <= REST_TANGENT * c2 * (1 + RIM_SLACK[n.dtype.name]))
     _refuse(~inside, n, "is turned beyond the rim of the mirror's range (25 deg)")
-    position: Floats = 2 * device[..., 2:] * device[..., :2] / (c2 * REST_TANGENT)[..., None]
+    position: Floats = 2 * device[..., 2:] * device[..., :2] / (c2 * n.dtype.type(REST_TANGENT))[..., None]
     return position
+
+
+def normal_to_device(normal: ArrayLike) -> Floats:
+    """Give the parts (..., 3) of normals along the device's X and Y axes and along the rest normal."""
+    n = _vectors(normal, 3, "mirror normal")
+    device: Floats = n @ _DEVICE_AXES.T.astype(n.dtype)
+    return device
 
 
 def direction_to_normal(direction: ArrayLike) -> Floats:
@@ -92,13 +128,13 @@ def direction_to_normal(direction: ArrayLike) -> Floats:
     o = _units(direction, "view direction")
     n = o.copy()
     n[..., 2] = -_one_minus_z(o)
-    _refuse(~np.any(n != 0, axis=-1), o, "is the camera's own ray, which no mirror makes")
     return _unit(n)
 
 
 def reflect(ray: ArrayLike, normal: ArrayLike) -> Floats:
     """Reflect travelling rays, o = k - 2 (n . k) n, over (..., 3) arrays that broadcast."""
-    k, n = np.asarray(ray, np.float64), np.asarray(normal, np.float64)
+    n = np.asarray(normal, _kept(ray, normal))
+    k = np.asarray(ray, n.dtype)
     out: Floats = k - 2 * np.sum(n * k, axis=-1, keepdims=True) * n
     return out
 
@@ -116,7 +152,7 @@ def direction_to_position(direction: ArrayLike) -> Floats:
 def scene_to_direction(tangents: ArrayLike) -> Floats:
     """Give unit directions (..., 3) of scene tangents (..., 2), xi along the line and eta along the scan."""
     t = _vectors(tangents, 2, "scene tangent")
-    return _unit(np.concatenate([np.ones((*t.shape[:-1], 1)), t], axis=-1))
+    return _unit(np.concatenate([np.ones((*t.shape[:-1], 1), t.dtype), t], axis=-1))
 
 
 def direction_to_scene(direction: ArrayLike) -> Floats:
@@ -132,24 +168,57 @@ def direction_to_scene(direction: ArrayLike) -> Floats:
     return tangents
 
 
-def line_rotation(direction: ArrayLike) -> Floats:
-    """Give the angle by which the image of the slit is turned in the scene tangent plane.
+def line_rotation(direction: ArrayLike, slit: Slit = "across") -> Floats:
+    """Give the angle by which the image of the slit is turned in the scene tangent plane, against rest.
 
-    psi = atan2(o_y, 1 - o_z), a property of the pose and not of the path (erratum E8). The line stays straight: it
-    runs along (cos psi, sin psi) in (xi, eta), exactly.
+    A property of the pose and not of the path (erratum E8). For the slit across the plane of incidence, along y,
+    psi = atan2(o_y, 1 - o_z); the line stays straight and runs along (cos psi, sin psi) in (xi, eta), exactly. For
+    the slit in the plane of incidence psi = atan2(o_y, 1 - o_y^2 / (1 - o_z)); its line runs along (-sin, cos).
 
     Parameters
     ----------
     direction
         (..., 3) unit view directions of the line's centre.
+    slit
+        "across" the plane of incidence or "in-plane".
 
     Returns
     -------
-    (...) float64, anticlockwise from xi to eta. [rad]
+    (...) angle, anticlockwise from xi to eta. [rad]
+
+    Raises
+    ------
+    PoseError : a direction is not finite, not of length 1, or is the camera's own ray.
+    ValueError : no such slit.
     """
+    if slit not in ("across", "in-plane"):
+        raise ValueError(f"slit must be 'across' or 'in-plane', got {slit!r}")
     o = _units(direction, "view direction")
-    psi: Floats = np.arctan2(o[..., 1], _one_minus_z(o))
+    psi: Floats = np.arctan2(o[..., 1], _one_minus_z(o) if slit == "across" else _in_plane_run(o))
     return psi
+
+
+def mirror_throughput(position: ArrayLike) -> Floats:
+    """Give the share of light that the mirror passes, over its share at rest: |n_z| / |n_z at rest| (erratum E16).
+
+    The mirror is the aperture stop; what it passes goes with its area as the camera sees it.
+
+    Parameters
+    ----------
+    position
+        (..., 2) device X and Y, in the closed unit disk.
+
+    Returns
+    -------
+    (...) factor [-]: 1 at rest, 0.48 to 1.33 over the disk.
+
+    Raises
+    ------
+    PoseError : a position is not finite or beyond the rim.
+    """
+    normal = position_to_normal(position)
+    share: Floats = -normal[..., 2] / normal.dtype.type(_HALF)
+    return share
 
 
 def line_centre(along: Floats, scan: Floats, across: ArrayLike) -> Floats:
@@ -167,9 +236,9 @@ def line_centre(along: Floats, scan: Floats, across: ArrayLike) -> Floats:
 
     Returns
     -------
-    (...) float64, NaN where no line passes: beyond 45 deg to the side.
+    (...) tangents, NaN where no line passes: beyond 45 deg to the side.
     """
-    c = np.asarray(across)
+    c = np.asarray(across, _kept(along, scan, across))
     gap = along - c
     reach = 1 + along * along - gap * gap
     reach = np.where(reach > 0, reach, np.nan)
@@ -183,28 +252,27 @@ def camera_slope(along: Floats, scan: Floats, across: ArrayLike, centre: Floats)
     The reflection of the ray (1, along, scan) in the normal c - k0, written out for the unit vector c to the line's
     centre. All are tangents; ``centre`` is that of :func:`line_centre`, the point's own line.
     """
-    c = np.asarray(across)
+    c = np.asarray(across, _kept(along, scan, across))
     r = np.sqrt(1 + c * c + centre * centre)
     ahead = 1 + along * c + scan * centre
     slope: Floats = (along * r - (ahead - scan * r) * c / (r - centre)) / ahead
     return slope
 
 
-def paper_position(normal: ArrayLike) -> Floats:
-    """Give what equation (7) of the paper takes for the position, X = n_x / sin 25 deg.
-
-    For comparison only: it agrees with the device at rest and at the rim, and is up to 6.40 deg wrong between.
-    """
-    device = _vectors(normal, 3, "mirror normal") @ _DEVICE_AXES.T
-    position: Floats = device[..., :2] / np.sin(np.deg2rad(25.0))
-    return position
-
-
 def _one_minus_z(o: Floats) -> Floats:
-    """1 - o_z of unit vectors without cancellation on either side."""
+    """1 - o_z of unit vectors without cancellation on either side; refused where it is 0."""
     z = o[..., 2]
     across = o[..., 0] ** 2 + o[..., 1] ** 2
+    _refuse((o[..., 0] == 0) & (o[..., 1] == 0) & (z > 0), o, "is the camera's own ray, which no mirror makes")
     return np.where(z > 0, across / (1 + np.maximum(z, 0)), 1 - z)
+
+
+def _in_plane_run(o: Floats) -> Floats:
+    """1 - o_y^2 / (1 - o_z) of unit vectors; towards o_z = 1 the quotient is (o_y / hypot(o_x, o_y))^2 (1 + o_z)."""
+    z, side = o[..., 2], np.hypot(o[..., 0], o[..., 1])
+    sine = o[..., 1] / np.where(side > 0, side, 1)
+    run: Floats = 1 - np.where(z > 0, sine**2 * (1 + z), o[..., 1] ** 2 / (1 - np.minimum(z, 0)))
+    return run
 
 
 def _unit(vectors: Floats) -> Floats:
@@ -214,9 +282,15 @@ def _unit(vectors: Floats) -> Floats:
     return unit
 
 
+def _kept(*values: ArrayLike) -> np.dtype[Any]:
+    """float32 where all arrays among the values are of that precision, else float64; plain numbers do not count."""
+    found = {value.dtype for value in values if isinstance(value, np.ndarray | np.generic)}
+    return np.dtype(np.float32 if found == {np.dtype(np.float32)} else np.float64)
+
+
 def _vectors(values: ArrayLike, size: int, name: str) -> Floats:
-    """Read ``values`` as (..., size) finite float64."""
-    array = np.asarray(values, np.float64)
+    """Read ``values`` as (..., size) finite floats."""
+    array = np.asarray(values, _kept(values))
     if array.ndim == 0 or array.shape[-1] != size:
         raise ShapeError(f"a {name} needs {size} numbers on the last axis, got shape {array.shape}")
     _refuse(~np.isfinite(array).all(axis=-1), array, "is not finite")
@@ -226,7 +300,8 @@ def _vectors(values: ArrayLike, size: int, name: str) -> Floats:
 def _units(values: ArrayLike, name: str) -> Floats:
     """Read ``values`` as (..., 3) vectors of length 1."""
     array = _vectors(values, 3, name)
-    _refuse(np.abs(np.sum(array**2, axis=-1) - 1) > LENGTH_SLACK, array, f"is not of length 1, as a {name} must be")
+    off = np.abs(np.sum(array**2, axis=-1) - 1) > LENGTH_SLACK[array.dtype.name]
+    _refuse(off, array, f"is not of length 1, as a {name} must be")
     return array
 
 

@@ -1,0 +1,150 @@
+"""Hard cases of the mirror: grazing, the rim to the last bit, zero, NaN, vertical tangents, both precisions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.errors import PoseError
+from pipeline.mirror import (
+    direction_to_normal,
+    direction_to_position,
+    direction_to_scene,
+    line_rotation,
+    mirror_throughput,
+    normal_to_position,
+    position_to_direction,
+    position_to_normal,
+    scene_to_direction,
+)
+from pipeline.paper import slope_rotation
+
+PRECISIONS = [np.float64, np.float32]
+
+
+def around_the_rim(precision: type, count: int = 720) -> np.ndarray:
+    """Positions of radius 1 in every direction."""
+    turn = np.linspace(0, 2 * np.pi, count)
+    return np.stack([np.cos(turn), np.sin(turn)], axis=-1).astype(precision)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("angle", [1e-3, 1e-6, 1e-12, 1e-18])
+def test_a_view_towards_the_camera_keeps_its_digits(precision: type, angle: float):
+    """o -> +z: the normal and both rotations have the values of their limits, in the precision that came in."""
+    o = np.array([0.6 * np.sin(angle), 0.8 * np.sin(angle), np.cos(angle)]).astype(precision)
+    normal, eps = direction_to_normal(o), 4 * float(np.finfo(precision).eps)
+    exact = [0.6 * np.cos(angle / 2), 0.8 * np.cos(angle / 2), -np.sin(angle / 2)]
+    assert normal.dtype == precision
+    assert normal == pytest.approx(exact, rel=2 * eps, abs=0)
+    assert line_rotation(o) == pytest.approx(np.arctan2(0.8, np.tan(angle / 2)), rel=eps)
+    assert line_rotation(o, "in-plane") == pytest.approx(
+        np.arctan2(0.8 * np.sin(angle), 1 - 0.64 * (1 + np.cos(angle))), rel=eps, abs=eps * angle
+    )
+
+
+def test_the_camera_itself_cannot_be_looked_at():
+    """o = +z has no mirror, whatever asks; the message holds the direction."""
+    for function in (direction_to_normal, direction_to_position, line_rotation):
+        with pytest.raises(PoseError, match=r"\(0, 0, 1\).*no mirror makes"):
+            function([0.0, 0.0, 1.0])
+
+
+def test_a_view_straight_back_has_a_normal_but_no_position():
+    """o = -z: the mirror faces the camera, the line is not turned, and the rig cannot get there."""
+    assert direction_to_normal([0.0, 0.0, -1.0]) == pytest.approx([0, 0, -1])
+    assert line_rotation([[0.0, 0.0, -1.0], [0.0, 1e-9, -1.0]]) == pytest.approx([0, 5e-10], abs=1e-24)
+    with pytest.raises(PoseError, match=r"\(-?0, 0, -1\).*beyond the rim"):
+        direction_to_position([0.0, 0.0, -1.0])
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("towards", [0.0, 2.0])
+def test_one_bit_either_side_of_the_rim_is_still_the_rim(precision: type, towards: float):
+    """Radius 1 + and - 1 ulp goes to a ray and back without an error or a lost digit."""
+    rim = np.nextafter(around_the_rim(precision), towards * around_the_rim(precision), dtype=precision)
+    for position in (rim, np.array([[np.nextafter(precision(1), precision(towards)), 0]], precision)):
+        back = direction_to_position(position_to_direction(position))
+        assert np.abs(back - position).max() < 16 * np.finfo(precision).eps
+
+
+@pytest.mark.parametrize(("precision", "beyond"), [(np.float64, 1e-11), (np.float32, 3e-6)])
+def test_just_beyond_the_rim_is_refused(precision: type, beyond: float):
+    """More than rounding beyond the rim raises, with all digits of the value."""
+    position = np.array([1 + beyond, 0], precision)
+    with pytest.raises(PoseError, match=rf"\({float(position[0]):.15g}, 0\).*outside the unit disk"):
+        position_to_normal(position)
+
+
+def test_a_tilt_just_beyond_the_rim_is_refused():
+    """25 deg + 1e-9 deg of tilt has no position; 25 deg has 1."""
+    axes = np.array([[-1.0, 0.0, -1.0], [1.0, 0.0, -1.0]]) / np.sqrt(2)
+
+    def at(tilt_deg: float) -> np.ndarray:
+        return np.sin(np.deg2rad(tilt_deg)) * axes[0] + np.cos(np.deg2rad(tilt_deg)) * axes[1]
+
+    assert normal_to_position(at(25.0)) == pytest.approx([1, 0], abs=1e-15)
+    with pytest.raises(PoseError, match="beyond the rim"):
+        normal_to_position(at(25.0 + 1e-9))
+
+
+@pytest.mark.parametrize("zero", [0.0, -0.0])
+def test_rest_is_exact(zero: float):
+    """XY = 0, of either sign, looks along x, is not turned, passes all light, and comes back as 0."""
+    rest = np.array([zero, zero])
+    direction = position_to_direction(rest)
+    assert direction_to_scene(direction) == pytest.approx([0, 0], abs=3e-16)
+    assert line_rotation(direction) == 0
+    assert line_rotation(direction, "in-plane") == 0
+    assert mirror_throughput(rest) == 1
+    assert np.abs(direction_to_position([1.0, 0.0, 0.0])).max() < 1e-15
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_numbers_that_are_not_finite_are_named(precision: type, value: float):
+    """NaN and infinity raise with their place among many, in both precisions."""
+    many = np.zeros((4, 2), precision)
+    many[2, 1] = value
+    for function in (position_to_normal, position_to_direction, mirror_throughput, scene_to_direction):
+        with pytest.raises(PoseError, match=rf"\(0, {value}\) \(index 2\) is not finite"):
+            function(many)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_rotation_at_the_rim_is_finite_and_continuous(precision: type):
+    """Round the rim psi stays below 90 deg, is odd in Y, and nowhere jumps."""
+    psi = np.rad2deg(line_rotation(position_to_direction(around_the_rim(precision))).astype(np.float64))
+    assert np.isfinite(psi).all()
+    assert np.abs(psi).max() < 90
+    assert np.abs(np.diff(psi)).max() < 1.0
+    assert psi + psi[::-1] == pytest.approx(0, abs=1e-4 if precision is np.float32 else 1e-11)
+
+
+def test_a_vertical_tangent_turns_no_line():
+    """Where the path has no dX the paper's slope is 90 deg; the pose says what the line really does."""
+    path = np.array([[0.1, -0.01], [0.1, 0.0], [0.1, 0.01]])
+    assert np.rad2deg(np.abs(slope_rotation(path))) == pytest.approx(90)
+    turned = np.rad2deg(line_rotation(position_to_direction(path)))
+    assert turned[1] == 0
+    assert np.abs(turned).max() < 0.6
+
+
+def test_repeated_positions_have_the_same_rotation():
+    """A dwell leaves the slope undefined (NaN), and the rotation by pose as it was."""
+    path = np.array([[0.1, 0.2]] * 3)
+    assert np.isnan(slope_rotation(path)).all()
+    assert np.ptp(line_rotation(position_to_direction(path))) == 0
+
+
+def test_single_precision_follows_double():
+    """float32 throughout differs from float64 of the same positions by less than 1e-6 rad and 1e-6 of light."""
+    rng = np.random.default_rng(3)
+    radius, turn = np.sqrt(rng.uniform(0, 1, 20_000)), rng.uniform(0, 2 * np.pi, 20_000)
+    single = (0.999 * radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)).astype(np.float32)
+    double = single.astype(np.float64)
+    assert np.linalg.norm(position_to_direction(single) - position_to_direction(double), axis=-1).max() < 1e-6
+    assert np.abs(mirror_throughput(single) - mirror_throughput(double)).max() < 1e-6
+    direction = position_to_direction(single)
+    apart = line_rotation(direction) - line_rotation(position_to_direction(double))
+    assert np.abs(apart).max() < 2e-6

@@ -1,0 +1,348 @@
+"""Figures of the errata E1 to E18: what the paper prints, beside what is right."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from models.tokens import paper_numbers
+from pipeline.camera import LineCamera
+from pipeline.errors import SettingsError
+from pipeline.mirror import (
+    REST_TANGENT,
+    direction_to_normal,
+    direction_to_position,
+    direction_to_scene,
+    line_rotation,
+    normal_to_position,
+    position_to_direction,
+    scene_to_direction,
+)
+from pipeline.mounting import Mounting
+from pipeline.paper import (
+    LINE_MODELS,
+    line_points,
+    mechanical_position,
+    paper_imaging_ms,
+    paper_normal,
+    paper_position,
+    paper_sample_rate,
+    paper_scene_speed,
+    paper_turn,
+    product_position,
+    public_cells,
+    reflection_matrix,
+    slope_rotation,
+    stable_normal,
+    straight_slope_rotation,
+    unlimited_position,
+)
+from pipeline.scan import CostModel
+from pipeline.timing import channel_cells, mirror_rates, sample_rate_hz, scene_speed
+
+CAMERA = LineCamera()
+IFOV = CAMERA.ifov_rad
+E1, E3 = np.array([-1.0, 0.0, -1.0]) / np.sqrt(2), np.array([1.0, 0.0, -1.0]) / np.sqrt(2)
+
+
+def tilted(tilt_deg: float) -> np.ndarray:
+    """The normal tilted in the plane of incidence."""
+    tilt = np.deg2rad(tilt_deg)
+    return np.sin(tilt) * E1 + np.cos(tilt) * E3
+
+
+def optical_deg(position: np.ndarray) -> float:
+    """How far the device deflects along X. [deg]"""
+    return float(np.rad2deg(np.arctan(position[0] * REST_TANGENT)))
+
+
+def aim(xi_px: object, eta_px: object) -> np.ndarray:
+    """Exact positions that look at scene points, beyond the rim too."""
+    tangents = np.stack(np.broadcast_arrays(xi_px, eta_px), axis=-1) * IFOV
+    return unlimited_position(direction_to_normal(scene_to_direction(tangents)))
+
+
+def looked_at(position: np.ndarray) -> np.ndarray:
+    """Scene points (xi, eta) that positions look at. [px]"""
+    return direction_to_scene(position_to_direction(position)) / IFOV
+
+
+def sweep_of_1450(xi_px: float) -> np.ndarray:
+    """Positions of 1450 lines over 1280 px of the scan, straight in the scene."""
+    return aim(xi_px, np.linspace(-640, 640, 1450))
+
+
+def turn_of(position: np.ndarray) -> np.ndarray:
+    """Exact rotation of the line at positions. [rad]"""
+    return line_rotation(position_to_direction(position))
+
+
+@pytest.mark.parametrize(
+    ("tilt", "x", "eq7", "error_deg", "error_px", "product_deg", "product_px"),
+    [
+        (1, 0.0293, 0.0413, 0.82, 135, -1.00, -165),
+        (5, 0.1480, 0.2062, 3.81, 629, -5.04, -832),
+        (10, 0.3054, 0.4109, 6.09, 1005, -10.3, -1700),
+        (12.56, 0.3934, 0.5146, 6.40, 1056, -13.1, -2169),
+        (20, 0.7041, 0.8093, 3.96, 654, -22.2, -3662),
+        (25, 1.0, 1.0, 0.0, 0, -29.0, -4795),
+    ],
+)
+def test_e1_e2_positions_differ_as_tabulated(tilt, x, eq7, error_deg, error_px, product_deg, product_px):
+    """Equation (7), code seen in public and equation (1) read with the tilt, against the device's coordinate."""
+    normal, px = tilted(tilt), np.deg2rad(1) / IFOV
+    assert [normal_to_position(normal)[0], paper_position(normal)[0]] == pytest.approx([x, eq7], abs=6e-5)
+    off = optical_deg(paper_position(normal)) - 2 * tilt
+    assert [off, off * px] == pytest.approx([error_deg, error_px], abs=0.5 if off > 9 else 0.6)
+    assert off == pytest.approx(error_deg, abs=0.006)
+    off = optical_deg(product_position(normal)) - 2 * tilt
+    assert off == pytest.approx(product_deg, abs=0.06)
+    assert off * px == pytest.approx(product_px, abs=0.6)
+    assert optical_deg(mechanical_position(normal)) == pytest.approx(tilt, abs=1e-12)
+
+
+def test_e2_asking_for_a_step_gives_another():
+    """With equation (7) 100 px become 141, 1280 px along the line 1792, and two axes bend: xi 4800 -> (5479, 163)."""
+    reached = {
+        asked: looked_at(paper_position(direction_to_normal(scene_to_direction(np.array(asked) * IFOV))))
+        for asked in ((100, 0), (0, 100), (0, 1280), (4800, 0))
+    }
+    assert reached[100, 0][0] == pytest.approx(141, abs=0.5)
+    assert reached[0, 100] == pytest.approx([0, 141], abs=0.5)
+    assert reached[0, 1280] == pytest.approx([0, 1792], abs=0.6)
+    assert reached[4800, 0] == pytest.approx([5479, 163], abs=0.5)
+
+
+def test_e3_the_corner_of_the_field_is_out_of_reach():
+    """10240 x 10240 px: the far corner needs radius 1.029, (4800, 5120) 0.965; 0.06 % of the field is not reachable."""
+    assert np.hypot(*aim(5120, 5120)) == pytest.approx(1.029, abs=5e-4)
+    assert np.hypot(*aim(4800, 5120)) == pytest.approx(0.965, abs=5e-4)
+    side = np.linspace(-5120, 5120, 401)
+    radius = np.linalg.norm(aim(side[:, None], side[None, :]), axis=-1)
+    assert np.mean(radius > 1) == pytest.approx(6e-4, abs=1e-4)
+
+
+def test_e4_the_papers_matrix_turns_the_ray_round():
+    """With the normal of equation (4), R i = -o: i and o point from the mirror, and o = (2 n n^T - I) i."""
+    o = scene_to_direction([[0.2, -0.4], [0.0, 0.0], [-0.5, 0.6]])
+    turned = reflection_matrix(paper_normal(o)) @ [0.0, 0.0, 1.0]
+    assert turned == pytest.approx(-o, abs=1e-15)
+
+
+def test_e5_the_turn_by_45_degrees_fits_one_side_only():
+    """The rest normal goes to (0, 0, 1) only with the scene on the -x side; for +x it becomes (1, 0, 0)."""
+    half = np.sqrt(0.5)
+    assert paper_turn() @ [-half, 0, half] == pytest.approx([0, 0, 1], abs=1e-15)
+    assert paper_turn() @ [half, 0, half] == pytest.approx([1, 0, 0], abs=1e-15)
+
+
+@pytest.mark.parametrize(("grazing", "view_px"), [(1e-2, 1.65), (1e-3, 454.0), (1e-4, np.inf)])
+def test_e7_equation_4_loses_its_digits_at_grazing(grazing: float, view_px: float):
+    """float32: the view is 1.6 px off at 10 mrad, 454 px at 1 mrad, not finite at 0.1 mrad; the stable form holds."""
+    turn = np.linspace(0, 2 * np.pi, 500)
+    o = np.stack([np.sin(grazing) * np.cos(turn), np.sin(grazing) * np.sin(turn), np.full(500, -np.cos(grazing))], -1)
+    single, exact = o.astype(np.float32), stable_normal(o.astype(np.float32).astype(np.longdouble))
+    off = 2 * np.linalg.norm((paper_normal(single) - exact).astype(np.float64), axis=-1).max() / IFOV
+    assert np.nan_to_num(off, nan=np.inf, posinf=np.inf) == pytest.approx(view_px, rel=0.01)
+    assert np.linalg.norm(stable_normal(single) - exact, axis=-1).max() < 1.6e-7
+    double, exact = paper_normal(o), stable_normal(o.astype(np.longdouble))
+    assert 2 * np.linalg.norm((double - exact).astype(np.float64), axis=-1).max() / IFOV < 6e-5
+
+
+@pytest.mark.parametrize(
+    ("position", "psi_deg", "seed_deg"),
+    [
+        ((0, 0.3), 13.8, 10.4), ((0.4, 0.3), 10.8, 7.6), ((-0.4, 0.3), 16.7, 11.3), ((0.8, 0.3), 8.5, 4.9),
+        ((-0.8, 0.3), 18.9, 10.3), ((0, 0.7), 27.1, 25.3), ((-0.4, 0.8), 34.2, 28.6),
+    ],
+)  # fmt: skip
+def test_e8_rotation_and_slope_at_seven_positions(position, psi_deg: float, seed_deg: float):
+    """What the line really turns by, and what the slope of the path says."""
+    xi, eta = looked_at(np.array(position))
+    assert np.rad2deg(turn_of(np.array(position))) == pytest.approx(psi_deg, abs=0.06)
+    assert np.rad2deg(straight_slope_rotation(xi, eta, CAMERA)) == pytest.approx(seed_deg, abs=0.06)
+
+
+def test_e8_the_slope_is_wrong_by_up_to_twelve_and_a_half_degrees():
+    """The slope is 1/sqrt 2 of the rotation near the axis, 4.4 deg off within 25 deg and 12.5 deg off in the disk."""
+    side = np.linspace(-1, 1, 201)
+    position = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    radius = np.linalg.norm(position, axis=-1)
+    position, radius = position[radius <= 1], radius[radius <= 1]
+    off = np.rad2deg(np.abs(straight_slope_rotation(*looked_at(position).T, CAMERA) - turn_of(position)))
+    assert off.max() == pytest.approx(12.5, abs=0.06)
+    assert off[radius <= np.tan(np.deg2rad(25)) / REST_TANGENT].max() == pytest.approx(4.4, abs=0.06)
+    near = straight_slope_rotation(1.0, 0.0, CAMERA) / turn_of(aim(1.0, 0.0))
+    assert near == pytest.approx(0.7071, abs=1e-4)
+
+
+def test_e8_the_slope_is_ill_conditioned():
+    """40 urad of noise: 47 deg rms by slope, 1.6e-2 px by position; %.6f: 1.6 px by slope, 7e-5 px by position."""
+    exact = sweep_of_1450(1000.0)
+    normal = direction_to_normal(position_to_direction(exact))
+    shaken = normal + np.random.default_rng(0).normal(0, 40e-6, normal.shape)
+    noisy = normal_to_position(shaken / np.linalg.norm(shaken, axis=-1, keepdims=True))
+
+    def rms(of: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(of**2)))
+
+    def by_slope(path: np.ndarray) -> float:
+        return rms(slope_rotation(path) - slope_rotation(exact))
+
+    def by_pose(path: np.ndarray) -> float:
+        return 320 * rms(turn_of(path) - turn_of(exact))
+
+    rounded = np.round(exact, 6)
+    assert np.rad2deg(by_slope(noisy)) == pytest.approx(47, abs=2)
+    assert np.rad2deg(by_slope(rounded)) == pytest.approx(0.29, abs=0.02)
+    assert 320 * by_slope(rounded) == pytest.approx(1.6, abs=0.1)
+    assert by_pose(noisy) == pytest.approx(1.8e-2, abs=2e-3)
+    assert by_pose(rounded) == pytest.approx(7.5e-5, abs=5e-6)
+
+
+@pytest.mark.parametrize(("xi_px", "seed_deg"), [(0, 90.0), (500, 87.9), (2365, 79.7)])
+def test_e9_the_slope_is_vertical_on_the_rigs_own_path(xi_px: float, seed_deg: float):
+    """With the axes of code seen in public the scan runs along Y, and -atan(dY/dX) is near 90 deg for no rotation."""
+    mounted = Mounting(axes=((0, 1), (-1, 0))).to_device(aim(xi_px, np.array([-0.5, 0.5])))
+    assert np.abs(np.rad2deg(slope_rotation(mounted))) == pytest.approx(seed_deg, abs=0.06)
+
+
+def test_e9_repeated_positions_have_no_slope():
+    """At four decimals 313 of 1450 positions repeat the one before: 0/0, or a silent 0 from atan2."""
+    path = np.round(sweep_of_1450(0.0), 4)
+    step = np.diff(path, axis=0) + 0.0  # no negative zeros
+    angle = slope_rotation(path)
+    assert int(np.isnan(angle).sum()) == int((step == 0).all(axis=1).sum()) == 313
+    assert (np.arctan2(step[:, 1], step[:, 0])[np.isnan(angle)] == 0).all()
+    assert np.isfinite(turn_of(path)).all()
+
+
+def test_e11_speed_needs_the_pitch_and_the_frame_period():
+    """Equation (8) with the whole sensor is 640 times the speed; the mirror's own rates are 1/2 and 1/sqrt 2 of it."""
+    sensor_mm = CAMERA.samples * CAMERA.pitch_um * 1e-3
+    assert paper_scene_speed(sensor_mm, 30.0, CAMERA) / scene_speed(CAMERA, 30.0) == pytest.approx(640)
+    in_plane, cross = mirror_rates(CAMERA)
+    view = IFOV / 0.1
+    assert (in_plane, cross) == pytest.approx((view / 2, view / np.sqrt(2)))
+    moved = position_to_direction(normal_to_position(tilted(np.rad2deg(in_plane * 0.1))))
+    assert np.abs(direction_to_scene(moved) / IFOV) == pytest.approx([0, 1], abs=1e-6)
+
+
+def test_e12_e13_rates_are_in_hertz_and_times_have_overheads():
+    """m / t_img in ms is 1000 times too small for Hz; 640 x 600 at 100 ms takes 60 s, and readout comes on top."""
+    assert sample_rate_hz(1500, 600, CAMERA) / paper_sample_rate(1500, 600, CAMERA) == pytest.approx(1000)
+    assert paper_imaging_ms(600, CAMERA) == 60_000 == 1e3 * CAMERA.scan_seconds(600)
+    slower = LineCamera(exposure_ms=100, readout_ms=5)
+    assert 1e3 * slower.scan_seconds(600) - paper_imaging_ms(600, slower) == pytest.approx(3000)
+    with pytest.raises(SettingsError, match="at least one sample"):
+        sample_rate_hz(0, 600, CAMERA)
+
+
+def test_e14_vector_memory_is_half_open():
+    """Cells 1451..2900 start one sample late or end beyond what was written; half-open ranges do neither."""
+    x, y = public_cells(1450, inclusive=False)
+    assert (len(x), len(y), y[0]) == (1450, 1449, 1451)
+    assert pytest.approx(0.44, abs=0.002) == 640 / 1450
+    x, y = public_cells(1450, inclusive=True)
+    assert (x[-1], y[-1]) == (1450, 2900)
+    ours_x, ours_y = channel_cells(1450)
+    assert (ours_x.start, ours_x.stop, ours_y.start, ours_y.stop) == (0, 1450, 1450, 2900)
+    assert ours_y.to_device(inclusive=True) == (1450, 2899)
+    assert ours_y.to_device(inclusive=False) == (1450, 2900)
+    with pytest.raises(SettingsError, match="1501 positions do not fit a vector memory of 1500"):
+        channel_cells(1501)
+
+
+def test_e15_the_slit_spans_lines():
+    """A slit of 20 um is 2.70 px along the scan: lines 1 px apart overlap 2.7 times."""
+    assert CAMERA.slit_px == pytest.approx(2.70, abs=0.005)
+
+
+def test_e17_the_full_scan_takes_hours():
+    """163 840 lines: 4.55 h at 100 ms and 27 min at 10 ms, 56.6 GB at 270 bands, 110 loads of 1500 positions."""
+    lines = 16 * 10240
+    fast = LineCamera(exposure_ms=10)
+    assert lines == 163_840
+    assert CAMERA.scan_seconds(lines) / 3600 == pytest.approx(4.55, abs=0.005)
+    assert fast.scan_seconds(lines) / 60 == pytest.approx(27.3, abs=0.05)
+    assert lines * CAMERA.samples * 270 * 2 / 1e9 == pytest.approx(56.6, abs=0.05)
+    assert -(-lines // CostModel().vector_pairs) == 110
+    assert CAMERA.scan_seconds(lines) / CAMERA.scan_seconds(lines // 4) == 4
+
+
+def test_e18_counts_of_the_table_and_jumps_of_the_encoding():
+    """256 coarse patches and 100 to 500 fine ones are 356 to 756; patches of 4 seats are 5 numbers apart: 21, 26."""
+    assert [(512 // 32) ** 2 + fine for fine in (100, 200, 300, 400, 500)] == [356, 456, 556, 656, 756]
+    # 4 columns of coarse patches of 2 x 2 seats; patches 4 and 5 are the first two of the second row.
+    coarse = torch.tensor([[2.0, 0.0], [2.0, 2.0]]) + 1.0
+    numbers = paper_numbers(coarse, torch.tensor([2.0, 2.0]), 4, 2)
+    assert numbers.tolist() == [21, 26]
+
+
+def greatest_errors(field_deg: float) -> list[float]:
+    """Greatest error of each line model at the line ends, over the disk that reaches ``field_deg`` along X. [px]"""
+    turn = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    radius = np.tan(np.deg2rad(field_deg)) / REST_TANGENT * np.array([1.0, 0.8, 0.4])
+    position = radius[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    greatest = np.zeros(len(LINE_MODELS))
+    for strip, centre in looked_at(position.reshape(-1, 2)):
+        points = [line_points(model, strip, np.array([centre]), CAMERA) for model in LINE_MODELS]
+        off = [np.hypot(a - points[-1][0], b - points[-1][1]).max() for a, b in points]
+        greatest = np.maximum(greatest, off)
+    return greatest.tolist()
+
+
+@pytest.mark.parametrize(
+    ("field_deg", "px"),
+    [
+        (5, (19.9, 6.0, 1.9, 0.67)), (10, (40, 12.9, 6.4, 1.37)), (25, (111, 47, 39, 3.9)),
+        (40, (217, 130, 119, 8.0)), (50, (337, 243, 227, 13.3)),
+    ],
+)  # fmt: skip
+def test_line_models_err_as_tabulated(field_deg: float, px: tuple[float, ...]):
+    """Rotation is not rectification: even the exact rotation with the local scale errs; rays do not."""
+    errors = greatest_errors(field_deg)
+    assert errors[:4] == pytest.approx(px, rel=0.012)
+    assert errors[4] == 0
+
+
+def test_every_line_model_agrees_on_the_line_centre():
+    """Models differ in turn and scale only; and an unknown one is refused."""
+    centre = np.array([-3000.0, 0.0, 2500.0])
+    for model in LINE_MODELS:
+        along, scan = line_points(model, 700.0, centre, CAMERA)
+        assert along.shape == scan.shape == (3, 640)
+        assert along[:, 319:321].mean(axis=1) == pytest.approx(700.0, abs=1e-3)
+        assert scan[:, 319:321].mean(axis=1) == pytest.approx(centre, abs=1e-3)
+    with pytest.raises(ValueError, match="one of L0, L1, L2, L3, L4, got 'L5'"):
+        line_points("L5", 0.0, centre, CAMERA)
+
+
+def test_lines_turn_and_stretch_over_the_field():
+    """10240 x 10240 px: psi is 14.5 deg on average and 37.0 at most, mean tan 0.265; lines stretch by up to 1.26."""
+    side = np.linspace(-5120, 5120, 257)
+    direction = scene_to_direction(np.stack(np.meshgrid(side, side), axis=-1) * IFOV)
+    psi, normal = np.abs(line_rotation(direction)), direction_to_normal(direction)
+    assert np.rad2deg([psi.mean(), psi.max()]) == pytest.approx([14.5, 37.0], abs=0.06)
+    assert np.tan(psi).mean() == pytest.approx(0.265, abs=5e-4)
+    assert (0.5 / np.abs(normal[..., 0] * normal[..., 2])).max() == pytest.approx(1.26, abs=0.005)
+
+
+def test_residual_of_the_slope_at_the_line_end():
+    """Five of the values of the design table, XY to px at the end of a 640-px line."""
+    table = {(-0.8, 0.3): 72, (-0.4, 0.5): 50, (0.0, 0.4): 23, (0.4, 0.4): 23, (0.8, 0.5): 35}
+    for position, px in table.items():
+        xi, eta = looked_at(np.array(position))
+        along, scan = line_points("L4", xi, np.array([eta]), CAMERA)
+        length = np.hypot(along - xi, scan - eta).max()
+        off = straight_slope_rotation(xi, eta, CAMERA) - turn_of(np.array(position))
+        assert length * 2 * np.abs(np.sin(off / 2)) == pytest.approx(px, abs=1)
+
+
+def test_six_decimals_are_enough_to_point():
+    """1e-6 in XY moves the view by at most 0.0115 px."""
+    rest = direction_to_position(scene_to_direction([0.0, 0.0]))
+    step = [np.linalg.norm(looked_at(rest + d) - looked_at(rest)) for d in ((1e-6, 0.0), (0.0, 1e-6))]
+    assert step == pytest.approx([1e-6 * REST_TANGENT / IFOV, 1e-6 * 0.8427 / IFOV], rel=1e-3)
+    assert max(step) < 0.0115
