@@ -1,4 +1,4 @@
-"""Lookup: the inverse of the exact rays, over the mirror's whole disk, for any path that does not turn."""
+"""Lookup: the inverse of the exact rays, over the mirror's whole disk, for any path."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 from pipeline.camera import LineCamera
 from pipeline.errors import PoseError, ShapeError
 from pipeline.mirror import direction_to_position, direction_to_scene, position_to_normal, reflect, scene_to_direction
-from pipeline.rectify.lookup import grid_lookup, lookup
+from pipeline.rectify.knot_curve import KnotCurve
+from pipeline.rectify.lookup import grid_lookup, lookup, track_lookup
+from pipeline.rectify.resample import resample
+from pipeline.rectify.tracks import Track, make_tracks
 from pipeline.scan import Sweep, line_positions, points_of_scan, scene_to_sweep
 
 CAMERA = LineCamera()
@@ -155,3 +158,62 @@ def test_no_points_give_none() -> None:
     assert lookup(position, CAMERA, np.zeros((0, 2)), along="x").shape == (0, 2)
     empty = grid_lookup(position, CAMERA, along="x", binning=1, origin_px=(0, 0), spacing_px=1, shape=(0, 5))
     assert empty.shape == (0, 5, 2)
+
+
+def wandering_track(seed: int, amount_px: float, strip: float = 2600.0) -> Track:
+    """A track of 120 lines about 1 px apart, each off its place by up to ``amount_px`` both ways."""
+    off = np.random.default_rng(seed).uniform(-amount_px, amount_px, (2, 120))
+    (track,) = make_tracks(aim(strip + off[0], np.arange(120.0) + off[1]), CAMERA, step_px=1.0)
+    return track
+
+
+def seen_by(track: Track) -> tuple[np.ndarray, np.ndarray]:
+    """Scene points (y, x) [px] of all samples of a track's knots, (knot, sample) each."""
+    centre = track.across / CAMERA.ifov_rad, track.scan / CAMERA.ifov_rad
+    rows = [points_of_scan(c, CAMERA, e, CAMERA.pixel_slopes()) for c, e in zip(*centre, strict=True)]
+    return np.array([scan for _, scan in rows]), np.array([along for along, _ in rows])
+
+
+@given(st.integers(0, 999), st.floats(0, 0.4), st.sampled_from([0.0, 2600.0, -4000.0]))
+@settings(max_examples=15, deadline=None)
+def test_linear_scene_comes_back_from_any_path(seed: int, amount: float, strip: float) -> None:
+    """What lines that lie unevenly and beside their strip saw of y and x is resampled to y and x, to float32."""
+    track = wandering_track(seed, amount, strip)
+    y, x = seen_by(track)
+    points = np.random.default_rng(seed).uniform((5, strip - 310), (115, strip + 310), (4000, 2))
+    at = track_lookup(track, CAMERA, points, along="x")
+    taps = np.floor(np.nan_to_num(at)).astype(int)[:, :, None] + np.arange(-1, 3)
+    whole = np.isfinite(at[:, 0]) & (taps >= 0).all(axis=(1, 2)) & (taps[:, 0] < len(track)).all(axis=1)
+    whole &= (taps[:, 1] < 640).all(axis=1) & track.seen[np.minimum(taps[:, 0], len(track) - 1)].all(axis=1)
+    values = np.stack([y - 60, x - strip], axis=-1).astype(np.float32)
+    found, _ = resample(values, np.ones(y.shape, np.bool_), at[whole])
+    np.testing.assert_allclose(found, points[whole] - [60, strip], atol=2e-4)
+    assert whole.sum() > 500
+
+
+@given(st.integers(0, 999), st.floats(0, 0.45))
+@settings(max_examples=25, deadline=None)
+def test_knots_are_found_at_their_own_points(seed: int, amount: float) -> None:
+    """A point that a line itself saw is found at this line or at another that saw it as well, on any path."""
+    track = wandering_track(seed, amount)
+    rng = np.random.default_rng(seed)
+    knot, sample = rng.integers(3, len(track) - 3, 300), rng.integers(5, 635, 300)
+    y, x = seen_by(track)
+    at = track_lookup(track, CAMERA, np.stack([y, x], axis=-1)[knot, sample], along="x")
+    on = np.isfinite(at[:, 0])
+    scan, _, across, _ = KnotCurve(track).at(at[on, 0])
+    slope = (at[on, 1] + 0.5 - CAMERA.samples / 2) * CAMERA.ifov_rad
+    along, down = points_of_scan(across / CAMERA.ifov_rad, CAMERA, scan / CAMERA.ifov_rad, slope)
+    np.testing.assert_allclose(np.stack([down, along], axis=-1), np.stack([y, x], -1)[knot, sample][on], atol=1e-6)
+    assert (on | ~track.seen[knot]).all()
+
+
+def test_evenness_changes_nothing_but_the_way() -> None:
+    """The closed form and Newton agree: lines 1e-6 px out of even give the same coordinates to 1e-5."""
+    points = np.random.default_rng(5).uniform((0, 2300), (119, 2900), (500, 2))
+    (even,) = make_tracks(aim(2600.0, np.arange(120.0)), CAMERA)
+    uneven = wandering_track(1, 1e-6)
+    assert even.uniform
+    assert not uneven.uniform
+    first, second = (track_lookup(track, CAMERA, points, along="x") for track in (even, uneven))
+    np.testing.assert_allclose(first, second, atol=1e-5)

@@ -1,0 +1,254 @@
+"""Tracks: where the lines of a sweep lie, as runs that go one way, whatever path the mirror took."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.camera import LineCamera
+from pipeline.errors import PoseError, ShapeError
+from pipeline.mirror import RIM_SLACK, direction_to_scene, position_to_direction
+
+STANDING_STEPS = 1e-3  # a mirror that moves less than this stands still
+DWELL_STEPS = 0.25  # lines closer than this show the same place
+GAP_STEPS = 1.5  # a wider distance misses a line; a smaller step back is noise
+NOISE_SIGMAS = 6.0  # nor does a path turn that goes back by less than this much of its own noise
+EVEN_STEPS = 1e-7  # a path this straight and even is looked up in closed form
+
+SIGMA_OF_MEDIAN = 1.4826  # of a normal law, from the median of its absolute values
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Track:
+    """One run of a sweep along the scan: knots where lines lie, in ascending order. Tangents of the scene plane.
+
+    A knot is one line, or several that show the same place, whose values are averaged. Where lines are missing the
+    track is filled with knots at even distances that nothing saw (``seen`` False), so that an even track stays even;
+    their one member is the nearest line, and does not count.
+    """
+
+    scan: Floats  # (knot,) of the line centres on the scan axis, ascending
+    across: Floats  # (knot,) of the line centres along the line
+    lines: NDArray[np.intp]  # (member,) numbers of the lines, knot by knot
+    starts: NDArray[np.intp]  # (knot,) first member of each knot in ``lines``
+    seen: NDArray[np.bool_]  # (knot,)
+    width: float  # usual distance of lines, as a tangent
+
+    def __len__(self) -> int:
+        return len(self.scan)
+
+    @property
+    def straight(self) -> bool:
+        """Whether all line centres lie on one parallel to the scan axis."""
+        return bool(np.ptp(self.across) < EVEN_STEPS * self.width)
+
+    @property
+    def uniform(self) -> bool:
+        """Whether all knots are ``width`` apart."""
+        even = self.scan[0] + self.width * np.arange(len(self.scan))
+        return bool(np.abs(self.scan - even).max() < EVEN_STEPS * self.width)
+
+
+def make_tracks(
+    position: Floats,
+    camera: LineCamera,
+    *,
+    usable: NDArray[np.bool_] | None = None,
+    shift_px: Floats | None = None,
+    binning: int = 1,
+    step_px: float | None = None,
+) -> tuple[Track, ...]:
+    """Split a sweep into runs that go one way along the scan, and order the lines of each.
+
+    A path turns where it goes back by more than 1.5 steps, and by more than six times the noise that its own second
+    differences show; what goes back less is put in order. Lines closer than a quarter step are one knot (a dwell).
+    Lines that are not usable say nothing of the path; where one is missing, or was lost, knots that nothing saw stand
+    in its place. Resampling then counts their values nothing, and fails where what is left weighs less than a half.
+
+    Parameters
+    ----------
+    position
+        (line, 2) mirror X and Y at mid exposure. Those of lines that are not usable do not matter.
+    usable
+        (line,) lines to be used; None for all.
+    shift_px
+        (line, 2) pointing corrections, along the line and along the scan, added to the line centres. [px]
+    binning
+        Neighbouring samples summed: lines are taken to be as far apart where the path itself does not say.
+    step_px
+        Planned distance of the lines; None takes the median of the path's own steps. [px]
+
+    Returns
+    -------
+    Tracks in the order in which they were taken; none where no line is usable.
+
+    Raises
+    ------
+    PoseError : the position of a usable line is not finite or beyond the mirror's disk; names the first.
+    ShapeError : arrays do not fit the lines.
+    """
+    scan, across, lines = line_centres(position, camera, usable, shift_px)
+    if not len(lines):
+        return ()
+    apart = camera.ifov_rad * binning
+    step = _usual_step(scan, lines, apart) if step_px is None else step_px * camera.ifov_rad
+    runs = _runs(scan, max(GAP_STEPS * step, NOISE_SIGMAS * _noise(scan)), DWELL_STEPS * step)
+    return tuple(_track(scan[run], across[run], lines[run], step) for run in runs)
+
+
+def line_centres(
+    position: Floats,
+    camera: LineCamera,
+    usable: NDArray[np.bool_] | None = None,
+    shift_px: Floats | None = None,
+) -> tuple[Floats, Floats, NDArray[np.intp]]:
+    """Give where the usable lines of a sweep have their centres, in the order of capture.
+
+    Parameters as of :func:`make_tracks`.
+
+    Returns
+    -------
+    Tangents on the scan axis and along the line, (usable line,) each, and the numbers of these lines.
+
+    Raises
+    ------
+    PoseError : the position of a usable line is not finite or beyond the mirror's disk; names the first.
+    ShapeError : arrays do not fit the lines.
+    """
+    if position.ndim != 2 or position.shape[1] != 2:
+        raise ShapeError(f"expected mirror positions (line, 2), got {position.shape}")
+    if usable is not None and usable.shape != position.shape[:1]:
+        raise ShapeError(f"usable has shape {usable.shape}, expected one flag for each of {len(position)} lines")
+    if shift_px is not None and shift_px.shape != position.shape:
+        raise ShapeError(f"shift_px has shape {shift_px.shape}, expected {position.shape}: along and scan of each line")
+    lines = np.arange(len(position)) if usable is None else np.flatnonzero(usable)
+    place = np.asarray(position[lines], np.float64)
+    _check_positions(place, lines)
+    tangent = direction_to_scene(position_to_direction(place))
+    if shift_px is not None:
+        tangent = tangent + shift_px[lines] * camera.ifov_rad
+    return tangent[:, 1], tangent[:, 0], lines
+
+
+def single_track(position: Floats, camera: LineCamera, binning: int = 1) -> Track:
+    """Make one track of lines that run one way, a knot for each line whatever their distances."""
+    scan, across, lines = line_centres(position, camera)
+    step = _usual_step(scan, lines, camera.ifov_rad * binning)
+    order = np.argsort(scan, kind="stable")
+    scan = scan[order]
+    return Track(scan, across[order], lines[order], np.arange(len(lines)), np.ones(len(lines), np.bool_),
+                 _width(scan, step))  # fmt: skip
+
+
+def _check_positions(place: Floats, lines: NDArray[np.intp]) -> None:
+    radius = np.hypot(place[:, 0], place[:, 1])
+    out = ~(radius <= 1 + RIM_SLACK["float64"])
+    if out.any():
+        first = int(np.argmax(out))
+        x, y = place[first]
+        raise PoseError(
+            f"line {lines[first]} is at mirror position ({x:.15g}, {y:.15g}), expected finite numbers in the unit"
+            " disk; mark the line as not usable, or keep the field within the mirror's range"
+        )
+
+
+def _usual_step(scan: Floats, lines: NDArray[np.intp], apart: float) -> float:
+    """Median distance of lines that follow each other, standing ones left out; ``apart`` where none move."""
+    steps = np.abs(np.diff(scan)) / np.diff(lines)
+    steps = steps[steps > STANDING_STEPS * apart]
+    if not len(steps):
+        return apart
+    moving = steps[steps >= DWELL_STEPS * np.median(steps)]
+    return float(np.percentile(moving, 50, method="lower"))  # of one step and one gap, the step
+
+
+def _noise(scan: Floats) -> float:
+    """Standard deviation of a position about its path, from the median of the second differences."""
+    if len(scan) < 3:
+        return 0.0
+    return float(np.median(np.abs(np.diff(scan, 2)))) * SIGMA_OF_MEDIAN / 6**0.5
+
+
+def _runs(scan: Floats, most_back: float, still: float) -> list[slice]:
+    """Parts of the path that go one way, up to steps back of ``most_back``.
+
+    The first line within ``still`` of the turn ends its part; those that stand there longer begin the next.
+    """
+    runs = []
+    first, rising = 0, _rises_first(scan, most_back)
+    while first < len(scan):
+        way = scan[first:] if rising else -scan[first:]
+        back = np.maximum.accumulate(way) - way > most_back
+        rise = way[: np.argmax(back)] if back.any() else way[:0]
+        stop = first + int(np.argmax(rise > rise.max() - still)) + 1 if len(rise) else len(scan)
+        runs.append(slice(first, stop))
+        first, rising = stop, not rising
+    return runs
+
+
+def _rises_first(scan: Floats, far: float) -> bool:
+    """Whether the path first goes up or down by more than ``far``; where it does neither, where it ends."""
+    up = scan - np.minimum.accumulate(scan) > far
+    down = np.maximum.accumulate(scan) - scan > far
+    if not up.any() and not down.any():
+        return bool(scan[-1] >= scan[0])
+    return bool(up.any() and (not down.any() or np.argmax(up) < np.argmax(down)))
+
+
+def _track(scan: Floats, across: Floats, lines: NDArray[np.intp], step: float) -> Track:
+    """Order one run, average its dwells and fill its gaps."""
+    order = np.argsort(scan, kind="stable")
+    scan, across, lines = scan[order], across[order], lines[order]
+    starts = _dwell_starts(scan, DWELL_STEPS * step)
+    counts = np.diff(starts, append=len(lines))
+    if len(starts) < len(lines):
+        lines = lines[np.lexsort((lines, np.repeat(np.arange(len(starts)), counts)))]
+        scan, across = (np.add.reduceat(values, starts) / counts for values in (scan, across))
+    missing = np.where(np.diff(scan) > GAP_STEPS * step, np.rint(np.diff(scan) / step) - 1, 0).astype(np.intp)
+    at = np.concatenate([[0], np.cumsum(missing + 1)])
+    seen = np.zeros(at[-1] + 1, np.bool_)
+    seen[at] = True
+    lines, starts = _with_stand_ins(lines, counts, at, seen)
+    knot = np.arange(len(seen))
+    scan, across = np.interp(knot, at, scan), np.interp(knot, at, across)
+    return Track(scan, across, lines, starts, seen, _width(scan, step))
+
+
+def _dwell_starts(scan: Floats, reach: float) -> NDArray[np.intp]:
+    """First members of the groups of lines that lie less than ``reach`` beyond the first of their group."""
+    if (np.diff(scan) >= reach).all():
+        return np.arange(len(scan))
+    starts = [0]
+    following = np.searchsorted(scan, scan + reach)
+    while (start := int(following[starts[-1]])) < len(scan):
+        starts.append(start)
+    return np.array(starts, np.intp)
+
+
+def _with_stand_ins(
+    lines: NDArray[np.intp], counts: NDArray[np.intp], at: NDArray[np.intp], seen: NDArray[np.bool_]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Members and first members of all knots: those that nothing saw get the nearest knot's first line."""
+    sizes = np.ones(len(seen), np.intp)
+    sizes[at] = counts
+    empty = np.flatnonzero(~seen)
+    before = np.searchsorted(at, empty) - 1
+    nearest = np.where(empty - at[before] <= at[np.minimum(before + 1, len(at) - 1)] - empty, before, before + 1)
+    members = np.empty(sizes.sum(), np.intp)
+    real = np.repeat(seen, sizes)
+    members[real] = lines
+    members[~real] = lines[(np.cumsum(counts) - counts)[nearest]]
+    return members, np.cumsum(sizes) - sizes
+
+
+def _width(scan: Floats, step: float) -> float:
+    """The mean step where all are equal up to rounding, else the usual one."""
+    if len(scan) == 1:
+        return step
+    mean = float(scan[-1] - scan[0]) / (len(scan) - 1)
+    even = np.abs(scan - scan[0] - mean * np.arange(len(scan))).max() < EVEN_STEPS * mean
+    return mean if even else step

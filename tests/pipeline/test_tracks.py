@@ -1,0 +1,134 @@
+"""Tracks: every line in one place, in order, whatever path the mirror took."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.camera import LineCamera
+from pipeline.errors import PoseError, ShapeError
+from pipeline.mirror import direction_to_position, scene_to_direction
+from pipeline.rectify.tracks import Track, line_centres, make_tracks, single_track
+
+CAMERA = LineCamera()
+STEPS = st.lists(st.sampled_from([-3.0, -1.0, 0.0, 0.1, 1.0, 1.0, 1.2, 4.0]), min_size=0, max_size=60)
+
+
+def aim(along_px: np.ndarray | float, scan_px: np.ndarray) -> np.ndarray:
+    """Mirror positions (line, 2) that look at points given in px along the line and the scan."""
+    tangents = np.stack(np.broadcast_arrays(along_px, scan_px), axis=-1) * CAMERA.ifov_rad
+    return direction_to_position(scene_to_direction(tangents))
+
+
+def members(track: Track) -> list[np.ndarray]:
+    """Lines of each knot."""
+    return np.split(track.lines, track.starts[1:])
+
+
+@given(STEPS, st.integers(0, 99))
+@settings(max_examples=120, deadline=None)
+def test_every_usable_line_is_on_one_knot(steps: list[float], seed: int) -> None:
+    """On any path each usable line is a member of one seen knot, at the mean of its members, and knots ascend."""
+    position = aim(30.0, np.concatenate([[0.0], np.cumsum(steps)]))
+    usable = np.random.default_rng(seed).random(len(position)) < 0.8
+    scan, across, _ = line_centres(position, CAMERA)
+    held = []
+    for track in make_tracks(position, CAMERA, usable=usable, step_px=1.0):
+        assert (np.diff(track.scan) > 0).all()
+        for knot, lines in enumerate(members(track)):
+            assert len(lines) > 0
+            if track.seen[knot]:
+                held += lines.tolist()
+                np.testing.assert_allclose(track.scan[knot], scan[lines].mean(), atol=1e-15)
+                np.testing.assert_allclose(track.across[knot], across[lines].mean(), atol=1e-15)
+    assert sorted(held) == np.flatnonzero(usable).tolist()
+
+
+@given(STEPS)
+@settings(max_examples=60, deadline=None)
+def test_no_gap_wider_than_a_step_and_a_half_is_left(steps: list[float]) -> None:
+    """Neighbouring knots are at most 1.5 steps apart: where lines are missing knots that nothing saw stand in."""
+    for track in make_tracks(aim(0.0, np.concatenate([[0.0], np.cumsum(steps)])), CAMERA, step_px=1.0):
+        assert np.diff(track.scan).max(initial=0) <= 1.5 * CAMERA.ifov_rad * (1 + 1e-9)
+        assert track.seen[[0, -1]].all()
+
+
+def test_even_sweep_is_one_even_track() -> None:
+    """A planned sweep gives a knot a line, straight and even, in either direction."""
+    position = aim(-700.0, 12.0 + 4 * np.arange(50.0))
+    (track,), (back,) = make_tracks(position, CAMERA), make_tracks(position[::-1], CAMERA)
+    assert track.straight
+    assert track.uniform
+    assert len(track) == 50
+    assert track.seen.all()
+    np.testing.assert_allclose(track.width, 4 * CAMERA.ifov_rad, rtol=1e-12)
+    np.testing.assert_array_equal(track.lines, np.arange(50))
+    np.testing.assert_array_equal(back.lines, np.arange(50)[::-1])
+    np.testing.assert_allclose(back.scan, track.scan, atol=1e-15)
+
+
+def test_lost_and_unusable_lines_keep_a_track_even() -> None:
+    """Where lines 3, 4 and 7 are lost or not usable the track has unseen knots at their places, and stays even."""
+    usable = np.ones(8, np.bool_)
+    usable[5] = False
+    (track,) = make_tracks(aim(0.0, np.array([0.0, 1, 2, 5, 6, 7, 8, 9])), CAMERA, usable=usable)
+    assert track.uniform
+    np.testing.assert_array_equal(track.seen, [True, True, True, False, False, True, True, False, True, True])
+    np.testing.assert_array_equal(track.lines, [0, 1, 2, 2, 3, 3, 4, 4, 6, 7])  # stand-ins are the nearest lines
+
+
+def test_corrections_move_the_line_centres() -> None:
+    """A shift in scene px is added along the line and along the scan."""
+    position = aim(100.0, np.arange(5.0))
+    shift = np.stack([np.full(5, 7.0), 0.5 * np.arange(5)], axis=-1)
+    (track,) = make_tracks(position, CAMERA, shift_px=shift)
+    np.testing.assert_allclose(track.across / CAMERA.ifov_rad, 107.0, atol=1e-9)
+    np.testing.assert_allclose(track.scan / CAMERA.ifov_rad, 1.5 * np.arange(5), atol=1e-9)
+
+
+def test_noise_of_the_position_is_no_turn() -> None:
+    """A path of 1 px steps stays one track under 0.8 px of noise, although lines change places."""
+    rng = np.random.default_rng(4)
+    tracks = make_tracks(aim(0.0, np.arange(400.0) + rng.normal(0, 0.8, 400)), CAMERA, step_px=1.0)
+    assert len(tracks) == 1
+    assert (np.diff(tracks[0].lines) < 0).any()
+
+
+def test_float32_positions_are_taken() -> None:
+    """Positions kept in float32 give the track to the 1e-3 px that they hold."""
+    (track,) = make_tracks(aim(50.0, np.arange(9.0)).astype(np.float32), CAMERA)
+    np.testing.assert_allclose(track.scan / CAMERA.ifov_rad, np.arange(9), atol=1e-3)
+
+
+def test_single_track_has_a_knot_for_every_line() -> None:
+    """Lines however near each other stay knots of their own, and gaps stay gaps."""
+    track = single_track(aim(0.0, np.array([0.0, 1, 1.1, 5])), CAMERA)
+    assert track.seen.all()
+    np.testing.assert_array_equal(track.lines, np.arange(4))
+
+
+def test_arrays_must_fit() -> None:
+    """Flags and shifts of another number of lines, and positions that are not pairs, raise."""
+    position = aim(0.0, np.arange(3.0))
+    with pytest.raises(ShapeError, match="one flag for each of 3 lines"):
+        make_tracks(position, CAMERA, usable=np.ones(2, np.bool_))
+    with pytest.raises(ShapeError, match=r"shift_px has shape \(3,\)"):
+        make_tracks(position, CAMERA, shift_px=np.zeros(3))
+    with pytest.raises(ShapeError, match=r"\(line, 2\)"):
+        make_tracks(np.zeros((3, 3)), CAMERA)
+
+
+def test_line_out_of_reach_is_named() -> None:
+    """A usable line beyond the disk or without a position raises with its number; one that is not usable does not."""
+    position = aim(0.0, np.arange(6.0))
+    position[4] = np.nan
+    with pytest.raises(PoseError, match="line 4 is at mirror position"):
+        make_tracks(position, CAMERA)
+    usable = np.arange(6) != 4
+    position[5] = 0.8, 0.8
+    with pytest.raises(PoseError, match=r"line 5 is at mirror position \(0.8, 0.8\)"):
+        make_tracks(position, CAMERA, usable=usable)
+    (track,) = make_tracks(position, CAMERA, usable=np.arange(6) < 4)
+    assert len(track) == 4
