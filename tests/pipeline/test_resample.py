@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pipeline.errors import ShapeError
-from pipeline.rectify.resample import BLOCK_PX, Kernel, gather, kernel_taps, resample
+from pipeline.rectify.resample import BLOCK_PX, Kernel, gather, kernel_taps, merge_lines, resample, to_uint16
 
 KERNELS: tuple[Kernel, ...] = ("catmull-rom", "bilinear", "nearest")
 
@@ -21,6 +18,42 @@ def everywhere(lines: int, samples: int, shift: float = 0.0) -> np.ndarray:
     """All pixel centres of a sweep, shifted, as (n, 2) coordinates."""
     grid = np.meshgrid(np.arange(lines) + shift, np.arange(samples) + shift, indexing="ij")
     return np.stack(grid, axis=-1).reshape(-1, 2)
+
+
+def by_hand(values: np.ndarray, valid: np.ndarray, at: np.ndarray, kernel: Kernel) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted sums in float64, point by point and band by band, and the weight that was valid in each band."""
+    usable = np.broadcast_to(valid if valid.ndim == 3 else valid[..., None], values.shape)
+    out, weight_of = np.full((len(at), values.shape[2]), np.nan), np.zeros((len(at), values.shape[2]))
+    for point, place in enumerate(at):
+        lines, samples = (kernel_taps(place[[axis]], kernel) for axis in (0, 1))
+        total, weight = np.zeros(values.shape[2]), np.zeros(values.shape[2])
+        for line, down in zip(lines[0][0], lines[1][0].astype(float), strict=True):
+            for sample, across in zip(samples[0][0], samples[1][0].astype(float), strict=True):
+                if 0 <= line < values.shape[0] and 0 <= sample < values.shape[1]:
+                    here = usable[line, sample]
+                    weight[here] += down * across
+                    total[here] += down * across * values[line, sample, here]
+        held = weight >= 0.5
+        out[point, held], weight_of[point] = total[held] / weight[held], weight
+    return out, weight_of
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("by_element", [False, True])
+def test_is_the_sum_written_out(kernel: Kernel, by_element: bool) -> None:
+    """Masks by sample and by element give what the sums written out give, band by band, at the borders too."""
+    rng = np.random.default_rng(11)
+    values = rng.random((9, 8, 5), np.float32)
+    valid = rng.random((9, 8)) > 0.1
+    if by_element:
+        valid = valid[..., None] & (rng.random((9, 8, 5)) > 0.1)
+    values[~valid] = np.nan
+    at = rng.uniform(-1.5, 10, (400, 2))
+    out, share = resample(values, valid, at, kernel)
+    wanted, weight = by_hand(values, valid, at, kernel)
+    sure = np.abs(weight - 0.5) > 1e-5
+    np.testing.assert_allclose(out[sure], wanted[sure], rtol=1e-4, atol=1e-5)
+    np.testing.assert_array_equal(share > 0, np.isfinite(out).any(axis=1))
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -81,6 +114,86 @@ def test_dead_sample_spoils_only_itself() -> None:
     assert np.flatnonzero(failed).tolist() == [3 * 8 + 4]
     np.testing.assert_array_equal(out[~failed], whole[~failed])
     assert share[3 * 8 + 4] == 0
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_dead_element_spoils_only_its_band(kernel: Kernel) -> None:
+    """With one NaN element out, the other bands and the points that do not touch it stay as they were, bit by bit."""
+    values = np.random.default_rng(9).random((12, 12, 4), np.float32)
+    at = np.random.default_rng(10).uniform(1, 10, (500, 2))
+    whole, share = resample(values, np.ones((12, 12), bool), at, kernel)
+    valid = np.ones((12, 12, 4), bool)
+    values[5, 6, 2], valid[5, 6, 2] = np.nan, False
+    out, share_of_any = resample(values, valid, at, kernel)
+    changed = out != whole
+    np.testing.assert_array_equal(np.flatnonzero(changed.any(axis=0)), [2])
+    assert (np.abs(at[changed.any(axis=1)] - (5, 6)) < 2).all()
+    assert 0 < np.isnan(out).sum() < changed.sum() or kernel == "nearest"
+    np.testing.assert_array_equal(share_of_any, share)
+
+
+def test_mask_by_element_may_be_one_by_sample() -> None:
+    """A mask by element that says the same of all bands gives the same bits as the mask by sample."""
+    rng = np.random.default_rng(12)
+    values, valid = rng.random((20, 20, 3), np.float32), rng.random((20, 20)) > 0.2
+    values[~valid] = np.nan
+    at = rng.uniform(-1, 20, (500, 2))
+    for kernel in KERNELS:
+        for one, other in zip(
+            resample(values, valid, at, kernel),
+            resample(values, np.repeat(valid[..., None], 3, axis=2), at, kernel),
+            strict=True,
+        ):
+            np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("bands", [1, 3, 300])
+def test_result_does_not_depend_on_the_blocks(kernel: Kernel, bands: int) -> None:
+    """All points at once, each alone and in any order give the same bits: whole windows, borders and masks alike."""
+    rng = np.random.default_rng(13)
+    values, valid = rng.random((14, 15, bands), np.float32), rng.random((14, 15, bands)) > 0.01
+    at = rng.uniform(-1, 15, (BLOCK_PX + 300, 2))
+    out, share = resample(values, valid, at, kernel)
+    order = rng.permutation(len(at))
+    shuffled, shuffled_share = resample(values, valid, at[order], kernel)
+    np.testing.assert_array_equal(shuffled, out[order])
+    np.testing.assert_array_equal(shuffled_share, share[order])
+    for point in (*range(60), BLOCK_PX - 1, BLOCK_PX, len(at) - 1):
+        np.testing.assert_array_equal(resample(values, valid, at[point : point + 1], kernel)[0], out[[point]])
+
+
+def test_raw_numbers_come_back_as_they_are() -> None:
+    """Nearest takes uint16 and gives the same uint16; 0 with no share where the sweep has nothing."""
+    values = np.random.default_rng(14).integers(0, 65_536, (6, 7, 3), dtype=np.uint16)
+    valid = np.ones((6, 7), bool)
+    valid[2, 2] = False
+    out, share = resample(values, valid, np.concatenate([everywhere(6, 7, 0.3), [[-3, 0], [np.nan, 1]]]), "nearest")
+    assert out.dtype == np.uint16
+    np.testing.assert_array_equal(out[:42].reshape(6, 7, 3)[valid], values[valid])
+    failed = [2 * 7 + 2, 42, 43]
+    assert np.flatnonzero(share == 0).tolist() == failed
+    assert not out[failed].any()
+
+
+@pytest.mark.parametrize("kernel", ["bilinear", "catmull-rom"])
+def test_uint16_is_read_as_its_numbers(kernel: Kernel) -> None:
+    """Raw uint16 and the same numbers in float32 give the same sums."""
+    values = np.random.default_rng(15).integers(0, 65_536, (9, 9, 2), dtype=np.uint16)
+    at = np.random.default_rng(16).uniform(-0.4, 8.4, (50, 2))
+    out, _ = resample(values, np.ones((9, 9), bool), at, kernel)
+    np.testing.assert_array_equal(out, resample(values.astype(np.float32), np.ones((9, 9), bool), at, kernel)[0])
+
+
+def test_writes_to_given_memory() -> None:
+    """``out`` receives the result and comes back; one that does not fit is refused."""
+    values, valid, at = np.random.default_rng(17).random((6, 6, 2), np.float32), np.ones((6, 6), bool), everywhere(6, 6)
+    memory = np.full((36, 2), 7, np.float32)
+    out, _ = resample(values, valid, at, out=memory)
+    assert out is memory
+    np.testing.assert_array_equal(out, resample(values, valid, at)[0])
+    with pytest.raises(ShapeError, match=r"\(36, 2\) of float32.*got \(36, 2\) of float64"):
+        resample(values, valid, at, out=memory.astype(float))
 
 
 def test_nan_of_invalid_samples_does_not_leak() -> None:
@@ -146,26 +259,66 @@ def test_scene_edges_are_repeated() -> None:
     np.testing.assert_allclose(gather(planes, at[:, 0], at[:, 1]), inside, rtol=1e-5)
 
 
-def test_cost_is_a_small_multiple_of_a_copy() -> None:
-    """On a sweep larger than the caches sixteen taps cost at most three copies of the same rows in the same blocks."""
-    values = np.ones((160, 640, 270), np.float32)
-    valid, table, at = np.ones((160, 640), bool), values.reshape(-1, 270), everywhere(156, 600, 1.3)
-    rows = at[:, 0].astype(int) * 640 + at[:, 1].astype(int)
+def test_dwell_is_the_mean_of_its_valid_lines() -> None:
+    """Lines of one dwell are averaged sample by sample over what is valid; a line alone comes back bit by bit."""
+    values = np.random.default_rng(18).random((6, 3, 2), np.float32)
+    valid = np.ones((6, 3), bool)
+    values[2, 1], valid[2, 1] = np.nan, False
+    valid[4:, 0] = False
+    merged, known = merge_lines(values, valid, np.array([0, 1, 4]))
+    np.testing.assert_array_equal(merged[0], values[0])
+    np.testing.assert_allclose(merged[1, 0], values[1:4, 0].mean(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(merged[1, 1], values[[1, 3], 1].mean(axis=0), rtol=1e-6)
+    assert np.isnan(merged[2, 0]).all()
+    assert known.tolist() == [[True] * 3, [True] * 3, [False, True, True]]
 
-    def copy_rows() -> None:
-        out = np.empty((len(at), 270), np.float32)
-        for start in range(0, len(at), BLOCK_PX):
-            out[start : start + BLOCK_PX] = np.take(table, rows[start : start + BLOCK_PX], axis=0)
 
-    # the best of each on its own: the least of the ratios would pick the copy that was disturbed most
-    assert least_seconds(lambda: resample(values, valid, at)) <= 3 * least_seconds(copy_rows)
+def test_dwell_by_element() -> None:
+    """With a mask by element each band has its own mean; sums of uint16 do not wrap."""
+    values = np.full((4, 1, 2), 65_535, np.uint16)
+    values[1, 0] = 1
+    valid = np.ones((4, 1, 2), bool)
+    valid[1, 0, 1] = False
+    merged, known = merge_lines(values, valid, np.array([0]))
+    np.testing.assert_allclose(merged, [[[(3 * 65_535 + 1) / 4, 65_535]]], rtol=1e-7)
+    assert known.shape == (1, 1, 2)
+    assert known.all()
 
 
-def least_seconds(work: Callable[[], object], repeats: int = 6) -> float:
-    """Least CPU time of this thread over some calls [s]."""
-    spent = []
-    for _ in range(repeats):
-        start = time.thread_time()
-        work()
-        spent.append(time.thread_time() - start)
-    return min(spent)
+def test_sweep_without_dwell_is_handed_through() -> None:
+    """Nothing is copied or converted where every line is alone, and no lines stay no lines."""
+    values, valid = np.ones((3, 2, 1), np.uint16), np.ones((3, 2), bool)
+    merged, known = merge_lines(values, valid, np.arange(3))
+    assert merged is values
+    assert known is valid
+    assert merge_lines(values[:0], valid[:0], np.arange(0))[0].shape == (0, 2, 1)
+
+
+@pytest.mark.parametrize("starts", [[1, 2], [0, 2, 2], [0, 2, 1], [0, 3], []])
+def test_dwells_must_part_the_lines(starts: list[int]) -> None:
+    """First lines that do not begin at 0, do not ascend or lie beyond the end are refused."""
+    with pytest.raises(ShapeError, match="ascending first lines from 0 on, below 3"):
+        merge_lines(np.ones((3, 2, 1), np.float32), np.ones((3, 2), bool), np.array(starts, np.intp))
+
+
+def test_rounds_to_uint16() -> None:
+    """Clipped to the range, halves to even, NaN to 0 with its place told."""
+    values = np.array([0.5, 1.5, 2.5, -3, 65_535.4, 70_000, np.inf, np.nan], np.float32)
+    rounded, known = to_uint16(values)
+    assert rounded.dtype == np.uint16
+    assert rounded.tolist() == [0, 2, 2, 0, 65_535, 65_535, 65_535, 0]
+    assert known.tolist() == [True] * 7 + [False]
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("kind", [np.float32, np.uint16])
+def test_what_stands_at_an_invalid_element_does_not_matter(kernel: Kernel, kind: type[np.generic]) -> None:
+    """Zero, which spares a copy, and any other number at invalid elements give the same; nothing is written."""
+    rng = np.random.default_rng(19)
+    values, valid = rng.integers(1, 60_000, (9, 9, 3)).astype(kind), rng.random((9, 9, 3)) > 0.1
+    kept, at = values.copy(), rng.uniform(-0.4, 8.4, (100, 2))
+    for one, other in zip(
+        resample(values, valid, at, kernel), resample(values * valid, valid, at, kernel), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(values, kept)

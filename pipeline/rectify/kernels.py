@@ -1,0 +1,175 @@
+"""Short separable kernels: which pixels a position reads, with which weights, and the weighted sum of table rows.
+
+The sums run on ``torch.nn.functional.embedding_bag``. Its threads are left as the process has set them: a worker that
+is to use one core says so once (``models.process.use_one_thread``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+Kernel = Literal["catmull-rom", "bilinear", "nearest"]
+Rows: TypeAlias = NDArray[np.intp]
+
+BAG_VALUES = 2**18  # per call: the sums are still in the cache when they are copied to where they belong
+TAPS = {"catmull-rom": 4, "bilinear": 2, "nearest": 1}
+
+
+@dataclass(frozen=True)
+class Windows:
+    """What a block of points reads: ``tap`` x ``tap`` pixels from a corner on, weighted along both axes."""
+
+    corner: NDArray[np.float64]  # (2, n) first line and sample; whole numbers, NaN where the point has none
+    weight: NDArray[np.float32]  # (2, tap, n)
+
+    @property
+    def points(self) -> int:
+        """How many points there are."""
+        return int(self.weight.shape[2])
+
+    @property
+    def taps(self) -> int:
+        """Taps along one axis."""
+        return int(self.weight.shape[1])
+
+    def chosen(self, which: Rows) -> Windows:
+        """The windows of some of the points."""
+        return Windows(self.corner[:, which], self.weight[:, :, which])
+
+    def inside(self, shape: tuple[int, int]) -> NDArray[np.bool_]:
+        """(n,) whether the whole window lies on an image of this (line, sample) shape."""
+        last = np.array(shape)[:, None] - self.taps
+        least, most = self.corner.min(axis=1, initial=0), self.corner.max(axis=1, initial=0)
+        if (least >= 0).all() and (most <= last[:, 0]).all():  # the rule, in the middle of a sweep; never with a NaN
+            return np.ones(self.points, np.bool_)
+        within: NDArray[np.bool_] = np.logical_and(*((self.corner >= 0) & (self.corner <= last)))
+        return within
+
+    def touches(self, shape: tuple[int, int]) -> NDArray[np.bool_]:
+        """(n,) whether any tap lies on an image of this (line, sample) shape."""
+        size = np.array(shape)[:, None]
+        touching: NDArray[np.bool_] = np.logical_and(*((self.corner > -self.taps) & (self.corner < size)))
+        return touching & bool(size.all())
+
+    def joint_weight(self) -> torch.Tensor:
+        """(n, tap * tap) products of the weights along both axes, lines first."""
+        down, across = _spread(self.taps)
+        along_lines, along_samples = (torch.from_numpy(part) for part in self.weight)
+        # Products with zeros and ones are exact, in whatever order they are summed, and much faster than broadcasting
+        # (n, 4, 1) over (n, 1, 4), which runs loops of four.
+        return torch.mm(along_lines.T, down).mul_(torch.mm(along_samples.T, across))
+
+    def flat_index(self, shape: tuple[int, int]) -> torch.Tensor:
+        """(n, tap * tap) rows of a (line * sample) table of this shape, for windows that lie inside."""
+        lines, samples = shape
+        kind = np.int32 if lines * samples < 2**31 else np.int64  # half the bytes
+        first = (self.corner[0] * samples + self.corner[1]).astype(kind)
+        step = np.add.outer(np.arange(self.taps) * samples, np.arange(self.taps)).ravel().astype(kind)
+        return torch.from_numpy(first)[:, None] + torch.from_numpy(step)
+
+    def taps_by_axis(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(n, tap) lines and samples, not clipped to any image; the corners must be finite."""
+        line, sample = self.corner.astype(np.int64)[:, :, None] + np.arange(self.taps)
+        return line, sample
+
+
+def taps_of(kernel: Kernel) -> int:
+    """Taps of a kernel along one axis: 4, 2 or 1."""
+    if kernel not in TAPS:
+        raise ValueError(f"kernel must be 'catmull-rom', 'bilinear' or 'nearest', got {kernel!r}")
+    return TAPS[kernel]
+
+
+def windows(coordinates: NDArray[np.float64], kernel: Kernel) -> Windows:
+    """Place the kernel around points, (n, 2) line and sample; integers are pixel centres. [px]"""
+    taps = taps_of(kernel)
+    position = np.array(coordinates.T, dtype=np.float64, order="C")
+    if kernel == "nearest":
+        return Windows(np.floor(position + 0.5), np.ones((2, 1, position.shape[1]), np.float32))
+    with np.errstate(invalid="ignore"):  # infinity less infinity
+        base = np.floor(position)
+        position -= base
+    t = position.astype(np.float32)
+    weight = np.empty((2, taps, t.shape[1]), np.float32)
+    if kernel == "bilinear":
+        np.subtract(1, t, out=weight[:, 0])
+        weight[:, 1] = t
+    else:
+        _catmull_rom(t, weight)
+        base -= 1
+    return Windows(base, weight)
+
+
+def kernel_taps(position: NDArray[np.float64], kernel: Kernel) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Give the pixels that each position reads and their weights, along one axis.
+
+    Parameters
+    ----------
+    position
+        (n,) finite coordinates; integers are pixel centres. [px]
+
+    Returns
+    -------
+    (n, tap) indices, not clipped to any image, and (n, tap) weights that sum to 1; 4, 2 or 1 taps.
+    """
+    placed = windows(np.stack([position, position], axis=1), kernel)
+    return placed.taps_by_axis()[0], np.ascontiguousarray(placed.weight[0].T)
+
+
+def weighted_rows(
+    table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor, out: NDArray[np.float32], at: Rows | None = None
+) -> None:
+    """Write sums of ``weight`` times the table's rows ``index``, (n, tap), to the rows ``at`` of ``out`` (or to all).
+
+    Each sum runs over its taps in order, whatever the other points are.
+    """
+    count, taps = index.shape
+    size = max(BAG_VALUES // max(table.shape[1], 1), 64)
+    starts = torch.arange(0, min(size, count) * taps, taps, dtype=index.dtype)
+    for first in range(0, count if table.shape[1] else 0, size):
+        part = slice(first, min(first + size, count))
+        places, weights = index[part].view(-1), weight[part].view(-1)
+        bags = torch.embedding_bag(table, places, starts[: part.stop - first], False, 0, False, weights, False)
+        out[part if at is None else at[part]] = bags[0].numpy()
+
+
+def outer_index(row: NDArray[np.int64], column: NDArray[np.int64], columns: int) -> NDArray[np.int64]:
+    """(n, tap * tap) places in an image's ravelled pixels, from (n, tap) rows and columns."""
+    return np.repeat(row * columns, column.shape[1], axis=1) + np.tile(column, (1, row.shape[1]))
+
+
+def tensor_rows(array: NDArray[np.float32]) -> torch.Tensor:
+    """View (row, column) float32 as a tensor; read-only memory is fine, for nothing here writes to it."""
+    return torch.from_numpy(array if array.flags.writeable else np.asarray(_Unlocked(array)))
+
+
+class _Unlocked:
+    """Memory of a read-only array as if it were not: torch warns of it, and warnings cannot be held off per thread."""
+
+    def __init__(self, array: NDArray[np.float32]) -> None:
+        self.array = array  # keeps the memory
+        description = array.__array_interface__
+        self.__array_interface__ = {**description, "data": (description["data"][0], False)}
+
+
+def _catmull_rom(t: NDArray[np.float32], weight: NDArray[np.float32]) -> None:
+    """Write the weights of the four taps around a fraction t in 0..1, (2, n) -> (2, 4, n) (Keys, 1981, a = -1/2)."""
+    half, s = np.float32(0.5), 1 - t
+    first, second, third, last = (weight[:, tap] for tap in range(4))
+    np.multiply(-half * t * s, s, out=first)
+    np.multiply(-half * s * t, t, out=last)
+    np.add(1, t * t * (np.float32(1.5) * t - np.float32(2.5)), out=second)
+    np.subtract(1 - first - second, last, out=third)
+
+
+@cache
+def _spread(taps: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Matrices (tap, tap * tap) of zeros and ones that repeat weights for every tap of the other axis."""
+    one, row = np.eye(taps, dtype=np.float32), np.ones((1, taps), np.float32)
+    return torch.from_numpy(np.kron(one, row)), torch.from_numpy(np.kron(row, one))

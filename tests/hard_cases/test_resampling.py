@@ -1,0 +1,214 @@
+"""Hard cases of resampling: band counts, long sweeps, NaN and saturation, step edges, borders, positions, threads."""
+
+from __future__ import annotations
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.rectify.resample import Kernel, resample, to_uint16
+
+KERNELS: tuple[Kernel, ...] = ("catmull-rom", "bilinear", "nearest")
+
+
+def ramp(lines: int, samples: int, bands: int = 1) -> np.ndarray:
+    """Values that grow by 1 along a line, by 10 from line to line, by 1000 from band to band, (line, sample, band)."""
+    line, sample, band = np.ogrid[:lines, :samples, :bands]
+    values: np.ndarray = (10.0 * line + sample + 1000.0 * band).astype(np.float32)
+    return values
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("bands", [1, 2, 128, 129, 270, 512, 513, 939])
+def test_every_band_count_is_read_to_its_last_band(kernel: Kernel, bands: int) -> None:
+    """All bands of a cube have the weights that one band alone has, for any count and both kinds of numbers."""
+    values = np.random.default_rng(bands).integers(0, 60_000, (7, 6, bands), dtype=np.uint16)
+    at = np.random.default_rng(1).uniform(0, 5, (30, 2))
+    out, share = resample(values, np.ones((7, 6), bool), at, kernel)
+    for band in {0, bands // 2, bands - 1}:
+        alone, _ = resample(values[..., band : band + 1].astype(np.float32), np.ones((7, 6), bool), at, kernel)
+        np.testing.assert_allclose(out[:, band], alone[:, 0], rtol=1e-5, atol=0.02)
+    assert (share > 0).all()
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("lines", [32_766, 32_767, 32_768, 40_000])
+def test_long_sweeps_are_read_to_their_last_line(kernel: Kernel, lines: int) -> None:
+    """Line numbers around the limit of 16 bits are lines like any other."""
+    values, valid = ramp(lines, 4), np.ones((lines, 4), bool)
+    at = np.array([[lines - 1, 3], [lines - 1, 0], [lines - 3, 2], [lines // 2, 1], [32_766 - 3, 2]])
+    out, _ = resample(values, valid, at, kernel)
+    np.testing.assert_array_equal(out[:, 0], 10 * at[:, 0] + at[:, 1])
+
+
+def test_lost_taps_are_made_up_for_by_the_rest() -> None:
+    """NaN taps that are marked leave a constant as it is while at least half of the weight is left, then NaN."""
+    values, valid = np.full((8, 8, 3), 40, np.float32), np.ones((8, 8), bool)
+    values[:, 4], valid[:, 4] = np.nan, False
+    at = np.stack([np.full(21, 3.5), np.linspace(3, 5, 21)], axis=1)
+    out, share = resample(values, valid, at, "bilinear")
+    left = 1 - np.maximum(0, 1 - np.abs(at[:, 1] - 4))
+    np.testing.assert_allclose(share, np.where(left >= 0.5, left, 0), atol=1e-6)
+    np.testing.assert_allclose(out[left >= 0.5], 40, rtol=1e-6)
+    assert np.isnan(out[left < 0.5]).all()
+
+
+def test_saturated_element_leaves_the_other_bands() -> None:
+    """One saturated band of a bright pixel is NaN where it weighs more than half; the other bands have their values."""
+    values, valid = ramp(9, 9, 4), np.ones((9, 9, 4), bool)
+    values[4, 4, 3], valid[4, 4, 3] = 65_535, False
+    at = np.array([[4, 4], [4.2, 4.1], [4.5, 4.5], [1.5, 1.5]])
+    out, share = resample(values, valid, at)
+    np.testing.assert_allclose(out[:, :3], (at @ [10, 1])[:, None] + [0, 1000, 2000], rtol=1e-5)
+    assert np.isnan(out[:, 3]).tolist() == [True, True, False, False]
+    assert out[2, 3] < 3060
+    assert (share == 1).all()
+
+
+def test_point_that_failed_in_every_band_has_no_share() -> None:
+    """Where each band lacks its own half of the taps nothing is left, and the share says so."""
+    values, valid = ramp(6, 6, 2), np.ones((6, 6, 2), bool)
+    valid[2, 2, 0] = valid[2, 3, 1] = False
+    at = np.array([[2, 2.5], [2, 2.4], [2, 2.6]])
+    out, share = resample(values, valid, at, "bilinear")
+    np.testing.assert_array_equal(np.isnan(out), [[False, False], [True, False], [False, True]])
+    assert (share == 1).all()
+    valid[2, 3, 0] = False
+    out, share = resample(values, valid, at[2:], "bilinear")
+    assert np.isnan(out).all()
+    assert share.tolist() == [0]
+
+
+def test_unmarked_nan_band_stays_on_its_own() -> None:
+    """A band without light is NaN in a valid sample: it stays NaN and touches no other band."""
+    values = ramp(6, 6, 3)
+    values[..., 1] = np.nan
+    out, share = resample(values, np.ones((6, 6), bool), np.array([[2.5, 2.5], [5, 5]]))
+    assert np.isnan(out[:, 1]).all()
+    assert np.isfinite(out[:, [0, 2]]).all()
+    assert (share == 1).all()
+
+
+def test_overshoot_at_a_step_is_clipped() -> None:
+    """Between black and white Catmull-Rom leaves the range of uint16 on both sides: clipped, a cast would wrap."""
+    values = np.zeros((8, 8, 1), np.uint16)
+    values[:, 4:] = 65_535
+    at = np.stack([np.full(57, 3.5), np.linspace(0, 7, 57)], axis=1)
+    out, _ = resample(values, np.ones((8, 8), bool), at)
+    assert out.min() < -1000
+    assert out.max() > 66_535
+    rounded, known = to_uint16(out)
+    assert known.all()
+    assert (rounded[at[:, 1] <= 3, 0] == 0).mean() > 0.9
+    assert (np.diff(rounded[(at[:, 1] >= 3) & (at[:, 1] <= 4), 0].astype(int)) >= 0).all()
+    assert rounded[at[:, 1] >= 4].min() > 60_000
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_right_and_bottom_border_are_part_of_the_sweep(kernel: Kernel) -> None:
+    """The outermost pixels have values up to half a pixel beyond their centres on all four sides, alike."""
+    values = ramp(7, 9)
+    reach = np.array([-0.49, 0.0, 3.0])
+    at = np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
+    near, near_share = resample(values, np.ones((7, 9), bool), at, kernel)
+    far, far_share = resample(values[::-1, ::-1], np.ones((7, 9), bool), np.array([6, 8]) - at, kernel)
+    np.testing.assert_allclose(near_share, far_share, atol=1e-6)
+    np.testing.assert_allclose(near, far, atol=2e-3)
+    assert (near_share[1:] >= 0.5).all()  # beyond both borders a quarter of the weight is left
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("kind", [np.float32, np.uint16])
+def test_block_without_any_point(kernel: Kernel, kind: type[np.generic]) -> None:
+    """A block of the grid that no line reaches is empty in the sweep's own type, without a warning."""
+    values = ramp(5, 5, 3).astype(kind)
+    at = np.array([[np.nan, np.nan], [np.nan, 2], [np.inf, 1], [-np.inf, -np.inf], [1e300, 0]])
+    out, share = resample(values, np.ones((5, 5), bool), at, kernel)
+    assert out.shape == (5, 3)
+    assert not np.nan_to_num(out).any()
+    assert np.isnan(out).all() or out.dtype == np.uint16
+    assert not share.any()
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_points_outside_the_swath_have_no_value(kernel: Kernel) -> None:
+    """A grid larger than the swath: values inside, none a pixel outside, none of them from the wrong line."""
+    values = ramp(6, 5)
+    grid = np.stack(np.meshgrid(np.arange(-4.0, 10), np.arange(-4.0, 9), indexing="ij"), axis=-1).reshape(-1, 2)
+    out, share = resample(values, np.ones((6, 5), bool), grid, kernel)
+    inside = ((grid >= 0) & (grid <= [5, 4])).all(axis=1)
+    np.testing.assert_array_equal(share > 0, inside)
+    np.testing.assert_array_equal(out[inside, 0], grid[inside] @ [10, 1])
+    assert np.isnan(out[~inside]).all()
+
+
+def test_positions_keep_what_float32_loses() -> None:
+    """At line 32 768 a float32 position moves in steps of 1/256 px; in float64 a thousandth of one is there."""
+    values = np.tile(np.array([[[0.0]], [[1.0]]], np.float32), (16_386, 5, 1))
+    at = np.array([[32_768 + 1e-5, 2], [32_768 + 1e-3, 2], [32_768.3, 2]])
+    out, _ = resample(values, np.ones(values.shape[:2], bool), at, "bilinear")
+    np.testing.assert_allclose(out[:, 0], at[:, 0] - 32_768, rtol=1e-5)
+    coarse, _ = resample(values, np.ones(values.shape[:2], bool), at.astype(np.float32), "bilinear")
+    np.testing.assert_allclose(coarse[:, 0], [0, 0, 0.30078125], atol=1e-7)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("shape", [(1, 6), (6, 1), (1, 1), (2, 2), (3, 3)])
+def test_fewer_pixels_than_taps(kernel: Kernel, shape: tuple[int, int]) -> None:
+    """One line, one sample and less than a kernel of either: centres come back, a pixel beyond there is nothing."""
+    values, valid = ramp(*shape, 2), np.ones(shape, bool)
+    centres = np.argwhere(valid).astype(float)
+    out, share = resample(values, valid, centres, kernel)
+    np.testing.assert_array_equal(out.reshape(values.shape), values)
+    assert (share == 1).all()
+    for away in ([1, 0], [0, 1], [-1, -1]):
+        beyond = centres + np.multiply(away, shape)
+        assert not resample(values, valid, beyond, kernel)[1].any()
+
+
+def test_sweep_without_a_valid_sample() -> None:
+    """Where nothing is valid nothing is read, by sample and by element."""
+    values = np.full((6, 6, 2), np.nan, np.float32)
+    for valid in (np.zeros((6, 6), bool), np.zeros((6, 6, 2), bool)):
+        for kernel in KERNELS:
+            out, share = resample(values, valid, np.array([[2.5, 2.5], [0, 0]]), kernel)
+            assert np.isnan(out).all()
+            assert not share.any()
+
+
+def test_threads_at_once_do_not_disturb_each_other() -> None:
+    """Four threads that resample at once get what one gets, read-only memory included, and leave torch's threads."""
+    rng = np.random.default_rng(3)
+    values, valid = rng.random((40, 40, 70), np.float32), rng.random((40, 40, 70)) > 0.001
+    values.flags.writeable = False
+    places = [rng.uniform(-1, 40, (3000, 2)) for _ in range(8)]
+    alone = [resample(values, valid, at) for at in places]
+    before, together = torch.get_num_threads(), threading.Barrier(4)
+
+    def work(first: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        together.wait()
+        return [resample(values, valid, at) for at in places[first::4] * 3]
+
+    with ThreadPoolExecutor(4) as pool:
+        results = list(pool.map(work, range(4)))
+    assert torch.get_num_threads() == before
+    for first, parts in enumerate(results):
+        for part, wanted in zip(parts, alone[first::4] * 3, strict=True):
+            np.testing.assert_array_equal(part[0], wanted[0])
+            np.testing.assert_array_equal(part[1], wanted[1])
+
+
+def test_new_threads_find_the_count_that_the_process_set() -> None:
+    """A worker's thread begins with the process's number of torch threads, before and after it resampled."""
+    values, valid, at = ramp(9, 9), np.ones((9, 9), bool), np.full((10, 2), 4.5)
+
+    def work() -> tuple[int, int]:
+        before = torch.get_num_threads()
+        resample(values, valid, at)
+        return before, torch.get_num_threads()
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(work).result() == (torch.get_num_threads(),) * 2
