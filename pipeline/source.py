@@ -30,12 +30,17 @@ class Line:
 class References:
     """Dark and white frames of one sweep's binning, (sample, band) float32 DN, and the panel's value per band.
 
-    A sample's scene value is ``(raw - dark) / (white - dark) * panel``.
+    A sample's scene value is ``(raw - dark) / (white - dark) * panel``, over ``flat`` where there is one, over the
+    mirror's throughput where ``by_mirror`` says that the light falls off with its tilt. ``bad`` elements of the
+    detector are not to be believed.
     """
 
     dark: NDArray[np.float32]
     white: NDArray[np.float32]
     panel: NDArray[np.float32]
+    bad: NDArray[np.bool_] | None = None  # (sample, band)
+    flat: NDArray[np.float32] | None = None  # (sample, band) relative response left over by the white frame
+    by_mirror: bool = False  # white was taken at rest; away from it the mirror passes another share of the light
 
 
 class Source(Protocol):
@@ -78,6 +83,10 @@ class SweepLines(Protocol):
     @property
     def position(self) -> NDArray[np.float64]:
         """(line, 2) mirror X and Y at mid exposure."""
+
+    @property
+    def time_s(self) -> NDArray[np.float64]:
+        """(line,) of mid exposure, since the start of the sweep [s]."""
 
     @property
     def valid_line(self) -> NDArray[np.bool_]:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import dask.array as da
 import numpy as np
+import xarray as xr
 import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
+from pipeline.rectify.calibrate import calibrate
 from pipeline.scan import Sweep
 from pipeline.source import Line, References
 from storage.layout import (
@@ -29,6 +32,7 @@ from storage.layout import (
 )
 
 _LINE_COORDINATES = "time mirror_x mirror_y exposure_ms valid_line"
+_NO_VALUES = np.empty((0, 0, 0), np.float32)
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,10 @@ class SweepHeader:
             )
         if self.references.panel.shape != (bands,):
             raise ShapeError(f"sweep {self.sweep.name}: panel has shape {self.references.panel.shape}, not ({bands},)")
+        for name in ("bad", "flat"):
+            extra = getattr(self.references, name)
+            if extra is not None and extra.shape != frame:
+                raise ShapeError(f"sweep {self.sweep.name}: {name} has shape {extra.shape}, the dark frame {frame}")
 
 
 class RawCubeWriter:
@@ -130,7 +138,8 @@ class RawCubeWriter:
 
 def _attributes(header: SweepHeader) -> dict[str, Any]:
     started = {} if header.started is None else {"started": header.started}
-    return {"sweep": asdict(header.sweep), "source": header.source, **started}
+    mirror = {"by_mirror": True} if header.references.by_mirror else {}
+    return {"sweep": asdict(header.sweep), "source": header.source, **started, **mirror}
 
 
 def _write_references(group: zarr.Group, references: References) -> None:
@@ -139,6 +148,20 @@ def _write_references(group: zarr.Group, references: References) -> None:
         write_small(group, name, ("sample", "band"), np.asarray(values, np.float32), about)
     about = {"long_name": "scene value of the white panel", "units": "1", "coordinates": "wavelength"}
     write_small(group, "panel", ("band",), np.asarray(references.panel, np.float32), about)
+    about = {"units": "1", "coordinates": "wavelength"}
+    if references.bad is not None:
+        named = {"long_name": "bad elements of the detector", **about}
+        write_small(group, "bad", ("sample", "band"), np.asarray(references.bad, np.bool_), named)
+    if references.flat is not None:
+        named = {"long_name": "relative response left over by the white frame", **about}
+        write_small(group, "flat", ("sample", "band"), np.asarray(references.flat, np.float32), named)
+
+
+def _read_references(group: zarr.Group) -> References:
+    """What :func:`_write_references` stored; cubes of before bad elements and flats have neither."""
+    dark, white, panel = (read_array(group, name) for name in ("dark", "white", "panel"))
+    bad, flat = (read_array(group, name) if name in group else None for name in ("bad", "flat"))
+    return References(dark, white, panel, bad, flat, bool(group.attrs.get("by_mirror", False)))
 
 
 def _write_line_facts(
@@ -180,6 +203,10 @@ class RawCube:
         """Raw numbers of the lines ``start`` to ``stop``, (line, sample, band) uint16; fastest on multiples of 64."""
         return read_array(self.group, "dn", slice(start, stop))
 
+    def read_window(self, lines: slice, samples: slice) -> NDArray[np.uint16]:
+        """Raw numbers of some lines and samples, (line, sample, band) uint16; decodes the chunks that hold them."""
+        return read_array(self.group, "dn", (lines, samples))
+
 
 def open_raw_cube(path: Path) -> RawCube:
     """Open a sweep that :class:`RawCubeWriter` stored.
@@ -194,7 +221,7 @@ def open_raw_cube(path: Path) -> RawCube:
         sweep = Sweep(**dict(group.attrs)["sweep"])  # type: ignore[arg-type]
     return RawCube(
         sweep=sweep,
-        references=References(*(read_array(group, name) for name in ("dark", "white", "panel"))),
+        references=_read_references(group),
         wavelength_nm=wavelength,
         fwhm_nm=fwhm,
         position=np.stack([read_array(group, "mirror_x"), read_array(group, "mirror_y")], axis=-1),
@@ -205,3 +232,49 @@ def open_raw_cube(path: Path) -> RawCube:
         started=None if "started" not in group.attrs else str(group.attrs["started"]),
         group=group,
     )
+
+
+def open_reflectance(path: Path, *, saturated_dn: float) -> xr.DataArray:
+    """Open a sweep in scene values, calibrated 64 lines at a time when a part is asked for.
+
+    The file keeps the raw numbers: nothing is stored twice, and other references give other values.
+
+    Parameters
+    ----------
+    saturated_dn
+        Least DN that counts as saturated, as of :func:`pipeline.rectify.calibrate.calibrate`.
+
+    Returns
+    -------
+    (line, sample, band) float32 backed by dask, in the unit of the panel's values; NaN where a sample is not valid.
+    Coordinates: wavelength, fwhm, time, mirror_x, mirror_y, exposure_ms, valid_line.
+
+    Raises
+    ------
+    IncompleteStoreError : there is no sweep, it was not closed, or it is damaged; on computing, where a chunk is.
+    """
+    cube = open_raw_cube(path)
+    lines, samples, bands = cube.shape
+    starts = range(0, lines, SHARD_ROWS)
+    chunks = (tuple(min(SHARD_ROWS, lines - start) for start in starts), (samples,), (bands,))
+    values = da.map_blocks(  # type: ignore[no-untyped-call]
+        _reflectance_block, cube, saturated_dn, chunks=chunks, dtype=np.float32, meta=_NO_VALUES
+    )
+    with xr.open_zarr(path, consolidated=False, chunks=None) as stored:
+        coordinates = stored["dn"].coords.to_dataset().load().coords
+    about = {"long_name": "scene value", "units": "1"}
+    return xr.DataArray(values, coordinates, ("line", "sample", "band"), "reflectance", about)
+
+
+def _reflectance_block(
+    cube: RawCube, saturated_dn: float, block_info: Mapping[Any, Any] | None = None
+) -> NDArray[np.float32]:
+    """One block of lines, NaN where not valid; dask says which."""
+    assert block_info is not None
+    start, stop = block_info[None]["array-location"][0]
+    values, valid = calibrate(
+        cube.read(start, stop), cube.references, saturated_dn=saturated_dn, position=cube.position[start:stop]
+    )
+    values[~valid] = np.nan
+    values[~cube.valid_line[start:stop]] = np.nan
+    return values

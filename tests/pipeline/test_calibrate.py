@@ -1,12 +1,19 @@
-"""Calibration: dark, white and panel to scene values; dead and saturated samples."""
+"""Calibration: dark, white and panel to scene values; bad and saturated elements, the flat and the mirror."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
-from pipeline.rectify.calibrate import calibrate, reflectance
+from pipeline.errors import PoseError, ShapeError
+from pipeline.mirror import mirror_throughput
+from pipeline.rectify.calibrate import calibrate, of_bands, reflectance
 from pipeline.source import References
 
 
@@ -27,22 +34,108 @@ def test_hand_worked_values() -> None:
     np.testing.assert_allclose(values[1, :, 0], [0, 2, 0.5, -0.1], atol=1e-6)
 
 
-def test_saturated_band_puts_its_sample_out() -> None:
-    """One saturated band makes the sample invalid, and no other."""
+def test_saturated_band_spoils_only_itself() -> None:
+    """One saturated band is invalid and leaves its sample's other bands valid; all of them put the sample out."""
     raw = np.full((2, 4, 3), 500, np.uint16)
-    raw[1, 2, 0] = 4095
+    raw[1, 2] = 4095
     _, valid = calibrate(raw, frames(), saturated_dn=4095)
     assert np.argwhere(~valid).tolist() == [[1, 2]]
+    raw[1, 3, 0] = 4095
+    _, valid = calibrate(raw, frames(), saturated_dn=4095)
+    assert np.argwhere(~valid).tolist() == [[1, 2, 0], [1, 2, 1], [1, 2, 2], [1, 3, 0]]
 
 
-def test_dead_detector_cell_puts_its_sample_out() -> None:
-    """Where white is not above dark in one band the value is NaN and the sample invalid on every line."""
+def test_element_without_response_spoils_only_itself() -> None:
+    """Where white is not above dark the value is NaN and invalid on every line, the sample's other bands are not."""
     references = frames()
     references.white[3, 1] = 60
     values, valid = calibrate(np.full((2, 4, 3), 500, np.uint16), references, saturated_dn=4095)
     assert np.isnan(values[:, 3, 1]).all()
     assert np.isfinite(values).sum() == values.size - 2
-    assert valid.tolist() == [[True, True, True, False]] * 2
+    assert np.argwhere(~valid).tolist() == [[0, 3, 1], [1, 3, 1]]
+
+
+def test_bad_elements_are_filled_along_the_line() -> None:
+    """A bad element takes the value between its good neighbours of the band, or of the only side that has one."""
+    raw = np.full((1, 6, 3), 60, np.uint16)
+    raw[0, :, 1] = [4095, 160, 4095, 4095, 460, 560]
+    bad = np.zeros((6, 3), np.bool_)
+    bad[[0, 2, 3], 1] = True
+    values, valid = calibrate(raw, replace(frames(6), bad=bad), saturated_dn=4095)
+    np.testing.assert_allclose(values[0, :, 1], [0.2, 0.2, 0.4, 0.6, 0.8, 1.0], rtol=1e-6)
+    assert valid.shape == (1, 6)
+    assert valid.all()
+
+
+def test_filled_from_saturated_is_invalid() -> None:
+    """What is filled from a saturated neighbour is as unknown as that neighbour."""
+    raw = np.full((2, 4, 3), 500, np.uint16)
+    raw[1, 0, 2] = 4095
+    bad = np.zeros((4, 3), np.bool_)
+    bad[1, 2] = True
+    _, valid = calibrate(raw, replace(frames(), bad=bad), saturated_dn=4095)
+    assert np.argwhere(~valid).tolist() == [[1, 0, 2], [1, 1, 2]]
+
+
+@given(arrays(np.bool_, (5, 4)), st.integers(0, 9))
+def test_bad_elements_change_nothing_else(bad: NDArray[np.bool_], seed: int) -> None:
+    """Good elements keep their values; a sample is out when more than half of its bands are bad."""
+    raw = np.random.default_rng(seed).integers(0, 900, (3, 5, 4), dtype=np.uint16)
+    values, valid = calibrate(raw, replace(frames(5, 4), bad=bad), saturated_dn=4095)
+    np.testing.assert_array_equal(values[:, ~bad], reflectance(raw, frames(5, 4))[:, ~bad])
+    lit = ~bad.all(axis=0)
+    gone = ((bad & lit).sum(axis=1) * 2 > lit.sum()) | (not lit.any())
+    whole = valid if valid.ndim == 2 else valid.any(axis=2)
+    np.testing.assert_array_equal(~whole, np.broadcast_to(gone, (3, 5)))
+    assert np.isfinite(values[:, ~gone][..., lit]).all() or valid.ndim == 3
+
+
+def test_flat_and_mirror_divide() -> None:
+    """The flat divides its column, the throughput its line: twice the light through a mirror is the same scene."""
+    raw = np.full((2, 4, 3), 560, np.uint16)
+    flat = np.ones((4, 3), np.float32)
+    flat[2] = 0.5
+    position = np.array([[0.0, 0.0], [0.3, -0.2]])
+    references = replace(frames(), flat=flat, by_mirror=True)
+    values = reflectance(raw, references, position=position)
+    np.testing.assert_allclose(values[0, :, 0], [1, 1, 2, 1], rtol=1e-6)
+    np.testing.assert_allclose(values[1] * mirror_throughput(position[1]), values[0], rtol=1e-6)
+
+
+def test_lines_without_a_position_are_out() -> None:
+    """Where the light depends on the mirror a line whose position is unknown is NaN and invalid; none is an error."""
+    raw = np.full((2, 4, 3), 560, np.uint16)
+    references = replace(frames(), by_mirror=True)
+    values, valid = calibrate(raw, references, saturated_dn=4095, position=[[0.0, 0.0], [np.nan, 0.0]])
+    assert np.isnan(values[1]).all()
+    assert valid.tolist() == [[True] * 4, [False] * 4]
+    with pytest.raises(PoseError, match="needs the lines' mirror positions"):
+        calibrate(raw, references, saturated_dn=4095)
+    with pytest.raises(ShapeError, match="each of 2 lines"):
+        reflectance(raw, references, position=np.zeros((3, 2)))
+
+
+def test_blocks_do_not_show() -> None:
+    """Lines calibrated together are those calibrated one by one."""
+    rng = np.random.default_rng(1)
+    references = replace(frames(700, 200), bad=rng.random((700, 200)) < 0.01)
+    raw = rng.integers(0, 4096, (5, 700, 200), dtype=np.uint16)
+    values, valid = calibrate(raw, references, saturated_dn=4090)
+    for n in range(5):
+        one, known = calibrate(raw[n : n + 1], references, saturated_dn=4090)
+        np.testing.assert_array_equal(values[n], one[0])
+        np.testing.assert_array_equal(valid[n], known[0])
+
+
+def test_of_bands_takes_everything_along() -> None:
+    """Some bands of the references calibrate some bands of the lines as all calibrate all."""
+    rng = np.random.default_rng(2)
+    references = replace(
+        frames(6, 5), bad=rng.random((6, 5)) < 0.1, flat=rng.uniform(0.9, 1.1, (6, 5)).astype(np.float32)
+    )
+    raw = rng.integers(0, 4000, (2, 6, 5), dtype=np.uint16)
+    some = reflectance(raw[..., [3, 0]], of_bands(references, [3, 0]))
+    np.testing.assert_array_equal(some, reflectance(raw, references)[..., [3, 0]])
 
 
 def test_band_without_light_stays_alone() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,13 @@ import pytest
 import xarray as xr
 
 from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
+from pipeline.rectify.calibrate import calibrate
 from pipeline.scan import Sweep
 from pipeline.source import Line, References
 from storage.archive import Archive
 from storage.attention import Attention, load_attention, write_attention
 from storage.class_maps import ClassMap, load_class_map, write_class_map
-from storage.cubes import RawCubeWriter, SweepHeader, open_raw_cube
+from storage.cubes import RawCubeWriter, SweepHeader, open_raw_cube, open_reflectance
 from storage.layout import AngularGrid, round_bits
 from storage.mosaics import Mosaic, MosaicWriter, load_mosaic
 from storage.patches import PatchWriter, open_patches
@@ -86,6 +88,66 @@ def test_raw_cube_refuses_what_does_not_fit(tmp_path: Path) -> None:
         cube.close()
     with pytest.raises(ShapeError, match="calibrate with the sweep's own binning"):
         SweepHeader(header.sweep, header.references, np.arange(3.0))
+
+
+def _calibrated(tmp_path: Path, started: str | None = None) -> tuple[Path, SweepHeader, list[Line]]:
+    """A stored sweep of 130 lines whose references have all that references can have."""
+    header = _header(130, 9, 4, started)
+    rng = np.random.default_rng(4)
+    flat = rng.uniform(0.9, 1.1, (9, 4)).astype(np.float32)
+    bad = np.zeros((9, 4), np.bool_)
+    bad[3, 1] = True
+    header = replace(header, references=replace(header.references, bad=bad, flat=flat, by_mirror=True))
+    lines = _lines(header)
+    with RawCubeWriter(tmp_path / "raw.zarr", header) as cube:
+        cube.write(lines)
+    return tmp_path / "raw.zarr", header, lines
+
+
+def test_bad_flat_and_mirror_come_back(tmp_path: Path) -> None:
+    """They are stored where there are any; without them nothing is, as in cubes of before."""
+    path, header, _ = _calibrated(tmp_path)
+    found = open_raw_cube(path).references
+    np.testing.assert_array_equal(found.bad, header.references.bad)
+    np.testing.assert_array_equal(found.flat, header.references.flat)
+    assert found.by_mirror
+    plain = _header(2, 9, 4)
+    with RawCubeWriter(tmp_path / "plain.zarr", plain) as cube:
+        cube.write(_lines(plain))
+    assert not {"bad", "flat"} & {path.name for path in (tmp_path / "plain.zarr").iterdir()}
+    found = open_raw_cube(tmp_path / "plain.zarr").references
+    assert (found.bad, found.flat, found.by_mirror) == (None, None, False)
+    with pytest.raises(ShapeError, match=r"bad has shape \(9, 3\), the dark frame \(9, 4\)"):
+        replace(plain, references=replace(plain.references, bad=np.zeros((9, 3), np.bool_)))
+
+
+def test_reflectance_is_the_calibrated_cube(tmp_path: Path) -> None:
+    """All of it equals the lines calibrated at once, NaN where not valid; coordinates say where and when."""
+    path, header, lines = _calibrated(tmp_path, started="2026-05-01T10:00:00")
+    opened = open_reflectance(path, saturated_dn=4000)
+    position = [(line.mirror_x, line.mirror_y) for line in lines]
+    raw = np.stack([line.data for line in lines])
+    values, valid = calibrate(raw, header.references, saturated_dn=4000, position=position)
+    values[~valid] = np.nan
+    values[[not line.valid for line in lines]] = np.nan
+    np.testing.assert_array_equal(opened.values, values)
+    assert 0 < np.isnan(values).sum() < values.size
+    assert opened.dims == ("line", "sample", "band")
+    assert {"wavelength", "fwhm", "time", "mirror_x", "mirror_y", "exposure_ms", "valid_line"} == set(opened.coords)
+    assert opened["time"].values[10] == np.datetime64("2026-05-01T10:00:01")
+    np.testing.assert_array_equal(opened["mirror_x"], [x for x, _ in position])
+
+
+def test_reflectance_reads_what_is_asked_for(tmp_path: Path) -> None:
+    """Opening reads no line: a damaged block is an error only where it is asked for, and is named."""
+    path, _, _ = _calibrated(tmp_path)
+    shard = path / "dn" / "c" / "1" / "0" / "0"
+    shard.write_bytes(shard.read_bytes()[:-40])
+    opened = open_reflectance(path, saturated_dn=4000)
+    assert opened.chunks == ((64, 64, 2), (9,), (4,))
+    assert np.isfinite(opened[11].mean().values)
+    with pytest.raises(IncompleteStoreError, match="dn cannot be read"):
+        opened[100].compute()
 
 
 def test_layout_is_one_range_read_a_patch(tmp_path: Path) -> None:

@@ -1,0 +1,114 @@
+"""Hard cases of the calibration: what the detector, the light and the references can do wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.rectify.calibrate import calibrate
+from pipeline.rectify.detector import find_bad_elements
+from pipeline.source import References
+
+FULL = 4095
+
+
+def frames(samples: int = 12, bands: int = 10) -> References:
+    """References with a dark of 60.5 DN, a white of 2060.5 DN and a panel of 1."""
+    dark = np.full((samples, bands), 60.5, np.float32)
+    return References(dark, dark + 2000, np.ones(bands, np.float32))
+
+
+def test_saturated_line() -> None:
+    """A line saturated throughout is invalid, its neighbours are not, and the mask stays (line, sample)."""
+    raw = np.full((3, 12, 10), 1000, np.uint16)
+    raw[1] = FULL
+    _, valid = calibrate(raw, frames(), saturated_dn=FULL)
+    assert valid.shape == (3, 12)
+    assert valid.all(axis=1).tolist() == [True, False, True]
+
+
+def test_sum_saturated_in_part() -> None:
+    """The two limits of the docstring: n F finds a sum saturated throughout, n (F - 1) + 1 one that must be in part."""
+    sums = np.array([4 * FULL, 4 * (FULL - 1) + 1, 4 * (FULL - 1)], np.uint16)
+    raw = np.broadcast_to(sums[None, :, None], (1, 3, 2))
+    assert calibrate(raw, frames(3, 2), saturated_dn=4 * FULL)[1].tolist() == [[False, True, True]]
+    assert calibrate(raw, frames(3, 2), saturated_dn=4 * (FULL - 1) + 1)[1].tolist() == [[False, False, True]]
+
+
+def test_below_dark_stays_negative() -> None:
+    """DN just below the dark level are small negative values, not 32-bit wraps, not zero; 0 DN is the most negative."""
+    raw = np.broadcast_to(np.array([0, 60, 61], np.uint16)[None, :, None], (2, 3, 10))
+    values, valid = calibrate(raw, frames(3), saturated_dn=FULL)
+    np.testing.assert_allclose(values[0, :, 0], np.array([-60.5, -0.5, 0.5]) / 2000, rtol=1e-6)
+    assert valid.all()
+
+
+def test_all_dark_line() -> None:
+    """A line without light is zero on average and valid."""
+    dark = np.full((1, 12, 10), 60, np.uint16)
+    values, valid = calibrate(np.concatenate([dark, dark + 1]), frames(), saturated_dn=FULL)
+    assert values.mean() == pytest.approx(0, abs=1e-8)
+    assert valid.all()
+
+
+def test_white_equal_to_dark_everywhere() -> None:
+    """References without any light calibrate nothing: all NaN, nothing valid, no warning."""
+    references = replace(frames(), white=frames().dark)
+    values, valid = calibrate(np.full((2, 12, 10), 500, np.uint16), references, saturated_dn=FULL)
+    assert np.isnan(values).all()
+    assert not valid.any()
+
+
+@pytest.mark.parametrize("kind", ["flagged", "unflagged"])
+def test_dead_column(kind: str) -> None:
+    """A column without response is invalid and invents nothing, be it known as bad or not; its neighbours stay."""
+    references = frames()
+    references.white[5] = references.dark[5]
+    if kind == "flagged":
+        references = replace(references, bad=find_bad_elements(references.dark, references.white, criteria=None))
+    raw = np.full((2, 12, 10), 500, np.uint16)
+    values, valid = calibrate(raw, references, saturated_dn=FULL)
+    assert np.isnan(values[:, 5]).all()
+    assert np.argwhere(~valid).tolist() == [[0, 5], [1, 5]]
+
+
+def test_hot_pixel() -> None:
+    """A hot element, found in the dark frame, is filled: on a smooth scene nothing of it is seen."""
+    references = frames(200)
+    references.dark[70, 4] = 900
+    ramp = (500 + np.arange(200))[None, :, None] * np.ones((1, 1, 10))
+    raw = ramp.astype(np.uint16)
+    raw[0, 70, 4] = FULL
+    found = find_bad_elements(references.dark, references.white)
+    assert np.argwhere(found).tolist() == [[70, 4]]
+    values, valid = calibrate(raw, replace(references, bad=found), saturated_dn=FULL)
+    np.testing.assert_allclose(values[0], (ramp[0] - 60.5) / 2000, rtol=1e-5)
+    assert valid.shape == (1, 200)
+    assert valid.all()
+
+
+@pytest.mark.parametrize("frame", ["dark", "white", "flat"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_reference_not_finite(frame: str, value: float) -> None:
+    """An element whose references are not finite is NaN and invalid, alone."""
+    references = replace(frames(), flat=np.ones((12, 10), np.float32))
+    getattr(references, frame)[3, 7] = value
+    values, valid = calibrate(np.full((1, 12, 10), 500, np.uint16), references, saturated_dn=FULL)
+    assert np.argwhere(np.isnan(values)).tolist() == [[0, 3, 7]]
+    assert np.argwhere(~valid).tolist() == [[0, 3, 7]]
+
+
+@pytest.mark.parametrize(("samples", "bands"), [(1, 1), (1, 10), (12, 1), (2, 2)])
+def test_smallest_sizes(samples: int, bands: int) -> None:
+    """One line, one sample and one band calibrate like any; with nothing to fill from a bad element is out."""
+    references = frames(samples, bands)
+    raw = np.full((1, samples, bands), 1060, np.uint16)
+    values, valid = calibrate(raw, references, saturated_dn=FULL)
+    np.testing.assert_allclose(values, (1060 - 60.5) / 2000, rtol=1e-6)
+    assert valid.all()
+    everything = replace(references, bad=np.ones((samples, bands), np.bool_))
+    values, valid = calibrate(raw, everything, saturated_dn=FULL)
+    assert np.isnan(values).all()
+    assert not valid.any()
