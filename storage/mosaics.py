@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ChunkError, ShapeError
 from storage.layout import (
-    SHARD_ROWS,
     AngularGrid,
     create_array,
     create_group,
@@ -24,6 +23,8 @@ from storage.layout import (
     write_bands,
     write_image,
 )
+
+BLOCK_VALUES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Mosaic:
 
 
 class MosaicWriter:
-    """Write a mosaic block of rows by block of rows, so that it never has to be in memory as a whole.
+    """Write a mosaic in rows or tiles of whole shards, so that it never has to be in memory as a whole.
 
     Values are rounded to 11 bits.
     """
@@ -62,6 +63,12 @@ class MosaicWriter:
         about = {"long_name": "weight of the samples seen", "units": "1", **place}
         self._coverage = create_array(self.group, "coverage", image_spec(("y", "x"), shape, "<f4"), about)
 
+    @property
+    def tile_shape(self) -> tuple[int, int]:
+        """(y, x) of a shard, the least that can be written by itself: 64 rows of at most 640 columns."""
+        rows, columns = image_spec(("y", "x"), self._shape[:2], "<f4").shard or self._shape[:2]
+        return rows, columns
+
     def write_rows(self, first: int, values: NDArray[np.floating], coverage: NDArray[np.floating]) -> None:
         """Store (row, x, band) values and (row, x) coverage from row ``first`` on.
 
@@ -75,17 +82,51 @@ class MosaicWriter:
             raise ShapeError(
                 f"rows {first}:{last} have shapes {values.shape} and {coverage.shape}; the mosaic is {self._shape}"
             )
-        if first % SHARD_ROWS or (last % SHARD_ROWS and last != self._shape[0]):
-            raise ChunkError(
-                f"rows {first}:{last} split the mosaic's shards of {SHARD_ROWS} rows; start and end at their multiples"
+        self.write_tile(first, 0, values, coverage)
+
+    def write_tile(
+        self, first_row: int, first_column: int, values: NDArray[np.floating], coverage: NDArray[np.generic]
+    ) -> None:
+        """Store (y, x, band) values and (y, x) coverage of whole shards; threads may write different ones at once.
+
+        Raises
+        ------
+        ChunkError : the tile splits a shard.
+        ShapeError : the tile does not fit the mosaic.
+        """
+        rows = slice(first_row, first_row + values.shape[0])
+        columns = slice(first_column, first_column + values.shape[1])
+        beyond = rows.stop > self._shape[0] or columns.stop > self._shape[1]
+        if values.shape[2:] != self._shape[2:] or coverage.shape != values.shape[:2] or beyond:
+            raise ShapeError(
+                f"the tile at row {first_row}, column {first_column} has shapes {values.shape} and {coverage.shape}; "
+                f"the mosaic is {self._shape}"
             )
-        self._values[first:last] = round_bits(values)
-        self._coverage[first:last] = coverage.astype(np.float32)
+        for name, part, size, step in zip(
+            ("rows", "columns"), (rows, columns), self._shape, self.tile_shape, strict=False
+        ):
+            if part.start % step or (part.stop % step and part.stop != size):
+                raise ChunkError(
+                    f"{name} {part.start}:{part.stop} split the mosaic's shards of {step} {name}; start and end at "
+                    "their multiples"
+                )
+        self._values[rows, columns] = _rounded(values)
+        self._coverage[rows, columns] = coverage.astype(np.float32)
 
     def write_quicklook(self, image: NDArray[np.uint8]) -> None:
         """Store a small colour picture, (y, x, 3) uint8, beside the mosaic."""
         about = {"long_name": "picture for viewers, red green blue"}
         write_image(self.group, "quicklook", ("quicklook_y", "quicklook_x", "rgb"), image, about)
+
+
+def _rounded(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    """``round_bits`` in blocks that stay in cache: in one go its temporaries cost more than the codec."""
+    flat = np.ascontiguousarray(values, np.float32).reshape(-1)
+    rounded = np.empty_like(flat)
+    for first in range(0, len(flat), BLOCK_VALUES):
+        block = slice(first, first + BLOCK_VALUES)
+        rounded[block] = round_bits(flat[block])
+    return rounded.reshape(values.shape)
 
 
 def load_mosaic(path: Path) -> Mosaic:

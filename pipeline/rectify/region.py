@@ -1,4 +1,4 @@
-"""Pixels of the scene grid from the lines of sweeps, a block of points at a time, reading only the lines it needs."""
+"""Pixels of a grid from the lines of sweeps: tiles of a mosaic, rows of it, and single patches."""
 
 from __future__ import annotations
 
@@ -9,43 +9,82 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.grid import SceneGrid
-from pipeline.rectify.calibrate import calibrate
-from pipeline.rectify.lookup import grid_lookup, lookup
-from pipeline.rectify.mosaic import Part, edge_distance, mosaic
-from pipeline.rectify.resample import Kernel, resample
+from pipeline.rectify.line_cache import LineCache, Raw, ReadWindow
+from pipeline.rectify.mosaic import mosaic
+from pipeline.rectify.placed import PixelGrid as PixelGrid
+from pipeline.rectify.placed import Placed as Placed
+from pipeline.rectify.placed import place as place
+from pipeline.rectify.reach import TAPS, ColumnReach, TrackReach, member_lines
+from pipeline.rectify.resample import Kernel
+from pipeline.rectify.tracks import Track
+from pipeline.rectify.window import Looked, cut_runs, read_part
 from pipeline.source import SweepLines
 
-REACH_LINES = 3  # beyond the outermost coordinate, for the kernel's taps
+GROUP_COLUMNS = 32  # tiles are cut between groups of so many columns
+
+Values = NDArray[np.float32]
+Counts = NDArray[np.intp]
+Reaches = Sequence[Sequence[ColumnReach | None]]  # of each sweep, of each of its tracks
 
 
-def read_points(
-    lines: SweepLines, camera: LineCamera, coordinates: NDArray[np.float64], kernel: Kernel = "catmull-rom"
-) -> Part:
-    """Calibrate and resample one sweep at lookup coordinates (n, 2).
+def column_reach(placed: Sequence[Placed], camera: LineCamera, grid: PixelGrid, columns: slice) -> Reaches:
+    """What every track of every sweep shows of some columns: made once, it serves all tiles of these columns."""
+    return [[TrackReach(one, track, camera, grid).in_columns(columns) for track, _ in one.tracks] for one in placed]
 
-    Invalid lines, saturated and uncalibrated samples count nothing; where they leave less than half of a kernel's
-    weight the point is NaN with weight 0.
+
+def mosaic_tile(
+    placed: Sequence[Placed],
+    camera: LineCamera,
+    grid: PixelGrid,
+    rows: slice,
+    columns: slice,
+    *,
+    kernel: Kernel = "catmull-rom",
+    cache: LineCache | None = None,
+    reach: Reaches | None = None,
+) -> tuple[Values, Counts]:
+    """Rectify and blend the sweeps on a part of a grid.
+
+    What comes out for a pixel does not depend on how the grid is cut into tiles, bit for bit.
+
+    Parameters
+    ----------
+    rows, columns
+        The part, with start and stop.
+    cache
+        Raw lines that earlier tiles read; None reads what is needed, once.
+    reach
+        Of :func:`column_reach` for these columns or more; None makes it.
+
+    Returns
+    -------
+    (y, x, band) float32 with NaN where no line reached, (y, x) how many sweeps did (a sweep that turns may count
+    once for each of its runs).
     """
-    total, samples = len(lines.valid_line), lines.references.dark.shape[0]
-    known = np.isfinite(coordinates.sum(axis=1))
-    edge = edge_distance(coordinates, total, samples)
-    if not known.any():
-        bands = lines.references.panel.shape[0]
-        return Part(np.full((len(known), bands), np.nan, np.float32), np.zeros(len(known), np.float32), edge)
-    place = coordinates[known, 0]
-    first = max(int(np.floor(place.min())) - REACH_LINES, 0)
-    last = min(int(np.ceil(place.max())) + REACH_LINES + 1, total)
-    saturated = camera.full_scale_dn * lines.sweep.binning
-    values, valid = calibrate(lines.read(first, last), lines.references, saturated_dn=saturated)
-    values_at, weight = resample(
-        values, valid & lines.valid_line[first:last, None], coordinates - np.array([first, 0.0]), kernel
-    )
-    return Part(values_at, weight, edge)
+    looked = []
+    for one, tracks in zip(placed, reach or column_reach(placed, camera, grid, columns), strict=True):
+        for number, near in enumerate(tracks):
+            knots = slice(0, 0) if near is None else near.knots(rows)
+            if near is None or knots.stop == knots.start:
+                continue
+            track = one.tracks[number][0]
+            coordinates = one.coordinates(number, camera, grid, rows, columns)
+            looked.append(Looked(one, track, coordinates, _reader(one, track, coordinates, cache, near.samples)))
+    shape = rows.stop - rows.start, columns.stop - columns.start
+    bands = len(placed[0].lines.references.panel)
+    values, coverage = np.empty((*shape, bands), np.float32), np.zeros(shape, np.intp)
+    if not looked:
+        values[...] = np.nan
+    for run in cut_runs([_column_groups(one.coordinates) for one in looked], bands) if looked else []:
+        part = slice(run.start * GROUP_COLUMNS, min(run.stop * GROUP_COLUMNS, shape[1]))
+        seen, counts = _blend([(one, one.coordinates[:, part]) for one in looked], camera, kernel)
+        values[:, part], coverage[:, part] = seen.reshape(shape[0], -1, bands), counts.reshape(shape[0], -1)
+    return values, coverage
 
 
 def mosaic_rows(
     sweeps: Sequence[SweepLines], camera: LineCamera, grid: SceneGrid, *, rows: int, kernel: Kernel = "catmull-rom"
-) -> Iterator[tuple[int, NDArray[np.float32], NDArray[np.intp]]]:
+) -> Iterator[tuple[int, Values, Counts]]:
     """Rectify and blend the sweeps of one pass onto its grid, ``rows`` rows at a time.
 
     The pass's step says which grid: 1 the scene's pixels, ``grid.factor`` the coarse ones.
@@ -54,20 +93,13 @@ def mosaic_rows(
     ------
     First row, (row, x, band) float32 with NaN where no line reached, (row, x) how many sweeps did.
     """
-    step = sweeps[0].sweep.step
-    height, width = (grid.height, grid.width) if step == 1 else grid.coarse_shape
-    origin = ((step - grid.height) / 2, (step - grid.width) / 2)
-    for first in range(0, height, rows):
-        shape = (min(rows, height - first), width)
-        parts = []
-        for lines in sweeps:
-            coordinates = grid_lookup(
-                lines.position, camera, along=lines.sweep.along, binning=lines.sweep.binning,
-                origin_px=(origin[0] + first * step, origin[1]), spacing_px=step, shape=shape,
-            )  # fmt: skip
-            parts.append(read_points(lines, camera, coordinates.reshape(-1, 2), kernel))
-        values, coverage = mosaic(parts)
-        yield first, values.reshape(*shape, -1), coverage.reshape(shape)
+    pixels = PixelGrid.of_scene(grid, sweeps[0].sweep.step)
+    placed = [place(lines, camera) for lines in sweeps]
+    columns = slice(0, pixels.shape[1])
+    reach = column_reach(placed, camera, pixels, columns)
+    for first in range(0, pixels.shape[0], rows):
+        part = slice(first, min(first + rows, pixels.shape[0]))
+        yield first, *mosaic_tile(placed, camera, pixels, part, columns, kernel=kernel, reach=reach)
 
 
 def seat_pixels(grid: SceneGrid, seats: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -91,24 +123,81 @@ def seat_pixels(grid: SceneGrid, seats: NDArray[np.integer]) -> tuple[NDArray[np
 
 
 def read_seats(
-    sweeps: Sequence[SweepLines],
+    sweeps: Sequence[SweepLines | Placed],
     camera: LineCamera,
     grid: SceneGrid,
     seats: NDArray[np.integer],
     kernel: Kernel = "catmull-rom",
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    *,
+    cache: LineCache | None = None,
+) -> tuple[Values, NDArray[np.bool_]]:
     """Rectify whole patches from the sweeps that saw them.
+
+    Parameters
+    ----------
+    sweeps
+        Sweeps placed with :func:`place`, or their lines alone. Placed ones are not placed again at every call.
+    seats
+        Best in the order in which the sweeps pass them: neighbours share what is read and calibrated.
+    cache
+        Raw lines that earlier calls read; None reads what is needed, once.
 
     Returns
     -------
     (seat, p, p, band) float32, NaN where no line reached, and (seat, p, p) pixels that lie on the scene and were seen.
     """
+    placed = [one if isinstance(one, Placed) else place(one, camera) for one in sweeps]
     points, on_scene = seat_pixels(grid, seats)
-    flat = points.reshape(-1, 2)
-    parts = []
-    for lines in sweeps:
-        coordinates = lookup(lines.position, camera, flat, along=lines.sweep.along, binning=lines.sweep.binning)
-        parts.append(read_points(lines, camera, coordinates, kernel))
-    values, coverage = mosaic(parts)
-    patches = values.reshape(*points.shape[:3], -1)
-    return patches, on_scene & (coverage > 0).reshape(on_scene.shape)
+    looked = []
+    for one in placed:
+        for track, _ in one.tracks:
+            coordinates = one.look_up(track, camera, points)
+            if np.isfinite(coordinates[..., 0]).any():
+                whole = slice(0, len(one.lines.references.dark))
+                looked.append(Looked(one, track, coordinates, _reader(one, track, coordinates, cache, whole)))
+    bands = len(placed[0].lines.references.panel)
+    values = np.full((*points.shape[:3], bands), np.nan, np.float32)
+    coverage = np.zeros(points.shape[:3], np.intp)
+    for run in cut_runs([one.coordinates for one in looked], bands) if looked else []:
+        seen, counts = _blend([(one, one.coordinates[run]) for one in looked], camera, kernel)
+        values[run], coverage[run] = seen.reshape(values[run].shape), counts.reshape(coverage[run].shape)
+    return values, on_scene & (coverage > 0)
+
+
+def _blend(
+    looked: Sequence[tuple[Looked, NDArray[np.float64]]], camera: LineCamera, kernel: Kernel
+) -> tuple[Values, Counts]:
+    """Read every track that reaches some of the points and blend them, (n, band) and (n,)."""
+    read = [read_part(one, coordinates.reshape(-1, 2), camera, kernel) for one, coordinates in looked]
+    parts = [part for part in read if part is not None]
+    if parts:
+        return mosaic(parts)
+    count, bands = looked[0][1].size // 2, len(looked[0][0].placed.references.panel)
+    return np.full((count, bands), np.nan, np.float32), np.zeros(count, np.intp)
+
+
+def _column_groups(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Group (y, x, 2) by 32 columns, (group, n, 2); the last group is filled with NaN."""
+    rows, columns = coordinates.shape[:2]
+    groups = -(-columns // GROUP_COLUMNS)
+    if groups * GROUP_COLUMNS > columns:
+        filled = np.full((rows, groups * GROUP_COLUMNS, 2), np.nan)
+        filled[:, :columns] = coordinates
+        coordinates = filled
+    return coordinates.reshape(rows, groups, GROUP_COLUMNS, 2).swapaxes(0, 1)
+
+
+def _reader(
+    one: Placed, track: Track, coordinates: NDArray[np.float64], cache: LineCache | None, likely: slice
+) -> ReadWindow:
+    """How to read windows of a sweep: from the cache, or from one read of all lines that the points need."""
+    if cache is not None:
+        return lambda wanted, samples: cache.window(one.lines, wanted, samples, likely=likely)
+    knot = coordinates[..., 0]
+    if not np.isfinite(knot).any():
+        return lambda wanted, samples: one.lines.read(wanted.start, wanted.stop)[:, samples]
+    first, last = int(np.floor(np.nanmin(knot))), int(np.ceil(np.nanmax(knot)))
+    members = member_lines(track, slice(max(first - TAPS, 0), min(last + TAPS + 1, len(track))))
+    origin = int(members.min())
+    raw: Raw = one.lines.read(origin, int(members.max()) + 1)
+    return lambda wanted, samples: raw[wanted.start - origin : wanted.stop - origin, samples]

@@ -61,6 +61,26 @@ def test_order_of_sweeps_does_not_matter() -> None:
     np.testing.assert_allclose(mosaic(parts)[0], mosaic(parts[::-1])[0], rtol=1e-5)
 
 
+def test_a_band_without_a_value_is_the_other_sweeps() -> None:
+    """Where one sweep lacks a band (a dead element), the other counts alone in it; where both do, it stays NaN."""
+    one, other = np.ones((1, 3), np.float32), np.full((1, 3), 3, np.float32)
+    one[0, 1:], other[0, 2] = np.nan, np.nan
+    full, edge = np.ones(1, np.float32), np.array([20.0])
+    values, coverage = mosaic([Part(one, full, edge), Part(other, full, edge)])
+    np.testing.assert_array_equal(values[0], [2, 3, np.nan])
+    assert coverage.tolist() == [2]
+
+
+@given(st.integers(0, 10_000), st.integers(1, 19))
+@settings(max_examples=20, deadline=None)
+def test_points_do_not_see_each_other(seed: int, cut: int) -> None:
+    """Blending some of the points gives what blending all of them gives there, bit by bit."""
+    parts = [part(seed), part(seed + 1)]
+    whole = mosaic(parts)[0]
+    some = mosaic([Part(one.values[:cut], one.weight[:cut], one.edge_px[:cut]) for one in parts])[0]
+    np.testing.assert_array_equal(some, whole[:cut])
+
+
 def test_very_edge_counts_where_nothing_else_reaches() -> None:
     """A point exactly on a sweep's edge keeps its value."""
     values, coverage = mosaic([Part(np.full((1, 1), 7, np.float32), np.ones(1, np.float32), np.zeros(1))])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera, footprint
 from pipeline.coverage import coarse_sweeps, full_sweeps
 from pipeline.grid import SceneGrid
-from pipeline.rectify.region import mosaic_rows, read_seats, seat_pixels
+from pipeline.rectify.line_cache import LineCache
+from pipeline.rectify.region import mosaic_rows, place, read_seats, seat_pixels
 from pipeline.scan import Sweep
 from pipeline.simulator.scene import RasterScene, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
@@ -49,14 +50,14 @@ def test_fine_mosaic_is_the_scene_behind_the_footprint(along: str) -> None:
 
 
 def test_blocks_of_rows_do_not_change_the_mosaic() -> None:
-    """Reading a mosaic in other blocks of rows gives the same numbers."""
+    """Reading a mosaic in other blocks of rows gives the same numbers, bit by bit."""
     grid = SceneGrid(50, 40, 8, 2)
     sweeps = looked_at(smooth_scene((50, 40)), coarse_sweeps(grid, CAMERA, "x"))
     whole, parts = (
         np.concatenate([values for _, values, _ in mosaic_rows(sweeps, CAMERA, grid, rows=rows)]) for rows in (64, 7)
     )
     assert whole.shape == (25, 20, 2)
-    np.testing.assert_allclose(whole, parts, rtol=2e-6)
+    np.testing.assert_array_equal(whole, parts)
 
 
 def test_seats_are_windows_of_the_mosaic() -> None:
@@ -65,9 +66,33 @@ def test_seats_are_windows_of_the_mosaic() -> None:
     sweeps = looked_at(smooth_scene((64, 64)), full_sweeps(grid, CAMERA, "x"))
     mosaic = np.concatenate([values for _, values, _ in mosaic_rows(sweeps, CAMERA, grid, rows=64)])
     patches, valid = read_seats(sweeps, CAMERA, grid, np.array([5, 10]))
-    np.testing.assert_allclose(patches[0], mosaic[16:32, 16:32], rtol=2e-6)
-    np.testing.assert_allclose(patches[1], mosaic[32:48, 32:48], rtol=2e-6)
+    np.testing.assert_array_equal(patches[0], mosaic[16:32, 16:32])
+    np.testing.assert_array_equal(patches[1], mosaic[32:48, 32:48])
     assert valid.all()
+
+
+def test_seats_from_a_cache_are_the_same() -> None:
+    """Sweeps placed once and lines kept between calls change no bit, and no line is read twice."""
+    grid = SceneGrid(150, 100, 10, 2)
+    sweeps = looked_at(smooth_scene((150, 100)), full_sweeps(grid, CAMERA, "x"))
+    seats = grid.valid_seats()
+    plain, valid = read_seats(sweeps, CAMERA, grid, seats)
+    placed, cache = [place(lines, CAMERA) for lines in sweeps], LineCache(2**30)
+    for first in range(0, len(seats), 7):
+        part = slice(first, first + 7)
+        values, seen = read_seats(placed, CAMERA, grid, seats[part], cache=cache)
+        np.testing.assert_array_equal(values, plain[part])
+        np.testing.assert_array_equal(seen, valid[part])
+    assert cache.reads == sum(-(-lines.sweep.lines // 64) for lines in sweeps)
+
+
+def test_seats_beside_all_sweeps_are_empty() -> None:
+    """A seat that no sweep shows is NaN and not valid."""
+    grid = SceneGrid(200, 40, 10, 2)
+    short = replace(full_sweeps(grid, CAMERA, "x")[0], lines=60)
+    patches, valid = read_seats(looked_at(smooth_scene((200, 40)), [short]), CAMERA, grid, grid.valid_seats()[-4:])
+    assert np.isnan(patches).all()
+    assert not valid.any()
 
 
 def test_a_partial_seat_is_filled_from_inside() -> None:
@@ -103,6 +128,11 @@ class OneBadLine:
     def position(self) -> NDArray[np.float64]:
         """As inside."""
         return self.inner.position
+
+    @property
+    def time_s(self) -> NDArray[np.float64]:
+        """As inside."""
+        return self.inner.time_s
 
     @property
     def valid_line(self) -> NDArray[np.bool_]:

@@ -1,0 +1,287 @@
+"""Tiles: what comes out for a pixel does not depend on how a grid is cut, and lines are read once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pipeline.camera import LineCamera
+from pipeline.rectify.line_cache import LineCache
+from pipeline.rectify.placed import PixelGrid, Placed, place
+from pipeline.rectify.reach import TrackReach
+from pipeline.rectify.region import mosaic_tile
+from pipeline.rectify.tiles import cache_bytes, plan_tiles
+from pipeline.rectify.window import cut_runs
+from pipeline.scan import Sweep, line_positions
+from pipeline.source import References
+
+CAMERA = LineCamera(samples=160)
+TURNED = Sweep("turned", "fine", "x", -4700.0, 2990.0, 200)  # lines lie at some 30 degrees to the grid's rows
+CORNER = (3040.0, -4760.0)
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A sweep of random numbers in memory, that notes what is read of it."""
+
+    sweep: Sweep
+    raw: NDArray[np.uint16]
+    references: References
+    valid_line: NDArray[np.bool_]
+    position: NDArray[np.float64]
+    asked: list[tuple[int, ...]] = field(default_factory=list)
+
+    @property
+    def time_s(self) -> NDArray[np.float64]:
+        """A tenth of a second a line."""
+        return np.arange(self.sweep.lines) * 0.1
+
+    def read(self, start: int, stop: int) -> NDArray[np.uint16]:
+        """Whole lines."""
+        self.asked.append((start, stop))
+        return self.raw[start:stop]
+
+
+@dataclass(frozen=True)
+class Cropped(Taken):
+    """The same, read by lines and samples."""
+
+    def read_window(self, lines: slice, samples: slice) -> NDArray[np.uint16]:
+        """A part of some lines."""
+        self.asked.append((lines.start, lines.stop, samples.start, samples.stop))
+        return self.raw[lines, samples]
+
+
+def taken(sweep: Sweep, *, bands: int = 3, seed: int = 0, kind: type[Taken] = Taken, faults: bool = False) -> Taken:
+    """A sweep of noise; with faults, of dead lines, saturated and bad elements as well."""
+    rng = np.random.default_rng(seed)
+    raw = rng.integers(100, 3000, (sweep.lines, CAMERA.samples, bands)).astype(np.uint16)
+    frame = (CAMERA.samples, bands)
+    references = References(np.zeros(frame, np.float32), np.ones(frame, np.float32), np.ones(bands, np.float32))
+    valid = np.ones(sweep.lines, np.bool_)
+    if faults:
+        raw[rng.random(raw.shape) < 0.002] = CAMERA.full_scale_dn
+        bad = rng.random(frame) < 0.02
+        bad[:, 1] |= np.arange(CAMERA.samples) % 20 < 5
+        references = replace(
+            references, bad=bad, by_mirror=True, white=rng.uniform(500, 4000, frame).astype(np.float32)
+        )
+        valid = rng.random(sweep.lines) > 0.02
+    return kind(sweep, raw, references, valid, line_positions(sweep, CAMERA))
+
+
+def in_tiles(
+    placed: list[Placed], grid: PixelGrid, shape: tuple[int, int], cache: LineCache | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """A grid's values and coverage, made in tiles of this shape."""
+    values = np.zeros((*grid.shape, len(placed[0].references.panel)), np.float32)
+    coverage = np.zeros(grid.shape, np.intp)
+    for tile in plan_tiles(placed, CAMERA, grid, shape):
+        at = tile.rows, tile.columns
+        values[at], coverage[at] = mosaic_tile(placed, CAMERA, grid, *at, cache=cache, reach=tile.reach)
+    return values, coverage
+
+
+def two_turned(grid: PixelGrid | None) -> list[Placed]:
+    """Two overlapping sweeps of turned lines with all kinds of faults."""
+    other = replace(TURNED, name="other", strip_px=-4600.0, start_px=3010.0)
+    gain = np.array([1.0, 0.9, 1.1], np.float32)
+    return [
+        place(taken(TURNED, faults=True), CAMERA, grid=grid, gain=gain),
+        place(taken(other, seed=1, kind=Cropped, faults=True), CAMERA, grid=grid),
+    ]
+
+
+@given(st.tuples(st.integers(5, 90), st.integers(5, 140)), st.booleans(), st.booleans())
+@settings(max_examples=8, deadline=None)
+def test_any_tiling_gives_the_same_bits(shape: tuple[int, int], tied: bool, cached: bool) -> None:
+    """Turned lines, an overlap, dead lines, saturated and bad elements: every tiling gives what one tile gives."""
+    grid = PixelGrid(CORNER, 1, (90, 140))
+    placed = two_turned(grid if tied else None)
+    whole, coverage = in_tiles(placed, grid, grid.shape)
+    assert set(np.unique(coverage)) == {0, 1, 2}
+    parts = in_tiles(placed, grid, shape, LineCache(200_000) if cached else None)
+    np.testing.assert_array_equal(parts[0], whole)
+    np.testing.assert_array_equal(parts[1], coverage)
+
+
+def test_cutting_a_tile_into_runs_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows as short as they can be give what one window for the whole tile gives."""
+    grid = PixelGrid(CORNER, 1, (40, 140))
+    whole = in_tiles(two_turned(None), grid, grid.shape)
+    monkeypatch.setattr("pipeline.rectify.window.RUN_ELEMENTS", 0)
+    cut = in_tiles(two_turned(None), grid, grid.shape)
+    for one, other in zip(whole, cut, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("kind", [Taken, Cropped])
+def test_a_block_of_lines_is_read_once_down_a_column(kind: type[Taken]) -> None:
+    """In the order of the tiles, with the cache that they are projected to need, nothing is read twice in a column."""
+    grid = PixelGrid((3010.0, -4770.0), 1, (160, 120))
+    lines = taken(TURNED, kind=kind)
+    placed = [place(lines, CAMERA)]
+    for tiles in (plan_tiles(placed, CAMERA, grid, (32, 120)), plan_tiles(placed, CAMERA, grid, (32, 60))[:5]):
+        lines.asked.clear()
+        cache = LineCache(cache_bytes(placed, tiles, 1))
+        for tile in tiles:
+            mosaic_tile(placed, CAMERA, grid, tile.rows, tile.columns, cache=cache, reach=tile.reach)
+            assert cache.bytes_held <= cache.most_bytes
+        assert len(lines.asked) == len(set(lines.asked)) == cache.reads > 1
+
+
+def test_only_chunks_of_samples_that_a_column_needs_are_read() -> None:
+    """A narrow column takes a part of every line, in whole chunks of 32 samples."""
+    lines = taken(TURNED, kind=Cropped)
+    placed = [place(lines, CAMERA)]
+    grid = PixelGrid((3040.0, -4700.0), 1, (64, 20))
+    in_tiles(placed, grid, (64, 640), LineCache(2**20))
+    first, last = (edge(asked[side] for asked in lines.asked) for edge, side in ((min, 2), (max, 3)))
+    assert first % 32 == 0
+    assert last - first < CAMERA.samples
+
+
+@given(st.integers(-100, 300), st.integers(-250, 250), st.integers(1, 60), st.integers(1, 60))
+@settings(max_examples=60, deadline=None)
+def test_reach_is_never_too_little(row: int, column: int, height: int, width: int) -> None:
+    """All knots and samples at which pixels are looked up, with a margin for taps, are among those foretold."""
+    grid = PixelGrid(CORNER, 1, (400, 400))
+    placed = place(taken(TURNED, bands=1), CAMERA)
+    rows, columns = slice(row, row + height), slice(column, column + width)
+    track = placed.tracks[0][0]
+    at = placed.coordinates(0, CAMERA, grid, rows, columns).reshape(-1, 2)
+    at = at[np.isfinite(at[:, 0])]
+    near = TrackReach(placed, track, CAMERA, grid).in_columns(columns)
+    if len(at):
+        assert near is not None
+        knots = near.knots(rows)
+        assert max(knots.start, 0) <= max(at[:, 0].min() - 2, 0)
+        assert knots.stop >= min(at[:, 0].max() + 3, len(track))
+        assert near.samples.start <= max(at[:, 1].min() - 2, 0)
+        assert near.samples.stop >= min(at[:, 1].max() + 3, CAMERA.samples)
+
+
+def test_turned_lines_are_cut_into_short_runs() -> None:
+    """A long tile of lines turned by 30 degrees is cut so that less than half as much is calibrated; upright is not."""
+    for tilt, most_share, runs in ((np.tan(np.pi / 6), 0.5, range(4, 20)), (0.0, 1.0, range(1, 2))):
+        y, x = np.mgrid[:64, :640]
+        place_of = np.stack([y + tilt * x, x - tilt * y], axis=-1).reshape(64, 20, 32, 2).swapaxes(0, 1)
+        cuts = cut_runs([place_of], 270)
+        areas = [np.prod(np.ptp(place_of[cut].reshape(-1, 2), axis=0)) for cut in cuts]
+        assert sum(areas) <= most_share * np.prod(np.ptp(place_of.reshape(-1, 2), axis=0))
+        assert len(cuts) in runs
+        assert np.concatenate([np.arange(20)[cut] for cut in cuts]).tolist() == list(range(20))
+
+
+def test_nearest_gives_raw_spectra() -> None:
+    """With references of one, the nearest kernel gives the very numbers that the camera gave."""
+    lines = taken(TURNED)
+    placed = [place(lines, CAMERA)]
+    grid = PixelGrid(CORNER, 1, (60, 90))
+    at = placed[0].coordinates(0, CAMERA, grid, slice(0, 60), slice(0, 90))
+    rows, columns = slice(0, 60), slice(0, 90)
+    values, coverage = mosaic_tile(placed, CAMERA, grid, rows, columns, kernel="nearest")
+    on = np.isfinite(at[..., 0])
+    line, sample = np.floor(at[on] + 0.5).astype(int).T
+    np.testing.assert_array_equal(values[on], lines.raw[line, sample])
+    assert (coverage == on).all()
+    assert on.any()
+
+
+def test_a_grid_beside_the_swath_is_empty() -> None:
+    """Pixels that no sweep saw are NaN with a coverage of 0, and nothing is read for them."""
+    lines = taken(TURNED)
+    values, coverage = in_tiles([place(lines, CAMERA)], PixelGrid((0.0, 0.0), 1, (70, 50)), (64, 640))
+    assert np.isnan(values).all()
+    assert not coverage.any()
+    assert not lines.asked
+
+
+def test_sweeps_that_do_not_meet_stand_side_by_side() -> None:
+    """With nothing in common every pixel is one sweep's own, bit by bit."""
+    grid = PixelGrid((-20.0, -200.0), 1, (40, 400))
+    sweeps = [Sweep(f"at {strip}", "fine", "x", strip, -30.0, 60) for strip in (-100.0, 100.0)]
+    placed = [place(taken(sweep, seed=number), CAMERA) for number, sweep in enumerate(sweeps)]
+    both, coverage = in_tiles(placed, grid, (64, 640))
+    one, other = (in_tiles([alone], grid, (64, 640))[0] for alone in placed)
+    assert set(np.unique(coverage)) == {0, 1}
+    np.testing.assert_array_equal(both, np.where(np.isnan(one), other, one))
+
+
+def test_a_dead_line_leaves_its_own_row_empty() -> None:
+    """What a dead line holds reaches no pixel; only pixels nearer to it than to its neighbours are lost."""
+    sweep = Sweep("straight", "fine", "x", 0.0, -30.0, 60)
+    lines = taken(sweep)
+    whole, _ = in_tiles([place(lines, CAMERA)], grid := PixelGrid((-20.0, -60.0), 1, (40, 120)), (64, 640))
+    lines.valid_line[30] = False
+    lines.raw[30] = 65535
+    seen, coverage = in_tiles([place(lines, CAMERA)], grid, (64, 640))
+    assert np.flatnonzero((coverage == 0).all(axis=1)).tolist() == [20]
+    assert np.nanmax(seen) < 4000
+    far = np.abs(np.arange(40) - 20) > 2
+    np.testing.assert_array_equal(seen[far], whole[far])
+
+
+def test_a_sweep_without_a_usable_line_shows_nothing() -> None:
+    """All lines dead: every pixel is NaN with a coverage of 0, and nothing is read."""
+    lines = taken(TURNED)
+    lines.valid_line[:] = False
+    values, coverage = in_tiles([place(lines, CAMERA)], PixelGrid(CORNER, 1, (30, 40)), (64, 640))
+    assert np.isnan(values).all()
+    assert not coverage.any()
+    assert not lines.asked
+
+
+def test_a_single_line_is_found() -> None:
+    """A sweep of one line shows the pixels within half a pixel of it, whatever tile they are in."""
+    lines = taken(Sweep("one", "fine", "x", 0.0, 7.0, 1))
+    values, coverage = in_tiles([place(lines, CAMERA)], PixelGrid((-20.0, -60.0), 1, (64, 120)), (16, 50))
+    assert np.flatnonzero(coverage.any(axis=1)).tolist() == [27]
+    assert np.isfinite(values[27]).all()
+
+
+def test_a_sweep_that_turns_is_two_sweeps() -> None:
+    """Lines taken there and back are blended as if each way were a sweep of its own, in any tiling."""
+    there = taken(Sweep("there", "fine", "x", 0.0, -30.0, 60))
+    path = np.concatenate([there.position, there.position[::-1]])
+    both = replace(
+        taken(replace(there.sweep, start_px=0.0, lines=120)), position=path, sweep=replace(there.sweep, lines=120)
+    )
+    placed = place(both, CAMERA)
+    each = [replace(placed, tracks=(track,)) for track in placed.tracks]
+    grid = PixelGrid((-20.0, -60.0), 1, (40, 120))
+    expected = in_tiles(each, grid, (64, 640))
+    assert (expected[1][5:-5, 5:-5] == 2).all()
+    for shape in ((64, 640), (7, 33)):
+        for one, other in zip(in_tiles([placed], grid, shape), expected, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_lines_of_a_mirror_that_stands_are_averaged() -> None:
+    """Each position held for three lines gives the mean of the three."""
+    once = taken(Sweep("once", "fine", "x", 0.0, -30.0, 60))
+    raw = np.random.default_rng(4).integers(100, 3000, (180, *once.raw.shape[1:])).astype(np.uint16)
+    held = Taken(
+        replace(once.sweep, lines=180),
+        raw,
+        once.references,
+        np.ones(180, np.bool_),
+        np.repeat(once.position, 3, axis=0),
+    )
+    grid, part = PixelGrid((-20.0, -59.5), 1, (40, 120)), (slice(0, 40), slice(0, 120))
+    seen, _ = mosaic_tile([place(held, CAMERA)], CAMERA, grid, *part, kernel="nearest", cache=LineCache(2**20))
+    mean = raw.reshape(60, 3, *raw.shape[1:]).mean(axis=1)
+    np.testing.assert_allclose(seen, mean[10:50, 20:140], rtol=1e-6)
+
+
+def test_gain_multiplies_a_sweeps_values() -> None:
+    """An illumination correction is a factor for each band."""
+    lines, grid = taken(TURNED), PixelGrid(CORNER, 1, (30, 40))
+    gain = np.array([2.0, 1.0, 0.5], np.float32)
+    plain, scaled = (in_tiles([place(lines, CAMERA, gain=g)], grid, (64, 640))[0] for g in (None, gain))
+    np.testing.assert_allclose(scaled, plain * gain, rtol=1e-6)

@@ -1,0 +1,117 @@
+"""Mosaics from disk to disk: the same bytes however many workers, bounded memory, progress."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.camera import LineCamera
+from pipeline.errors import SettingsError
+from pipeline.rectify.placed import PixelGrid, place
+from pipeline.rectify.tiles import Tile
+from pipeline.scan import Sweep, line_positions
+from pipeline.source import Line, References
+from storage.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
+from storage.mosaics import MosaicWriter, load_mosaic
+from storage.tile_work import MosaicWork, Thumbnail, write_mosaic
+
+CAMERA = LineCamera()
+BANDS = np.array([500.0, 600.0, 700.0])
+GRID = PixelGrid((-70.0, -420.0), 1, (140, 900))
+PLENTY = 2 * 2**30
+
+
+@pytest.fixture(scope="module")
+def cubes(tmp_path_factory: pytest.TempPathFactory) -> list[RawCube]:
+    """Two stored sweeps of noise, side by side."""
+    folder, rng = tmp_path_factory.mktemp("raw"), np.random.default_rng(8)
+    frame = (CAMERA.samples, len(BANDS))
+    references = References(np.zeros(frame, np.float32), np.full(frame, 2000, np.float32), np.ones(3, np.float32))
+    for strip in (-250.0, 250.0):
+        sweep = Sweep(f"at {strip}", "fine", "x", strip, -120.0, 240)
+        raw, position = rng.integers(0, 3000, (240, *frame)).astype(np.uint16), line_positions(sweep, CAMERA)
+        with RawCubeWriter(folder / f"{strip}.zarr", SweepHeader(sweep, references, BANDS)) as cube:
+            cube.write([Line(n, raw[n], *position[n], n * 0.1, 100.0) for n in range(240)])
+    return [open_raw_cube(path) for path in sorted(folder.iterdir())]
+
+
+def work_of(cubes: list[RawCube]) -> MosaicWork:
+    """Both sweeps on the grid."""
+    return MosaicWork([place(cube, CAMERA, grid=GRID) for cube in cubes], CAMERA, GRID)
+
+
+def digest_of(folder: Path) -> str:
+    """Hash of all files of a store, names included."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return hashlib.sha256(
+        b"".join(f"{path.relative_to(folder)}".encode() + path.read_bytes() for path in files)
+    ).hexdigest()
+
+
+def test_workers_do_not_change_a_byte(tmp_path: Path, cubes: list[RawCube]) -> None:
+    """One tile at a time in a plain loop, or three at once, the files are the same; cubes read whole give them too."""
+    digests = set()
+    for workers in (1, 3):
+        path = tmp_path / f"{workers}.zarr"
+        budget = write_mosaic(work_of(cubes), MosaicWriter(path, GRID.shape, BANDS), memory=PLENTY, workers=workers)
+        assert budget.workers == workers
+        digests.add(digest_of(path))
+    assert len(digests) == 1
+    plain = MosaicWork([place(cube, CAMERA, grid=GRID) for cube in cubes], CAMERA, GRID)
+    write_mosaic(plain, MosaicWriter(tmp_path / "whole.zarr", GRID.shape, BANDS), memory=PLENTY, workers=1)
+    np.testing.assert_array_equal(load_mosaic(tmp_path / "whole.zarr").values, load_mosaic(tmp_path / "1.zarr").values)
+
+
+def test_progress_and_tiles_are_told(tmp_path: Path, cubes: list[RawCube]) -> None:
+    """Every tile is shown once with its values, and the share done rises to 1."""
+    seen: list[tuple[int, int]] = []
+    shares: list[float] = []
+
+    def show(tile: Tile, values: np.ndarray) -> None:
+        assert values.shape == (tile.rows.stop - tile.rows.start, tile.columns.stop - tile.columns.start, 3)
+        seen.append((tile.rows.start, tile.columns.start))
+
+    write_mosaic(
+        work_of(cubes), MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS),
+        memory=PLENTY, workers=2, seen=show, report=shares.append,
+    )  # fmt: skip
+    assert sorted(seen) == [(y, x) for y in (0, 64, 128) for x in (0, 640)]
+    assert shares == sorted(shares)
+    assert shares[-1] == 1
+
+
+@pytest.mark.parametrize("most_px", [37, 140, 2000])
+def test_thumbnail_is_every_nth_pixel(tmp_path: Path, cubes: list[RawCube], most_px: int) -> None:
+    """Whatever tiles it is made of, a thumbnail holds the mosaic's own pixels, at most so many a side."""
+    thumbnail = Thumbnail(GRID.shape, [2, 0], most_px)
+    path = tmp_path / "m.zarr"
+    write_mosaic(work_of(cubes), MosaicWriter(path, GRID.shape, BANDS), memory=PLENTY, workers=1, seen=thumbnail)
+    down, across = (-(-size // most_px) for size in GRID.shape)
+    whole = load_mosaic(path).values[::down, ::across, ::-2]
+    np.testing.assert_allclose(thumbnail.image, whole, rtol=3e-4)
+    assert max(thumbnail.image.shape[:2]) <= most_px
+
+
+def test_memory_says_how_many_tiles_at_a_time(tmp_path: Path, cubes: list[RawCube]) -> None:
+    """With memory for one tile only one is made at a time, whatever is allowed; a byte less and none is."""
+    work = work_of(cubes)
+    least = write_mosaic(work, MosaicWriter(tmp_path / "a.zarr", GRID.shape, BANDS), memory=PLENTY, workers=1).projected
+    tight = write_mosaic(work, MosaicWriter(tmp_path / "b.zarr", GRID.shape, BANDS), memory=least, workers=4)
+    assert tight.workers == 1
+    with pytest.raises(SettingsError, match=r"projected memory \d+ MiB exceeds --memory \d+ MiB: one tile of 64 x 640"):
+        write_mosaic(work, MosaicWriter(tmp_path / "c.zarr", GRID.shape, BANDS), memory=least - 2**20)
+
+
+def test_an_error_in_a_tile_ends_the_work(tmp_path: Path, cubes: list[RawCube]) -> None:
+    """What goes wrong in a worker is raised where the work was asked for."""
+
+    def fail(tile: Tile, values: np.ndarray) -> None:
+        raise ValueError(f"tile at {tile.columns.start}")
+
+    with pytest.raises(ValueError, match="tile at 0"):
+        write_mosaic(
+            work_of(cubes), MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS), memory=PLENTY, workers=2, seen=fail
+        )
