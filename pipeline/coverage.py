@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -18,22 +19,34 @@ ROUNDING_PX = 1e-6
 _PROBES = 65  # scan positions at which a strip's reach is taken; it changes by 1e-3 px between two
 
 
-def full_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis) -> list[Sweep]:
+def full_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis, *, overlap_px: float = 0) -> list[Sweep]:
     """Cover the whole scene at full resolution with the fewest strips of lines along one axis.
+
+    Parameters
+    ----------
+    overlap_px
+        Least width that neighbouring strips share, and half of it beyond either end of the field. [px]
 
     Raises
     ------
     PoseError : the field is beyond the mirror's range.
+    SettingsError : an overlap that is negative or leaves nothing of a line.
     """
-    return _cover(grid, camera, along, step=1)
+    return _cover(grid, camera, along, step=1, overlap_px=overlap_px)
 
 
-def coarse_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis) -> list[Sweep]:
+def coarse_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis, *, overlap_px: float = 0) -> list[Sweep]:
     """Cover the whole scene with lines of ``grid.factor`` held positions and as many samples summed.
+
+    Parameters
+    ----------
+    overlap_px
+        As of :func:`full_sweeps`, in px of the full resolution.
 
     Raises
     ------
-    SettingsError : the sum of ``grid.factor`` samples does not fit 16 bits, or a line has fewer samples.
+    SettingsError : the sum of ``grid.factor`` samples does not fit 16 bits, or a line has fewer samples; or the
+        overlap is negative or leaves nothing of a line.
     PoseError : the field is beyond the mirror's range.
     """
     most = min(camera.most_binning, camera.samples)
@@ -42,11 +55,18 @@ def coarse_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis) -> list[Swee
             f"the coarse factor must be at most {most} for {camera.bits}-bit lines of {camera.samples} samples "
             f"(samples are summed in 16 bits), got {grid.factor}"
         )
-    return _cover(grid, camera, along, step=grid.factor)
+    return _cover(grid, camera, along, step=grid.factor, overlap_px=overlap_px)
 
 
-def cheapest_full(grid: SceneGrid, camera: LineCamera, cost: CostModel) -> tuple[Axis, list[Sweep], float]:
+def cheapest_full(
+    grid: SceneGrid, camera: LineCamera, cost: CostModel, *, overlap_px: float = 0
+) -> tuple[Axis, list[Sweep], float]:
     """Choose the orientation of the full scan that takes the least time: axis of the lines, sweeps, seconds.
+
+    Parameters
+    ----------
+    overlap_px
+        As of :func:`full_sweeps`.
 
     Raises
     ------
@@ -57,7 +77,7 @@ def cheapest_full(grid: SceneGrid, camera: LineCamera, cost: CostModel) -> tuple
     axes: tuple[Axis, Axis] = ("x", "y")
     for along in axes:
         try:
-            sweeps = full_sweeps(grid, camera, along)
+            sweeps = full_sweeps(grid, camera, along, overlap_px=overlap_px)
         except PoseError as error:
             refused = error
             continue
@@ -66,6 +86,22 @@ def cheapest_full(grid: SceneGrid, camera: LineCamera, cost: CostModel) -> tuple
         assert refused is not None
         raise refused
     return min(found, key=lambda option: option[2])
+
+
+def with_margin(sweeps: Sequence[Sweep], camera: LineCamera, margin_px: float) -> list[Sweep]:
+    """Begin every sweep so much earlier and end it so much later, for a mirror that may look beside the plan.
+
+    Raises
+    ------
+    PoseError : a sweep then leaves the mirror's range.
+    """
+    more = [-(-margin_px // sweep.step) for sweep in sweeps]
+    grown = [
+        replace(sweep, start_px=sweep.start_px - count * sweep.step, lines=sweep.lines + 2 * int(count))
+        for sweep, count in zip(sweeps, more, strict=True)
+    ]
+    check_reach(grown, camera)
+    return grown
 
 
 def on_scene(shape: tuple[int, int], camera: LineCamera, sweep: Sweep) -> NDArray[np.bool_]:
@@ -93,14 +129,19 @@ def field_px(grid: SceneGrid, along: Axis) -> tuple[int, int]:
     return (grid.width, grid.height) if along == "x" else (grid.height, grid.width)
 
 
-def _cover(grid: SceneGrid, camera: LineCamera, along: Axis, *, step: int) -> list[Sweep]:
+def _cover(grid: SceneGrid, camera: LineCamera, along: Axis, *, step: int, overlap_px: float) -> list[Sweep]:
+    if not 0 <= overlap_px < camera.samples // step * step:
+        raise SettingsError(
+            f"strips of lines of {camera.samples} samples can overlap by 0 px or more and less than a line, "
+            f"got {overlap_px} px; choose a smaller overlap"
+        )
     across, scan = field_px(grid, along)
     cells = -(-across // step)
     low, high = -across / 2, cells * step - across / 2
     kind: Literal["coarse", "fine"] = "fine" if step == 1 else "coarse"
     name = "full" if step == 1 else "coarse"
     sweeps = []
-    for number, strip in enumerate(_strip_centres((low, high), scan, camera, step)):
+    for number, strip in enumerate(_strip_centres((low, high), scan, camera, step, overlap_px)):
         ends = strip + reach_px(strip, scan, camera, step)
         seen = np.clip(ends, low + step / 2, high - step / 2)
         start, lines = _scan_range(float(strip), seen, scan, camera, step)
@@ -109,7 +150,9 @@ def _cover(grid: SceneGrid, camera: LineCamera, along: Axis, *, step: int) -> li
     return sweeps
 
 
-def _strip_centres(field: tuple[float, float], scan: int, camera: LineCamera, binning: int) -> NDArray[np.float64]:
+def _strip_centres(
+    field: tuple[float, float], scan: int, camera: LineCamera, binning: int, least_overlap: float
+) -> NDArray[np.float64]:
     """Place the fewest strips that cover ``field``, all overlaps equal and half as much beyond either end.
 
     A strip's reach depends on where it lies (the line's image is stretched, more so away from the axis), hence the
@@ -124,7 +167,7 @@ def _strip_centres(field: tuple[float, float], scan: int, camera: LineCamera, bi
             reach = np.stack([reach_px(float(centre), scan, camera, binning) for centre in centres])
             width = reach[:, 1] - reach[:, 0]
             overlap = (width.sum() - (high - low)) / count
-            if overlap < -ROUNDING_PX:
+            if overlap < least_overlap - ROUNDING_PX:
                 break
             starts = low - overlap / 2 + np.concatenate([[0.0], np.cumsum(width - overlap)[:-1]])
             centres = starts - reach[:, 0]

@@ -7,17 +7,24 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.coverage import on_scene as on_scene
-from pipeline.mirror import position_to_normal
+from pipeline.mirror import mirror_throughput, position_to_normal
+from pipeline.rectify.alignment import shifted_position
 from pipeline.scan import Axis, Sweep, line_positions, sweep_positions
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene, to_bands
 
-ALL_EFFECTS = frozenset({"slit", "smear", "shot", "read"})
+ALL_EFFECTS = frozenset({"slit", "smear", "throughput", "shot", "read"})
 SLIT_NODES = 4
 PIXEL_NODES = 2
 
 
 def expected_lines(
-    scene: Scene, camera: LineCamera, sweep: Sweep, lines: range, *, effects: frozenset[str] = ALL_EFFECTS
+    scene: Scene,
+    camera: LineCamera,
+    sweep: Sweep,
+    lines: range,
+    *,
+    effects: frozenset[str] = ALL_EFFECTS,
+    shift_px: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float32]:
     """Give the electrons that each sample of some lines gathers on average.
 
@@ -30,32 +37,45 @@ def expected_lines(
         Numbers of the lines within the sweep. A line's result does not depend on the others asked for.
     effects
         Without ``slit`` the footprint is the ray of the sample's centre; without ``smear`` the mirror stands at mid
-        exposure.
+        exposure; without ``throughput`` it passes as much light at any tilt as at rest.
+    shift_px
+        (line, 2) how far beside the plan the mirror looks, along the line and the scan, at all that it holds in the
+        line's exposure. [px]
 
     Returns
     -------
     (line, sample, band) float32, all samples of the camera before binning. [e-]
+
+    Raises
+    ------
+    PoseError : a position, with its shift, is out of the mirror's reach.
     """
-    normals = _held_normals(camera, sweep, lines, effects)
+    position = _held_positions(camera, sweep, lines, effects)
+    if shift_px is not None:
+        position = shifted_position(position, shift_px[:, None], camera)
+    normals = position_to_normal(position)
+    share = mirror_throughput(position).astype(np.float32) if "throughput" in effects else None
     across, along, weights = _footprint(camera, effects)
     slopes = camera.pixel_slopes()
     gathered = np.zeros((len(lines) * camera.samples, scene.electrons.shape[0]), np.float32)
-    for held in np.moveaxis(normals, 1, 0):
+    for step, held in enumerate(np.moveaxis(normals, 1, 0)):
         for turn, run, weight in zip(across, along, weights, strict=True):
             y, x = _ray_pixels(held[:, None], turn, slopes + run, scene.shape, along=sweep.along, ifov=camera.ifov_rad)
             seen = scene.sample(y.ravel(), x.ravel())
             seen *= np.float32(weight / normals.shape[1])
+            if share is not None:
+                seen *= np.repeat(share[:, step], camera.samples)[:, None]
             gathered += seen
     light = gathered.reshape(len(lines), camera.samples, gathered.shape[1])
     return to_bands(light, scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS))
 
 
-def _held_normals(camera: LineCamera, sweep: Sweep, lines: range, effects: frozenset[str]) -> NDArray[np.float64]:
-    """Mirror normals of the positions held in each line's exposure, (line, step, 3)."""
+def _held_positions(camera: LineCamera, sweep: Sweep, lines: range, effects: frozenset[str]) -> NDArray[np.float64]:
+    """Mirror positions held in each line's exposure, (line, step, 2)."""
     asked = slice(lines.start, lines.stop, lines.step)
     if "smear" in effects:
-        return position_to_normal(sweep_positions(sweep, camera)[asked])
-    return position_to_normal(line_positions(sweep, camera)[asked, None])
+        return sweep_positions(sweep, camera)[asked]
+    return line_positions(sweep, camera)[asked, None]
 
 
 def _footprint(camera: LineCamera, effects: frozenset[str]) -> tuple[NDArray[np.float64], ...]:

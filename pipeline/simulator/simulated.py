@@ -14,6 +14,7 @@ from pipeline.camera import LineCamera, bin_samples, digitise
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.scan import Sweep, line_positions
 from pipeline.simulator.instrument import ALL_EFFECTS, expected_lines
+from pipeline.simulator.pointing import Pointing
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene
 from pipeline.source import Line, References
 
@@ -25,7 +26,8 @@ class SimulatedSource:
     """A source that looks at ``scene``. Quantisation and saturation are always on, for raw lines are uint16.
 
     Every line draws its noise from a stream of its own, keyed (seed, sweep name, line number): neither the first line
-    asked for nor the order of sweeps changes a line.
+    asked for nor the order of sweeps changes a line. With ``pointing`` the mirror looks beside the planned positions
+    and still reports those.
     """
 
     scene: Scene
@@ -33,6 +35,7 @@ class SimulatedSource:
     seed: int = 0
     effects: frozenset[str] = ALL_EFFECTS
     name: str = "sim"
+    pointing: Pointing | None = None
 
     def __post_init__(self) -> None:
         unknown = self.effects - ALL_EFFECTS
@@ -61,7 +64,8 @@ class SimulatedSource:
         middle = line_positions(sweep, self.camera)
         for start in range(first, sweep.lines, BLOCK_LINES):
             numbers = range(start, min(start + BLOCK_LINES, sweep.lines))
-            light = expected_lines(self.scene, self.camera, sweep, numbers, effects=self.effects)
+            shift = None if self.pointing is None else self.pointing.of_lines(sweep.name, numbers)
+            light = expected_lines(self.scene, self.camera, sweep, numbers, effects=self.effects, shift_px=shift)
             for number, electrons in zip(numbers, light, strict=True):
                 data = self._read_out(electrons, line_stream(self.seed, sweep.name, number))
                 yield Line(
@@ -76,14 +80,16 @@ class SimulatedSource:
     def references(self, sweep: Sweep) -> References:
         """Mean dark and white frames with the sweep's binning, free of noise.
 
-        The white frame is scaled to the exposure from a shorter one, so that it does not saturate.
+        The white frame is scaled to the exposure from a shorter one, so that it does not saturate. It is taken with
+        the mirror at rest.
         """
         camera, bands = self.camera, len(self.scene.wavelength_nm)
         shape = (camera.samples // sweep.binning, bands)
         dark = np.full(shape, camera.dark_dn * sweep.binning, np.float32)
         gain = sweep.binning * camera.exposure_ms / DEFAULT_EXPOSURE_MS / camera.electrons_per_dn
         white = dark + self.scene.panel_electrons.astype(np.float32) * np.float32(gain)
-        return References(dark=dark, white=white, panel=self.scene.panel.astype(np.float32))
+        panel = self.scene.panel.astype(np.float32)
+        return References(dark=dark, white=white, panel=panel, by_mirror="throughput" in self.effects)
 
     def _read_out(self, electrons: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint16]:
         """Digitise one line with the noises that are on, (sample, band) e- -> DN."""
@@ -130,6 +136,12 @@ class SimulatedSweep:
     def position(self) -> NDArray[np.float64]:
         """(line, 2) mirror X and Y at mid exposure."""
         return line_positions(self.sweep, self.source.camera)
+
+    @property
+    def time_s(self) -> NDArray[np.float64]:
+        """(line,) of mid exposure, since the start of the sweep [s]."""
+        camera = self.source.camera
+        return (np.arange(self.sweep.lines, dtype=np.float64) * camera.frame_ms + camera.exposure_ms / 2) * 1e-3
 
     @property
     def valid_line(self) -> NDArray[np.bool_]:

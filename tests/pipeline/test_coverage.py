@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_full, coarse_sweeps, full_sweeps, on_scene
+from pipeline.coverage import cheapest_full, coarse_sweeps, full_sweeps, on_scene, reach_px
 from pipeline.errors import PoseError, SettingsError
 from pipeline.grid import SceneGrid
 from pipeline.mirror import direction_to_scene, position_to_normal, reflect
@@ -114,3 +115,22 @@ def test_mask_follows_the_rays(along: str, binning: int):
     met = np.all((place >= [-2350, -1050]) & (place < [2350, 1050]), axis=-1)
     assert 0 < met.sum() < met.size
     np.testing.assert_array_equal(on_scene(shape, CAMERA, sweep), met)
+
+
+@pytest.mark.parametrize("overlap_px", [0.0, 64.0, 164.0, 320.0])
+def test_strips_overlap_by_what_is_asked(overlap_px: float):
+    """Neighbours share at least the overlap, with no strip more than it takes, and 0 changes nothing."""
+    grid = SceneGrid(300, 1100, 16, 4)
+    for cover in (full_sweeps, coarse_sweeps):
+        sweeps = cover(grid, CAMERA, "x", overlap_px=overlap_px)
+        reach = [sweep.strip_px + reach_px(sweep.strip_px, grid.height, CAMERA, sweep.binning) for sweep in sweeps]
+        assert all(left[1] - right[0] >= overlap_px - 1e-3 for left, right in pairwise(reach))
+        assert len(sweeps) == int(np.ceil(1100 / (640 - overlap_px)))
+    assert full_sweeps(grid, CAMERA, "x", overlap_px=0) == full_sweeps(grid, CAMERA, "x")
+
+
+@pytest.mark.parametrize("overlap_px", [-1.0, 640.0, float("nan")])
+def test_impossible_overlaps_are_refused(overlap_px: float):
+    """An overlap below 0 or of a whole line is named."""
+    with pytest.raises(SettingsError, match="less than a line"):
+        full_sweeps(SceneGrid(100, 100, 16, 4), CAMERA, "x", overlap_px=overlap_px)

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from pipeline.camera import LineCamera, look
-from pipeline.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.scan import Sweep, line_positions
-from pipeline.simulator.instrument import expected_lines
+from pipeline.mirror import direction_to_scene, mirror_throughput, position_to_normal, reflect
+from pipeline.scan import Sweep, line_positions, sweep_positions
+from pipeline.simulator.instrument import ALL_EFFECTS, expected_lines
 from pipeline.simulator.scene import RasterScene, raster_from_values
 
 CAMERA = LineCamera()
+OPTICS = ALL_EFFECTS - {"throughput"}
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-19.5, lines=40)
 
 
@@ -34,13 +35,33 @@ def smooth(shape: tuple[int, int, int], seed: int = 0) -> np.ndarray:
 
 
 def test_flat_scene_gives_flat_lines() -> None:
-    """Whatever the pose, a flat scene gives each sample the same electrons, in proportion to the exposure."""
+    """At any pose a flat scene gives each sample the same electrons but for the mirror, by exposure."""
     scene = scene_of(np.full((30, 30, 2), 4.0))
     far = Sweep("far", "coarse", "y", strip_px=2000.0, start_px=-3000.0, lines=5, step=4, binning=4)
     expected = np.broadcast_to(4 * scene.electrons, (5, 640, 2))
-    np.testing.assert_allclose(expected_lines(scene, CAMERA, far, range(5)), expected, rtol=1e-5)
-    longer = expected_lines(scene, replace(CAMERA, exposure_ms=250.0), far, range(5))
+    np.testing.assert_allclose(expected_lines(scene, CAMERA, far, range(5), effects=OPTICS), expected, rtol=1e-5)
+    longer = expected_lines(scene, replace(CAMERA, exposure_ms=250.0), far, range(5), effects=OPTICS)
     np.testing.assert_allclose(longer, 2.5 * expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("step", [1, 4])
+def test_mirror_passes_its_share_at_every_held_position(step: int) -> None:
+    """A flat scene shows the mirror's throughput, averaged over the positions held in each exposure."""
+    scene = scene_of(np.full((30, 30, 1), 4.0))
+    far = Sweep("far", "fine", "x", strip_px=-1500.0, start_px=2000.0, lines=6, step=step)
+    lines = expected_lines(scene, CAMERA, far, range(6), effects=frozenset({"smear", "throughput"}))[..., 0]
+    share = mirror_throughput(sweep_positions(far, CAMERA)).mean(axis=1)
+    assert abs(share[0] - 1) > 0.05
+    np.testing.assert_allclose(lines / (4 * scene.electrons[0]), np.broadcast_to(share[:, None], (6, 640)), rtol=1e-5)
+
+
+def test_shifted_lines_see_the_shifted_place() -> None:
+    """A line looked at beside its plan is the line planned there."""
+    scene = scene_of(smooth((200, 700, 1)))
+    sweep = Sweep("s", "fine", "x", strip_px=10.0, start_px=-50.0, lines=20, step=2)
+    moved = replace(sweep, strip_px=17.0, start_px=-38.5)
+    shifted = expected_lines(scene, CAMERA, sweep, range(3, 9), shift_px=np.tile([7.0, 11.5], (6, 1)))
+    np.testing.assert_allclose(shifted, expected_lines(scene, CAMERA, moved, range(3, 9)), rtol=1e-5)
 
 
 @pytest.mark.parametrize("step", [1, 4])
@@ -49,7 +70,7 @@ def test_undeflected_sweep_is_the_operator_on_the_grid(step: int) -> None:
     values = smooth((40, 640, 1))
     scene = scene_of(values)
     sweep = replace(SWEEP, lines=40 // step, step=step)
-    lines = expected_lines(scene, CAMERA, sweep, range(sweep.lines))
+    lines = expected_lines(scene, CAMERA, sweep, range(sweep.lines), effects=OPTICS)
     exact = replace(CAMERA, electrons_per_dn=1.0, bits=16)  # four of its samples still fit uint16
     looked = look(values.astype(np.float32) * scene.electrons, exact, step=step, rng=None)
     binned = lines.reshape(sweep.lines, 640 // step, step, 1).mean(axis=2)
@@ -98,7 +119,7 @@ def test_samples_off_the_scene_see_its_edge() -> None:
     values = np.ones((40, 100, 1))
     values[:, :50] = 3
     scene = scene_of(values)
-    middle = expected_lines(scene, CAMERA, SWEEP, range(20, 21))[0, :, 0] / scene.electrons[0]
+    middle = expected_lines(scene, CAMERA, SWEEP, range(20, 21), effects=OPTICS)[0, :, 0] / scene.electrons[0]
     np.testing.assert_allclose(middle[:260], 3, rtol=1e-5)
     np.testing.assert_allclose(middle[380:], 1, rtol=1e-5)
 

@@ -105,12 +105,27 @@ def test_references_give_back_scene_values(binning: int, exposure_ms: float) -> 
     assert valid.all() == (values.max() * source.scene.electrons[0] * exposure_ms / 100 < CAMERA.full_well_e)
 
 
+def test_calibration_takes_the_mirror_out() -> None:
+    """Far from rest the light falls off and the references say so; calibrated lines are scene values again."""
+    values = np.random.default_rng(4).uniform(0.2, 0.6, (1, 1, 6)) * np.ones((40, 40, 1))
+    sweep = replace(SWEEP, strip_px=2500.0, start_px=-3000.0, lines=20)
+    for effects in (QUIET, QUIET | {"throughput"}):
+        source = source_of(values, effects=effects)
+        references, position = source.references(sweep), line_positions(sweep, CAMERA)
+        assert references.by_mirror == ("throughput" in effects)
+        out, valid = calibrate(raw_of(source, sweep), references, saturated_dn=4095, position=position)
+        assert valid.all()
+        step = source.scene.panel[0] / source.scene.panel_electrons[0] * CAMERA.electrons_per_dn
+        np.testing.assert_allclose(out, np.broadcast_to(values[0, 0], out.shape), atol=0.6 * step)
+
+
 def test_black_scene_reads_dark() -> None:
     """An all-black scene gives the dark level, zeros after calibration, and read noise alone."""
     source = source_of(np.zeros((20, 20, 2)))
     raw = raw_of(source)
     assert raw.mean() == pytest.approx(64, abs=0.1)
-    out, valid = calibrate(raw, source.references(SWEEP), saturated_dn=4095)
+    position = line_positions(SWEEP, CAMERA)
+    out, valid = calibrate(raw, source.references(SWEEP), saturated_dn=4095, position=position)
     assert valid.all()
     assert abs(out.mean()) < 1e-3 * source.scene.panel[0]
 

@@ -1,0 +1,138 @@
+"""Illumination of sweeps from what overlaps show twice: drift recovered, spectra kept, what nothing ties left at 1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.camera import LineCamera
+from pipeline.coverage import full_sweeps
+from pipeline.errors import SettingsError, ShapeError
+from pipeline.grid import SceneGrid
+from pipeline.rectify.illumination import LightRatio, light_ratio, overlap_light, solve_lights
+from pipeline.rectify.overlaps import Window
+from pipeline.rectify.region import PixelGrid, mosaic_tile, place
+from pipeline.simulator.scene import raster_from_values
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+
+WAVELENGTH = np.linspace(400, 1000, 31)
+PLACE = (WAVELENGTH - 700) / 300
+
+
+def ratios_of(log_light: np.ndarray, error: float, seed: int = 0) -> list[LightRatio]:
+    """Ratios of neighbours with noise of a stated size."""
+    rng = np.random.default_rng(seed)
+    return [
+        LightRatio(one, one + 1, step + rng.normal(0, error, len(step)), np.full(len(step), error))
+        for one, step in enumerate(np.diff(log_light, axis=0))
+    ]
+
+
+def smooth_lights(count: int) -> np.ndarray:
+    """Log lights that drift by colour, of mean 0 over the sweeps."""
+    draws = np.random.default_rng(1).normal(0, [0.2, 0.1, 0.05, 0.02], (count, 4))
+    lights = draws @ np.polynomial.legendre.legvander(PLACE, 3).T
+    return lights - lights.mean(axis=0)
+
+
+def test_smooth_drift_is_recovered():
+    """From ratios with 1 % of noise per band, the light of every sweep comes back to 0.7 %: smoothness averages it."""
+    truth = smooth_lights(5)
+    found = solve_lights(ratios_of(truth, 0.01), 5, WAVELENGTH)
+    np.testing.assert_allclose(np.log(found.light), truth, atol=0.02)
+    assert np.sqrt(np.mean((np.log(found.light) - truth) ** 2)) < 0.007
+    np.testing.assert_allclose(np.log(found.light).mean(axis=0), 0, atol=1e-6)
+    np.testing.assert_allclose(found.gain(2) * found.light[2], 1, rtol=1e-6)
+
+
+def test_bands_without_light_take_no_part():
+    """NaN ratios and bands of large error neither spread nor bend the rest."""
+    truth = smooth_lights(3)
+    ratios = ratios_of(truth, 1e-4)
+    broken = [
+        replace(
+            ratio,
+            log_ratio=np.where(PLACE < -0.8, np.nan, ratio.log_ratio + (PLACE > 0.9) * 2.0),
+            error=np.where(PLACE < -0.8, np.inf, np.where(PLACE > 0.9, 50.0, ratio.error)),
+        )
+        for ratio in ratios
+    ]
+    np.testing.assert_allclose(np.log(solve_lights(broken, 3, WAVELENGTH).light), truth, atol=0.01)
+
+
+def test_sweeps_apart_keep_a_mean_of_one():
+    """A sweep in no ratio stays at 1 and is named; groups that nothing joins have a mean log light of 0 each."""
+    truth = np.array([[0.1], [-0.1], [0.0], [0.3], [-0.3]]) * np.ones((1, 31))
+    ratios = [ratio for ratio in ratios_of(truth, 1e-6) if 2 not in (ratio.reference, ratio.moving)]
+    found = solve_lights(ratios, 5, WAVELENGTH)
+    assert found.untied == (2,)
+    np.testing.assert_allclose(np.log(found.light), truth, atol=1e-4)
+    assert (solve_lights([], 2, WAVELENGTH).light == 1).all()
+
+
+def test_ratio_is_not_moved_by_noise_or_by_what_moved():
+    """Noise of a fifth of the light and a quarter of changed rows leave the ratio to 2 %."""
+    rng = np.random.default_rng(2)
+    ground = rng.uniform(0.2, 1.0, (40, 60, 3))
+    moving = ground * np.array([1.1, 0.9, 1.0]) + rng.normal(0, 0.1, ground.shape)
+    moving[:10] *= 3.0
+    moving[20:22], ground[:, 5] = np.nan, np.nan
+    found = light_ratio(ground + rng.normal(0, 0.1, ground.shape), moving, pair=(0, 1))
+    np.testing.assert_allclose(np.exp(found.log_ratio), [1.1, 0.9, 1.0], rtol=0.02)
+    assert (found.error < 0.02).all()
+    dark = light_ratio(np.zeros((40, 60, 3)), moving, pair=(0, 1))
+    assert np.isnan(dark.log_ratio).all()
+    assert np.isinf(dark.error).all()
+
+
+def test_drift_between_captured_sweeps_is_taken_out():
+    """Two simulated sweeps, one lit 20 % more and redder, agree to 0.5 % in every band once gains are in."""
+    camera = LineCamera(samples=120)
+    rng = np.random.default_rng(3)
+    values = np.kron(rng.uniform(0.3, 1, (15, 26, 8)), np.ones((8, 8, 1)))
+    scene = raster_from_values(values, camera, name="t", wavelength_nm=np.linspace(400, 1000, 8))
+    source = SimulatedSource(scene, camera, 0, frozenset({"shot", "read"}))
+    sweeps = full_sweeps(SceneGrid(100, 150, 16, 4), camera, "x", overlap_px=64)[:2]
+    light = 1.2 + 0.1 * np.linspace(-1, 1, 8)
+
+    @dataclass(frozen=True)
+    class Lit:
+        inner: SimulatedSweep
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self.inner, name)
+
+        def read(self, start: int, stop: int) -> np.ndarray:
+            dark = self.inner.references.dark
+            return np.rint((self.inner.read(start, stop) - dark) * light * 0.8 + dark).astype(np.uint16)
+
+    placed = [place(SimulatedSweep(source, sweeps[0]), camera), place(Lit(SimulatedSweep(source, sweeps[1])), camera)]  # type: ignore[arg-type]
+    low, high = sweeps[1].strip_px - 59, sweeps[0].strip_px + 59
+    (ratio,) = overlap_light(placed, camera, [Window(0, 1, (low, high), (-45.0, 45.0))])
+    found = solve_lights([ratio], 2, scene.wavelength_nm)
+    np.testing.assert_allclose(found.light[1] / found.light[0], light * 0.8, rtol=5e-3)
+    grid = PixelGrid((-40.0, low), 1, (80, int(high - low)))
+    means = [
+        np.nanmean(
+            mosaic_tile([replace(one, gain=found.gain(k))], camera, grid, slice(0, 80), slice(0, grid.shape[1]))[0],
+            axis=(0, 1),
+        )
+        for k, one in enumerate(placed)
+    ]
+    np.testing.assert_allclose(means[0], means[1], rtol=5e-3)
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    """Unlike arrays, unknown sweeps, other bands and negative orders are named."""
+    with pytest.raises(ShapeError, match="same points"):
+        light_ratio(np.zeros((3, 4, 5)), np.zeros((3, 4, 6)), pair=(0, 1))
+    ratio = LightRatio(0, 1, np.zeros(31), np.ones(31))
+    with pytest.raises(ShapeError, match="there are 1 sweeps of 31 bands"):
+        solve_lights([ratio], 1, WAVELENGTH)
+    with pytest.raises(ShapeError, match="has 31 bands"):
+        solve_lights([ratio], 2, WAVELENGTH[:5])
+    with pytest.raises(SettingsError, match="must be 0 or more, got -1"):
+        solve_lights([ratio], 2, WAVELENGTH, order=-1)

@@ -1,0 +1,158 @@
+"""Overlaps of sweeps: broad-band images, windows of neighbours, and a pass registered against the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.camera import LineCamera
+from pipeline.coverage import coarse_sweeps, full_sweeps
+from pipeline.errors import SettingsError
+from pipeline.grid import SceneGrid
+from pipeline.rectify.alignment import no_shifts
+from pipeline.rectify.overlaps import BroadSweep, overlap_windows, places_seen
+from pipeline.rectify.seams import Registration, measure_windows, place_images, register_sweeps
+from pipeline.scan import Axis, Sweep, line_positions, sweep_to_scene
+from pipeline.simulator.pointing import PointingErrors
+from pipeline.simulator.scene import raster_from_values
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+
+CAMERA = LineCamera(samples=160)
+GRID = SceneGrid(260, 300, 16, 4)
+
+
+def source_of(pointing: PointingErrors | None = None, bands: int = 2, *, turned: bool = False) -> SimulatedSource:
+    """A source over random waves of 6 to 60 px, wider than the grid by 40 px."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[: GRID.height + 80, : GRID.width + 80].astype(float)
+    values = np.full(y.shape, 1.0)
+    for _ in range(30):
+        period, angle, phase = np.exp(rng.uniform(*np.log((6, 60)))), *rng.uniform(0, 2 * np.pi, 2)
+        values += 0.06 * np.cos(2 * np.pi * (np.sin(angle) * y + np.cos(angle) * x) / period + phase)
+    values = values.T if turned else values
+    cube = np.repeat(values[..., None], bands, axis=2)
+    scene = raster_from_values(cube, CAMERA, name="t", wavelength_nm=np.linspace(500, 800, bands))
+    return SimulatedSource(scene, CAMERA, 0, frozenset({"read"}), pointing=pointing)
+
+
+def registered(pointing: PointingErrors, along: Axis, **options: Any) -> tuple[list[Sweep], Registration]:
+    """A full pass over the grid with an overlap of 84 px, registered."""
+    grid = GRID if along == "x" else replace(GRID, height=GRID.width, width=GRID.height)
+    sweeps = full_sweeps(grid, CAMERA, along, overlap_px=84)
+    source = source_of(pointing, turned=along == "y")
+    broad = [BroadSweep.read(SimulatedSweep(source, sweep), CAMERA) for sweep in sweeps]
+    return sweeps, register_sweeps(broad, CAMERA, **{"prior_px": 10, "window_px": 130, **options})
+
+
+@pytest.mark.parametrize("along", ["x", "y"])
+def test_pass_is_registered_to_a_tenth(along: Axis):
+    """Sweeps that look up to 10 px beside the plan, and jitter, are brought together to 0.2 px."""
+    pointing = PointingErrors(offset_px=10, jitter_px=0.3, seed=2)
+    sweeps, found = registered(pointing, along)
+    assert len(sweeps) == 4
+    assert (found.untied, found.narrow) == ((), ())
+    held = pointing.offset(found.reference or "")
+    for sweep in sweeps:
+        left = found.of(sweep.name).offset - (pointing.offset(sweep.name) - held)
+        assert np.abs(left).max() < 0.2
+    assert np.nanmax(np.abs([window.residual_px for window in found.windows])) < 0.2
+
+
+def test_corrected_sweeps_show_no_shift():
+    """Measured again where the corrections put them, neighbours are together."""
+    pointing = PointingErrors(offset_px=10, jitter_px=0.0, seed=4)
+    sweeps, found = registered(pointing, "x")
+    broad = [BroadSweep.read(SimulatedSweep(source_of(pointing), sweep), CAMERA) for sweep in sweeps]
+    again = measure_windows(place_images(broad, found.shifts, CAMERA), reach_px=3, window_px=130)
+    shifts = np.array([window.measured.shift for window in again if window.measured is not None])
+    assert len(shifts) >= 3
+    assert np.abs(shifts).max() < 0.05
+
+
+def test_narrow_overlaps_are_reported():
+    """Overlaps below 64 px beyond the prior are named with their width, and nothing is moved."""
+    sweeps, found = registered(PointingErrors(5, 0), "x", prior_px=15)
+    narrow = {(one.reference, one.moving): one for one in found.narrow}
+    for one, other in pairwise(sweeps):
+        assert 80 < narrow[one.name, other.name].width_px < narrow[one.name, other.name].needed_px == 94
+    assert len(found.untied) == len(sweeps) - 1
+    assert all((shift.offset == 0).all() for shift in found.shifts)
+
+
+def test_coarse_pass_is_registered_in_scene_pixels():
+    """Lines 2 px apart of binned samples give corrections in px of the scene, as fine ones do."""
+    pointing = PointingErrors(offset_px=6, jitter_px=0, seed=5)
+    sweeps = coarse_sweeps(replace(GRID, factor=2), CAMERA, "x", overlap_px=84)
+    source = source_of(pointing)
+    broad = [BroadSweep.read(SimulatedSweep(source, sweep), CAMERA) for sweep in sweeps]
+    found = register_sweeps(broad, CAMERA, prior_px=8, window_px=300)
+    held = pointing.offset(found.reference or "")
+    for sweep in sweeps:
+        np.testing.assert_allclose(found.of(sweep.name).offset, pointing.offset(sweep.name) - held, atol=0.3)
+
+
+def test_windows_lie_where_both_sweeps_look():
+    """Every window's corners are seen by both of its sweeps, except where lines end."""
+    sweeps = full_sweeps(GRID, CAMERA, "x", overlap_px=84)
+    source = source_of()
+    broad = [BroadSweep.read(SimulatedSweep(source, sweep), CAMERA) for sweep in sweeps]
+    images = place_images(broad, no_shifts([sweep.name for sweep in sweeps]), CAMERA)
+    windows = overlap_windows(images, window_px=100)
+    assert {(window.reference, window.moving) for window in windows} >= {(0, 1), (1, 2), (2, 3)}
+    for window in windows:
+        inner = [np.linspace(low + 2, high - 2, 5) for low, high in (window.along_px, window.scan_px)]
+        for number in (window.reference, window.moving):
+            assert np.isfinite(images[number].seen_at(*inner)).all()
+    with pytest.raises(SettingsError, match="at least 64 px long, got 32 px"):
+        overlap_windows(images, window_px=32)
+
+
+def test_broad_image_is_the_mean_of_the_bands():
+    """Without noise the image is the scene's mean over bands; lost lines and dead elements leave NaN."""
+    source = replace(source_of(bands=5), effects=frozenset())
+    sweep = full_sweeps(GRID, CAMERA, "x")[0]
+
+    @dataclass(frozen=True)
+    class Holed:
+        inner: SimulatedSweep
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self.inner, name)
+
+        @property
+        def valid_line(self) -> np.ndarray:
+            return np.arange(sweep.lines) != 7
+
+        @property
+        def position(self) -> np.ndarray:
+            return np.where(self.valid_line[:, None], self.inner.position, np.nan)
+
+    broad = BroadSweep.read(Holed(SimulatedSweep(source, sweep)), CAMERA, bands=3)  # type: ignore[arg-type]
+    along, scan = sweep_to_scene(sweep, CAMERA)
+    y, x = scan + (source.field_shape[0] - 1) / 2, along + (source.field_shape[1] - 1) / 2
+    truth = source.scene.sample(y.ravel(), x.ravel()).mean(axis=1).reshape(along.shape)
+    assert np.isnan(broad.image[7]).all()
+    kept = np.arange(sweep.lines) != 7
+    np.testing.assert_allclose(broad.image[kept], truth[kept], atol=2e-3)
+    assert np.isfinite(place_images([broad], no_shifts(["s"]), CAMERA)[0].edges).all()
+
+
+def test_places_are_those_of_the_scan():
+    """Rays from mirror positions meet the places that the scan's closed form gives."""
+    sweep = Sweep("s", "fine", "x", 900.0, -700.0, 30)
+    seen = places_seen(line_positions(sweep, CAMERA), CAMERA.pixel_slopes(), CAMERA)
+    np.testing.assert_allclose(np.moveaxis(seen, -1, 0), sweep_to_scene(sweep, CAMERA), atol=1e-7)
+
+
+def test_no_sweeps_and_impossible_settings():
+    """Nothing registers to nothing; a negative prior and no rounds are refused."""
+    found = register_sweeps([], CAMERA, prior_px=5)
+    assert (found.shifts, found.reference, found.untied) == ((), None, ())
+    with pytest.raises(SettingsError, match="got -1 px, 2 rounds"):
+        register_sweeps([], CAMERA, prior_px=-1)
+    with pytest.raises(SettingsError, match="0 rounds"):
+        register_sweeps([], CAMERA, prior_px=1, rounds=0)
