@@ -1,0 +1,231 @@
+r"""The ground under a posed rig: scene points to metres east, north and up of its foot, and back, in closed form.
+
+Scene points are (y, x) px from the scene's centre, the undeflected view direction v. Seen along v, x goes right and y
+goes down, whichever way the lines lie; row 0 of an image is up. The foot is the ground straight below the pivot::
+
+       the scene, along v           from the side: tilt t          from above: heading h
+
+      +---------------+           pivot o - - - - horizon              north   v
+      |       v       |                 | \ t                            |    /
+      |       o---> x |          height |   \ v                          | h /
+      |       |       |                 |     \                          |  /
+      |       y       |        ---------+-------x--- ground              | /
+      +---------------+               foot                           foot o------ east
+
+A heading of 0 looks north and grows clockwise; a tilt of 0 looks at the horizon, of 90 straight down, where the
+heading is that of the image's upper edge. A positive roll turns the rig's right side down. The ground is a plane
+through the foot that falls by ``slope_deg`` towards ``aspect_deg`` (clockwise from north).
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipeline.errors import PoseError, ShapeError
+
+Floats = NDArray[np.float64]
+
+LEAST_SINK = 1e-12  # a ray that sinks less along its depth counts as parallel to the ground
+ROWS_AT_ONCE = 256
+# least and greatest value of each angle and length that stands in a pose
+LIMITS = {
+    "lon_deg": (-180.0, 180.0),
+    "lat_deg": (-90.0, 90.0),
+    "height_m": (0.01, 20_000.0),
+    "range_m": (0.01, 50_000.0),
+    "heading_deg": (-360.0, 360.0),
+    "tilt_deg": (-90.0, 90.0),
+    "roll_deg": (-180.0, 180.0),
+    "slope_deg": (0.0, 80.0),
+    "aspect_deg": (-360.0, 360.0),
+    "elevation_m": (-500.0, 9000.0),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigPose:
+    """Where the mirror's pivot stands, where it looks undeflected, and the plane of ground that it looks at.
+
+    Give ``height_m`` above the foot, or ``range_m`` to the ground along the undeflected direction.
+
+    Raises
+    ------
+    PoseError : a value is not finite or out of range, or not exactly one of height and range is given.
+    """
+
+    lon_deg: float  # WGS 84
+    lat_deg: float
+    heading_deg: float
+    tilt_deg: float
+    height_m: float | None = None
+    range_m: float | None = None
+    roll_deg: float = 0.0
+    slope_deg: float = 0.0
+    aspect_deg: float = 0.0
+    elevation_m: float = 0.0  # of the foot above the ellipsoid; 1000 m are 1.6e-4 of the map's scale
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            low, high = LIMITS[item.name]
+            if value is not None and not low <= value <= high:  # NaN fails as well
+                raise PoseError(f"{item.name} of the rig's pose must be from {low:g} to {high:g}, got {value!r}")
+        if (self.height_m is None) == (self.range_m is None):
+            got = f"height_m = {self.height_m}, range_m = {self.range_m}"
+            raise PoseError(f"the rig's pose needs height_m or range_m, one of the two; got {got}")
+
+    def __str__(self) -> str:
+        return ", ".join(f"{name} {value:g}" for name, value in asdict(self).items() if value is not None)
+
+
+@dataclass(frozen=True)
+class GroundView:
+    """A posed rig with its pixel's angle: every scene point's ray and where it meets the ground.
+
+    A ray v + x r + y d (tangents x and y, r right, d down) sinks by w = -n . ray per unit of depth, n being the
+    ground's normal with n_up = 1; it meets the ground at the depth height / w. All of this class follows from w being
+    linear in the scene.
+    """
+
+    pose: RigPose
+    ifov_rad: float
+
+    @cached_property
+    def axes(self) -> Floats:
+        """(3, 3) view, right and down as rows, in east, north, up."""
+        heading, tilt, roll = np.deg2rad([self.pose.heading_deg, self.pose.tilt_deg, self.pose.roll_deg])
+        away = np.array([np.sin(heading), np.cos(heading), 0.0])
+        up = np.array([0.0, 0.0, 1.0])
+        view = np.cos(tilt) * away - np.sin(tilt) * up
+        right = np.array([np.cos(heading), -np.sin(heading), 0.0])
+        down = -np.sin(tilt) * away - np.cos(tilt) * up
+        c, s = np.cos(roll), np.sin(roll)
+        return np.stack([view, c * right + s * down, c * down - s * right])
+
+    @cached_property
+    def normal(self) -> Floats:
+        """(3,) normal of the ground with 1 upwards, in east, north, up."""
+        slope, aspect = np.deg2rad([self.pose.slope_deg, self.pose.aspect_deg])
+        return np.array([np.tan(slope) * np.sin(aspect), np.tan(slope) * np.cos(aspect), 1.0])
+
+    @cached_property
+    def sinks(self) -> Floats:
+        """(3,) w of view, right and down."""
+        sinks: Floats = -self.axes @ self.normal
+        return sinks
+
+    @cached_property
+    def height_m(self) -> float:
+        """Height of the pivot above the foot.
+
+        Raises
+        ------
+        PoseError : a range is given, and the undeflected direction does not meet the ground.
+        """
+        if self.pose.height_m is not None:
+            return self.pose.height_m
+        assert self.pose.range_m is not None
+        if self.sinks[0] <= LEAST_SINK:
+            raise PoseError(
+                f"a range needs a view direction that meets the ground, got {self.pose}; tilt it below the horizon, "
+                "or give height_m instead"
+            )
+        return float(self.pose.range_m * self.sinks[0])
+
+    def sink(self, points_px: ArrayLike) -> Floats:
+        """Give w of scene points (..., 2): above 0 where the ray meets the ground, 0 at the horizon."""
+        tangents = _pairs(points_px) * self.ifov_rad
+        w: Floats = self.sinks[0] + tangents[..., 1] * self.sinks[1] + tangents[..., 0] * self.sinks[2]
+        return w
+
+    def scene_to_ground(self, points_px: ArrayLike) -> Floats:
+        """Give where the rays of scene points meet the ground.
+
+        Parameters
+        ----------
+        points_px
+            (..., 2) y and x from the scene's centre. [px]
+
+        Returns
+        -------
+        (..., 3) east, north and up of the foot [m]; NaN where the ray is at or above the horizon.
+        """
+        tangents = _pairs(points_px) * self.ifov_rad
+        view, right, down = self.axes
+        rays = view + tangents[..., 1:] * right + tangents[..., :1] * down
+        points: Floats = rays * self._depth(self.sink(points_px))[..., None]
+        points[..., 2] += self.height_m
+        return points
+
+    def ground_to_scene(self, ground_m: ArrayLike) -> Floats:
+        """Give the scene points (..., 2) [px] at which points (..., 3) east, north, up of the foot [m] are seen.
+
+        The inverse of ``scene_to_ground``, and right for points above or below the plane too. NaN for points that lie
+        beside or behind the pivot.
+        """
+        seen = (np.asarray(ground_m, np.float64) - np.array([0.0, 0.0, self.height_m])) @ self.axes.T
+        depth = np.where(seen[..., :1] > 0, seen[..., :1], np.nan)
+        points: Floats = seen[..., :0:-1] / (depth * self.ifov_rad)
+        return points
+
+    def footprint_m(self, points_px: ArrayLike) -> Floats:
+        """Give how far the ground reaches under one pixel down and right, (..., 2) along y and x [m]; NaN off it."""
+        tangents = _pairs(points_px) * self.ifov_rad
+        view, right, down = self.axes
+        w = self.sink(points_px)[..., None]
+        rays = view + tangents[..., 1:] * right + tangents[..., :1] * down
+        scale = self.height_m * self.ifov_rad / np.where(w > LEAST_SINK, w, np.nan) ** 2
+        steps = [down * w - rays * self.sinks[2], right * w - rays * self.sinks[1]]
+        return np.stack([np.linalg.norm(step * scale, axis=-1) for step in steps], axis=-1)
+
+    def area_m2(self, points_px: ArrayLike) -> Floats:
+        """Give the ground under a pixel as a map shows it (of a slope its level share), (...) [m2]; NaN off it.
+
+        The cross product of the two sides of the footprint is -n (height ifov)^2 / w^3: its level part has no other
+        dependence on the direction.
+        """
+        w = self.sink(points_px)
+        area: Floats = (self.height_m * self.ifov_rad) ** 2 / np.where(w > LEAST_SINK, w, np.nan) ** 3
+        return area
+
+    def count_ground(self, scene_shape: tuple[int, int], least_sink: float = LEAST_SINK) -> int:
+        """Count the pixels of a scene of (y, x) px whose rays meet the ground, sinking by more than ``least_sink``."""
+        y, x = pixel_places(scene_shape)
+        across = self.ifov_rad * self.sinks[1] * x
+        down = self.sinks[0] + self.ifov_rad * self.sinks[2] * y
+        blocks = (down[first : first + ROWS_AT_ONCE, None] for first in range(0, len(y), ROWS_AT_ONCE))
+        return sum(int(np.count_nonzero(block + across > least_sink)) for block in blocks)
+
+    def outline_px(self, scene_shape: tuple[int, int], least_sink: float) -> Floats:
+        """Give the corners (corner, 2) [px] of the part of a scene that sinks by ``least_sink`` or more, in order."""
+        half_y, half_x = scene_shape[0] / 2, scene_shape[1] / 2
+        corners = np.array([[-half_y, -half_x], [-half_y, half_x], [half_y, half_x], [half_y, -half_x]])
+        excess = self.sink(corners) - least_sink
+        kept: list[Floats] = []
+        for here, there in zip(range(4), (1, 2, 3, 0), strict=True):
+            if excess[here] >= 0:
+                kept.append(corners[here])
+            if (excess[here] >= 0) != (excess[there] >= 0):
+                share = excess[here] / (excess[here] - excess[there])
+                kept.append(corners[here] + share * (corners[there] - corners[here]))
+        return np.array(kept).reshape(-1, 2)
+
+    def _depth(self, w: Floats) -> Floats:
+        return self.height_m / np.where(w > LEAST_SINK, w, np.nan)
+
+
+def pixel_places(scene_shape: tuple[int, int]) -> tuple[Floats, Floats]:
+    """Give y of every row and x of every column of a scene, from its centre [px]."""
+    rows, columns = (np.arange(size, dtype=np.float64) for size in scene_shape)
+    return rows - (scene_shape[0] - 1) / 2, columns - (scene_shape[1] - 1) / 2
+
+
+def _pairs(points_px: ArrayLike) -> Floats:
+    points = np.asarray(points_px, np.float64)
+    if points.ndim == 0 or points.shape[-1] != 2:
+        raise ShapeError(f"scene points need y and x on the last axis, got shape {points.shape}")
+    return points

@@ -1,0 +1,133 @@
+"""Poses at the edge: nadir, horizon, sky, poles, date line, steep slopes, one pixel, and what is no number."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.errors import PoseError
+from pipeline.ground import GroundView, RigPose, pixel_places
+from pipeline.ground_grid import GroundGrid, ground_grid
+
+pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
+IFOV = 7.4e-3 / 70
+
+
+def view(**changes: Any) -> GroundView:
+    """A rig 12 m up that looks down at 40 deg, or as changed."""
+    given = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 0.0, "tilt_deg": 40.0, "height_m": 12.0}
+    return GroundView(RigPose(**(given | changes)), IFOV)
+
+
+def seen(grid: GroundGrid) -> np.ndarray:
+    """Scene pixels of all of a map, (y, x, 2)."""
+    return grid.scene_pixels(slice(0, grid.shape[0]), slice(0, grid.shape[1]))
+
+
+def test_nadir_has_no_heading_of_its_own_but_keeps_the_rigs():
+    """Straight down, the image's upper edge points where the rig heads, and every pixel is square."""
+    rig = view(tilt_deg=90.0, heading_deg=70.0)
+    up = rig.scene_to_ground([-1000, 0])
+    assert np.rad2deg(np.arctan2(up[0], up[1])) == pytest.approx(70.0)
+    assert rig.footprint_m([0, 0]) == pytest.approx([12 * IFOV] * 2)
+    assert rig.ground_to_scene(rig.scene_to_ground([0, 0])) == pytest.approx([0, 0], abs=1e-9)
+
+
+def test_the_horizon_itself_is_no_ground():
+    """A ray that runs level or up is NaN, both ways; one a hair below the horizon is finite."""
+    rig = view(tilt_deg=0.0)
+    assert np.isnan(rig.scene_to_ground([[0, 0], [0, 500], [-1, 0]])).all()
+    assert np.isfinite(rig.scene_to_ground([1e-3, 0])).all()
+    assert np.isnan(rig.ground_to_scene([[0, -5, 0], [0, 0, 0], [3, 0, 12]])).all()
+
+
+def test_half_of_the_field_is_sky():
+    """The map ends before the horizon; sky, far ground and mapped ground add up to the field."""
+    grid = ground_grid(view(tilt_deg=0.0), (200, 150))
+    counts = grid.counts()
+    assert counts["no_ground_px"] == 200 * 150 / 2
+    assert counts["mapped_px"] > counts["beyond_reach_px"] > 0
+    assert sum(counts.values()) == 200 * 150
+    rows = seen(grid)[..., 0]
+    assert np.nanmin(rows) > 99.5
+
+
+def test_a_field_of_sky_is_refused_with_its_pose():
+    """Nothing to map: the message names tilt and height, and what to do."""
+    with pytest.raises(PoseError, match=r"no ray of the field meets the ground .*tilt_deg -20, height_m 12.*tilt it"):
+        ground_grid(view(tilt_deg=-20.0), (64, 64))
+    with pytest.raises(PoseError, match="a range needs a view direction that meets the ground"):
+        ground_grid(view(tilt_deg=0.0, height_m=None, range_m=30.0), (64, 64))
+
+
+@pytest.mark.parametrize("slope", [30.0, 45.0])
+def test_a_slope_that_falls_away_hides_its_ground(slope: float):
+    """Ground that falls as steeply as the rays is not met; seen from the other side it fills the field."""
+    away = view(tilt_deg=30.0, slope_deg=slope, aspect_deg=0.0)
+    if slope > 30:
+        with pytest.raises(PoseError, match="slope_deg 45"):
+            ground_grid(away, (80, 80))
+    else:
+        assert away.count_ground((80, 80)) == 40 * 80
+    assert view(tilt_deg=30.0, slope_deg=slope, aspect_deg=180.0).count_ground((80, 80)) == 80 * 80
+
+
+@pytest.mark.parametrize(("lat", "epsg"), [(85.3, 5041), (89.9999, 5041), (90.0, 5041), (-88.0, 5042), (-90.0, 5042)])
+def test_near_a_pole_the_map_is_stereographic(lat: float, epsg: int):
+    """UTM ends at 84 N and 80 S; the default goes on, up to the pole itself, and areas stay true."""
+    shape = (120, 90)
+    grid = ground_grid(view(lat_deg=lat), shape)
+    assert grid.geobox.crs is not None
+    assert grid.geobox.crs.epsg == epsg
+    exact = grid.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(shape), indexing="ij"), axis=-1)).sum()
+    assert np.isfinite(seen(grid)[..., 0]).sum() * grid.pixel_area_m2() == pytest.approx(exact, rel=1e-2)
+
+
+def test_utm_asked_for_near_a_pole_is_refused():
+    """The message says where the zone ends and which CRS suits."""
+    with pytest.raises(PoseError, match=r"EPSG:32632 .* latitudes 0 to 84; .*lat_deg 86; leave epsg out for EPSG:5041"):
+        ground_grid(view(lat_deg=86.0), (64, 64), epsg=32632)
+
+
+@pytest.mark.parametrize(("lon", "heading"), [(179.99999, 90.0), (-179.99999, -90.0), (180.0, 90.0), (-180.0, 0.0)])
+def test_the_date_line_is_no_border(lon: float, heading: float):
+    """A field across it is one small map in the rig's zone, as large as the same field elsewhere."""
+    across = ground_grid(view(lon_deg=lon, lat_deg=-17.0, heading_deg=heading), (100, 100))
+    here = ground_grid(view(lon_deg=170.5, lat_deg=-17.0, heading_deg=heading), (100, 100))
+    assert np.abs(np.array(across.shape) - here.shape).max() <= 8  # the zone's meridians turn it a little
+    assert np.isfinite(seen(across)[..., 0]).mean() == pytest.approx(np.isfinite(seen(here)[..., 0]).mean(), abs=0.1)
+
+
+def test_a_range_makes_the_same_map_as_the_height_it_means():
+    """12 m up at 40 deg is a range of 12 / sin 40 deg."""
+    by_range = ground_grid(view(height_m=None, range_m=12 / np.sin(np.deg2rad(40))), (64, 64))
+    assert by_range.geobox == ground_grid(view(), (64, 64)).geobox
+
+
+def test_one_pixel_is_a_map():
+    """A scene of one pixel has a footprint, a grid, and its class on it."""
+    grid = ground_grid(view(), (1, 1))
+    places = seen(grid)[..., 0]
+    assert 1 <= np.isfinite(places).sum() <= 6
+    assert np.nanmax(np.abs(places)) <= 0.5
+    assert grid.counts() == {"mapped_px": 1, "beyond_reach_px": 0, "no_ground_px": 0}
+
+
+@pytest.mark.parametrize("name", ["lon_deg", "lat_deg", "height_m", "heading_deg", "tilt_deg", "slope_deg"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_no_number_is_no_pose(name: str, value: float):
+    """The message names the field and what came."""
+    with pytest.raises(PoseError, match=rf"{name} of the rig's pose must be from .*, got {value!r}"):
+        view(**{name: value})
+
+
+def test_a_kilometre_away_rays_come_back_to_the_pixel():
+    """Twenty metres up and one degree below the horizon, ray, map and back agree to 1e-3 px."""
+    rig = view(height_m=20.0, tilt_deg=1.0)
+    grid = ground_grid(rig, (60, 60))
+    points = np.array([[-20.0, 13.0], [0.0, 0.0], [25.0, -29.0]])
+    ground = grid.frame.map_to_ground(grid.frame.ground_to_map(rig.scene_to_ground(points)))
+    assert np.hypot(*ground[1, :2]) > 1000
+    assert rig.ground_to_scene(ground) == pytest.approx(points, abs=1e-3)

@@ -1,0 +1,145 @@
+"""A posed rig's rays: known places, exact inverses, footprints as derivatives, and what the horizon leaves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import PoseError, ShapeError
+from pipeline.ground import LEAST_SINK, LIMITS, GroundView, RigPose, pixel_places
+
+IFOV = 7.4e-3 / 70
+
+
+def view(**changes: float | None) -> GroundView:
+    """A rig 12 m above Hanover's clay looking down at 40 deg, or as changed."""
+    given: dict[str, Any] = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 30.0, "tilt_deg": 40.0, "height_m": 12.0}
+    return GroundView(RigPose(**(given | changes)), IFOV)
+
+
+poses = st.builds(
+    lambda heading, tilt, roll, slope, aspect: view(
+        heading_deg=heading, tilt_deg=tilt, roll_deg=roll, slope_deg=slope, aspect_deg=aspect
+    ),
+    st.floats(-360, 360), st.floats(20, 90), st.floats(-180, 180), st.floats(0, 10), st.floats(-180, 180),
+)  # fmt: skip
+places = st.tuples(st.floats(-900, 900), st.floats(-900, 900))
+
+
+def test_looking_straight_down_is_a_north_up_picture():
+    """At tilt 90 and heading 0, x is east and y is south, by height times tangent."""
+    points = view(heading_deg=0, tilt_deg=90, height_m=10).scene_to_ground([[0, 0], [0, 100], [100, 0]])
+    step = 100 * IFOV * 10
+    assert points == pytest.approx(np.array([[0, 0, 0], [step, 0, 0], [0, -step, 0]]), abs=1e-12)
+
+
+@pytest.mark.parametrize(("heading", "towards"), [(0, (0, 1)), (90, (1, 0)), (180, (0, -1)), (-90, (-1, 0))])
+def test_the_undeflected_ray_goes_where_the_rig_heads(heading: float, towards: tuple[int, int]):
+    """At 45 deg the centre of the scene lies as far ahead as the rig is high."""
+    found = view(heading_deg=heading, tilt_deg=45, height_m=10).scene_to_ground([0, 0])
+    assert found == pytest.approx([10 * towards[0], 10 * towards[1], 0], abs=1e-12)
+
+
+def test_rows_further_down_are_nearer_and_roll_turns_the_right_side_down():
+    """y grows towards the rig; with a positive roll a pixel to the right sinks more than one to the left."""
+    straight, rolled = view(), view(roll_deg=10)
+    near, far = straight.scene_to_ground([[300, 0], [-300, 0]])
+    assert np.hypot(*near[:2]) < np.hypot(*far[:2])
+    right, left = rolled.sink([[0, 300], [0, -300]])
+    assert right > left
+    assert straight.sink([0, 300]) == pytest.approx(straight.sink([0, -300]))
+
+
+@given(poses, places)
+def test_ground_and_scene_undo_each_other(rig: GroundView, place: tuple[float, float]):
+    """Every ray that meets the ground comes back to its pixel, and ends on the plane."""
+    ground = rig.scene_to_ground(place)
+    if rig.sink(place) < 0.05:
+        return
+    assert rig.ground_to_scene(ground) == pytest.approx(place, abs=1e-8)
+    assert ground @ rig.normal == pytest.approx(0, abs=1e-9)
+
+
+@given(poses, places)
+def test_footprints_are_the_derivatives_of_the_ground(rig: GroundView, place: tuple[float, float]):
+    """Both sides of a pixel and its level area agree with finite differences."""
+    if rig.sink(place) < 0.1:
+        return
+    half = 0.05
+    y, x = place
+    down = (rig.scene_to_ground([y + half, x]) - rig.scene_to_ground([y - half, x])) / (2 * half)
+    right = (rig.scene_to_ground([y, x + half]) - rig.scene_to_ground([y, x - half])) / (2 * half)
+    sides = [np.linalg.norm(down), np.linalg.norm(right)]
+    assert rig.footprint_m(place) == pytest.approx(sides, rel=1e-5)
+    assert rig.area_m2(place) == pytest.approx(abs(down[0] * right[1] - down[1] * right[0]), rel=1e-5)
+
+
+def test_a_range_stands_for_the_height_above_the_plane():
+    """18 m to ground that falls by 5 deg along the view put the undeflected ray's end 18 m away, on the plane."""
+    rig = view(height_m=None, range_m=18.0, slope_deg=5.0, aspect_deg=30.0)
+    centre = rig.scene_to_ground([0, 0])
+    assert np.linalg.norm(centre - [0, 0, rig.height_m]) == pytest.approx(18.0)
+    assert centre[2] == pytest.approx(-np.tan(np.deg2rad(5)) * np.hypot(*centre[:2]))
+
+
+def test_a_slope_falls_towards_its_aspect():
+    """Ground with aspect 90 is lower in the east, and the rig sees it further away there."""
+    rig = view(tilt_deg=90, heading_deg=0, slope_deg=20, aspect_deg=90)
+    east, west = rig.scene_to_ground([[0, 1000], [0, -1000]])
+    assert east[2] < 0 < west[2]
+    assert east[0] > -west[0]
+
+
+def test_rays_that_meet_no_ground_are_nan_and_counted():
+    """With the horizon across the middle of the scene, the upper rows have no ground and no footprint."""
+    rig = view(tilt_deg=0)
+    y, x = pixel_places((101, 40))
+    points = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1)
+    ground = rig.scene_to_ground(points)
+    assert np.isnan(ground[:51]).all()
+    assert np.isfinite(ground[51:]).all()
+    assert np.isnan(rig.footprint_m(points)[:51]).all()
+    assert rig.count_ground((101, 40)) == 50 * 40 == np.isfinite(rig.area_m2(points)).sum()
+
+
+@given(poses, st.floats(0.01, 1.2))
+def test_the_outline_holds_exactly_the_pixels_that_sink_enough(rig: GroundView, least: float):
+    """Its corners sink by the least or more, and its area over the field's is the share of such pixels."""
+    outline = rig.outline_px((90, 120), least)
+    assert (rig.sink(outline) >= least - 1e-9).all()
+    after = np.roll(outline, -1, axis=0)
+    area = abs(np.sum(outline[:, 0] * after[:, 1] - outline[:, 1] * after[:, 0])) / 2
+    assert rig.count_ground((90, 120), least) == pytest.approx(area, abs=120)
+
+
+@pytest.mark.parametrize("name", sorted(LIMITS))
+def test_values_out_of_range_or_not_finite_are_named(name: str):
+    """Each field of the pose refuses NaN, infinity and what lies beyond its limits."""
+    for value in (np.nan, np.inf, LIMITS[name][1] * 1.01 + 1):
+        with pytest.raises(PoseError, match=rf"{name} of the rig's pose must be from .* got {value!r}"):
+            view(**{name: value})
+
+
+def test_height_or_range_but_not_both():
+    """None of them, or both, say nothing or two things."""
+    for said in ({"height_m": None}, {"range_m": 5.0}):
+        with pytest.raises(PoseError, match="height_m or range_m, one of the two"):
+            view(**said)
+
+
+def test_points_need_two_numbers():
+    """A scene point is a pair; ground that is no scene's is refused by its shape."""
+    with pytest.raises(ShapeError, match=r"y and x on the last axis, got shape \(3,\)"):
+        view().scene_to_ground([1, 2, 3])
+
+
+def test_all_ground_is_counted_to_the_pixel():
+    """The count follows the closed form row by row, in blocks."""
+    rig = view(tilt_deg=3, roll_deg=7)
+    y, x = pixel_places((700, 90))
+    inside = rig.sink(np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1)) > LEAST_SINK
+    assert rig.count_ground((700, 90)) == np.count_nonzero(inside)

@@ -1,0 +1,168 @@
+"""The map's grid: it covers the field, agrees with exact areas, and shows the scene's own pixels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import PoseError, ShapeError
+from pipeline.grid import UNLABELLED
+from pipeline.ground import GroundView, RigPose, pixel_places
+from pipeline.ground_grid import (
+    GroundGrid,
+    classes_at,
+    ground_grid,
+    image_at,
+    map_blocks,
+    median_footprint_m,
+    median_sink,
+    round_step,
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
+IFOV = 7.4e-3 / 70
+
+
+def view(**changes: Any) -> GroundView:
+    """A rig 12 m up that looks down at 40 deg, or as changed."""
+    given = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 30.0, "tilt_deg": 40.0, "height_m": 12.0}
+    return GroundView(RigPose(**(given | changes)), IFOV)
+
+
+def whole(grid: GroundGrid) -> np.ndarray:
+    """Scene pixels of all of a map."""
+    return grid.scene_pixels(slice(0, grid.shape[0]), slice(0, grid.shape[1]))
+
+
+@pytest.mark.parametrize(
+    "pose", [{}, {"tilt_deg": 90.0}, {"roll_deg": 20.0, "slope_deg": 8.0, "aspect_deg": 200.0}, {"lat_deg": -89.5}]
+)
+def test_every_pixel_of_the_field_is_on_the_map(pose: dict[str, float]):
+    """The centres of the scene's border pixels fall on the map, and none of the map lies far outside the field."""
+    shape = (160, 200)
+    grid = ground_grid(view(**pose), shape)
+    y, x = pixel_places(shape)
+    corners = np.array([[y[0], x[0]], [y[0], x[-1]], [y[-1], x[0]], [y[-1], x[-1]]])
+    place = grid.frame.ground_to_map(grid.frame.view.scene_to_ground(corners))
+    column, row = ~grid.geobox.affine * place.T
+    assert (row >= 0).all() and (row <= grid.shape[0]).all()  # noqa: PT018
+    assert (column >= 0).all() and (column <= grid.shape[1]).all()  # noqa: PT018
+    seen = np.isfinite(whole(grid)[..., 0])
+    for edge in (seen[:3], seen[-3:], seen[:, :3], seen[:, -3:]):
+        assert edge.any()
+
+
+@pytest.mark.parametrize("pose", [{}, {"tilt_deg": 90.0}, {"slope_deg": 10.0, "aspect_deg": 120.0}, {"lat_deg": 85.0}])
+def test_mapped_area_is_the_sum_of_the_pixels_footprints(pose: dict[str, float]):
+    """Map pixels seen, times the ground that each stands for, are the closed form's area of the field."""
+    shape = (300, 260)
+    grid = ground_grid(view(**pose), shape)
+    exact = grid.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(shape), indexing="ij"), axis=-1)).sum()
+    assert np.isfinite(whole(grid)[..., 0]).sum() * grid.pixel_area_m2() == pytest.approx(exact, rel=2e-3)
+
+
+def test_a_map_pixel_shows_the_scene_pixel_that_sees_it():
+    """Forward from the scene pixel given by the lookup, the ray ends in the map pixel's centre."""
+    grid = ground_grid(view(slope_deg=5.0), (80, 120))
+    pixels = whole(grid)
+    row, column = (int(at) for at in np.argwhere(np.isfinite(pixels[..., 0]))[1234])
+    place = pixels[row, column] - (np.array([80, 120]) - 1) / 2
+    found = grid.frame.ground_to_map(grid.frame.view.scene_to_ground(place))
+    assert found == pytest.approx(grid.geobox.affine * (column + 0.5, row + 0.5), abs=1e-6)
+
+
+@pytest.mark.parametrize(("step", "bound"), [(0.05, 1e-6), (1.0, 2e-5)])
+@pytest.mark.parametrize("pose", [{}, {"lat_deg": 85.0}, {"lat_deg": -79.0, "slope_deg": 12.0}])
+def test_places_between_ties_are_the_exact_ones(pose: dict[str, float], step: float, bound: float):
+    """Linear between exact places every 32 pixels, map pixels lie where PROJ puts them, in parts of a pixel."""
+    grid = ground_grid(view(**({"height_m": 1000.0, "tilt_deg": 80.0} | pose)), (900, 900), resolution_m=step)
+    rows, columns = (slice(size // 3, size // 3 + 75) for size in grid.shape)
+    x, y = (np.arange(part.start, part.stop) + 0.5 for part in (columns, rows))
+    affine = grid.geobox.affine
+    exact = grid.frame.map_to_ground(np.stack(np.meshgrid(affine.c + affine.a * x, affine.f + affine.e * y), axis=-1))
+    worst = np.abs(grid.ground_m(rows, columns) - exact).max() / step
+    assert worst < bound
+
+
+def test_resolution_is_the_median_footprint_rounded():
+    """The default lies within a ratio of 1.16 of the median footprint; one asked for is kept."""
+    rig = view()
+    median = median_footprint_m(rig, (200, 200))
+    step = ground_grid(rig, (200, 200)).resolution_m
+    assert abs(np.log(step / median)) < np.log(1.16)
+    assert step == round_step(step) == float(f"{step:.1e}")
+    assert ground_grid(rig, (200, 200), resolution_m=0.0123).resolution_m == pytest.approx(0.0123)
+
+
+@given(st.floats(1e-4, 1e3))
+def test_rounding_keeps_the_order_and_is_idempotent(step: float):
+    """A rounded step is its own rounding, within a ratio of 1.16 of what came."""
+    rounded = round_step(step)
+    assert round_step(rounded) == rounded
+    assert max(rounded / step, step / rounded) < 1.16
+
+
+def test_grids_of_two_days_share_their_pixels():
+    """A rig moved by a metre has another map, with pixels at the same multiples of the resolution."""
+    here, there = (ground_grid(view(lat_deg=52.1 + shift), (90, 90)) for shift in (0.0, 1e-5))
+    offset = (here.geobox.affine.f - there.geobox.affine.f) / here.resolution_m
+    assert offset == pytest.approx(round(offset), abs=1e-4)
+    assert abs(offset) > 10
+
+
+def test_far_pixels_are_left_out_and_counted():
+    """Towards the horizon a pixel covers ever more: the map ends, and all pixels are accounted for."""
+    grid = ground_grid(view(tilt_deg=0.5), (400, 300))
+    counts = grid.counts()
+    assert all(count > 0 for count in counts.values())
+    assert sum(counts.values()) == 400 * 300
+    assert grid.shape[0] * grid.shape[1] < 1.4 * 8 * 400 * 300  # rounded
+    assert grid.least_sink == pytest.approx(median_sink(grid.frame.view, (400, 300)) / 4)
+    nearest_sky = np.nanmin(whole(grid)[..., 0]) - 199.5
+    side = np.sqrt(grid.frame.view.area_m2([nearest_sky, 0.0]))
+    assert side == pytest.approx(8 * median_footprint_m(grid.frame.view, (400, 300)), rel=0.2)
+
+
+def test_a_resolution_too_fine_for_memory_is_refused():
+    """The message names the finest that goes, and the median footprint."""
+    with pytest.raises(PoseError, match=r"resolution_m = 1e-05 .* 64 times the scene's .*; use 0\.\d+ or more"):
+        ground_grid(view(), (100, 100), resolution_m=1e-5)
+
+
+def test_blocks_cover_the_map_once():
+    """Each pixel lies in one block, and blocks start at multiples of their size."""
+    seen = np.zeros((70, 45), int)
+    for rows, columns in map_blocks((70, 45), (32, 20)):
+        assert rows.start % 32 == columns.start % 20 == 0
+        seen[rows, columns] += 1
+    assert (seen == 1).all()
+
+
+def test_classes_are_the_nearest_pixels():
+    """Halves of pixels belong to them up to the border; NaN has no class."""
+    classes = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    places = np.array([[[-0.5, -0.5], [0.49, 0.51], [2.5, 3.5], [np.nan, 1.0]]])
+    assert classes_at(classes, places).tolist() == [[0, 1, 11, UNLABELLED]]
+
+
+def test_images_are_read_between_their_own_pixels():
+    """A ramp at a quarter of the resolution is read as the ramp; a pixel without value leaves its neighbours."""
+    y, x = (np.arange(size) * 4 + 1.5 for size in (5, 6))
+    ramp = (y[:, None] * 2 + x + np.zeros((5, 6))).astype(np.float32)[..., None]
+    places = np.array([[[3.0, 7.25], [9.5, 2.0], [np.nan, np.nan]]])
+    found = image_at(ramp, places, factor=4)[0, :, 0]
+    assert found[:2] == pytest.approx([13.25, 21.0], abs=1e-5)
+    assert np.isnan(found[2])
+    ramp[0, 0] = np.nan
+    assert np.isnan(image_at(ramp, np.array([[[1.5, 1.5]]]), factor=4)).all()
+    assert image_at(ramp, np.array([[[1.5, 5.5]]]), factor=4)[0, 0, 0] == pytest.approx(8.5)
+
+
+def test_an_image_without_bands_is_refused():
+    """The message says what axes an image has."""
+    with pytest.raises(ShapeError, match=r"axes \(y, x, band\), got shape \(4, 4\)"):
+        image_at(np.zeros((4, 4), np.float32), np.zeros((1, 1, 2)))
