@@ -1,21 +1,28 @@
-"""The fine pass: which line runs of which strips show the seats that matter most, within a budget of seconds."""
+"""The fine pass: which line runs at which strip offsets show the seats that matter most, within a budget of seconds."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from math import ceil, isfinite
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
-from pipeline.coverage import ROUNDING_PX, TAPS_AFTER, TAPS_BEFORE, check_reach, field_px, reach_px
-from pipeline.errors import BudgetError, SettingsError, ShapeError
+from pipeline.coverage import check_reach, full_sweeps
+from pipeline.covering import NEGLIGIBLE, Cover, Field
+from pipeline.errors import BudgetError, PoseError, ShapeError
 from pipeline.grid import SceneGrid
-from pipeline.runs import Plan, Prices, Wanted, plan_runs
-from pipeline.scan import Axis, CostModel, Sweep, scene_to_sweep
+from pipeline.runs import Prices, Run
+from pipeline.scan import Axis, CostModel, Sweep
+from pipeline.spending import cheapest_cover, spend
+from pipeline.strips import covered_seats, look_from, seat_lines, strips_at_seats
+
+__all__ = [
+    "FinePlan", "SeatsPrice", "check_budget", "covered_seats", "least_budget", "plan_fine", "price_of_seats",
+    "price_seats", "seat_lines",
+]  # fmt: skip
 
 LEAST_DIGITS = 4  # of the least budget that a refusal names
 ROUNDING = 1e-9
@@ -23,16 +30,63 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class FinePlan:
-    """Sweeps of the fine pass, every valid seat that lies wholly in one of them, and the price.
+    """Sweeps of the fine pass, the valid seats they show, and the price.
 
-    ``worth`` is the score that was bought. Seats that a sweep shows besides, because it overlaps another's strip,
-    are in ``seats`` and not in ``worth``.
+    ``worth`` is the score that was bought. Seats that a sweep shows besides are in ``seats``; what they add may not be
+    in ``worth``. ``kind`` says whether the sweeps are runs of lines, whose seats lie wholly in one of them, or those of
+    the full scan, taken because it is cheaper or as cheap; ``reason`` says so in a sentence.
     """
 
     sweeps: list[Sweep]
     seats: NDArray[np.intp]  # ascending
     seconds: float
     worth: float
+    kind: Literal["lines", "full"] = "lines"
+    reason: str = ""
+    wanted_worth: float = 0.0  # score of all seats that a line within the mirror's range shows
+    full_seconds: float | None = None  # of the full scan with lines along the same axis; None beyond the mirror's range
+    out_of_reach: int = 0  # seats worth something that no line within the mirror's range shows
+
+    @property
+    def lines(self) -> int:
+        """Lines of all sweeps."""
+        return sum(sweep.lines for sweep in self.sweeps)
+
+    @property
+    def worth_per_second(self) -> float | None:
+        """Score bought per second of the fine pass; None where nothing was."""
+        return self.worth / self.seconds if self.seconds else None
+
+
+@dataclass(frozen=True)
+class SeatsPrice:
+    """What certain seats cost by runs of lines, and what the full scan does, which shows them too."""
+
+    lines: int
+    seconds: float
+    full_lines: int | None  # None where the full scan is beyond the mirror's range
+    full_seconds: float | None
+
+    @property
+    def kind(self) -> Literal["lines", "full"]:
+        """The cheaper way: runs of lines, or the full scan."""
+        return "full" if self.full_seconds is not None and self.full_seconds <= self.seconds else "lines"
+
+    @property
+    def least(self) -> tuple[int, float]:
+        """Lines and seconds of the cheaper way."""
+        if self.kind == "full" and self.full_lines is not None and self.full_seconds is not None:
+            return self.full_lines, self.full_seconds
+        return self.lines, self.seconds
+
+    @property
+    def sentence(self) -> str:
+        """Both prices in words."""
+        own = f"by runs of lines these seats take {self.lines} lines and {self.seconds:.1f} s"
+        if self.full_seconds is None:
+            return f"{own}; a full scan is beyond the mirror's range"
+        cheaper = "which is cheaper and shows every seat" if self.kind == "full" else "which is dearer"
+        return f"{own}; the full scan takes {self.full_lines} lines and {self.full_seconds:.1f} s, {cheaper}"
 
 
 def least_budget(coarse_seconds: float, full_seconds: float) -> float:
@@ -69,47 +123,15 @@ def check_budget(budget: float, coarse_seconds: float, full_seconds: float) -> f
     return max(left, 0.0)
 
 
-def seat_lines(
-    grid: SceneGrid, camera: LineCamera, sweep: Sweep, seats: NDArray[np.integer]
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Give the lines of a fine sweep that each seat needs, resampling taps included.
-
-    Parameters
-    ----------
-    sweep
-        A ``step=1`` sweep; lines count from its first. They need not exist: compare with ``sweep.lines``.
-    seats
-        (seat,) numbers. Only their pixels on the scene count.
-
-    Returns
-    -------
-    (seat, 2) first line and the one after the last; (seat,) whether the line's samples reach all pixels. A seat
-    without a pixel on the scene is never reached.
-    """
-    if sweep.step != 1:
-        raise ShapeError(f"seats are cut from fine sweeps of step 1, got {sweep.name} with step {sweep.step}")
-    origin = grid.seat_origin(seats)
-    size = np.array([grid.height, grid.width])
-    low, high = origin - (size - 1) / 2, np.minimum(origin + grid.patch, size) - 1 - (size - 1) / 2
-    along, scan = (1, 0) if sweep.along == "x" else (0, 1)
-    # Line and sample of a point are monotone in either coordinate, so a rectangle's corners hold the extremes.
-    corners_along = np.stack([low, low, high, high])[..., along]
-    corners_scan = np.stack([low, high, low, high])[..., scan]
-    at = scene_to_sweep(sweep, camera, corners_along, corners_scan)
-    first = np.floor(at[..., 0].min(axis=0) + ROUNDING_PX).astype(np.intp) - TAPS_BEFORE
-    stop = np.floor(at[..., 0].max(axis=0) + ROUNDING_PX).astype(np.intp) + TAPS_AFTER + 1
-    reached = (at[..., 1].min(axis=0) >= -0.5) & (at[..., 1].max(axis=0) <= camera.samples - 0.5)
-    return np.stack([first, stop], axis=-1), reached & np.all(origin < size, axis=-1)
-
-
 def plan_fine(
     grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis, scores: NDArray[np.floating], *, budget_s: float
 ) -> FinePlan:
     """Choose the line runs that show the most score for at most ``budget_s`` seconds.
 
-    Strips are laid out in up to four ways that let no seat straddle two of them; for each the runs are chosen over all
-    strips together, and the layout with the most score wins. The price counts lines, a set-up for each run and reloads
-    of the vector memory, and never exceeds the budget; with the same scores a bigger budget never has less ``worth``.
+    Each run lies at a strip offset of its own. The price counts lines, a set-up for each run and reloads of the vector
+    memory, and never exceeds the budget; with the same scores a bigger budget never has less ``worth``. Where no runs
+    that take less than the full scan show all that is worth something and the budget pays for the full scan, its sweeps
+    are the plan, and show every seat.
 
     Parameters
     ----------
@@ -123,34 +145,73 @@ def plan_fine(
     BudgetError : the budget is negative or not finite.
     ShapeError : the number of scores is not that of the seats.
     SettingsError : a patch is wider than a line.
-    PoseError : the field is beyond the mirror's range.
+    PoseError : no line within the mirror's range shows any of the seats that are worth something.
     """
     if not isfinite(budget_s) or budget_s < 0:
         raise BudgetError(f"the fine pass needs a finite number of seconds, 0 or more, got {budget_s}")
     worth = _worth(grid, scores)
-    prices = Prices(camera.frame_ms * 1e-3, cost.setup_seconds(camera), cost.reload_s, cost.vector_pairs)
-    chosen: tuple[Plan, list[Sweep]] | None = None
-    for layout in _layouts(grid, camera, along, worth):
-        strips = [_strip(grid, camera, along, columns) for columns in layout]
-        check_reach(strips, camera)
-        wanted = [_wanted(grid, camera, *pair, worth) for pair in zip(strips, layout, strict=True)]
-        plan = plan_runs(wanted, prices, budget_s)
-        if chosen is None or plan.worth > chosen[0].worth:
-            chosen = plan, strips
-    assert chosen is not None
-    plan, strips = chosen
-    sweeps = [_cut(strip, run) for strip, runs in zip(strips, plan.runs, strict=True) for run in runs]
-    return FinePlan(sweeps, covered_seats(grid, camera, sweeps), cost.seconds(sweeps, camera), plan.worth)
+    field = _field(grid, camera, cost, along, worth)
+    missed = int(np.count_nonzero(worth)) - len(np.unique(field.views.seat))
+    full = _full(grid, camera, cost, along)
+    full_s = None if full is None else full[1]
+    plan = spend(field, budget_s if full_s is None else min(budget_s, float(np.nextafter(full_s, 0.0))))
+    everything = plan.worth >= field.total * (1 - NEGLIGIBLE)
+    if full is not None and full_s is not None and full_s <= budget_s and not everything:
+        reason = (
+            f"no runs of lines that show every seat worth something take less than the full scan's {full_s:.1f} s; "
+            f"the full scan is taken, which shows all seats"
+        )
+        return FinePlan(full[0], grid.valid_seats(), full_s, field.total, "full", reason, field.total, full_s, missed)
+    sweeps = _sweeps(field, plan)
+    check_reach(sweeps, camera)
+    seconds = cost.seconds(sweeps, camera)
+    seats = covered_seats(grid, camera, sweeps)
+    return FinePlan(
+        sweeps, seats, seconds, plan.worth, "lines", _lines_reason(seconds, full_s), field.total, full_s, missed
+    )
 
 
-def covered_seats(grid: SceneGrid, camera: LineCamera, sweeps: Sequence[Sweep]) -> NDArray[np.intp]:
-    """Give the valid seats that lie wholly, taps included, in one of the fine sweeps, ascending."""
-    seats = grid.valid_seats()
-    shown = np.zeros(len(seats), bool)
-    for sweep in sweeps:
-        lines, reached = seat_lines(grid, camera, sweep, seats)
-        shown |= reached & (lines[:, 0] >= 0) & (lines[:, 1] <= sweep.lines)
-    return seats[shown]
+def _lines_reason(seconds: float, full_s: float | None) -> str:
+    if full_s is None:
+        return f"runs of lines take {seconds:.1f} s; a full scan is beyond the mirror's range"
+    return f"runs of lines take {seconds:.1f} s, less than the full scan's {full_s:.1f} s"
+
+
+def _full(grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis) -> tuple[list[Sweep], float] | None:
+    """The full scan with lines along one axis and its seconds; None beyond the mirror's range."""
+    try:
+        sweeps = full_sweeps(grid, camera, along)
+    except PoseError:
+        return None
+    return sweeps, cost.seconds(sweeps, camera)
+
+
+def _field(grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis, worth: NDArray[np.float64]) -> Field:
+    """What strips at every offset show of the seats that are worth something."""
+    views = look_from(grid, camera, strips_at_seats(grid, camera, along), worth > 0)
+    if np.any(worth > 0) and not len(views.seat):
+        first = int(np.flatnonzero(worth > 0)[0])
+        raise PoseError(
+            f"none of the {np.count_nonzero(worth > 0)} seats worth something (the first is {first}) is shown by a "
+            f"line within the mirror's range; use a smaller scene or a smaller angle per pixel"
+        )
+    row, column = np.divmod(np.arange(len(worth)), grid.seat_shape[1])
+    return Field(views, worth, column if along == "x" else row, prices_of(camera, cost))
+
+
+def prices_of(camera: LineCamera, cost: CostModel) -> Prices:
+    """Give the cost model's prices of fine lines (one held position each) and runs."""
+    return Prices(camera.frame_ms * 1e-3, cost.setup_seconds(camera), cost.reload_s, cost.vector_pairs)
+
+
+def _sweeps(field: Field, cover: Cover) -> list[Sweep]:
+    """Runs as sweeps, strip by strip; a name holds strip and first line, so that names sort in the same order."""
+    return [_cut(field.views.strips[run.strip], run) for run in sorted(cover.runs)]
+
+
+def _cut(strip: Sweep, run: Run) -> Sweep:
+    name = f"{strip.name}-{run.first:05d}"
+    return replace(strip, name=name, start_px=strip.start_px + run.first, lines=run.stop - run.first)
 
 
 def _worth(grid: SceneGrid, scores: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -170,91 +231,39 @@ def _worth(grid: SceneGrid, scores: NDArray[np.floating]) -> NDArray[np.float64]
     return worth
 
 
-def _layouts(
-    grid: SceneGrid, camera: LineCamera, along: Axis, worth: NDArray[np.float64]
-) -> list[tuple[tuple[int, int], ...]]:
-    """Ways to share the seat columns among strips, each a tuple of half-open column ranges.
+def price_of_seats(
+    grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis, seats: NDArray[np.integer]
+) -> SeatsPrice:
+    """Price exactly these seats by runs of lines, strip offsets free, beside the full scan.
 
-    Even shares; full strips from either end; a full strip where a strip's width holds the most worth. None looks at
-    the budget.
+    What ``frame`` mode leaves out: it buys seats free of each other, the rig pays for the lines beneath them.
+
+    Raises
+    ------
+    PoseError : a seat is shown by no line within the mirror's range.
     """
-    across, _ = field_px(grid, along)
-    most = camera.samples // grid.patch
-    if most == 0:
-        raise SettingsError(f"a patch of {grid.patch} px is wider than a line of {camera.samples}; take a smaller one")
-    columns = -(-across // grid.patch)
-    count = -(-columns // most)
-    edges = [round(i * columns / count) for i in range(count + 1)]
-    found = [_ranges(edges), _fill(0, columns, most), tuple(_fill_back(0, columns, most))]
-    held = worth.reshape(grid.seat_shape).sum(axis=0 if along == "x" else 1)[:columns]
-    if columns > most:
-        windows = np.convolve(held, np.ones(most), mode="valid")
-        peak = int(np.argmax(windows))
-        found.append((*_fill_back(0, peak, most), (peak, peak + most), *_fill(peak + most, columns, most)))
-    return list(dict.fromkeys(found))
-
-
-def _ranges(edges: Sequence[int]) -> tuple[tuple[int, int], ...]:
-    return tuple(pairwise(edges))
-
-
-def _fill(low: int, high: int, most: int) -> tuple[tuple[int, int], ...]:
-    """Ranges of ``most`` from the low end up."""
-    return _ranges([*range(low, high, most), high])
-
-
-def _fill_back(low: int, high: int, most: int) -> tuple[tuple[int, int], ...]:
-    """Ranges of ``most`` from the high end down, ascending."""
-    return _ranges([low, *sorted(range(high, low, -most))]) if high > low else ()
-
-
-def _strip(grid: SceneGrid, camera: LineCamera, along: Axis, columns: tuple[int, int]) -> Sweep:
-    """A sweep over a strip's whole length that shows a range of seat columns, kept on the scene where it can be."""
-    across, scan = field_px(grid, along)
-    low, high = columns[0] * grid.patch, min(columns[1] * grid.patch, across)
-    room = max(across - camera.samples, 0) / 2
-    middle = float(np.clip((low + high - across) / 2, -room, room))
-    middle -= float(reach_px(middle, scan, camera, 1).sum()) / 2  # the line's image is longer on its outer side
-    sweep = Sweep(f"fine-{columns[0]}", "fine", along, middle, -(scan - 1) / 2, 1)
-    needs, _ = seat_lines(grid, camera, sweep, grid.valid_seats())
-    first = int(needs[:, 0].min())
-    return replace(sweep, start_px=sweep.start_px + first, lines=int(needs[:, 1].max()) - first)
-
-
-def _wanted(
-    grid: SceneGrid, camera: LineCamera, strip: Sweep, columns: tuple[int, int], worth: NDArray[np.float64]
-) -> Wanted:
-    """The seats of a strip's columns that are worth something, with the lines they need."""
-    row, column = np.divmod(np.arange(len(worth)), grid.seat_shape[1])
-    place = column if strip.along == "x" else row
-    seats = np.flatnonzero((worth > 0) & (place >= columns[0]) & (place < columns[1]))
-    lines, reached = seat_lines(grid, camera, strip, seats)
-    return Wanted(lines[reached, 0], lines[reached, 1], worth[seats[reached]])
-
-
-def _cut(strip: Sweep, run: tuple[int, int]) -> Sweep:
-    first, stop = run
-    name = f"{strip.name}-{first:05d}"
-    return replace(strip, name=name, start_px=strip.start_px + first, lines=stop - first)
+    worth = np.zeros(int(np.prod(grid.seat_shape)))
+    worth[np.asarray(seats, np.intp)] = 1.0
+    field = _field(grid, camera, cost, along, worth)
+    missed = np.setdiff1d(np.flatnonzero(worth), field.views.seat)
+    if len(missed):
+        raise PoseError(
+            f"seat {missed[0]} and {len(missed) - 1} more of {np.count_nonzero(worth)} are shown by no line within "
+            f"the mirror's range; leave them out"
+        )
+    sweeps = _sweeps(field, cheapest_cover(field))
+    full = _full(grid, camera, cost, along)
+    lines = sum(sweep.lines for sweep in sweeps)
+    full_lines = None if full is None else sum(sweep.lines for sweep in full[0])
+    return SeatsPrice(lines, cost.seconds(sweeps, camera), full_lines, None if full is None else full[1])
 
 
 def price_seats(
     grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis, seats: NDArray[np.integer]
 ) -> tuple[int, float]:
-    """Lines and seconds that exactly these seats would take on the rig, in even strips; neighbours share their lines.
+    """Lines and seconds of exactly these seats by runs of lines, without the full scan that may be cheaper.
 
-    What ``frame`` mode leaves out: it buys seats free of each other, the rig pays for the lines beneath them.
+    :func:`price_of_seats` gives both.
     """
-    worth = np.zeros(int(np.prod(grid.seat_shape)))
-    worth[np.asarray(seats, np.intp)] = 1.0
-    sweeps = []
-    for columns in _layouts(grid, camera, along, worth)[0]:
-        strip = _strip(grid, camera, along, columns)
-        wanted = _wanted(grid, camera, strip, columns, worth)
-        needed = np.zeros(strip.lines + 1, np.int64)
-        np.add.at(needed, wanted.first, 1)
-        np.add.at(needed, wanted.stop, -1)
-        held = np.concatenate([[False], np.cumsum(needed)[:-1] > 0, [False]])
-        starts, stops = np.flatnonzero(held[1:] & ~held[:-1]), np.flatnonzero(held[:-1] & ~held[1:])
-        sweeps += [_cut(strip, run) for run in zip(starts.tolist(), stops.tolist(), strict=True)]
-    return sum(sweep.lines for sweep in sweeps), cost.seconds(sweeps, camera)
+    price = price_of_seats(grid, camera, cost, along, seats)
+    return price.lines, price.seconds

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.camera import LineCamera
 from pipeline.errors import ShapeError
 from pipeline.mirror import camera_slope, direction_to_position, line_centre, scene_to_direction
+from pipeline.vector_memory import count_loads
 
 Axis = Literal["x", "y"]
 Floats = NDArray[np.float64]
@@ -64,8 +65,7 @@ class CostModel:
     def seconds(self, sweeps: list[Sweep], camera: LineCamera) -> float:
         """Price of the sweeps in the given order [s]: lines, a set-up each, and reloads of the vector memory."""
         lines = sum(sweep.lines for sweep in sweeps)
-        pairs = sum(sweep.lines * sweep.step for sweep in sweeps)
-        reloads = -(-pairs // self.vector_pairs)
+        reloads = count_loads(sweeps, self.vector_pairs)
         return camera.scan_seconds(lines) + len(sweeps) * self.setup_seconds(camera) + reloads * self.reload_s
 
 

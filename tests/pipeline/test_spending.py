@@ -1,0 +1,131 @@
+"""Spending: laws of the budget, and the optimum of an integer programme on small fields."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import sparse
+from scipy.optimize import Bounds, LinearConstraint, milp
+
+from pipeline.covering import Field
+from pipeline.runs import Prices
+from pipeline.scan import Sweep
+from pipeline.spending import cheapest_cover, spend
+from pipeline.strips import Views
+
+PRICES = Prices(line_s=0.1, run_s=0.9, reload_s=1.6, lines_per_reload=150)
+LINES = 8  # of a seat
+
+
+def blocks(worth: np.ndarray, most: int, prices: Prices = PRICES) -> Field:
+    """A field of (row, column) seats seen ``most`` columns at a time from every offset."""
+    rows, columns = worth.shape
+    strips = range(max(columns - most, 0) + 1)
+    seen = [np.argwhere(worth[:, s : s + most] > 0) + np.array([0, s]) for s in strips]
+    row, column = np.concatenate(seen).T
+    sweeps = tuple(Sweep(f"fine-{s:03d}", "fine", "x", float(s), 0.0, rows * LINES) for s in strips)
+    views = Views(
+        sweeps, rows * LINES, np.cumsum([0, *map(len, seen)]), row * columns + column, row * LINES, (row + 1) * LINES
+    )
+    return Field(views, worth.ravel(), np.tile(np.arange(columns), rows), prices)
+
+
+def drawn(rows: int, columns: int, seed: int) -> np.ndarray:
+    """Worth with a few strong seats, one in four worth nothing."""
+    rng = np.random.default_rng(seed)
+    return rng.exponential(size=(rows, columns)) ** 2 * (rng.random((rows, columns)) > 0.25)
+
+
+def optimum(worth: np.ndarray, most: int, budget_s: float | None) -> float:
+    """Most worth for a budget, or with None the least seconds for all of it, by an integer programme.
+
+    Unknowns: is a strip on in a row, does it start there, is a seat shown, loads of the memory.
+    """
+    rows, columns = worth.shape
+    strips = columns - most + 1
+    on = rows * strips
+    seats = np.flatnonzero(worth)
+    loads = 2 * on + len(seats)
+    cells: list[tuple[int, int, float]] = []
+    top: list[float] = []
+    for s in range(strips):
+        for r in range(rows):
+            cells += [(len(top), s * rows + r, 1), (len(top), on + s * rows + r, -1)]
+            cells += [(len(top), s * rows + r - 1, -1)] if r else []
+            top.append(0)
+    for place, seat in enumerate(seats.tolist()):
+        r, c = divmod(seat, columns)
+        near = range(max(c - most + 1, 0), min(c, strips - 1) + 1)
+        cells += [(len(top), 2 * on + place, 1), *((len(top), s * rows + r, -1) for s in near)]
+        top.append(0)
+    cells += [(len(top), i, LINES) for i in range(on)] + [(len(top), loads, -PRICES.lines_per_reload)]
+    top.append(0)
+    seconds = np.zeros(loads + 1)
+    seconds[:on], seconds[on : 2 * on], seconds[loads] = LINES * PRICES.line_s, PRICES.run_s, PRICES.reload_s
+    value = np.zeros(loads + 1)
+    value[2 * on : loads] = worth.ravel()[seats]
+    row, column, entry = zip(*cells, strict=True)
+    limits = [LinearConstraint(sparse.csr_matrix((entry, (row, column)), (len(top), loads + 1)), -np.inf, top)]
+    least = np.zeros(loads + 1)
+    if budget_s is None:
+        least[2 * on : loads] = 1
+    else:
+        limits.append(LinearConstraint(seconds[None], -np.inf, budget_s))
+    most_of = np.ones(loads + 1)
+    most_of[loads] = 99
+    whole = np.zeros(loads + 1)
+    whole[:on] = whole[loads] = 1
+    found = milp(seconds if budget_s is None else -value, constraints=limits, bounds=Bounds(least, most_of),
+                 integrality=whole, options={"mip_rel_gap": 1e-6})  # fmt: skip
+    return float(found.fun if budget_s is None else -found.fun)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(2, 9), st.integers(3, 12), st.integers(0, 99), st.floats(0, 30), st.floats(0, 30))
+def test_a_bigger_budget_never_buys_less(rows: int, columns: int, seed: int, one: float, other: float):
+    """The true price, reloads included, stays within the budget, and worth grows with it, in narrow fields and wide."""
+    field = blocks(drawn(rows, columns, seed), 3)
+    small, large = (spend(field, budget) for budget in sorted((one, other)))
+    assert small.seconds(PRICES) <= min(one, other)
+    assert large.seconds(PRICES) <= max(one, other)
+    assert large.worth >= small.worth - 1e-9
+    for cover in (small, large):
+        assert cover.worth <= field.cover(cover.runs).worth + 1e-9
+
+
+def test_plans_are_near_the_optimum():
+    """Over fields of 1.4 and 2.2 strips and three budgets the plan has 99 % of the integer programme's worth."""
+    shares = []
+    for seed, columns in enumerate((7, 11)):
+        worth = drawn(9, columns, seed)
+        for budget_s in (4.0, 7.0, 15.0):
+            shares.append(spend(blocks(worth, 5), budget_s).worth / optimum(worth, 5, budget_s))
+    assert min(shares) > 0.95
+    assert np.mean(shares) > 0.99
+    assert max(shares) <= 1 + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_all_seats_at_nearly_the_least_price(seed: int):
+    """Covers of every seat take at most 2 % more seconds than the integer programme's."""
+    rng = np.random.default_rng(seed)
+    worth = (rng.random((12, 9)) < 0.12).astype(float)
+    cover = cheapest_cover(blocks(worth, 4))
+    assert cover.worth == worth.sum()
+    assert optimum(worth, 4, None) * (1 - 1e-9) <= cover.seconds(PRICES) <= optimum(worth, 4, None) * 1.02
+
+
+def test_equal_worth_everywhere_fills_the_budget():
+    """With nothing to tell seats apart one run takes all the rows that the budget allows."""
+    field = blocks(np.ones((30, 4)), 4)
+    cover = spend(field, 0.9 + 1.6 + 17 * 0.8 + 0.5)
+    assert [(run.first % LINES, run.stop - run.first) for run in cover.runs] == [(0, 17 * LINES)]
+
+
+def test_worths_far_apart_are_all_bought_in_the_end():
+    """A seat a million times weaker than another is bought by a budget for all."""
+    worth = np.zeros((9, 6))
+    worth[0, 0], worth[4, 5], worth[8, 2] = 1e6, 1.0, 1e3
+    assert spend(blocks(worth, 3), 1e4).worth == worth.sum()
