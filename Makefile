@@ -5,6 +5,7 @@ VENV ?= .venv
 ARCHIVE ?= archive
 SCENE ?= farm
 PYTEST_ARGS ?=
+BENCH ?=
 BIN := $(VENV)/bin
 
 # The tools beneath are asked to send no analytics.
@@ -19,7 +20,7 @@ setup: $(BIN)/.ok
 $(BIN)/.ok: pyproject.toml constraints.txt
 	$(PY) -m venv $(VENV) 2>/dev/null || { $(PY) -m venv --without-pip $(VENV) \
 		&& $(PY) -m pip --python $(BIN)/python install -q pip; }
-	$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev,geo]'
+	$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev,geo,bench]'
 	touch $@
 
 survey: $(BIN)/.ok
@@ -32,15 +33,17 @@ lint: $(BIN)/.ok
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+# Every goal with the peers beside it (BENCH="geometry lookup" for some), then what accuracy costs in time.
 bench: $(BIN)/.ok
-	OMP_NUM_THREADS=1 $(BIN)/spectralzoom tradeoff
+	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks $(BENCH); crashed=$$?; \
+		OMP_NUM_THREADS=1 $(BIN)/spectralzoom tradeoff && exit $$crashed
 
 # Names and versions only. A machine that is offered a CPU wheel of torch does not resolve the accelerator's packages:
 # their lines are kept as they are.
 lock:
 	$(PY) -m venv $(VENV)-lock 2>/dev/null || { $(PY) -m venv --without-pip $(VENV)-lock \
 		&& $(PY) -m pip --python $(VENV)-lock/bin/python install -q pip; }
-	$(VENV)-lock/bin/python -m pip install -q --dry-run --ignore-installed --report $(VENV)-lock/report.json '.[dev,geo]'
+	$(VENV)-lock/bin/python -m pip install -q --dry-run --ignore-installed --report $(VENV)-lock/report.json '.[dev,geo,bench]'
 	$(VENV)-lock/bin/python -c "$$LOCK" $(VENV)-lock/report.json constraints.txt
 	rm -rf $(VENV)-lock
 

@@ -1,0 +1,127 @@
+"""Run the benchmarks beside this file and print one table: python tests/benchmarks [name ...] [--markdown FILE].
+
+A name is what follows bench_. A goal that is missed is printed like one that is met; a benchmark that crashes is named,
+the others go on, and the exit code is 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import platform
+import sys
+import textwrap
+import time
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+# Before numpy and torch are loaded: one thread, as the figures are meant.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE), str(HERE.parents[1])]
+
+if TYPE_CHECKING:
+    from measure import Row
+
+HEADINGS = ("what", "figure", "goal", "met", "peers")
+WIDTHS = (58, 26, 24, 3, 60)
+MET = {True: "yes", False: "NO", None: "-"}
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the benchmarks asked for, or all; print the table and write it as Markdown where asked."""
+    parser = argparse.ArgumentParser(prog="python tests/benchmarks", description="Benchmarks with goals and peers.")
+    parser.add_argument("names", nargs="*", help="benchmarks to run, as in bench_NAME.py; all where none is given")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table as Markdown as well")
+    asked = parser.parse_args(arguments)
+    there = sorted(path.stem.removeprefix("bench_") for path in HERE.glob("bench_*.py"))
+    unknown = sorted(set(asked.names) - set(there))
+    if unknown:
+        parser.error(f"no benchmark {', '.join(unknown)}; there are: {', '.join(there)}")
+    tables: dict[str, Sequence[Row]] = {}
+    failed = []
+    print(_machine())
+    for name in asked.names or there:
+        began = time.perf_counter()
+        try:
+            tables[name] = importlib.import_module(f"bench_{name}").rows()
+        except Exception:
+            failed.append(name)
+            traceback.print_exc()
+            print(f"\n{name}: crashed; the others go on")
+            continue
+        print(f"\n{name} ({time.perf_counter() - began:.0f} s)")
+        print(plain_table(tables[name]), flush=True)
+    _summarise(tables, failed)
+    if asked.markdown:
+        asked.markdown.write_text(markdown_table([row for rows in tables.values() for row in rows]), encoding="utf-8")
+        print(f"{asked.markdown}")
+    return 1 if failed else 0
+
+
+def plain_table(rows: Sequence[Row]) -> str:
+    """Set rows in aligned columns, long texts folded inside their own."""
+    cells = [HEADINGS, *(_cells(row) for row in rows)]
+    widths = [
+        min(width, max(len(line[column]) for line in cells)) for column, width in zip(range(5), WIDTHS, strict=True)
+    ]
+    lines = [line for cell in cells for line in _folded(cell, widths)]
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def markdown_table(rows: Sequence[Row]) -> str:
+    """Set rows as a table of Markdown."""
+    lines = [f"| {' | '.join(HEADINGS)} |", "|---|---|---|---|---|"]
+    lines += [f"| {' | '.join(text.replace('|', chr(92) + '|') for text in _cells(row))} |" for row in rows]
+    return "\n".join([*lines, "", _machine(), ""])
+
+
+def _cells(row: Row) -> tuple[str, str, str, str, str]:
+    return row.what, row.figure, row.goal or "-", MET[row.met], row.peers or "-"
+
+
+def _folded(cells: Sequence[str], widths: Sequence[int]) -> list[str]:
+    """One row of cells as lines of text."""
+    columns = [textwrap.wrap(text, width) or [""] for text, width in zip(cells, widths, strict=True)]
+    height = max(map(len, columns))
+    return [
+        "  ".join(
+            (column[line] if line < len(column) else "").ljust(width)
+            for column, width in zip(columns, widths, strict=True)
+        )
+        for line in range(height)
+    ]
+
+
+def _summarise(tables: dict[str, Sequence[Row]], failed: Sequence[str]) -> None:
+    goals = [row for rows in tables.values() for row in rows if row.met is not None]
+    missed = [row.what for row in goals if not row.met]
+    print(f"\n{len(goals) - len(missed)} of {len(goals)} goals met", end="")
+    print(f"; missed: {'; '.join(missed)}" if missed else "")
+    if failed:
+        print(f"crashed: {', '.join(failed)}")
+
+
+def _machine() -> str:
+    """Processor, cores, load and versions, on one line."""
+    from importlib import metadata
+
+    names = (line.partition(":")[2].strip() for line in _cpuinfo() if line.startswith("model name"))
+    processor = next(names, platform.processor() or "unknown processor")
+    versions = ", ".join(f"{name} {metadata.version(name)}" for name in ("numpy", "scipy", "torch"))
+    load = f", load {os.getloadavg()[0]:.2f}" if hasattr(os, "getloadavg") else ""
+    return f"{processor}, {os.cpu_count()} cores{load}, one thread; python {platform.python_version()}, {versions}"
+
+
+def _cpuinfo() -> list[str]:
+    path = Path("/proc/cpuinfo")
+    return path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,0 +1,231 @@
+"""Resampling: cost beside a copy of the same rows, beside other libraries, and by band count, mask and engine."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from measure import Clock, Row, ratio, time_in_turn
+from numpy.typing import NDArray
+from resample_engines import ENGINES
+from resample_peers import BANDS, Peer, Turned, cv2_parts, peers, spline, turned_waves
+
+from pipeline.rectify.kernels import windows
+from pipeline.rectify.resample import Kernel, resample
+
+KERNELS: dict[Kernel, tuple[int, str]] = {
+    "nearest": (0, "nearest"),
+    "bilinear": (1, "linear"),
+    "catmull-rom": (3, "cubic"),
+}
+BLOCK = 2048
+ALIKE = 1.001  # errors that differ by less are those of rounding
+ROUNDS = 3
+TILES = 3  # in a row, as a worker does them
+
+
+def rows() -> list[Row]:
+    """All figures, on one thread."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what the other libraries warn of
+            natural, flat = turned_waves(1), turned_waves(0)
+            beside = [row for kernel in KERNELS for row in _beside_peers(kernel, natural, flat)]
+            beside += [*_over_linear(natural, flat), _beside_spline(natural), _engines(natural)]
+        return [*_over_take(natural), *beside, _by_bands(natural), _masked(natural)]
+    finally:
+        torch.set_num_threads(before)
+
+
+def _call(scene: Turned, kernel: Kernel, out: NDArray[Any] | None = None, valid: Any = None) -> Callable[[], Any]:
+    valid = np.ones(scene.samples.shape[:2], bool) if valid is None else valid
+    return lambda: resample(scene.samples, valid, scene.coordinates, kernel, out=out)
+
+
+def _take(scene: Turned, out: NDArray[np.float32]) -> Callable[[], None]:
+    """Copy each point's nearest row in blocks; mode="clip", for numpy copies once more in its default."""
+    table = scene.samples.reshape(-1, scene.samples.shape[2])
+    line, sample = np.rint(scene.coordinates).astype(np.intp).T
+    index = line * scene.samples.shape[1] + sample
+
+    def call() -> None:
+        for start in range(0, len(index), BLOCK):
+            np.take(table, index[start : start + BLOCK], axis=0, out=out[start : start + BLOCK], mode="clip")
+
+    return call
+
+
+def _ns(clock: Clock, values: int) -> float:
+    return clock.cpu_min_s / values * 1e9
+
+
+def _over_take(scene: Turned) -> list[Row]:
+    """Each kernel over a copy of the same rows, on a sweep larger than the cache and on one that stays in it."""
+    out = np.empty(scene.truth.shape, np.float32)
+    calls = {"take": _take(scene, out)} | {kernel: _call(scene, kernel, out) for kernel in KERNELS}
+    clocks = time_in_turn({name: _often(call, TILES) for name, call in calls.items()}, 7)
+    take = _ns(clocks["take"], TILES * out.size)
+    found = []
+    for kernel in KERNELS:
+        times, goal = ratio(clocks, kernel, "take"), 3.0 if kernel == "catmull-rom" else None
+        found.append(Row(
+            f"{kernel}, {BANDS} bands, over np.take of the same rows", f"{times:.2f} x",
+            f"<= {goal:g} x" if goal else "", times <= goal if goal else None,
+            f"{_ns(clocks[kernel], TILES * out.size):.2f} ns/(px*band), np.take {take:.2f}",
+        ))  # fmt: skip
+    return [*found, _over_take_cached(scene)]
+
+
+def _over_take_cached(scene: Turned) -> Row:
+    """A corner of the sweep again and again: np.take then copies from cache to cache, which 16 taps cannot follow."""
+    middle, near = slice(100, 156), (np.abs(scene.coordinates - 127.5) < 20).all(axis=1)
+    samples, coordinates = np.ascontiguousarray(scene.samples[middle, middle]), scene.coordinates[near] - middle.start
+    small = replace(scene, samples=samples, coordinates=coordinates, truth=scene.truth[near])
+    out = np.empty(small.truth.shape, np.float32)
+    once = {"take": _take(small, out), "ours": _call(small, "catmull-rom", out)}
+    clocks = time_in_turn({name: _often(call, 20) for name, call in once.items()}, 5)
+    ours, take = (_ns(clocks[name], 20 * out.size) for name in ("ours", "take"))
+    return Row(
+        f"catmull-rom, {BANDS} bands, the same with rows and result in the cache",
+        f"{ratio(clocks, 'ours', 'take'):.2f} x",
+        peers=f"{ours:.2f} ns/(px*band), np.take {take:.2f}",
+    )
+
+
+def _often(call: Callable[[], Any], times: int) -> Callable[[], None]:
+    def repeated() -> None:
+        for _ in range(times):
+            call()
+
+    return repeated
+
+
+def _beside_peers(kernel: Kernel, natural: Turned, flat: Turned) -> list[Row]:
+    """Time and error of one order, ours to used memory beside those that are given some, to fresh beside the rest."""
+    order, name = KERNELS[kernel]
+    others, out = peers(natural, order), np.empty(natural.truth.shape, np.float32)
+    ours = {"warm": _call(natural, kernel, out), "fresh": _call(natural, kernel)}
+    clocks = time_in_turn(ours | {peer.name: peer.call for peer in others}, ROUNDS)
+    warm, fresh = (_ns(clocks[memory], out.size) for memory in ours)
+    theirs = {peer.name: _ns(clocks[peer.name], peer.bands * len(natural.truth)) for peer in others}
+    met = all((warm if peer.warm else fresh) < theirs[peer.name] for peer in others)
+    listed = _listed(theirs, "{:.3g}") + _prepared(others, natural)
+    found = [
+        Row(f"{name}: ns/(px*band), given memory / fresh", f"{warm:.2f} / {fresh:.2f}", "less than each", met, listed)
+    ]
+    for what, scene, there in (("amplitude as period", natural, others), ("all waves alike", flat, peers(flat, order))):
+        error = scene.error(_call(scene, kernel)()[0])
+        errors = {peer.name: scene.error(peer.by_pixel(peer.call())) for peer in there}
+        met, listed = all(error <= other * ALIKE for other in errors.values()), _listed(errors, "{:.4f}")
+        found.append(Row(f"{name}: rmse / std, {what}", f"{error:.4f}", "no larger than each", met, listed))
+    return found
+
+
+def _over_linear(natural: Turned, flat: Turned) -> list[Row]:
+    """Catmull-Rom beside cv2's linear."""
+    found = []
+    for what, scene in (("amplitude as period", natural), ("all waves alike", flat)):
+        linear = peers(scene, 1, only="cv2.remap")[0]
+        ours, theirs = scene.error(_call(scene, "catmull-rom")()[0]), scene.error(linear.by_pixel(linear.call()))
+        listed = f"{ours:.4f}, cv2 linear {theirs:.4f}"
+        share = ours / theirs
+        found.append(
+            Row(f"catmull-rom: error over cv2.remap linear, {what}", f"{share:.3f}", "<= 1/3", share <= 1 / 3, listed)
+        )
+    out = np.empty(natural.truth.shape, np.float32)
+    calls = {"ours": _call(natural, "catmull-rom", out), "joined": peers(natural, 1, only="cv2.remap")[0].call}
+    calls["parted"] = cv2_parts(natural, 1)
+    clocks = time_in_turn({name: _often(call, TILES) for name, call in calls.items()}, 7)
+    times, parted = ratio(clocks, "ours", "joined"), ratio(clocks, "ours", "parted")
+    listed = f"{times:.2f} x with its three parts of 90 bands joined, {parted:.2f} x with them left apart"
+    return [*found, Row("catmull-rom: time over cv2.remap linear", f"{times:.2f} x", "< 1 x", times < 1, listed)]
+
+
+def _beside_spline(natural: Turned) -> Row:
+    smooth = spline(natural)
+    clocks = time_in_turn({"ours": _call(natural, "catmull-rom"), "spline": smooth.call}, ROUNDS)
+    ours, theirs = _ns(clocks["ours"], natural.truth.size), _ns(clocks["spline"], smooth.bands * len(natural.truth))
+    errors = natural.error(_call(natural, "catmull-rom")()[0]), natural.error(smooth.by_pixel(smooth.call()))
+    return Row(
+        "catmull-rom beside the order-3 spline", f"{ours:.2f} ns, {errors[0]:.4f}",
+        peers=f"scipy spline {theirs:.0f} ns, {errors[1]:.4f}",
+    )  # fmt: skip
+
+
+def _listed(figures: Mapping[str, float], form: str) -> str:
+    return ", ".join(f"{name} {form.format(figure)}" for name, figure in figures.items())
+
+
+def _prepared(others: Sequence[Peer], scene: Turned) -> str:
+    """What is not in the times: the building of an index, per output pixel."""
+    before = {f"{peer.name}'s index": peer.prepare for peer in others if peer.prepare}
+    if not before:
+        return ""
+    clocks = time_in_turn(before, 1)
+    return "; not counted: " + _listed(
+        {name: _ns(clock, len(scene.truth)) for name, clock in clocks.items()}, "{:.0f} ns/px"
+    )
+
+
+def _by_bands(scene: Turned) -> Row:
+    """Nanoseconds per pixel and band at few and many bands."""
+    many, figures = (2, 4, 15, 64, 270, 939), []
+    for bands in many:
+        samples = np.random.default_rng(bands).random((*scene.samples.shape[:2], bands), np.float32)
+        out = np.empty((len(scene.truth), bands), np.float32)
+        cube = replace(scene, samples=samples)
+        times = max(1, 64 // bands)  # long enough that what happens between the calls does not count
+        clocks = time_in_turn({kernel: _often(_call(cube, kernel, out), times) for kernel in KERNELS}, ROUNDS)
+        figures.append([f"{_ns(clocks[kernel], times * out.size):.2g}" for kernel in KERNELS])
+    nearest, bilinear, cubic = ("/".join(column) for column in zip(*figures, strict=True))
+    return Row(
+        f"catmull-rom, ns/(px*band), {'/'.join(map(str, many))} bands", cubic,
+        peers=f"ours bilinear {bilinear}, nearest {nearest}",
+    )  # fmt: skip
+
+
+def _masked(scene: Turned) -> Row:
+    """What masks cost: one sample in a thousand out, and one element of the detector in a thousand."""
+    rng, shape = np.random.default_rng(0), scene.samples.shape
+    samples, elements = rng.random(shape[:2]) > 1e-3, np.broadcast_to(rng.random(shape[1:]) > 1e-3, shape)
+    zeroed, out = replace(scene, samples=scene.samples * elements), np.empty(scene.truth.shape, np.float32)
+    calls = {
+        "none": _call(scene, "catmull-rom", out),
+        "samples": _call(scene, "catmull-rom", out, samples),
+        "elements": _call(scene, "catmull-rom", out, elements),
+        "zeroed": _call(zeroed, "catmull-rom", out, elements),
+    }
+    clocks = time_in_turn(calls, ROUNDS)
+    times = [f"{ratio(clocks, name, 'none'):.2f}" for name in ("samples", "elements", "zeroed")]
+    return Row(
+        "catmull-rom, 0.1 % of the samples / of the detector's elements / of elements that are 0 already out",
+        " / ".join(times) + " x", peers="of the time with none out",
+    )  # fmt: skip
+
+
+def _engines(scene: Turned) -> Row:
+    """The same sixteen taps by other means, index and weights given: why the sums run on embedding_bag."""
+    table = torch.from_numpy(scene.samples.reshape(-1, BANDS))
+    blocks = []
+    for start in range(0, 4 * BLOCK, BLOCK):
+        placed = windows(scene.coordinates[start : start + BLOCK], "catmull-rom")
+        blocks.append(
+            (placed.flat_index(scene.samples.shape[:2]), placed.joint_weight(), torch.from_numpy(placed.weight))
+        )
+    calls = {
+        name: (lambda engine=engine: [engine(table, *block) for block in blocks])
+        for name, engine in ENGINES.items()
+    }  # fmt: skip
+    clocks = time_in_turn(calls, ROUNDS)
+    spent = {name: _ns(clock, len(blocks) * BLOCK * BANDS) for name, clock in clocks.items()}
+    first = spent.pop("embedding_bag 16 taps")
+    return Row(
+        f"engine of 16 taps, {BANDS} bands: embedding_bag", f"{first:.2f} ns/(px*band)", "least of all",
+        all(first < ns for ns in spent.values()), _listed(spent, "{:.2f}"),
+    )  # fmt: skip

@@ -1,0 +1,210 @@
+"""Other libraries that resample an image: each read at the points of one rotated grid, in the layout it likes best."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.tradeoff_resample import draw_waves
+
+SIDE, BANDS, EDGE = 256, 270, 176  # of the sweep; of the output grid, which lies inside it when turned
+TURN_DEG = 14.0
+CRS, ORIGIN_M = "EPSG:32631", (500_000.0, 5_000_000.0)  # one metre a pixel, for what wants to be on the Earth
+FEW = 18  # bands of the libraries that take one at a time and long for each
+
+
+@dataclass(frozen=True)
+class Peer:
+    """One library: what is timed, how its result becomes (y * x, band), and of how many bands."""
+
+    name: str
+    call: Callable[[], Any]
+    by_pixel: Callable[[Any], NDArray[np.float32]]
+    bands: int
+    warm: bool = False  # writes to memory that is given, and was used before
+    prepare: Callable[[], object] | None = None  # the index it builds first
+
+
+@dataclass(frozen=True)
+class Turned:
+    """A sweep of waves and a grid turned against it; ``truth`` is what the waves are at the grid's points."""
+
+    samples: NDArray[np.float32]  # (line, sample, band)
+    coordinates: NDArray[np.float64]  # (y * x, 2) line and sample
+    affine: NDArray[np.float64]  # (2, 3): (line, sample) of grid pixel (y, x) is affine @ (y, x, 1)
+    truth: NDArray[np.float64]  # (y * x, band)
+
+    @property
+    def planes(self) -> NDArray[np.float32]:
+        """The sweep band by band, (band, line, sample)."""
+        return np.ascontiguousarray(np.moveaxis(self.samples, 2, 0))
+
+    def error(self, out: NDArray[np.floating]) -> float:
+        """Root mean square error over the standard deviation, of the first bands, which all libraries give."""
+        truth = self.truth[:, :FEW]
+        return float(np.sqrt(np.mean((out[:, :FEW] - truth) ** 2)) / np.std(truth))
+
+
+def turned_waves(falloff: float, bands: int = BANDS) -> Turned:
+    """Waves of 4 to 40 px, sampled on a sweep, with a grid turned by 14 degrees about the middle.
+
+    Their amplitude is the period to the power of ``falloff``: 1 as in pictures of natural scenes, 0 for all alike.
+    """
+    waves = draw_waves(0, bands)
+    size = np.linalg.norm(waves.frequency, axis=1)[:, None] ** -falloff
+    waves = replace(waves, cosine=waves.cosine * size, sine=waves.sine * size)
+    cos, sin = np.cos(np.deg2rad(TURN_DEG)), np.sin(np.deg2rad(TURN_DEG))
+    turn, middle = np.array([[cos, -sin], [sin, cos]]), np.array([SIDE / 2 + 0.2, SIDE / 2 - 0.3])
+    affine = np.column_stack([turn, middle - turn @ np.full(2, (EDGE - 1) / 2)])
+    grid = np.argwhere(np.ones((EDGE, EDGE), bool))
+    coordinates = grid @ turn.T + affine[:, 2]
+    lines = np.argwhere(np.ones((SIDE, SIDE), bool)).astype(np.float64)
+    samples = waves.at(lines).astype(np.float32).reshape(SIDE, SIDE, bands)
+    return Turned(samples, coordinates, affine, waves.at(coordinates))
+
+
+def peers(scene: Turned, order: int, only: str | None = None) -> list[Peer]:
+    """Each library at one order (0 nearest, 1 linear, 3 cubic convolution), or ``only`` one of them."""
+    makers = {
+        "cv2.remap": _cv2_remap, "torch grid_sample": _grid_sample, "skimage warp": _skimage_warp,
+        "rasterio reproject": _rasterio_reproject, "scipy map_coordinates": _map_coordinates, "pyresample": _pyresample,
+    }  # fmt: skip
+    without_cubic = {"scipy map_coordinates", "pyresample"}
+    return [
+        maker(scene, order)
+        for name, maker in makers.items()
+        if only in (None, name) and not (order == 3 and name in without_cubic)
+    ]
+
+
+def spline(scene: Turned) -> Peer:
+    """The order-3 spline of scipy, its filter counted."""
+    return _map_coordinates(scene, 3)
+
+
+def _by_pixel(planes: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.reshape(planes, (len(planes), -1)).T
+
+
+def _cv2_remap(scene: Turned, order: int) -> Peer:
+    """The sweep parted into groups of bands beforehand, the result joined, for that is what the others give."""
+    parts, joined = cv2_parts(scene, order), np.empty((EDGE, EDGE, BANDS), np.float32)
+    return Peer(
+        "cv2.remap",
+        lambda: np.concatenate(parts(), axis=2, out=joined),
+        lambda _: joined.reshape(-1, BANDS), BANDS, warm=True,
+    )  # fmt: skip
+
+
+def cv2_parts(scene: Turned, order: int) -> Callable[[], list[NDArray[np.float32]]]:
+    """cv2.remap by groups of bands: 90 are faster than 4 and 1 where it takes as many, for cubic 4 than 1."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    size, flag = {0: (90, cv2.INTER_NEAREST), 1: (90, cv2.INTER_LINEAR), 3: (4, cv2.INTER_CUBIC)}[order]
+    y, x = scene.coordinates.T.astype(np.float32).reshape(2, EDGE, EDGE)
+    parts = [np.ascontiguousarray(scene.samples[..., at : at + size]) for at in range(0, BANDS, size)]
+    outs = [np.empty((EDGE, EDGE, part.shape[2]), np.float32) for part in parts]
+
+    def call() -> list[NDArray[np.float32]]:
+        for part, out in zip(parts, outs, strict=True):
+            cv2.remap(part, x, y, flag, dst=out, borderMode=cv2.BORDER_REFLECT_101)
+        return outs
+
+    return call
+
+
+def _grid_sample(scene: Turned, order: int) -> Peer:
+    import torch
+
+    mode = {0: "nearest", 1: "bilinear", 3: "bicubic"}[order]
+    grid = (scene.coordinates[:, ::-1] / (SIDE - 1) * 2 - 1).astype(np.float32).reshape(1, EDGE, EDGE, 2)
+    image = torch.from_numpy(scene.planes)[None].contiguous(memory_format=torch.channels_last)  # half the time of NCHW
+    return Peer(
+        "torch grid_sample",
+        lambda: torch.nn.functional.grid_sample(image, torch.from_numpy(grid), mode=mode, align_corners=True),
+        lambda out: _by_pixel(out[0].numpy()),
+        BANDS,
+    )
+
+
+def _map_coordinates(scene: Turned, order: int) -> Peer:
+    from scipy.ndimage import map_coordinates
+
+    planes, at = scene.planes[:FEW], scene.coordinates.T
+    return Peer(
+        "scipy map_coordinates" if order < 3 else "scipy spline",
+        lambda: [map_coordinates(plane, at, order=order, mode="mirror") for plane in planes],
+        lambda out: np.stack(out, axis=1),
+        FEW,
+    )
+
+
+def _skimage_warp(scene: Turned, order: int) -> Peer:
+    from skimage.transform import AffineTransform, warp
+
+    planes = scene.planes[:FEW]
+    (yy, yx, y0), (xy, xx, x0) = scene.affine  # skimage's matrix takes (x, y)
+    turn = AffineTransform(matrix=np.array([[xx, xy, x0], [yx, yy, y0], [0, 0, 1]]))
+    shape = (EDGE, EDGE)
+    return Peer(
+        "skimage warp",
+        lambda: [warp(plane, turn, output_shape=shape, order=order, preserve_range=True) for plane in planes],
+        lambda out: _by_pixel(np.stack(out)),
+        FEW,
+    )
+
+
+def _rasterio_reproject(scene: Turned, order: int) -> Peer:
+    from rasterio.transform import Affine
+    from rasterio.warp import Resampling, reproject
+
+    kernel = {0: Resampling.nearest, 1: Resampling.bilinear, 3: Resampling.cubic}[order]
+    planes, out = scene.planes, np.zeros((BANDS, EDGE, EDGE), np.float32)
+    (yy, yx, y0), (xy, xx, x0) = scene.affine
+    # Its coordinates count from the corner of the first pixel, y upwards.
+    grid = Affine(xx, xy, x0 + 0.5 - (xx + xy) / 2, -yx, -yy, -(y0 + 0.5 - (yx + yy) / 2))
+    origin, down = Affine.translation(*ORIGIN_M), Affine.scale(1, -1)
+    place = {"src_transform": origin @ down, "dst_transform": origin @ grid, "src_crs": CRS, "dst_crs": CRS}
+    return Peer(
+        "rasterio reproject",
+        lambda: reproject(planes, out, resampling=kernel, num_threads=1, **place),
+        lambda _: _by_pixel(out),
+        BANDS,
+        warm=True,
+    )
+
+
+def _pyresample(scene: Turned, order: int) -> Peer:
+    """The grid is an area of metres, the sweep a swath of longitudes and latitudes."""
+    from pyresample import kd_tree
+    from pyresample.bilinear import NumpyBilinearResampler
+
+    swath, area = _swath_and_area(scene)
+    if order == 0:
+        index = lambda: kd_tree.get_neighbour_info(swath, area, 2.0, neighbours=1)  # noqa: E731
+        found = index()[:3]
+        call = lambda: kd_tree.get_sample_from_neighbour_info("nn", (EDGE, EDGE), scene.samples, *found)  # noqa: E731
+    else:
+        resampler = NumpyBilinearResampler(swath, area, 3.0, neighbours=8)
+        resampler.get_bil_info()
+        index = lambda: NumpyBilinearResampler(swath, area, 3.0, neighbours=8).get_bil_info()  # noqa: E731
+        call = lambda: resampler.get_sample_from_bil_info(scene.samples)  # noqa: E731
+    return Peer("pyresample", call, lambda out: np.asarray(out).reshape(-1, BANDS), BANDS, prepare=index)
+
+
+def _swath_and_area(scene: Turned) -> tuple[Any, Any]:
+    import pyproj
+    from pyresample.geometry import AreaDefinition, SwathDefinition
+
+    pixel = np.argwhere(np.ones((SIDE, SIDE), bool))
+    back = np.linalg.inv(scene.affine[:, :2])
+    y, x = (back @ (pixel - scene.affine[:, 2]).T).reshape(2, SIDE, SIDE)  # where the sweep's pixels lie on the grid
+    east, north = ORIGIN_M
+    lon, lat = pyproj.Transformer.from_crs(CRS, "EPSG:4326", always_xy=True).transform(east + x, north - y)
+    extent = (east - 0.5, north - EDGE + 0.5, east + EDGE - 0.5, north + 0.5)
+    return SwathDefinition(lon, lat), AreaDefinition("grid", "grid", "grid", pyproj.CRS(CRS), EDGE, EDGE, extent)

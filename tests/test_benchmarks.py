@@ -1,0 +1,58 @@
+"""The benchmark runner: one table, goals missed are told, a crash is named and does not stop the others."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+SOURCE = Path(__file__).parent / "benchmarks"
+GOOD = """
+from measure import Row
+
+def rows():
+    missed = Row("fast | enough", "1.5 s", "<= 1 s", False, "peer: 3 s")
+    return [missed, Row("right", "0 px", "< 1 px", True), Row("aside", "7")]
+"""
+
+
+def run_copy(folder: Path, *arguments: str, crash: bool = False) -> subprocess.CompletedProcess[str]:
+    """Run the table on made-up benchmarks in a folder of their own."""
+    place = folder / "tests" / "benchmarks"
+    place.mkdir(parents=True, exist_ok=True)
+    for name in ("__main__.py", "measure.py"):
+        shutil.copy(SOURCE / name, place / name)
+    (place / "bench_good.py").write_text(GOOD)
+    if crash:
+        (place / "bench_bad.py").write_text("def rows():\n    raise RuntimeError('no such peer')\n")
+    command = [sys.executable, str(place), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, check=False)
+
+
+def test_a_missed_goal_is_printed_and_is_no_failure(tmp_path: Path) -> None:
+    """All rows stand in the table, the missed one also below it, and the exit code is 0; Markdown holds the same."""
+    done = run_copy(tmp_path, "--markdown", "table.md")
+    assert done.returncode == 0, done.stderr
+    assert "1 of 2 goals met; missed: fast | enough" in done.stdout
+    assert ["aside", "7", "-", "-", "-"] in [line.split() for line in done.stdout.splitlines()]
+    table = (tmp_path / "table.md").read_text().splitlines()
+    assert table[0] == "| what | figure | goal | met | peers |"
+    assert table[2] == r"| fast \| enough | 1.5 s | <= 1 s | NO | peer: 3 s |"
+
+
+def test_a_crash_is_named_and_the_others_go_on(tmp_path: Path) -> None:
+    """The crashed benchmark comes first, the good one's table still follows, and the exit code is 1."""
+    done = run_copy(tmp_path, crash=True)
+    assert done.returncode == 1
+    assert "bad: crashed; the others go on" in done.stdout
+    assert "RuntimeError: no such peer" in done.stderr
+    assert "crashed: bad" in done.stdout.splitlines()[-1]
+    assert "right" in done.stdout
+
+
+def test_an_unknown_name_is_refused_with_those_there_are(tmp_path: Path) -> None:
+    """A benchmark that is not there names the ones that are."""
+    done = run_copy(tmp_path, "speed")
+    assert done.returncode == 2
+    assert "no benchmark speed; there are: good" in done.stderr
