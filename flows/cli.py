@@ -52,6 +52,8 @@ def survey(
     controls: bool | None = None,
     engine: str | None = None,
     memory: str | None = None,
+    kernel: str | None = None,
+    pointing_px: str | None = None,
     size: str | None = None,
     exposure_ms: str | None = None,
     as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
@@ -87,13 +89,17 @@ def survey(
     seed
         Of the scene `farm` and of all noise.
     effects
-        auto, all, none, or names with commas: slit,smear,shot,read
+        auto, all, none, or names with commas: slit,smear,throughput,shot,read
     controls
         Also judge other placements of the same number of seats (needs labels).
     engine
         `prefect`, or `plain` where no server can start.
     memory
         Sizes the blocks in which the controls scan the whole field: 4GiB by default.
+    kernel
+        How lines are read between samples: catmull-rom (default), bilinear, or nearest, which mixes no spectra.
+    pointing_px
+        How far off the mirror may point [px]; above 0 sweeps overlap by more and their seams are registered.
     size
         Of the scene `farm`, width x height: 1280x1024
     exposure_ms
@@ -107,7 +113,8 @@ def survey(
     flags = {
         "scene": scene, "labels": labels, "bands": bands, "wavelengths": wavelengths, "source": source, "out": out,
         "budget": budget, "policy": policy, "mask": mask, "weights": weights, "rounds": rounds, "seed": seed,
-        "effects": effects, "controls": controls, "engine": engine, "memory": memory, "size": size,
+        "effects": effects, "controls": controls, "engine": engine, "memory": memory, "kernel": kernel,
+        "pointing_px": pointing_px, "size": size,
         "camera.exposure_ms": exposure_ms,
     }  # fmt: skip
     published = run_survey(load_settings(settings, flags), stderr)
@@ -132,7 +139,7 @@ def tradeoff(
     Parameters
     ----------
     stage
-        resample or plan; all without one.
+        rectify or plan; all without one.
     out
         Folder for tradeoff.json and tradeoff.png.
     repeats

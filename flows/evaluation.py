@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,26 +16,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.full_look import columns_of_all_seats
+from flows.pointing_stage import load_registration
 from flows.run import SurveyRun
-from flows.stages import KERNEL, Produce, digest, glance_at, patch_columns, write_json
+from flows.stages import Produce, digest, glance_at, patch_columns, write_json
 from models.controls import CONTROL_SHARE, Controls, run_controls
 from models.inference import Glance, glance_of_columns, segment
 from models.metrics import average_accuracy, confusion, gap_closed, iou_per_class, kappa, mean_iou, overall_accuracy
 from models.policies import score_seats
-from pipeline.planning import price_seats
+from pipeline.grid import UNLABELLED
+from pipeline.planning import price_of_seats
 from pipeline.savings import count_lines
 from pipeline.selection import frame_seats
+from pipeline.simulator.pointing import CommonOffset, PointingErrors
+from pipeline.simulator.simulated import SimulatedSource
 from storage.archive import StageRef
 from storage.class_maps import load_class_map
 
 
 def evaluate(
-    run: SurveyRun, produce: Produce, mosaic: StageRef, patches: StageRef, class_map: StageRef
+    run: SurveyRun, produce: Produce, mosaic: StageRef, patches: StageRef, class_map: StageRef, *pointing: StageRef
 ) -> StageRef | None:
     """Judge the map by the labels, and what other placements would have given. Not part of the survey's own cost."""
-    labels = run.labels
-    if labels is None:
+    if run.labels is None:
         return None
+    off = _map_offset(run, pointing)
+    labels = _moved(run, off)
 
     def build(path: Path) -> None:
         classes = load_class_map(class_map.path / "class_map.zarr").classes
@@ -46,16 +52,46 @@ def evaluate(
         result["none"] = _figures(run, confusion(labels, none.classes, run.weights.config.classes))
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
         if run.settings.controls:
-            result |= _controls(run, seen, patches, labels, result)
+            result |= _controls(replace(run, source=_sure_source(run, off)), seen, patches, labels, result)
         write_json(path / "accuracy.json", result)
 
     params = {
         "weights": run.weights_key,
         "labels": digest(labels),
         "controls": run.settings.controls,
+        "kernel": run.settings.kernel,
         **run.source_key(),
     }
-    return produce("evaluate", build, params, [mosaic, patches, class_map])
+    return produce("evaluate", build, params, [mosaic, patches, class_map, *pointing])
+
+
+def _map_offset(run: SurveyRun, pointing: Sequence[StageRef]) -> NDArray[np.float64]:
+    """How far the whole map lies beside the scene, (along, scan) px: what the sweep that registration held is off by.
+
+    Overlaps tie sweeps to each other and not to the ground. Only the simulator knows the rest.
+    """
+    errors = run.source.pointing
+    if not isinstance(errors, PointingErrors) or not pointing:
+        return np.zeros(2)
+    return errors.offset(load_registration(pointing[0])["reference"])
+
+
+def _moved(run: SurveyRun, off: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """The labels as the map shows the scene, to the nearest pixel; what it shows beyond them is unlabelled."""
+    labels = run.labels
+    assert labels is not None
+    down, across = np.rint(off[::-1] if run.plan.along == "x" else off).astype(int)
+    rows, columns = (np.arange(size) + by for size, by in zip(labels.shape, (down, across), strict=True))
+    inside = ((rows >= 0) & (rows < labels.shape[0]))[:, None] & ((columns >= 0) & (columns < labels.shape[1]))
+    moved = labels[np.clip(rows, 0, labels.shape[0] - 1)[:, None], np.clip(columns, 0, labels.shape[1] - 1)]
+    return np.where(inside, moved, np.uint8(UNLABELLED))
+
+
+def _sure_source(run: SurveyRun, off: NDArray[np.float64]) -> SimulatedSource:
+    """A mirror that looks as far beside the scene as the map lies, everywhere: controls share the map's pixels."""
+    if run.source.pointing is None:
+        return run.source
+    return replace(run.source, pointing=CommonOffset((float(off[0]), float(off[1]))))
 
 
 def _controls(
@@ -64,7 +100,7 @@ def _controls(
     """`all`, the other placements, and how long either reading takes."""
     columns = columns_of_all_seats(
         run.source, run.plan.full, run.grid, run.weights,
-        memory=run.settings.memory, kernel=KERNEL, report=lambda done: run.report(0.6 * done),
+        memory=run.settings.memory, kernel=run.settings.kernel, report=lambda done: run.report(0.6 * done),
     )  # fmt: skip
     rows = 0
 
@@ -91,15 +127,15 @@ def _controls_mode(run: SurveyRun, seen: Glance, controls: Controls) -> dict[str
     grid, share = run.grid, run.grid.valid_share().ravel()
     seats = frame_seats(score_seats("entropy", seen), controls.share, share > 0).seats
     fine = share[seats].sum() * grid.patch**2  # samples beside the scene do not count
-    lines, seconds = price_seats(grid, run.camera, run.settings.cost, run.plan.along, seats)
+    price = price_of_seats(grid, run.camera, run.settings.cost, run.plan.along, seats)
     coarse_lines, full_lines = count_lines(run.plan.coarse), count_lines(run.plan.full)
     return {
         "mode": "frame",
         "share_of_seats": controls.share,
         "seats": controls.seats,
         "share_of_samples": (fine + np.prod(grid.coarse_shape)) / (grid.height * grid.width),
-        "share_of_lines": (coarse_lines + lines) / full_lines,
-        "share_of_seconds": (run.plan.coarse_s + seconds) / run.plan.full_s,
+        "share_of_lines": (coarse_lines + price.lines) / full_lines,
+        "share_of_seconds": (run.plan.coarse_s + price.seconds) / run.plan.full_s,
     }
 
 

@@ -13,23 +13,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.evaluation import load_accuracy
+from flows.findings import find_out
+from flows.ground_picture import draw_ground
+from flows.ground_stage import STORE
 from flows.panels import choose_bands
+from flows.pointing_stage import RECORD
 from flows.quicklook import QuicklookData, draw_quicklook
 from flows.receipt import Header, Receipt, build_receipt, to_json
-from flows.report import write_report
+from flows.report import Picture, write_report
 from flows.run import SurveyRun, now
 from flows.stages import SEATS_AT_ONCE, captured, load_plan
 from flows.survey import Products, StageRunner
 from models.cost import MultiplyAdds, multiply_adds
 from pipeline.planning import FinePlan
-from pipeline.rectify.calibrate import reflectance
+from pipeline.rectify.calibrate import of_bands, reflectance
 from pipeline.savings import Entry, capture_savings
 from pipeline.scan import Sweep
 from pipeline.simulator.instrument import ALL_EFFECTS, on_scene
-from pipeline.source import References
 from storage.attention import load_attention
 from storage.class_maps import ClassMap, load_class_map
 from storage.cubes import RawCube
+from storage.ground_maps import load_ground_map
 from storage.mosaics import load_mosaic
 from storage.patches import open_patches
 
@@ -37,6 +41,7 @@ LIBRARIES = ("spectralzoom", "numpy", "torch", "zarr", "xarray", "prefect")
 VARIANTS = {
     "slit": "box of the slit's width, 4 Gauss nodes",
     "smear": "mean over the positions held in one exposure",
+    "throughput": "light by the mirror's area as seen along the ray",
     "shot": "one normal draw with the counts' skewness",
     "read": "normal, in the same draw",
 }
@@ -62,14 +67,20 @@ def publish_run(runner: StageRunner, products: Products, started: str) -> Publis
         draw_quicklook(draft.folder / "quicklook.png", panels)
         draft.write_file("receipt.json", to_json(receipt))
         picture = (draft.folder / "quicklook.png").read_bytes()
-        write_report(draft.folder / "report.html", receipt, picture, looked_twice=looked_twice)
+        write_report(draft.folder / "report.html", receipt, picture, _pictures(products), looked_twice=looked_twice)
         folder = draft.publish(survey=receipt["survey"])
     return Published(receipt, folder, looked_twice)
 
 
-def make_receipt(
-    runner: StageRunner, products: Products, plan: FinePlan, started: str, folder: str
-) -> Receipt:
+def _pictures(products: Products) -> list[Picture]:
+    """Pictures that not every survey has."""
+    if products.ground_map is None:
+        return []
+    drawn = draw_ground(load_ground_map(products.ground_map.path / STORE))
+    return [Picture(drawn, "The map on the ground, north up.")]
+
+
+def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, started: str, folder: str) -> Receipt:
     """Put together what the run has to say for itself."""
     run = runner.run
     accuracy = None if products.accuracy is None else load_accuracy(products.accuracy)
@@ -83,7 +94,7 @@ def make_receipt(
     )  # fmt: skip
     return build_receipt(
         header, runner.records.values(), savings, _addresses(products, folder),
-        accuracy=accuracy, effects=_effects(run),
+        accuracy=accuracy, effects=_effects(run), findings=find_out(run, products),
     )  # fmt: skip
 
 
@@ -98,6 +109,7 @@ def _versions() -> dict[str, str]:
 def _addresses(products: Products, folder: str) -> dict[str, str]:
     named = {
         "raw_coarse": products.raw_coarse.uri,
+        "lookup": f"{products.lookup.uri}/lookup.zarr",
         "mosaic": f"{products.mosaic.uri}/mosaic.zarr",
         "attention": f"{products.attention.uri}/attention.zarr",
         "plan": f"{products.attention.uri}/plan.json",
@@ -105,6 +117,11 @@ def _addresses(products: Products, folder: str) -> dict[str, str]:
         "patches": f"{products.patches.uri}/patches.zarr",
         "class_map": f"{products.class_map.uri}/class_map.zarr",
     }
+    for name, ref in (("coarse_pointing", products.coarse_pointing), ("fine_pointing", products.fine_pointing)):
+        if ref is not None:
+            named[name] = f"{ref.uri}/{RECORD}"
+    if products.ground_map is not None:
+        named["ground_map"] = f"{products.ground_map.uri}/{STORE}"
     if products.accuracy is not None:
         named["accuracy"] = f"{products.accuracy.uri}/accuracy.json"
     return named | {name: f"{folder}/{name}" for name in ("receipt.json", "quicklook.png", "report.html")}
@@ -117,7 +134,7 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
     entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
     stored = [run.archive.stored_bytes(ref) for ref in (products.raw_coarse, products.raw_fine)]
     # Fine lines compress like the full scan's would; without any, the coarse ones have to stand for them.
-    like, kept = ((plan.sweeps, stored[1]) if plan.sweeps else (run.plan.coarse, stored[0]))
+    like, kept = (plan.sweeps, stored[1]) if plan.sweeps else (run.plan.coarse, stored[0])
     of_these = capture_savings(like, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
     full_stored = entries["bytes_raw"].full * kept / of_these["bytes_raw"].done
     config, valid = run.weights.config, len(run.grid.valid_seats())
@@ -192,9 +209,7 @@ def _by_strip(cubes: list[RawCube]) -> list[RawCube]:
 
 def _calibrated(run: SurveyRun, cube: RawCube, bands: list[int]) -> NDArray[np.float32]:
     """Some bands of a sweep's lines in scene values; NaN where a sample looked past the scene."""
-    frames = cube.references
-    some = References(frames.dark[:, bands], frames.white[:, bands], frames.panel[bands])
-    values = reflectance(cube.read()[..., bands], some)
+    values = reflectance(cube.read()[..., bands], of_bands(cube.references, bands), position=cube.position)
     values[~on_scene(run.scene.shape, run.camera, cube.sweep)] = np.nan
     return values
 
@@ -221,4 +236,3 @@ def block_of(sweep: Sweep, run: SurveyRun) -> tuple[int, int, int, int]:
     x0, x1 = np.clip(np.rint(across), 0, size[0]).astype(int).tolist()
     y0, y1 = np.clip(np.rint(scan), 0, size[1]).astype(int).tolist()
     return (y0, y1, x0, x1) if sweep.along == "x" else (x0, x1, y0, y1)
-

@@ -92,6 +92,10 @@ class Receipt(TypedDict):
     savings: Savings
     accuracy: NotRequired[Accuracy]
     effects: NotRequired[list[dict[str, Any]]]
+    plan: NotRequired[dict[str, Any]]  # how the fine pass was laid out, and what the other orientation would cost
+    pointing: NotRequired[dict[str, Any]]  # only where the mirror may look beside the plan
+    lines: NotRequired[dict[str, Any]]  # sweeps with lines lost, repeated, out of order, late or invalid
+    ground: NotRequired[dict[str, Any]]  # only with a pose: grid and hectares
     products: dict[str, str]
 
 
@@ -124,6 +128,7 @@ class Header:
 
 
 COSTS = ("lines", "samples", "bytes_raw", "bytes_stored", "capture_s", "tokens", "multiply_adds")
+FINDINGS = ("plan", "pointing", "lines", "ground")
 _SAVING_FIELDS = ("done", "full", "ratio", "full_is")
 _SPLIT_FIELDS = ("glance", "score", "encode", "decode")
 _STAGE_FIELDS = ("name", "key", "state", "wall_s", "cpu_s", "peak_rss_bytes", "bytes_in", "bytes_out")
@@ -141,6 +146,7 @@ def build_receipt(
     *,
     accuracy: Mapping[str, object] | None = None,
     effects: Iterable[Mapping[str, object]] | None = None,
+    findings: Mapping[str, object] | None = None,
 ) -> Receipt:
     """Put a receipt together in its fixed order and check that nothing is missing.
 
@@ -152,6 +158,8 @@ def build_receipt(
         Fields of `Accuracy`; None without labels.
     effects
         Rows with name, state, variant, bound, measured, cost_s, why; None for a source that is not simulated.
+    findings
+        Parts that not every survey has: `FINDINGS`.
 
     Raises
     ------
@@ -163,6 +171,7 @@ def build_receipt(
         receipt["accuracy"] = accuracy
     if effects is not None:
         receipt["effects"] = list(effects)
+    receipt |= {name: found for name in FINDINGS if (found := (findings or {}).get(name))}
     receipt["products"] = dict(products)
     return check_receipt(json.loads(to_json(receipt)))
 

@@ -15,6 +15,7 @@ from string import Template
 from typing import Any
 
 from flows.figures import DASH, format_bytes, format_percent, format_points, format_seconds
+from flows.finding_words import sentences
 from flows.receipt import COST_LABELS, Accuracy, Receipt, Saving, Savings, control_seats, headline
 
 
@@ -58,6 +59,7 @@ def render_report(
     sections = [
         _figure(Picture(quicklook_png, "The survey at a glance.")),
         _savings(receipt["savings"]),
+        _found(receipt),
         _accuracy(receipt["accuracy"]) if "accuracy" in receipt else "",
         *(_figure(picture) for picture in pictures),
         _stages(receipt["stages"]),
@@ -74,6 +76,14 @@ def render_report(
         style=_STYLE,
         body="\n".join(section for section in sections if section),
     )
+
+
+def _found(receipt: Receipt) -> str:
+    """What the survey found out on the way, in sentences."""
+    words = sentences(receipt)
+    if not words:
+        return ""
+    return _section("How it was captured", "".join(f"<p>{escape(sentence)}</p>" for sentence in words))
 
 
 def _figure(picture: Picture) -> str:

@@ -19,13 +19,17 @@ from flows.settings import BUILT_IN_SCENES, Settings
 from flows.training_data import scene_of_file, unpack_mask
 from models.weights import Weights, load_weights
 from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_full, coarse_sweeps
+from pipeline.coverage import cheapest_full, coarse_sweeps, with_margin
 from pipeline.errors import SceneError, SettingsError, WeightsError
 from pipeline.grid import UNLABELLED, SceneGrid
+from pipeline.ground import GroundView
+from pipeline.ground_grid import ground_grid
 from pipeline.planning import check_budget
+from pipeline.rectify.overlaps import LEAST_OVERLAP_PX
 from pipeline.scan import Axis, Sweep
 from pipeline.simulator.farm import farm_scene
 from pipeline.simulator.instrument import ALL_EFFECTS
+from pipeline.simulator.pointing import PointingErrors
 from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive import Archive
@@ -49,6 +53,7 @@ class CapturePlan:
     coarse_s: float
     full_s: float
     fine_s: float  # left by the budget for the fine pass
+    overlap_px: float  # of neighbouring coarse strips, at least
 
 
 @dataclass(frozen=True)
@@ -93,6 +98,7 @@ class SurveyRun:
             "seed": self.settings.seed,
             "effects": sorted(self.source.effects),
             "camera": asdict(self.camera),
+            "pointing_px": self.settings.pointing_px,
         }
 
 
@@ -115,12 +121,27 @@ def open_run(settings: Settings) -> SurveyRun:
     if settings.mask is not None:
         _check_mask(settings.mask, scene.shape)
     effects = _chosen_effects(settings.effects)
-    source = SimulatedSource(scene, settings.camera, settings.seed, effects)
+    source = SimulatedSource(scene, settings.camera, settings.seed, effects, pointing=_pointing(settings))
+    _check_pose(settings, scene.shape)
     key = hashlib.sha256(path.read_bytes()).hexdigest()[:20]
     return SurveyRun(
         settings, Archive.open(settings.out), source, scene, weights, key, grid, plan, labels,
         (*notes, *band_notes, *label_notes),
     )  # fmt: skip
+
+
+def _pointing(settings: Settings) -> PointingErrors | None:
+    """What the simulated mirror gets wrong, where the settings allow it to: nothing otherwise."""
+    if not settings.pointing_px:
+        return None
+    return PointingErrors(offset_px=settings.pointing_px, jitter_px=0.0, seed=settings.seed)
+
+
+def _check_pose(settings: Settings, shape: tuple[int, int]) -> None:
+    """Refuse a pose from which there is no ground to map, before anything is captured."""
+    if settings.pose is not None:
+        view = GroundView(settings.pose, settings.camera.ifov_rad)
+        ground_grid(view, shape, epsg=settings.map.epsg, resolution_m=settings.map.resolution_m)
 
 
 def _chosen_effects(text: str) -> frozenset[str]:
@@ -231,11 +252,15 @@ def _judged_labels(scene: RasterScene, weights: Weights) -> tuple[NDArray[np.uin
 
 
 def _plan(settings: Settings, grid: SceneGrid) -> CapturePlan:
-    camera, cost = settings.camera, settings.cost
-    along, full, full_s = cheapest_full(grid, camera, cost)
-    coarse = coarse_sweeps(grid, camera, along)
-    coarse_s = cost.seconds(coarse, camera)
-    return CapturePlan(along, coarse, full, coarse_s, full_s, check_budget(settings.budget, coarse_s, full_s))
+    """Coarse and full sweeps; where the mirror may look beside the plan, with overlaps to register and margins."""
+    camera, cost, off = settings.camera, settings.cost, settings.pointing_px
+    overlap = 2 * off + LEAST_OVERLAP_PX * grid.factor if off else 0.0
+    along, full, _ = cheapest_full(grid, camera, cost, overlap_px=overlap)
+    coarse = with_margin(coarse_sweeps(grid, camera, along, overlap_px=overlap), camera, off)
+    full = with_margin(full, camera, off)
+    full_s, coarse_s = cost.seconds(full, camera), cost.seconds(coarse, camera)
+    fine_s = check_budget(settings.budget, coarse_s, full_s)
+    return CapturePlan(along, coarse, full, coarse_s, full_s, fine_s, overlap)
 
 
 def now() -> str:

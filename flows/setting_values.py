@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from pipeline.errors import BudgetError, SettingsError
 
-EFFECTS = ("slit", "smear", "shot", "read")
+EFFECTS = ("slit", "smear", "throughput", "shot", "read")
 LEAST_MEMORY = 256 * 1024**2
 _BYTES = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12,
           "kib": 2**10, "mib": 2**20, "gib": 2**30, "tib": 2**40}  # fmt: skip
@@ -21,6 +21,8 @@ _OTHER_UNITS: dict[str, tuple[tuple[str, float], ...]] = {
     "mm": (("metres", 1e3), ("micrometres", 1e-3)),
     "nm": (("micrometres", 1e3), ("metres", 1e9)),
     "hz": (("kilohertz", 1e3),),
+    "m": (("millimetres", 1e-3), ("kilometres", 1e3)),
+    "deg": (("1e-7 degrees", 1e-7), ("millionths of a degree", 1e-6)),
 }
 
 

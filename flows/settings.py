@@ -5,9 +5,9 @@ from __future__ import annotations
 import difflib
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, Field, asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Literal, TypeVar, cast
+from typing import Any, Literal, cast
 
 from flows.setting_values import (
     Span,
@@ -24,17 +24,26 @@ from flows.setting_values import (
     parse_whole,
 )
 from pipeline.camera import LineCamera
-from pipeline.errors import SettingsError
+from pipeline.errors import PoseError, SettingsError
+from pipeline.ground import LIMITS, RigPose
 from pipeline.scan import CostModel
 
 POLICIES = ("entropy", "sobel", "random", "mask")
 ENGINES = ("prefect", "plain")
+KERNELS = ("catmull-rom", "bilinear", "nearest")
 BUILT_IN_SCENES = ("farm",)
 BUILT_IN_SOURCES = ("sim", "rig")
 _PATHS = ("scene", "labels", "source", "out", "mask", "weights")
 
 Parser = Callable[[object, str], object]
-Table = TypeVar("Table", LineCamera, CostModel)
+
+
+@dataclass(frozen=True)
+class MapChoice:
+    """What map to draw of a posed survey; None leaves the choice to the pose."""
+
+    epsg: int | None = None  # a projected CRS in metres; by default the rig's UTM zone
+    resolution_m: float | None = None  # by default the median footprint of a pixel
 
 
 @dataclass(frozen=True)
@@ -57,9 +66,13 @@ class Settings:
     controls: bool = True
     engine: Literal["prefect", "plain"] = "prefect"
     memory: int = 4 * 1024**3  # [bytes]
+    kernel: Literal["catmull-rom", "bilinear", "nearest"] = "catmull-rom"
+    pointing_px: float = 0.0  # how far off the mirror may point; above 0 sweeps overlap and their seams are registered
     size: tuple[int, int] | None = None  # (width, height) of the built-in scene [px]
     camera: LineCamera = field(default_factory=LineCamera)
     cost: CostModel = field(default_factory=CostModel)
+    pose: RigPose | None = None  # without one nothing is put on the ground
+    map: MapChoice = field(default_factory=MapChoice)
 
     @property
     def shape(self) -> tuple[int, int] | None:
@@ -101,7 +114,8 @@ def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None
     Parameters
     ----------
     table
-        Keys and values as in the file, ``camera`` and ``cost`` being tables themselves.
+        Keys and values as in the file, ``camera``, ``cost``, ``pose`` and ``map`` being tables themselves; None in
+        them means not given.
     origin
         Where each (dotted) key came from, for the messages: a file's name or ``flag``.
     """
@@ -134,15 +148,26 @@ def _parse_table(key: str, value: object, origin: Mapping[str, str]) -> object:
         place = _place(key, origin.get(key))
         raise SettingsError(f"{place} must be a table, [{key}] with keys below it; got {value!r}")
     make, spans = _TABLES[key]
-    return make(**_check_table(value, spans, f"{key}.", origin))
+    given = _check_table({k: v for k, v in value.items() if v is not None}, spans, f"{key}.", origin)
+    missing = [item.name for item in fields(make) if _is_required(item) and item.name not in given]
+    if missing:
+        raise SettingsError(f"[{key}] lacks {', '.join(missing)}; give every one, or leave the table out")
+    try:
+        return make(**given)
+    except PoseError as error:
+        raise SettingsError(f"[{key}]: {error}") from None
+
+
+def _is_required(item: Field[Any]) -> bool:
+    return item.default is MISSING and item.default_factory is MISSING
 
 
 def _refuse_key(full: str, known: Mapping[str, Parser], prefix: str, origin: str | None) -> None:
     """Raise for an unknown key, naming the nearest of its table, or of another table."""
     everywhere = [*_SURVEY, *(f"{name}.{key}" for name, (_, spans) in _TABLES.items() for key in spans)]
     short = full.removeprefix(prefix)
-    near = difflib.get_close_matches(short, known, n=1, cutoff=0.5)
-    near = [prefix + key for key in near] or [name for name in everywhere if name.split(".")[-1] == short]
+    near = [name for name in everywhere if name.split(".")[-1] == short]
+    near = near or [prefix + key for key in difflib.get_close_matches(short, known, n=1, cutoff=0.5)]
     hint = f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(prefix + key for key in known)}"
     raise SettingsError(f"unknown setting {_place(full, origin)}{hint}")
 
@@ -166,6 +191,8 @@ def _check_together(settings: Settings, origin: Mapping[str, str]) -> None:
             f"camera.dark_dn = {settings.camera.dark_dn:g} leaves no room below the {settings.camera.full_scale_dn} DN "
             f"of {settings.camera.bits} bits; use a smaller dark level"
         )
+    if settings.pose is None and settings.map != MapChoice():
+        raise SettingsError("[map] says how to draw the ground, which needs to know where the rig stands: give [pose]")
 
 
 def _read_toml(path: Path) -> dict[str, object]:
@@ -239,9 +266,18 @@ _COST: dict[str, Parser] = {
     "vector_pairs": parse_whole(1, 10_000_000),
     "provenance": parse_text,
 }
-_TABLES: dict[str, tuple[Callable[..., object], dict[str, Parser]]] = {
+_POSE: dict[str, Parser] = {
+    name: parse_number(Span(*limits, name.rpartition("_")[2])) for name, limits in LIMITS.items()
+}
+_MAP: dict[str, Parser] = {
+    "epsg": parse_whole(1024, 32_767, why="the number after EPSG:, such as 32632"),
+    "resolution_m": parse_number(Span(1e-4, 1000, "m")),
+}
+_TABLES: dict[str, tuple[type[Any], dict[str, Parser]]] = {
     "camera": (LineCamera, _CAMERA),
     "cost": (CostModel, _COST),
+    "pose": (RigPose, _POSE),
+    "map": (MapChoice, _MAP),
 }
 _SURVEY: dict[str, Parser] = {
     "scene": parse_text,
@@ -260,6 +296,8 @@ _SURVEY: dict[str, Parser] = {
     "controls": parse_switch,
     "engine": parse_choice(ENGINES),
     "memory": parse_memory,
+    "kernel": parse_choice(KERNELS),
+    "pointing_px": parse_number(Span(0, 300, "px")),
     "size": parse_size,
     **dict.fromkeys(_TABLES, parse_text),  # checked by _parse_table
 }

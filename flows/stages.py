@@ -16,28 +16,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.panels import choose_bands
 from flows.run import SurveyRun
 from models.inference import Glance, glance, segment
 from models.policies import score_seats
-from pipeline.planning import FinePlan, covered_seats, plan_fine
-from pipeline.rectify.region import mosaic_rows, read_seats
-from pipeline.rectify.resample import Kernel
+from pipeline.crop_rows import CropRows, find_rows
+from pipeline.orientation import compare_orientations
+from pipeline.planning import FinePlan, plan_fine
 from pipeline.scan import Sweep
-from pipeline.source import SweepLines
 from storage.archive import StageRef, stage_key
 from storage.attention import Attention, write_attention
 from storage.class_maps import ClassMap, write_class_map
 from storage.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from storage.layout import SHARD_ROWS
-from storage.mosaics import MosaicWriter, load_mosaic
-from storage.patches import PatchWriter, open_patches
+from storage.mosaics import load_mosaic
+from storage.patches import open_patches
 from storage.spool import Spool
 
-VERSIONS = {"capture": 1, "rectify": 1, "attend": 2, "patches": 1, "segment": 2, "evaluate": 2}
-KERNEL: Kernel = "catmull-rom"
+VERSIONS = {
+    "capture": 2, "register": 1, "locate": 1, "rectify": 2, "attend": 3, "patches": 2, "segment": 2, "ground": 1,
+    "evaluate": 3,
+}  # fmt: skip
 SEATS_AT_ONCE = 64
-QUICKLOOK_PX = 512
 
 Build = Callable[[Path], None]
 Produce = Callable[[str, Build, dict[str, Any], Sequence[StageRef]], StageRef]
@@ -90,38 +89,6 @@ def captured(ref: StageRef) -> list[RawCube]:
     return [open_raw_cube(path) for path in sorted(ref.path.glob("*.zarr"))]
 
 
-def rectify(run: SurveyRun, produce: Produce, raw: StageRef) -> StageRef:
-    """Bring the coarse sweeps onto the scene grid and blend them into one mosaic."""
-
-    def build(path: Path) -> None:
-        sweeps: Sequence[SweepLines] = captured(raw)
-        shape = run.grid.coarse_shape
-        writer = MosaicWriter(
-            path / "mosaic.zarr", shape, run.scene.wavelength_nm,
-            fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(run.grid.factor),
-        )  # fmt: skip
-        colours, _ = choose_bands(run.scene.wavelength_nm)
-        preview = []
-        for first, values, coverage in mosaic_rows(sweeps, run.camera, run.grid, rows=SHARD_ROWS, kernel=KERNEL):
-            writer.write_rows(first, values, coverage.astype(np.float32))
-            preview.append(values[..., list(colours)])
-            run.report((first + len(values)) / shape[0])
-        writer.write_quicklook(_preview(np.concatenate(preview)))
-
-    params = {"grid": asdict(run.grid), "kernel": KERNEL}
-    return produce("rectify", build, params, [raw])
-
-
-def _preview(image: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Colours for viewers: 2-98 % of each band, at most 512 px a side, (y, x, 3) uint8."""
-    small = image[:: -(-image.shape[0] // QUICKLOOK_PX), :: -(-image.shape[1] // QUICKLOOK_PX)]
-    seen = np.where(np.isfinite(small).any(axis=(0, 1)), small, 0)
-    low, high = np.nanpercentile(seen, (2, 98), axis=(0, 1))
-    scaled = np.clip((seen - low) / np.where(high > low, high - low, 1), 0, 1)
-    picture: NDArray[np.uint8] = np.nan_to_num(scaled * 255).astype(np.uint8)
-    return picture
-
-
 def glance_at(run: SurveyRun, mosaic: StageRef) -> Glance:
     """What the model says of a stored coarse mosaic alone."""
     return glance(run.weights, load_mosaic(mosaic.path / "mosaic.zarr").values, run.scene.wavelength_nm, run.grid)
@@ -138,10 +105,13 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
         rank = np.full(scores.shape, -1, np.int32)
         rank[plan.seats[np.argsort(-scores[plan.seats], kind="stable")]] = np.arange(len(plan.seats))
         shape = run.grid.seat_shape
-        write_attention(
-            path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), settings.policy)
-        )
+        write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), settings.policy))
         write_json(path / "plan.json", asdict(plan) | {"seats": plan.seats.tolist()})
+        turned = compare_orientations(
+            run.grid, run.camera, settings.cost, run.plan.along, scores, budget_s=run.plan.fine_s, plan=plan,
+            rows=_crop_rows(mosaic), overlap_px=run.plan.overlap_px,
+        )  # fmt: skip
+        write_json(path / "orientation.json", asdict(turned) | {"sentence": turned.sentence})
 
     params = {
         "weights": run.weights_key,
@@ -150,6 +120,7 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
         "seed": settings.seed if settings.policy == "random" else None,
         "mask": None if run.mask is None else digest(run.mask),
         "fine_s": run.plan.fine_s,
+        "overlap_px": run.plan.overlap_px,
         "along": run.plan.along,
         "camera": asdict(run.camera),
         "cost": asdict(settings.cost),
@@ -157,40 +128,22 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
     return produce("attend", build, params, [mosaic])
 
 
+def _crop_rows(mosaic: StageRef) -> CropRows:
+    """Crop rows as the coarse mosaic shows them, all bands together."""
+    return find_rows(load_mosaic(mosaic.path / "mosaic.zarr").values.mean(axis=-1))
+
+
 def load_plan(attention: StageRef) -> FinePlan:
     """Read the plan of an attention store."""
     plan = json.loads((attention.path / "plan.json").read_text())
-    return FinePlan(
-        [Sweep(**sweep) for sweep in plan["sweeps"]], np.array(plan["seats"], np.intp), plan["seconds"], plan["worth"]
-    )
+    kept = {"sweeps": [Sweep(**sweep) for sweep in plan["sweeps"]], "seats": np.array(plan["seats"], np.intp)}
+    return FinePlan(**(plan | kept))
 
 
-def cut_patches(run: SurveyRun, produce: Produce, attention: StageRef, raw: StageRef) -> StageRef:
-    """Bring every seat that the fine sweeps saw whole onto the scene grid, one patch a seat."""
-
-    def build(path: Path) -> None:
-        plan = load_plan(attention)
-        ordered = _along_scan(run, plan.seats)
-        writer = PatchWriter(
-            path / "patches.zarr", ordered, run.grid.seat_origin(ordered), run.grid.patch,
-            run.scene.wavelength_nm, fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(),
-        )  # fmt: skip
-        sweeps = {cube.sweep.name: cube for cube in captured(raw)}
-        shown = {sweep.name: covered_seats(run.grid, run.camera, [sweep]) for sweep in plan.sweeps}
-        for first in range(0, len(ordered), SEATS_AT_ONCE):
-            seats = ordered[first : first + SEATS_AT_ONCE]
-            near = [sweeps[name] for name, covered in shown.items() if np.isin(seats, covered).any()]
-            writer.write(first, *read_seats(near, run.camera, run.grid, seats, KERNEL))
-            run.report((first + len(seats)) / len(ordered))
-
-    params = {"grid": asdict(run.grid), "kernel": KERNEL}
-    return produce("patches", build, params, [attention, raw])
-
-
-def _along_scan(run: SurveyRun, seats: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Seats in the order in which the sweeps pass them, so that a few of them need few lines at a time."""
-    row, column = np.divmod(seats, run.grid.seat_shape[1])
-    return seats[np.lexsort((column, row) if run.plan.along == "x" else (row, column))]
+def load_orientation(attention: StageRef) -> dict[str, Any]:
+    """Read what the other orientation of the line would have shown, and which way crop rows run."""
+    found: dict[str, Any] = json.loads((attention.path / "orientation.json").read_text())
+    return found
 
 
 def patch_columns(run: SurveyRun, patches: StageRef) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

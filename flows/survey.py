@@ -10,28 +10,38 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from flows import stages
+from flows import placement, stages
 from flows.evaluation import evaluate
+from flows.ground_stage import ground
+from flows.pointing_stage import register_coarse, register_fine
 from flows.receipt import StageRecord, State
 from flows.run import SurveyRun
 from storage.archive import StageRef
 
 STAGES: dict[str, Callable[..., StageRef | None]] = {
     "capture_coarse": stages.capture_coarse,
-    "rectify": stages.rectify,
+    "register_coarse": register_coarse,
+    "locate": placement.locate,
+    "rectify": placement.rectify,
     "attend": stages.attend,
     "capture_fine": stages.capture_fine,
-    "cut_patches": stages.cut_patches,
+    "register_fine": register_fine,
+    "cut_patches": placement.cut_patches,
     "draw_map": stages.draw_map,
+    "ground": ground,
     "evaluate": evaluate,
 }
 TITLES = {
     "capture_coarse": "coarse sweep",
+    "register_coarse": "seams of the coarse sweeps",
+    "locate": "lookup",
     "rectify": "mosaic",
     "attend": "attention and plan",
     "capture_fine": "fine sweeps",
+    "register_fine": "fine sweeps on the mosaic",
     "cut_patches": "fine patches",
     "draw_map": "class map",
+    "ground": "map on the ground",
     "evaluate": "controls (not part of the survey)",
 }
 
@@ -45,27 +55,42 @@ class Step(Protocol):
 
 @dataclass(frozen=True)
 class Products:
-    """The stores that a survey leaves."""
+    """The stores that a survey leaves; None where a stage had nothing to do."""
 
     raw_coarse: StageRef
+    coarse_pointing: StageRef | None
+    lookup: StageRef
     mosaic: StageRef
     attention: StageRef
     raw_fine: StageRef
+    fine_pointing: StageRef | None
     patches: StageRef
     class_map: StageRef
+    ground_map: StageRef | None
     accuracy: StageRef | None
 
 
 def survey(step: Step) -> Products:
     """Sweep the field coarsely, decide where detail changes the map, look there again, and draw the map."""
     raw = _needed(step("capture_coarse"))
-    mosaic = _needed(step("rectify", raw))
+    coarse_pointing = step("register_coarse", raw)
+    lookup = _needed(step("locate", raw, *_there(coarse_pointing)))
+    mosaic = _needed(step("rectify", raw, lookup, *_there(coarse_pointing)))
     attention = _needed(step("attend", mosaic))
     fine = _needed(step("capture_fine", attention))
-    patches = _needed(step("cut_patches", attention, fine))
+    fine_pointing = step("register_fine", fine, mosaic)
+    patches = _needed(step("cut_patches", attention, fine, *_there(fine_pointing)))
     class_map = _needed(step("draw_map", mosaic, patches))
-    accuracy = step("evaluate", mosaic, patches, class_map)
-    return Products(raw, mosaic, attention, fine, patches, class_map, accuracy)
+    ground_map = step("ground", class_map, mosaic)
+    accuracy = step("evaluate", mosaic, patches, class_map, *_there(coarse_pointing))
+    return Products(
+        raw, coarse_pointing, lookup, mosaic, attention, fine, fine_pointing, patches, class_map, ground_map, accuracy
+    )
+
+
+def _there(ref: StageRef | None) -> tuple[StageRef, ...]:
+    """A reference that may be missing, as inputs."""
+    return () if ref is None else (ref,)
 
 
 def _needed(ref: StageRef | None) -> StageRef:

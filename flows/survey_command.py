@@ -5,6 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 from rich.markup import escape
 
+from flows.finding_words import sentences
 from flows.progress import StageProgress
 from flows.publish import Published, publish_run
 from flows.receipt import headline, print_table
@@ -36,6 +37,8 @@ def run_survey(settings: Settings, console: Console) -> Published:
         published = publish_run(runner, products, started)
     print_table(published.receipt, console)
     console.print(escape(headline(published.receipt, published.looked_twice)), highlight=False)
+    for sentence in sentences(published.receipt):
+        console.print(escape(sentence), highlight=False)
     for name in ("report.html", "quicklook.png", "receipt.json"):
         console.print(f"  {escape(str(published.folder / name))}", highlight=False, soft_wrap=True)
     return published

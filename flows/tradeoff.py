@@ -1,4 +1,4 @@
-"""What accuracy costs in time: stages register knob, reference and error measure; one runner prices the settings.
+"""What accuracy costs in time: stages register knobs, each with reference and error measure; one runner prices them.
 
 Processor time and least wall time are taken by interleaved repeats on one thread, so that a loaded machine shifts all
 settings alike and ratios hold. The results name machine, load, threads and versions.
@@ -7,17 +7,13 @@ settings alike and ratios hold. The results name machine, load, threads and vers
 from __future__ import annotations
 
 import math
-import os
-import platform
 import statistics
-import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from importlib import metadata
 from typing import Any, Generic, TypeVar
 
+from flows.tradeoff_machine import Copying, describe_machine, mean_load, one_thread
 from pipeline.errors import SettingsError
 
 Setting = str | float
@@ -26,10 +22,20 @@ Output = TypeVar("Output")
 
 
 @dataclass(frozen=True)
+class Level:
+    """An error below which more exactness is lost in something else, such as a tenth of the noise."""
+
+    name: str
+    error: float
+
+
+@dataclass(frozen=True)
 class Tradeoff(Generic[State, Output]):
     """One knob of one stage. ``run`` alone is timed.
 
     A stage whose time is not spent on this machine (capture) gives it by ``modelled_s``; it then counts as the price.
+    ``levels`` and ``moved_bytes`` say which floors apply: errors that drown in noise, and the bytes that one unit must
+    at least read and write, priced by a copy of memory in the same rounds.
     """
 
     stage: str
@@ -43,6 +49,8 @@ class Tradeoff(Generic[State, Output]):
     judge: Callable[[State, Setting, Output], float]  # -> error
     work: Callable[[State, Setting], float]  # -> count of units that one run handles
     modelled_s: Callable[[State, Setting, Output], float] | None = None
+    levels: Callable[[State], tuple[Level, ...]] | None = None
+    moved_bytes: float | None = None
 
 
 @dataclass(frozen=True)
@@ -84,6 +92,8 @@ class Result:
     seed: int
     machine: Mapping[str, object]
     points: tuple[Point, ...]
+    levels: tuple[Level, ...] = ()
+    memory_floor_ns: float | None = None  # for one unit: its bytes copied and nothing else
 
     def to_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
@@ -93,25 +103,27 @@ class Result:
         return {**asdict(self), "machine": dict(self.machine), "points": points}
 
 
-_REGISTRY: dict[str, Tradeoff[Any, Any]] = {}
+_REGISTRY: dict[tuple[str, str], Tradeoff[Any, Any]] = {}
 
 
 def register(tradeoff: Tradeoff[State, Output]) -> Tradeoff[State, Output]:
-    """Add a trade-off under its stage's name and give it back; the same stage again replaces it."""
-    _REGISTRY[tradeoff.stage] = tradeoff
+    """Add a trade-off under its stage and knob and give it back; the same stage and knob again replaces it."""
+    _REGISTRY[tradeoff.stage, tradeoff.knob] = tradeoff
     return tradeoff
 
 
-def registered() -> dict[str, Tradeoff[Any, Any]]:
-    """Give the trade-offs registered so far, by stage."""
+def registered() -> dict[tuple[str, str], Tradeoff[Any, Any]]:
+    """Give the trade-offs registered so far, by stage and knob."""
     return dict(_REGISTRY)
 
 
-def find_tradeoff(stage: str) -> Tradeoff[Any, Any]:
-    """Give the trade-off of one stage; SettingsError naming those there are."""
-    if stage not in _REGISTRY:
-        raise SettingsError(f"no trade-off for stage {stage!r}; there are: {', '.join(sorted(_REGISTRY)) or 'none'}")
-    return _REGISTRY[stage]
+def find_tradeoffs(stage: str) -> tuple[Tradeoff[Any, Any], ...]:
+    """Give all trade-offs of one stage, in the order registered; SettingsError naming the stages there are."""
+    found = tuple(tradeoff for (its, _), tradeoff in _REGISTRY.items() if its == stage)
+    if not found:
+        stages = ", ".join(sorted({its for its, _ in _REGISTRY})) or "none"
+        raise SettingsError(f"no trade-off for stage {stage!r}; there are: {stages}")
+    return found
 
 
 def measure_tradeoff(tradeoff: Tradeoff[State, Output], *, repeats: int = 5, seed: int = 0) -> Result:
@@ -124,14 +136,17 @@ def measure_tradeoff(tradeoff: Tradeoff[State, Output], *, repeats: int = 5, see
     if repeats < 1:
         raise SettingsError(f"repeats must be at least 1, got {repeats}")
     state = tradeoff.prepare(seed)
+    copying = None if tradeoff.moved_bytes is None else Copying()
     with one_thread() as threads:
-        load_before = _load()
+        load_before = mean_load()
         judged = [_judge(tradeoff, state, setting) for setting in tradeoff.settings]
-        clocks = _time_in_turn(tradeoff, state, repeats)
-        machine = describe_machine(threads) | {"load_before": load_before, "load_after": _load()}
+        clocks = _time_in_turn(tradeoff, state, repeats, copying)
+        machine = describe_machine(threads) | {"load_before": load_before, "load_after": mean_load()}
     points = [_point(tradeoff, state, number, judged[number], clocks) for number in range(len(tradeoff.settings))]
     named = (tradeoff.stage, tradeoff.knob, tradeoff.error, tradeoff.unit, tradeoff.reference)
-    return Result(*named, repeats, seed, machine, mark_pareto(points))
+    levels = () if tradeoff.levels is None else tradeoff.levels(state)
+    floor = None if copying is None else copying.ns_per_byte * (tradeoff.moved_bytes or 0)
+    return Result(*named, repeats, seed, machine, mark_pareto(points), levels, floor)
 
 
 def _judge(tradeoff: Tradeoff[State, Output], state: State, setting: Setting) -> tuple[float, float | None]:
@@ -141,11 +156,15 @@ def _judge(tradeoff: Tradeoff[State, Output], state: State, setting: Setting) ->
     return float(tradeoff.judge(state, setting, output)), modelled
 
 
-def _time_in_turn(tradeoff: Tradeoff[State, Output], state: State, repeats: int) -> list[list[tuple[float, float]]]:
+def _time_in_turn(
+    tradeoff: Tradeoff[State, Output], state: State, repeats: int, copying: Copying | None
+) -> list[list[tuple[float, float]]]:
     """(processor, wall) seconds by setting and round; every round starts at another setting."""
     count = len(tradeoff.settings)
     clocks: list[list[tuple[float, float]]] = [[] for _ in range(count)]
     for turn in range(repeats):
+        if copying is not None:
+            copying.run()
         for offset in range(count):
             number = (turn + offset) % count
             wall, cpu = time.perf_counter(), time.process_time()
@@ -194,45 +213,3 @@ def best_within(result: Result, seconds: float) -> Point | None:
     """Give the point of least error whose price is at most ``seconds``; None where no setting is that cheap."""
     cheap = [point for point in result.points if point.price_s <= seconds and math.isfinite(point.error)]
     return min(cheap, key=lambda point: point.error, default=None)
-
-
-@contextmanager
-def one_thread() -> Iterator[int]:
-    """Hold torch, where a stage has loaded it, to one thread; gives the number of threads in use."""
-    # Stages own torch; flows must neither import it nor pay for it where no stage needs it.
-    torch = sys.modules.get("torch")
-    if torch is None:
-        yield 1
-        return
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield torch.get_num_threads()
-    finally:
-        torch.set_num_threads(before)
-
-
-def describe_machine(threads: int) -> dict[str, object]:
-    """Processor, cores, system, threads in use and versions of what computes."""
-    return {
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "system": f"{platform.system()} {platform.machine()}",
-        "python": platform.python_version(),
-        "threads": threads,
-        "versions": {name: metadata.version(name) for name in ("numpy", "scipy", "torch")},
-    }
-
-
-def _processor() -> str:
-    """The processor's name as the system knows it."""
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as lines:  # noqa: PTH123
-            return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown")
-    except OSError:
-        return platform.processor() or "unknown"
-
-
-def _load() -> float | None:
-    """Mean number of running processes over the last minute; None where the system does not say."""
-    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None

@@ -64,9 +64,7 @@ def _prepare(seed: int) -> Field:
     columns = columns_of_all_seats(source, full, grid, weights, memory=2**31, kernel="catmull-rom")
     seen = glance(weights, mosaic, scene.wavelength_nm, grid)
     labels = np.asarray(scene.labels)
-    return Field(
-        weights, grid, camera, along, CostModel().seconds(coarse, camera), full_s, seen, columns, labels
-    )
+    return Field(weights, grid, camera, along, CostModel().seconds(coarse, camera), full_s, seen, columns, labels)
 
 
 def _run(state: Field, budget: Setting) -> Surveyed:

@@ -9,19 +9,24 @@ from typing import Any
 from rich.console import Console
 
 import flows.tradeoff_budget
-import flows.tradeoff_resample  # noqa: F401 - registers its entry
-from flows.tradeoff import find_tradeoff, measure_tradeoff, registered
-from flows.tradeoff_figures import draw_tradeoffs, print_tradeoff
+import flows.tradeoff_line_model
+import flows.tradeoff_overlap
+import flows.tradeoff_resample
+import flows.tradeoff_scan_step
+import flows.tradeoff_tie_spacing  # noqa: F401 - each registers its entry
+from flows.tradeoff import find_tradeoffs, measure_tradeoff, registered
+from flows.tradeoff_figures import draw_tradeoffs
+from flows.tradeoff_table import print_tradeoff
 from pipeline.errors import ArchiveError, SettingsError
 
 
 def run_tradeoff(stage: str | None, out: Path, repeats: int, seed: int, console: Console) -> dict[str, Any]:
-    """Measure one stage's trade-off, or all; write tradeoff.json and tradeoff.png into ``out`` and print the tables."""
+    """Measure the trade-offs of one stage, or all; write tradeoff.json and .png into ``out`` and print the tables."""
     if repeats < 1:
         raise SettingsError(f"--repeats must be at least 1, got {repeats}")
     if seed < 0:
         raise SettingsError(f"--seed must be 0 or more, got {seed}")
-    wanted = [find_tradeoff(stage)] if stage else list(registered().values())
+    wanted = find_tradeoffs(stage) if stage else tuple(registered().values())
     results = []
     for tradeoff in wanted:
         with console.status(f"measuring {tradeoff.stage}: {tradeoff.knob}"):

@@ -8,12 +8,15 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tradeoff import Setting, Tradeoff, register
+from flows.tradeoff import Level, Setting, Tradeoff, register
+from pipeline.camera import LineCamera
 from pipeline.rectify.resample import Kernel, resample
 
 SIDE, BANDS, POINTS = 256, 64, 40_000
 PERIODS_PX = (4.0, 40.0)
 WAVES = 24
+CONTRAST = 0.2  # standard deviation of the scene over its mean, which fills half of the converter's range
+RAW_AND_RESULT = 6.0  # bytes: a uint16 read and a float32 written
 
 
 @dataclass(frozen=True)
@@ -41,10 +44,10 @@ class Scattered:
     truth: NDArray[np.float64]  # (n, band)
 
 
-def draw_waves(seed: int, bands: int = BANDS) -> Waves:
+def draw_waves(seed: int, bands: int = BANDS, periods_px: tuple[float, float] = PERIODS_PX) -> Waves:
     """Waves of random directions, their periods even in logarithm."""
     rng = np.random.default_rng(seed)
-    period = np.exp(rng.uniform(np.log(PERIODS_PX[0]), np.log(PERIODS_PX[1]), WAVES))
+    period = np.exp(rng.uniform(np.log(periods_px[0]), np.log(periods_px[1]), WAVES))
     angle = rng.uniform(0, np.pi, WAVES)
     frequency = np.stack([np.sin(angle), np.cos(angle)], axis=-1) / period[:, None]
     return Waves(frequency, rng.standard_normal((WAVES, bands)), rng.standard_normal((WAVES, bands)))
@@ -68,9 +71,20 @@ def _judge(state: Scattered, _kernel: Setting, out: NDArray[np.float32]) -> floa
     return float(np.sqrt(np.mean((out - state.truth) ** 2)) / np.std(state.truth))
 
 
+def noise_levels(camera: LineCamera) -> tuple[Level, ...]:
+    """A tenth of the noise and half a step of the converter, over the scene's standard deviation."""
+    electrons = camera.full_well_e / 2
+    scene = CONTRAST * electrons
+    noise = np.sqrt(electrons + camera.read_noise_e**2)
+    return (
+        Level("0.1 σ of noise", 0.1 * float(noise) / scene),  # noqa: RUF001
+        Level("0.5 LSB", 0.5 * camera.electrons_per_dn / scene),
+    )
+
+
 RESAMPLE = register(
     Tradeoff(
-        stage="resample",
+        stage="rectify",
         knob="kernel",
         error="rmse / standard deviation",
         unit="px*band",
@@ -80,5 +94,7 @@ RESAMPLE = register(
         run=_run,
         judge=_judge,
         work=lambda state, _kernel: float(state.truth.size),
+        levels=lambda _state: noise_levels(LineCamera()),
+        moved_bytes=RAW_AND_RESULT,
     )
 )

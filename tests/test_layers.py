@@ -35,6 +35,7 @@ DISTRIBUTIONS = {
     "PIL": "pillow",
     "serial": "pyserial",
     "skimage": "scikit-image",
+    "odc": "odc-geo",
     "cv2": "opencv-contrib-python-headless",
 }
 FILE_MODULES = {"pathlib", "shutil", "tempfile", "glob", "io", "fileinput"}

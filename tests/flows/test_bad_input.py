@@ -92,7 +92,7 @@ REFUSED = {
     "unknown source": (2, "--source rig", "use --source sim"),
     "exposure in seconds": (2, "--exposure-ms 0.1", "--exposure-ms must be a number from 0.5.*then write 100"),
     "farm beyond memory": (2, "--scene farm --size 60000x60000", "takes about .* GB of memory, this machine has"),
-    "unknown effect": (2, "--effects slit,fog", "some of slit,smear,shot,read; got 'slit,fog'"),
+    "unknown effect": (2, "--effects slit,fog", "some of slit,smear,throughput,shot,read; got 'slit,fog'"),
 }
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+import tomllib
+from dataclasses import asdict, fields, replace
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from hypothesis import given
@@ -11,14 +13,17 @@ from hypothesis import strategies as st
 
 from flows import setting_values
 from flows import settings as settings_module
-from flows.settings import Settings, load_settings, parse_settings
+from flows.settings import MapChoice, Settings, load_settings, parse_settings
 from models import policies
 from pipeline.camera import LineCamera
 from pipeline.errors import BudgetError, SettingsError
+from pipeline.ground import RigPose
+from pipeline.rectify.resample import Kernel
 from pipeline.scan import CostModel
 from pipeline.simulator.instrument import ALL_EFFECTS
 
 EXAMPLE = Path(__file__).parents[2] / "survey.example.toml"
+POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 30, "tilt_deg": 40, "height_m": 12}
 
 
 @pytest.fixture
@@ -45,12 +50,13 @@ def test_every_field_of_the_dataclasses_can_be_set():
     assert {item.name for item in fields(Settings)} == set(settings_module._SURVEY)
     for name, (make, spans) in settings_module._TABLES.items():
         assert {item.name for item in fields(make)} == set(spans), name
-        defaults = getattr(Settings(), name)
-        parse_settings({name: {item.name: getattr(defaults, item.name) for item in fields(make)}})
+    for name in ("camera", "cost"):
+        assert parse_settings({name: asdict(getattr(Settings(), name))}) == Settings()
 
 
 def test_words_are_those_of_the_parts_that_use_them():
-    """Policies and effects that the settings accept are exactly those that exist."""
+    """Policies, effects and kernels that the settings accept are exactly those that exist."""
+    assert set(settings_module.KERNELS) == set(get_args(Kernel))
     assert settings_module.POLICIES == policies.POLICIES
     assert set(setting_values.EFFECTS) == ALL_EFFECTS
 
@@ -86,6 +92,10 @@ def test_example_in_the_project_is_valid():
         ("[camera]\nexposure = 100", "'camera.exposure_ms'"),
         ("[camra]\nbits = 12", "'camera'"),
         ("exposure_ms = 100", "'camera.exposure_ms'"),
+        ("[pose]\nlat = 52.1", "'pose.lat_deg'"),
+        ("height_m = 12", "'pose.height_m'"),
+        ("[map]\nresolution = 0.1", "'map.resolution_m'"),
+        ("pointing = 50", "'pointing_px'"),
     ],
 )
 def test_unknown_key_is_refused_with_the_nearest(toml, line, near):
@@ -104,6 +114,9 @@ def test_unknown_key_is_refused_with_the_nearest(toml, line, near):
         ({"cost": {"slew_s": 50}}, "s, got 50; was it given in milliseconds.* 0.05"),
         ({"wavelengths": [0.66, 0.8]}, "nm, got 0.66; was it given in micrometres.* 660"),
         ({"camera": {"exposure_ms": float("nan")}}, "got nan$"),
+        ({"pose": POSE | {"lat_deg": 521000000}}, "90 deg, got 521000000; was it given in 1e-7 degrees.* 52.1"),
+        ({"pose": POSE | {"height_m": 120_000}}, "20000 m, got 120000; was it given in millimetres.* 120"),
+        ({"map": {"resolution_m": 1e-5}}, "m, got 1e-05; was it given in kilometres.* 0.01"),
     ],
 )
 def test_unit_mistakes_are_refused_with_a_guess(table, words):
@@ -153,7 +166,7 @@ def test_memory_reads_units(text, count):
         ({"policy": "entropi"}, "one of entropy, sobel, random, mask"),
         ({"policy": "mask"}, "needs a mask file"),
         ({"mask": "m.png"}, "policy 'mask' only"),
-        ({"effects": "smear,glare"}, "some of slit,smear,shot,read"),
+        ({"effects": "smear,glare"}, "some of slit,smear,throughput,shot,read"),
         ({"bands": [0, 0]}, "names a band twice"),
         ({"bands": "0;1"}, "counted from 0"),
         ({"bands": [0, 1], "wavelengths": [660]}, "each of the 2 bands, got 1"),
@@ -163,12 +176,41 @@ def test_memory_reads_units(text, count):
         ({"camera": 3}, "must be a table"),
         ({"camera": {"dark_dn": 5000}}, "leaves no room"),
         ({"out": " "}, "text that is not empty"),
+        ({"kernel": "cubic"}, "one of catmull-rom, bilinear, nearest; got 'cubic'"),
+        ({"pointing_px": -1}, "from 0 to 300 px, got -1"),
+        ({"pose": {"lat_deg": 52.1, "tilt_deg": 40}}, r"\[pose\] lacks lon_deg, heading_deg; give every one"),
+        ({"pose": POSE | {"range_m": 20}}, r"\[pose\]: .* height_m or range_m, one of the two; got height_m = 12"),
+        ({"pose": POSE | {"height_m": None}}, "needs height_m or range_m, one of the two"),
+        ({"pose": POSE | {"tilt_deg": 91}}, "tilt_deg' must be a number from -90 to 90 deg, got 91"),
+        ({"pose": POSE | {"slope_deg": float("inf")}}, "slope_deg' must be a number from 0 to 80 deg"),
+        ({"map": {"epsg": 32632}}, r"\[map\] .* where the rig stands: give \[pose\]"),
+        ({"pose": POSE, "map": {"epsg": "UTM 32"}}, "from 1024 to 32767, got 'UTM 32'; the number after EPSG:"),
     ],
 )
 def test_wrong_values_are_refused(table, words):
     """Each wrong value is refused by a message that says what is wanted."""
     with pytest.raises(SettingsError, match=words):
         parse_settings(table)
+
+
+def test_a_pose_and_its_map_are_read(toml):
+    """The tables become the pose and the choice of the map; without them there is no pose."""
+    found = load_settings(toml("[pose]\nlon_deg = -3.25\nlat_deg = 57\nheading_deg = 350\ntilt_deg = 20\nrange_m = 40"))
+    assert found.pose == RigPose(lon_deg=-3.25, lat_deg=57.0, heading_deg=350.0, tilt_deg=20.0, range_m=40.0)
+    assert (found.map, Settings().pose) == (MapChoice(), None)
+    found = parse_settings({"pose": POSE, "map": {"epsg": 25832, "resolution_m": 0.05}})
+    assert found.map == MapChoice(25832, 0.05)
+
+
+def test_the_commented_pose_of_the_example_is_valid():
+    """Taking off the comment signs of [pose] and [map] gives a posed survey (with one of height and range)."""
+    text = EXAMPLE.read_text(encoding="utf-8")
+    lines = [line.removeprefix("# ") for line in text[text.index("# [pose]") :].splitlines()]
+    table = tomllib.loads("\n".join(line for line in lines if not line.startswith("range_m")))
+    found = parse_settings(table)
+    assert found.pose is not None
+    assert (found.pose.height_m, found.map.epsg) == (12.0, 32632)
+    assert set(table["pose"]) | {"range_m"} == {item.name for item in fields(RigPose)}
 
 
 def test_file_that_cannot_be_read_is_one_message(toml, tmp_path):
@@ -196,8 +238,9 @@ def test_text_and_lists_say_the_same():
     memory=st.integers(2**28, 2**40),
     exposure=st.floats(0.5, 10_000),
     slew=st.floats(0, 10),
+    posed=st.booleans(),
 )
-def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposure, slew):
+def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposure, slew, posed):
     """`parse_settings` undoes `to_dict`, so that a receipt's settings can be run again."""
     settings = Settings(
         budget=budget,
@@ -206,5 +249,8 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
         memory=memory,
         camera=LineCamera(exposure_ms=exposure),
         cost=CostModel(slew_s=slew),
+        pose=RigPose(**POSE) if posed else None,
+        map=MapChoice(resolution_m=0.1 if posed else None),
+        pointing_px=slew,
     )
     assert parse_settings(settings.to_dict()) == settings

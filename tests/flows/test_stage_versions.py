@@ -17,28 +17,42 @@ from flows.stages import VERSIONS
 
 ROOT = Path(__file__).parents[2]
 RECORD = Path(__file__).with_name("stage_digests.json")
-GEOMETRY = ("pipeline/camera.py", "pipeline/mirror.py", "pipeline/scan.py", "pipeline/coverage.py", "pipeline/grid.py")
+GEOMETRY = ("pipeline/camera.py", "pipeline/mirror.py", "pipeline/scan.py", "pipeline/coverage.py", "pipeline/grid.py",
+            "pipeline/vector_memory.py")  # fmt: skip
 RECTIFY = (*GEOMETRY, "pipeline/rectify")
 READ = ("models/spectral.py", "models/tokens.py", "models/encoder.py", "models/patches.py", "models/segmenter.py",
         "models/inference.py", "models/weights.py", "pipeline/grid.py")  # fmt: skip
+PLANNING = ("pipeline/planning.py", "pipeline/runs.py", "pipeline/covering.py", "pipeline/spending.py",
+            "pipeline/strips.py", "pipeline/orientation.py", "pipeline/crop_rows.py")  # fmt: skip
+GATHER = ("pipeline/rectify/resample.py", "pipeline/rectify/kernels.py", "pipeline/rectify/line_table.py",
+          "pipeline/rectify/alignment.py")  # fmt: skip
 SOURCES = {
-    "capture": (*GEOMETRY, "pipeline/simulator", "pipeline/rectify/resample.py", "storage/cubes.py"),
-    "rectify": (*RECTIFY, "storage/mosaics.py"),
-    "attend": (*READ, "models/policies.py", "pipeline/planning.py", "pipeline/runs.py", "storage/attention.py"),
-    "patches": (*RECTIFY, "pipeline/planning.py", "storage/patches.py"),
+    "capture": (*GEOMETRY, *GATHER, "pipeline/simulator", "storage/cubes.py"),
+    "register": (*RECTIFY, "flows/pointing_stage.py"),
+    "locate": (*RECTIFY, "storage/lookups.py"),
+    "rectify": (*RECTIFY, "storage/mosaics.py", "storage/tile_work.py"),
+    "attend": (*READ, *PLANNING, "models/policies.py", "storage/attention.py"),
+    "patches": (*RECTIFY, "pipeline/strips.py", "storage/patches.py"),
     "segment": (*READ, "storage/class_maps.py"),
-    "evaluate": (*READ, *RECTIFY, "models/controls.py", "models/metrics.py", "models/policies.py",
-                 "pipeline/planning.py", "pipeline/savings.py", "pipeline/selection.py",
-                 "flows/evaluation.py", "flows/full_look.py"),
+    "ground": ("pipeline/ground.py", "pipeline/ground_grid.py", "pipeline/projection.py", *GATHER,
+               "storage/georeference.py", "storage/ground_maps.py", "flows/ground_stage.py", "flows/panels.py"),
+    "evaluate": (*READ, *RECTIFY, *PLANNING, "models/controls.py", "models/metrics.py", "models/policies.py",
+                 "pipeline/savings.py", "pipeline/selection.py", "flows/evaluation.py", "flows/full_look.py"),
 }  # fmt: skip
-STAGES_FILE = ROOT / "flows" / "stages.py"
-FUNCTIONS = {  # of flows/stages.py
-    "capture": ("_capture", "_capture_sweep"),
-    "rectify": ("rectify", "_preview"),
-    "attend": ("glance_at", "attend"),
-    "patches": ("load_plan", "captured", "cut_patches", "_along_scan"),
-    "segment": ("glance_at", "patch_columns", "draw_map"),
-    "evaluate": ("glance_at", "patch_columns"),
+STAGES_FILE, PLACEMENT = "flows/stages.py", "flows/placement.py"
+FUNCTIONS: dict[str, dict[str, tuple[str, ...]]] = {  # of files that several stages share
+    "capture": {STAGES_FILE: ("_capture", "_capture_sweep")},
+    "register": {PLACEMENT: ("Sighted", "sighted"), STAGES_FILE: ("captured",)},
+    "locate": {PLACEMENT: ("Sighted", "sighted", "locate"), STAGES_FILE: ("captured",)},
+    "rectify": {PLACEMENT: ("Sighted", "sighted", "rectify", "_with_tables", "_preview"), STAGES_FILE: ("captured",)},
+    "attend": {STAGES_FILE: ("glance_at", "attend", "_crop_rows")},
+    "patches": {
+        PLACEMENT: ("Sighted", "sighted", "cut_patches", "_along_scan"),
+        STAGES_FILE: ("load_plan", "captured"),
+    },
+    "segment": {STAGES_FILE: ("glance_at", "patch_columns", "draw_map")},
+    "ground": {},
+    "evaluate": {STAGES_FILE: ("glance_at", "patch_columns")},
 }
 
 
@@ -49,9 +63,11 @@ def digest_of(stage: str) -> str:
         path = ROOT / name
         for file in sorted(path.glob("*.py")) if path.is_dir() else [path]:
             digest.update(ast.dump(_bare_code(file)).encode())
-    functions = {node.name: node for node in _bare_code(STAGES_FILE).body if isinstance(node, ast.FunctionDef)}
-    for name in FUNCTIONS[stage]:
-        digest.update(ast.dump(functions[name]).encode())
+    for shared, names in FUNCTIONS[stage].items():
+        nodes = [node for node in _bare_code(ROOT / shared).body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
+        found = {node.name: node for node in nodes}
+        for name in names:
+            digest.update(ast.dump(found[name]).encode())
     return digest.hexdigest()[:20]
 
 

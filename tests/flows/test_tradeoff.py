@@ -1,4 +1,4 @@
-"""Trade-offs: what is timed and judged, which points win, and the two that a user asks for."""
+"""Trade-offs: what is timed and judged, which points win, which floors apply, and the entries of rectification."""
 
 from __future__ import annotations
 
@@ -16,17 +16,26 @@ from rich.console import Console
 
 from flows import tradeoff as tradeoff_module
 from flows.tradeoff import (
+    Level,
     Point,
+    Result,
     Tradeoff,
     best_within,
     cheapest_within,
-    find_tradeoff,
+    find_tradeoffs,
     mark_pareto,
     measure_tradeoff,
     register,
+    registered,
 )
-from flows.tradeoff_figures import draw_tradeoffs, print_tradeoff
-from flows.tradeoff_resample import RESAMPLE, draw_waves
+from flows.tradeoff_figures import draw_tradeoffs
+from flows.tradeoff_line_model import LINE_MODEL
+from flows.tradeoff_overlap import OVERLAP
+from flows.tradeoff_resample import RESAMPLE, draw_waves, noise_levels
+from flows.tradeoff_scan_step import SCAN_STEP
+from flows.tradeoff_table import print_tradeoff
+from flows.tradeoff_tie_spacing import TIE_SPACING
+from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
 
 
@@ -119,12 +128,21 @@ def test_one_number_finds_the_setting():
     assert best_within(result, 0.5) is None
 
 
-def test_registry_finds_by_stage(monkeypatch):
-    """A stage is found by its name; an unknown one is refused with the names there are."""
+def test_registry_finds_all_knobs_of_a_stage(monkeypatch):
+    """A stage gives its knobs in their order; the same knob again replaces; an unknown stage names those there are."""
     monkeypatch.setattr(tradeoff_module, "_REGISTRY", {})
-    assert register(SERIES) is find_tradeoff("series")
-    with pytest.raises(SettingsError, match="no trade-off for stage 'serie'; there are: series"):
-        find_tradeoff("serie")
+    first, other = register(SERIES), register(replace(SERIES, knob="order"))
+    register(replace(SERIES, stage="plan"))
+    assert find_tradeoffs("series") == (first, other)
+    again = register(replace(SERIES, unit="term"))
+    assert find_tradeoffs("series") == (again, other)
+    assert list(registered()) == [("series", "terms"), ("series", "order"), ("plan", "terms")]
+    with pytest.raises(SettingsError, match="no trade-off for stage 'serie'; there are: plan, series"):
+        find_tradeoffs("serie")
+
+
+def test_no_repeats_are_refused():
+    """At least one timed round is needed."""
     with pytest.raises(SettingsError, match="at least 1, got 0"):
         measure_tradeoff(SERIES, repeats=0)
 
@@ -145,13 +163,82 @@ def test_waves_are_what_they_claim():
     np.testing.assert_array_equal(waves.at(np.ones((1, 2))), draw_waves(3).at(np.ones((1, 2))))
 
 
-def test_resampling_kernels_rank_by_error(tmp_path):
-    """More taps are more exact on 4-40 px content, and the table and plot show all three."""
-    result = measure_tradeoff(RESAMPLE, repeats=1)
-    nearest, bilinear, cubic = (point.error for point in result.points)
-    assert 0 < cubic < 0.5 * bilinear < 0.5 * nearest < 0.2
+def printed(result: Result) -> str:
+    """The table as a terminal shows it."""
     console = Console(file=io.StringIO(), width=140)
     print_tradeoff(result, console)
+    return console.file.getvalue()
+
+
+def test_floors_are_those_that_an_entry_declares(tmp_path):
+    """Levels of error and the time of copying the bytes are in the result, the table and the plot; or in none."""
+    levels = (Level("a thousandth", 1e-3), Level("nothing", 1e-9))
+    floored = replace(SERIES, settings=(10.0, 4000.0), levels=lambda truth: levels, moved_bytes=6.0)
+    result = measure_tradeoff(floored, repeats=1)
+    assert result.levels == levels
+    assert result.memory_floor_ns > 0
+    words = printed(result)
+    assert "within a thousandth (0.001): 4000.0, " in words
+    assert "within nothing (1e-09): no setting" in words
+    assert "copying the bytes of a sum alone" in words
     draw_tradeoffs(tmp_path / "plot.png", [result])
-    assert all(name in console.file.getvalue() for name in RESAMPLE.settings)
+    bare = measure_tradeoff(SERIES, repeats=1)
+    assert (bare.levels, bare.memory_floor_ns) == ((), None)
+    assert "within" not in printed(bare)
+
+
+@pytest.mark.parametrize("errors", [(0.0, 0.1, 3.0), (0.0, 0.0), (math.inf, 0.5), (math.nan, math.nan)])
+def test_plots_take_errors_of_zero_and_none_at_all(tmp_path, errors):
+    """Exact settings and failed ones neither stop the plot nor warn."""
+    points = mark_pareto([make_point(error, 1.0 + number) for number, error in enumerate(errors)])
+    result = replace(measure_tradeoff(SERIES, repeats=1), points=points, levels=(Level("half", 0.5),))
+    draw_tradeoffs(tmp_path / "plot.png", [result] * 4)
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_noise_levels_follow_the_camera():
+    """Half the converter's range at a contrast of 0.2: a tenth of shot and read noise, and half a step."""
+    camera = LineCamera()
+    electrons = camera.full_well_e / 2
+    noise, step = (level.error * 0.2 * electrons for level in noise_levels(camera))
+    assert 10 * noise == pytest.approx(math.sqrt(electrons + 20**2))
+    assert step == pytest.approx(2.5)
+
+
+def test_resampling_kernels_rank_by_error():
+    """More taps are more exact on 4-40 px content; nearest errs by 24 % of the scene's deviation (erratum E10)."""
+    result = measure_tradeoff(RESAMPLE, repeats=1)
+    nearest, bilinear, cubic = (point.error for point in result.points)
+    assert (nearest, bilinear, cubic) == pytest.approx((0.24, 0.093, 0.029), rel=0.03)
+    assert all(name in printed(result) for name in RESAMPLE.settings)
+
+
+def test_line_models_get_better_to_the_exact():
+    """Over the field of 10240 x 10240 px no rotation errs by 307 px, the slope by 185, exact rays by nothing."""
+    errors = [point.error for point in measure_tradeoff(LINE_MODEL, repeats=1).points]
+    assert errors[:4] == pytest.approx([307, 185, 183, 12.2], rel=0.01)
+    assert errors[4] == 0
+
+
+def test_ties_sixteen_apart_keep_the_goal():
+    """The error grows with the square of the distance, stays below 2e-3 px at 16, and is rounding without ties."""
+    errors = {point.setting: point.error for point in measure_tradeoff(TIE_SPACING, repeats=1).points}
+    assert errors[1] < 1e-9
+    assert errors[16] < 2e-3
+    assert errors[64] / errors[16] == pytest.approx(16, rel=0.1)
+
+
+def test_wider_overlaps_find_shifts_better():
+    """Every overlap finds the known shifts to 0.1 px, and the widest at least three times better than the narrowest."""
+    errors = [point.error for point in measure_tradeoff(OVERLAP, repeats=1).points]
+    assert max(errors) < 0.1
+    assert errors[-1] < errors[0] / 3
+
+
+def test_fewer_lines_take_less_time_and_show_less():
+    """Beyond the slit's width the error grows with the scan's step, while the modelled seconds shrink."""
+    result = measure_tradeoff(SCAN_STEP, repeats=1)
+    seconds, errors = [point.price_s for point in result.points], [point.error for point in result.points]
+    assert seconds == sorted(seconds, reverse=True)
+    assert errors[1:] == sorted(errors[1:])
+    assert errors[0] == pytest.approx(result.levels[0].error, rel=0.1)

@@ -1,0 +1,72 @@
+"""What a survey found out on the way: how it was planned, where the mirror looked, lines that were lost, hectares."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flows.ground_stage import STORE
+from flows.placement import line_facts
+from flows.pointing_stage import load_registration
+from flows.run import SurveyRun
+from flows.stages import load_orientation, load_plan
+from flows.survey import Products
+from storage.archive import StageRef
+from storage.ground_maps import load_ground_map
+
+
+def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
+    """Gather ``plan`` and the parts of the receipt that not every survey has: ``pointing``, ``ground``, ``lines``."""
+    found: dict[str, Any] = {"plan": _plan(products.attention)}
+    passes = {"coarse": products.coarse_pointing, "fine": products.fine_pointing}
+    pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
+    if pointing:
+        found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
+    if products.ground_map is not None:
+        found["ground"] = _ground(products.ground_map)
+    troubled = {name: facts for name, facts in line_facts(products.mosaic).items() if any(facts.values())}
+    if troubled:
+        found["lines"] = troubled
+    return found
+
+
+def _plan(attention: StageRef) -> dict[str, Any]:
+    """How the fine pass was laid out, and what the other orientation would have shown."""
+    plan, turned = load_plan(attention), load_orientation(attention)
+    return {
+        "kind": plan.kind,
+        "reason": plan.reason,
+        "lines": plan.lines,
+        "seconds": plan.seconds,
+        "score_share": plan.worth / plan.wanted_worth if plan.wanted_worth else None,
+        "score_per_second": plan.worth_per_second,
+        "full_seconds": plan.full_seconds,
+        "out_of_reach": plan.out_of_reach,
+        "orientation": turned,
+    }
+
+
+def _pointing(ref: StageRef) -> dict[str, Any]:
+    """Corrections of one pass, and what its windows say of them."""
+    record = load_registration(ref)
+    left = np.array([window["residual_px"] for window in record["windows"] if window.get("residual_px")])
+    return {
+        "held": record["reference"],
+        "sweeps": {name: one["offset_px"] for name, one in record["sweeps"].items()},
+        "residual_rms_px": float(np.sqrt(np.mean(left**2))) if left.size else None,
+        "not_found": record["untied"],
+        "too_narrow": record["narrow"],
+    }
+
+
+def _ground(ref: StageRef) -> dict[str, Any]:
+    """The map's grid and what each class covers on the ground."""
+    found = load_ground_map(ref.path / STORE)
+    box = found.geobox
+    return {
+        "crs": str(box.crs),
+        "resolution_m": abs(float(box.resolution.x)),
+        "shape": [int(size) for size in box.shape],
+        "areas_ha": {name: area["ha"] for name, area in found.areas.items()},
+    }

@@ -1,0 +1,191 @@
+"""Where the lines of a capture lie, and what they show on the grid: registration, lookup, mosaic, patches."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.panels import choose_bands
+from flows.run import SurveyRun
+from flows.stages import SEATS_AT_ONCE, Produce, captured, load_plan, write_json
+from pipeline.errors import ShapeError
+from pipeline.rectify.alignment import SweepShift, no_shifts
+from pipeline.rectify.line_cache import LineCache
+from pipeline.rectify.line_numbers import LineNumbers, number_lines
+from pipeline.rectify.placed import PixelGrid, Placed, place
+from pipeline.rectify.region import read_seats
+from pipeline.rectify.ties import TieTable
+from pipeline.rectify.tracks import Track
+from storage.archive import StageRef
+from storage.cubes import RawCube
+from storage.lookups import open_lookup, path_digest, write_lookup
+from storage.mosaics import MosaicWriter
+from storage.patches import PatchWriter
+from storage.tile_work import MosaicWork, Thumbnail, write_mosaic
+
+QUICKLOOK_PX = 512
+CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the memory
+
+Tables = Mapping[str, Sequence[tuple[Track, TieTable]]]
+
+
+@dataclass(frozen=True)
+class Sighted:
+    """One captured sweep, which of its lines may be believed, and its corrections."""
+
+    cube: RawCube
+    numbers: LineNumbers
+    shift: SweepShift
+    gain: NDArray[np.float32] | None
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """(line,) valid lines with a time stamp of their own."""
+        return self.cube.valid_line & self.numbers.usable
+
+    @property
+    def shift_px(self) -> NDArray[np.float64]:
+        """(line, 2) pointing corrections along the line and the scan [px]."""
+        return self.shift.of_lines(len(self.cube.time_s))
+
+    def placed(self, run: SurveyRun, grid: PixelGrid | None = None) -> Placed:
+        """Find where its lines lie."""
+        return place(self.cube, run.camera, grid=grid, usable=self.usable, shift_px=self.shift_px, gain=self.gain)
+
+    def facts(self) -> dict[str, int]:
+        """Lines that were lost, sent twice, out of order or late."""
+        found = self.numbers
+        counts = {"lost": found.lost, "repeated": found.repeated, "backward": found.backward, "late": found.late}
+        return counts | {"invalid": int(np.count_nonzero(~self.cube.valid_line))}
+
+
+def sighted(run: SurveyRun, raw: StageRef, registration: StageRef | None) -> list[Sighted]:
+    """Open the sweeps of a capture with what registration found of them."""
+    cubes = captured(raw)
+    shifts = {shift.name: shift for shift in no_shifts([cube.sweep.name for cube in cubes])}
+    gains: dict[str, NDArray[np.float32]] = {}
+    if registration is not None:
+        found = json.loads((registration.path / "registration.json").read_text())
+        for name, one in found["sweeps"].items():
+            shifts[name] = SweepShift(name, np.array(one["offset_px"]), np.array(one["drift_px_per_line"]))
+            if one["gain"] is not None:
+                gains[name] = np.array(one["gain"], np.float32)
+    frame_s = run.camera.frame_ms * 1e-3
+    return [
+        Sighted(cube, number_lines(cube.time_s, frame_s), shifts[cube.sweep.name], gains.get(cube.sweep.name))
+        for cube in cubes
+    ]
+
+
+def locate(run: SurveyRun, produce: Produce, raw: StageRef, *registration: StageRef) -> StageRef:
+    """Look up where each coarse pixel was seen: a table that every survey along the same path shares."""
+    grid = PixelGrid.of_scene(run.grid, run.grid.factor)
+    sweeps = sighted(run, raw, _only(registration))
+    camera = {name: getattr(run.camera, name) for name in ("samples", "pitch_um", "focal_length_mm")}
+    params = {
+        "camera": camera,
+        "grid": asdict(grid),
+        "paths": {
+            one.cube.sweep.name: {
+                "path": path_digest(one.cube.position, one.usable, one.shift_px),
+                **{name: getattr(one.cube.sweep, name) for name in ("along", "step", "binning")},
+            }
+            for one in sweeps
+        },
+    }
+
+    def build(path: Path) -> None:
+        tables: dict[str, list[tuple[Track, TieTable]]] = {}
+        for number, one in enumerate(sweeps):
+            made = one.placed(run, grid).tracks
+            whole = [(track, table) for track, table in made if table is not None]
+            # Where lines lie too unevenly for ties there is nothing to keep: such a sweep is looked up directly.
+            tables[one.cube.sweep.name] = whole if len(whole) == len(made) else []
+            run.report((number + 1) / len(sweeps))
+        write_lookup(path / "lookup.zarr", tables, params)
+
+    return produce("locate", build, params, [])  # keyed by the paths, not by what was seen along them
+
+
+def rectify(run: SurveyRun, produce: Produce, raw: StageRef, lookup: StageRef, *registration: StageRef) -> StageRef:
+    """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
+
+    def build(path: Path) -> None:
+        grid = PixelGrid.of_scene(run.grid, run.grid.factor)
+        tables = open_lookup(lookup.path / "lookup.zarr")
+        sweeps = sighted(run, raw, _only(registration))
+        work = MosaicWork([_with_tables(run, one, tables) for one in sweeps], run.camera, grid, run.settings.kernel)
+        writer = MosaicWriter(
+            path / "mosaic.zarr", grid.shape, run.scene.wavelength_nm,
+            fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(run.grid.factor),
+        )  # fmt: skip
+        colours, _ = choose_bands(run.scene.wavelength_nm)
+        picture = Thumbnail(grid.shape, colours, QUICKLOOK_PX)
+        write_mosaic(work, writer, memory=run.settings.memory, seen=picture, report=run.report)
+        writer.write_quicklook(_preview(picture.image))
+        write_json(path / "lines.json", {one.cube.sweep.name: one.facts() for one in sweeps})
+
+    params = {"grid": asdict(run.grid), "kernel": run.settings.kernel}
+    return produce("rectify", build, params, [raw, lookup, *registration])
+
+
+def _with_tables(run: SurveyRun, one: Sighted, tables: Tables) -> Placed:
+    """A sweep with its stored tables; without, where its lines lie too unevenly for one."""
+    stored = tables.get(one.cube.sweep.name)
+    return Placed(one.cube, tuple(stored), one.gain) if stored else one.placed(run)
+
+
+def _preview(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Colours for viewers: 2-98 % of each band, (y, x, 3) uint8."""
+    seen = np.where(np.isfinite(image).any(axis=(0, 1)), image, 0)
+    low, high = np.nanpercentile(seen, (2, 98), axis=(0, 1))
+    scaled = np.clip((seen - low) / np.where(high > low, high - low, 1), 0, 1)
+    picture: NDArray[np.uint8] = np.nan_to_num(scaled * 255).astype(np.uint8)
+    return picture
+
+
+def cut_patches(
+    run: SurveyRun, produce: Produce, attention: StageRef, raw: StageRef, *registration: StageRef
+) -> StageRef:
+    """Bring every seat that the fine sweeps saw whole onto the scene grid, one patch a seat."""
+
+    def build(path: Path) -> None:
+        ordered = _along_scan(run, load_plan(attention).seats)
+        writer = PatchWriter(
+            path / "patches.zarr", ordered, run.grid.seat_origin(ordered), run.grid.patch,
+            run.scene.wavelength_nm, fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(),
+        )  # fmt: skip
+        sweeps = [one.placed(run) for one in sighted(run, raw, _only(registration))]
+        cache = LineCache(run.settings.memory // CACHE_SHARE)
+        for first in range(0, len(ordered), SEATS_AT_ONCE):
+            seats = ordered[first : first + SEATS_AT_ONCE]
+            writer.write(first, *read_seats(sweeps, run.camera, run.grid, seats, run.settings.kernel, cache=cache))
+            run.report((first + len(seats)) / len(ordered))
+
+    params = {"grid": asdict(run.grid), "kernel": run.settings.kernel}
+    return produce("patches", build, params, [attention, raw, *registration])
+
+
+def _along_scan(run: SurveyRun, seats: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Seats in the order in which the sweeps pass them, so that a few of them need few lines at a time."""
+    row, column = np.divmod(seats, run.grid.seat_shape[1])
+    return seats[np.lexsort((column, row) if run.plan.along == "x" else (row, column))]
+
+
+def _only(registration: Sequence[StageRef]) -> StageRef | None:
+    """The registration where there is one."""
+    if len(registration) > 1:
+        raise ShapeError(f"expected one registration or none, got {len(registration)}")
+    return registration[0] if registration else None
+
+
+def line_facts(mosaic: StageRef) -> dict[str, dict[str, Any]]:
+    """Read, by sweep, how many lines were lost, repeated, out of order, late or invalid."""
+    found: dict[str, dict[str, Any]] = json.loads((mosaic.path / "lines.json").read_text())
+    return found

@@ -1,0 +1,171 @@
+"""The ground stage: a posed survey's map in the archive, with hectares; nothing without a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from flows.ground_stage import STORE, coarse_colours, ground, survey_grid
+from flows.run import SurveyRun
+from flows.settings import MapChoice, Settings
+from pipeline.errors import PoseError
+from pipeline.grid import UNLABELLED, SceneGrid
+from pipeline.ground import RigPose, pixel_places
+from storage.archive import Archive, StageRef
+from storage.class_maps import ClassMap, write_class_map
+from storage.ground_maps import load_ground_map
+from storage.layout import AngularGrid
+from storage.mosaics import MosaicWriter
+
+pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
+POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
+SHAPE = (120, 160)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """As much of a scene as the stage looks at."""
+
+    shape: tuple[int, int] = SHAPE
+
+
+@dataclass(frozen=True)
+class Run:
+    """As much of a survey as the stage looks at."""
+
+    archive: Archive
+    settings: Settings = field(default_factory=lambda: Settings(pose=POSE))
+    scene: Scene = field(default_factory=Scene)
+    grid: SceneGrid = field(default_factory=lambda: SceneGrid(*SHAPE, 8, 4))
+    report: Callable[[float], None] = lambda done: None
+
+    @property
+    def camera(self) -> Any:
+        """The settings' camera."""
+        return self.settings.camera
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    """A posed survey of a small field."""
+    return Run(Archive.open(tmp_path / "archive"))
+
+
+@pytest.fixture
+def stores(tmp_path: Path) -> tuple[StageRef, StageRef]:
+    """A class map of two halves, the right one unknown in its upper part, and a coarse mosaic that brightens down."""
+    classes = np.zeros(SHAPE, np.uint8)
+    classes[:, 80:] = 1
+    classes[:30, 80:] = UNLABELLED
+    confidence = np.where(classes == UNLABELLED, np.nan, 0.25 + 0.5 * (classes == 1)).astype(np.float32)
+    legend = (("weed", "crop"), np.array([[255, 0, 0], [0, 255, 0]], np.uint8))
+    write_class_map(tmp_path / "map" / "class_map.zarr", ClassMap(classes, confidence, *legend))
+    rows, columns = SHAPE[0] // 4, SHAPE[1] // 4
+    writer = MosaicWriter(
+        tmp_path / "mosaic" / "mosaic.zarr", (rows, columns), np.array([460.0, 550.0, 640.0, 800.0]),
+        grid=AngularGrid(1e-4, SHAPE, 4),
+    )  # fmt: skip
+    values = np.linspace(0.1, 0.9, rows)[:, None, None] * np.ones((rows, columns, 4))
+    values[:5, :5] = np.nan
+    writer.write_rows(0, values, np.ones((rows, columns)))
+    return StageRef("segment", "m", tmp_path / "map"), StageRef("rectify", "r", tmp_path / "mosaic")
+
+
+def draw(run: Run, stores: tuple[StageRef, StageRef]) -> StageRef | None:
+    """Run the stage as an engine would."""
+
+    def produce(name: str, build: Any, params: Any, refs: Any) -> StageRef:
+        return run.archive.produce(name, build, version=1, params=params, inputs=[ref.key for ref in refs])[0]
+
+    return ground(cast("SurveyRun", run), produce, *stores)
+
+
+def test_without_a_pose_there_is_no_ground(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """Nothing is written, nothing is looked at."""
+    assert draw(replace(run, settings=Settings()), stores) is None
+    assert run.archive.refs() == []
+
+
+def test_the_map_shows_the_class_map_where_the_rays_end(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """Every scene pixel's class is found again on the map at the place where its ray meets the ground."""
+    ref = draw(run, stores)
+    assert ref is not None
+    found = load_ground_map(ref.path / STORE)
+    grid = survey_grid(cast("SurveyRun", run))
+    assert grid is not None
+    y, x = pixel_places(SHAPE)
+    points = np.stack(np.meshgrid(y[10:-10:9], x[10:-10:9], indexing="ij"), axis=-1).reshape(-1, 2)
+    places = grid.frame.ground_to_map(grid.frame.view.scene_to_ground(points))
+    column, row = (np.floor(part).astype(int) for part in ~found.geobox.affine * places.T)
+    wanted = np.where(points[:, 1] < 0, 0, np.where(points[:, 0] < y[30], UNLABELLED, 1))
+    assert found.classes[row, column].tolist() == wanted.tolist()
+    sure = found.confidence[row, column]
+    np.testing.assert_array_equal(np.isnan(sure), wanted == UNLABELLED)
+    assert sure[wanted == 1] == pytest.approx(0.75)
+
+
+def test_hectares_are_those_of_the_pixels_footprints(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """Each class's area on the map is the sum of its scene pixels' footprints, within the border pixels."""
+    ref = draw(run, stores)
+    assert ref is not None
+    areas = load_ground_map(ref.path / STORE).areas
+    grid = survey_grid(cast("SurveyRun", run))
+    assert grid is not None
+    exact = grid.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1))
+    assert areas["weed"]["m2"] == pytest.approx(exact[:, :80].sum(), rel=0.01)
+    assert areas["crop"]["m2"] == pytest.approx(exact[30:, 80:].sum(), rel=0.01)
+    assert areas["crop"]["ha"] == pytest.approx(areas["crop"]["m2"] / 10_000)
+
+
+def test_the_picture_brightens_towards_the_rig(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """The coarse mosaic's ramp lies on the ground, 1 to 255 where seen, 0 where neither rays nor light were."""
+    ref = draw(run, stores)
+    assert ref is not None
+    found = load_ground_map(ref.path / STORE)
+    tones = coarse_colours(stores[1])
+    assert np.nanmin(tones) >= 1
+    assert np.isnan(tones[:5, :5]).all()
+    seen = found.picture.max(axis=2) > 0
+    assert 0.3 < seen.mean() < 0.95
+    assert not seen[0, 0]
+    row, column = np.nonzero(seen)
+    along = row * np.cos(np.deg2rad(25)) - column * np.sin(np.deg2rad(25))  # towards the rig on a north-up map
+    assert np.corrcoef(along, found.picture[row, column, 0])[0, 1] > 0.95
+
+
+def test_the_key_follows_pose_and_map(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """The same pose finds its store; another tilt or resolution makes another."""
+    changed = [
+        run.settings,
+        replace(run.settings, pose=replace(POSE, tilt_deg=51.0)),
+        replace(run.settings, map=MapChoice(resolution_m=0.01)),
+        run.settings,
+    ]
+    refs = [draw(replace(run, settings=settings), stores) for settings in changed]
+    keys = [ref.key for ref in refs if ref is not None]
+    assert keys[0] == keys[3]
+    assert len(set(keys)) == 3
+
+
+def test_the_store_says_where_it_was_seen_from(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """Plain xarray reads pose, counts of pixels and the CRS asked for."""
+    ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(epsg=25832))), stores)
+    assert ref is not None
+    with xr.open_zarr(ref.path / STORE, consolidated=False) as content:
+        assert content.attrs["proj:code"] == "EPSG:25832"
+        assert content.attrs["rig_pose"]["tilt_deg"] == 50.0
+        assert content.attrs["scene_pixels"] == {"mapped_px": 120 * 160, "beyond_reach_px": 0, "no_ground_px": 0}
+
+
+def test_a_pose_that_sees_no_ground_is_refused_and_leaves_nothing(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """The error names the pose; the archive stays empty."""
+    sky = Settings(pose=replace(POSE, tilt_deg=-30.0))
+    with pytest.raises(PoseError, match=r"no ray of the field meets the ground .*tilt_deg -30"):
+        draw(replace(run, settings=sky), stores)
+    assert run.archive.refs() == []
