@@ -15,8 +15,7 @@ from pipeline.rectify.line_table import Values, table_for
 
 __all__ = ["BLOCK_PX", "Kernel", "gather", "kernel_taps", "merge_lines", "resample", "to_uint16"]
 
-BLOCK_PX = 8192  # smaller blocks pay calls
-MANY_BANDS = 128  # from here on half the block, for its taps share the cache with what they read
+BLOCK_PX = 16384  # smaller blocks pay calls, and larger ones gain nothing
 
 
 def gather(
@@ -38,7 +37,7 @@ def gather(
     rows, columns, components = planes.shape
     table = tensor_rows(np.ascontiguousarray(planes, np.float32).reshape(rows * columns, components))
     out = np.empty((len(y), components), np.float32)
-    for block in _blocks(*out.shape):
+    for block in _blocks(len(out)):
         placed = windows(np.stack([y[block], x[block]], axis=1), kernel)
         edge = np.flatnonzero(~placed.inside((rows, columns)))
         row, column = placed.chosen(edge).taps_by_axis()
@@ -94,7 +93,7 @@ def resample(
     table = table_for(values[first:stop], valid[first:stop], kernel)
     out = _checked_out(out, (len(coordinates), values.shape[2]), table.rows.dtype)
     share = np.zeros(len(coordinates), np.float32)
-    for block in _blocks(*out.shape):
+    for block in _blocks(len(out)):
         placed = windows(coordinates[block], kernel)
         placed.corner[0] -= first
         table.read(placed, out[block], share[block])
@@ -165,10 +164,9 @@ def to_uint16(values: NDArray[np.floating]) -> tuple[NDArray[np.uint16], NDArray
     return np.rint(held, out=held).astype(np.uint16), known
 
 
-def _blocks(count: int, bands: int) -> Iterator[slice]:
-    size = BLOCK_PX if bands < MANY_BANDS else BLOCK_PX // 2
-    for start in range(0, count, size):
-        yield slice(start, min(start + size, count))
+def _blocks(count: int) -> Iterator[slice]:
+    for start in range(0, count, BLOCK_PX):
+        yield slice(start, min(start + BLOCK_PX, count))
 
 
 def _lines_in_reach(place: NDArray[np.float64], lines: int) -> tuple[int, int]:
