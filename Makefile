@@ -31,6 +31,7 @@ test: $(BIN)/.ok
 
 lint: $(BIN)/.ok
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
 # Every goal with the peers beside it (BENCH="geometry lookup" for some), then what accuracy costs in time.

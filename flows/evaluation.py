@@ -144,7 +144,7 @@ def _segment_seconds(run: SurveyRun, seen: Glance, patches: StageRef, columns: N
 
     As captured: glance, scores and map. With every seat there is nothing to choose: the map alone.
     """
-    (seats, own), settings = patch_columns(run, patches), run.settings
+    (seats, own), settings = patch_columns(run, patches, seen), run.settings
     valid = run.grid.valid_seats()
     every = columns[valid]
 

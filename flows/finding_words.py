@@ -14,8 +14,8 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
     """The findings in words, for the terminal and the report."""
     words = _plan_words(found["plan"]) if "plan" in found else []
     for name, one in found.get("pointing", {}).items():
-        if isinstance(one, Mapping):
-            words.append(_pointing_words(name, one))
+        if isinstance(one, Mapping) and (told := _pointing_words(name, one)):
+            words.append(told)
     for sweep, facts in found.get("lines", {}).items():
         told = ", ".join(f"{count} {what}" for what, count in facts.items() if count)
         words.append(f"Sweep {sweep}: lines {told}; what they would have shown is left out.")
@@ -42,15 +42,23 @@ def _sentence(text: str) -> str:
 
 
 def _pointing_words(name: str, one: Mapping[str, Any]) -> str:
-    most = max((float(np.hypot(*offset)) for offset in one["sweeps"].values()), default=0.0)
-    left = one["residual_rms_px"]
-    text = f"The {name} sweeps were put right by up to {most:.1f} px"
-    text += "." if left is None else f"; {left:.2f} px rms are left at the seams."
+    put = [float(np.hypot(*offset)) for sweep, offset in one["sweeps"].items() if sweep not in one["not_found"]]
+    left, text = one["residual_rms_px"], ""
+    if len(one["sweeps"]) == 1 and one["held"] in one["sweeps"]:
+        text = f"The {name} pass is one sweep, which has no seam to be put right by."
+    elif put:
+        rest = "" if left is None else f"; {left:.2f} px rms are left at the seams"
+        text = f"The {name} sweeps were put right by up to {max(put):.1f} px{rest}."
     if one["not_found"]:
-        text += f" Nothing could be told of {', '.join(one['not_found'])}."
+        text += f" Nothing could be told of {', '.join(one['not_found'])}: left where the mirror reported."
     if one["too_narrow"]:
         text += f" {len(one['too_narrow'])} overlaps were too narrow to compare."
-    return text
+    if one.get("partly_seen"):
+        text += (
+            f" {one['partly_seen']} chosen places were not seen whole; what is missing of them is mapped by the coarse "
+            f"look."
+        )
+    return text.strip()
 
 
 def area_words(hectares: float) -> str:

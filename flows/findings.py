@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from flows.ground_stage import STORE
-from flows.placement import line_facts
+from flows.placement import line_facts, seen_shares
 from flows.pointing_stage import load_registration
 from flows.run import SurveyRun
 from flows.stages import load_orientation, load_plan
@@ -21,6 +21,8 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     found: dict[str, Any] = {"plan": _plan(products.attention)}
     passes = {"coarse": products.coarse_pointing, "fine": products.fine_pointing}
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
+    if "fine" in pointing:
+        pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_shares(run, products.patches) < 1))
     if pointing:
         found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
     if products.ground_map is not None:
@@ -48,13 +50,17 @@ def _plan(attention: StageRef) -> dict[str, Any]:
 
 
 def _pointing(ref: StageRef) -> dict[str, Any]:
-    """Corrections of one pass, and what its windows say of them."""
+    """Corrections of one pass, and what its windows say of them.
+
+    Each sweep beside the held one has an offset and a drift: where windows are no more than these, they leave nothing.
+    """
     record = load_registration(ref)
     left = np.array([window["residual_px"] for window in record["windows"] if window.get("residual_px")])
+    tells = len(left) > 2 * (len(record["sweeps"]) - len(record["untied"]) - 1)
     return {
         "held": record["reference"],
         "sweeps": {name: one["offset_px"] for name, one in record["sweeps"].items()},
-        "residual_rms_px": float(np.sqrt(np.mean(left**2))) if left.size else None,
+        "residual_rms_px": float(np.sqrt(np.mean(left**2))) if left.size and tells else None,
         "not_found": record["untied"],
         "too_narrow": record["narrow"],
     }

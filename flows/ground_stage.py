@@ -32,14 +32,11 @@ def ground(run: SurveyRun, produce: Produce, class_map: StageRef, mosaic: StageR
         found = load_class_map(class_map.path / "class_map.zarr")
         colours = coarse_colours(mosaic)
         about = {"rig_pose": asdict(grid.frame.view.pose), "scene_pixels": grid.counts()}
-        writer = GroundMapWriter(
-            path / STORE, grid.geobox, ClassLegend(found.names, found.colours),
-            pixel_area_m2=grid.pixel_area_m2(), about=about,
-        )  # fmt: skip
+        writer = GroundMapWriter(path / STORE, grid.geobox, ClassLegend(found.names, found.colours), about=about)
         for rows, columns in map_blocks(grid.shape, BLOCK):
             writer.write_block(rows, columns, *_draw_block(grid, found, colours, run.grid.factor, (rows, columns)))
             run.report(rows.stop / grid.shape[0])
-        writer.finish()
+        writer.finish(grid.class_areas_m2(found.classes, len(found.names)))
 
     params = {
         "pose": None if pose is None else asdict(pose),

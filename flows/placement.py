@@ -24,9 +24,10 @@ from pipeline.rectify.ties import TieTable
 from pipeline.rectify.tracks import Track
 from storage.archive import StageRef
 from storage.cubes import RawCube
+from storage.layout import read_array
 from storage.lookups import open_lookup, path_digest, write_lookup
 from storage.mosaics import MosaicWriter
-from storage.patches import PatchWriter
+from storage.patches import PatchWriter, open_patches
 from storage.tile_work import MosaicWork, Thumbnail, write_mosaic
 
 QUICKLOOK_PX = 512
@@ -46,8 +47,10 @@ class Sighted:
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """(line,) valid lines with a time stamp of their own."""
-        return self.cube.valid_line & self.numbers.usable
+        """(line,) valid lines with a time stamp and a position of their own."""
+        known = np.isfinite(self.cube.position.sum(axis=1))
+        usable: NDArray[np.bool_] = self.cube.valid_line & self.numbers.usable & known
+        return usable
 
     @property
     def shift_px(self) -> NDArray[np.float64]:
@@ -153,7 +156,7 @@ def _preview(image: NDArray[np.float32]) -> NDArray[np.uint8]:
 def cut_patches(
     run: SurveyRun, produce: Produce, attention: StageRef, raw: StageRef, *registration: StageRef
 ) -> StageRef:
-    """Bring every seat that the fine sweeps saw whole onto the scene grid, one patch a seat."""
+    """Bring every chosen seat onto the scene grid, one patch a seat; NaN where a mirror off the plan did not look."""
 
     def build(path: Path) -> None:
         ordered = _along_scan(run, load_plan(attention).seats)
@@ -170,6 +173,13 @@ def cut_patches(
 
     params = {"grid": asdict(run.grid), "kernel": run.settings.kernel}
     return produce("patches", build, params, [attention, raw, *registration])
+
+
+def seen_shares(run: SurveyRun, patches: StageRef) -> NDArray[np.float64]:
+    """How much of each patch was seen, (patch,) 0..1 of its pixels on the scene."""
+    store = open_patches(patches.path / "patches.zarr")
+    seen: NDArray[np.float64] = read_array(store.group, "valid").mean(axis=(1, 2))
+    return seen / run.grid.valid_share().ravel()[store.seats]
 
 
 def _along_scan(run: SurveyRun, seats: NDArray[np.intp]) -> NDArray[np.intp]:

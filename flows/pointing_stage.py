@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from pipeline.rectify.alignment import SweepShift
 from pipeline.rectify.anchoring import Anchor, anchor_sweep
 from pipeline.rectify.illumination import overlap_light, solve_lights
 from pipeline.rectify.overlaps import BroadSweep, broad_bands
-from pipeline.rectify.placed import Placed, place
+from pipeline.rectify.placed import Placed
 from pipeline.rectify.seams import Registration, SeamWindow, register_sweeps
 from storage.archive import StageRef
 from storage.mosaics import load_mosaic
@@ -36,14 +36,12 @@ def register_coarse(run: SurveyRun, produce: Produce, raw: StageRef) -> StageRef
         return None
 
     def build(path: Path) -> None:
-        cubes = [one.cube for one in sighted(run, raw, None)]
-        broad = [BroadSweep.read(cube, run.camera) for cube in cubes]
+        sweeps = sighted(run, raw, None)
+        broad = [BroadSweep.read(one.cube, run.camera, usable=one.usable) for one in sweeps]
         run.report(0.4)
         found = register_sweeps(broad, run.camera, prior_px=prior)
         run.report(0.8)
-        placed = [
-            place(cube, run.camera, shift_px=found.of(cube.sweep.name).of_lines(len(cube.time_s))) for cube in cubes
-        ]
+        placed = [replace(one, shift=found.of(one.cube.sweep.name)).placed(run) for one in sweeps]
         write_json(path / RECORD, _seams_record(found, _gains(run, found, placed)))
 
     return produce("register", build, {"prior_px": prior, "pass": "coarse"}, [raw])
@@ -92,14 +90,14 @@ def register_fine(run: SurveyRun, produce: Produce, raw: StageRef, mosaic: Stage
         return None
 
     def build(path: Path) -> None:
-        cubes = [one.cube for one in sighted(run, raw, None)]
+        sweeps = sighted(run, raw, None)
         anchors: list[Anchor] = []
-        values = load_mosaic(mosaic.path / "mosaic.zarr").values if cubes else np.empty((0, 0, 0), np.float32)
-        for number, cube in enumerate(cubes):
-            under = _broad_mean(values, broad_bands(cube.references))
-            broad = BroadSweep.read(cube, run.camera)
+        values = load_mosaic(mosaic.path / "mosaic.zarr").values if sweeps else np.empty((0, 0, 0), np.float32)
+        for number, one in enumerate(sweeps):
+            under = _broad_mean(values, broad_bands(one.cube.references))
+            broad = BroadSweep.read(one.cube, run.camera, usable=one.usable)
             anchors.append(anchor_sweep(broad, run.camera, run.grid, under, prior_px=2 * prior))
-            run.report((number + 1) / len(cubes))
+            run.report((number + 1) / len(sweeps))
         write_json(path / RECORD, _anchors_record(anchors))
 
     return produce("register", build, {"prior_px": prior, "pass": "fine", "grid": asdict(run.grid)}, [raw, mosaic])

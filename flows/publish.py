@@ -17,6 +17,7 @@ from flows.findings import find_out
 from flows.ground_picture import draw_ground
 from flows.ground_stage import STORE
 from flows.panels import choose_bands
+from flows.placement import seen_shares
 from flows.pointing_stage import RECORD
 from flows.quicklook import QuicklookData, draw_quicklook
 from flows.receipt import Header, Receipt, build_receipt, to_json
@@ -60,7 +61,7 @@ def publish_run(runner: StageRunner, products: Products, started: str) -> Publis
     """Write receipt.json, quicklook.png and report.html into a run folder and publish it as a whole."""
     run = runner.run
     plan = load_plan(products.attention)
-    looked_twice = len(plan.seats) / len(run.grid.valid_seats())
+    looked_twice = float(seen_shares(run, products.patches).sum()) / len(run.grid.valid_seats())
     with run.archive.new_run(run.name) as draft:
         receipt = make_receipt(runner, products, plan, started, f"runs/{draft.id}")
         panels = quicklook_data(run, products, plan, receipt)
@@ -209,7 +210,8 @@ def _by_strip(cubes: list[RawCube]) -> list[RawCube]:
 
 def _calibrated(run: SurveyRun, cube: RawCube, bands: list[int]) -> NDArray[np.float32]:
     """Some bands of a sweep's lines in scene values; NaN where a sample looked past the scene."""
-    values = reflectance(cube.read()[..., bands], of_bands(cube.references, bands), position=cube.position)
+    position = np.where(cube.valid_line[:, None], cube.position, np.nan)  # what an invalid line reports may be anything
+    values = reflectance(cube.read()[..., bands], of_bands(cube.references, bands), position=position)
     values[~on_scene(run.scene.shape, run.camera, cube.sweep)] = np.nan
     return values
 

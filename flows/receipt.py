@@ -240,12 +240,15 @@ def _plain(value: object) -> object:
 def comparable(receipt: Receipt) -> dict[str, Any]:
     """What two runs of the same seed and settings must agree on.
 
-    Without times, memory, the archive's place, whether a stage was read or made, and the addresses of the products
-    (their names stay).
+    Without times, memory, the archive's place, whether a stage was read or made, the size of the evaluation (which
+    holds times, in more digits or fewer), and the addresses of the products (their names stay).
     """
     same: dict[str, Any] = {key: value for key, value in receipt.items() if key not in ("started", "finished")}
     same["settings"] = {key: value for key, value in receipt["settings"].items() if key != "out"}
-    same["stages"] = [_without(stage, (*_MEASURED_FIELDS, "state")) for stage in receipt["stages"]]
+    same["stages"] = [
+        _without(stage, (*_MEASURED_FIELDS, "state", *(("bytes_out",) if stage["name"] == "evaluate" else ())))
+        for stage in receipt["stages"]
+    ]
     same["savings"] = _without(receipt["savings"], ("segment_wall_s",))
     if "effects" in receipt:
         same["effects"] = [_without(effect, ("cost_s",)) for effect in receipt["effects"]]

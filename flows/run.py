@@ -15,18 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.capture_plan import CapturePlan, check_memory, plan_capture
 from flows.settings import BUILT_IN_SCENES, Settings
 from flows.training_data import scene_of_file, unpack_mask
 from models.weights import Weights, load_weights
 from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_full, coarse_sweeps, with_margin
 from pipeline.errors import SceneError, SettingsError, WeightsError
 from pipeline.grid import UNLABELLED, SceneGrid
 from pipeline.ground import GroundView
 from pipeline.ground_grid import ground_grid
-from pipeline.planning import check_budget
-from pipeline.rectify.overlaps import LEAST_OVERLAP_PX
-from pipeline.scan import Axis, Sweep
 from pipeline.simulator.farm import farm_scene
 from pipeline.simulator.instrument import ALL_EFFECTS
 from pipeline.simulator.pointing import PointingErrors
@@ -41,19 +38,6 @@ SHIPPED = "farm.safetensors"
 FARM_BYTES_PER_PX = 570  # peak of a survey of 2560 x 2560 px without controls, 3.76 GB
 
 Report = Callable[[float], None]  # how far a stage is, 0..1
-
-
-@dataclass(frozen=True)
-class CapturePlan:
-    """What every survey of this field has in common: orientation, coarse and full sweeps, and their seconds."""
-
-    along: Axis
-    coarse: list[Sweep]
-    full: list[Sweep]
-    coarse_s: float
-    full_s: float
-    fine_s: float  # left by the budget for the fine pass
-    overlap_px: float  # of neighbouring coarse strips, at least
 
 
 @dataclass(frozen=True)
@@ -116,12 +100,13 @@ def open_run(settings: Settings) -> SurveyRun:
     scene, notes = _open_scene(settings)
     labels, label_notes = _judged_labels(scene, weights)
     grid = SceneGrid(*scene.shape, weights.config.patch, weights.config.factor)
-    plan = _plan(settings, grid)
+    plan = plan_capture(settings, grid)
     band_notes = _check_bands(scene, weights, path)
     if settings.mask is not None:
         _check_mask(settings.mask, scene.shape)
     effects = _chosen_effects(settings.effects)
     source = SimulatedSource(scene, settings.camera, settings.seed, effects, pointing=_pointing(settings))
+    check_memory(settings, source, grid, plan)
     _check_pose(settings, scene.shape)
     key = hashlib.sha256(path.read_bytes()).hexdigest()[:20]
     return SurveyRun(
@@ -169,12 +154,12 @@ def _open_farm(settings: Settings) -> RasterScene:
     if settings.shape is None:
         farm = farm_scene(settings.seed, camera=settings.camera)
     else:
-        _check_memory(settings.shape)
+        _check_machine(settings.shape)
         farm = farm_scene(settings.seed, shape=settings.shape, camera=settings.camera)
     return farm if settings.bands is None else _some_bands(farm, settings.bands)
 
 
-def _check_memory(shape: tuple[int, int]) -> None:
+def _check_machine(shape: tuple[int, int]) -> None:
     """Refuse a farm that this machine cannot hold, before it tries."""
     needed = shape[0] * shape[1] * FARM_BYTES_PER_PX
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -249,18 +234,6 @@ def _judged_labels(scene: RasterScene, weights: Weights) -> tuple[NDArray[np.uin
     if scene.key in split.get("train", {}).values():
         return labels, ("the weights were trained on this scene: its accuracy says nothing of other fields",)
     return labels, ()
-
-
-def _plan(settings: Settings, grid: SceneGrid) -> CapturePlan:
-    """Coarse and full sweeps; where the mirror may look beside the plan, with overlaps to register and margins."""
-    camera, cost, off = settings.camera, settings.cost, settings.pointing_px
-    overlap = 2 * off + LEAST_OVERLAP_PX * grid.factor if off else 0.0
-    along, full, _ = cheapest_full(grid, camera, cost, overlap_px=overlap)
-    coarse = with_margin(coarse_sweeps(grid, camera, along, overlap_px=overlap), camera, off)
-    full = with_margin(full, camera, off)
-    full_s, coarse_s = cost.seconds(full, camera), cost.seconds(coarse, camera)
-    fine_s = check_budget(settings.budget, coarse_s, full_s)
-    return CapturePlan(along, coarse, full, coarse_s, full_s, fine_s, overlap)
 
 
 def now() -> str:

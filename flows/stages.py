@@ -33,8 +33,8 @@ from storage.patches import open_patches
 from storage.spool import Spool
 
 VERSIONS = {
-    "capture": 2, "register": 1, "locate": 1, "rectify": 2, "attend": 3, "patches": 2, "segment": 2, "ground": 1,
-    "evaluate": 3,
+    "capture": 2, "register": 2, "locate": 2, "rectify": 3, "attend": 4, "patches": 3, "segment": 3, "ground": 2,
+    "evaluate": 5,
 }  # fmt: skip
 SEATS_AT_ONCE = 64
 
@@ -109,7 +109,7 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
         write_json(path / "plan.json", asdict(plan) | {"seats": plan.seats.tolist()})
         turned = compare_orientations(
             run.grid, run.camera, settings.cost, run.plan.along, scores, budget_s=run.plan.fine_s, plan=plan,
-            rows=_crop_rows(mosaic), overlap_px=run.plan.overlap_px,
+            rows=_crop_rows(mosaic), overlap_px=run.plan.overlap_px, margin_px=run.plan.margin_px,
         )  # fmt: skip
         write_json(path / "orientation.json", asdict(turned) | {"sentence": turned.sentence})
 
@@ -146,24 +146,46 @@ def load_orientation(attention: StageRef) -> dict[str, Any]:
     return found
 
 
-def patch_columns(run: SurveyRun, patches: StageRef) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Seats and their normalised spectral columns, (seat, p, p, column), read a few patches at a time."""
+def patch_columns(run: SurveyRun, patches: StageRef, seen: Glance) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Seats and their normalised spectral columns, (seat, p, p, column), read a few patches at a time.
+
+    A mirror that looks beside the plan leaves pixels of a seat unseen: they take the columns of the coarse pixel over
+    them. A seat of which nothing was seen is left out.
+    """
     store = open_patches(patches.path / "patches.zarr")
-    p, count = run.grid.patch, len(store.seats)
-    columns = np.empty((count, p, p, run.weights.basis.columns), np.float32)
+    p, count, kept = run.grid.patch, len(store.seats), 0
+    seats, columns = np.empty(count, np.int64), np.empty((count, p, p, run.weights.basis.columns), np.float32)
     for first in range(0, count, SEATS_AT_ONCE):
         values = store.read(first, first + SEATS_AT_ONCE)
-        columns[first : first + len(values)] = run.weights.columns(values, run.scene.wavelength_nm)
-    return store.seats, columns
+        reached = np.asarray(np.isfinite(values).any(axis=-1), np.bool_)
+        some = np.asarray(reached.any(axis=(1, 2)), np.bool_)
+        part = slice(kept, kept := kept + int(some.sum()))
+        seats[part] = store.seats[first : first + len(values)][some]
+        columns[part] = run.weights.columns(values[some], run.scene.wavelength_nm)
+        _fill_unseen(columns[part], seats[part], reached[some], seen)
+    return seats[:kept], columns[:kept]
+
+
+def _fill_unseen(
+    columns: NDArray[np.float32], seats: NDArray[np.int64], reached: NDArray[np.bool_], seen: Glance
+) -> None:
+    """Put the columns of the coarse look, in place, where no line reached a pixel of a seat."""
+    pixel = np.arange(seen.grid.patch)
+    for patch, seat, there in zip(columns, seats, reached, strict=True):
+        if not there.all():
+            y, x = seen.grid.seat_origin(seat)[..., None] + pixel
+            coarse = seen.columns[np.ix_(y // seen.grid.factor, x // seen.grid.factor)]
+            patch[~there] = coarse[~there]
 
 
 def draw_map(run: SurveyRun, produce: Produce, mosaic: StageRef, patches: StageRef) -> StageRef:
     """Read coarse and fine patches together and draw the class map."""
 
     def build(path: Path) -> None:
-        seats, columns = patch_columns(run, patches)
+        seen = glance_at(run, mosaic)
+        seats, columns = patch_columns(run, patches, seen)
         run.report(0.4)
-        drawn = segment(run.weights, glance_at(run, mosaic), columns, seats)
+        drawn = segment(run.weights, seen, columns, seats)
         weights = run.weights
         found = ClassMap(
             drawn.classes, drawn.confidence, weights.class_names, weights.class_colours, run.angular_grid()

@@ -64,7 +64,7 @@ class Point:
     cpu_median_s: float
     wall_min_s: float
     wall_median_s: float
-    ratio: float  # of processor time to the first setting's, median over the rounds
+    ratio: float  # of the price to the first setting's; of processor time its median over the rounds
     modelled_s: float | None
     pareto: bool = False
 
@@ -76,7 +76,7 @@ class Point:
     @property
     def ns_per_unit(self) -> float:
         """The price for one unit of work [ns]."""
-        return 1e9 * self.price_s / self.work if self.work else math.nan
+        return 1e9 * self.price_s / self.work
 
 
 @dataclass(frozen=True)
@@ -96,11 +96,16 @@ class Result:
     memory_floor_ns: float | None = None  # for one unit: its bytes copied and nothing else
 
     def to_dict(self) -> dict[str, object]:
-        """Plain values for JSON."""
+        """Plain values for JSON, which has no NaN and no infinity: they become None."""
         points = [
-            {**asdict(point), "price_s": point.price_s, "ns_per_unit": point.ns_per_unit} for point in self.points
+            _finite({**asdict(point), "price_s": point.price_s, "ns_per_unit": point.ns_per_unit})
+            for point in self.points
         ]
         return {**asdict(self), "machine": dict(self.machine), "points": points}
+
+
+def _finite(values: Mapping[str, object]) -> dict[str, object]:
+    return {key: None if isinstance(v, float) and not math.isfinite(v) else v for key, v in values.items()}
 
 
 _REGISTRY: dict[tuple[str, str], Tradeoff[Any, Any]] = {}
@@ -142,7 +147,7 @@ def measure_tradeoff(tradeoff: Tradeoff[State, Output], *, repeats: int = 5, see
         judged = [_judge(tradeoff, state, setting) for setting in tradeoff.settings]
         clocks = _time_in_turn(tradeoff, state, repeats, copying)
         machine = describe_machine(threads) | {"load_before": load_before, "load_after": mean_load()}
-    points = [_point(tradeoff, state, number, judged[number], clocks) for number in range(len(tradeoff.settings))]
+    points = [_point(tradeoff, state, number, judged, clocks) for number in range(len(tradeoff.settings))]
     named = (tradeoff.stage, tradeoff.knob, tradeoff.error, tradeoff.unit, tradeoff.reference)
     levels = () if tradeoff.levels is None else tradeoff.levels(state)
     floor = None if copying is None else copying.ns_per_byte * (tradeoff.moved_bytes or 0)
@@ -174,16 +179,20 @@ def _time_in_turn(
 
 
 def _point(
-    tradeoff: Tradeoff[State, Output], state: State, number: int, judged: tuple[float, float | None],
+    tradeoff: Tradeoff[State, Output], state: State, number: int, judged: Sequence[tuple[float, float | None]],
     clocks: Sequence[Sequence[tuple[float, float]]],
 ) -> Point:  # fmt: skip
     cpu, wall = zip(*clocks[number], strict=True)
-    ratios = [own[0] / first[0] for own, first in zip(clocks[number], clocks[0], strict=True) if first[0] > 0]
+    (error, modelled), first_modelled = judged[number], judged[0][1]
+    prices = zip(cpu, (first for first, _ in clocks[0]), strict=True)
+    if modelled is not None and first_modelled is not None:
+        prices = zip((modelled,), (first_modelled,), strict=True)
+    ratios = [own / first for own, first in prices if first > 0]
     return Point(
-        setting=tradeoff.settings[number], error=judged[0], work=tradeoff.work(state, tradeoff.settings[number]),
+        setting=tradeoff.settings[number], error=error, work=tradeoff.work(state, tradeoff.settings[number]),
         cpu_min_s=min(cpu), cpu_median_s=statistics.median(cpu),
         wall_min_s=min(wall), wall_median_s=statistics.median(wall),
-        ratio=statistics.median(ratios) if ratios else math.nan, modelled_s=judged[1],
+        ratio=statistics.median(ratios) if ratios else math.nan, modelled_s=modelled,
     )  # fmt: skip
 
 
@@ -207,9 +216,3 @@ def cheapest_within(result: Result, error: float) -> Point | None:
     """Give the point of least price whose error is at most ``error``; None where no setting is that good."""
     good = [point for point in result.points if point.error <= error]
     return min(good, key=lambda point: point.price_s, default=None)
-
-
-def best_within(result: Result, seconds: float) -> Point | None:
-    """Give the point of least error whose price is at most ``seconds``; None where no setting is that cheap."""
-    cheap = [point for point in result.points if point.price_s <= seconds and math.isfinite(point.error)]
-    return min(cheap, key=lambda point: point.error, default=None)

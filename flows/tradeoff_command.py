@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,8 @@ def run_tradeoff(stage: str | None, out: Path, repeats: int, seed: int, console:
     if seed < 0:
         raise SettingsError(f"--seed must be 0 or more, got {seed}")
     wanted = find_tradeoffs(stage) if stage else tuple(registered().values())
+    with _writing(out):
+        out.mkdir(parents=True, exist_ok=True)  # before minutes are spent on what cannot be kept
     results = []
     for tradeoff in wanted:
         with console.status(f"measuring {tradeoff.stage}: {tradeoff.knob}"):
@@ -34,11 +38,16 @@ def run_tradeoff(stage: str | None, out: Path, repeats: int, seed: int, console:
         print_tradeoff(result, console)
         results.append(result)
     content = {"tradeoffs": [result.to_dict() for result in results]}
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "tradeoff.json").write_text(json.dumps(content, indent=2) + "\n")
+    with _writing(out):
+        (out / "tradeoff.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
         draw_tradeoffs(out / "tradeoff.png", results)
-    except OSError as error:
-        raise ArchiveError(f"cannot write to {out}: {error.strerror}; choose another --out") from error
     console.print(f"{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}", highlight=False, soft_wrap=True)
     return content
+
+
+@contextmanager
+def _writing(out: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ArchiveError(f"cannot write to {out}: {error.strerror}; choose another --out") from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 from matplotlib.transforms import blended_transform_factory
 
@@ -28,7 +30,14 @@ _ROOM, _RIGHT_ROOM = 0.18, 0.28  # of the range of the logarithms, beyond points
 
 
 def draw_tradeoffs(path: str | Path, results: Sequence[Result]) -> None:
-    """Draw one panel for each trade-off as a PNG: points that no other beats filled and joined, the others hollow."""
+    """Draw one panel for each trade-off into a PNG file."""
+    figure = tradeoff_figure(results)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, format="png")
+
+
+def tradeoff_figure(results: Sequence[Result]) -> Figure:
+    """Give a figure of one panel for each trade-off: points that no other beats filled and joined, others hollow."""
     across = min(_ACROSS, len(results))
     down = -(-len(results) // across)
     figure = Figure(figsize=(6.0 * across, 4.9 * down + 0.5), dpi=120, layout="constrained", facecolor=_PAPER)
@@ -40,8 +49,7 @@ def draw_tradeoffs(path: str | Path, results: Sequence[Result]) -> None:
         axes.set_axis_off()
     keys = [Line2D([], [], linewidth=1.4, **_FRONT), Line2D([], [], linewidth=0, **_BEATEN)]
     figure.legend(handles=keys, loc="outside lower center", ncols=2, frameon=False, labelcolor=INK)
-    FigureCanvasAgg(figure)
-    figure.savefig(path, format="png")
+    return figure
 
 
 def _draw_tradeoff(axes: Axes, result: Result) -> None:
@@ -50,17 +58,19 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
     place = {id(point): (_time(result, point) / size, point.error) for point in points}
     exact = _logarithmic(axes, result, list(place.values()), (result.memory_floor_ns or 0) / size)
     place = {key: (x, y if y > 0 else exact) for key, (x, y) in place.items()}
-    _draw_levels(axes, result, list(place.values()))
-    if result.memory_floor_ns is not None:
-        _draw_memory_floor(axes, result.memory_floor_ns / size)
+    floor = None if result.memory_floor_ns is None else result.memory_floor_ns / size
+    _draw_levels(axes, result, list(place.values()), floor)
+    if floor is not None:
+        _draw_memory_floor(axes, floor)
     front = sorted((point for point in points if point.pareto), key=lambda point: point.price_s)
     for group, style, line in ((front, _FRONT, 1.4), ([p for p in points if not p.pareto], _BEATEN, 0)):
         axes.plot(*_columns([place[id(point)] for point in group]), linewidth=line, zorder=3, **style)
     for point in points:
         beside = (7, 7) if point.pareto else (9, -4)
         axes.annotate(
-            str(point.setting), place[id(point)], beside, textcoords="offset points", color=INK, size=10.5, zorder=4
-        )
+            str(point.setting), place[id(point)], beside, textcoords="offset points", color=INK, size=10.5, zorder=4,
+            path_effects=[withStroke(linewidth=3, foreground=_PAPER)],
+        )  # fmt: skip
     axes.set_title(f"{result.stage}: {result.knob}", loc="left", weight="bold", color=INK, size=13)
     axes.set_xlabel("seconds by the cost model" if unit == "s" else f"{unit} / {result.unit}", color=INK)
     axes.set_ylabel(result.error, color=INK)
@@ -91,20 +101,20 @@ def _time_unit(result: Result) -> tuple[float, str]:
     return next(((size, name) for size, name in _UNITS if least >= size), _UNITS[-1])
 
 
-def _draw_levels(axes: Axes, result: Result, places: Sequence[tuple[float, float]]) -> None:
-    """Lines across, each with its name at the end where no point is near."""
+def _draw_levels(axes: Axes, result: Result, places: Sequence[tuple[float, float]], floor: float | None) -> None:
+    """Lines across, each with its name at the end where no point is near, right of the memory's floor."""
     across, (_, bottom) = axes.transData, axes.transData.transform((1, axes.get_ylim()[0]))
     height = across.transform((1, axes.get_ylim()[1]))[1] - bottom
     span = math.log(axes.get_xlim()[1] / axes.get_xlim()[0])
-    for level, colour in zip(result.levels, _LEVELS, strict=False):
+    start = axes.get_xlim()[0] if floor is None else floor
+    for level, colour in zip(result.levels, cycle(_LEVELS), strict=False):
         here = across.transform((1, level.error))[1]
         near = [x for x, y in places if abs(across.transform((x, y))[1] - here) < 0.07 * height]
         left = any(math.log(x / axes.get_xlim()[0]) > 0.6 * span for x in near)
         axes.axhline(level.error, color=colour, linewidth=1.1, linestyle=(0, (5, 3)), zorder=1)
         axes.annotate(
-            level.name, (0 if left else 1, level.error), (3 if left else -2, 3), textcoords="offset points",
-            xycoords=blended_transform_factory(axes.transAxes, axes.transData), ha="left" if left else "right",
-            color=colour, size=9,
+            level.name, (start if left else axes.get_xlim()[1], level.error), (3 if left else -2, 3),
+            textcoords="offset points", ha="left" if left else "right", color=colour, size=9,
         )  # fmt: skip
 
 
@@ -115,6 +125,7 @@ def _draw_memory_floor(axes: Axes, floor: float) -> None:
     axes.annotate(
         "bytes copied alone", (floor, 0.98), (-3, 0), textcoords="offset points", rotation=90, ha="right", va="top",
         xycoords=blended_transform_factory(axes.transData, axes.transAxes), color=_FLOOR, size=9,
+        path_effects=[withStroke(linewidth=3, foreground=_PAPER, alpha=0.8)],
     )  # fmt: skip
 
 

@@ -18,9 +18,11 @@ def print_tradeoff(result: Result, console: Console) -> None:
         title_justify="left", title_style="bold",
         header_style="dim", box=SIMPLE_HEAD, caption=_caption(result), caption_justify="left",
     )  # fmt: skip
+    longest = max(len(str(point.setting)) for point in result.points)
     headings = ("", result.knob, "error", f"per {result.unit}", "price", "x first", "wall, least", "wall, median")
     for number, heading in enumerate(headings):
-        table.add_column(escape(heading), justify="left" if number < 2 else "right")
+        left = number < 2
+        table.add_column(escape(heading), justify="left" if left else "right", min_width=longest if number == 1 else 1)
     for point in sorted(result.points, key=lambda point: point.error):
         table.add_row(*_row(point), style="" if point.pareto else "dim")
     console.print(table)
@@ -46,10 +48,11 @@ def _caption(result: Result) -> str:
     floors = "".join(f"{_within(result, level)}\n" for level in result.levels)
     if result.memory_floor_ns is not None:
         floors += f"copying the bytes of a {result.unit} alone: {_short(result.memory_floor_ns * 1e-9)}\n"
+    rounds = f"{result.repeats} repeat{'s' if result.repeats > 1 else ''} in turn"
     words = (
         f"error: {result.error}, against {result.reference}; price: {priced}; ● no other setting beats it\n{floors}"
-        f"{result.repeats} repeats in turn, {machine['threads']} thread, load {machine['load_before']} to "
-        f"{machine['load_after']}, {machine['processor']}"
+        f"{rounds}, {machine['threads']} thread, load {machine['load_before']} to {machine['load_after']}, "
+        f"{machine['processor']}"
     )
     return escape(words)
 

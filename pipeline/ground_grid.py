@@ -11,7 +11,7 @@ from odc.geo.geobox import GeoBox
 
 from pipeline.errors import PoseError, ShapeError
 from pipeline.grid import UNLABELLED
-from pipeline.ground import LEAST_SINK, GroundView, pixel_places
+from pipeline.ground import LEAST_SINK, ROWS_AT_ONCE, GroundView, pixel_places
 from pipeline.projection import MapFrame, map_crs
 from pipeline.rectify.resample import resample
 
@@ -41,11 +41,6 @@ class GroundGrid:
         rows, columns = self.geobox.shape
         return int(rows), int(columns)
 
-    @property
-    def resolution_m(self) -> float:
-        """Side of a map pixel."""
-        return float(self.geobox.affine.a)
-
     def scene_pixels(self, rows: slice, columns: slice) -> Floats:
         """Give where map pixels lie in the scene's image, (row, column, 2); integers are centres of its pixels.
 
@@ -74,11 +69,26 @@ class GroundGrid:
         near, ground = (view.count_ground(self.scene_shape, sink) for sink in (self.least_sink, LEAST_SINK))
         return {"mapped_px": near, "beyond_reach_px": ground - near, "no_ground_px": total - ground}
 
-    def pixel_area_m2(self) -> float:
-        """Ground under one map pixel, level share, at the middle of the map."""
-        outline = self.frame.view.outline_px(self.scene_shape, self.least_sink)
-        middle = self.frame.view.scene_to_ground(outline.mean(axis=0))
-        return self.resolution_m**2 / self.frame.areal_scale(middle)
+    def class_areas_m2(self, classes: NDArray[np.uint8], count: int) -> Floats:
+        """Sum the ground under the scene's pixels by class, level share, (count,) [m2].
+
+        Of the pixels that the map shows, and from their footprints: counting the map's pixels would be off by as many
+        as lie on borders between classes.
+
+        Raises
+        ------
+        ShapeError : the class map is not the scene's.
+        """
+        if classes.shape != self.scene_shape:
+            raise ShapeError(f"expected the classes of a scene of {self.scene_shape} px (y, x), got {classes.shape}")
+        view, (y, x) = self.frame.view, pixel_places(self.scene_shape)
+        areas = np.zeros(UNLABELLED + 1)
+        for first in range(0, len(y), ROWS_AT_ONCE):
+            rows = slice(first, first + ROWS_AT_ONCE)
+            points = np.stack(np.meshgrid(y[rows], x, indexing="ij"), axis=-1)
+            seen = np.where(view.sink(points) > self.least_sink, view.area_m2(points), 0.0)
+            areas += np.bincount(classes[rows].ravel(), seen.ravel(), len(areas))
+        return areas[:count]
 
 
 def ground_grid(

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
-from pipeline.coverage import coarse_sweeps
+from pipeline.coverage import coarse_sweeps, with_margin
 from pipeline.crop_rows import CropRows
 from pipeline.errors import PoseError
 from pipeline.grid import SceneGrid
 from pipeline.planning import FinePlan, plan_fine
 from pipeline.scan import Axis, CostModel
 
+WORDS: dict[Axis, str] = {"x": "across the picture", "y": "down the picture"}  # for people, where lines lie
+
 
 @dataclass(frozen=True)
-class Mounting:
+class Outcome:
     """Both passes with lines along one axis: seconds of either, fine lines, and the share of the score bought."""
 
     along: Axis
@@ -34,32 +37,44 @@ class OrientationReport:
     ``other`` is None where that is not possible: ``why_not`` says why.
     """
 
-    taken: Mounting
-    other: Mounting | None
+    taken: Outcome
+    other: Outcome | None
     rows: CropRows | None
     why_not: str = ""
 
     @property
     def sentence(self) -> str:
         """The comparison in words."""
-        here = f"lines lie along {self.taken.along} and show {_percent(self.taken.worth_share)} of the score"
-        if self.other is None:
-            there = f"along {_turned(self.taken.along)} they could not: {self.why_not}"
-        else:
-            there = (
-                f"along {self.other.along} they would show {_percent(self.other.worth_share)} in the same time "
-                f"({self.other.coarse_s:.1f} s coarse and {self.other.fine_s:.1f} s fine, here "
-                f"{self.taken.coarse_s:.1f} s and {self.taken.fine_s:.1f} s)"
-            )
-        return f"{here}; {there}{self._rows_clause()}"
+        return "; ".join(part for part in (self._here, self._there, self._rows) if part)
 
-    def _rows_clause(self) -> str:
+    @property
+    def _here(self) -> str:
+        if self.taken.worth_share is None:
+            return "no place is worth a second look"
+        words, share = WORDS[self.taken.along], _percent(self.taken.worth_share)
+        return f"with camera lines {words} the fine sweeps show {share} of what is worth a second look"
+
+    @property
+    def _there(self) -> str:
+        words = WORDS[_turned(self.taken.along)]
+        if self.other is None:
+            return f"with lines {words} it could not be done: {self.why_not}"
+        if self.other.worth_share is None:
+            return ""
+        return (
+            f"with lines {words} they would show {_percent(self.other.worth_share)} in no more time "
+            f"({self.other.coarse_s:.1f} s coarse and {self.other.fine_s:.1f} s fine, here "
+            f"{self.taken.coarse_s:.1f} s and {self.taken.fine_s:.1f} s)"
+        )
+
+    @property
+    def _rows(self) -> str:
         if self.rows is None:
             return ""
-        if self.rows.angle_deg is None:
-            return "; the field shows no crop rows"
-        lie = f"at {self.rows.angle_deg:.0f} deg, nearest to {self.rows.nearest_axis}"
-        return f"; crop rows run {lie} (strength {self.rows.strength:.2f})"
+        if self.rows.angle_deg is None or self.rows.nearest_axis is None:
+            return "no crop rows are seen"
+        off = abs((self.rows.angle_deg + 45) % 90 - 45)
+        return f"crop rows run {WORDS[self.rows.nearest_axis]}, to within {ceil(off)} degrees"
 
 
 def compare_orientations(
@@ -73,6 +88,7 @@ def compare_orientations(
     plan: FinePlan | None = None,
     rows: CropRows | None = None,
     overlap_px: float = 0,
+    margin_px: float = 0,
 ) -> OrientationReport:
     """Plan the same scores with lines along the other axis, for the seconds that both passes have here.
 
@@ -86,17 +102,24 @@ def compare_orientations(
         Crop rows of the coarse image, for the sentence.
     overlap_px
         Of the coarse pass, as of :func:`pipeline.coverage.coarse_sweeps`.
+    margin_px
+        By which its sweeps begin earlier and end later, as of :func:`pipeline.coverage.with_margin`.
 
     Raises
     ------
     PoseError : the field is beyond the mirror's range with lines along ``along``; the other axis is only reported.
     """
     here = plan or plan_fine(grid, camera, cost, along, scores, budget_s=budget_s)
-    coarse_s = cost.seconds(coarse_sweeps(grid, camera, along, overlap_px=overlap_px), camera)
-    taken = _mounting(along, coarse_s, here)
+
+    def coarse_seconds(axis: Axis) -> float:
+        sweeps = coarse_sweeps(grid, camera, axis, overlap_px=overlap_px)
+        return cost.seconds(with_margin(sweeps, camera, margin_px), camera)
+
+    coarse_s = coarse_seconds(along)
+    taken = _outcome(along, coarse_s, here)
     other = _turned(along)
     try:
-        other_coarse_s = cost.seconds(coarse_sweeps(grid, camera, other, overlap_px=overlap_px), camera)
+        other_coarse_s = coarse_seconds(other)
         left = coarse_s + budget_s - other_coarse_s
         if left < 0:
             reason = f"the coarse pass alone takes {other_coarse_s:.1f} s"
@@ -104,17 +127,17 @@ def compare_orientations(
         turned = plan_fine(grid, camera, cost, other, scores, budget_s=left)
     except PoseError as error:
         return OrientationReport(taken, None, rows, str(error))
-    return OrientationReport(taken, _mounting(other, other_coarse_s, turned), rows)
+    return OrientationReport(taken, _outcome(other, other_coarse_s, turned), rows)
 
 
 def _turned(along: Axis) -> Axis:
     return "y" if along == "x" else "x"
 
 
-def _mounting(along: Axis, coarse_s: float, plan: FinePlan) -> Mounting:
+def _outcome(along: Axis, coarse_s: float, plan: FinePlan) -> Outcome:
     share = plan.worth / plan.wanted_worth if plan.wanted_worth else None
-    return Mounting(along, coarse_s, plan.seconds, plan.lines, share)
+    return Outcome(along, coarse_s, plan.seconds, plan.lines, share)
 
 
-def _percent(share: float | None) -> str:
-    return "none" if share is None else f"{share:.1%}"
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"

@@ -17,12 +17,7 @@ from pipeline.grid import SceneGrid
 from pipeline.runs import Prices, Run
 from pipeline.scan import Axis, CostModel, Sweep
 from pipeline.spending import cheapest_cover, spend
-from pipeline.strips import covered_seats, look_from, seat_lines, strips_at_seats
-
-__all__ = [
-    "FinePlan", "SeatsPrice", "check_budget", "covered_seats", "least_budget", "plan_fine", "price_of_seats",
-    "price_seats", "seat_lines",
-]  # fmt: skip
+from pipeline.strips import covered_seats, look_from, strips_at_seats
 
 LEAST_DIGITS = 4  # of the least budget that a refusal names
 ROUNDING = 1e-9
@@ -158,8 +153,8 @@ def plan_fine(
     everything = plan.worth >= field.total * (1 - NEGLIGIBLE)
     if full is not None and full_s is not None and full_s <= budget_s and not everything:
         reason = (
-            f"no runs of lines that show every seat worth something take less than the full scan's {full_s:.1f} s; "
-            f"the full scan is taken, which shows all seats"
+            f"to show every place worth a second look takes no less time than to scan everything in detail, "
+            f"{full_s:.1f} s; the full scan is taken, which shows all of the field"
         )
         return FinePlan(full[0], grid.valid_seats(), full_s, field.total, "full", reason, field.total, full_s, missed)
     sweeps = _sweeps(field, plan)
@@ -256,14 +251,3 @@ def price_of_seats(
     lines = sum(sweep.lines for sweep in sweeps)
     full_lines = None if full is None else sum(sweep.lines for sweep in full[0])
     return SeatsPrice(lines, cost.seconds(sweeps, camera), full_lines, None if full is None else full[1])
-
-
-def price_seats(
-    grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis, seats: NDArray[np.integer]
-) -> tuple[int, float]:
-    """Lines and seconds of exactly these seats by runs of lines, without the full scan that may be cheaper.
-
-    :func:`price_of_seats` gives both.
-    """
-    price = price_of_seats(grid, camera, cost, along, seats)
-    return price.lines, price.seconds

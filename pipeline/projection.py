@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pyproj import CRS, Proj, Transformer
+from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
 from pipeline.errors import PoseError
@@ -22,7 +22,6 @@ Floats = NDArray[np.float64]
 WGS84 = 4326
 UTM_LATITUDES = (-80.0, 84.0)
 POLAR = {False: 5042, True: 5041}  # universal polar stereographic, south and north, axes east and north
-EARTH_RADIUS_M = 6.371e6  # for the scale of high ground: half a percent of 1e-4
 AREA_SLACK_DEG = 1.0  # a field may lie this far outside the area that a CRS is made for
 
 
@@ -102,12 +101,6 @@ class MapFrame:
         rise = -(point @ self.view.normal) / (up @ self.view.normal)
         ground: Floats = point + rise[..., None] * up
         return ground
-
-    def areal_scale(self, ground_m: ArrayLike) -> float:
-        """Give how large one square metre at a point (3,) of the ground is on the map [m2]: 0.9992 on a UTM axis."""
-        lon, lat, _ = self.ground_to_geodetic(ground_m)
-        raised = 1 + self.view.pose.elevation_m / EARTH_RADIUS_M
-        return float(Proj(self.crs).get_factors(lon, lat).areal_scale / raised**2)
 
     def _vertical(self, lon_deg: Floats, lat_deg: Floats) -> Floats:
         """(..., 3) normals of the ellipsoid at other places, in east, north, up of the foot."""

@@ -49,7 +49,7 @@ class Prices:
         load = self.lines_per_reload * self.line_s + self.reload_s
         loads = int(left // load)
         rest = max(int((left - loads * load - self.reload_s) / self.line_s), 0)
-        lines = loads * self.lines_per_reload + min(rest, self.lines_per_reload)
+        lines = loads * self.lines_per_reload + rest
         while lines >= 0 and self.seconds(lines, runs) > seconds:  # rounding
             lines -= 1
         return lines

@@ -145,6 +145,8 @@ def _first_rate(field: Field) -> float:
         if net[strip, stop] <= 0:
             break
         first = int(toll[strip, : stop + 1].argmin())
+        if first == stop:  # nothing but rounding is left to gain
+            break
         worth = float(tables.closed[strip, stop] - tables.begun[strip, first])
         density = worth / float(seconds[stop] - seconds[first] + prices.run_s)
         if density <= rate * (1 + RATE_SLACK):

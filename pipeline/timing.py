@@ -1,12 +1,10 @@
-"""How fast the mirror must go, and the cells of its vector memory: the right forms of the paper's equations 8 to 10.
+"""How fast the mirror must go: the right forms of the paper's equations 8 and 9, for whoever drives a rig.
 
-Frame period and imaging time are :class:`pipeline.camera.LineCamera`'s. The paper's own forms are in
-:mod:`pipeline.paper`.
+Frame period and imaging time (equation 10) are :class:`pipeline.camera.LineCamera`'s, the layout of the vector memory
+:mod:`pipeline.vector_memory`'s. The paper's own forms are in :mod:`pipeline.paper`.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
@@ -36,27 +34,3 @@ def sample_rate_hz(samples: int, lines: int, camera: LineCamera) -> float:
     if samples < 1 or lines < 1:
         raise SettingsError(f"expected at least one sample and one line, got {samples} and {lines}")
     return samples / camera.scan_seconds(lines)
-
-
-@dataclass(frozen=True)
-class Cells:
-    """Cells of the one vector memory that channels share: from ``start`` up to, not including, ``stop`` (E14)."""
-
-    start: int
-    stop: int
-
-    def to_device(self, *, inclusive: bool) -> tuple[int, int]:
-        """Give start and end as the device counts them; whether its ends are included is to be tested on it."""
-        return self.start, self.stop - 1 if inclusive else self.stop
-
-
-def channel_cells(samples: int, memory: int = 3000) -> tuple[Cells, Cells]:
-    """Lay out X and Y of ``samples`` positions one behind the other.
-
-    Raises
-    ------
-    SettingsError : they do not fit the memory, or there are none.
-    """
-    if not 1 <= samples <= memory // 2:
-        raise SettingsError(f"{samples} positions do not fit a vector memory of {memory // 2}; send them in parts")
-    return Cells(0, samples), Cells(samples, 2 * samples)

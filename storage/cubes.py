@@ -272,9 +272,9 @@ def _reflectance_block(
     """One block of lines, NaN where not valid; dask says which."""
     assert block_info is not None
     start, stop = block_info[None]["array-location"][0]
-    values, valid = calibrate(
-        cube.read(start, stop), cube.references, saturated_dn=saturated_dn, position=cube.position[start:stop]
-    )
+    usable = cube.valid_line[start:stop]
+    position = np.where(usable[:, None], cube.position[start:stop], np.nan)  # of other lines it may be beyond the rim
+    values, valid = calibrate(cube.read(start, stop), cube.references, saturated_dn=saturated_dn, position=position)
     values[~valid] = np.nan
-    values[~cube.valid_line[start:stop]] = np.nan
+    values[~usable] = np.nan
     return values

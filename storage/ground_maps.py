@@ -41,20 +41,14 @@ class GroundMap:
 
 
 class GroundMapWriter:
-    """Write a map block by block, so that it never has to be in memory as a whole.
+    """Write a map block by block, so that it never has to be in memory as a whole."""
 
-    ``pixel_area_m2`` is the ground that one map pixel stands for: on most maps not the square of its side.
-    """
-
-    def __init__(
-        self, path: Path, geobox: GeoBox, legend: ClassLegend, *, pixel_area_m2: float, about: Mapping[str, Any]
-    ) -> None:
+    def __init__(self, path: Path, geobox: GeoBox, legend: ClassLegend, *, about: Mapping[str, Any]) -> None:
         place = map_attributes(geobox)
         names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
         self._group = create_group(path, "class map on the ground", {**place, **names, **about})
         write_map_coordinates(self._group, geobox)
-        self._shape, self._legend, self._pixel_m2 = tuple(geobox.shape), legend, pixel_area_m2
-        self._pixels = np.zeros(len(legend.names), np.int64)
+        self._shape, self._legend = tuple(geobox.shape), legend
         dims, shape = ("y", "x"), self._shape
         about_classes = {**class_flags(legend), **place, **ON_THE_MAP}
         self._classes = create_array(self._group, "classes", image_spec(dims, shape, "|u1"), about_classes)
@@ -73,7 +67,7 @@ class GroundMapWriter:
         confidence: NDArray[np.float32],
         picture: NDArray[np.uint8],
     ) -> None:
-        """Store one block and count its classes.
+        """Store one block.
 
         Raises
         ------
@@ -87,24 +81,20 @@ class GroundMapWriter:
                 f"{picture.shape}; give one value a pixel"
             )
         _check_place(rows, columns, self._shape)
-        counts = np.bincount(classes.ravel(), minlength=UNLABELLED + 1)[:UNLABELLED]
-        if counts[len(self._pixels) :].any():
-            worst = int(np.flatnonzero(counts)[-1])
-            raise ShapeError(f"class {worst} is in the map, but only {len(self._pixels)} classes have names")
-        self._pixels += counts[: len(self._pixels)]
+        worst = int(classes.max(initial=0, where=classes != UNLABELLED))
+        if worst >= len(self._legend.names):
+            raise ShapeError(f"class {worst} is in the map, but only {len(self._legend.names)} classes have names")
         self._classes[rows, columns] = classes
         self._confidence[rows, columns] = confidence
         self._picture[rows, columns] = picture
 
-    def finish(self) -> dict[str, dict[str, float]]:
-        """Store each class's area beside the map, and give it: m2, ha and share of the classified area."""
-        total = max(int(self._pixels.sum()), 1)
-        areas = {}
-        for name, count in zip(self._legend.names, self._pixels.tolist(), strict=True):
-            m2 = count * self._pixel_m2
-            areas[name] = {"m2": m2, "ha": m2 / M2_PER_HECTARE, "share": count / total}
-        self._group.attrs["areas"] = areas
-        return areas
+    def finish(self, areas_m2: NDArray[np.float64]) -> None:
+        """Store the area of each class (class,) beside the map: m2, ha and share of the classified area."""
+        total = float(areas_m2.sum()) or 1.0
+        self._group.attrs["areas"] = {
+            name: {"m2": m2, "ha": m2 / M2_PER_HECTARE, "share": m2 / total}
+            for name, m2 in zip(self._legend.names, areas_m2.tolist(), strict=True)
+        }
 
 
 def class_flags(legend: ClassLegend) -> dict[str, Any]:

@@ -56,32 +56,34 @@ def anchor_sweep(
     (shift,) = no_shifts([sweep.sweep.name])
     lines = len(sweep.position)
     if not sweep.usable.any():
-        return Anchor(shift, pair_shift(np.full((1, 1), np.nan), np.full((1, 1), np.nan), prior_px=prior_px))
+        return Anchor(shift, _nothing(prior_px))
     for turn in range(ROUNDS):
         reach = prior_px if turn == 0 else min(prior_px, SETTLED_PRIOR_PX)
         image = PlacedImage(sweep, camera, shift.of_lines(lines))
-        found, middle = _compare(image, grid, mosaic, reach)
-        seen = None if found.status != "found" or middle is None else image.line_and_turn(*middle)
-        if seen is None:
+        found = _compare(image, grid, mosaic, reach)
+        if found.status != "found":
             return Anchor(no_shifts([sweep.sweep.name])[0], found)
-        moved = np.asarray(np.linalg.solve(seen[1], found.shift[::-1]), np.float64)
+        moved = np.asarray(np.linalg.solve(image.turn_at_middle, found.shift[::-1]), np.float64)
         shift = shift.plus(SweepShift(shift.name, moved, np.zeros(2)))
     return Anchor(shift, found)
 
 
-def _compare(
-    image: PlacedImage, grid: SceneGrid, mosaic: NDArray[np.floating], reach_px: float
-) -> tuple[PairShift, tuple[float, float] | None]:
-    """Compare a sweep with the mosaic under it; also the place (along, scan) of the middle of what was compared."""
+def _compare(image: PlacedImage, grid: SceneGrid, mosaic: NDArray[np.floating], reach_px: float) -> PairShift:
+    """Compare a sweep with the mosaic under it."""
     along_px, scan_px = _box(image, grid, reach_px)
     if not (len(along_px) and len(scan_px)):
-        nothing = np.full((1, 1), np.nan)
-        return pair_shift(nothing, nothing, prior_px=reach_px), None
+        return _nothing(reach_px)
     seen = image.seen_at(along_px, scan_px).astype(np.float64)
     for axis in (0, 1):  # a coarse pixel is a mean over factor x factor; what is not seen spreads by as much
         seen = convolve1d(seen, _coarse_footprint(grid.factor), axis=axis, mode="constant", cval=np.nan)
     under = _interpolated(mosaic, grid, image, (along_px, scan_px))
-    return pair_shift(under, seen, prior_px=reach_px), (float(along_px.mean()), float(scan_px.mean()))
+    return pair_shift(under, seen, prior_px=reach_px)
+
+
+def _nothing(reach_px: float) -> PairShift:
+    """What a comparison of nothing says."""
+    nothing = np.full((1, 1), np.nan)
+    return pair_shift(nothing, nothing, prior_px=reach_px)
 
 
 def _coarse_footprint(factor: int) -> Floats:

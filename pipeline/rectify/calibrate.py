@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import PoseError, ShapeError
 from pipeline.mirror import mirror_throughput
+from pipeline.rectify.elements import Bools, Elements, Floats32, judge_elements
 from pipeline.source import References
-
-Floats32 = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 BLOCK_ELEMENTS = 1 << 18  # 1 MB of float32: cast, subtraction and product meet the block in the cache
 
@@ -21,8 +19,8 @@ BLOCK_ELEMENTS = 1 << 18  # 1 MB of float32: cast, subtraction and product meet 
 def reflectance(raw: NDArray[np.uint16], references: References, *, position: ArrayLike | None = None) -> Floats32:
     """Turn raw lines into scene values, ``(raw - dark) / (white - dark) * panel / flat / throughput``.
 
-    A bad element takes the value between the nearest good samples of its line and band, linear in sample, so that it
-    spoils only itself; a sample with more than half of its bands bad is left as it is.
+    A bad element takes the value between the nearest good samples of its line and band, at most 8 away, linear in
+    sample, so that it spoils only itself; in a sample with more than half of its bands bad none is filled.
 
     Parameters
     ----------
@@ -37,25 +35,29 @@ def reflectance(raw: NDArray[np.uint16], references: References, *, position: Ar
     Returns
     -------
     (line, sample, band) float32, unit of the panel's values, negative below dark; NaN where the white frame is not
-    above the dark one, a reference is not finite, or a bad element has no good one beside it.
+    above the dark one, a reference is not finite, or a bad element is not filled.
 
     Raises
     ------
     ShapeError : the references or the positions do not fit the lines.
     PoseError : positions are needed and missing, or one lies beyond the mirror's rim.
     """
-    _check_references(raw, references)
-    return _scene_values(raw, references, _standing(references), _line_gain(raw, references, position))
+    elements = _judged(raw, references)
+    return _scene_values(raw, elements, _line_gain(raw, references, position))
 
 
 def calibrate(
-    raw: NDArray[np.uint16], references: References, *, saturated_dn: float, position: ArrayLike | None = None
+    raw: NDArray[np.uint16],
+    references: References | Elements,
+    *,
+    saturated_dn: float,
+    position: ArrayLike | None = None,
 ) -> tuple[Floats32, Bools]:
     """Turn raw lines into scene values and say which of them may be used.
 
-    Out are saturated elements and those without a calibration, whole samples with more than half of their bands bad,
-    and filled elements whose neighbours are saturated. A band that no sample is calibrated in (no light at all) puts
-    nothing out: it stays NaN everywhere, on its own. Where every band is like that nothing is valid.
+    Out are what :func:`pipeline.rectify.elements.judge_elements` puts out, saturated elements, and filled ones whose
+    neighbours are saturated. A band that no sample is calibrated in (no light at all) puts nothing out: it stays NaN
+    everywhere, on its own. Where every band is like that nothing is valid.
 
     Of a sum of n samples (the coarse pass) DN tell less than of one. Let F be full scale: at n F all of them were
     saturated, above n (F - 1) one of them at least was, below F none was, and between nothing can be known. By how
@@ -64,8 +66,10 @@ def calibrate(
 
     Parameters
     ----------
-    raw, references, position
+    raw, position
         As of :func:`reflectance`.
+    references
+        Of the whole line; or elements judged already, where ``raw`` holds some of the samples or for the sake of time.
     saturated_dn
         Least DN that counts as saturated, for the binning of ``raw``: n times full scale finds sums saturated
         throughout, n times one less and 1 those known to be saturated in part.
@@ -79,11 +83,10 @@ def calibrate(
     ------
     ShapeError, PoseError : as of :func:`reflectance`.
     """
-    _check_references(raw, references)
-    standing = _standing(references)
-    line_gain = _line_gain(raw, references, position)
-    values = _scene_values(raw, references, standing, line_gain)
-    valid = _valid(raw, standing, saturated_dn)
+    elements = _judged(raw, references)
+    line_gain = _line_gain(raw, elements.references, position)
+    values = _scene_values(raw, elements, line_gain)
+    valid = _valid(raw, elements, saturated_dn)
     if line_gain is not None:
         valid[~np.isfinite(line_gain)] = False
     return values, valid
@@ -100,69 +103,6 @@ def of_bands(references: References, bands: Sequence[int]) -> References:
         bad=None if references.bad is None else references.bad[:, chosen],
         flat=None if references.flat is None else references.flat[:, chosen],
     )
-
-
-@dataclass(frozen=True)
-class _Standing:
-    """What the references alone decide, the same on every line. All (sample, band) but ``lit`` and the fill's parts."""
-
-    gain: Floats32  # NaN where an element has no calibration
-    out: Bools  # not valid on any line
-    lit: Bools  # (band,) at least one sample has a calibration
-    fill: _Fill
-
-
-@dataclass(frozen=True)
-class _Fill:
-    """Elements to be filled, and the good ones they are filled from, (n,) as indices of a flattened frame."""
-
-    element: NDArray[np.intp]
-    before: NDArray[np.intp]
-    after: NDArray[np.intp]
-    share: Floats32  # of ``after``
-
-
-def _standing(references: References) -> _Standing:
-    gain = _gain(references)
-    bad = np.zeros(gain.shape, np.bool_) if references.bad is None else references.bad
-    trusted = np.isfinite(gain) & ~bad
-    lit = np.asarray(trusted.any(axis=0))
-    lost = ~trusted & lit
-    out: Bools = np.logical_or(lost, 2 * lost.sum(axis=1, keepdims=True) > lit.sum())
-    if not lit.any():
-        out[...] = True
-    fill = _fill_of(bad & lit & ~out.all(axis=1, keepdims=True), trusted & ~out)
-    out.flat[fill.element] = False
-    gain[~trusted] = np.nan  # those that are filled are written over
-    return _Standing(gain, out, lit, fill)
-
-
-def _gain(references: References) -> Floats32:
-    span = references.white - references.dark
-    if references.flat is not None:
-        span = np.where(references.flat > 0, span * references.flat, np.nan)
-    gain = np.full(span.shape, np.nan, np.float32)
-    known = np.isfinite(span) & (span > 0)
-    with np.errstate(over="ignore"):
-        np.divide(np.broadcast_to(references.panel, span.shape), span, out=gain, where=known)
-    gain[~np.isfinite(gain)] = np.nan
-    return gain
-
-
-def _fill_of(wanted: Bools, good: Bools) -> _Fill:
-    """Where each wanted element finds its good neighbours of the same band; without any it is left out."""
-    bands = np.flatnonzero(wanted.any(axis=0) & good.any(axis=0))
-    samples = len(good)
-    number = np.arange(samples)[:, None]
-    below = np.maximum.accumulate(np.where(good[:, bands], number, -1), axis=0)
-    above = np.minimum.accumulate(np.where(good[:, bands], number, samples)[::-1], axis=0)[::-1]
-    sample, column = np.nonzero(wanted[:, bands])
-    before, after = below[sample, column], above[sample, column]
-    before, after = np.where(before < 0, after, before), np.where(after == samples, before, after)
-    share = (sample - before) / np.maximum(after - before, 1)
-    band = bands[column]
-    width = good.shape[1]
-    return _Fill(sample * width + band, before * width + band, after * width + band, share.astype(np.float32))
 
 
 def _line_gain(raw: NDArray[np.uint16], references: References, position: ArrayLike | None) -> Floats32 | None:
@@ -185,16 +125,14 @@ def _blocks(raw: NDArray[np.uint16]) -> Iterator[slice]:
     return (slice(first, first + lines) for first in range(0, len(raw), lines))
 
 
-def _scene_values(
-    raw: NDArray[np.uint16], references: References, standing: _Standing, line_gain: Floats32 | None
-) -> Floats32:
+def _scene_values(raw: NDArray[np.uint16], elements: Elements, line_gain: Floats32 | None) -> Floats32:
     values = np.empty(raw.shape, np.float32)
-    fill = standing.fill
+    dark, fill = elements.references.dark, elements.fill
     for block in _blocks(raw):
         part = values[block]
         part[...] = raw[block]
-        part -= references.dark
-        part *= standing.gain
+        part -= dark
+        part *= elements.gain
         if line_gain is not None:
             part *= line_gain[block, None, None]
         if len(fill.element):
@@ -204,10 +142,10 @@ def _scene_values(
     return values
 
 
-def _valid(raw: NDArray[np.uint16], standing: _Standing, saturated_dn: float) -> Bools:
+def _valid(raw: NDArray[np.uint16], elements: Elements, saturated_dn: float) -> Bools:
     """(line, sample), or (line, sample, band) where only some bands of a sample are out."""
-    out, lit = standing.out, standing.lit
-    found = [_saturated(raw, block, standing, saturated_dn) for block in _blocks(raw)]
+    out, lit = elements.out, elements.lit
+    found = [_saturated(raw, block, elements, saturated_dn) for block in _blocks(raw)]
     line, sample = (np.concatenate([np.zeros(0, np.intp), *(part[k] for part in found)]) for k in (0, 1))
     hot = np.concatenate([out[:0], *(part[2] for part in found)]) | out[sample]
     whole, whole_hot = _sample_out(out, lit), _sample_out(hot, lit)
@@ -223,16 +161,16 @@ def _valid(raw: NDArray[np.uint16], standing: _Standing, saturated_dn: float) ->
 
 
 def _saturated(
-    raw: NDArray[np.uint16], block: slice, standing: _Standing, saturated_dn: float
+    raw: NDArray[np.uint16], block: slice, elements: Elements, saturated_dn: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Bools]:
     """Lines and samples with elements at or above the limit, or filled from them, and which, (n, band)."""
     part = raw[block]
     if not part.size or part.max() < saturated_dn:
         nothing = np.zeros(0, np.intp)
-        return nothing, nothing, standing.out[:0]
+        return nothing, nothing, elements.out[:0]
     hot = part >= saturated_dn
-    hot &= standing.lit
-    fill = standing.fill
+    hot &= elements.lit
+    fill = elements.fill
     if len(fill.element):
         flat = hot.reshape(len(hot), -1)
         flat[:, fill.element] = flat[:, fill.before] | flat[:, fill.after]
@@ -249,6 +187,14 @@ def _sample_out(out: Bools, lit: Bools) -> Bools:
 def _is_parted(out: Bools, whole: Bools) -> bool:
     """Whether some but not all bands of a sample are out."""
     return bool(np.any(out.any(axis=-1) & ~whole))
+
+
+def _judged(raw: NDArray[np.uint16], references: References | Elements) -> Elements:
+    if isinstance(references, Elements):
+        _check_references(raw, references.references)
+        return references
+    _check_references(raw, references)
+    return judge_elements(references)
 
 
 def _check_references(raw: NDArray[np.uint16], references: References) -> None:

@@ -20,7 +20,8 @@ ORDER = 3  # of the polynomial in wavelength: daylight drifts by colour, not by 
 ERROR_FLOOR = 1e-3  # of a log ratio
 SIGMA_OF_MEDIAN = 1.4826  # standard deviation of a normal law over its median absolute deviation
 MEDIAN_LOSS = 1.2533  # standard error of a median over that of a mean
-PROBE_ROWS, PROBE_PITCH = 24, 4  # of every window: rows at its middle, and their distance [px of the pass]
+PROBE_ROWS = 96  # at the middle of every window
+GROUP_PX = 16  # side of the squares whose sums are compared: some periods of crop rows
 LEAST_GROUPS = 5
 
 
@@ -53,7 +54,7 @@ def light_ratio(
 ) -> LightRatio:
     """Compare two sweeps over the same points.
 
-    The points come in groups (rows of pixels). The ratio is the median over groups of the ratio of their sums: sums
+    The points come in groups (squares of pixels). The ratio is the median over groups of the ratio of their sums: sums
     first, so that noise has no say in the sign of a pixel; the median, so that what moved between the sweeps has none.
 
     Parameters
@@ -137,7 +138,9 @@ def solve_lights(
 def overlap_light(placed: Sequence[Placed], camera: LineCamera, windows: Sequence[Window]) -> list[LightRatio]:
     """Read both sweeps of every pair at the middle rows of their windows, and compare them band by band.
 
-    A window takes 24 rows, 4 px of the pass apart in either direction, from either sweep: little is read.
+    A window takes 96 rows from either sweep, every pixel of them, summed in squares of 16 px: single rows, or every
+    few pixels, would meet crop rows always at one place between two plants, which two sweeps do not blur alike, and
+    their ratio would pass for light.
 
     Parameters
     ----------
@@ -154,8 +157,8 @@ def overlap_light(placed: Sequence[Placed], camera: LineCamera, windows: Sequenc
     for pair in sorted({(window.reference, window.moving) for window in windows}):
         here = [window for window in windows if (window.reference, window.moving) == pair]
         sides = [[_probe(placed[number], camera, window) for window in here] for number in pair]
-        widest = max(values.shape[1] for values in sides[0])
-        both = (np.concatenate([_padded(values, widest) for values in side]) for side in sides)
+        rows, columns = (min(GROUP_PX, *(values.shape[axis] for values in sides[0])) for axis in (0, 1))
+        both = (np.concatenate([_squares(values, rows, columns) for values in side]) for side in sides)
         ratios.append(light_ratio(*both, pair=pair))
     return ratios
 
@@ -163,7 +166,7 @@ def overlap_light(placed: Sequence[Placed], camera: LineCamera, windows: Sequenc
 def _probe(placed: Placed, camera: LineCamera, window: Window) -> NDArray[np.float32]:
     """Values of one sweep in a window, (row along the scan, column along the line, band)."""
     sweep = placed.lines.sweep
-    spacing = PROBE_PITCH * sweep.step
+    spacing = sweep.step
     middle = sum(window.scan_px) / 2
     rows = min(PROBE_ROWS, int((window.scan_px[1] - window.scan_px[0]) // spacing) + 1)
     columns = int((window.along_px[1] - window.along_px[0]) // spacing) + 1
@@ -174,8 +177,11 @@ def _probe(placed: Placed, camera: LineCamera, window: Window) -> NDArray[np.flo
     return values.swapaxes(0, 1) if turned else values
 
 
-def _padded(values: NDArray[np.float32], points: int) -> NDArray[np.float32]:
-    return np.pad(values, ((0, 0), (0, points - values.shape[1]), (0, 0)), constant_values=np.nan)
+def _squares(values: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float32]:
+    """Cut (row, column, band) into groups of neighbours, (group, point, band); what is left at the ends falls away."""
+    down, across, bands = values.shape[0] // rows, values.shape[1] // columns, values.shape[2]
+    whole = values[: down * rows, : across * columns].reshape(down, rows, across, columns, bands)
+    return whole.swapaxes(1, 2).reshape(down * across, rows * columns, bands)
 
 
 def _basis(wavelength_nm: Floats, order: int) -> Floats:

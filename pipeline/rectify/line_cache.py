@@ -66,7 +66,7 @@ class LineCache:
         -------
         (line, sample, band) uint16; not to be written to.
         """
-        held = _held_samples(lines, samples, likely)
+        held = held_samples(lines, samples, likely)
         within = slice(samples.start - held.start, samples.stop - held.start)
         parts = []
         for number in line_blocks(wanted):
@@ -105,19 +105,19 @@ def line_blocks(lines: slice) -> range:
     return range(lines.start // BLOCK_LINES, -(-lines.stop // BLOCK_LINES))
 
 
-def whole_chunks(samples: slice, count: int) -> slice:
-    """Grow a range of samples to whole chunks of 32, within 0..count."""
-    first = samples.start // CHUNK_SAMPLES * CHUNK_SAMPLES
-    return slice(first, min(-(-samples.stop // CHUNK_SAMPLES) * CHUNK_SAMPLES, count))
-
-
-def _held_samples(lines: SweepLines, samples: slice, likely: slice | None) -> slice:
+def held_samples(lines: SweepLines, samples: slice, likely: slice | None = None) -> slice:
     """Samples to read and hold: those wanted and likely, in whole chunks; all of a sweep read by whole lines."""
     count = lines.references.dark.shape[0]
     if not isinstance(lines, WindowedLines):
         return slice(0, count)
     other = samples if likely is None else likely
-    return whole_chunks(slice(min(samples.start, other.start), max(samples.stop, other.stop)), count)
+    return _whole_chunks(slice(min(samples.start, other.start), max(samples.stop, other.stop)), count)
+
+
+def _whole_chunks(samples: slice, count: int) -> slice:
+    """Grow a range of samples to whole chunks of 32, within 0..count."""
+    first = samples.start // CHUNK_SAMPLES * CHUNK_SAMPLES
+    return slice(first, min(-(-samples.stop // CHUNK_SAMPLES) * CHUNK_SAMPLES, count))
 
 
 def _read(lines: SweepLines, number: int, samples: slice) -> Raw:

@@ -13,6 +13,7 @@ from pipeline.mirror import direction_to_position, direction_to_scene, position_
 
 LATE_FRAMES = 0.25
 LEAST_FRAMES = 3  # below that none can be told to be the late one
+WILD_FRAMES = 1000  # a first or last stamp so far off the others is wrong, if they all lie nearer to each other
 FITS = 2  # the second without the frames that the first finds late
 
 Floats = NDArray[np.float64]
@@ -27,7 +28,7 @@ class LineNumbers:
     usable: NDArray[np.bool_]  # (frame,)
     lost: int  # lines between the first and the last for which no frame came
     repeated: int  # frames that came again under the same stamp
-    backward: int  # frames whose stamp goes back, or is no number
+    backward: int  # frames whose stamp goes back, lies far off all others, or is no number
     late: int  # usable frames more than a quarter period from their place
 
 
@@ -36,7 +37,8 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
 
     A gap of more than 1.5 periods leaves numbers out. Of frames with equal stamps the first is kept. A stamp that goes
     back is not believed: the longest ascending row of stamps is, and of equally long ones that with the earlier frames,
-    so that one wild stamp costs one line. A late frame is used: its position is that of its own time.
+    so that one wild stamp costs one line; so does a wild one that comes first or last. A late frame is used: its
+    position is that of its own time.
 
     Parameters
     ----------
@@ -60,7 +62,8 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
     repeated = int((known & ~first).sum())
     fresh = np.flatnonzero(known & first)
     usable = np.zeros(len(time_s), np.bool_)
-    usable[fresh[_longest_ascent(time_s[fresh])]] = True
+    row = fresh[_longest_ascent(time_s[fresh])]
+    usable[row[_without_wild_ends(time_s[row], frame_s)]] = True
     count = _numbers(time_s[usable], frame_s)
     return LineNumbers(
         number=_numbers_of_all(time_s, usable, count),
@@ -130,6 +133,15 @@ def _longest_ascent(values: Floats) -> NDArray[np.intp]:
         row.append(index)
         index = int(below[index])
     return np.array(row, np.intp)
+
+
+def _without_wild_ends(time_s: Floats, frame_s: float) -> slice:
+    """Ascending stamps but for a first and a last one that lie farther off than the others from each other."""
+    if len(time_s) < LEAST_FRAMES:
+        return slice(None)
+    far = max(WILD_FRAMES * frame_s, float(time_s[-2] - time_s[1]))
+    wild_first, wild_last = time_s[1] - time_s[0] > far, time_s[-1] - time_s[-2] > far
+    return slice(int(wild_first), len(time_s) - int(wild_last))
 
 
 def _numbers(time_s: Floats, frame_s: float) -> NDArray[np.intp]:

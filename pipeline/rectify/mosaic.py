@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,7 +74,8 @@ def mosaic(parts: Sequence[Part]) -> tuple[NDArray[np.float32], NDArray[np.intp]
 def _blend_shared(blended: NDArray[np.float32], parts: Sequence[Part], points: NDArray[np.intp]) -> None:
     """Write the mixtures at ``points``, which several parts reach."""
     shares = np.stack([_share(part, points) for part in parts])
-    weights = (shares / shares.sum(axis=0)).astype(np.float32) if len(points) else shares
+    total = reduce(np.add, shares)  # part by part: ndarray.sum takes another order where there is one point alone
+    weights = (shares / total).astype(np.float32)
     for first in range(0, len(points), BLOCK_POINTS):
         block = points[first : first + BLOCK_POINTS]
         mixed = np.zeros((len(block), blended.shape[1]), np.float32)
@@ -90,10 +92,10 @@ def _by_band(parts: Sequence[Part], weights: NDArray[np.floating], points: NDArr
     """Mixtures at points where a part has no value in some bands: there the others count alone."""
     values = np.stack([part.values[points] for part in parts])
     counts = np.where(np.isnan(values), 0, weights[..., None])
-    total = counts.sum(axis=0)
+    total = reduce(np.add, counts)
     mixed = np.where(counts > 0, values, 0) * counts
     found: NDArray[np.floating] = np.full(total.shape, np.nan)
-    np.divide(mixed.sum(axis=0), total, out=found, where=total > 0)
+    np.divide(reduce(np.add, mixed), total, out=found, where=total > 0)
     return found
 
 

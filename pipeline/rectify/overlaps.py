@@ -41,15 +41,28 @@ class BroadSweep:
     image: NDArray[np.float32]  # (line, sample), NaN where a band is not valid
 
     @classmethod
-    def read(cls, lines: SweepLines, camera: LineCamera, *, bands: int = BROAD_BANDS) -> BroadSweep:
-        """Read and calibrate a sweep's lines, 64 at a time, keeping the mean of ``bands`` bands spread over all."""
+    def read(
+        cls,
+        lines: SweepLines,
+        camera: LineCamera,
+        *,
+        bands: int = BROAD_BANDS,
+        usable: NDArray[np.bool_] | None = None,
+    ) -> BroadSweep:
+        """Read and calibrate a sweep's lines, 64 at a time, keeping the mean of ``bands`` bands spread over all.
+
+        Parameters
+        ----------
+        usable
+            (line,) lines whose position may be believed; None takes ``lines.valid_line``.
+        """
         chosen = broad_bands(lines.references, bands)
         references = _of_bands(lines.references, chosen)
         total = len(lines.valid_line)
         image = np.full((total, references.dark.shape[0]), np.nan, np.float32)
         saturated = camera.full_scale_dn * lines.sweep.binning
         position = np.asarray(lines.position, np.float64)
-        usable = lines.valid_line & np.isfinite(position).all(axis=1)
+        usable = (lines.valid_line if usable is None else usable) & np.isfinite(position).all(axis=1)
         for first in range(0, total, BLOCK_LINES):
             part = slice(first, min(first + BLOCK_LINES, total))
             raw = np.ascontiguousarray(lines.read(part.start, part.stop)[..., chosen])
@@ -111,6 +124,12 @@ class PlacedImage:
                 line = int(track.lines[track.starts[int(np.clip(np.rint(at[0]), 0, len(track.scan) - 1))]])
                 return float(line), self._turn(line, float(at[1]))
         return None
+
+    @cached_property
+    def turn_at_middle(self) -> Floats:
+        """How the place that the middle sample of the middle usable line sees moves with the line's centre, (2, 2)."""
+        usable = np.flatnonzero(self.broad.usable)
+        return self._turn(int(usable[len(usable) // 2]), (self.broad.image.shape[1] - 1) / 2)
 
     def _turn(self, line: int, sample: float) -> Floats:
         slope = (sample + 0.5) * self.broad.sweep.binning - self.camera.samples / 2

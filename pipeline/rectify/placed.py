@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.errors import ShapeError
 from pipeline.grid import SceneGrid
+from pipeline.rectify.elements import Elements, judge_elements
 from pipeline.rectify.lookup import track_lookup
 from pipeline.rectify.ties import TieTable, tie_table
 from pipeline.rectify.tracks import Track, make_tracks
-from pipeline.source import References, SweepLines
+from pipeline.source import SweepLines
 
 LEAST_TIE_PX = 4  # closer ties take a byte a pixel and more
 
@@ -49,40 +50,16 @@ class Placed:
     gain: NDArray[np.float32] | None = None  # (band,) what the sweep's values are multiplied by
 
     @cached_property
-    def references(self) -> References:
-        """References with the gain in the panel's values."""
+    def elements(self) -> Elements:
+        """The detector's elements, judged by all of the references; the gain is in the panel's values."""
         plain = self.lines.references
         if self.gain is None:
-            return plain
+            return judge_elements(plain)
         if self.gain.shape != plain.panel.shape:
             raise ShapeError(
                 f"sweep {self.lines.sweep.name} has {len(plain.panel)} bands, its gain has shape {self.gain.shape}"
             )
-        return replace(plain, panel=(plain.panel * self.gain).astype(np.float32))
-
-    @cached_property
-    def _sound(self) -> NDArray[np.bool_]:
-        """(sample,) whether every band that any sample is calibrated in is calibrated in this one."""
-        ref = self.lines.references
-        span = ref.white - ref.dark
-        trusted = np.isfinite(span) & (span > 0)
-        if ref.bad is not None:
-            trusted &= ~ref.bad
-        if ref.flat is not None:
-            trusted &= np.isfinite(ref.flat) & (ref.flat > 0)
-        alike: NDArray[np.bool_] = np.all(trusted == trusted.any(axis=0), axis=1)
-        return alike
-
-    def alone(self, samples: slice) -> slice:
-        """Grow a run of samples until it can be calibrated by itself.
-
-        Bad elements are filled from the next good ones, so the run has to end in samples without any, or with the line.
-        """
-        below, above = np.flatnonzero(self._sound[: samples.start + 1]), np.flatnonzero(self._sound[samples.stop - 1 :])
-        return slice(
-            int(below[-1]) if len(below) else 0,
-            samples.stop + int(above[0]) if len(above) else len(self._sound),
-        )
+        return judge_elements(replace(plain, panel=(plain.panel * self.gain).astype(np.float32)))
 
     def coordinates(
         self, number: int, camera: LineCamera, grid: PixelGrid, rows: slice, columns: slice

@@ -59,7 +59,7 @@ class TrackReach:
         return ColumnReach(
             top=np.where(hit, self._top, np.inf).min(axis=1),
             bottom=np.where(hit, self._bottom, -np.inf).max(axis=1),
-            samples=self._placed.alone(slice(max(first - TAPS, 0), min(last + TAPS, self._count))),
+            samples=self._placed.elements.alone(slice(max(first - TAPS, 0), min(last + TAPS, self._count))),
         )
 
 

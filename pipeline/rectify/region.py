@@ -172,7 +172,7 @@ def _blend(
     parts = [part for part in read if part is not None]
     if parts:
         return mosaic(parts)
-    count, bands = looked[0][1].size // 2, len(looked[0][0].placed.references.panel)
+    count, bands = looked[0][1].size // 2, len(looked[0][0].placed.lines.references.panel)
     return np.full((count, bands), np.nan, np.float32), np.zeros(count, np.intp)
 
 

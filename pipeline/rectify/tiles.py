@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from pipeline.camera import LineCamera
-from pipeline.rectify.line_cache import BLOCK_LINES, line_blocks
+from pipeline.rectify.line_cache import BLOCK_LINES, held_samples, line_blocks
 from pipeline.rectify.placed import PixelGrid, Placed
 from pipeline.rectify.reach import ColumnReach, TrackReach, member_lines
 
@@ -60,7 +60,7 @@ def _blocks_of(placed: Sequence[Placed], tile: Tile) -> dict[tuple[int, int, int
             if near is None or knots.start == knots.stop:
                 continue
             members = member_lines(track, knots)
-            first, last = near.samples.start, near.samples.stop
+            held = held_samples(one.lines, near.samples)
             for number in line_blocks(slice(int(members.min()), int(members.max()) + 1)):
-                blocks[sweep, number, first, last] = BLOCK_LINES * (last - first) * bands * 2
+                blocks[sweep, number, held.start, held.stop] = BLOCK_LINES * (held.stop - held.start) * bands * 2
     return blocks

@@ -162,8 +162,7 @@ def _usual_step(scan: Floats, lines: NDArray[np.intp], apart: float) -> float:
     steps = steps[steps > STANDING_STEPS * apart]
     if not len(steps):
         return apart
-    moving = steps[steps >= DWELL_STEPS * np.median(steps)]
-    return float(np.percentile(moving, 50, method="lower"))  # of one step and one gap, the step
+    return float(np.percentile(steps, 50, method="lower"))  # of one step and one gap, the step
 
 
 def _noise(scan: Floats) -> float:
@@ -191,11 +190,9 @@ def _runs(scan: Floats, most_back: float, still: float) -> list[slice]:
 
 
 def _rises_first(scan: Floats, far: float) -> bool:
-    """Whether the path first goes up or down by more than ``far``; where it does neither, where it ends."""
+    """Whether the path first goes up by more than ``far``, and not down; where it does neither, it does not matter."""
     up = scan - np.minimum.accumulate(scan) > far
     down = np.maximum.accumulate(scan) - scan > far
-    if not up.any() and not down.any():
-        return bool(scan[-1] >= scan[0])
     return bool(up.any() and (not down.any() or np.argmax(up) < np.argmax(down)))
 
 

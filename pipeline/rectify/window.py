@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,6 @@ from pipeline.rectify.placed import Placed
 from pipeline.rectify.reach import TAPS, member_lines
 from pipeline.rectify.resample import Kernel, merge_lines, resample
 from pipeline.rectify.tracks import Track
-from pipeline.source import References
 
 RUN_ELEMENTS = 250_000  # what one more window costs, in elements (sample and band of a line) calibrated
 
@@ -43,11 +42,12 @@ def read_part(looked: Looked, coordinates: NDArray[np.float64], camera: LineCame
         return None
     lines, track = looked.placed.lines, looked.track
     count = lines.references.dark.shape[0]
-    knots, samples = _span(box[0], box[1], len(track)), looked.placed.alone(_span(box[2], box[3], count))
+    elements = looked.placed.elements
+    knots, samples = _span(box[0], box[1], len(track)), elements.alone(_span(box[2], box[3], count))
     members = member_lines(track, knots)
     values, valid = calibrate(
         _raw_of(looked.read, members, samples),
-        _cropped(looked.placed.references, samples),
+        elements.part(samples),
         saturated_dn=camera.full_scale_dn * lines.sweep.binning,
         position=lines.position[members],
     )
@@ -128,13 +128,3 @@ def _raw_of(read: ReadWindow, members: NDArray[np.intp], samples: slice) -> Raw:
         if (np.diff(members) == -1).all():
             return raw[::-1]
     return raw[members - first]
-
-
-def _cropped(references: References, samples: slice) -> References:
-    return replace(
-        references,
-        dark=references.dark[samples],
-        white=references.white[samples],
-        bad=None if references.bad is None else references.bad[samples],
-        flat=None if references.flat is None else references.flat[samples],
-    )

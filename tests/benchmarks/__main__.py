@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
-import platform
 import sys
 import textwrap
 import time
@@ -109,18 +108,11 @@ def _summarise(tables: dict[str, Sequence[Row]], failed: Sequence[str]) -> None:
 
 def _machine() -> str:
     """Processor, cores, load and versions, on one line."""
-    from importlib import metadata
+    from flows.tradeoff_machine import describe_machine, mean_load
 
-    names = (line.partition(":")[2].strip() for line in _cpuinfo() if line.startswith("model name"))
-    processor = next(names, platform.processor() or "unknown processor")
-    versions = ", ".join(f"{name} {metadata.version(name)}" for name in ("numpy", "scipy", "torch"))
-    load = f", load {os.getloadavg()[0]:.2f}" if hasattr(os, "getloadavg") else ""
-    return f"{processor}, {os.cpu_count()} cores{load}, one thread; python {platform.python_version()}, {versions}"
-
-
-def _cpuinfo() -> list[str]:
-    path = Path("/proc/cpuinfo")
-    return path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    it = describe_machine(threads=1)
+    versions = ", ".join(f"{name} {version}" for name, version in it["versions"].items())
+    return f"{it['processor']}, {it['cores']} cores, load {mean_load()}, one thread; python {it['python']}, {versions}"
 
 
 if __name__ == "__main__":

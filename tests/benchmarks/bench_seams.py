@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 
 import numpy as np
-from measure import Row
+from measure import Row, not_run
 from numpy.typing import NDArray
 from seam_pictures import RGBN, cut_and_join, given_neighbours, join_neighbours
 from seam_survey import LINES, SAMPLES, left_again, line_errors, make_survey, seam_offsets
@@ -88,8 +87,9 @@ def _row_results(seeds: int, gaps: float) -> tuple[list[tuple[PairShift, Floats]
 def _survey() -> list[Row]:
     survey = make_survey()
     before, after = (seam_offsets(survey, shifts) for shifts in (survey.unregistered, survey.found.shifts))
-    worst = [max(float(np.hypot(*seam.mean(axis=0))) for seam in seams) for seams in (before, after)]
-    again = max(float(np.hypot(*mean)) for mean in left_again(survey, survey.found.shifts))
+    # np.max, for max() would pass over a seam that is NaN: not seen, or not measured.
+    worst = [float(np.max([np.hypot(*seam.mean(axis=0)) for seam in seams])) for seams in (before, after)]
+    again = float(np.max([np.hypot(*mean) for mean in left_again(survey, survey.found.shifts)]))
     jitter = np.concatenate(line_errors(survey)).std()
     what = f"survey of {LINES} lines x {SAMPLES} samples, {len(survey.sweeps)} strips, 50 px and 0.8 px per line off"
     return [
@@ -102,7 +102,7 @@ def _survey() -> list[Row]:
 
 def _pictures() -> list[Row]:
     if not RGBN.is_dir():
-        return [Row("two parts of rgbn.tif put together", f"not run: no {RGBN}, set SPECTRALZOOM_DATA")]
+        return [not_run("two parts of rgbn.tif put together", RGBN)]
     exact, smooth = cut_and_join()
     rows = [
         Row("two parts of rgbn.tif, 3 and 4 px out of place, put together by nearest: pixels that differ",
@@ -127,9 +127,11 @@ def _skimage(reference: Floats, moving: Floats) -> Floats:
 
 
 def _opencv(reference: Floats, moving: Floats) -> Floats:
-    cv2 = importlib.import_module("cv2")
+    import cv2
+
     window = cv2.createHanningWindow(reference.shape[::-1], cv2.CV_64F)
-    (right, down), _ = cv2.phaseCorrelate(reference, moving, window)
+    # Copies, for it puts the window on what it is given where the size needs no padding.
+    (right, down), _ = cv2.phaseCorrelate(reference.copy(), moving.copy(), window)
     return np.array([-down, -right])
 
 

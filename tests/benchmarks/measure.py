@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import gc
+import os
 import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,16 @@ class Clock:
     def wall_min_s(self) -> float:
         """Least wall time [s]."""
         return min(self.wall_s)
+
+
+def data_folder(name: str) -> Path:
+    """Give where a real data set lies, there or not: in $SPECTRALZOOM_DATA, or in shared/data beside the checkout."""
+    return Path(os.environ.get("SPECTRALZOOM_DATA", ROOT.parent / "shared" / "data")) / name
+
+
+def not_run(what: str, folder: Path) -> Row:
+    """Say that a row needs data that is not there."""
+    return Row(what, f"not run: no {folder}, set SPECTRALZOOM_DATA")
 
 
 def time_in_turn(calls: Mapping[str, Callable[[], object]], rounds: int = 5) -> dict[str, Clock]:

@@ -170,9 +170,11 @@ def _rasterio_reproject(scene: Turned, order: int) -> Peer:
     grid = Affine(xx, xy, x0 + 0.5 - (xx + xy) / 2, -yx, -yy, -(y0 + 0.5 - (yx + yy) / 2))
     origin, down = Affine.translation(*ORIGIN_M), Affine.scale(1, -1)
     place = {"src_transform": origin @ down, "dst_transform": origin @ grid, "src_crs": CRS, "dst_crs": CRS}
+    # A turned grid seems coarser to GDAL, which then widens its kernels: three times slower, and less exact.
+    same_scale = {"XSCALE": 1, "YSCALE": 1}
     return Peer(
         "rasterio reproject",
-        lambda: reproject(planes, out, resampling=kernel, num_threads=1, **place),
+        lambda: reproject(planes, out, resampling=kernel, num_threads=1, **place, **same_scale),
         lambda _: _by_pixel(out),
         BANDS,
         warm=True,

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
-import os
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
+from measure import data_folder
 from numpy.typing import NDArray
 from scipy.ndimage import shift as spline_shift
 
@@ -16,8 +14,7 @@ from pipeline.rectify.resample import Kernel
 
 Floats = NDArray[np.float64]
 
-ROOT = Path(__file__).resolve().parents[2]
-RGBN = Path(os.environ.get("SPECTRALZOOM_DATA", ROOT.parent / "shared" / "data")) / "rgbn"
+RGBN = data_folder("rgbn")
 NEIGHBOURS = ("rgbn_suba.tif", "rgbn_subb.tif")
 CUT_LEFT, CUT_RIGHT = 220, 320  # columns that both parts have
 WRONG_BY = np.array([3.0, -4.0])
@@ -38,7 +35,8 @@ class Joined:
 
 def read_picture(name: str) -> tuple[Picture, Floats]:
     """Read one picture with its mask and the map coordinates (y, x) of its first corner."""
-    rasterio = importlib.import_module("rasterio")
+    import rasterio
+
     with rasterio.open(RGBN / name) as file:
         values = file.read().transpose(1, 2, 0).astype(np.float32)
         corner, pixel = np.array([file.transform.f, file.transform.c]), np.array([file.transform.e, file.transform.a])

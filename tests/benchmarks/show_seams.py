@@ -50,7 +50,7 @@ def main(arguments: Sequence[str]) -> int:
     if RGBN.is_dir():
         show_pictures(folder / "picture_seams.png")
     else:
-        print(f"no {RGBN}: pictures not shown; set SPECTRALZOOM_DATA")
+        print(f"picture_seams.png: not run: no {RGBN}, set SPECTRALZOOM_DATA")
     return 0
 
 

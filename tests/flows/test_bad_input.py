@@ -92,6 +92,16 @@ REFUSED = {
     "unknown source": (2, "--source rig", "use --source sim"),
     "exposure in seconds": (2, "--exposure-ms 0.1", "--exposure-ms must be a number from 0.5.*then write 100"),
     "farm beyond memory": (2, "--scene farm --size 60000x60000", "takes about .* GB of memory, this machine has"),
+    "memory for no tile": (
+        2,
+        "--memory 300MiB --budget 1",
+        "exceeds --memory 300 MiB: .* give at least --memory 5.. MiB",
+    ),
+    "mirror off by a line": (
+        2,
+        "--pointing-px 200 --budget 1",
+        "^--pointing-px 200: .* overlap by 656 px .* give less than 192$",
+    ),
     "unknown effect": (2, "--effects slit,fog", "some of slit,smear,throughput,shot,read; got 'slit,fog'"),
 }
 

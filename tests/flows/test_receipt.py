@@ -151,6 +151,10 @@ def test_comparable_leaves_times_out_and_nothing_else():
     one, two = make_receipt(wall=1.5), make_receipt(wall=2.5)
     assert one != two
     assert comparable(one) == comparable(two)
+    two["stages"][-1] = {**two["stages"][-1], "name": "evaluate"}
+    longer = {**two, "stages": [*two["stages"][:-1], {**two["stages"][-1], "bytes_out": 1}]}
+    assert comparable(longer) == comparable(two)  # times in more digits
+    two["stages"][-1]["name"] = one["stages"][-1]["name"]
     two["savings"]["lines"]["done"] += 1
     assert comparable(one) != comparable(two)
     assert comparable(one) != comparable({**one, "seed": 8})

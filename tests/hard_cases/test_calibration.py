@@ -100,6 +100,15 @@ def test_reference_not_finite(frame: str, value: float) -> None:
     assert np.argwhere(~valid).tolist() == [[0, 3, 7]]
 
 
+@pytest.mark.parametrize(("above", "flat"), [(-5, 1), (-5, -1), (5, -1), (5, 0), (1e-39, 1)])
+def test_references_that_make_no_sense(above: float, flat: float) -> None:
+    """An element whose white is below dark, too near to it for a number, or whose flat is not positive is out."""
+    references = replace(frames(), flat=np.ones((12, 10), np.float32))
+    references.dark[3, 7], references.white[3, 7], references.flat[3, 7] = 0, above, flat  # type: ignore[index]
+    values, valid = calibrate(np.full((1, 12, 10), 500, np.uint16), references, saturated_dn=FULL)
+    assert np.argwhere(np.isnan(values)).tolist() == np.argwhere(~valid).tolist() == [[0, 3, 7]]
+
+
 @pytest.mark.parametrize(("samples", "bands"), [(1, 1), (1, 10), (12, 1), (2, 2)])
 def test_smallest_sizes(samples: int, bands: int) -> None:
     """One line, one sample and one band calibrate like any; with nothing to fill from a bad element is out."""

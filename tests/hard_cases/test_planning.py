@@ -9,7 +9,7 @@ from pipeline.camera import LineCamera
 from pipeline.coverage import check_reach, full_sweeps
 from pipeline.errors import PoseError, SettingsError
 from pipeline.grid import SceneGrid
-from pipeline.planning import plan_fine, price_of_seats, price_seats
+from pipeline.planning import plan_fine, price_of_seats
 from pipeline.scan import CostModel, Sweep
 from pipeline.vector_memory import memory_loads
 
@@ -37,6 +37,15 @@ def test_a_plan_stops_at_the_memorys_last_pair_where_a_reload_does_not_pay():
     plan = plan_fine(GRID, CAMERA, cost, "x", even(GRID), budget_s=30.0 + 20.0)
     assert 100 < plan.lines <= 150
     assert plan.seconds <= 50.0
+
+
+def test_set_ups_that_cost_nothing():
+    """Where slews, settling and starts are free, plans keep to the budget and grow with it."""
+    cost = CostModel(slew_s=0.0, settle_frames=0.0, capture_start_s=0.0)
+    scores = np.random.default_rng(0).exponential(size=int(np.prod(GRID.seat_shape)))
+    plans = [plan_fine(GRID, CAMERA, cost, "x", scores, budget_s=budget_s) for budget_s in (5.0, 10.0, 20.0)]
+    assert all(plan.seconds <= budget_s for plan, budget_s in zip(plans, (5.0, 10.0, 20.0), strict=True))
+    assert 0 < plans[0].worth < plans[1].worth < plans[2].worth
 
 
 @pytest.mark.parametrize("value", [np.nan, -np.inf, -1.0, 0.0])
@@ -96,7 +105,7 @@ def test_a_seat_wider_than_the_line():
     with pytest.raises(SettingsError, match="patch of 641 px is wider than a line of 640"):
         plan_fine(grid, CAMERA, COST, "x", np.ones(1), budget_s=1.0)
     with pytest.raises(SettingsError, match="patch of 641 px"):
-        price_seats(grid, CAMERA, COST, "x", np.array([0]))
+        price_of_seats(grid, CAMERA, COST, "x", np.array([0]))
 
 
 def test_a_seat_as_wide_as_the_line():
@@ -162,7 +171,7 @@ def test_seats_that_nothing_reaches_are_refused():
 def test_a_seat_costs_its_rotated_footprint():
     """Far off the axis a line lies across a patch: 320 (1 + tan psi) lines and the kernel's, not 320."""
     grid = SceneGrid(10_240, 10_240, 320, 1)
-    lines, _ = price_seats(grid, CAMERA, COST, "x", np.array([16 * 32 + 31]))
+    lines = price_of_seats(grid, CAMERA, COST, "x", np.array([16 * 32 + 31])).lines
     xi = 4800 * CAMERA.ifov_rad
     psi = np.arctan2(xi, np.sqrt(1 + xi * xi))  # of a line at xi on the axis, to a few lines over the patch
     assert lines == pytest.approx(320 * (1 + np.tan(psi)) + 3, abs=6)

@@ -56,6 +56,24 @@ def test_lost_taps_are_made_up_for_by_the_rest() -> None:
     assert np.isnan(out[left < 0.5]).all()
 
 
+def test_share_is_never_above_one() -> None:
+    """Where only taps of negative weight are lost, what is left weighs more than all: it counts as all."""
+    valid = np.ones((9, 9), bool)
+    valid[:, [2, 5]] = False
+    out, share = resample(np.full((9, 9, 1), 40, np.float32), valid, np.array([[4, 3.5]]))
+    np.testing.assert_allclose(out, 40, rtol=1e-6)
+    assert share.tolist() == [1]
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.uint16])
+def test_nearest_rounds_halves_up(kind: type[np.generic]) -> None:
+    """Half-way points take the next pixel throughout: none is taken twice and none is left out."""
+    at = np.array([[0.5, 0], [1.5, 0], [2.5, 0], [3, 0.5], [3, 1.5]])
+    out, _ = resample(ramp(6, 4).astype(kind), np.ones((6, 4), bool), at, "nearest")
+    assert out[:, 0].tolist() == [10, 20, 30, 31, 32]
+    assert out.dtype == kind
+
+
 def test_saturated_element_leaves_the_other_bands() -> None:
     """One saturated band of a bright pixel is NaN where it weighs more than half; the other bands have their values."""
     values, valid = ramp(9, 9, 4), np.ones((9, 9, 4), bool)

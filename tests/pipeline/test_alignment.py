@@ -97,6 +97,13 @@ def test_one_window_gives_an_offset_and_no_drift():
     np.testing.assert_allclose(found.shifts[1].of_lines(1000), [[7.0, -3.0]] * 1000, atol=1e-3)
 
 
+def test_drift_leaves_the_middle_of_a_sweep():
+    """Of an even or odd number of lines, those either side of the middle drift by as much, the other way."""
+    shift = SweepShift("a", np.array([1.0, -2.0]), np.array([0.5, 0.25]))
+    np.testing.assert_array_equal(shift.of_lines(2), [[0.75, -2.125], [1.25, -1.875]])
+    np.testing.assert_array_equal(shift.of_lines(3), [[0.5, -2.25], [1.0, -2.0], [1.5, -1.75]])
+
+
 def test_positions_shift_as_the_scene_does():
     """Line centres of shifted positions lie beside the old ones by the shift."""
     camera = LineCamera()

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pipeline.errors import PoseError, ShapeError
 from pipeline.mirror import mirror_throughput
 from pipeline.rectify.calibrate import calibrate, of_bands, reflectance
+from pipeline.rectify.elements import judge_elements
 from pipeline.source import References
 
 
@@ -70,11 +71,71 @@ def test_bad_elements_are_filled_along_the_line() -> None:
 def test_filled_from_saturated_is_invalid() -> None:
     """What is filled from a saturated neighbour is as unknown as that neighbour."""
     raw = np.full((2, 4, 3), 500, np.uint16)
-    raw[1, 0, 2] = 4095
+    raw[0, 2, 2] = raw[1, 0, 2] = 4095
     bad = np.zeros((4, 3), np.bool_)
     bad[1, 2] = True
     _, valid = calibrate(raw, replace(frames(), bad=bad), saturated_dn=4095)
-    assert np.argwhere(~valid).tolist() == [[1, 0, 2], [1, 1, 2]]
+    assert np.argwhere(~valid).tolist() == [[0, 1, 2], [0, 2, 2], [1, 0, 2], [1, 1, 2]]
+
+
+def test_saturated_beside_uncalibrated() -> None:
+    """In one sample a saturated band and a band without a calibration are both out, and the third is not."""
+    references = frames()
+    references.white[3, 1] = 60
+    raw = np.full((1, 4, 3), 500, np.uint16)
+    raw[0, 3, 2] = 4095
+    _, valid = calibrate(raw, references, saturated_dn=4095)
+    assert np.argwhere(~valid).tolist() == [[0, 3, 1], [0, 3, 2]]
+
+
+def test_a_sample_that_is_out_fills_nothing() -> None:
+    """A bad element is filled past a sample with more than half of its bands bad, whose other bands are out as well."""
+    raw = np.broadcast_to(np.array([60, 160, 4000, 360], np.uint16)[None, :, None], (1, 4, 3))
+    bad = np.zeros((4, 3), np.bool_)
+    bad[2, :2] = bad[1, 2] = True
+    values, valid = calibrate(raw, replace(frames(), bad=bad), saturated_dn=4095)
+    np.testing.assert_allclose(values[0, 1, 2], 0.2, rtol=1e-6)
+    assert np.argwhere(~valid).tolist() == [[0, 2]]
+
+
+def test_bad_elements_are_filled_from_near() -> None:
+    """A neighbour more than 8 samples away counts nothing: the other is taken alone, and without one nothing is."""
+    raw = np.full((1, 30, 3), 60, np.uint16)
+    raw[0, :, 1] = 60 + 10 * np.arange(30)
+    bad = np.zeros((30, 3), np.bool_)
+    bad[3:21, 1] = True
+    values, valid = calibrate(raw, replace(frames(30), bad=bad), saturated_dn=4095)
+    np.testing.assert_allclose(values[0, 3:11, 1], 0.02 * 2, rtol=1e-6)
+    np.testing.assert_allclose(values[0, 13:21, 1], 0.02 * 21, rtol=1e-6)
+    assert np.argwhere(~valid).tolist() == [[0, 11, 1], [0, 12, 1]]
+    assert np.isnan(values[0, 11:13, 1]).all()
+
+
+@given(st.integers(0, 99), st.integers(0, 39), st.integers(1, 40))
+def test_some_samples_under_the_judgement_of_all(seed: int, first: int, count: int) -> None:
+    """Samples calibrated by themselves, grown by what fills them, are what they are within the whole line."""
+    rng = np.random.default_rng(seed)
+    white = np.where(rng.random((40, 5)) < 0.3, 60, 1060).astype(np.float32)
+    references = replace(frames(40, 5), white=white, bad=rng.random((40, 5)) < 0.2)
+    elements = judge_elements(references)
+    wanted = slice(first, min(first + count, 40))
+    grown = elements.alone(wanted)
+    raw = rng.integers(0, 4096, (3, 40, 5), dtype=np.uint16)
+    values, valid = calibrate(raw, references, saturated_dn=4000)
+    some, known = calibrate(raw[:, grown], elements.part(grown), saturated_dn=4000)
+    here = slice(wanted.start - grown.start, wanted.stop - grown.start)
+    np.testing.assert_array_equal(some[:, here], values[:, wanted])
+    by_element = (mask if mask.ndim == 3 else np.repeat(mask[..., None], 5, axis=2) for mask in (known, valid))
+    np.testing.assert_array_equal(*(mask[:, part] for mask, part in zip(by_element, (here, wanted), strict=True)))
+
+
+def test_filled_from_beyond_a_part_is_out() -> None:
+    """Of samples taken without those that fill them, the elements to be filled are out and NaN."""
+    bad = np.zeros((6, 3), np.bool_)
+    bad[2, 1] = True
+    part = judge_elements(replace(frames(6), bad=bad)).part(slice(2, 5))
+    values, valid = calibrate(np.full((1, 3, 3), 500, np.uint16), part, saturated_dn=4095)
+    assert np.argwhere(np.isnan(values)).tolist() == np.argwhere(~valid).tolist() == [[0, 0, 1]]
 
 
 @given(arrays(np.bool_, (5, 4)), st.integers(0, 9))
@@ -146,6 +207,16 @@ def test_band_without_light_stays_alone() -> None:
     assert np.isnan(values[..., 2]).all()
     assert np.isfinite(values[..., :2]).all()
     assert valid.all()
+
+
+def test_bands_without_light_do_not_hold_a_sample() -> None:
+    """A sample saturated in all bands that have light is out whole, and one saturated in some only in those."""
+    references = frames()
+    references.white[:, 2] = references.dark[:, 2]
+    raw = np.full((1, 4, 3), 500, np.uint16)
+    raw[0, 0, :2] = raw[0, 3, 0] = 4095
+    _, valid = calibrate(raw, references, saturated_dn=4095)
+    assert np.argwhere(~valid).tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 3, 0]]
 
 
 def test_all_dark_lines_are_zero_and_valid() -> None:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_full, coarse_sweeps, full_sweeps, on_scene, reach_px
+from pipeline.coverage import cheapest_full, coarse_sweeps, full_sweeps, on_scene, reach_px, with_margin
 from pipeline.errors import PoseError, SettingsError
 from pipeline.grid import SceneGrid
 from pipeline.mirror import direction_to_scene, position_to_normal, reflect
@@ -134,3 +134,20 @@ def test_impossible_overlaps_are_refused(overlap_px: float):
     """An overlap below 0 or of a whole line is named."""
     with pytest.raises(SettingsError, match="less than a line"):
         full_sweeps(SceneGrid(100, 100, 16, 4), CAMERA, "x", overlap_px=overlap_px)
+
+
+@pytest.mark.parametrize(("margin_px", "lines"), [(0.0, 0), (0.5, 1), (8.0, 2), (9.0, 3)])
+def test_margins_are_whole_lines_at_both_ends(margin_px: float, lines: int):
+    """Every sweep begins and ends at least so much further out, by no line too many, and keeps its own lines."""
+    sweeps = coarse_sweeps(SceneGrid(300, 700, 16, 4), CAMERA, "x")
+    for sweep, grown in zip(sweeps, with_margin(sweeps, CAMERA, margin_px), strict=True):
+        assert grown == replace(sweep, start_px=sweep.start_px - 4 * lines, lines=sweep.lines + 2 * lines)
+        assert sweep.held_px()[0, 0] - grown.held_px()[0, 0] >= margin_px
+        assert grown.held_px()[-1, -1] - sweep.held_px()[-1, -1] >= margin_px
+
+
+def test_margins_beyond_the_mirror_are_refused():
+    """A margin that leaves the mirror's range names the sweep."""
+    sweeps = full_sweeps(SceneGrid(17_000, 640, 32, 4), CAMERA, "x")
+    with pytest.raises(PoseError, match=r"sweep full-0 .* beyond the mirror's range"):
+        with_margin(sweeps, CAMERA, 4000)

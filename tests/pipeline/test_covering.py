@@ -125,3 +125,11 @@ def test_coarser_tables_lose_little(seed: int, unit: int):
     one, other = best_cover(fine, (), rate), best_cover(coarse, (), rate)
     assert other.worth == pytest.approx(fine.cover(other.runs).worth)
     assert other.worth - rate * other.even_s >= 0.95 * (one.worth - rate * one.even_s)
+
+
+def test_the_gap_that_is_scanned_through_costs_no_more_than_a_set_up():
+    """Its lines, with their share of reloads, stay within a set-up; one more would not."""
+    prices = Prices(line_s=0.1, run_s=0.9, reload_s=1.6, lines_per_reload=150)
+    gap = blocks(np.ones((2, 2)), 2, prices=prices).gap
+    assert gap == 8
+    assert gap * prices.even_line_s <= prices.run_s < (gap + 1) * prices.even_line_s

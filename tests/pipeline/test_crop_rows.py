@@ -64,7 +64,26 @@ def test_one_border_between_fields_is_no_row():
     assert find_rows(image).angle_deg is None
 
 
-@pytest.mark.parametrize(("angle", "axis"), [(0, "x"), (44, "x"), (46, "y"), (90, "y"), (134, "y"), (136, "x")])
+@pytest.mark.parametrize("seed", [0, 5])
+def test_plots_with_rows_every_which_way_have_no_common_direction(seed: int):
+    """Strong rows that plots do not agree on are none of the field's, even where their mean is not small."""
+    turns = np.random.default_rng(seed).uniform(0, 180, 4)
+    found = find_rows(np.block([[rows(turn, 6.0, 0.3, (40, 40)) for turn in turns] for _ in range(3)]))
+    assert found.strength > 0.12
+    assert found.angle_deg is None
+
+
+def test_a_trace_of_rows_is_too_little():
+    """Rows deep below the noise, though all tiles agree on them, are not reported."""
+    assert find_rows(rows(30.0, 6.0, 3.0, (300, 350))).angle_deg is None
+
+
+def test_a_picture_of_three_tiles_is_too_small():
+    """Three tiles cannot tell agreement from chance."""
+    assert find_rows(rows(30.0, 6.0, 0.1, (12, 40))) == CropRows(None, 0.0)
+
+
+@pytest.mark.parametrize(("angle", "axis"), [(0, "x"), (44.5, "x"), (46, "y"), (90, "y"), (134.5, "y"), (136, "x")])
 def test_the_nearest_axis(angle: float, axis: str):
     """Rows up to 45 deg from x count as along x."""
     assert CropRows(float(angle), 0.5).nearest_axis == axis

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pyproj import Proj
 
 from pipeline.errors import PoseError, ShapeError
 from pipeline.grid import UNLABELLED
@@ -61,8 +62,24 @@ def test_mapped_area_is_the_sum_of_the_pixels_footprints(pose: dict[str, float])
     """Map pixels seen, times the ground that each stands for, are the closed form's area of the field."""
     shape = (300, 260)
     grid = ground_grid(view(**pose), shape)
-    exact = grid.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(shape), indexing="ij"), axis=-1)).sum()
-    assert np.isfinite(whole(grid)[..., 0]).sum() * grid.pixel_area_m2() == pytest.approx(exact, rel=2e-3)
+    rig, areal_scale = grid.frame.view.pose, Proj(grid.frame.crs).get_factors
+    pixel_m2 = grid.geobox.resolution.x**2 / areal_scale(rig.lon_deg, rig.lat_deg).areal_scale
+    (exact,) = grid.class_areas_m2(np.zeros(shape, np.uint8), 1)
+    assert np.isfinite(whole(grid)[..., 0]).sum() * pixel_m2 == pytest.approx(exact, rel=2e-3)
+
+
+def test_areas_by_class_are_sums_of_footprints():
+    """Of the pixels that the map shows, over more rows than are taken at once; what is of no class counts nothing."""
+    shape = (600, 30)
+    grid = ground_grid(view(tilt_deg=2.0), shape)  # the upper rows see the sky
+    classes = np.random.default_rng(0).choice(np.array([0, 2, UNLABELLED], np.uint8), shape)
+    points = np.stack(np.meshgrid(*pixel_places(shape), indexing="ij"), axis=-1)
+    near = grid.frame.view.sink(points) > grid.least_sink
+    assert 0 < near.sum() < near.size
+    wanted = [grid.frame.view.area_m2(points[near & (classes == number)]).sum() for number in range(3)]
+    assert grid.class_areas_m2(classes, 3) == pytest.approx(wanted, rel=1e-12)
+    with pytest.raises(ShapeError, match=r"scene of \(600, 30\) px .*got \(30, 600\)"):
+        grid.class_areas_m2(classes.T, 3)
 
 
 def test_a_map_pixel_shows_the_scene_pixel_that_sees_it():
@@ -92,10 +109,10 @@ def test_resolution_is_the_median_footprint_rounded():
     """The default lies within a ratio of 1.16 of the median footprint; one asked for is kept."""
     rig = view()
     median = median_footprint_m(rig, (200, 200))
-    step = ground_grid(rig, (200, 200)).resolution_m
+    step = ground_grid(rig, (200, 200)).geobox.resolution.x
     assert abs(np.log(step / median)) < np.log(1.16)
     assert step == round_step(step) == float(f"{step:.1e}")
-    assert ground_grid(rig, (200, 200), resolution_m=0.0123).resolution_m == pytest.approx(0.0123)
+    assert ground_grid(rig, (200, 200), resolution_m=0.0123).geobox.resolution.x == pytest.approx(0.0123)
 
 
 @given(st.floats(1e-4, 1e3))
@@ -109,7 +126,7 @@ def test_rounding_keeps_the_order_and_is_idempotent(step: float):
 def test_grids_of_two_days_share_their_pixels():
     """A rig moved by a metre has another map, with pixels at the same multiples of the resolution."""
     here, there = (ground_grid(view(lat_deg=52.1 + shift), (90, 90)) for shift in (0.0, 1e-5))
-    offset = (here.geobox.affine.f - there.geobox.affine.f) / here.resolution_m
+    offset = (here.geobox.affine.f - there.geobox.affine.f) / here.geobox.resolution.x
     assert offset == pytest.approx(round(offset), abs=1e-4)
     assert abs(offset) > 10
 

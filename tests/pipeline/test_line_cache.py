@@ -58,6 +58,39 @@ def test_the_block_used_longest_ago_goes_first() -> None:
     assert [start // 64 for start, _ in lines.asked] == [0, 1, 2, 1]
 
 
+def test_the_newest_block_stays_even_without_room() -> None:
+    """A cache too small for one block still keeps the last one read, for who reads on in it."""
+    lines, cache = Numbered(), LineCache(0)
+    for first in (0, 5, 70, 80):
+        cache.window(lines, slice(first, first + 5), slice(0, 10))  # type: ignore[arg-type]
+    assert [start // 64 for start, _ in lines.asked] == [0, 1]
+
+
+def test_a_block_being_read_is_not_let_go() -> None:
+    """While one thread reads a block another fills a full cache: both get their lines."""
+    started, go = threading.Event(), threading.Event()
+
+    class Held(Numbered):
+        def read(self, start: int, stop: int) -> np.ndarray:
+            if start == 0:
+                started.set()
+                go.wait(10)
+            return super().read(start, stop)
+
+    lines, cache = Held(), LineCache(0)
+    got: list[np.ndarray] = []
+    slow = threading.Thread(target=lambda: got.append(cache.window(lines, slice(0, 4), slice(0, 4))))  # type: ignore[arg-type]
+    slow.start()
+    assert started.wait(10)
+    try:
+        other = cache.window(lines, slice(70, 74), slice(0, 4))  # type: ignore[arg-type]
+    finally:
+        go.set()
+        slow.join()
+    np.testing.assert_array_equal(other, lines.raw[70:74, :4])
+    np.testing.assert_array_equal(got[0], lines.raw[:4, :4])
+
+
 def test_sweeps_do_not_share_blocks() -> None:
     """The same lines of two sweeps are two blocks."""
     one, other, cache = Numbered(), Numbered(), LineCache(2**20)

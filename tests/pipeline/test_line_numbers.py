@@ -53,6 +53,15 @@ def test_copies_and_wild_stamps_change_no_other_line(seed: int, lines: int) -> N
     assert (found.repeated, found.backward, found.lost, found.late) == (1, 1, 0, 0)
 
 
+@pytest.mark.parametrize("ends", [[1e6], [1e300], [-1e6], [-1e300, 1e300]])
+def test_wild_stamps_at_the_ends_are_not_believed(ends: list[float]) -> None:
+    """A first or last stamp far off all others goes neither back nor loses a million lines: it costs its own line."""
+    found = number_lines(np.sort([*ends, *np.arange(20.0)]), 1.0)
+    assert found.usable.sum() == 20
+    assert (found.backward, found.lost, found.late) == (len(ends), 0, 0)
+    assert number_lines(np.array([0.0, 1, 900]), 1.0).lost == 898
+
+
 def test_longest_ascent_of_equal_ones_keeps_the_earlier_frames() -> None:
     """Of two stamps that contradict each other the one that goes back is not believed."""
     found = number_lines(np.array([0, 1, 2, 3, 2.5, 4]), 1.0)
@@ -60,11 +69,29 @@ def test_longest_ascent_of_equal_ones_keeps_the_earlier_frames() -> None:
     np.testing.assert_array_equal(found.number, [0, 1, 2, 3, 3, 4])
 
 
+def test_frame_that_came_again_has_the_number_of_the_first() -> None:
+    """However late the copy comes, it is the line that its stamp says."""
+    found = number_lines(np.array([0.0, 1, 2, 1, 3]), 1.0)
+    np.testing.assert_array_equal(found.number, [0, 1, 2, 1, 3])
+    np.testing.assert_array_equal(found.usable, [True, True, True, False, True])
+
+
 def test_late_frame_is_no_lost_line() -> None:
     """A frame 0.6 periods late keeps its own number; the one after shows that none was lost."""
     found = number_lines(np.array([0, 1, 2.6, 3, 4, 5]), 1.0)
     np.testing.assert_array_equal(found.number, np.arange(6))
     assert (found.late, found.lost) == (1, 0)
+
+
+def test_very_late_frame_makes_no_other_late() -> None:
+    """A frame 0.8 periods late tilts the clock that is fitted to all, but not the one without it."""
+    assert number_lines(np.array([0, 1, 2, 3.8, 4]), 1.0).late == 1
+
+
+@pytest.mark.parametrize(("gap", "lost"), [(1.45, 0), (1.5, 0), (1.55, 1), (2.45, 1), (2.55, 2)])
+def test_a_gap_of_more_than_one_and_a_half_periods_loses_a_line(gap: float, lost: int) -> None:
+    """Gaps are counted to the nearest line, halves to fewer."""
+    assert number_lines(np.concatenate([np.arange(4.0), 3 + gap + np.arange(4)]), 1.0).lost == lost
 
 
 def test_slow_clock_makes_no_frame_late() -> None:

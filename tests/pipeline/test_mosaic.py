@@ -81,11 +81,29 @@ def test_points_do_not_see_each_other(seed: int, cut: int) -> None:
     np.testing.assert_array_equal(some, whole[:cut])
 
 
+def test_a_point_alone_is_summed_as_among_others() -> None:
+    """One point of one band in many sweeps, some without a value, is mixed in the order in which many points are."""
+    rng = np.random.default_rng(5)
+    full = np.ones(40, np.float32)
+    parts = [
+        Part(np.where(rng.random((40, 1)) < 0.3, np.nan, rng.random((40, 1))).astype(np.float32), full,
+             rng.uniform(0, 300, 40))
+        for _ in range(12)
+    ]  # fmt: skip
+    whole = mosaic(parts)[0]
+    alone = [
+        mosaic([Part(one.values[[at]], one.weight[[at]], one.edge_px[[at]]) for one in parts])[0] for at in range(40)
+    ]
+    np.testing.assert_array_equal(np.concatenate(alone), whole)
+
+
 def test_very_edge_counts_where_nothing_else_reaches() -> None:
-    """A point exactly on a sweep's edge keeps its value."""
+    """A point exactly on a sweep's edge keeps its value, and on the edges of two it is their mean."""
     values, coverage = mosaic([Part(np.full((1, 1), 7, np.float32), np.ones(1, np.float32), np.zeros(1))])
     assert values[0, 0] == 7
     assert coverage[0] == 1
+    parts = [Part(np.full((1, 1), level, np.float32), np.ones(1, np.float32), np.zeros(1)) for level in (2, 4)]
+    assert mosaic(parts)[0].tolist() == [[3]]
 
 
 def test_edge_distance_is_to_the_nearest_border() -> None:

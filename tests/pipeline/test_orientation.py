@@ -30,8 +30,8 @@ def test_lines_along_the_worth_show_more_of_it():
     assert report.other.worth_share == 1.0
     assert report.other.fine_lines == 35
     assert report.taken.worth_share < 0.5
-    assert report.sentence.startswith("lines lie along y and show ")
-    assert "along x they would show 100.0% in the same time" in report.sentence
+    assert report.sentence.startswith("with camera lines down the picture the fine sweeps show ")
+    assert "; with lines across the picture they would show 100.0 % in no more time (" in report.sentence
 
 
 def test_both_have_the_same_seconds():
@@ -45,6 +45,26 @@ def test_both_have_the_same_seconds():
     assert report.other.coarse_s + report.other.fine_s <= whole
 
 
+def test_coarse_strips_that_overlap_are_paid_for():
+    """The coarse seconds of either orientation are those of strips that overlap by as much."""
+    grid = SceneGrid(700, 1280, 32, 4)
+    scores = np.zeros(int(np.prod(grid.seat_shape)))
+    report = compare_orientations(grid, CAMERA, COST, "x", scores, budget_s=60.0, overlap_px=300)
+    for one in (report.taken, report.other):
+        assert one.coarse_s == COST.seconds(coarse_sweeps(grid, CAMERA, one.along, overlap_px=300), CAMERA)
+        assert one.coarse_s > COST.seconds(coarse_sweeps(grid, CAMERA, one.along), CAMERA)
+
+
+def test_margins_are_paid_for_in_either_orientation():
+    """Coarse sweeps that begin earlier and end later cost their lines: two strips along x, one along y."""
+    grid = SceneGrid(300, 1280, 32, 4)
+    scores = np.zeros(int(np.prod(grid.seat_shape)))
+    plain = compare_orientations(grid, CAMERA, COST, "x", scores, budget_s=30.0)
+    wide = compare_orientations(grid, CAMERA, COST, "x", scores, budget_s=30.0, margin_px=40)
+    assert wide.taken.coarse_s - plain.taken.coarse_s == pytest.approx(2 * 20 * 0.1)
+    assert wide.other.coarse_s - plain.other.coarse_s == pytest.approx(1 * 20 * 0.1)
+
+
 def test_a_plan_made_already_is_not_made_again():
     """The plan that is handed in is the one reported."""
     plan = plan_fine(GRID, CAMERA, COST, "y", row_of_seats(), budget_s=20.0)
@@ -56,8 +76,11 @@ def test_a_plan_made_already_is_not_made_again():
     ("rows", "words"),
     [
         (None, "fine, here 18.3 s"),
-        (CropRows(None, 0.02), "the field shows no crop rows"),
-        (CropRows(88.0, 0.3), "crop rows run at 88 deg, nearest to y (strength 0.30)"),
+        (CropRows(None, 0.02), "; no crop rows are seen"),
+        (CropRows(88.0, 0.3), "; crop rows run down the picture, to within 2 degrees"),
+        (CropRows(100.5, 0.3), "; crop rows run down the picture, to within 11 degrees"),
+        (CropRows(170.0, 0.3), "; crop rows run across the picture, to within 10 degrees"),
+        (CropRows(0.0, 0.3), "; crop rows run across the picture, to within 0 degrees"),
     ],
 )
 def test_rows_are_named(rows: CropRows | None, words: str):
@@ -72,11 +95,11 @@ def test_no_time_for_the_other_coarse_pass_is_said():
     report = compare_orientations(grid, CAMERA, COST, "y", np.ones(int(np.prod(grid.seat_shape))), budget_s=0.0)
     turned = compare_orientations(grid, CAMERA, COST, "x", np.ones(int(np.prod(grid.seat_shape))), budget_s=0.0)
     without = next(each for each in (report, turned) if each.other is None)
-    assert "the coarse pass alone takes" in without.sentence
+    assert "the picture it could not be done: the coarse pass alone takes" in without.sentence
 
 
 def test_scores_without_worth_have_no_share():
     """Nothing wanted, nothing shown: a share would be 0 over 0."""
     report = compare_orientations(GRID, CAMERA, COST, "x", np.zeros(400), budget_s=9.0)
     assert report.taken.worth_share is None
-    assert "show none of the score" in report.sentence
+    assert report.sentence == "no place is worth a second look"

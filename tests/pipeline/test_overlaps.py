@@ -14,9 +14,9 @@ from pipeline.coverage import coarse_sweeps, full_sweeps
 from pipeline.errors import SettingsError
 from pipeline.grid import SceneGrid
 from pipeline.rectify.alignment import no_shifts
-from pipeline.rectify.overlaps import BroadSweep, overlap_windows, places_seen
+from pipeline.rectify.overlaps import BroadSweep, PlacedImage, broad_bands, overlap_windows, places_seen
 from pipeline.rectify.seams import Registration, measure_windows, place_images, register_sweeps
-from pipeline.scan import Axis, Sweep, line_positions, sweep_to_scene
+from pipeline.scan import Axis, Sweep, line_positions, points_of_scan, sweep_to_scene
 from pipeline.simulator.pointing import PointingErrors
 from pipeline.simulator.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
@@ -93,6 +93,9 @@ def test_coarse_pass_is_registered_in_scene_pixels():
     held = pointing.offset(found.reference or "")
     for sweep in sweeps:
         np.testing.assert_allclose(found.of(sweep.name).offset, pointing.offset(sweep.name) - held, atol=0.3)
+    for window in found.windows:
+        if window.found is not None and window.measured is not None:
+            np.testing.assert_array_equal(window.measured.error_px, 2 * window.found.error_px[::-1])
 
 
 def test_windows_lie_where_both_sweeps_look():
@@ -138,6 +141,51 @@ def test_broad_image_is_the_mean_of_the_bands():
     assert np.isnan(broad.image[7]).all()
     kept = np.arange(sweep.lines) != 7
     np.testing.assert_allclose(broad.image[kept], truth[kept], atol=2e-3)
+    believed = np.arange(sweep.lines) != 9
+    doubted = BroadSweep.read(SimulatedSweep(source, sweep), CAMERA, bands=3, usable=believed)
+    np.testing.assert_array_equal(np.isnan(doubted.image).all(axis=1), ~believed)
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_saturated_samples_are_left_out(factor: int):
+    """Where the converter is at its end, of one sample or of a sum, the broad image holds nothing."""
+    values = np.full((GRID.height, GRID.width, 1), 1.0)
+    values[100:140, 120:180] = 2.0  # 60 % of the full well
+    scene = raster_from_values(values, CAMERA, name="t", wavelength_nm=np.array([600.0]))
+    bright = replace(scene, electrons=scene.electrons * 2.4)
+    sweep = Sweep("s", "fine", "x", 0.0, -40.0, 80 // factor, factor, factor)
+    broad = BroadSweep.read(SimulatedSweep(SimulatedSource(bright, CAMERA, 0, frozenset()), sweep), CAMERA)
+    middle = broad.image.shape[0] // 2, broad.image.shape[1] // 2
+    assert np.isnan(broad.image[middle])
+    assert np.isfinite(broad.image[0]).all()
+
+
+def test_bands_that_few_samples_have_take_no_part():
+    """A band without white reference in every fifth sample is left out, unless no band is better."""
+    references = SimulatedSweep(source_of(bands=4), full_sweeps(GRID, CAMERA, "x")[0]).references
+    white = references.white.copy()
+    white[::5, 1] = references.dark[::5, 1]
+    assert broad_bands(replace(references, white=white)).tolist() == [0, 2, 3]
+    white[::5] = references.dark[::5]
+    assert broad_bands(replace(references, white=white)).tolist() == [0, 1, 2, 3]
+
+
+def test_turn_is_how_places_move_with_the_strip():
+    """Far off the axis the turn says where a sample looks when its strip lies a little further along."""
+    sweep = Sweep("s", "fine", "x", 1500.0, -900.0, 3)
+    broad = BroadSweep.read(SimulatedSweep(source_of(), sweep), CAMERA)
+    image = PlacedImage(broad, CAMERA, np.zeros((3, 2)))
+    slope = CAMERA.pixel_slopes()[140]
+    (here,), (there,) = (
+        np.stack(points_of_scan(1500.0 + step, CAMERA, np.array([-899.0]), np.array([slope])), axis=-1)
+        for step in (-0.5, 0.5)
+    )
+    found = image.line_and_turn(*(here + there) / 2)
+    assert found is not None
+    line, turn = found
+    assert line == 1
+    np.testing.assert_allclose(turn[:, 0], there - here, atol=1e-5)
+    assert np.abs(turn - np.eye(2)).max() > 1e-3
     assert np.isfinite(place_images([broad], no_shifts(["s"]), CAMERA)[0].edges).all()
 
 

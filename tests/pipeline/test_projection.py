@@ -112,12 +112,19 @@ def test_any_projected_crs_of_the_place_can_be_asked_for():
     assert frame(lon=12.3, epsg=32632).crs.utm_zone == "32N"
 
 
-def test_areas_follow_the_maps_scale_and_the_ground_height():
+@pytest.mark.parametrize(
+    ("place", "square_m2"),
+    [
+        ({"lon": 9.0}, 0.9996**2),
+        ({"epsg": 3857}, 2.6458),
+        ({"lon": 9.0, "elevation_m": 2000.0}, 0.9996**2 * (1 - 6.26e-4)),
+    ],
+)
+def test_the_map_has_its_own_scale(place: dict[str, float], square_m2: float):
     """A square metre is 0.9992 m2 near a UTM zone's axis, 2.65 m2 in web Mercator, and less on high ground."""
-    assert frame(lon=9.0).areal_scale([0, 0, 0]) == pytest.approx(0.9996**2, rel=1e-6)
-    assert frame(epsg=3857).areal_scale([0, 0, 0]) == pytest.approx(2.65, abs=0.02)
-    high, low = (frame(elevation_m=metres).areal_scale([0, 0, 0]) for metres in (2000.0, 0.0))
-    assert high / low == pytest.approx(1 - 2 * 2000 / 6.371e6, rel=1e-6)
+    origin, east, north = frame(**place).ground_to_map(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]))
+    a, b = east - origin, north - origin
+    assert a[0] * b[1] - a[1] * b[0] == pytest.approx(square_m2, rel=1e-4)
 
 
 def test_nan_stays_nan():

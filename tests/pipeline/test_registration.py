@@ -119,3 +119,23 @@ def test_unlike_images_and_bad_priors_are_refused():
         pair_shift(image[:0, :3], image[:0, :3], prior_px=3)
     with pytest.raises(SettingsError, match="got -1 px"):
         pair_shift(image, image, prior_px=-1)
+
+
+def test_error_is_the_scatter_of_the_shift():
+    """Over noisy views of one overlap the stated error is the scatter found, to a third; the peak is a correlation."""
+    shift = np.array([2.3, -1.4])
+    drawn = np.random.default_rng(9)
+    clean = waves(3, (96, 96), shift, np.inf, (8, 60))
+    found = [pair_shift(*(view + drawn.normal(0, 0.5, view.shape) for view in clean), prior_px=5) for _ in range(40)]
+    scatter = np.sqrt(np.mean([(each.shift - shift) ** 2 for each in found], axis=0))
+    np.testing.assert_allclose(np.mean([each.error_px for each in found], axis=0), scatter, rtol=0.35)
+    smoothed = 0.25 * 2 * (35 / 128) ** 2  # variance that smoothing leaves of both noises, over that of one view
+    assert np.mean([each.peak**2 for each in found]) == pytest.approx(1 - smoothed, abs=0.02)
+
+
+def test_negative_of_an_image_is_no_likeness():
+    """An overlap that one sweep shows bright where the other shows it dark is not registered."""
+    for seed in range(4):
+        one, other = waves(seed, (128, 96), np.array([1.2, -0.7]), 50, (30, 300))
+        assert pair_shift(one, other, prior_px=4).status == "found"
+        assert pair_shift(one, -other, prior_px=4).status == "undecidable"

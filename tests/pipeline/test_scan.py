@@ -91,6 +91,11 @@ def test_sweeps_out_of_reach_are_refused():
         line_positions(sweep(start_px=12_000.0), CAMERA)
 
 
+def test_settling_takes_whole_frames():
+    """Two frames of 100 ms and 5 ms of readout, beside the slew and the start."""
+    assert CostModel().setup_seconds(LineCamera(exposure_ms=100, readout_ms=5)) == pytest.approx(0.05 + 0.2 + 2 * 0.105)
+
+
 def test_price_counts_lines_setups_and_reloads():
     """Two sweeps of 1000 coarse lines hold 8000 positions: six reloads beside lines and set-ups."""
     cost = CostModel()

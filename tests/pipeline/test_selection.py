@@ -84,6 +84,11 @@ def test_counts_follow_shares(share: float, valid: int):
     assert 0 <= count <= valid
 
 
+def test_halves_are_rounded_up():
+    """Half of five seats are three, whatever is even."""
+    assert (seat_count(0.5, 5), seat_count(0.5, 3), seat_count(0.5, 1)) == (3, 2, 1)
+
+
 @pytest.mark.parametrize("share", [-0.1, 1.01, float("nan"), float("inf")])
 def test_shares_out_of_range_are_refused(share: float):
     """A share is a number from 0 to 1."""

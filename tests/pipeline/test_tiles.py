@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
+from pipeline.rectify.kernels import kernel_taps
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.placed import PixelGrid, Placed, place
 from pipeline.rectify.reach import TrackReach
@@ -79,7 +80,7 @@ def in_tiles(
     placed: list[Placed], grid: PixelGrid, shape: tuple[int, int], cache: LineCache | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """A grid's values and coverage, made in tiles of this shape."""
-    values = np.zeros((*grid.shape, len(placed[0].references.panel)), np.float32)
+    values = np.zeros((*grid.shape, len(placed[0].lines.references.panel)), np.float32)
     coverage = np.zeros(grid.shape, np.intp)
     for tile in plan_tiles(placed, CAMERA, grid, shape):
         at = tile.rows, tile.columns
@@ -110,6 +111,36 @@ def test_any_tiling_gives_the_same_bits(shape: tuple[int, int], tied: bool, cach
     np.testing.assert_array_equal(parts[1], coverage)
 
 
+def partly_lit(lines: Taken) -> Taken:
+    """The same with references as real ones are: every band without light somewhere, most in a part of the slit."""
+    sample, band = np.mgrid[: CAMERA.samples, : lines.raw.shape[2]]
+    white = lines.references.white.copy()
+    white[(sample + 20 * band) % 60 < 15] = 0
+    white[40:120, 1:] = 0
+    return replace(lines, references=replace(lines.references, white=white))
+
+
+@pytest.mark.parametrize("shape", [(90, 33), (17, 140), (17, 20)])
+def test_any_tiling_of_a_partly_lit_detector_gives_the_same_bits(shape: tuple[int, int]) -> None:
+    """Where no sample has light in all bands, tiles are judged by the whole slit, not by the samples they need."""
+    grid = PixelGrid(CORNER, 1, (90, 140))
+    placed = [place(partly_lit(taken(TURNED, bands=4, faults=True)), CAMERA)]
+    whole, coverage = in_tiles(placed, grid, grid.shape)
+    assert 0.05 < np.isnan(whole[coverage > 0]).mean() < 0.9
+    parts = in_tiles(placed, grid, shape, LineCache(200_000))
+    np.testing.assert_array_equal(parts[0], whole)
+    np.testing.assert_array_equal(parts[1], coverage)
+
+
+def test_a_partly_lit_detector_is_read_where_it_is_needed() -> None:
+    """A narrow column takes no more samples of a detector that is nowhere lit in all bands than of another."""
+    grid, asked = PixelGrid((3040.0, -4700.0), 1, (64, 20)), []
+    for lines in (taken(TURNED, bands=4, kind=Cropped), partly_lit(taken(TURNED, bands=4, kind=Cropped))):
+        in_tiles([place(lines, CAMERA)], grid, (64, 640), LineCache(2**20))
+        asked.append(sorted(lines.asked))
+    assert asked[0] == asked[1]
+
+
 def test_cutting_a_tile_into_runs_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows as short as they can be give what one window for the whole tile gives."""
     grid = PixelGrid(CORNER, 1, (40, 140))
@@ -133,6 +164,21 @@ def test_a_block_of_lines_is_read_once_down_a_column(kind: type[Taken]) -> None:
             mosaic_tile(placed, CAMERA, grid, tile.rows, tile.columns, cache=cache, reach=tile.reach)
             assert cache.bytes_held <= cache.most_bytes
         assert len(lines.asked) == len(set(lines.asked)) == cache.reads > 1
+
+
+@pytest.mark.parametrize("kind", [Taken, Cropped])
+def test_raw_lines_are_projected_as_they_are_held(kind: type[Taken]) -> None:
+    """A tile holds no more raw lines than projected: whole ones of a sweep read so, else whole chunks of samples."""
+    grid = PixelGrid((3010.0, -4770.0), 1, (160, 120))
+    placed = [place(taken(TURNED, kind=kind), CAMERA)]
+    tiles = plan_tiles(placed, CAMERA, grid, (32, 20))
+    whole = LineCache(2**30)
+    for tile in tiles:
+        alone = LineCache(2**30)
+        for cache in (alone, whole):
+            mosaic_tile(placed, CAMERA, grid, tile.rows, tile.columns, cache=cache, reach=tile.reach)
+        assert alone.bytes_held <= cache_bytes(placed, [tile], 1)
+    assert cache_bytes(placed, tiles, 1) < whole.bytes_held <= cache_bytes(placed, tiles, len(tiles))
 
 
 def test_only_chunks_of_samples_that_a_column_needs_are_read() -> None:
@@ -213,18 +259,49 @@ def test_sweeps_that_do_not_meet_stand_side_by_side() -> None:
     np.testing.assert_array_equal(both, np.where(np.isnan(one), other, one))
 
 
-def test_a_dead_line_leaves_its_own_row_empty() -> None:
-    """What a dead line holds reaches no pixel; only pixels nearer to it than to its neighbours are lost."""
+@pytest.mark.parametrize("placed_by_it", [False, True])
+def test_a_dead_line_leaves_its_own_row_empty(placed_by_it: bool) -> None:
+    """What a dead line holds reaches no pixel, even if its place is believed; only pixels nearest to it are lost."""
     sweep = Sweep("straight", "fine", "x", 0.0, -30.0, 60)
     lines = taken(sweep)
     whole, _ = in_tiles([place(lines, CAMERA)], grid := PixelGrid((-20.0, -60.0), 1, (40, 120)), (64, 640))
     lines.valid_line[30] = False
-    lines.raw[30] = 65535
-    seen, coverage = in_tiles([place(lines, CAMERA)], grid, (64, 640))
+    lines.raw[30] = 4000
+    usable = np.ones(60, np.bool_) if placed_by_it else None
+    seen, coverage = in_tiles([place(lines, CAMERA, usable=usable)], grid, (64, 640))
     assert np.flatnonzero((coverage == 0).all(axis=1)).tolist() == [20]
     assert np.nanmax(seen) < 4000
     far = np.abs(np.arange(40) - 20) > 2
     np.testing.assert_array_equal(seen[far], whole[far])
+
+
+def test_lines_that_are_missing_count_nothing() -> None:
+    """Beside a lost line a point is what the kernel's other lines say: the line that stands in for it has no weight."""
+    whole = taken(Sweep("straight", "fine", "x", 0.0, -30.0, 60))
+    came = np.arange(60) != 30
+    lines = replace(
+        whole, raw=whole.raw[came], position=whole.position[came], valid_line=whole.valid_line[came],
+        sweep=replace(whole.sweep, lines=59),
+    )  # fmt: skip
+    seen, coverage = in_tiles([place(lines, CAMERA)], PixelGrid((-0.7, -59.5), 1, (1, 120)), (64, 640))
+    assert (coverage == 1).all()
+    number, weight = kernel_taps(np.array([29.3]), "catmull-rom")
+    weight[number == 30] = 0
+    expected = np.tensordot(weight[0] / weight.sum(), whole.raw[number[0], 20:140], 1)
+    np.testing.assert_allclose(seen[0], expected, rtol=1e-3)
+
+
+def test_sums_of_samples_saturate_later() -> None:
+    """A sum of two samples beyond one's full scale has a value, a sum of two full ones has none."""
+    sweep = Sweep("binned", "coarse", "x", 0.0, -30.0, 40, step=2, binning=2)
+    half = taken(sweep)
+    raw, references = half.raw[:, ::2].copy(), half.references
+    raw[...], raw[20:] = 5000, 2 * CAMERA.full_scale_dn
+    frames = replace(references, dark=references.dark[::2], white=references.white[::2])
+    placed = [place(replace(half, raw=raw, references=frames), CAMERA)]
+    seen, _ = in_tiles(placed, PixelGrid((-30.0, -60.0), 2, (40, 60)), (64, 640))
+    np.testing.assert_allclose(seen[:19], 5000, rtol=1e-6)
+    assert np.isnan(seen[21:]).all()
 
 
 def test_a_sweep_without_a_usable_line_shows_nothing() -> None:

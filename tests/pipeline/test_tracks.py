@@ -96,6 +96,44 @@ def test_noise_of_the_position_is_no_turn() -> None:
     assert (np.diff(tracks[0].lines) < 0).any()
 
 
+def test_turn_beyond_the_noise_is_a_turn() -> None:
+    """Under 0.3 px of noise a path that goes back by 3.5 px turns twice."""
+    scan = np.concatenate([np.arange(60.0), 59 - 0.5 * np.arange(1, 8), 55.5 + np.arange(1, 60)])
+    noise = np.random.default_rng(2).normal(0, 0.3, len(scan))
+    assert len(make_tracks(aim(0.0, scan + noise), CAMERA, step_px=1.0)) == 3
+
+
+def test_lines_nearer_than_a_quarter_step_are_one_knot() -> None:
+    """Pairs of lines 0.2 steps apart are a knot each, pairs 0.3 apart are not."""
+    pairs = np.repeat(np.arange(10.0), 2)
+    for apart, knots in ((0.2, 10), (0.3, 20)):
+        (track,) = make_tracks(aim(0.0, pairs + np.tile([0, apart], 10)), CAMERA, step_px=1.0)
+        assert len(track) == knots
+
+
+@pytest.mark.parametrize(
+    ("scan", "lines"),
+    [
+        (np.repeat(np.arange(6.0), 9) + 1e-6 * np.arange(54), np.arange(54)),  # stands, and creeps while it does
+        (np.array([0.0, 1.0, 4.0]), np.arange(3)),  # as many gaps as steps
+        (np.arange(5.0), np.arange(0, 5, 2)),  # every other line not usable
+    ],
+)
+def test_the_step_is_taken_from_the_path(scan: np.ndarray, lines: np.ndarray) -> None:
+    """Without a planned step it is that of a moving mirror from one line to the next: knots are 1 px apart."""
+    (track,) = make_tracks(aim(0.0, scan), CAMERA, usable=np.isin(np.arange(len(scan)), lines))
+    np.testing.assert_allclose(np.diff(track.scan) / CAMERA.ifov_rad, 1, atol=1e-4)
+
+
+def test_a_pace_off_the_plan_is_still_even() -> None:
+    """An even path at a pace a thousandth off the planned one is looked up in closed form, at its own pace."""
+    (track,) = make_tracks(aim(0.0, 1.001 * np.arange(50.0)), CAMERA, step_px=1.0)
+    assert track.uniform
+    np.testing.assert_allclose(track.width, 1.001 * CAMERA.ifov_rad, rtol=1e-9)
+    (uneven,) = make_tracks(aim(0.0, np.array([0, 1, 2, 3.4, 4.8])), CAMERA, step_px=1.0)
+    np.testing.assert_allclose(uneven.width, CAMERA.ifov_rad, rtol=1e-9)
+
+
 def test_float32_positions_are_taken() -> None:
     """Positions kept in float32 give the track to the 1e-3 px that they hold."""
     (track,) = make_tracks(aim(50.0, np.arange(9.0)).astype(np.float32), CAMERA)

@@ -138,6 +138,17 @@ def test_reflectance_is_the_calibrated_cube(tmp_path: Path) -> None:
     np.testing.assert_array_equal(opened["mirror_x"], [x for x, _ in position])
 
 
+def test_reflectance_of_an_invalid_line_with_an_impossible_position(tmp_path: Path) -> None:
+    """A line marked as not valid, whose mirror was read beyond the rim, is NaN; its neighbours are as they were."""
+    path, header, lines = _calibrated(tmp_path)
+    spoilt = [replace(line, mirror_x=1.5, valid=False) if line.number == 7 else line for line in lines]
+    with RawCubeWriter(tmp_path / "spoilt.zarr", header) as cube:
+        cube.write(spoilt)
+    expected = open_reflectance(path, saturated_dn=4000).values
+    expected[7] = np.nan
+    np.testing.assert_array_equal(open_reflectance(tmp_path / "spoilt.zarr", saturated_dn=4000).values, expected)
+
+
 def test_reflectance_reads_what_is_asked_for(tmp_path: Path) -> None:
     """Opening reads no line: a damaged block is an error only where it is asked for, and is named."""
     path, _, _ = _calibrated(tmp_path)

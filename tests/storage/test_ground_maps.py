@@ -1,4 +1,4 @@
-"""The stored map: what was written comes back, classes are counted into hectares, and wrong blocks are refused."""
+"""The stored map: what was written comes back, areas in hectares too, and wrong blocks are refused."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecatio
 LEGEND = ClassLegend(("sugar beet", "bare soil"), np.array([[10, 200, 30], [120, 90, 60]], np.uint8))
 
 
-def begin(path: Path, shape: tuple[int, int] = (100, 90), pixel_area_m2: float = 2.5) -> GroundMapWriter:
+def begin(path: Path, shape: tuple[int, int] = (100, 90)) -> GroundMapWriter:
     """A writer of a map of the shape."""
     geobox = GeoBox.from_bbox((0, 0, shape[1] * 0.5, shape[0] * 0.5), crs="EPSG:32632", shape=shape, tight=True)
-    return GroundMapWriter(path, geobox, LEGEND, pixel_area_m2=pixel_area_m2, about={"rig_pose": {"tilt_deg": 40}})
+    return GroundMapWriter(path, geobox, LEGEND, about={"rig_pose": {"tilt_deg": 40}})
 
 
 def block(shape: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -39,7 +39,7 @@ def test_a_map_written_in_blocks_comes_back(tmp_path: Path) -> None:
     for rows in (slice(0, 64), slice(64, 150)):
         for columns in (slice(0, SHARD_COLUMNS), slice(SHARD_COLUMNS, 700)):
             writer.write_block(rows, columns, *(part[rows, columns] for part in whole))
-    writer.finish()
+    writer.finish(np.zeros(2))
     found = load_ground_map(tmp_path / "a.zarr")
     for stored, written in zip((found.classes, found.confidence, found.picture), whole, strict=True):
         np.testing.assert_array_equal(stored, written)
@@ -48,25 +48,20 @@ def test_a_map_written_in_blocks_comes_back(tmp_path: Path) -> None:
     assert tuple(found.geobox.shape) == (150, 700)
 
 
-def test_areas_are_counted_in_hectares(tmp_path: Path) -> None:
-    """Pixels of each class times their ground; what is not seen counts nothing; shares add up to one."""
-    writer = begin(tmp_path / "a.zarr")
-    classes, confidence, picture = block((100, 90))
-    writer.write_block(slice(0, 100), slice(0, 90), classes, confidence, picture)
-    areas = writer.finish()
-    for number, name in enumerate(LEGEND.names):
-        m2 = 2.5 * np.count_nonzero(classes == number)
-        assert areas[name]["m2"] == pytest.approx(m2)
-        assert areas[name]["ha"] == pytest.approx(m2 / 10_000)
-    assert sum(area["share"] for area in areas.values()) == pytest.approx(1)
-    assert load_ground_map(tmp_path / "a.zarr").areas == areas
+@pytest.mark.parametrize(("areas_m2", "shares"), [((7500.0, 2500.0), (0.75, 0.25)), ((0.0, 0.0), (0.0, 0.0))])
+def test_areas_are_kept_in_hectares(tmp_path: Path, areas_m2: tuple[float, ...], shares: tuple[float, ...]) -> None:
+    """Each class has its square metres, hectares and share; a map of no class has shares of nothing."""
+    begin(tmp_path / "a.zarr").finish(np.array(areas_m2))
+    found = load_ground_map(tmp_path / "a.zarr").areas
+    for name, m2, share in zip(LEGEND.names, areas_m2, shares, strict=True):
+        assert found[name] == {"m2": m2, "ha": m2 / 10_000, "share": share}
 
 
 def test_plain_xarray_opens_it_with_flags_and_areas(tmp_path: Path) -> None:
     """Class flags, hectares, pose and grid mapping are there without this project's code; unseen pixels are NaN."""
     writer = begin(tmp_path / "a.zarr")
     writer.write_block(slice(0, 64), slice(0, 90), *block((64, 90)))
-    writer.finish()
+    writer.finish(np.ones(2))
     with xr.open_zarr(tmp_path / "a.zarr", consolidated=False) as content:
         assert content.classes.dims == ("y", "x")
         assert content.classes.attrs["flag_meanings"] == "sugar_beet bare_soil"

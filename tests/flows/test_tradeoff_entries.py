@@ -1,0 +1,99 @@
+"""The entries of the trade-offs: their errors are those known of rectification and planning."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flows import tradeoff_budget
+from flows.tradeoff import measure_tradeoff
+from flows.tradeoff_line_model import LINE_MODEL
+from flows.tradeoff_overlap import OVERLAP, Seams
+from flows.tradeoff_resample import RESAMPLE, draw_waves, noise_levels
+from flows.tradeoff_scan_step import SCAN_STEP
+from flows.tradeoff_tie_spacing import TIE_SPACING
+from pipeline.camera import LineCamera
+from pipeline.coverage import cheapest_full
+from pipeline.grid import SceneGrid
+from pipeline.rectify.registration import PairShift
+from pipeline.scan import CostModel
+
+
+def test_waves_are_what_they_claim():
+    """The analytic scene holds periods of 4 to 40 px only and is the same for the same seed."""
+    waves = draw_waves(3)
+    period = 1 / np.hypot(*waves.frequency.T)
+    assert period.min() >= 4
+    assert period.max() <= 40
+    np.testing.assert_array_equal(waves.at(np.ones((1, 2))), draw_waves(3).at(np.ones((1, 2))))
+
+
+def test_noise_levels_follow_the_camera():
+    """Half the converter's range at a contrast of 0.2: a tenth of shot and read noise, and half a step."""
+    camera = LineCamera()
+    electrons = camera.full_well_e / 2
+    noise, step = (level.error * 0.2 * electrons for level in noise_levels(camera))
+    assert 10 * noise == pytest.approx(math.sqrt(electrons + 20**2))
+    assert step == pytest.approx(2.5)
+
+
+def test_resampling_kernels_rank_by_error():
+    """More taps are more exact on 4-40 px content; nearest errs by 24 % of the scene's deviation (erratum E10)."""
+    result = measure_tradeoff(RESAMPLE, repeats=1)
+    nearest, bilinear, cubic = (point.error for point in result.points)
+    assert (nearest, bilinear, cubic) == pytest.approx((0.24, 0.093, 0.029), rel=0.03)
+
+
+def test_line_models_get_better_to_the_exact():
+    """Over the field of 10240 x 10240 px no rotation errs by 307 px, the slope by 185, exact rays by nothing."""
+    errors = [point.error for point in measure_tradeoff(LINE_MODEL, repeats=1).points]
+    assert errors[:4] == pytest.approx([307, 185, 183, 12.2], rel=0.01)
+    assert errors[4] == 0
+
+
+def test_ties_sixteen_apart_keep_the_goal():
+    """The greatest error grows with the square of the distance, is 1.6e-3 px at 16, and rounding without ties."""
+    errors = {point.setting: point.error for point in measure_tradeoff(TIE_SPACING, repeats=1).points}
+    assert errors[1] < 1e-9
+    assert errors[16] == pytest.approx(1.61e-3, rel=0.02)
+    assert errors[64] / errors[16] == pytest.approx(16, rel=0.1)
+
+
+def test_wider_overlaps_find_shifts_better():
+    """Every overlap finds the known shifts to 0.1 px, and the widest at least three times better than the narrowest."""
+    errors = [point.error for point in measure_tradeoff(OVERLAP, repeats=1).points]
+    assert max(errors) < 0.1
+    assert errors[-1] < errors[0] / 3
+
+
+def test_undecided_shifts_count_as_infinitely_far():
+    """Where most pairs are not decided there is no error to tell."""
+    state = Seams([], np.zeros((3, 2)))
+    unknown = np.full(2, np.nan)
+    undecided, decided = PairShift("undecidable", unknown, unknown), PairShift("found", np.array([0.0, 0.3]), unknown)
+    assert OVERLAP.judge(state, 16, [undecided, decided, undecided]) == np.inf
+    assert OVERLAP.judge(state, 16, [decided, decided, undecided]) == pytest.approx(0.3)
+
+
+def test_fewer_lines_take_less_time_and_show_less():
+    """Beyond the slit's width the error grows with the scan's step, while the modelled seconds shrink."""
+    result = measure_tradeoff(SCAN_STEP, repeats=1)
+    seconds, errors = [point.price_s for point in result.points], [point.error for point in result.points]
+    assert seconds == sorted(seconds, reverse=True)
+    assert errors[1:] == sorted(errors[1:])
+    noise, tenth = (level.error for level in result.levels)
+    assert (errors[0], 10 * tenth) == pytest.approx((noise, noise), rel=0.1)
+    assert noise == pytest.approx(0.045, rel=0.1)
+
+
+def test_a_larger_budget_takes_more_seconds_and_draws_a_better_map(monkeypatch):
+    """Coarse and fine seconds together keep the budget and nearly use it up; the error is that of the class map."""
+    monkeypatch.setattr(tradeoff_budget, "SHAPE", (256, 640))
+    half, whole = measure_tradeoff(replace(tradeoff_budget.BUDGET, settings=(0.6, 1.0)), repeats=1).points
+    *_, full_s = cheapest_full(SceneGrid(256, 640, 16, 4), LineCamera(), CostModel())
+    assert 0.55 < half.price_s / full_s <= 0.6
+    assert 0.95 < whole.price_s / full_s <= 1.0
+    assert 0 < whole.error < half.error < 0.5

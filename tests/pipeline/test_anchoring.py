@@ -1,0 +1,116 @@
+"""Anchoring: a fine sweep is found on the coarse mosaic, wherever it lies and however short it is, or left alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from pipeline.camera import LineCamera
+from pipeline.errors import SettingsError
+from pipeline.grid import SceneGrid
+from pipeline.rectify.anchoring import Anchor, anchor_sweep
+from pipeline.rectify.overlaps import BroadSweep
+from pipeline.scan import Axis, Sweep
+from pipeline.simulator.pointing import CommonOffset
+from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+
+CAMERA = LineCamera(samples=96)
+GRID = SceneGrid(240, 300, 16, 4)
+
+
+def textured(seed: int = 0) -> RasterScene:
+    """A scene of the grid's size with texture of 4 px and more."""
+    values = gaussian_filter(np.random.default_rng(seed).normal(size=(GRID.height, GRID.width)), 4.0)
+    cube = np.repeat((1 + 0.3 * values / values.std())[..., None], 2, axis=2)
+    return raster_from_values(cube, CAMERA, name="t", wavelength_nm=np.array([600.0, 700.0]))
+
+
+def coarse_mean(scene: RasterScene, factor: int) -> np.ndarray:
+    """What a coarse pass sees: the mean over whole coarse pixels, repeated pixels beyond the border."""
+    y, x = np.mgrid[: -(-GRID.height // factor) * factor, : -(-GRID.width // factor) * factor]
+    fine = scene.sample(y.ravel().astype(float), x.ravel().astype(float)).mean(axis=1).reshape(y.shape)
+    return np.asarray(fine.reshape(y.shape[0] // factor, factor, -1, factor).mean(axis=(1, 3)))
+
+
+def anchored(
+    sweep: Sweep,
+    offset: tuple[float, float],
+    *,
+    factor: int = 4,
+    prior_px: float = 16,
+    scene: RasterScene | None = None,
+) -> Anchor:
+    """A sweep seen by a mirror that looks beside the plan, on the mosaic of one that does not."""
+    seen = textured() if scene is None else scene
+    source = SimulatedSource(seen, CAMERA, 0, frozenset({"read"}), pointing=CommonOffset(offset))
+    broad = BroadSweep.read(SimulatedSweep(source, sweep), CAMERA)
+    return anchor_sweep(broad, CAMERA, replace(GRID, factor=factor), coarse_mean(seen, factor), prior_px=prior_px)
+
+
+def sweep_of(along: Axis = "x", *, strip: float = -20.0, start: float = -70.0, lines: int = 140) -> Sweep:
+    """A fine sweep in the middle of the field."""
+    return Sweep("fine", "fine", along, strip, start, lines)
+
+
+@pytest.mark.parametrize("factor", [2, 3, 4])
+@pytest.mark.parametrize("along", ["x", "y"])
+def test_sweep_is_found_on_the_mosaic(along: Axis, factor: int) -> None:
+    """Where the mirror looked is found to 0.1 px, by sign and axis, for even and odd factors and either orientation."""
+    found = anchored(sweep_of(along), (9.3, -6.6), factor=factor)
+    assert found.found.status == "found"
+    np.testing.assert_allclose(found.shift.offset, [9.3, -6.6], atol=0.1)
+    assert (found.shift.drift == 0).all()
+
+
+@pytest.mark.parametrize("start", [-119.0, 80.0])
+def test_short_sweep_at_the_end_of_the_field_is_found(start: float) -> None:
+    """Where the middle of what may have been seen is no place of the sweep, the sweep is put right all the same."""
+    found = anchored(sweep_of(start=start, lines=40), (-8.0, 2.5), prior_px=40)
+    assert found.found.status == "found"
+    np.testing.assert_allclose(found.shift.offset, [-8.0, 2.5], atol=0.15)
+
+
+def test_sweep_is_compared_with_all_that_it_may_have_seen() -> None:
+    """Twenty lines that looked as many pixels further on share nothing with where they were to look, and are found."""
+    found = anchored(sweep_of(start=-10.0, lines=24), (-3.0, 24.0), prior_px=30)
+    np.testing.assert_allclose(found.shift.offset, [-3.0, 24.0], atol=0.2)
+    back = anchored(sweep_of(start=-10.0, lines=24), (3.0, -24.0), prior_px=30)
+    np.testing.assert_allclose(back.shift.offset, [3.0, -24.0], atol=0.2)
+
+
+def test_sweep_without_texture_stays_and_says_so() -> None:
+    """On a field without texture nothing is found and nothing is moved."""
+    flat = raster_from_values(np.ones((240, 300, 2)), CAMERA, name="t", wavelength_nm=np.array([600.0, 700.0]))
+    found = anchored(sweep_of(), (5.0, 5.0), scene=flat)
+    assert found.found.status == "flat"
+    assert (found.shift.offset == 0).all()
+
+
+def test_sweep_beyond_the_prior_stays_where_it_was() -> None:
+    """A sweep further off than can be is not put elsewhere."""
+    found = anchored(sweep_of(), (14.0, 0.0), prior_px=6)
+    assert found.found.status == "undecidable"
+    assert (found.shift.offset == 0).all()
+
+
+def test_sweep_that_shows_nothing_of_the_mosaic_is_empty() -> None:
+    """Without a usable line, beside the field, or on a mosaic that holds nothing, there is nothing to compare."""
+    source = SimulatedSource(textured(), CAMERA, 0, frozenset())
+    broad = BroadSweep.read(SimulatedSweep(source, sweep_of()), CAMERA)
+    blind = replace(broad, usable=np.zeros(140, bool))
+    mosaic = coarse_mean(textured(), 4)
+    assert anchor_sweep(blind, CAMERA, GRID, mosaic, prior_px=8).found.status == "empty"
+    assert anchor_sweep(broad, CAMERA, GRID, np.full_like(mosaic, np.nan), prior_px=8).found.status == "empty"
+    beside = BroadSweep.read(SimulatedSweep(source, sweep_of(strip=400.0)), CAMERA)
+    assert anchor_sweep(beside, CAMERA, GRID, mosaic, prior_px=8).found.status == "empty"
+
+
+@pytest.mark.parametrize("prior_px", [-1.0, float("nan"), float("inf")])
+def test_prior_that_is_none_is_refused(prior_px: float) -> None:
+    """A negative or endless prior is named."""
+    with pytest.raises(SettingsError, match="finite prior >= 0 px, got"):
+        anchored(sweep_of(), (0.0, 0.0), prior_px=prior_px)
