@@ -101,7 +101,10 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
     def build(path: Path) -> None:
         scores = score_seats(settings.policy, glance_at(run, mosaic), seed=settings.seed, mask=run.mask)
         run.report(0.5)
-        plan = plan_fine(run.grid, run.camera, settings.cost, run.plan.along, scores, budget_s=run.plan.fine_s)
+        plan = plan_fine(
+            run.grid, run.camera, settings.cost, run.plan.along, scores,
+            budget_s=run.plan.fine_s, margin_px=run.plan.margin_px, full=run.plan.full,
+        )  # fmt: skip
         rank = np.full(scores.shape, -1, np.int32)
         rank[plan.seats[np.argsort(-scores[plan.seats], kind="stable")]] = np.arange(len(plan.seats))
         shape = run.grid.seat_shape
@@ -121,6 +124,7 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
         "mask": None if run.mask is None else digest(run.mask),
         "fine_s": run.plan.fine_s,
         "overlap_px": run.plan.overlap_px,
+        "margin_px": run.plan.margin_px,
         "along": run.plan.along,
         "camera": asdict(run.camera),
         "cost": asdict(settings.cost),

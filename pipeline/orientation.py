@@ -103,13 +103,14 @@ def compare_orientations(
     overlap_px
         Of the coarse pass, as of :func:`pipeline.coverage.coarse_sweeps`.
     margin_px
-        By which its sweeps begin earlier and end later, as of :func:`pipeline.coverage.with_margin`.
+        By which its sweeps begin earlier and end later, as of :func:`pipeline.coverage.with_margin`; and what the fine
+        pass allows for, as of :func:`pipeline.planning.plan_fine`.
 
     Raises
     ------
     PoseError : the field is beyond the mirror's range with lines along ``along``; the other axis is only reported.
     """
-    here = plan or plan_fine(grid, camera, cost, along, scores, budget_s=budget_s)
+    here = plan or plan_fine(grid, camera, cost, along, scores, budget_s=budget_s, margin_px=margin_px)
 
     def coarse_seconds(axis: Axis) -> float:
         sweeps = coarse_sweeps(grid, camera, axis, overlap_px=overlap_px)
@@ -124,7 +125,7 @@ def compare_orientations(
         if left < 0:
             reason = f"the coarse pass alone takes {other_coarse_s:.1f} s"
             return OrientationReport(taken, None, rows, reason)
-        turned = plan_fine(grid, camera, cost, other, scores, budget_s=left)
+        turned = plan_fine(grid, camera, cost, other, scores, budget_s=left, margin_px=margin_px)
     except PoseError as error:
         return OrientationReport(taken, None, rows, str(error))
     return OrientationReport(taken, _outcome(other, other_coarse_s, turned), rows)

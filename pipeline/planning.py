@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import ceil, isfinite
 from typing import Literal
@@ -119,7 +120,15 @@ def check_budget(budget: float, coarse_seconds: float, full_seconds: float) -> f
 
 
 def plan_fine(
-    grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis, scores: NDArray[np.floating], *, budget_s: float
+    grid: SceneGrid,
+    camera: LineCamera,
+    cost: CostModel,
+    along: Axis,
+    scores: NDArray[np.floating],
+    *,
+    budget_s: float,
+    margin_px: float = 0.0,
+    full: Sequence[Sweep] | None = None,
 ) -> FinePlan:
     """Choose the line runs that show the most score for at most ``budget_s`` seconds.
 
@@ -134,6 +143,10 @@ def plan_fine(
         (seat,) gain of each seat of ``grid``; NaN, -inf and negative ones are worth nothing, +inf more than all others.
     budget_s
         Seconds for the fine pass, 0 or more.
+    margin_px
+        How far beside the plan the mirror may look: every run shows its seats even so. [px]
+    full
+        Sweeps of the full scan; None lays the fewest strips that cover the field.
 
     Raises
     ------
@@ -145,22 +158,22 @@ def plan_fine(
     if not isfinite(budget_s) or budget_s < 0:
         raise BudgetError(f"the fine pass needs a finite number of seconds, 0 or more, got {budget_s}")
     worth = _worth(grid, scores)
-    field = _field(grid, camera, cost, along, worth)
+    field = _field(grid, camera, cost, along, worth, margin_px)
     missed = int(np.count_nonzero(worth)) - len(np.unique(field.views.seat))
-    full = _full(grid, camera, cost, along)
-    full_s = None if full is None else full[1]
+    whole = _full(grid, camera, cost, along) if full is None else (list(full), cost.seconds(list(full), camera))
+    full_s = None if whole is None else whole[1]
     plan = spend(field, budget_s if full_s is None else min(budget_s, float(np.nextafter(full_s, 0.0))))
     everything = plan.worth >= field.total * (1 - NEGLIGIBLE)
-    if full is not None and full_s is not None and full_s <= budget_s and not everything:
+    if whole is not None and full_s is not None and full_s <= budget_s and not everything:
         reason = (
             f"to show every place worth a second look takes no less time than to scan everything in detail, "
             f"{full_s:.1f} s; the full scan is taken, which shows all of the field"
         )
-        return FinePlan(full[0], grid.valid_seats(), full_s, field.total, "full", reason, field.total, full_s, missed)
+        return FinePlan(whole[0], grid.valid_seats(), full_s, field.total, "full", reason, field.total, full_s, missed)
     sweeps = _sweeps(field, plan)
     check_reach(sweeps, camera)
     seconds = cost.seconds(sweeps, camera)
-    seats = covered_seats(grid, camera, sweeps)
+    seats = covered_seats(grid, camera, sweeps, margin_px=margin_px)
     return FinePlan(
         sweeps, seats, seconds, plan.worth, "lines", _lines_reason(seconds, full_s), field.total, full_s, missed
     )
@@ -181,9 +194,12 @@ def _full(grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis) -> 
     return sweeps, cost.seconds(sweeps, camera)
 
 
-def _field(grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis, worth: NDArray[np.float64]) -> Field:
+def _field(
+    grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis, worth: NDArray[np.float64], margin_px: float
+) -> Field:
     """What strips at every offset show of the seats that are worth something."""
-    views = look_from(grid, camera, strips_at_seats(grid, camera, along), worth > 0)
+    strips = strips_at_seats(grid, camera, along, margin_px=margin_px)
+    views = look_from(grid, camera, strips, worth > 0, margin_px=margin_px)
     if np.any(worth > 0) and not len(views.seat):
         first = int(np.flatnonzero(worth > 0)[0])
         raise PoseError(
@@ -239,7 +255,7 @@ def price_of_seats(
     """
     worth = np.zeros(int(np.prod(grid.seat_shape)))
     worth[np.asarray(seats, np.intp)] = 1.0
-    field = _field(grid, camera, cost, along, worth)
+    field = _field(grid, camera, cost, along, worth, 0.0)
     missed = np.setdiff1d(np.flatnonzero(worth), field.views.seat)
     if len(missed):
         raise PoseError(

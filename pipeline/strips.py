@@ -44,7 +44,7 @@ class Views:
 
 
 def seat_lines(
-    grid: SceneGrid, camera: LineCamera, sweep: Sweep, seats: NDArray[np.integer]
+    grid: SceneGrid, camera: LineCamera, sweep: Sweep, seats: NDArray[np.integer], *, margin_px: float = 0.0
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Give the lines of a fine sweep that each seat needs, resampling taps included.
 
@@ -54,6 +54,8 @@ def seat_lines(
         A ``step=1`` sweep; lines count from its first. They need not exist: compare with ``sweep.lines``.
     seats
         (seat,) numbers. Only their pixels on the scene count.
+    margin_px
+        How far beside the plan the mirror may look: so many lines and samples more are needed all around. [px]
 
     Returns
     -------
@@ -72,9 +74,10 @@ def seat_lines(
     corners_along = np.stack([low, low, high, high])[..., along]
     corners_scan = np.stack([low, high, low, high])[..., scan]
     at = scene_to_sweep(sweep, camera, corners_along, corners_scan)
-    first = np.floor(at[..., 0].min(axis=0) + ROUNDING_PX).astype(np.intp) - TAPS_BEFORE
-    stop = np.floor(at[..., 0].max(axis=0) + ROUNDING_PX).astype(np.intp) + TAPS_AFTER + 1
-    reached = (at[..., 1].min(axis=0) >= -0.5) & (at[..., 1].max(axis=0) <= camera.samples - 0.5)
+    more = int(np.ceil(margin_px)) + 1 if margin_px else 0  # a line that is shifted turns as well, by less than a pixel
+    first = np.floor(at[..., 0].min(axis=0) + ROUNDING_PX).astype(np.intp) - TAPS_BEFORE - more
+    stop = np.floor(at[..., 0].max(axis=0) + ROUNDING_PX).astype(np.intp) + TAPS_AFTER + 1 + more
+    reached = (at[..., 1].min(axis=0) >= more - 0.5) & (at[..., 1].max(axis=0) <= camera.samples - 0.5 - more)
     return np.stack([first, stop], axis=-1), reached & on_scene
 
 
@@ -88,12 +91,12 @@ def _seat_edges(
     return origin - middle, np.minimum(origin + grid.patch, size) - 1 - middle, np.all(origin < size, axis=-1)
 
 
-def covered_seats(grid: SceneGrid, camera: LineCamera, sweeps: Sequence[Sweep]) -> Seats:
-    """Give the valid seats that lie wholly, taps included, in one of the fine sweeps, ascending."""
+def covered_seats(grid: SceneGrid, camera: LineCamera, sweeps: Sequence[Sweep], *, margin_px: float = 0.0) -> Seats:
+    """Give the valid seats that lie wholly, taps and margin included, in one of the fine sweeps, ascending."""
     shown = np.zeros(int(np.prod(grid.seat_shape)), bool)
     for sweep in sweeps:
         seats = seats_near(grid, camera, sweep)
-        lines, reached = seat_lines(grid, camera, sweep, seats)
+        lines, reached = seat_lines(grid, camera, sweep, seats, margin_px=margin_px)
         shown[seats[reached & (lines[:, 0] >= 0) & (lines[:, 1] <= sweep.lines)]] = True
     return np.flatnonzero(shown)
 
@@ -114,8 +117,10 @@ def seats_near(grid: SceneGrid, camera: LineCamera, sweep: Sweep) -> Seats:
     return (span[0][:, None] * grid.seat_shape[1] + span[1]).ravel()
 
 
-def strips_at_seats(grid: SceneGrid, camera: LineCamera, along: Axis) -> list[Sweep]:
+def strips_at_seats(grid: SceneGrid, camera: LineCamera, along: Axis, *, margin_px: float = 0.0) -> list[Sweep]:
     """Lay a strip with its lower end on the edge of each seat column, kept on the scene where it can be.
+
+    With a margin the ends lie so far outside the columns and the scene.
 
     A line shows whole seats only, so a strip between two such offsets shows no seat that one of them does not.
 
@@ -127,14 +132,17 @@ def strips_at_seats(grid: SceneGrid, camera: LineCamera, along: Axis) -> list[Sw
     ------
     SettingsError : a patch is wider than a line.
     """
-    if camera.samples < grid.patch:
-        raise SettingsError(f"a patch of {grid.patch} px is wider than a line of {camera.samples}; take a smaller one")
+    if camera.samples < grid.patch + 2 * margin_px:
+        beside = f" and {margin_px:g} px on either side" if margin_px else ""
+        raise SettingsError(
+            f"a patch of {grid.patch} px{beside} is wider than a line of {camera.samples}; take a smaller one"
+        )
     across, scan = field_px(grid, along)
     start = -(scan - 1) / 2
     found: list[Sweep] = []
     for column in range(-(-across // grid.patch)):
         low = column * grid.patch - across / 2
-        strip = _strip_from(low, across / 2, scan, camera)
+        strip = _strip_from(low - margin_px, across / 2 + margin_px, scan, camera)
         if found and strip <= found[-1].strip_px + ROUNDING_PX:
             break
         found.append(Sweep(f"fine-{column:03d}", "fine", along, strip, start, 0, 1))
@@ -155,7 +163,14 @@ def _strip_from(low: float, end: float, scan: int, camera: LineCamera) -> float:
     return centre
 
 
-def look_from(grid: SceneGrid, camera: LineCamera, strips: Sequence[Sweep], wanted: NDArray[np.bool_]) -> Views:
+def look_from(
+    grid: SceneGrid,
+    camera: LineCamera,
+    strips: Sequence[Sweep],
+    wanted: NDArray[np.bool_],
+    *,
+    margin_px: float = 0.0,
+) -> Views:
     """List what strips show of the wanted seats with lines that the mirror can point.
 
     Parameters
@@ -169,7 +184,7 @@ def look_from(grid: SceneGrid, camera: LineCamera, strips: Sequence[Sweep], want
     for number, strip in enumerate(strips):
         seats = _columns_near(grid, camera, strip)
         seats = seats[wanted[seats]]
-        needs, reached = seat_lines(grid, camera, strip, seats)
+        needs, reached = seat_lines(grid, camera, strip, seats, margin_px=margin_px)
         ends = strip.start_px + needs[reached] - np.array([0, 1])
         fits = np.all(within_reach(strip.strip_px, ends, camera), axis=-1)
         parts.append((np.full(int(fits.sum()), number), seats[reached][fits], needs[reached][fits]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -242,3 +244,14 @@ def test_prices_without_a_full_scan():
     price = SeatsPrice(900, 95.0, None, None)
     assert (price.kind, price.least) == ("lines", (900, 95.0))
     assert "beyond the mirror's range" in price.sentence
+
+
+def test_a_margin_shows_the_seats_wherever_the_mirror_looks() -> None:
+    """Runs planned for a mirror that may be 6 px off still show their seats whole when all of it is."""
+    grid, camera = SceneGrid(300, 900, 32, 4), LineCamera()
+    scores = np.random.default_rng(2).random(int(np.prod(grid.seat_shape))) ** 4
+    plan = plan_fine(grid, camera, CostModel(), "x", scores, budget_s=20.0, margin_px=6.0)
+    assert len(plan.seats) > 20
+    for along, scan in ((6, 6), (-6, 6), (6, -6), (-6, -6)):
+        beside = [replace(one, strip_px=one.strip_px + along, start_px=one.start_px + scan) for one in plan.sweeps]
+        assert set(plan.seats) <= set(covered_seats(grid, camera, beside))
