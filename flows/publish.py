@@ -69,7 +69,10 @@ def publish_run(runner: StageRunner, products: Products, started: str) -> Publis
         draft.write_file("receipt.json", to_json(receipt))
         picture = (draft.folder / "quicklook.png").read_bytes()
         write_report(draft.folder / "report.html", receipt, picture, _pictures(products), looked_twice=looked_twice)
-        folder = draft.publish(survey=receipt["survey"])
+        named = [ref for ref in vars(products).values() if ref is not None]
+        folder = draft.publish(
+            survey=receipt["survey"], settings=receipt["settings"], rests_on=run.archive.manifest_hashes(named)
+        )
     return Published(receipt, folder, looked_twice)
 
 

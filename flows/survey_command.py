@@ -9,7 +9,7 @@ from flows.finding_words import sentences
 from flows.progress import StageProgress
 from flows.publish import Published, publish_run
 from flows.receipt import headline, print_table
-from flows.run import now, open_run
+from flows.run import SurveyRun, now, open_run
 from flows.settings import Settings
 from flows.survey import TITLES, Products, StageRunner, survey
 from models.process import keep_freed_memory, use_one_thread
@@ -25,6 +25,19 @@ def run_survey(settings: Settings, console: Console) -> Published:
         run.archive.reclaim()  # what a killed run left half made
     for note in run.notes:
         console.print(f"[dim]note: {escape(note)}[/]", highlight=False)
+    with run.archive.in_use():
+        published = _survey_and_publish(run, settings, console, started)
+    print_table(published.receipt, console)
+    console.print(escape(headline(published.receipt, published.looked_twice)), highlight=False)
+    for sentence in sentences(published.receipt):
+        console.print(escape(sentence), highlight=False)
+    for name in ("report.html", "quicklook.png", "receipt.json"):
+        console.print(f"  {escape(str(published.folder / name))}", highlight=False, soft_wrap=True)
+    return published
+
+
+def _survey_and_publish(run: SurveyRun, settings: Settings, console: Console, started: str) -> Published:
+    """Run the stages with a bar each, then draw and publish what they left."""
     with StageProgress(console, TITLES) as progress:
 
         def watch(stage: str, state: str, done: float) -> None:
@@ -35,12 +48,6 @@ def run_survey(settings: Settings, console: Console) -> Published:
         products = _run(runner, settings.engine, console)
     with console.status("drawing pictures and report"):
         published = publish_run(runner, products, started)
-    print_table(published.receipt, console)
-    console.print(escape(headline(published.receipt, published.looked_twice)), highlight=False)
-    for sentence in sentences(published.receipt):
-        console.print(escape(sentence), highlight=False)
-    for name in ("report.html", "quicklook.png", "receipt.json"):
-        console.print(f"  {escape(str(published.folder / name))}", highlight=False, soft_wrap=True)
     return published
 
 

@@ -5,6 +5,7 @@
     stages/<stage>/<key>/     what a stage made, with manifest.json
     runs/<run id>/            receipt.json, report.html, quicklook.png
     spool/<key>/              lines of a capture under way
+    .aside/<stage>/<key>/     what a repair under way puts back where it cannot be remade
     .locks/                   held while something is made
 
 A folder whose name ends in ``.part`` is not finished: whoever makes the same thing next removes it.
@@ -12,47 +13,33 @@ A folder whose name ends in ``.part`` is not finished: whoever makes the same th
 
 from __future__ import annotations
 
-import os
 import re
-import secrets
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import ArchiveError, IncompleteStoreError
+from storage.addresses import StageRef, published_runs, published_stores, store_at
+from storage.archive_folder import open_folder
 from storage.keys import plain, stage_key
-from storage.run_folders import RunDraft
-from storage.staging import (
-    MANIFEST_NAME,
-    PART_SUFFIX,
+from storage.lineage import rests_on
+from storage.manifests import (
+    Cost,
+    Stopwatch,
     check_files,
-    check_name,
+    cost_of,
+    listed_bytes,
+    manifest_sha256,
     read_manifest,
-    refusals,
-    remove_tree,
-    rename_into_place,
-    take_lock,
     write_manifest,
 )
+from storage.run_folders import RunDraft
+from storage.staging import PART_SUFFIX, check_name, refusals, remove_tree, rename_into_place, retire, take_lock
+from storage.verification import Finding, Progress, verify_everything
 
-__all__ = ["Archive", "Finding", "RunDraft", "StageRef", "StagedStore", "stage_key"]
-
-
-@dataclass(frozen=True)
-class StageRef:
-    """Address of one published store: what tasks hand to each other instead of arrays."""
-
-    stage: str
-    key: str
-    path: Path
-
-    @property
-    def uri(self) -> str:
-        """Address relative to the archive."""
-        return f"stages/{self.stage}/{self.key}"
+__all__ = ["Archive", "Cost", "Finding", "RunDraft", "StageRef", "StagedStore", "stage_key"]
 
 
 @dataclass(frozen=True)
@@ -62,14 +49,6 @@ class StagedStore:
     path: Path  # folder to write into
     ref: StageRef
     done: bool
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What ``verify`` says of one store or run; ``problem`` is None where every byte is as published."""
-
-    uri: str
-    problem: str | None
 
 
 class Archive:
@@ -87,15 +66,7 @@ class Archive:
         ArchiveError : the path is a file, is not there, or does not let itself be written to (``write``).
         """
         path = Path(root).absolute()
-        with _any_refusal(path), refusals(path, "use the archive"):
-            if path.exists() and not path.is_dir():
-                raise ArchiveError(f"{path} is a file, expected a folder for the archive; choose another --out")
-            if not create and not (path / "stages").is_dir():
-                state = "is a folder but no archive (it has no folder stages)" if path.is_dir() else "is not there"
-                raise ArchiveError(f"{path} {state}; check the name, or make an archive with survey --out")
-            _make_and_probe(path, create=create, write=write)
-            if not os.access(path, os.R_OK | os.X_OK):
-                raise ArchiveError(f"cannot read the archive {path}: permission is denied; change the folder's rights")
+        open_folder(path, create=create, write=write)
         return cls(path)
 
     # --- stages -------------------------------------------------------------------------------------------------------
@@ -105,10 +76,10 @@ class Archive:
 
         Raises
         ------
-        IncompleteStoreError : it is there, but a file is missing or has another size.
+        IncompleteStoreError : it is there, but its manifest or a file is missing, or has another size.
         """
-        ref = self._ref(stage, key)
-        if not (ref.path / MANIFEST_NAME).is_file():
+        ref = store_at(self.root, stage, key)
+        if not ref.path.exists():
             return None
         check_files(ref.path, hashes=False)
         return ref
@@ -122,17 +93,19 @@ class Archive:
         version: int | str = 1,
         params: Mapping[str, Any] | None = None,
         inputs: Sequence[str] | Mapping[str, str] = (),
+        work: float | None = None,
     ) -> Iterator[StagedStore]:
         """Give a folder to write into, and publish it when the block ends well.
 
         One process at a time makes a key; the others wait and then find ``done``. When the block fails, the folder
-        is removed and the archive is as before.
+        is removed and the archive is as before. The manifest says what the block took, with ``work``, how much it had
+        to do in units of the stage's own: from these the cost of the next one is estimated.
 
         Raises
         ------
         ArchiveError : the disk refuses; the message names the path and what to do.
         """
-        ref = self._ref(stage, key)
+        ref = store_at(self.root, stage, key)
         facts = {"stage": stage, "key": key, "version": version, "params": plain(params or {}), "inputs": plain(inputs)}
         with refusals(self.root, "write to the archive"), self._locked(f"{stage}-{key}"):
             done = self.find(stage, key) is not None
@@ -140,10 +113,10 @@ class Archive:
             remove_tree(part)
             part.mkdir(parents=True)
             try:
+                watch = Stopwatch()
                 yield StagedStore(part, ref, done)
                 if not done:
-                    write_manifest(part, facts)
-                    _retire(ref.path)
+                    write_manifest(part, facts | {"cost": watch.cost(work)})
                     rename_into_place(part, ref.path)
             finally:
                 remove_tree(part)
@@ -156,35 +129,73 @@ class Archive:
         version: int | str,
         params: Mapping[str, Any],
         inputs: Sequence[str] | Mapping[str, str] = (),
+        work: float | None = None,
     ) -> tuple[StageRef, bool]:
-        """Find the store of these facts, or have ``build`` write it; the second value says whether it was built."""
+        """Find the store of these facts, or have ``build`` write it; the second value says whether it was built.
+
+        ``work`` has no part in the key: it is what `cost` tells later, beside the time that ``build`` took.
+        """
         key = stage_key(stage, version, params, inputs)
         found = self.find(stage, key)
         if found is not None:
             return found, False
-        with self.publish(stage, key, version=version, params=params, inputs=inputs) as staged:
+        with self.publish(stage, key, version=version, params=params, inputs=inputs, work=work) as staged:
             if not staged.done:
                 build(staged.path)
         return staged.ref, not staged.done
 
     def manifest(self, ref: StageRef) -> dict[str, Any]:
-        """What is known of a store: stage, key, version, params, inputs, created, libraries, files."""
+        """What is known of a store: stage, key, version, params, inputs, cost, created, libraries, files."""
         return read_manifest(ref.path)
 
     def stored_bytes(self, ref: StageRef) -> int:
         """Size of a store's files by its manifest."""
-        return sum(int(entry["size"]) for entry in self.manifest(ref)["files"].values())
+        return listed_bytes(self.manifest(ref))
+
+    def cost(self, ref: StageRef) -> Cost | None:
+        """What the making of a store took, by its manifest; None for stores of before this was recorded."""
+        return cost_of(self.manifest(ref))
+
+    def manifest_hash(self, ref: StageRef) -> str:
+        """SHA-256 of a store's manifest.json, and so of every byte of the store."""
+        return manifest_sha256(ref.path)
+
+    def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
+        """`manifest_hash` by address, of stores and of all they rest on, for ``RunDraft.publish(rests_on=...)``."""
+        return {ref.uri: manifest_sha256(ref.path) for ref in rests_on(self.root, refs)}
 
     def refs(self, stage: str | None = None) -> list[StageRef]:
         """Every published store (of one stage), by stage and key."""
-        folders = sorted((self.root / "stages").glob(f"{stage or '*'}/*/{MANIFEST_NAME}"))
-        found = [folder.parent for folder in folders if not folder.parent.name.endswith(PART_SUFFIX)]
-        return [StageRef(path.parent.name, path.name, path) for path in found]
+        return published_stores(self.root, stage)
 
-    def discard(self, ref: StageRef) -> None:
-        """Take one store away, for good; a key that is asked for again is made again."""
-        with refusals(self.root, "remove from the archive"), self._locked(f"{ref.stage}-{ref.key}"):
-            _retire(ref.path)
+    def discard(self, ref: StageRef, *, wait: bool = True) -> bool:
+        """Take one store away, for good; a key that is asked for again is made again.
+
+        False where another process works on it and ``wait`` is false.
+        """
+        with refusals(self.root, "remove from the archive"):
+            release = take_lock(self._lock_path(f"{ref.stage}-{ref.key}"), wait=wait)
+            if release is None:
+                return False
+            try:
+                retire(ref.path)
+            finally:
+                release()
+        return True
+
+    @contextmanager
+    def in_use(self, *, alone: bool = False) -> Iterator[bool]:
+        """Keep others from clearing stores away while the block runs; many may do so at a time.
+
+        With ``alone`` ask to be the only one: gives False, at once, where somebody uses the archive.
+        """
+        with refusals(self.root, "write to the archive"):
+            release = take_lock(self._lock_path("use"), wait=not alone, shared=not alone)
+        try:
+            yield release is not None
+        finally:
+            if release is not None:
+                release()
 
     # --- verification and clearing up ---------------------------------------------------------------------------------
 
@@ -197,11 +208,9 @@ class Archive:
         """
         check_files(ref.path, hashes=True)
 
-    def verify_all(self) -> list[Finding]:
-        """Check every store and every run."""
-        runs = [(f"runs/{path.name}", path) for path in self.runs()]
-        stores = [(ref.uri, ref.path) for ref in self.refs()]
-        return [Finding(uri, _problem(path)) for uri, path in (*stores, *runs)]
+    def verify_all(self, progress: Progress | None = None) -> list[Finding]:
+        """Check every store and every run; each file and shard that is broken has a finding of its own."""
+        return verify_everything(self.root, progress)
 
     def reclaim(self) -> list[str]:
         """Remove unfinished folders that no living process works on; gives their addresses."""
@@ -247,8 +256,7 @@ class Archive:
 
     def runs(self) -> list[Path]:
         """Folders of the published runs, oldest first."""
-        found = sorted(path.parent for path in (self.root / "runs").glob(f"*/{MANIFEST_NAME}"))
-        return [path for path in found if not path.name.endswith(PART_SUFFIX)]
+        return published_runs(self.root)
 
     def spool_folder(self, key: str) -> Path:
         """Folder for the lines of a capture under way; it outlives the process, unlike a staged store."""
@@ -263,11 +271,6 @@ class Archive:
         check_name(key)
         remove_tree(self.root / "spool" / key)
 
-    def _ref(self, stage: str, key: str) -> StageRef:
-        check_name(stage)
-        check_name(key)
-        return StageRef(stage, key, self.root / "stages" / stage / key)
-
     def _lock_path(self, name: str) -> Path:
         return self.root / ".locks" / f"{name}.lock"
 
@@ -279,52 +282,3 @@ class Archive:
         finally:
             if release is not None:
                 release()
-
-
-@contextmanager
-def _any_refusal(path: Path) -> Iterator[None]:
-    """At the door whatever the system answers means that this is no place for an archive."""
-    try:
-        yield
-    except ArchiveError:
-        raise
-    except OSError as error:
-        raise ArchiveError(f"cannot use {path} as an archive: {error.strerror}; choose another --out") from error
-
-
-def _make_and_probe(path: Path, *, create: bool, write: bool) -> None:
-    try:
-        if create:
-            (path / "stages").mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise ArchiveError(
-            f"{error.filename} is or lies below a file, expected a folder; choose another --out"
-        ) from error
-    if write:
-        _probe(path)
-
-
-def _probe(path: Path) -> None:
-    """Write and remove a small file: rights alone do not tell of a read-only or full disk."""
-    probe = path / f".probe-{os.getpid()}-{secrets.token_hex(4)}"
-    try:
-        probe.write_bytes(b"written to see whether this can be written to")
-    finally:
-        with suppress(OSError):
-            probe.unlink(missing_ok=True)
-
-
-def _retire(path: Path) -> None:
-    """Take a folder away in one step: first its name, then its files."""
-    if path.exists():
-        away = path.with_name(f"{path.name}-{secrets.token_hex(4)}{PART_SUFFIX}")
-        path.rename(away)
-        remove_tree(away)
-
-
-def _problem(path: Path) -> str | None:
-    try:
-        check_files(path, hashes=True)
-    except (IncompleteStoreError, OSError) as error:
-        return str(error)
-    return None

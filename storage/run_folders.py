@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from storage.keys import plain
-from storage.staging import check_name, refusals, remove_tree, rename_into_place, write_manifest
+from storage.manifests import write_manifest
+from storage.staging import check_name, refusals, remove_tree, rename_into_place
 
 
 class RunDraft:
@@ -43,11 +44,15 @@ class RunDraft:
             path.write_bytes(content.encode() if isinstance(content, str) else content)
         return path
 
-    def publish(self, **facts: Any) -> Path:
-        """Make the run seen under ``runs``; gives its folder. ``facts`` go into the manifest."""
+    def publish(self, *, rests_on: Mapping[str, str] | None = None, **facts: Any) -> Path:
+        """Make the run seen under ``runs``; gives its folder. ``facts`` go into the manifest.
+
+        ``rests_on`` is what `Archive.manifest_hashes` gives of the run's products: by it `verify` knows that their
+        manifests, too, are as they were, and `gc` what to keep, even where the receipt is damaged.
+        """
         final = self.folder.with_name(self.id)
         with refusals(self._root, "write to the archive"):
-            write_manifest(self.folder, {"run": self.id, **plain(facts)})
+            write_manifest(self.folder, {"run": self.id, "rests_on": dict(rests_on or {}), **plain(facts)})
             rename_into_place(self.folder, final)
         self._release()
         return final

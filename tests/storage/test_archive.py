@@ -81,7 +81,7 @@ def test_one_changed_byte_is_named(tmp_path: Path, victim: str) -> None:
     assert ref is not None
     with pytest.raises(IncompleteStoreError, match=rf"{victim} has changed since it was published"):
         archive.verify(ref)
-    assert [finding.problem is None for finding in archive.verify_all()] == [False]
+    assert [finding.problem is None for finding in archive.verify_all() if finding.uri == ref.uri] == [False]
 
 
 def test_missing_short_and_extra_files_are_named(tmp_path: Path) -> None:

@@ -1,0 +1,62 @@
+"""Addresses in an archive: of stores and runs, and how they are told apart from what merely lies there."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from storage.staging import MANIFEST_NAME, PART_SUFFIX, check_name
+
+STORE_URI = re.compile(r"stages/([^/\s]+)/([^/\s]+)")
+
+
+@dataclass(frozen=True)
+class StageRef:
+    """Address of one published store: what tasks hand to each other instead of arrays."""
+
+    stage: str
+    key: str
+    path: Path
+
+    @property
+    def uri(self) -> str:
+        """Address relative to the archive."""
+        return f"stages/{self.stage}/{self.key}"
+
+
+def store_at(root: Path, stage: str, key: str) -> StageRef:
+    """Address of a store, whether it is there or not (ArchiveError: no such names can be)."""
+    check_name(stage)
+    check_name(key)
+    return StageRef(stage, key, root / "stages" / stage / key)
+
+
+def published_stores(root: Path, stage: str | None = None) -> list[StageRef]:
+    """Every published store (of one stage), by stage and key."""
+    folders = sorted((root / "stages").glob(f"{stage or '*'}/*/{MANIFEST_NAME}"))
+    found = [folder.parent for folder in folders if not folder.parent.name.endswith(PART_SUFFIX)]
+    return [StageRef(path.parent.name, path.name, path) for path in found]
+
+
+def published_runs(root: Path) -> list[Path]:
+    """Folders of the published runs, oldest first."""
+    found = sorted(path.parent for path in (root / "runs").glob(f"*/{MANIFEST_NAME}"))
+    return [path for path in found if not path.name.endswith(PART_SUFFIX)]
+
+
+def without_manifest(root: Path) -> list[Path]:
+    """What lies among stores and runs and is neither: folders that lost their manifest, and other people's files."""
+    inside = [*root.glob("stages/*/*"), *root.glob("runs/*")]
+    loose = [path for path in root.glob("stages/*") if not path.is_dir()]
+    return sorted(
+        path
+        for path in (*inside, *loose)
+        if not path.name.endswith(PART_SUFFIX) and not (path / MANIFEST_NAME).is_file()
+    )
+
+
+def in_text(text: str) -> str | None:
+    """The store's address that a text such as ``stages/rectify/<key>/mosaic.zarr`` begins with, or None."""
+    found = STORE_URI.match(text)
+    return None if found is None else found.group(0)

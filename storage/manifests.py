@@ -1,0 +1,228 @@
+"""Manifests: the facts of a published folder, the hash and size of every file, and a seal over the manifest itself.
+
+The seal is the SHA-256 of the manifest's text without it, so that a bit that flips in the manifest is found by the
+manifest alone. Manifests of before (no ``format``, no ``seal``) still open; their sizes and hashes count as ever.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import math
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from pipeline.errors import ArchiveError, IncompleteStoreError
+from storage.staging import MANIFEST_NAME, file_hash, files_below, sync_path
+
+FORMAT = 2
+CURE = "restore it from a copy, or run verify --repair on the archive"
+_DISTRIBUTIONS = ("spectralzoom", "numpy", "torch", "xarray", "zarr", "numcodecs")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What the making of one store took. ``work`` is in units of the stage's own, None where it gave none."""
+
+    wall_s: float
+    cpu_s: float
+    work: float | None
+    size: int  # of the store's files [bytes]
+
+
+class Stopwatch:
+    """Wall and CPU seconds of this process since it was made."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def cost(self, work: float | None) -> dict[str, Any]:
+        """The entry ``cost`` of a manifest.
+
+        Raises
+        ------
+        ArchiveError : ``work`` is no amount.
+        """
+        if work is not None and not (math.isfinite(work) and work >= 0):
+            raise ArchiveError(f"work is {work}, expected a number of units of work, 0 or more, or None")
+        times = {"wall_s": time.perf_counter() - self._wall, "cpu_s": time.process_time() - self._cpu}
+        return {name: round(value, 6) for name, value in times.items()} | (
+            {} if work is None else {"work": float(work)}
+        )
+
+
+def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
+    """Sync every file of a staged folder and write ``manifest.json`` with their hashes and sizes beside ``facts``."""
+    files: dict[str, dict[str, Any]] = {}
+    for path in files_below(folder):
+        sync_path(path)
+        files[path.relative_to(folder).as_posix()] = {"sha256": file_hash(path), "size": path.stat().st_size}
+    content = {
+        **facts,
+        "created": datetime.now(UTC).isoformat(timespec="milliseconds"),
+        "libraries": library_versions(),
+        "files": files,
+        "format": FORMAT,
+    }
+    manifest = folder / MANIFEST_NAME
+    manifest.write_text(_text(content | {"seal": _seal(content)}), encoding="utf-8")
+    sync_path(manifest)
+    for inner in sorted(path for path in folder.rglob("*") if path.is_dir()):
+        sync_path(inner)
+    sync_path(folder)
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Content of a published folder's manifest.
+
+    Raises
+    ------
+    IncompleteStoreError : there is none, it cannot be read, its own seal says that it has changed, or it lists what
+        cannot be a file of this folder.
+    """
+    content, problem = try_manifest(folder)
+    if problem is not None:
+        raise IncompleteStoreError(f"{folder} has no valid {MANIFEST_NAME} ({problem}); {CURE}")
+    return content
+
+
+def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
+    """Content of a published folder's manifest and None, or nothing and what is wrong with it."""
+    try:
+        text = (folder / MANIFEST_NAME).read_bytes().decode()
+        content = json.loads(text)
+        if not isinstance(content, dict) or not isinstance(content.get("files"), dict):
+            raise TypeError("it lists no files")
+        _check_seal(text, content)
+        for name, entry in content["files"].items():
+            _check_entry(name, entry)
+    except FileNotFoundError:
+        return {}, "it is missing"
+    except RecursionError:
+        return {}, "it is nested too deeply"
+    except (OSError, ValueError, TypeError) as error:
+        return {}, str(error)
+    return content, None
+
+
+def is_sealed(manifest: Mapping[str, Any]) -> bool:
+    """Whether a manifest vouches for itself; those of before do not."""
+    return "seal" in manifest or "format" in manifest
+
+
+def manifest_sha256(folder: Path) -> str:
+    """SHA-256 of a published folder's manifest.json: what a run records of each store that it rests on.
+
+    Raises
+    ------
+    IncompleteStoreError : there is none.
+    """
+    try:
+        return file_hash(folder / MANIFEST_NAME)
+    except OSError as error:
+        raise IncompleteStoreError(f"{folder / MANIFEST_NAME} cannot be read: {error.strerror}; {CURE}") from error
+
+
+def cost_of(manifest: Mapping[str, Any]) -> Cost | None:
+    """What the making took; None where the manifest does not tell."""
+    cost = manifest.get("cost")
+    if not isinstance(cost, Mapping):
+        return None
+    wall, cpu, work = (_amount(cost.get(name)) for name in ("wall_s", "cpu_s", "work"))
+    return None if wall is None or cpu is None else Cost(wall, cpu, work, listed_bytes(manifest))
+
+
+def listed_bytes(manifest: Mapping[str, Any]) -> int:
+    """Size of all files that a manifest lists."""
+    return sum(entry["size"] for entry in manifest["files"].values())
+
+
+def check_files(folder: Path, *, hashes: bool) -> None:
+    """Compare a published folder with its manifest: names and sizes, and every byte where ``hashes``.
+
+    Raises
+    ------
+    IncompleteStoreError : names the first file that is missing, has another size or content, or is not listed.
+    """
+    for name, problem in broken_files(folder, read_manifest(folder), hashes=hashes):
+        raise IncompleteStoreError(f"{folder / name} {problem}; {CURE}")
+
+
+def broken_files(folder: Path, manifest: Mapping[str, Any], *, hashes: bool) -> Iterator[tuple[str, str]]:
+    """Give name and problem of every file that is not as the manifest lists it; with ``hashes`` also extra ones."""
+    listed = manifest["files"]
+    for name, entry in listed.items():
+        problem = _file_problem(folder / name, entry, hashes=hashes)
+        if problem is not None:
+            yield name, problem
+    if hashes:
+        found = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if _is_file(path)}
+        for name in sorted(found - set(listed) - {MANIFEST_NAME}):
+            yield name, "is not in the manifest: take it out of the archive"
+
+
+def _is_file(path: Path) -> bool:
+    return path.is_symlink() or path.is_file()
+
+
+def _file_problem(path: Path, entry: Mapping[str, Any], *, hashes: bool) -> str | None:
+    try:
+        if hashes and path.is_symlink():
+            return "is a link, expected a file"
+        size = path.stat().st_size
+        if size != entry["size"]:
+            return f"has {size} bytes, expected {entry['size']}"
+        if hashes and file_hash(path) != entry["sha256"]:
+            return "has changed since it was published (its SHA-256 differs)"
+    except FileNotFoundError:
+        return "cannot be read: it is missing"
+    except OSError as error:
+        return f"cannot be read: {error.strerror}"
+    return None
+
+
+def _text(content: Mapping[str, Any]) -> str:
+    return json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n"
+
+
+def _seal(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(_text(content).encode()).hexdigest()
+
+
+def _check_seal(text: str, content: dict[str, Any]) -> None:
+    """Every byte is either covered by the seal, or is not as it would be written."""
+    if not is_sealed(content):
+        return
+    rest = {name: value for name, value in content.items() if name != "seal"}
+    if content.get("seal") != _seal(rest) or text != _text(content):
+        raise ValueError("it has changed since it was published: its seal does not fit")
+
+
+def _check_entry(name: str, entry: object) -> None:
+    parts = PurePosixPath(name).parts
+    if not parts or name.startswith("/") or ".." in parts or "\0" in name:
+        raise ValueError(f"it lists {name!r}, which is no file of this folder")
+    size, digest = (entry.get("size"), entry.get("sha256")) if isinstance(entry, dict) else (None, None)
+    if isinstance(size, bool) or not isinstance(size, int) or not isinstance(digest, str):
+        raise ValueError(f"it gives no size and hash of {name!r}")
+
+
+def _amount(value: object) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
+        return None
+    return float(value)
+
+
+def library_versions() -> dict[str, str]:
+    """Versions of the libraries that a stored result may depend on, as installed."""
+    found: dict[str, str] = {}
+    for name in _DISTRIBUTIONS:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found

@@ -1,0 +1,115 @@
+"""Reading a whole archive again: every byte against its manifest, every manifest against its seal and its runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from storage.addresses import without_manifest
+from storage.lineage import Catalogue
+from storage.manifests import broken_files, is_sealed, listed_bytes, manifest_sha256, try_manifest
+from storage.records import Run, Store
+from storage.shard_names import name_damage
+from storage.staging import MANIFEST_NAME
+
+ASIDE = ".aside"
+Kind = Literal["whole", "broken", "missing", "stray"]
+Progress = Callable[[str, float], None]  # address of what is being read, how far of all bytes, 0..1
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What ``verify`` says of one store or run; ``problem`` is None where every byte is as published.
+
+    ``missing``: something names or rests on a store that is not there. ``stray``: what is no part of the archive.
+    """
+
+    uri: str
+    problem: str | None
+    kind: Kind = "whole"
+
+
+def verify_everything(root: Path, progress: Progress | None = None) -> list[Finding]:
+    """Check every store and run of an archive; a finding for each that is whole, and for each thing that is not."""
+    catalogue = Catalogue.read(root)
+    places = [(uri, store.ref.path, store.size) for uri, store in catalogue.stores.items()]
+    places += [(run.uri, run.folder, _bytes(run)) for run in catalogue.runs]
+    total, done = sum(size for *_, size in places) or 1, 0
+    found: list[Finding] = []
+    for uri, path, size in places:
+        if progress is not None:
+            progress(uri, done / total)
+        problems = list(_problems(path)) + list(_identity_problems(catalogue, uri))
+        found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
+        done += size
+    return [*found, *_lost(root), *_missing(catalogue), *_left_aside(root)]
+
+
+def _bytes(run: Run) -> int:
+    return listed_bytes(run.facts) if run.facts else 0
+
+
+def _problems(folder: Path) -> Iterator[str]:
+    """What is wrong with one published folder, file by file."""
+    manifest, problem = try_manifest(folder)
+    if problem is not None:
+        yield f"{MANIFEST_NAME} cannot be believed: {problem}"
+        return
+    for name, problem in broken_files(folder, manifest, hashes=True):
+        yield f"{name} {problem}{name_damage(folder, name) if name in manifest['files'] else ''}"
+
+
+def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
+    """Whether a store is the one that its place and the runs say."""
+    store = catalogue.stores.get(uri)
+    if store is None or store.problem is not None:
+        return
+    stated = f"stages/{store.facts.get('stage')}/{store.facts.get('key')}"
+    if stated != uri:
+        yield f"its {MANIFEST_NAME} is that of {stated}; move it back, or take it out of the archive"
+    doubter = _doubter(catalogue, store)
+    if doubter is not None:
+        yield f"its {MANIFEST_NAME} has changed since {doubter.uri} was published (its SHA-256 differs)"
+
+
+def _doubter(catalogue: Catalogue, store: Store) -> Run | None:
+    """A run that knows another manifest, unless a run knows this one or the store was made anew since."""
+    knowing = [run for run in catalogue.runs if store.ref.uri in run.recorded]
+    if not knowing:
+        return None
+    found = manifest_sha256(store.ref.path)
+    if any(run.recorded[store.ref.uri] == found for run in knowing):
+        return None
+    anew = is_sealed(store.facts) and all(store.created > run.created for run in knowing)
+    return None if anew else knowing[-1]
+
+
+def _lost(root: Path) -> Iterator[Finding]:
+    """What lies among stores and runs without a manifest."""
+    for path in without_manifest(root):
+        uri = path.relative_to(root).as_posix()
+        if not path.is_dir() or len(path.relative_to(root).parts) < 2:
+            yield Finding(uri, "is a file, expected a folder with a manifest; take it out of the archive", "stray")
+        else:
+            yield Finding(uri, f"{MANIFEST_NAME} is missing", "broken")
+
+
+def _missing(catalogue: Catalogue) -> Iterator[Finding]:
+    """What runs name and stores rest on, and is not there."""
+    there, told = set(catalogue.stores), set[str]()
+    for run in catalogue.runs:
+        for uri in sorted(run.names - there - told):
+            told.add(uri)
+            yield Finding(uri, f"is not there, but {run.uri} names it", "missing")
+    for uri in catalogue.stores:
+        for given in catalogue.inputs_of(uri):
+            if given not in there | told:
+                told.add(given)
+                yield Finding(given, f"is not there, but {uri} was made of it", "missing")
+
+
+def _left_aside(root: Path) -> Iterator[Finding]:
+    for path in sorted((root / ASIDE).glob("*/*")):
+        yield Finding(path.relative_to(root).as_posix(), "a repair was broken off; run verify --repair again", "stray")

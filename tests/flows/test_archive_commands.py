@@ -1,0 +1,219 @@
+"""ls, gc, explain and verify on the archive of a real, tiny survey: what they print, and what they leave."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from flows.archive_commands import DONE, FAILED, PARTLY, run_explain, run_gc, run_ls, run_verify
+from flows.archive_contents import command, contents
+from flows.settings import load_settings
+from pipeline.errors import ArchiveError
+from storage.archive import Archive
+from tests.conftest import Survey
+from tests.storage.small_archive import flip, small_survey
+
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> Path:
+    """An archive of two surveys of one scene with different budgets; not to be changed."""
+    folder = tmp_path_factory.mktemp("surveyed")
+    for budget in ("0.8", "0.7"):
+        survey_png(folder, budget=budget)
+    return folder
+
+
+@pytest.fixture
+def archive(surveyed: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(surveyed, tmp_path / "archive"))
+
+
+def _json(capsys: pytest.CaptureFixture[str], run: Callable[[], int], code: int = DONE) -> dict[str, Any]:
+    capsys.readouterr()
+    assert run() == code
+    content: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return content
+
+
+def test_ls_shows_runs_and_stores(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As JSON with figures, and for people with units."""
+    content = _json(capsys, lambda: run_ls(surveyed, as_json=True))
+    first, second = content["runs"]
+    assert (first["survey"], first["budget"], second["budget"], first["seed"]) == ("scene", 0.8, 0.7, 0)
+    assert first["state"] == second["state"] == "there"
+    assert 0 < first["miou"] < 1
+    assert first["bytes"] > second["bytes"] > 10_000
+    assert [len(content["stages"][stage]) for stage in ("capture", "rectify", "segment")] == [3, 1, 2]
+    assert content["stages"]["rectify"][0]["runs"] == 2
+    run_ls(surveyed)
+    out = capsys.readouterr().out
+    assert first["id"] in out
+    assert content["stages"]["rectify"][0]["key"] in out
+    assert "2 runs, 13 stores" in out
+
+
+def test_ages_are_told_in_days(surveyed: Path) -> None:
+    """And a clock that was set back gives no error."""
+    for days in (3, -3):
+        content = contents(Archive.open(surveyed), datetime.now(UTC) + timedelta(days=days))
+        assert content["stages"]["rectify"][0]["age_s"] == pytest.approx(days * 86400, abs=1000)
+
+
+def test_an_empty_and_a_damaged_archive_are_listed(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What is damaged or lost is said where it would have stood."""
+    Archive.open(archive.parent / "empty")
+    assert run_ls(archive.parent / "empty") == DONE
+    assert "no runs" in capsys.readouterr().out
+    mosaic, coarse = (Archive.open(archive).refs(stage)[0] for stage in ("rectify", "locate"))
+    flip(mosaic.path / "manifest.json", at=40)
+    (coarse.path / "manifest.json").unlink()
+    flip(Archive.open(archive).runs()[0] / "receipt.json", at=40)
+    content = _json(capsys, lambda: run_ls(archive, as_json=True))
+    assert [run["state"] for run in content["runs"]] == ["damaged", "1 missing and 1 damaged"]
+    assert content["lost"] == [coarse.uri]
+    run_ls(archive)
+    assert "has lost its manifest; run verify" in capsys.readouterr().out
+
+
+def test_explain_shows_lineage_and_what_changed(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The second map differs by its budget, which the plan turned into other sweeps."""
+    content = _json(capsys, lambda: run_explain(surveyed, "class_map", as_json=True))
+    (top,) = content["lineage"]
+    assert (top["stage"], top["called"], [one["stage"] for one in top["inputs"]]) == (
+        "segment", ["draw_map"], ["rectify", "patches"],
+    )  # fmt: skip
+    assert top["wall_s"] > 0
+    assert content["before"].startswith("stages/segment/")
+    kinds = {(one["where"], one["kind"], one["name"]) for one in content["changes"]}
+    assert {("segment", "input", "patches"), ("attend", "parameter", "fine_s")} <= kinds
+    run_explain(surveyed, "class_map")
+    out = capsys.readouterr().out
+    assert "segment" in out
+    assert "└── capture" in out
+    assert "(capture_fine)" in out
+    assert "fine_s" in out
+
+
+def test_a_fine_capture_is_not_taken_for_a_version_of_the_coarse_one(
+    surveyed: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both are of the stage capture; the first survey's coarse sweeps are the first of their kind."""
+    assert _json(capsys, lambda: run_explain(surveyed, "raw_coarse", as_json=True))["before"] is None
+    run_explain(surveyed, "raw_coarse")
+    assert "no earlier version" in capsys.readouterr().out
+    fine = _json(capsys, lambda: run_explain(surveyed, "raw_fine", as_json=True))
+    (earlier,) = [run for run in contents(Archive.open(surveyed))["runs"] if run["budget"] == 0.8]
+    runs = _json(capsys, lambda: run_explain(surveyed, fine["before"], as_json=True))["runs"]
+    assert runs == [f"runs/{earlier['id']}"]
+
+
+def test_a_run_is_explained_by_its_command_and_stores(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each store opens once; what nothing else was made of is at the top."""
+    (first, _) = (run["id"] for run in contents(Archive.open(surveyed))["runs"])
+    content = _json(capsys, lambda: run_explain(surveyed, first, as_json=True))
+    assert [tree["stage"] for tree in content["lineage"]] == ["evaluate"]
+    assert "--budget 0.8" in content["run"]["command"]
+    run_explain(surveyed, first)
+    out = capsys.readouterr().out
+    assert "spectralzoom survey --scene" in " ".join(out.split())
+    assert out.count("capture_coarse") == 1
+
+
+def test_explain_bears_damage_and_circles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A lineage is shown as far as it can be read."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive)
+    flip(small.raw.path / "manifest.json", at=40)
+    archive.discard(small.mosaic)
+    for key, given in (("aaaa", "bbbb"), ("bbbb", "aaaa")):
+        with archive.publish("segment", key, inputs=[given]):
+            pass
+    (top,) = _json(capsys, lambda: run_explain(tmp_path, small.map.uri, as_json=True))["lineage"]
+    assert [one["problem"].split(":")[0] for one in top["inputs"]] == [
+        "is not there",
+        "manifest.json cannot be believed",
+    ]
+    (top,) = _json(capsys, lambda: run_explain(tmp_path, "aaaa", as_json=True))["lineage"]
+    assert top["inputs"][0]["inputs"][0]["see"] == "in a circle"
+    for product in (small.map.uri, small.raw.uri, "aaaa"):
+        run_explain(tmp_path, product)
+    assert "damaged" in capsys.readouterr().out
+    with pytest.raises(ArchiveError, match="cannot be a name"):
+        run_explain(tmp_path, "../../etc/passwd")
+
+
+def test_gc_keeps_what_surveys_name(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """After one run has gone, its own stores go and those it shares stay."""
+    shutil.rmtree(Archive.open(archive).runs()[0])
+    assert _json(capsys, lambda: run_gc(archive, QUIET, as_json=True))["removals"] == []
+    planned = _json(capsys, lambda: run_gc(archive, QUIET, keep_days=0, dry_run=True, as_json=True))
+    assert len(planned["removals"]) == 5
+    done = _json(capsys, lambda: run_gc(archive, QUIET, keep_days=0, as_json=True))
+    assert done["removals"] == planned["removals"]
+    assert done["bytes"] == sum(one["size"] for one in done["removals"]) > 10_000
+    assert run_verify(archive, QUIET) == DONE
+    flip(Archive.open(archive).runs()[0] / "manifest.json", at=40)
+    assert run_gc(archive, QUIET, keep_days=0) == PARTLY
+    assert "no store is removed" in capsys.readouterr().out
+
+
+def test_verify_repairs_by_surveying_again(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A mosaic is broken: both surveys run again from their settings, wherever the archive now lies."""
+    (mosaic,) = Archive.open(archive).refs("rectify")
+    flip(mosaic.path / "mosaic.zarr/values/c/0/0/0")
+    content = _json(capsys, lambda: run_verify(archive, QUIET, as_json=True), FAILED)
+    assert [one["uri"] for one in content["problems"]] == [mosaic.uri]
+    assert "mosaic.zarr/values" in content["problems"][0]["problem"]
+    assert len(content["surveys"]) == 2
+    content = _json(capsys, lambda: run_verify(archive, QUIET, remake=True, as_json=True))
+    assert content["repair"]["complete"]
+    assert mosaic.uri in content["repair"]["remade"]
+    ages = {row["key"]: row["age_s"] for row in contents(Archive.open(archive))["stages"]["capture"]}
+    (coarse,) = set(ages) - {uri.rpartition("/")[2] for uri in content["repair"]["remade"]}
+    assert ages[coarse] == max(ages.values())
+    assert run_verify(archive, QUIET) == DONE
+    assert "17 of 17 stores and runs are as published" in capsys.readouterr().out
+
+
+def test_verify_says_what_it_could_not_repair(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The scene's file has gone: what was there is there again, and the exit code tells."""
+    opened = Archive.open(archive)
+    (mosaic,) = opened.refs("rectify")
+    flip(mosaic.path / "lines.json")
+
+    def fail(settings: dict[str, Any]) -> None:
+        assert settings["scene"].endswith("scene.png")
+        raise ArchiveError("no such scene")
+
+    before = [ref.uri for ref in opened.refs()]
+    assert run_verify(archive, QUIET, remake=True, rerun=fail) == FAILED
+    out = capsys.readouterr().out
+    assert "no such scene" in out
+    assert "some is left as it was" in out
+    assert [ref.uri for ref in opened.refs()] == before
+
+
+def test_progress_is_told_on_the_console(surveyed: Path) -> None:
+    """Not on stdout, which is for the answer."""
+    told = io.StringIO()
+    run_verify(surveyed, Console(file=told))
+    assert "reading again: 100%" in told.getvalue()
+
+
+def test_commands_ask_for_the_settings_again(tmp_path: Path) -> None:
+    """Only what differs from the defaults; tables are pointed at."""
+    flags = {"scene": "farm", "size": "640x512", "bands": "3,4", "controls": False, "camera.exposure_ms": 50}
+    told = command({**load_settings(None, flags).to_dict(), "notes": ["x"]})
+    assert told == ("spectralzoom survey --bands 3,4 --no-controls --size 640x512  (with [camera] as in its receipt)")
+    assert command({}) == ""

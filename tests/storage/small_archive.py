@@ -1,0 +1,75 @@
+"""An archive of small surveys without any science: stores that rest on each other, and runs that name them."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from storage.archive import Archive, StageRef
+
+DAY_S = 86400
+
+
+@dataclass(frozen=True)
+class Small:
+    """Stores of one survey: raw lines, a mosaic made of them, a map made of both, and the run that names the map."""
+
+    raw: StageRef
+    mosaic: StageRef
+    map: StageRef
+    run: Path | None
+
+
+def settings(seed: int = 0, **more: Any) -> dict[str, Any]:
+    """What a receipt says of the survey."""
+    return {"scene": "farm", "source": "sim", "seed": seed, "budget": 0.5, **more}
+
+
+def small_survey(
+    archive: Archive, *, seed: int = 0, kernel: str = "bilinear", named: bool = True, simulated: bool = True
+) -> Small:
+    """Make (or find) the stores of one survey, and a run that rests on them where ``named``."""
+    light = {"scene": "farm", "seed": seed, **({"effects": ["shot"]} if simulated else {"source": "rig"})}
+    raw = _store(archive, "capture", light, [])
+    mosaic = _store(archive, "rectify", {"grid": {"height": 8, "width": 8}, "kernel": kernel}, [raw])
+    drawn = _store(archive, "segment", {"weights": "w0"}, [mosaic, raw])
+    if not named:
+        return Small(raw, mosaic, drawn, None)
+    receipt = {
+        "survey": "farm", "settings": settings(seed, kernel=kernel, source="sim" if simulated else "rig"),
+        "stages": [{"name": "capture_coarse", "key": raw.key, "state": "ran", "wall_s": 1.5, "cpu_s": 1.0}],
+        "products": {"class_map": f"{drawn.uri}/class_map.zarr", "mosaic": f"{mosaic.uri}/mosaic.zarr"},
+    }  # fmt: skip
+    with archive.new_run("farm") as draft:
+        draft.write_file("receipt.json", json.dumps(receipt))
+        folder = draft.publish(survey="farm", rests_on=archive.manifest_hashes([drawn]))
+    return Small(raw, mosaic, drawn, folder)
+
+
+def _store(archive: Archive, stage: str, params: dict[str, Any], inputs: list[StageRef]) -> StageRef:
+    def build(path: Path) -> None:
+        (path / "data.bin").write_bytes(json.dumps([stage, params]).encode() * 40)
+
+    return archive.produce(stage, build, version=1, params=params, inputs=[ref.key for ref in inputs], work=64.0)[0]
+
+
+def flip(path: Path, at: int = -3, bit: int = 2) -> None:
+    """Let one bit of a file rot."""
+    content = bytearray(path.read_bytes())
+    content[at] ^= 1 << bit
+    path.write_bytes(content)
+
+
+def grow_old(ref: StageRef, days: float) -> None:
+    """Set a store's date back, in its (unsealed) manifest and on its file."""
+    path = ref.path / "manifest.json"
+    content = json.loads(path.read_text())
+    for name in ("seal", "format"):
+        content.pop(name, None)
+    content["created"] = "2020-01-01T00:00:00+00:00"
+    path.write_text(json.dumps(content))
+    moment = path.stat().st_mtime - days * DAY_S
+    os.utime(path, (moment, moment))

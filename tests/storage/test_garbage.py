@@ -1,0 +1,178 @@
+"""Clearing up takes what nobody needs and nothing else, and leaves a whole archive wherever it is broken off."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import SettingsError
+from storage.archive import Archive
+from storage.garbage import IN_USE, Removal, clear_up, plan_clearance
+from tests.storage.small_archive import flip, grow_old, small_survey
+
+
+def _problems(archive: Archive) -> list[str]:
+    return [f"{one.uri} {one.problem}" for one in archive.verify_all() if one.problem is not None]
+
+
+def test_what_no_run_names_goes_and_the_rest_stays(tmp_path: Path) -> None:
+    """A store that a named one was made of stays, though no receipt names it."""
+    archive = Archive.open(tmp_path)
+    kept, gone = small_survey(archive), small_survey(archive, seed=1, named=False)
+    planned = clear_up(archive, keep_days=0, dry_run=True)
+    assert [removal.uri for removal in planned.removals] == [gone.map.uri, gone.mosaic.uri, gone.raw.uri]
+    assert len(archive.refs()) == 6
+    done = clear_up(archive, keep_days=0)
+    assert done == planned
+    assert done.size > 3 * 40 * 40
+    assert {ref.uri for ref in archive.refs()} == {kept.raw.uri, kept.mosaic.uri, kept.map.uri}
+    assert _problems(archive) == []
+    assert clear_up(archive, keep_days=0).removals == ()
+
+
+def test_a_shared_input_stays(tmp_path: Path) -> None:
+    """Of a map with another kernel that no run names, the raw lines are those of a map that one names."""
+    archive = Archive.open(tmp_path)
+    kept, gone = small_survey(archive), small_survey(archive, kernel="nearest", named=False)
+    assert gone.raw == kept.raw
+    assert [one.uri for one in clear_up(archive, keep_days=0).removals] == [gone.map.uri, gone.mosaic.uri]
+
+
+def test_young_stores_stay_with_what_they_rest_on(tmp_path: Path) -> None:
+    """A survey under way has made a map of old raw lines: neither goes."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive, named=False)
+    other = small_survey(archive, seed=5, named=False)
+    for ref in (small.raw, small.mosaic, other.raw, other.mosaic, other.map):
+        grow_old(ref, days=3)
+    plan = plan_clearance(archive, keep_days=2)
+    assert {one.uri for one in plan.removals} == {other.raw.uri, other.mosaic.uri, other.map.uri}
+    assert plan.kept == {
+        small.raw.uri: "what stays was made of it", small.mosaic.uri: "what stays was made of it",
+        small.map.uri: "younger than 2 days",
+    }  # fmt: skip
+    assert len(plan_clearance(archive, keep_days=4).removals) == 0
+
+
+def test_raw_lines_of_a_rig_go_only_when_asked(tmp_path: Path) -> None:
+    """A survey that broke off after its capture has lines that no run names and that cannot be had again."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive, named=False, simulated=False)
+    assert small.raw.uri in clear_up(archive, keep_days=0).kept
+    assert [ref.uri for ref in archive.refs()] == [small.raw.uri]
+    clear_up(archive, keep_days=0, raw_too=True)
+    assert archive.refs() == []
+
+
+def test_spools_of_published_captures_and_dead_parts_go(tmp_path: Path) -> None:
+    """The spool of a capture that is not published is what its lines will be continued from."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive)
+    for key in (small.raw.key, "underway"):
+        (archive.spool_folder(key) / "lines.bil").write_bytes(b"x" * 100)
+    (tmp_path / "stages" / "rectify" / "dead.part").mkdir()
+    (tmp_path / "stages" / "rectify" / "dead.part" / "half").write_bytes(b"y" * 10)
+    with archive.publish("rectify", "living") as staged:
+        found = clear_up(archive, keep_days=0)
+        assert staged.path.is_dir()
+    assert {(one.uri, one.what, one.size) for one in found.removals} == {
+        (f"spool/{small.raw.key}", "spool", 100),
+        ("stages/rectify/dead.part", "unfinished", 10),
+    }
+    assert [path.name for path in (tmp_path / "spool").iterdir()] == ["underway"]
+    assert not (tmp_path / "stages" / "rectify" / "dead.part").exists()
+
+
+def test_nothing_goes_while_somebody_uses_the_archive(tmp_path: Path) -> None:
+    """Two surveys may use an archive at a time; clearing up waits for its turn, and says so."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive, named=False)
+    with archive.in_use(), Archive.open(tmp_path).in_use():
+        done = clear_up(archive, keep_days=0)
+        assert (done.removals, done.obstacle) == ((), IN_USE)
+    with archive.publish("segment", "another"):
+        pass
+    assert len(clear_up(archive, keep_days=0).removals) == 4
+    assert archive.find("capture", small.raw.key) is None
+
+
+def test_a_store_that_is_held_stays(tmp_path: Path) -> None:
+    """Whoever holds a key's lock works on it."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive, named=False)
+    with archive.publish(small.map.stage, small.map.key) as staged:
+        assert staged.done
+        assert small.map.uri not in {one.uri for one in clear_up(archive, keep_days=0).removals}
+    assert archive.find(small.map.stage, small.map.key) == small.map
+
+
+@pytest.mark.parametrize("victim", ["receipt.json", "manifest.json"])
+def test_no_store_goes_where_a_run_cannot_tell_what_it_names(tmp_path: Path, victim: str) -> None:
+    """A damaged receipt is made up for by the run's manifest; with that damaged or gone all stores stay."""
+    archive = Archive.open(tmp_path)
+    small, other = small_survey(archive), small_survey(archive, seed=1, named=False)
+    assert small.run is not None
+    flip(small.run / victim)
+    found = clear_up(archive, keep_days=0)
+    if victim == "receipt.json":
+        assert (found.obstacle, len(found.removals)) == (None, 3)
+        return
+    assert found.obstacle is not None
+    assert found.obstacle.startswith(f"no store is removed: runs/{small.run.name} does not tell")
+    (small.run / victim).unlink()
+    found = clear_up(archive, keep_days=0)
+    assert found.obstacle is not None
+    assert "has lost its manifest.json" in found.obstacle
+    assert archive.find("segment", other.map.key) == other.map
+
+
+def test_no_store_goes_where_a_store_cannot_tell_what_it_rests_on(tmp_path: Path) -> None:
+    """The map's manifest is damaged and no run recorded what it was made of: the mosaic might be its input."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive, named=False)
+    with archive.new_run("old") as draft:
+        draft.write_file("receipt.json", f'{{"products": {{"map": "{small.map.uri}/class_map.zarr"}}}}')
+    (small.map.path / "manifest.json").write_text("{")
+    found = clear_up(archive, keep_days=0)
+    assert found.obstacle is not None
+    assert f"{small.map.uri} does not tell what it was made of" in found.obstacle
+    assert len(archive.refs()) == 3
+
+
+@pytest.mark.parametrize("at", range(4))
+def test_broken_off_it_leaves_a_whole_archive(tmp_path: Path, at: int) -> None:
+    """Stores go before those that they were made of; the next time does the rest."""
+    archive = Archive.open(tmp_path)
+    small_survey(archive)
+    small_survey(archive, seed=1, named=False)
+    (archive.spool_folder(archive.refs("capture")[0].key) / "lines.bil").write_bytes(b"x")
+    steps: list[Removal] = []
+
+    def stop(removal: Removal, done: float) -> None:
+        steps.append(removal)
+        if len(steps) > at:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        clear_up(archive, keep_days=0, progress=stop)
+    assert _problems(archive) == []
+    clear_up(archive, keep_days=0)
+    assert len(archive.refs()) == 3
+
+
+def test_manifests_in_a_circle_do_not_hang(tmp_path: Path) -> None:
+    """Two stores that claim to be made of each other are cleared up like others."""
+    archive = Archive.open(tmp_path)
+    for key, given in (("aaaa", "bbbb"), ("bbbb", "aaaa"), ("cccc", "cccc")):
+        with archive.publish("segment", key, inputs=[given]) as staged:
+            (staged.path / "data").write_bytes(b"x")
+    assert len(clear_up(archive, keep_days=0).removals) == 3
+    assert archive.refs() == []
+
+
+def test_a_negative_age_is_refused(tmp_path: Path) -> None:
+    """So is what is no number."""
+    for days in (-1.0, float("nan")):
+        with pytest.raises(SettingsError, match="expected a number of days"):
+            clear_up(Archive.open(tmp_path), keep_days=days)

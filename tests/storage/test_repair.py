@@ -1,0 +1,183 @@
+"""A repair makes anew what is broken and what was made of it, and loses nothing that it cannot make."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.errors import ArchiveError, SceneError
+from storage.archive import Archive
+from storage.repair import Repaired, plan_repair, put_back, repair
+from tests.storage.small_archive import Small, flip, small_survey
+
+VERSIONS = {"capture": 1, "rectify": 1, "segment": 1}
+
+
+def _bad(archive: Archive) -> list[str]:
+    return [one.uri for one in archive.verify_all() if one.problem is not None]
+
+
+def _repair(archive: Archive, rerun: Callable[[dict[str, Any]], None] | None = None) -> Repaired:
+    def again(settings: dict[str, Any]) -> None:
+        small_survey(archive, seed=settings["seed"], kernel=settings["kernel"])
+
+    return repair(archive, archive.verify_all(), rerun or again, versions=VERSIONS)
+
+
+def _two(archive: Archive) -> tuple[Small, Small]:
+    return small_survey(archive), small_survey(archive, kernel="nearest")
+
+
+def _moments(archive: Archive) -> dict[str, int]:
+    return {ref.uri: (ref.path / "manifest.json").stat().st_mtime_ns for ref in archive.refs()}
+
+
+def test_only_what_depends_on_it_is_made_again(tmp_path: Path) -> None:
+    """A broken mosaic: it and its map; not the raw lines, and nothing of the other survey."""
+    archive = Archive.open(tmp_path)
+    small, _ = _two(archive)
+    before = _moments(archive)
+    flip(small.mosaic.path / "data.bin")
+    done = _repair(archive)
+    assert done.complete
+    assert set(done.remade) == {small.mosaic.uri, small.map.uri}
+    after = _moments(archive)
+    assert {uri for uri in after if after[uri] != before[uri]} == set(done.remade)
+    assert _bad(archive) == []
+    assert not (tmp_path / ".aside").exists()
+
+
+@pytest.mark.parametrize("how", ["flip", "manifest", "lost", "gone"])
+def test_broken_raw_lines_of_the_simulator_are_made_again(tmp_path: Path, how: str) -> None:
+    """Whatever is wrong with them: both surveys that name them run again."""
+    archive = Archive.open(tmp_path)
+    small, _ = _two(archive)
+    if how == "flip":
+        flip(small.raw.path / "data.bin")
+    elif how == "manifest":
+        flip(small.raw.path / "manifest.json", at=30)
+    elif how == "lost":
+        (small.raw.path / "manifest.json").unlink()
+    else:
+        archive.discard(small.raw)
+    ran: list[str] = []
+
+    def again(settings: dict[str, Any]) -> None:
+        ran.append(settings["kernel"])
+        small_survey(archive, kernel=settings["kernel"])
+
+    done = _repair(archive, again)
+    assert done.complete
+    assert sorted(ran) == ["bilinear", "nearest"]
+    assert len(done.remade) == 5
+    assert _bad(archive) == []
+
+
+def test_raw_lines_of_a_rig_stay_with_all_that_was_made_of_them(tmp_path: Path) -> None:
+    """They cannot be had again; a broken map beside them is made again of them."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive, simulated=False)
+    before = _moments(archive)
+    flip(small.raw.path / "data.bin")
+    done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
+    assert not done.complete
+    assert "raw lines that cannot be had again" in done.plan.hopeless[small.raw.uri]
+    assert _moments(archive) == before
+    assert _bad(archive) == [small.raw.uri]
+    flip(small.map.path / "data.bin")
+    done = _repair(archive, lambda settings: small_survey(archive, simulated=False) and None)
+    assert done.remade == [small.map.uri]
+    assert _bad(archive) == [small.raw.uri]
+
+
+def test_what_cannot_be_made_is_put_back(tmp_path: Path) -> None:
+    """The scene has gone: the sound map, set aside with the broken mosaic, is where it was."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive)
+    before = _moments(archive)
+    flip(small.mosaic.path / "data.bin")
+
+    def fail(settings: dict[str, Any]) -> None:
+        raise SceneError("no scene farm.png; give the file")
+
+    done = _repair(archive, fail)
+    assert not done.complete
+    assert done.put_back == dict.fromkeys((small.mosaic.uri, small.map.uri), "no scene farm.png; give the file")
+    assert _moments(archive) == before
+    assert _bad(archive) == [small.mosaic.uri]
+
+
+def test_a_repair_broken_off_is_put_back_first(tmp_path: Path) -> None:
+    """At once where the process lives, and by the next repair where it was killed."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive)
+    before = _moments(archive)
+    flip(small.mosaic.path / "data.bin")
+
+    def interrupt(settings: dict[str, Any]) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        _repair(archive, interrupt)
+    assert _moments(archive) == before
+    (tmp_path / ".aside" / "segment").mkdir(parents=True)
+    small.map.path.rename(tmp_path / ".aside" / "segment" / small.map.key)
+    told = {one.uri: one.problem for one in archive.verify_all() if one.problem is not None}
+    assert "a repair was broken off" in (told[f".aside/segment/{small.map.key}"] or "")
+    assert put_back(tmp_path) == [small.map.uri]
+    assert _moments(archive) == before
+
+
+def test_what_no_run_names_is_dropped(tmp_path: Path) -> None:
+    """Nobody asks for it: it is made again by whoever does."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive, named=False)
+    flip(small.mosaic.path / "data.bin")
+    done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
+    assert done.complete
+    assert set(done.dropped) == {small.mosaic.uri, small.map.uri}
+    assert _bad(archive) == []
+
+
+def test_stores_of_a_version_no_longer_made_stay(tmp_path: Path) -> None:
+    """Sound ones with those that are broken: this version would make something else."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive)
+    flip(small.raw.path / "data.bin")
+    plan = plan_repair(archive, archive.verify_all(), versions=VERSIONS | {"segment": 2})
+    assert plan.remade == (small.mosaic.uri, small.raw.uri)
+    plan = plan_repair(archive, archive.verify_all(), versions=VERSIONS | {"capture": 2})
+    assert plan.remade == ()
+    assert "made by version 1 of the stage capture, which is now 2" in plan.hopeless[small.raw.uri]
+
+
+def test_a_damaged_run_is_run_again(tmp_path: Path) -> None:
+    """By the settings of its receipt where only a picture is damaged; not by those of a damaged receipt."""
+    archive = Archive.open(tmp_path)
+    with archive.new_run("farm") as draft:
+        draft.write_file("receipt.json", json.dumps({"settings": {"seed": 0, "kernel": "bilinear", "source": "sim"}}))
+        draft.write_file("quicklook.png", b"picture")
+    (run,) = archive.runs()
+    flip(run / "quicklook.png")
+    done = _repair(archive)
+    assert done.complete
+    assert done.remade == [f"runs/{run.name}"]
+    assert not run.exists()
+    (run,) = archive.runs()
+    flip(run / "receipt.json")
+    done = _repair(archive)
+    assert not done.complete
+    assert "run that survey again by hand" in done.failed[f"runs/{run.name}"]
+    assert run.exists()
+
+
+def test_it_waits_for_nobody(tmp_path: Path) -> None:
+    """While a survey uses the archive, nothing of it is set aside."""
+    archive = Archive.open(tmp_path)
+    small_survey(archive)
+    with archive.in_use(), pytest.raises(ArchiveError, match="is in use; run verify --repair again"):
+        _repair(archive)

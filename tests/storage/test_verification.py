@@ -1,0 +1,167 @@
+"""Verification finds every bit that has changed and names the store, file and part of the array that holds it."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import IncompleteStoreError
+from storage.archive import Archive, StageRef
+from storage.layout import create_group, open_group, read_array, write_image, write_small
+from storage.shard_names import find_shard, name_damage
+from tests.storage.small_archive import flip, small_survey
+
+FLIPS = 80
+
+
+def _with_cube(archive: Archive) -> StageRef:
+    """A store with a cube of (130, 700, 3): shards of 64 rows and 640 columns, chunks of 32 x 32."""
+    values = np.random.default_rng(2).integers(0, 4096, (130, 700, 3), dtype=np.uint16)
+
+    def build(path: Path) -> None:
+        group = create_group(path / "mosaic.zarr", "a cube", {})
+        write_image(group, "values", ("y", "x", "band"), values, {})
+        write_small(group, "wavelength", ("band",), np.arange(3.0), {})
+
+    return archive.produce("rectify", build, version=1, params={})[0]
+
+
+def _found(archive: Archive) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for one in archive.verify_all():
+        if one.problem is not None:
+            found.setdefault(one.uri, []).append(one.problem)
+    return found
+
+
+def test_bits_that_flip_anywhere_are_found_and_named(tmp_path: Path) -> None:
+    """Places are drawn from all bytes and from all files, manifests and receipts among them."""
+    archive = Archive.open(tmp_path)
+    small_survey(archive)
+    _with_cube(archive)
+    files = [path for path in sorted(tmp_path.rglob("*")) if path.is_file()]
+    chance = random.Random(4)
+    for number in range(FLIPS):
+        weights = [path.stat().st_size if number % 2 else 1 for path in files]
+        (path,) = chance.choices(files, weights)
+        at, bit = chance.randrange(path.stat().st_size), chance.randrange(8)
+        flip(path, at, bit)
+        place = next(parent for parent in path.parents if (parent / "manifest.json").is_file())
+        problems = _found(archive)[place.relative_to(tmp_path).as_posix()]
+        assert any(path.relative_to(place).as_posix() in problem for problem in problems), (path, at, bit, problems)
+        flip(path, at, bit)
+    assert _found(archive) == {}
+
+
+def test_a_broken_shard_is_named_by_its_rows_and_columns(tmp_path: Path) -> None:
+    """And in it the chunks that fail their checksum, every broken file on its own."""
+    archive = Archive.open(tmp_path)
+    ref = _with_cube(archive)
+    flip(ref.path / "mosaic.zarr/values/c/1/0/0", at=100)
+    flip(ref.path / "mosaic.zarr/values/c/0/1/0", at=-3)
+    flip(ref.path / "mosaic.zarr/wavelength/c/0", at=-1)
+    first, second, third = sorted(_found(archive)[ref.uri])
+    assert first.startswith("mosaic.zarr/values/c/0/1/0 has changed since it was published")
+    assert "values: rows 0 to 63, columns 640 to 699; none of its chunks can be read)" in first
+    assert "values: rows 64 to 127, columns 0 to 639; unreadable: rows 64 to 95, columns 0 to 31)" in second
+    assert third.endswith("(mosaic.zarr/wavelength: all of it)")
+
+
+@pytest.mark.parametrize("at", [0, 1000, -10])
+def test_no_flipped_bit_of_a_shard_is_read_silently(tmp_path: Path, at: int) -> None:
+    """Chunks and the shard's index have checksums: reading raises, or gives what was written."""
+    archive = Archive.open(tmp_path)
+    ref = _with_cube(archive)
+    before = read_array(open_group(ref.path / "mosaic.zarr"), "values")
+    flip(ref.path / "mosaic.zarr/values/c/0/0/0", at=at)
+    with pytest.raises(IncompleteStoreError, match=r"mosaic\.zarr/values cannot be read"):
+        read_array(open_group(ref.path / "mosaic.zarr"), "values")
+    there = read_array(open_group(ref.path / "mosaic.zarr"), "values", (slice(64, 130),))
+    np.testing.assert_array_equal(there, before[64:])
+
+
+def test_missing_short_and_extra_files_each_have_a_finding(tmp_path: Path) -> None:
+    """A link is no file of an archive, even where it leads to the same bytes."""
+    archive = Archive.open(tmp_path / "a")
+    ref = _with_cube(archive)
+    values = ref.path / "mosaic.zarr/values"
+    (values / "c/0/0/0").unlink()
+    (values / "c/1/0/0").write_bytes((values / "c/1/0/0").read_bytes()[:-50])
+    (values / "c/2/0/0").rename(tmp_path / "elsewhere")
+    (values / "c/2/0/0").symlink_to(tmp_path / "elsewhere")
+    (values / "notes.txt").write_text("x")
+    missing, short, link, extra = sorted(_found(archive)[ref.uri])
+    assert missing.endswith("it is missing (mosaic.zarr/values: rows 0 to 63, columns 0 to 639)")
+    assert "bytes, expected" in short
+    assert "rows 64 to 127" in short
+    assert "is a link, expected a file" in link
+    assert "values/notes.txt is not in the manifest" in extra
+
+
+def test_what_is_no_array_has_no_range(tmp_path: Path) -> None:
+    """Nor has a file of an array whose description is damaged, or whose name is no chunk's."""
+    ref = _with_cube(Archive.open(tmp_path))
+    assert find_shard(ref.path, "mosaic.zarr/values/zarr.json") is None
+    assert find_shard(ref.path, "manifest.json") is None
+    assert name_damage(ref.path, "mosaic.zarr/values/c/0/zero/0") == ""
+    assert name_damage(ref.path, "mosaic.zarr/values/x/0/0/0") == ""
+    (ref.path / "mosaic.zarr/values/zarr.json").write_text('{"node_type": "array", "shape": 3}')
+    assert name_damage(ref.path, "mosaic.zarr/values/c/0/0/0") == ""
+
+
+def test_a_lost_manifest_and_a_lost_store_are_told(tmp_path: Path) -> None:
+    """By the folder that is left, by the run that names it, and by what was made of it."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive)
+    (small.mosaic.path / "manifest.json").unlink()
+    with pytest.raises(IncompleteStoreError, match="it is missing"):
+        archive.find("rectify", small.mosaic.key)
+    shutil.rmtree(small.raw.path)
+    (tmp_path / "stages" / "note.txt").write_text("x")
+    found = _found(archive)
+    assert small.run is not None
+    assert f"is not there, but runs/{small.run.name} names it" in found.pop(small.raw.uri)
+    assert "manifest.json is missing" in found.pop(small.mosaic.uri)
+    assert "is a file, expected a folder" in found.pop("stages/note.txt")[0]
+    assert found == {}
+
+
+def test_another_store_in_its_place_is_told(tmp_path: Path) -> None:
+    """A store moved to another key, and one whose manifest is not that which a run recorded."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive)
+    path = small.mosaic.path / "manifest.json"
+    content = json.loads(path.read_text())
+    for name in ("seal", "format"):  # as an earlier version would have written it
+        del content[name]
+    path.write_text(json.dumps(content | {"created": "2031-01-01T00:00:00+00:00"}))
+    assert any("has changed since runs/" in one for one in _found(archive)[small.mosaic.uri])
+    small.map.path.rename(small.map.path.with_name("another"))
+    assert any(f"is that of {small.map.uri}" in one for one in _found(archive)["stages/segment/another"])
+
+
+def test_a_store_made_anew_is_not_doubted(tmp_path: Path) -> None:
+    """Its manifest differs from what the run recorded, in its date; its seal and its later date stand for it."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive)
+    recorded = archive.manifest_hash(small.mosaic)
+    archive.discard(small.mosaic)
+    small_survey(archive, named=False)
+    assert archive.manifest_hash(small.mosaic) != recorded
+    assert _found(archive) == {}
+
+
+def test_progress_goes_by_bytes(tmp_path: Path) -> None:
+    """From nothing to nearly all, store by store."""
+    archive = Archive.open(tmp_path)
+    small_survey(archive)
+    seen: list[tuple[str, float]] = []
+    archive.verify_all(lambda uri, done: seen.append((uri, done)))
+    assert len(seen) == 4
+    assert [done for _, done in seen] == sorted(done for _, done in seen)
+    assert seen[0][1] == 0.0 < seen[-1][1] < 1.0
