@@ -1,0 +1,210 @@
+"""Cloud-optimised GeoTIFFs: what rasterio reads of them, their layout, and that only whole files get a name."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+
+from pipeline.errors import ArchiveError, ShapeError
+from pipeline.grid import UNLABELLED
+from storage.cog_files import ANGULAR, CogImage, Place, cog_problems, need_rasterio, write_cog
+from storage.ground_maps import ClassLegend
+from storage.layout import AngularGrid
+
+rasterio = pytest.importorskip("rasterio", reason="GeoTIFF is written with rasterio, of the extra [geo]")
+pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
+LEGEND = ClassLegend(
+    ("sugar beet", "soil & stones", "maïs"), np.array([[10, 200, 30], [120, 90, 60], [0, 0, 255]], "u1")
+)
+GRID = AngularGrid(1e-4, (1300, 1100))
+FEW = (90, 70)
+
+
+def on_map(shape: tuple[int, int], crs: str = "EPSG:32632") -> GeoBox:
+    """A grid of 0.5 m somewhere in Germany."""
+    height, width = (size / 2 for size in shape)
+    return GeoBox.from_bbox((500000, 5770000, 500000 + width, 5770000 + height), crs=crs, resolution=0.5)
+
+
+def classes_of(shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Blocks of three classes, some pixels of none."""
+    rng = np.random.default_rng(4)
+    small = rng.integers(0, 3, (-(-shape[0] // 20), -(-shape[1] // 20)), dtype=np.uint8)
+    found = np.kron(small, np.ones((20, 20), np.uint8))[: shape[0], : shape[1]]
+    return np.where(rng.random(shape) < 0.1, np.uint8(UNLABELLED), found)
+
+
+def rows_of(values: NDArray[Any]) -> Iterator[tuple[int, NDArray[Any]]]:
+    """The image in blocks of 64 rows."""
+    for first in range(0, len(values), 64):
+        yield first, values[first : first + 64]
+
+
+def class_image(shape: tuple[int, int], place: Place | None = None) -> CogImage:
+    """What a file of classes holds."""
+    return CogImage(shape, "uint8", place or Place.on_map(on_map(shape)), ("class",), UNLABELLED, LEGEND, {"run": "r1"})
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:25832", "EPSG:3035", "EPSG:32733"])
+def test_rasterio_reads_what_was_written(tmp_path: Path, crs: str) -> None:
+    """Values, CRS, transform, nodata, band names and tags of a map are those given."""
+    values, box = classes_of(FEW), on_map(FEW, crs)
+    write_cog(tmp_path / "a.tif", class_image(FEW, Place.on_map(box)), rows_of(values))
+    with rasterio.open(tmp_path / "a.tif") as file:
+        np.testing.assert_array_equal(file.read(1), values)
+        assert file.crs == rasterio.crs.CRS.from_string(crs)
+        assert file.transform == box.affine
+        assert (file.nodata, file.descriptions, file.dtypes) == (UNLABELLED, ("class",), ("uint8",))
+        assert file.tags()["run"] == "r1"
+
+
+def test_without_a_pose_the_transform_is_in_radians(tmp_path: Path) -> None:
+    """On the angular grid there is no CRS, pixels lie where the Zarr attributes say, and y grows downwards."""
+    values = np.random.default_rng(0).random(FEW).astype(np.float32)
+    values[:5] = np.nan
+    place = Place.on_angles(AngularGrid(1e-4, FEW), FEW)
+    write_cog(
+        tmp_path / "a.tif",
+        CogImage(FEW, "float32", place, ("confidence",), np.nan, tags={"place": ANGULAR}),
+        rows_of(values),
+    )
+    with rasterio.open(tmp_path / "a.tif") as file:
+        np.testing.assert_array_equal(file.read(1), values)
+        assert file.crs is None
+        assert np.isnan(file.nodata)
+        assert file.transform[:6] == place.transform == pytest.approx((1e-4, 0, -35e-4, 0, 1e-4, -45e-4))
+        assert "[rad]" in file.tags()["place"]
+        assert "no CRS" in file.tags()["place"]
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "float32", "float64"])
+def test_a_large_image_is_cloud_optimised(tmp_path: Path, dtype: str) -> None:
+    """Tiles, halving overviews down to one tile, directories first: every check passes, also with three bands."""
+    values = np.random.default_rng(1).integers(0, 200, (1300, 1100, 3)).astype(dtype)
+    image = CogImage((1300, 1100), dtype, Place.on_angles(GRID, (1300, 1100)), ("r", "g", "b"), 0)
+    write_cog(tmp_path / "a.tif", image, rows_of(values))
+    assert cog_problems(tmp_path / "a.tif") == []
+    with rasterio.open(tmp_path / "a.tif") as file:
+        np.testing.assert_array_equal(np.moveaxis(file.read(), 0, -1), values)
+        assert file.overviews(1) == [2, 4]
+        assert file.block_shapes[0] == (512, 512)
+
+
+def test_overviews_of_classes_hold_classes(tmp_path: Path) -> None:
+    """A coarser level takes the commonest of its four pixels: no class between two others appears."""
+    values = classes_of((1300, 1100))
+    write_cog(tmp_path / "a.tif", class_image(values.shape), rows_of(values))
+    with rasterio.open(tmp_path / "a.tif", overview_level=0) as file:
+        coarse = file.read(1)
+    assert coarse.shape == (650, 550)
+    assert set(np.unique(coarse)) <= {0, 1, 2, UNLABELLED}
+    four = values.reshape(650, 2, 550, 2).swapaxes(1, 2).reshape(650, 550, 4)
+    alike = (four == four[..., :1]).all(axis=-1)
+    np.testing.assert_array_equal(coarse[alike], four[alike][:, 0])
+
+
+def test_confidence_of_overviews_leaves_out_what_is_not_known(tmp_path: Path) -> None:
+    """The mean of two known pixels and two NaN is the mean of the known."""
+    values = np.full((1300, 1100), 0.25, np.float32)
+    values[1::2] = np.nan
+    image = CogImage(values.shape, "float32", Place.on_angles(GRID, values.shape), ("confidence",), np.nan)
+    write_cog(tmp_path / "a.tif", image, rows_of(values))
+    with rasterio.open(tmp_path / "a.tif", overview_level=0) as file:
+        assert (file.read(1) == 0.25).all()
+
+
+@pytest.mark.parametrize("shape", [FEW, (700, 600)])
+def test_an_image_of_nothing_is_whole_too(tmp_path: Path, shape: tuple[int, int]) -> None:
+    """Where every pixel is nodata the file still has its pixels and its layout."""
+    image = CogImage(shape, "float32", Place.on_map(on_map(shape)), ("confidence",), np.nan)
+    write_cog(tmp_path / "a.tif", image, rows_of(np.full(shape, np.nan, np.float32)))
+    assert cog_problems(tmp_path / "a.tif") == []
+
+
+def test_classes_have_colours_and_names(tmp_path: Path) -> None:
+    """Colour table, tags, and GDAL's own category names, which a VRT made by GDAL repeats."""
+    write_cog(tmp_path / "a.tif", class_image(FEW), rows_of(classes_of(FEW)))
+    with rasterio.open(tmp_path / "a.tif") as file:
+        table = file.colormap(1)
+        tags = file.tags(1)
+    assert [table[number][:3] for number in range(3)] == [tuple(colour) for colour in LEGEND.colours.tolist()]
+    assert [tags[f"CLASS_{number}"] for number in range(3)] == list(LEGEND.names)
+    assert tags["flag_meanings"] == "sugar_beet soil_&_stones maïs"
+    importlib.import_module("rasterio.shutil").copy(str(tmp_path / "a.tif"), str(tmp_path / "a.vrt"), driver="VRT")
+    names = ElementTree.parse(tmp_path / "a.vrt").getroot().findall(".//CategoryNames/Category")
+    assert [name.text for name in names] == list(LEGEND.names)
+
+
+def test_an_existing_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
+    """The second file of a name has nothing of the first, and nothing else is left in the folder."""
+    for shape in (FEW, (40, 30)):
+        write_cog(tmp_path / "a.tif", class_image(shape), rows_of(classes_of(shape)))
+    with rasterio.open(tmp_path / "a.tif") as file:
+        assert file.shape == (40, 30)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.tif", "a.tif.aux.xml"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([(0, np.zeros((64, 70), "u1"))], "64 of 90 rows were given"),
+        ([(0, np.zeros((90, 71), "u1"))], "do not follow 0"),
+        ([(64, np.zeros((26, 70), "u1"))], "do not follow 0"),
+        ([(0, np.zeros((90, 70, 2), "u1"))], "do not follow 0"),
+    ],
+)
+def test_blocks_that_do_not_fill_the_image_change_nothing(tmp_path: Path, rows: Any, words: str) -> None:
+    """Missing, shifted or wider blocks are refused; the file of before stays, byte for byte."""
+    write_cog(tmp_path / "a.tif", class_image(FEW), rows_of(classes_of(FEW)))
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(ShapeError, match=words):
+        write_cog(tmp_path / "a.tif", class_image(FEW), iter(rows))
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.3, 0.9])
+def test_a_file_that_the_disk_cut_short_gets_no_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: float
+) -> None:
+    """What does not read back as it was given is an error, whatever GDAL said while it wrote."""
+    module = importlib.import_module("rasterio.shutil")
+    whole = module.copy
+
+    def cut(source: str, target: str, **options: str) -> None:
+        whole(source, target, **options)
+        with Path(target).open("r+b") as file:
+            file.truncate(int(kept * Path(target).stat().st_size))
+
+    monkeypatch.setattr(module, "copy", cut)
+    values = np.random.default_rng(2).random(FEW).astype(np.float32)
+    image = CogImage(FEW, "float32", Place.on_map(on_map(FEW)), ("confidence",), np.nan)
+    with pytest.raises(ArchiveError, match=r"a\.tif (cannot be written|did not come out as written)"):
+        write_cog(tmp_path / "a.tif", image, rows_of(values))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_plain_tiff_is_told_from_a_cloud_optimised_one(tmp_path: Path) -> None:
+    """Strips without overviews are named as what is wrong."""
+    profile = {"driver": "GTiff", "height": 700, "width": 600, "count": 1, "dtype": "uint8"}
+    profile["transform"] = rasterio.Affine(*Place.on_map(on_map((700, 600))).transform)
+    with rasterio.open(tmp_path / "a.tif", "w", **profile) as file:
+        file.write(np.ones((1, 700, 600), np.uint8))
+    problems = " ".join(cog_problems(tmp_path / "a.tif"))
+    for words in ("does not call it a COG", "not tiled", "do not reach down to one tile"):
+        assert words in problems
+
+
+def test_without_rasterio_one_message_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The extra is named."""
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    with pytest.raises(ArchiveError, match=r"needs rasterio.*pip install 'spectralzoom\[geo\]'"):
+        need_rasterio()

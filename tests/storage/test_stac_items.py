@@ -1,0 +1,216 @@
+"""STAC: items and a collection that pystac reads and its schemas accept, without a network."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from odc.geo.geobox import GeoBox
+
+from pipeline.errors import ArchiveError
+from storage.ground_maps import ClassLegend
+from storage.stac_fields import (
+    COG,
+    ZARR,
+    angular,
+    bounds,
+    classes,
+    clean_id,
+    footprint,
+    projection,
+    spectral_bands,
+    wavelengths,
+)
+from storage.stac_items import COLLECTION, Collection, Item, need_pystac, stac_problems, write_stac
+
+pystac = pytest.importorskip("pystac", reason="STAC is written with pystac, of the extra [geo]")
+pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
+BOX = GeoBox.from_bbox((500000, 5770000, 500050, 5770040), crs="EPSG:32632", resolution=0.5)
+ABOUT = Collection("field-a", "Surveys of field-a", "Surveys")
+LEGEND = ClassLegend(("sugar beet", "???"), np.array([[10, 200, 30], [255, 0, 7]], np.uint8))
+WAVE = np.array([444.5, 550.0, 800.0])
+
+
+def seen(shape: tuple[int, int] = (80, 100)) -> np.ndarray:
+    """A tilted square of seen pixels."""
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    mask: np.ndarray = np.abs(x - 50) + np.abs(y - 40) * 1.3 < 45
+    return mask
+
+
+def item(name: str, *, day: int = 1, placed: bool = True) -> Item:
+    """An item with an image and a store."""
+    image: dict[str, Any] = {"href": "class_map.tif", "type": COG, "roles": ["data"], **classes(LEGEND)}
+    image["bands"] = [{"name": "class", "data_type": "uint8", "nodata": 255}]
+    bands = spectral_bands(WAVE, np.full(3, 6.0), {"data_type": "float32", "nodata": "nan"})
+    store: dict[str, Any] = {"href": "../../a/mosaic.zarr", "type": ZARR, "roles": ["data"], **bands}
+    properties = {"processing:level": "L4", "processing:software": {"spectralzoom": "0.1.0"}, **wavelengths(WAVE)}
+    place = None
+    if placed:
+        properties["proj:code"] = "EPSG:32632"
+        image |= projection(BOX)
+        store |= angular((1e-3, 0, -0.1, 0, 1e-3, -0.1), (20, 30))
+        place = footprint(BOX, [(0, seen())])
+    times = f"2026-05-{day:02d}T10:00:00Z", f"2026-05-{day:02d}T11:00:00Z"
+    return Item(name, *times, properties, {"class_map": image, "mosaic": store}, place)
+
+
+def read(path: Path) -> dict[str, Any]:
+    """A JSON file."""
+    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return found
+
+
+@pytest.mark.parametrize("placed", [True, False])
+def test_item_and_collection_fit_the_schemas(tmp_path: Path, placed: bool) -> None:
+    """STAC's core schemas find nothing, and pystac reads both as what they are."""
+    paths = write_stac(tmp_path, ABOUT, item("r1", placed=placed))
+    assert [stac_problems(read(path)) for path in paths] == [[], []]
+    collection = pystac.Collection.from_file(str(tmp_path / COLLECTION))
+    (found,) = collection.get_items(recursive=True)
+    assert found.id == "r1"
+    assert found.collection_id == collection.id == "field-a"
+    assert found.get_parent().id == "field-a"
+    assert found.datetime.isoformat() == "2026-05-01T10:00:00+00:00"
+
+
+def test_the_schemas_find_what_is_wrong(tmp_path: Path) -> None:
+    """A missing time, a bounding box without a geometry and a bad type of band are refused, the last by its place."""
+    good = read(write_stac(tmp_path, ABOUT, item("r1", placed=False))[0])
+    assert stac_problems(good | {"properties": {}})
+    assert stac_problems(good | {"bbox": [0, 0, 1, 1]})
+    good["assets"]["class_map"]["bands"][0]["data_type"] = "u1"
+    assert any("data_type" in text for text in stac_problems(good))
+
+
+def test_without_a_place_there_is_no_geometry(tmp_path: Path) -> None:
+    """Geometry is null, there is no bbox and no CRS; the collection's extent is the whole earth."""
+    path, collection = write_stac(tmp_path, ABOUT, item("r1", placed=False))
+    content = read(path)
+    assert content["geometry"] is None
+    assert "bbox" not in content
+    assert "proj:" not in path.read_text()
+    assert not any("projection" in uri for uri in content["stac_extensions"])
+    assert read(collection)["extent"]["spatial"]["bbox"] == [[-180, -90, 180, 90]]
+
+
+def test_every_prefix_used_is_declared_and_no_other(tmp_path: Path) -> None:
+    """Extensions are those of the fields in properties, assets and bands."""
+    content = read(write_stac(tmp_path, ABOUT, item("r1"))[0])
+    names = [uri.split("/")[3] for uri in content["stac_extensions"]]
+    assert names == ["projection", "processing", "hsi", "classification", "eo"]
+    plain = Item("r2", "2026-05-01T10:00:00Z", "2026-05-01T11:00:00Z", {}, {"a": {"href": "a.tif", "type": COG}})
+    assert read(write_stac(tmp_path, ABOUT, plain)[0])["stac_extensions"] == []
+
+
+def test_items_of_one_folder_are_one_collection(tmp_path: Path) -> None:
+    """Items come in order of time, those of before stay as they are, and the extents hold them all."""
+    first, _ = write_stac(tmp_path, ABOUT, item("r2", day=2))
+    before = first.read_bytes()
+    write_stac(tmp_path, ABOUT, item("r1", day=1, placed=False))
+    write_stac(tmp_path, ABOUT, item("r3", day=3))
+    assert first.read_bytes() == before
+    content = read(tmp_path / COLLECTION)
+    links = [link["href"] for link in content["links"] if link["rel"] == "item"]
+    assert links == ["./r1/r1.json", "./r2/r2.json", "./r3/r3.json"]
+    assert content["extent"]["temporal"]["interval"] == [["2026-05-01T10:00:00Z", "2026-05-03T11:00:00Z"]]
+    assert content["extent"]["spatial"]["bbox"] == [read(first)["bbox"]]
+    assert content["summaries"]["proj:code"] == ["EPSG:32632"]
+    assert content["summaries"]["hsi:wavelength_max"] == {"minimum": 0.8, "maximum": 0.8}
+    assert sorted(path.name for path in tmp_path.iterdir()) == [COLLECTION, "r1", "r2", "r3"]
+
+
+def test_the_same_export_twice_gives_the_same_bytes(tmp_path: Path) -> None:
+    """Nothing of the clock or of the order of work stands in the files."""
+    texts = [[path.read_bytes() for path in write_stac(tmp_path, ABOUT, item("r1"))] for _ in range(2)]
+    assert texts[0] == texts[1]
+
+
+def test_links_are_relative(tmp_path: Path) -> None:
+    """The folder can be moved: no link and no asset holds a path of this machine, none says where it lies itself."""
+    paths = write_stac(tmp_path, ABOUT, item("r1"))
+    for path in paths:
+        content = read(path)
+        hrefs = [about["href"] for about in (*content["links"], *content.get("assets", {}).values())]
+        assert not any(Path(href).is_absolute() or ":" in href for href in hrefs)
+        assert "self" not in {link["rel"] for link in content["links"]}
+        assert str(tmp_path) not in path.read_text()
+
+
+def test_the_footprint_holds_what_is_seen(tmp_path: Path) -> None:
+    """An anticlockwise ring in degrees around all seen pixels, to within a pixel, whatever the blocks."""
+    mask = seen()
+    found = footprint(BOX, [(0, mask)])
+    assert found == footprint(BOX, [(first, mask[first : first + 7]) for first in range(0, 80, 7)])
+    assert found is not None
+    ring = np.array(found["coordinates"][0])
+    assert (ring[0] == ring[-1]).all()
+    area = np.sum(ring[:-1, 0] * ring[1:, 1] - ring[1:, 0] * ring[:-1, 1]) / 2
+    assert area > 0
+    metres = np.cos(np.deg2rad(ring[0, 1])) * 111_300**2
+    assert area * metres == pytest.approx(mask.sum() / 4, rel=0.03)
+    west, south, east, north = bounds(found)
+    assert 9 <= west < east < 9.001
+    assert 52 < south < north < 52.1
+    assert footprint(BOX, [(0, np.zeros_like(mask))]) is None
+
+
+def test_the_grid_is_said_as_the_projection_extension_wants_it() -> None:
+    """Code, shape, and the transform in rasterio's order; WKT where there is no code; null where there is no CRS."""
+    assert projection(BOX) == {
+        "proj:code": "EPSG:32632",
+        "proj:shape": [80, 100],
+        "proj:transform": [0.5, 0, 500000, 0, -0.5, 5770040],
+        "proj:bbox": [500000, 5770000, 500050, 5770040],
+    }
+    own = GeoBox(BOX.shape, BOX.affine, "+proj=tmerc +lat_0=52.1 +lon_0=9.5 +units=m +datum=WGS84")
+    assert projection(own)["proj:code"] is None
+    assert projection(own)["proj:wkt2"].startswith("PROJCRS")
+    assert angular((1, 0, 0, 0, 1, 0), (2, 3))["proj:code"] is None
+
+
+def test_wavelengths_are_in_micrometres() -> None:
+    """Of the whole cube, and of every band beside its width."""
+    assert wavelengths(WAVE) == {"hsi:wavelength_min": 0.4445, "hsi:wavelength_max": 0.8}
+    bands = spectral_bands(WAVE, np.array([5.0, 6.0, 7.0]), {"unit": "1"})["bands"]
+    assert bands[2] == {
+        "name": "B002", "eo:center_wavelength": 0.8, "unit": "1", "eo:full_width_half_max": 0.007,
+    }  # fmt: skip
+    assert "eo:full_width_half_max" not in spectral_bands(WAVE, None, {})["bands"][0]
+
+
+def test_classes_have_names_that_the_extension_allows() -> None:
+    """Letters, digits, - and _ alone, the name as it is beside it, and the colour in six hex digits."""
+    found = classes(LEGEND)["classification:classes"]
+    assert found[0] == {"value": 0, "name": "sugar-beet", "title": "sugar beet", "color_hint": "0AC81E"}
+    assert found[1]["name"] == "class-1"
+    assert clean_id("Feld 3/Süd", "x") == "Feld-3-S-d"
+
+
+def test_a_folder_of_another_archive_is_refused(tmp_path: Path) -> None:
+    """Its collection stays, and nothing is written."""
+    write_stac(tmp_path, ABOUT, item("r1"))
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(ArchiveError, match="collection 'field-a' of another archive, expected 'field-b'"):
+        write_stac(tmp_path, Collection("field-b", "", "Surveys"), item("r2"))
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"type": "Feature"}', '{"type": "Feature", "id": "r1"}'])
+def test_a_damaged_item_of_before_is_named(tmp_path: Path, text: str) -> None:
+    """The message says which file to remove."""
+    (tmp_path / "r1").mkdir()
+    (tmp_path / "r1" / "r1.json").write_text(text)
+    with pytest.raises(ArchiveError, match=r"r1\.json .*remove"):
+        write_stac(tmp_path, ABOUT, item("r2"))
+
+
+def test_without_pystac_one_message_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The extra is named."""
+    monkeypatch.setitem(sys.modules, "pystac", None)
+    with pytest.raises(ArchiveError, match=r"pystac.*pip install 'spectralzoom\[geo\]'"):
+        need_pystac()
