@@ -100,7 +100,7 @@ def _view(path: Path, header: EnviHeader, lines: int, held: int) -> NDArray[Any]
     strides = {
         "bil": (bands * samples * item, item, samples * item),
         "bip": (samples * bands * item, bands * item, item),
-        "bsq": (samples * item, item, lines * samples * item),
+        "bsq": (samples * item, item, lines * samples * item if bands > 1 else item),  # lines may be any promise
     }[header.interleave]
     content = np.memmap(path, np.uint8, mode="r")
     return np.ndarray((held, samples, bands), header.dtype, content, header.offset, strides)

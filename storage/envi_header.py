@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 
-LARGEST_HEADER = 1 << 24  # bytes; the largest seen holds 33 thousand
+LARGEST_HEADER = 1 << 22  # bytes; the largest seen holds 33 thousand
+UNBALANCED = "opens more braces than it closes"
+MOST_UNBALANCED = 16  # values that open more braces than they close: looking for each one's end reads the rest
 INTERLEAVES = ("bil", "bip", "bsq")
 # data type codes of the format's description
 DATA_TYPES = {
@@ -26,8 +28,8 @@ NANOMETRES = {"nm", "nanometer", "nanometers", "nanometre", "nanometres"}
 MICROMETRES = {"um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"}
 UNSAID = {"", "unknown"}
 
-_KEY = re.compile(r"^\s*([^={}]*[^={}\s])\s*=\s*(.*)$")
-_COMMENT = re.compile(r"^\s*;\s*([^=:]*[^=:\s])\s*[=:]\s*(.*?)\s*$")
+_BRACE = re.compile(r"[{}]")
+_SIGN = re.compile(r"[=:]")
 
 
 @dataclass(frozen=True)
@@ -126,8 +128,10 @@ def _split(text: str, where: str, notes: list[str]) -> tuple[dict[str, str], dic
     for line in lines[first + 1 :]:
         if not line.lstrip().startswith(";"):
             plain.append(line)
-        elif found := _COMMENT.match(line):
-            settings[found[1].lower()] = found[2]
+        elif sign := _SIGN.search(line):
+            key = line[: sign.start()].lstrip()[1:].strip()
+            if key:
+                settings[key.lower()] = line[sign.end() :].strip()
     fields: dict[str, str] = {}
     for key, value in _pairs(plain, where, notes):
         if fields.get(key, value) != value:
@@ -140,13 +144,14 @@ def _pairs(lines: list[str], where: str, notes: list[str]) -> Iterator[tuple[str
     """Keys and values, the outer braces taken off."""
     number = 0
     while number < len(lines):
-        found = _KEY.match(lines[number])
+        line = lines[number].strip()
         number += 1
-        if found is None:
-            if lines[number - 1].strip():
-                notes.append(f"passed over {lines[number - 1].strip()[:40]!r}, which is no key = value")
+        key, sign, value = (part.strip() for part in line.partition("="))
+        if not sign or not key or _BRACE.search(key):
+            if line:
+                notes.append(f"passed over {line[:40]!r}, which is no key = value")
             continue
-        key, value = re.sub(r"\s+", " ", found[1]).lower(), found[2].strip()
+        key = " ".join(key.split()).lower()
         if value.startswith("{"):
             value, number = _braced(value, lines, number, f"{where}: {key}", notes)
         yield key, value
@@ -166,7 +171,9 @@ def _braced(value: str, lines: list[str], number: int, where: str, notes: list[s
         if not ends:
             raise SceneError(f"{where} opens a brace that is never closed; is the header cut off?")
         parts, end = parts[: ends[0] + 1], number + ends[0]
-        notes.append(f"{where} opens more braces than it closes")
+        notes.append(f"{where} {UNBALANCED}")
+        if sum(note.endswith(UNBALANCED) for note in notes) > MOST_UNBALANCED:
+            raise SceneError(f"{where} {UNBALANCED}, as do {MOST_UNBALANCED} values before it; correct the header")
     return _unwrapped("\n".join(parts)), end
 
 

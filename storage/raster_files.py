@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import re
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import SceneError
+from storage.envi_cubes import open_envi_cube
+from storage.wavelengths import BandWavelengths
 
 RGB_NM = (640.0, 550.0, 460.0)
 NEAR_INFRARED_NM = 800.0
@@ -22,9 +26,9 @@ GREY_NM = 550.0
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")
 TIFF_ENDINGS = (".tif", ".tiff")
 NAMED_ENDINGS = (".mat", ".npz")  # hold several arrays: FILE:VARIABLE picks one
-SCENE_ENDINGS = (*IMAGE_ENDINGS, *TIFF_ENDINGS, ".npy", *NAMED_ENDINGS)
+SCENE_ENDINGS = (*IMAGE_ENDINGS, *TIFF_ENDINGS, ".npy", *NAMED_ENDINGS, ".hdr")
 
-_WITH_VARIABLE = re.compile(r"^(?P<path>.+\.(?:mat|npz)):(?P<variable>[^/\\:]+)$", re.IGNORECASE)
+_WITH_VARIABLE = re.compile(r"^(?P<path>.+\.(?:mat|npz|zarr)):(?P<variable>[^/\\:]+)$", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,8 @@ class Raster:
     nodata: float | None = None
     notes: tuple[str, ...] = ()
     indices: NDArray[np.uint8] | None = None  # (y, x) of an image that numbers its colours
+    known: BandWavelengths | None = None  # what the file says of its bands
+    files: tuple[Path, ...] = ()  # that it was read from, where that is more than the one named
 
 
 def split_variable(address: str | Path) -> tuple[Path, str | None]:
@@ -46,6 +52,8 @@ def split_variable(address: str | Path) -> tuple[Path, str | None]:
 
 def load_raster(address: str | Path, *, dims: int) -> Raster:
     """Read one file; of a file with several arrays, the only one with ``dims`` axes (or the variable named).
+
+    Arrays of .npy and ENVI files are read-only views: their numbers stay in the file until they are asked for.
 
     Raises
     ------
@@ -64,7 +72,8 @@ def load_raster(address: str | Path, *, dims: int) -> Raster:
     except SceneError:
         raise
     except Exception as error:  # decoders raise anything at all on damaged bytes
-        why = "it holds Python objects or is damaged" if "pickle" in str(error) else str(error)
+        objects = "pickle" in str(error) or "Python objects" in str(error)
+        why = "it holds Python objects or is damaged" if objects else str(error)
         raise SceneError(f"{path} cannot be read as {ending}: {why}; write it again as plain numbers") from error
     _check_numbers(raster.values, path)
     return raster
@@ -76,9 +85,19 @@ def _read(path: Path, ending: str, variable: str | None, dims: int) -> Raster:
     if ending in TIFF_ENDINGS:
         return _read_tiff(path)
     if ending == ".npy":
-        return Raster(np.load(path, allow_pickle=False))
-    arrays = _npz_arrays(path) if ending == ".npz" else _mat_arrays(path)
+        return Raster(np.load(path, mmap_mode="r", allow_pickle=False))
+    if ending == ".hdr":
+        return _read_envi(path)
+    arrays = _npz_arrays(path) if ending == ".npz" else _mat_arrays(path, variable)
     return Raster(_pick(arrays, path, variable, dims))
+
+
+def _read_envi(path: Path) -> Raster:
+    cube = open_envi_cube(path)
+    known = None
+    if cube.header.wavelength_nm is not None:
+        known = BandWavelengths(cube.header.wavelength_nm, cube.header.fwhm_nm, f"wavelengths from {path}")
+    return Raster(cube.values, None, cube.header.nodata, cube.notes, known=known, files=(path, cube.path))
 
 
 def _check_numbers(values: NDArray[Any], path: Path) -> None:
@@ -156,20 +175,68 @@ def _read_tiff(path: Path) -> Raster:
         rasterio = importlib.import_module("rasterio")
     except ImportError:
         return _read_plain_tiff(path)
+    with _tiff(rasterio, path) as file:
+        planes, nodata = file.read(), file.nodata
+        keep, assumed, notes = _named_bands([kind.name for kind in file.colorinterp])
+    return Raster(np.moveaxis(planes, 0, -1)[..., keep], assumed, nodata, notes)
+
+
+def open_tiff_rows(path: Path) -> TiffRows | None:
+    """Open a TIFF to be read some rows at a time; None where rasterio, which can do so, is not installed.
+
+    Raises
+    ------
+    SceneError : the file is missing or damaged.
+    """
+    try:
+        rasterio = importlib.import_module("rasterio")
+    except ImportError:
+        return None
+    if not path.is_file():
+        raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
+    with _tiff(rasterio, path) as file:
+        keep, assumed, notes = _named_bands([kind.name for kind in file.colorinterp])
+        kind = np.result_type(*(file.dtypes[band] for band in keep))
+        return TiffRows(path, (file.height, file.width, len(keep)), kind, tuple(keep), assumed, file.nodata, notes)
+
+
+@dataclass(frozen=True)
+class TiffRows:
+    """A TIFF, opened: (y, x, band) of ``dtype``, without its alpha channel."""
+
+    path: Path
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
+    bands: tuple[int, ...]  # of the file, counted from 0
+    assumed_nm: tuple[float, ...] | None
+    nodata: float | None
+    notes: tuple[str, ...]
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Rows ``start`` to ``stop`` (SceneError where they are damaged)."""
+        rasterio = importlib.import_module("rasterio")
+        with _tiff(rasterio, self.path) as file:
+            rows = rasterio.windows.Window(0, start, self.shape[1], stop - start)
+            planes = file.read([band + 1 for band in self.bands], window=rows)
+        return np.ascontiguousarray(np.moveaxis(planes, 0, -1), self.dtype)
+
+
+@contextmanager
+def _tiff(rasterio: Any, path: Path) -> Iterator[Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # a scene lies on the camera's grid
         try:
             with rasterio.open(path) as file:
-                planes, nodata = file.read(), file.nodata
-                names = [kind.name for kind in file.colorinterp]
+                yield file
         except rasterio.errors.RasterioError as error:
             raise SceneError(f"{path} cannot be read as TIFF: {error}; is it damaged?") from error
-    values = np.moveaxis(planes, 0, -1)
-    return _named_bands(values, names, nodata)
 
 
-def _named_bands(values: NDArray[Any], names: list[str], nodata: float | None) -> Raster:
-    """Drop alpha; wavelengths are assumed only where the file names its bands red, green and blue, or grey."""
+def _named_bands(names: list[str]) -> tuple[list[int], tuple[float, ...] | None, tuple[str, ...]]:
+    """Which bands are kept (alpha is not), their wavelengths, and notes.
+
+    Wavelengths are assumed only where the file names its bands red, green and blue, or grey.
+    """
     keep = [index for index, name in enumerate(names) if name != "alpha"]
     notes = ("alpha channel dropped",) if len(keep) < len(names) else ()
     kinds = [names[index] for index in keep]
@@ -180,7 +247,7 @@ def _named_bands(values: NDArray[Any], names: list[str], nodata: float | None) -
         assumed = (*RGB_NM, NEAR_INFRARED_NM)
     elif kinds in (["gray"], ["palette"]):
         assumed = (GREY_NM,)
-    return Raster(values[..., keep], assumed, nodata, notes)
+    return keep, assumed, notes
 
 
 def _read_plain_tiff(path: Path) -> Raster:
@@ -203,7 +270,8 @@ def _read_plain_tiff(path: Path) -> Raster:
     names += ["alpha" if "ALPHA" in kind else "undefined" for kind in extra]
     names += ["undefined"] * (count - len(names))
     void = None if nodata is None else float(nodata)
-    return _named_bands(values.reshape(*values.shape[:2], count), names[:count], void)
+    keep, assumed, notes = _named_bands(names[:count])
+    return Raster(values.reshape(*values.shape[:2], count)[..., keep], assumed, void, notes)
 
 
 # --- files with several arrays ----------------------------------------------------------------------------------------
@@ -214,12 +282,21 @@ def _npz_arrays(path: Path) -> dict[str, NDArray[Any]]:
         return {name: file[name] for name in file.files}
 
 
-def _mat_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def is_hdf_mat(path: Path) -> bool:
+    """Whether a .mat file is of version 7.3, which is HDF5 behind 512 bytes of MATLAB's own."""
     with path.open("rb") as file:
         head = file.read(520)
-    if b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:]):  # version 7.3 is HDF5, behind 512 bytes of MATLAB's own
+    return b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:])
+
+
+def _mat_arrays(path: Path, wanted: str | None) -> dict[str, NDArray[Any]]:
+    """All arrays of numbers; only the one wanted, where it is there."""
+    if is_hdf_mat(path):
         return _hdf_arrays(path)
-    content = importlib.import_module("scipy.io").loadmat(path)
+    read = importlib.import_module("scipy.io").loadmat
+    content = {} if wanted is None else read(path, variable_names=[wanted])
+    if wanted is None or wanted not in content:
+        content = read(path)
     arrays = {name: value for name, value in content.items() if isinstance(value, np.ndarray)}
     return {name: value for name, value in arrays.items() if value.dtype.kind in "buifc"}
 
@@ -231,7 +308,15 @@ def _hdf_arrays(path: Path) -> dict[str, NDArray[Any]]:
         raise SceneError(f"{path} is MATLAB 7.3, which needs h5py; pip install h5py, or save it with -v7") from error
     with h5py.File(path, "r") as file:
         # MATLAB counts axes from the other end than HDF5
-        return {name: np.asarray(item).T for name, item in file.items() if isinstance(item, h5py.Dataset)}
+        return {name: np.asarray(file[name]).T for name in file if _is_own(file, name, h5py)}
+
+
+def _is_own(file: Any, name: str, h5py: Any) -> bool:
+    """Whether a name is a data set of numbers kept in this very file: others may lead anywhere on the disk."""
+    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+        return False
+    item = file[name]
+    return isinstance(item, h5py.Dataset) and not item.external and not item.is_virtual and item.dtype.kind in "buifc"
 
 
 def _pick(arrays: dict[str, NDArray[Any]], path: Path, variable: str | None, dims: int) -> NDArray[Any]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,8 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
+from storage.cube_sources import BLOCK_LINES, scene_lines
+from storage.dataset_layouts import find_layout
 from storage.labels import Labels, load_labels
-from storage.raster_files import load_raster, split_variable
+from storage.raster_files import Raster, load_raster, split_variable
+from storage.scan_files import is_scan, known_bands, open_cube_source
 from storage.scene_toml import ClassValue, SceneSettings, find_scene_settings
 from storage.staging import file_hash
 from storage.wavelengths import settle_wavelengths
@@ -51,14 +56,17 @@ def load_scene_file(
     bands: Sequence[int] | None = None,
     wavelengths: Sequence[float] | None = None,
 ) -> SceneFile:
-    """Read a scene from PNG, JPEG, TIFF, .npy, .npz or .mat; what is given here wins over the ``scene.toml`` beside it.
+    """Read a scene from an image, .npy, .npz, .mat, ENVI, Zarr or a Headwall folder.
+
+    What is given here wins over the ``scene.toml`` beside the file, and that over what the file says.
 
     Parameters
     ----------
     path
-        File, or ``FILE.mat:VARIABLE``. Axes are y, x, band; two axes are one band.
+        File or folder, or ``FILE.mat:VARIABLE``, ``STORE.zarr:ARRAY``. Axes are y, x, band; two axes are one band.
+        What comes in lines with dark and white frames is taken over the white panel.
     labels
-        File of class numbers or colours on the same pixels.
+        File of class numbers or colours on the same pixels. Frames of HyKo2 and RANUS bring their own.
     bands
         Bands of the file to use, counted from 0.
     wavelengths
@@ -70,16 +78,22 @@ def load_scene_file(
     WavelengthError : wavelengths are missing, or their number, unit or range is wrong.
     """
     file, variable = split_variable(path)
-    raster = load_raster(path, dims=3)
+    layout = find_layout(file, variable)
+    raster = layout.raster if layout is not None else load_scan(path) if is_scan(path) else load_raster(path, dims=3)
     settings = find_scene_settings(file)
     cube = _three_axes(raster.values, file)
     chosen = _chosen_bands(bands, settings, cube.shape[2], file)
     light = settle_wavelengths(
-        file, chosen, cube.shape[2], stated=wavelengths, settings=settings, assumed_nm=raster.assumed_nm
-    )
+        file, chosen, cube.shape[2], stated=wavelengths, settings=settings, assumed_nm=raster.assumed_nm,
+        known=raster.known,
+    )  # fmt: skip
     values, notes = _as_float(cube, chosen, raster.nodata, file)
     found, label_note = _labels(file, (cube.shape[0], cube.shape[1]), labels, settings)
-    light_hash = _digest(file_hash(file), variable, chosen, light.centre_nm.tolist(), _listed(light.fwhm_nm))
+    if layout is not None and labels is None and settings.labels is None:
+        found, label_note = layout.labels, (layout.label_note,)
+    light_hash = _digest(
+        _content_hash(file, raster), variable, chosen, light.centre_nm.tolist(), _listed(light.fwhm_nm)
+    )
     return SceneFile(
         name=file.stem,
         path=file,
@@ -94,6 +108,44 @@ def load_scene_file(
         light_hash=light_hash,
         provenance=(*_band_note(chosen, cube.shape[2]), *raster.notes, light.origin, *notes, *label_note),
     )
+
+
+def load_scan(address: str | Path) -> Raster:
+    """Read a cube that comes in lines as one array, over the white panel where dark and white frames are known.
+
+    Raises
+    ------
+    SceneError : the cube cannot be used, or this machine has not the memory for it.
+    """
+    source = open_cube_source(address)
+    needed = 8 * math.prod(source.shape)  # as float32, and once more while the scene is made
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > there:
+        raise SceneError(
+            f"{address} is a cube of {source.shape}: as a scene it takes about {needed / 1e9:.0f} GB of memory, this "
+            f"machine has {there / 1e9:.0f}; cut a part out of it, or ingest it"
+        )
+    starts = range(0, source.shape[0], BLOCK_LINES)
+    blocks = [scene_lines(source, start, min(start + BLOCK_LINES, source.shape[0])) for start in starts]
+    over = source.dark is not None and source.white is not None
+    notes = (*source.notes, "values are over the white panel") if over else source.notes
+    return Raster(
+        np.concatenate(blocks), None, None if over else source.nodata, notes, known=known_bands(source),
+        files=source.files,
+    )  # fmt: skip
+
+
+def _content_hash(file: Path, raster: Raster) -> str:
+    """Of all files that the numbers came from; within a folder their names count, too."""
+    files = raster.files or (file,)
+    if files == (file,):
+        return file_hash(file)
+    inside = file if file.is_dir() else None
+    return _digest(*((_name_within(inside, entry), file_hash(entry)) for entry in files))
+
+
+def _name_within(folder: Path | None, file: Path) -> str:
+    return file.relative_to(folder).as_posix() if folder is not None and file.is_relative_to(folder) else ""
 
 
 def _three_axes(values: NDArray[Any], path: Path) -> NDArray[Any]:

@@ -56,8 +56,9 @@ def settle_wavelengths(
     stated: Sequence[float] | None,
     settings: SceneSettings,
     assumed_nm: Sequence[float] | None,
+    known: BandWavelengths | None = None,
 ) -> BandWavelengths:
-    """Wavelengths of the chosen bands: the flag first, then ``scene.toml``, then what the file's colours suggest.
+    """Wavelengths of the chosen bands: the flag first, then ``scene.toml``, then the file, then its colours.
 
     Parameters
     ----------
@@ -67,6 +68,8 @@ def settle_wavelengths(
         From the flag: one for each chosen band, or one for each band of the file. [nm]
     assumed_nm
         One for each band of the file, or None where nothing can be assumed. [nm]
+    known
+        What the file itself says, of every band.
 
     Raises
     ------
@@ -84,6 +87,9 @@ def settle_wavelengths(
         return BandWavelengths(fitting, None, f"wavelengths from {settings.path}")
     if settings.wavelengths_file is not None:
         return _from_file(settings.wavelengths_file, settings.dropped_bands, chosen, file_bands)
+    if known is not None and len(known.centre_nm) == file_bands:
+        centre = check_wavelengths(known.centre_nm, str(path))[chosen]
+        return BandWavelengths(centre, None if known.fwhm_nm is None else known.fwhm_nm[chosen], known.origin)
     if assumed_nm is not None and len(assumed_nm) == file_bands:
         centre = np.asarray(assumed_nm, np.float64)[chosen]
         return BandWavelengths(centre, None, f"wavelengths assumed from the file's colours: {_listed(centre)} nm")

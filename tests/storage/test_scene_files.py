@@ -266,3 +266,99 @@ def test_field_frames(real_data: Path) -> None:
     assert scene.wavelength_nm.tolist() == [660, 800]
     assert scene.class_names == ("soil", "crop", "weed")
     assert np.bincount(scene.labels.ravel()).tolist() == [1112027, 15254, 124655]  # type: ignore[union-attr]
+
+
+ENVI = "ENVI\nsamples = 9\nlines = 7\nbands = 5\ndata type = 12\ninterleave = bip\nbyte order = 0\n"
+ENVI_NM = "wavelength units = um\nwavelength = {0.45, 0.55, 0.65, 0.8, 0.9}\nfwhm = {0.01, 0.01, 0.01, 0.02, 0.02}\n"
+
+
+@pytest.mark.parametrize("name", ["a.hdr", "a.img"])
+def test_envi_scenes(tmp_path: Path, cube: NDArray[np.uint16], name: str) -> None:
+    """A cube is named by its header or its data; wavelengths in micrometres become nm."""
+    (tmp_path / "a.hdr").write_text(ENVI + ENVI_NM)
+    (tmp_path / "a.img").write_bytes(cube.tobytes())
+    scene = load_scene_file(tmp_path / name)
+    np.testing.assert_array_equal(scene.values, cube)
+    np.testing.assert_allclose(scene.wavelength_nm, NM)
+    assert scene.fwhm_nm is not None
+    np.testing.assert_allclose(scene.fwhm_nm, [10, 10, 10, 20, 20])
+    assert load_scene_file(tmp_path / name, bands=[1], wavelengths=[560]).wavelength_nm.tolist() == [560]
+
+
+def test_envi_scenes_that_are_cut_off(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Lines that the file lacks are missing, and told of; without wavelengths they must be stated."""
+    (tmp_path / "a.hdr").write_text(ENVI)
+    (tmp_path / "a.img").write_bytes(cube.tobytes()[:-100])
+    with pytest.raises(WavelengthError, match="nothing says their wavelengths"):
+        load_scene_file(tmp_path / "a.hdr")
+    scene = load_scene_file(tmp_path / "a.hdr", wavelengths=NM)
+    np.testing.assert_array_equal(scene.values[:5], cube[:5])
+    assert np.isnan(scene.values[5:]).all()
+    assert "a.img is cut off: 5 of 7 lines are whole" in scene.provenance
+
+
+def test_envi_labels(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """A class map may be ENVI, too."""
+    labels = np.random.default_rng(0).integers(0, 3, (7, 9), dtype=np.uint8)
+    (tmp_path / "l.hdr").write_text("ENVI\nsamples = 9\nlines = 7\nbands = 1\ndata type = 1\ninterleave = bsq\n")
+    (tmp_path / "l.dat").write_bytes(labels.tobytes())
+    scene = load_scene_file(_save(tmp_path / "a.npy", cube), wavelengths=NM, labels=tmp_path / "l.hdr")
+    np.testing.assert_array_equal(scene.labels, labels)
+
+
+def test_headwall_scenes_are_taken_over_the_white_panel(tmp_path: Path) -> None:
+    """With dark and white frames beside its parts a folder is a scene of reflectance, without them of raw numbers."""
+    shown = np.random.default_rng(5).uniform(0.1, 0.9, (6, 40, 5))
+    raw = np.rint(100 + shown * 1000).astype(np.uint16)
+    head = ENVI.replace("9", "40").replace("bip", "bil")
+    frames = {"raw_0": raw[:4], "raw_4": raw[4:], "darkReference": np.full((2, 40, 5), 100, np.uint16)}
+    frames["whiteReference"] = np.full((1, 40, 5), 1100, np.uint16)
+    for name, values in frames.items():
+        (tmp_path / name).write_bytes(values.transpose(0, 2, 1).tobytes())
+        (tmp_path / f"{name}.hdr").write_text(head.replace("lines = 7", f"lines = {len(values)}") + ENVI_NM)
+    scene = load_scene_file(tmp_path)
+    np.testing.assert_allclose(scene.values, shown, atol=1e-3)
+    assert "values are over the white panel" in scene.provenance
+    before = scene.light_hash
+    (tmp_path / "whiteReference.hdr").unlink()
+    plain = load_scene_file(tmp_path)
+    np.testing.assert_array_equal(plain.values, raw)
+    assert plain.light_hash != before
+
+
+def test_objects_in_arrays_are_never_unpickled(tmp_path: Path) -> None:
+    """.npy and .npz of objects are refused; objects in a .mat file are passed over."""
+    trap = np.array([{"a": 1}], object)
+    np.save(tmp_path / "a.npy", trap, allow_pickle=True)
+    np.savez(tmp_path / "a.npz", cube=trap)
+    scipy.io.savemat(tmp_path / "a.mat", {"cube": trap})
+    for name in ("a.npy", "a.npz"):
+        with pytest.raises(SceneError, match="holds Python objects or is damaged"):
+            load_scene_file(tmp_path / name, wavelengths=NM)
+    with pytest.raises(SceneError, match="has no single array with 3 axes; it has none"):
+        load_scene_file(tmp_path / "a.mat", wavelengths=NM)
+
+
+def test_links_in_a_mat_file_lead_nowhere(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """A MATLAB 7.3 file cannot bring arrays of other files with it: by link, external storage or virtual data set."""
+    secret = _save(tmp_path / "secret73.mat", cube)
+    (tmp_path / "raw.bin").write_bytes(cube.tobytes())
+    layout = h5py.VirtualLayout(cube.shape, cube.dtype)
+    layout[:] = h5py.VirtualSource(secret, "cube", shape=cube.shape)
+    with h5py.File(tmp_path / "a73.mat", "w", userblock_size=512) as file:
+        file["link"] = h5py.ExternalLink("secret73.mat", "/cube")
+        file["soft"] = h5py.SoftLink("/link")
+        file.create_dataset("outside", cube.shape, cube.dtype, external=[("raw.bin", 0, cube.nbytes)])
+        file.create_virtual_dataset("virtual", layout)
+    with pytest.raises(SceneError, match="has no single array with 3 axes; it has none"):
+        load_scene_file(tmp_path / "a73.mat", wavelengths=NM)
+
+
+def test_npy_that_claims_more_than_it_holds(tmp_path: Path) -> None:
+    """A header of 10^12 numbers over a few bytes is refused before they are asked for."""
+    np.save(tmp_path / "a.npy", np.zeros((4, 4, 4), np.uint8))
+    content = (tmp_path / "a.npy").read_bytes()
+    claim = content.replace(b"(4, 4, 4)", b"(10000, 10000, 10000)").replace(b" " * 12 + b"\n", b"\n")
+    (tmp_path / "a.npy").write_bytes(claim)
+    with pytest.raises(SceneError, match="cannot be read as"):
+        load_scene_file(tmp_path / "a.npy", wavelengths=NM)

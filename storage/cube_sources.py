@@ -1,0 +1,117 @@
+"""What a cube gives that is to be stored or looked at, wherever it comes from: its lines when asked, and what is known.
+
+Those who open one (:mod:`storage.scan_files`, :mod:`storage.zarr_scenes`) fill it in; whoever stores it asks for 64
+lines at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+from pipeline.rectify.calibrate import calibrate
+from pipeline.source import References
+
+BLOCK_LINES = 64
+MOST_MISSING = 1 << 14  # lines a cube may promise beyond those it has: each costs memory before any of them is seen
+
+ReadLines = Callable[[int, int], NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class LineFacts:
+    """What is known of each line; None where nothing is known of any."""
+
+    valid: NDArray[np.bool_]  # (line,) the file holds it whole
+    time_s: NDArray[np.float64] | None = None  # (line,) since the first stamp; NaN where not known
+    exposure_ms: NDArray[np.float64] | None = None  # (line,)
+    frame: NDArray[np.int64] | None = None  # (line,) as the camera counts; -1 where not known
+    first_stamp_us: int | None = None
+
+
+@dataclass(frozen=True)
+class Bands:
+    """What is known of the bands; None where nothing is."""
+
+    wavelength_nm: NDArray[np.float64] | None = None  # (band,)
+    fwhm_nm: NDArray[np.float64] | None = None  # (band,)
+    units: str = ""  # of wavelengths, as the file says them
+    origin: str = ""  # one sentence
+
+
+@dataclass(frozen=True)
+class CubeSource:
+    """A cube, opened. ``read(start, stop)`` gives lines as (line, sample, band) of ``dtype``, native byte order."""
+
+    name: str
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
+    read: ReadLines
+    files: tuple[Path, ...]  # that all this came from
+    lines: LineFacts
+    bands: Bands = field(default_factory=Bands)
+    dark: NDArray[np.float32] | None = None  # (sample, band)
+    white: NDArray[np.float32] | None = None  # (sample, band)
+    panel: NDArray[np.float32] | None = None  # (band,) value of the white panel; 1 where None
+    bad: NDArray[np.bool_] | None = None  # (sample, band) elements not to be believed
+    flat: NDArray[np.float32] | None = None  # (sample, band) response left over by the white frame
+    position: NDArray[np.float64] | None = None  # (line, 2) mirror, where the light falls off with its tilt
+    nodata: float | None = None
+    headers: Mapping[str, str] = field(default_factory=dict)  # file name -> its text
+    root: Path | None = None  # of a store whose files' names count, too
+    notes: tuple[str, ...] = ()
+
+    @property
+    def lost_lines(self) -> int:
+        """Lines that should be there and are not."""
+        return int(np.count_nonzero(~self.lines.valid))
+
+
+def check_cube_source(source: CubeSource) -> None:
+    """Refuse what cannot be a cube (SceneError): no real numbers, nothing in it, frames of another size."""
+    where = source.name
+    if source.dtype.kind == "c":
+        raise SceneError(f"{where} holds complex numbers; store their magnitude")
+    if source.dtype.kind not in "buif":
+        raise SceneError(f"{where} holds {source.dtype}, expected whole or floating numbers")
+    if min(source.shape) < 1:
+        raise SceneError(f"{where} holds an empty cube of shape {source.shape}")
+    for name, frame in (("dark", source.dark), ("white", source.white)):
+        if frame is not None and frame.shape != source.shape[1:]:
+            raise SceneError(
+                f"the {name} frame is {frame.shape} (sample, band), {where} is {source.shape[1:]}; give one taken with "
+                "the cube's own binning"
+            )
+
+
+def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:
+    """Lines as a scene shows them: over the white panel where dark and white are known, else as they stand.
+
+    Returns
+    -------
+    (line, sample, band): float32 with NaN where a line is missing, an element bad or the file says no data; the
+    source's own numbers where nothing is missing and there are no references.
+    """
+    raw = source.read(start, stop)
+    valid = source.lines.valid[start:stop]
+    if source.dark is None or source.white is None:
+        if valid.all():
+            return raw
+        values = raw.astype(np.float32)
+    else:
+        panel = np.ones(source.shape[2], np.float32) if source.panel is None else source.panel
+        by_mirror = source.position is not None
+        references = References(source.dark, source.white, panel, source.bad, source.flat, by_mirror)
+        position = None if source.position is None else source.position[start:stop]
+        values, usable = calibrate(raw, references, saturated_dn=np.inf, position=position)
+        values[~usable] = np.nan
+        if source.nodata is not None:
+            values[raw == source.nodata] = np.nan
+    values[~valid] = np.nan
+    return values

@@ -1,0 +1,217 @@
+"""Ingested cubes: what a file or folder holds, as one immutable array with all that is known of it.
+
+::
+
+    cube.zarr/values          (line, sample, band): whole numbers as uint8 or uint16 where they fit, else float32
+    cube.zarr/wavelength      (band,) nm, fwhm beside it; missing where nothing says them
+    cube.zarr/valid_line      (line,) false for lines that no file holds whole; time, exposure_ms, frame where told
+    cube.zarr/dark, white     (sample, band) reference frames, where there are some
+    cube.zarr/quicklook       (y, x, 3) for viewers; the same as quicklook.png beside the cube
+
+Attributes say where it came from: file names without folders, sizes, SHA-256, header texts, notes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from PIL import Image
+
+from storage.cube_sources import BLOCK_LINES, CubeSource
+from storage.layout import create_array, create_group, image_spec, write_bands, write_image, write_small
+
+KIND = "ingested cube"
+QUICKLOOK_PX = 1024
+RGB_NM = (640.0, 550.0, 460.0)
+LONGEST_HEADER = 1 << 16  # characters of a header's text that are kept
+
+Report = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """One file that a cube came from."""
+
+    name: str  # without folders, but those within a store
+    size: int
+    sha256: str
+
+    def record(self) -> dict[str, Any]:
+        """As attributes and receipts hold it."""
+        return {"name": self.name, "size": self.size, "sha256": self.sha256}
+
+
+def write_ingested_cube(
+    folder: Path, source: CubeSource, files: Sequence[SourceFile], *, name: str, report: Report = lambda done: None
+) -> None:
+    """Store a cube as ``cube.zarr`` and ``quicklook.png`` in a folder, 64 lines at a time.
+
+    Parameters
+    ----------
+    files
+        What the cube came from, for its attributes.
+    name
+        What the cube is called.
+    report
+        Told how far it is, 0..1.
+
+    Raises
+    ------
+    SceneError : lines cannot be read.
+    """
+    kind = stored_dtype(source, lambda done: report(0.3 * done))
+    begin = 0.3 if _needs_a_look(source) else 0.0
+    group = create_group(folder / "cube.zarr", f"{KIND} {name}", _attributes(source, files, name))
+    coordinates = _write_coordinates(group, source)
+    about = {"long_name": "numbers of the file", "units": "1", **({"coordinates": coordinates} if coordinates else {})}
+    array = create_array(group, "values", image_spec(("line", "sample", "band"), source.shape, kind.str), about)
+    thumbnail = _Thumbnail(source)
+    for start, stop in _blocks(source):
+        lines = source.read(start, stop)
+        array[start:stop] = _stored(lines, kind, source.lines.valid[start:stop])
+        thumbnail.add(start, lines)
+        report(begin + (1 - begin) * stop / source.shape[0])
+    picture = thumbnail.picture()
+    about = {"long_name": "picture for viewers, red green blue"}
+    write_image(group, "quicklook", ("quicklook_y", "quicklook_x", "rgb"), picture, about)
+    Image.fromarray(picture).save(folder / "quicklook.png")
+
+
+def stored_dtype(source: CubeSource, report: Report = lambda done: None) -> np.dtype[Any]:
+    """Type of the store: uint8 and uint16 stay, other whole numbers become uint16 where all fit, the rest float32."""
+    if source.dtype.kind == "b" or source.dtype == np.uint8:
+        return np.dtype(np.uint8)
+    if source.dtype == np.uint16:
+        return np.dtype(np.uint16)
+    if source.dtype.kind not in "ui":
+        return np.dtype(np.float32)
+    for start, stop in _blocks(source):
+        lines = source.read(start, stop)
+        if lines.min() < 0 or lines.max() > np.iinfo(np.uint16).max:
+            return np.dtype(np.float32)
+        report(stop / source.shape[0])
+    return np.dtype(np.uint16)
+
+
+def _needs_a_look(source: CubeSource) -> bool:
+    return source.dtype.kind in "ui" and source.dtype not in (np.uint8, np.uint16)
+
+
+def _blocks(source: CubeSource) -> Iterator[tuple[int, int]]:
+    for start in range(0, source.shape[0], BLOCK_LINES):
+        yield start, min(start + BLOCK_LINES, source.shape[0])
+
+
+def _stored(lines: NDArray[Any], kind: np.dtype[Any], valid: NDArray[np.bool_]) -> NDArray[Any]:
+    with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, and a scene takes that for missing
+        block = lines.astype(kind)
+    if not valid.all():
+        block[~valid] = np.nan if kind.kind == "f" else 0
+    return block
+
+
+def _attributes(source: CubeSource, files: Sequence[SourceFile], name: str) -> dict[str, Any]:
+    facts: dict[str, Any] = {
+        "kind": KIND,
+        "name": name,
+        "files": [file.record() for file in files],
+        "headers": {file: text[:LONGEST_HEADER] for file, text in source.headers.items()},
+        "source_dtype": source.dtype.str,
+        "lost_lines": source.lost_lines,
+        "notes": list(source.notes),
+        "wavelength_origin": source.bands.origin or "nothing says the wavelengths",
+        "wavelength_units_in_file": source.bands.units,
+    }
+    if source.nodata is not None and np.isfinite(source.nodata):
+        facts["nodata"] = source.nodata
+    if source.position is not None:
+        facts["by_mirror"] = True
+    if source.lines.first_stamp_us is not None:
+        facts["first_stamp_us"] = source.lines.first_stamp_us
+    return facts
+
+
+def _write_coordinates(group: zarr.Group, source: CubeSource) -> str:
+    """Store what is known of lines and bands, and the reference frames; give the coordinates' names."""
+    names: list[str] = []
+    if source.bands.wavelength_nm is not None:
+        names.append(write_bands(group, source.bands.wavelength_nm, source.bands.fwhm_nm))
+    columns: Mapping[str, tuple[NDArray[Any] | None, dict[str, Any]]] = {
+        "time": (source.lines.time_s, {"long_name": "since the first stamp of a frame", "units": "s"}),
+        "exposure_ms": (source.lines.exposure_ms, {"units": "ms"}),
+        "frame": (source.lines.frame, {"long_name": "number that the camera gave, -1 where not known", "units": "1"}),
+        "valid_line": (source.lines.valid, {"long_name": "line is whole in its file"}),
+    }
+    for name, (values, about) in columns.items():
+        if values is not None:
+            write_small(group, name, ("line",), np.asarray(values), about)
+            names.append(name)
+    _write_references(group, source)
+    return " ".join(names)
+
+
+def _write_references(group: zarr.Group, source: CubeSource) -> None:
+    frames: Mapping[str, tuple[NDArray[Any] | None, str]] = {
+        "dark": (source.dark, "dark reference frame"),
+        "white": (source.white, "white reference frame"),
+        "bad": (source.bad, "bad elements of the detector"),
+        "flat": (source.flat, "relative response left over by the white frame"),
+    }
+    for name, (frame, title) in frames.items():
+        if frame is not None:
+            write_small(group, name, ("sample", "band"), np.asarray(frame), {"long_name": title, "units": "1"})
+    if source.panel is not None:
+        write_small(group, "panel", ("band",), source.panel, {"long_name": "scene value of the white panel"})
+    if source.position is not None:
+        for name, axis in zip(("mirror_x", "mirror_y"), source.position.T, strict=True):
+            write_small(group, name, ("line",), np.ascontiguousarray(axis), {"long_name": "mirror position"})
+
+
+class _Thumbnail:
+    """Every n-th pixel of three bands, gathered as lines pass."""
+
+    def __init__(self, source: CubeSource) -> None:
+        lines, samples, bands = source.shape
+        self._source = source
+        self._step = max(1, -(-max(lines, samples) // QUICKLOOK_PX))
+        self._bands = _three_bands(source.bands.wavelength_nm, bands)
+        self._rows: list[NDArray[np.float32]] = []
+
+    def add(self, start: int, lines: NDArray[Any]) -> None:
+        """Take what the picture needs of the lines from ``start`` on."""
+        rows = slice(-start % self._step, None, self._step)
+        part = np.asarray(lines[rows, :: self._step][..., self._bands], np.float32)
+        dark, white = self._source.dark, self._source.white
+        if dark is not None and white is not None:
+            level, light = (frame[:: self._step][:, self._bands] for frame in (dark, white))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                part = (part - level) / (light - level)
+        part[~self._source.lines.valid[start : start + len(lines)][rows]] = np.nan
+        self._rows.append(part)
+
+    def picture(self) -> NDArray[np.uint8]:
+        """(y, x, 3), each band stretched from its 2nd to its 98th percentile; what is missing is black."""
+        image = np.concatenate(self._rows)
+        image[~np.isfinite(image)] = np.nan
+        out = np.zeros(image.shape, np.uint8)
+        for band in range(3):
+            plane = image[..., band]
+            known = plane[np.isfinite(plane)]
+            if known.size:
+                low, high = np.percentile(known, (2, 98))
+                span = high - low if high > low else 1.0
+                out[..., band] = np.nan_to_num(np.clip((plane - low) / span, 0, 1) * 255)
+        return out
+
+
+def _three_bands(wavelength_nm: NDArray[np.float64] | None, count: int) -> list[int]:
+    """Bands for red, green and blue: the nearest by wavelength, else spread over the file's order."""
+    if wavelength_nm is not None and np.isfinite(wavelength_nm).all():
+        return [int(np.abs(wavelength_nm - centre).argmin()) for centre in RGB_NM]
+    return [(count - 1) * share // 4 for share in (3, 2, 1)]

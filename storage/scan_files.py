@@ -1,0 +1,259 @@
+"""Anything that holds a cube, opened to be read 64 lines at a time: ENVI, Headwall folders, Zarr, images and arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+from storage.cube_sources import Bands, CubeSource, LineFacts, check_cube_source
+from storage.dataset_layouts import find_layout
+from storage.envi_cubes import DATA_ENDINGS, find_envi_pair, open_envi_cube
+from storage.envi_header import EnviHeader
+from storage.headwall_folders import PartedCube, find_reference, is_headwall_folder, one_part, open_parts
+from storage.raster_files import SCENE_ENDINGS, TIFF_ENDINGS, TiffRows, load_raster, open_tiff_rows, split_variable
+from storage.scene_toml import SceneSettings, find_scene_settings
+from storage.wavelengths import BandWavelengths, settle_wavelengths
+from storage.zarr_scenes import find_zarr_store, open_zarr_cube
+
+_EXPOSURE = "exposure (ms)"  # a setting in the comments of Headwall's headers
+
+
+def is_scan(address: str | Path) -> bool:
+    """Whether an address is of a kind that comes in lines: a folder, a Zarr store, an ENVI header or its data file."""
+    path, _ = split_variable(address)
+    if path.is_dir() or path.suffix.lower() == ".hdr":
+        return True
+    if path.suffix.lower() in SCENE_ENDINGS or not path.is_file():
+        return False
+    beside = {path.with_name(path.name + ".hdr").name.lower(), path.with_suffix(".hdr").name.lower()}
+    return path.suffix.lower() in DATA_ENDINGS or any(entry.name.lower() in beside for entry in path.parent.iterdir())
+
+
+def open_cube_source(
+    address: str | Path, *, dark: str | Path | None = None, white: str | Path | None = None
+) -> CubeSource:
+    """Open whatever holds a cube; nothing of its numbers is read yet but small images, .mat and .npz, which are whole.
+
+    Parameters
+    ----------
+    address
+        ENVI header or data file, Headwall folder, Zarr store (``STORE:ARRAY``), or a file that
+        :func:`storage.raster_files.load_raster` reads.
+    dark, white
+        ENVI or .npy files of reference frames, averaged over their lines; they win over those in a Headwall folder.
+
+    Raises
+    ------
+    SceneError : there is no such thing, it is damaged, or not of a kind or shape that can be used.
+    """
+    path, variable = split_variable(address)
+    store = find_zarr_store(path)
+    if store is not None:
+        source = open_zarr_cube(store, variable)
+    elif path.is_dir():
+        source = _headwall_source(path, dark is None, white is None)
+    elif is_scan(path):
+        source = _envi_source(path)
+    else:
+        source = _raster_source(address)
+    for kind, stated in (("dark", dark), ("white", white)):
+        if stated is not None:
+            source = _with_frame(source, kind, stated)
+    check_cube_source(source)
+    return source
+
+
+def with_wavelengths(source: CubeSource, stated: Sequence[float]) -> CubeSource:
+    """The same cube with wavelengths as a flag says them [nm], one a band (WavelengthError where they do not fit)."""
+    path, count = Path(source.name), source.shape[2]
+    found = settle_wavelengths(
+        path, range(count), count, stated=stated, settings=find_scene_settings(path), assumed_nm=None
+    )
+    return replace(source, bands=Bands(found.centre_nm, None, "nm", found.origin))
+
+
+def known_bands(source: CubeSource) -> BandWavelengths | None:
+    """What a scene takes as its file's own wavelengths."""
+    bands = source.bands
+    if bands.wavelength_nm is None:
+        return None
+    return BandWavelengths(bands.wavelength_nm, bands.fwhm_nm, bands.origin)
+
+
+def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ...]]:
+    """Read one reference frame, (sample, band), the mean of its lines, and the files that it stands in.
+
+    Raises
+    ------
+    SceneError : the file cannot be read or holds no real numbers.
+    """
+    path, _ = split_variable(address)
+    if is_scan(path):
+        if path.is_dir():
+            raise SceneError(f"{path} is a folder, expected a reference frame (ENVI or .npy); name the file")
+        files: tuple[Path, ...] = find_envi_pair(path)
+        values = open_envi_cube(path).values
+    else:
+        values, files = load_raster(address, dims=3).values, (path,)
+    if values.dtype.kind not in "uif":
+        raise SceneError(f"{path} holds {values.dtype}, expected the real numbers of a reference frame")
+    frame = values[None] if values.ndim == 2 else values
+    return np.asarray(frame.mean(axis=0, dtype=np.float64), np.float32), files
+
+
+# --- ENVI -------------------------------------------------------------------------------------------------------------
+
+
+def _envi_source(path: Path) -> CubeSource:
+    header, data = find_envi_pair(path)
+    cube = open_envi_cube(header)
+    return _parted_source(data.name, one_part(cube), [header], (), cube.header)
+
+
+def _headwall_source(folder: Path, find_dark: bool, find_white: bool) -> CubeSource:
+    if not is_headwall_folder(folder):
+        raise SceneError(
+            f"{folder} is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files of a Headwall "
+            "camera; name one of the files in it"
+        )
+    whole = open_parts(folder)
+    headers = [Path(part.cube.header.where) for part in whole.parts]
+    source = _parted_source(folder.resolve().name, whole, headers, whole.index_files, whole.parts[0].cube.header)
+    for kind, wanted in (("dark", find_dark), ("white", find_white)):
+        file = find_reference(folder, kind) if wanted else None
+        if file is not None:
+            source = _with_frame(source, kind, file)
+    return source
+
+
+def _with_frame(source: CubeSource, kind: str, address: str | Path) -> CubeSource:
+    """The same cube with its dark or white frame, and a note on where that is from."""
+    frame, more = load_frame(address)
+    files, notes = (*source.files, *more), (*source.notes, f"{kind} frame from {Path(address).name}")
+    if kind == "dark":
+        return replace(source, dark=frame, files=files, notes=notes)
+    return replace(source, white=frame, files=files, notes=notes)
+
+
+def _parted_source(
+    name: str, whole: PartedCube, headers: Sequence[Path], extra: tuple[Path, ...], first: EnviHeader
+) -> CubeSource:
+    values = whole.parts[0].cube.values
+    told = next((p.cube.header for p in whole.parts if p.cube.header.wavelength_nm is not None), first)
+    bands = Bands()
+    if told.wavelength_nm is not None:
+        units = told.fields.get("wavelength units", "")
+        bands = Bands(told.wavelength_nm, told.fwhm_nm, units, f"wavelengths from {Path(told.where).name}")
+    data = [file for header, part in zip(headers, whole.parts, strict=True) for file in (header, part.cube.path)]
+    return CubeSource(
+        name=name,
+        shape=(whole.lines, values.shape[1], values.shape[2]),
+        dtype=values.dtype.newbyteorder("="),
+        read=whole.read,
+        files=(*data, *extra),
+        lines=_line_facts(whole),
+        bands=bands,
+        nodata=first.nodata,
+        headers={header.name: _text(header) for header in headers},
+        notes=whole.notes,
+    )
+
+
+def _text(header: Path) -> str:
+    return header.read_bytes().decode("utf-8", errors="replace")
+
+
+def _line_facts(whole: PartedCube) -> LineFacts:
+    valid, stated = whole.valid_lines(), [_header_exposure(part.cube.header) for part in whole.parts]
+    if whole.times is None and np.isnan(stated).all():
+        return LineFacts(valid)
+    exposure = np.full(whole.lines, np.nan)
+    for part, value in zip(whole.parts, stated, strict=True):
+        exposure[part.start : part.stop] = value
+    if whole.times is None:
+        return LineFacts(valid, exposure_ms=_told(exposure))
+    stamps, known = whole.times.stamp_us, whole.times.stamp_us >= 0
+    exposure = np.where(np.isnan(whole.times.exposure_ms), exposure, whole.times.exposure_ms)
+    if not known.any():
+        return LineFacts(valid, exposure_ms=_told(exposure), frame=whole.times.frame)
+    first = int(stamps[known][0])
+    time_s = np.where(known, (stamps - first) * 1e-6, np.nan)
+    return LineFacts(valid, time_s, _told(exposure), whole.times.frame, first)
+
+
+def _header_exposure(header: EnviHeader) -> float:
+    try:
+        return float(header.settings.get(_EXPOSURE, "nan"))
+    except ValueError:
+        return float("nan")
+
+
+def _told(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    return None if np.isnan(values).all() else values
+
+
+# --- images and arrays ------------------------------------------------------------------------------------------------
+
+
+def _raster_source(address: str | Path) -> CubeSource:
+    path, variable = split_variable(address)
+    rows = open_tiff_rows(path) if path.suffix.lower() in TIFF_ENDINGS else None
+    if rows is not None:
+        return _tiff_source(rows)
+    layout = find_layout(path, variable)
+    raster = layout.raster if layout is not None else load_raster(address, dims=3)
+    values = raster.values[..., None] if raster.values.ndim == 2 else raster.values
+    if values.ndim != 3:
+        raise SceneError(f"{path} holds shape {values.shape}; expected (y, x, band), or (y, x) for one band")
+    files = tuple(raster.files) or (path,)
+    return CubeSource(
+        name=path.name,
+        shape=(values.shape[0], values.shape[1], values.shape[2]),
+        dtype=values.dtype.newbyteorder("="),
+        read=_reader(values),
+        files=files,
+        lines=LineFacts(np.ones(values.shape[0], np.bool_)),
+        bands=_raster_bands(path, raster.assumed_nm, raster.known, values.shape[2]),
+        nodata=raster.nodata,
+        notes=raster.notes,
+    )
+
+
+def _tiff_source(rows: TiffRows) -> CubeSource:
+    return CubeSource(
+        name=rows.path.name,
+        shape=rows.shape,
+        dtype=rows.dtype,
+        read=rows.read,
+        files=(rows.path,),
+        lines=LineFacts(np.ones(rows.shape[0], np.bool_)),
+        bands=_raster_bands(rows.path, rows.assumed_nm, None, rows.shape[2]),
+        nodata=rows.nodata,
+        notes=rows.notes,
+    )
+
+
+def _reader(values: NDArray[Any]) -> Any:
+    native = values.dtype.newbyteorder("=")
+    return lambda start, stop: np.asarray(values[start:stop], native)
+
+
+def _raster_bands(path: Path, assumed_nm: Sequence[float] | None, known: BandWavelengths | None, count: int) -> Bands:
+    """Wavelengths by ``scene.toml``, the file, or its colours; none where nothing says those of every band."""
+    settings = find_scene_settings(path)
+    if settings.bands is not None and settings.wavelengths_nm is not None and len(settings.wavelengths_nm) != count:
+        settings = SceneSettings()  # stated for some of the bands only
+    said = settings.wavelengths_nm is not None or settings.wavelengths_file is not None
+    if not said and known is None and (assumed_nm is None or len(assumed_nm) != count):
+        return Bands()
+    found = settle_wavelengths(
+        path, range(count), count, stated=None, settings=settings, assumed_nm=assumed_nm, known=known
+    )
+    folder = "" if settings.path is None else f"{settings.path.parent}/"
+    return Bands(found.centre_nm, found.fwhm_nm, "nm", found.origin.replace(folder, ""))

@@ -1,0 +1,223 @@
+"""Cubes out of Zarr stores: those of this project, and arrays of anyone with dims y x and band, or band y x.
+
+What a store says of itself is judged before it is opened (:mod:`storage.zarr_metadata`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+from storage.cube_sources import Bands, CubeSource, LineFacts, ReadLines
+from storage.envi_header import MICROMETRES, NANOMETRES
+from storage.zarr_metadata import METADATA, check_metadata, check_size, open_options
+
+ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing")
+COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitude", "easting")
+BANDS = ("band", "bands", "wavelength", "wavelengths", "channel", "channels", "spectral")
+WAVELENGTHS = ("wavelength", "wavelengths", "radiation_wavelength")
+
+
+@dataclass(frozen=True)
+class _Packing:
+    """How stored numbers become values: CF's fill, scale and offset."""
+
+    fill: float | None
+    scale: float
+    offset: float
+
+    @property
+    def plain(self) -> bool:
+        return self.scale == 1.0 and self.offset == 0.0
+
+
+def find_zarr_store(path: Path) -> Path | None:
+    """The Zarr store at a path, or the ``cube.zarr`` in it; None where there is neither."""
+    for folder in (path, path / "cube.zarr"):
+        if any((folder / name).is_file() for name in METADATA):
+            return folder
+    return None
+
+
+def open_zarr_cube(path: Path, variable: str | None = None) -> CubeSource:
+    """Open one array of a store as a cube.
+
+    Of this project: raw cubes (with their references), ingested cubes, mosaics. Of anyone's: the only array with three
+    axes of numbers, or the one named; wavelengths come from a coordinate of that name, or of the band axis with a unit.
+
+    Raises
+    ------
+    SceneError : the store is damaged, holds no such array, has dims that are not known, a codec that is not allowed, or
+        claims to hold far more than lies on the disk.
+    """
+    with _named(path):
+        check_metadata(path)
+        node = zarr.open(path, mode="r", **open_options(path))
+        group = node if isinstance(node, zarr.Group) else None
+        arrays: dict[str, Any] = dict(node.arrays()) if isinstance(node, zarr.Group) else {"": node}
+        name = _chosen(arrays, variable, path)
+        array = arrays[name]
+        check_size(array, path, name)
+        order, notes = _axes(array, path)
+        attributes = {} if group is None else dict(group.attrs)
+        return _source(path, array, order, arrays, attributes, notes)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except SceneError:
+        raise
+    except Exception as error:  # codecs and parsers raise anything at all on damaged bytes
+        raise SceneError(f"{path} cannot be read as Zarr: {type(error).__name__}: {error}; is it damaged?") from error
+
+
+def _chosen(arrays: Mapping[str, zarr.Array[Any]], variable: str | None, path: Path) -> str:
+    listing = ", ".join(f"{name} {array.shape}" for name, array in arrays.items()) or "none"
+    if variable is not None:
+        if variable not in arrays:
+            raise SceneError(f"{path} has no array {variable}; it has {listing}")
+        return variable
+    cubes = [name for name, array in arrays.items() if array.ndim == 3 and array.dtype.kind in "buif"]
+    own = [name for name in ("dn", "values") if name in cubes]
+    if own or len(cubes) == 1:
+        return (own or cubes)[0]
+    if cubes:
+        raise SceneError(f"{path} has several arrays with three axes; it has {listing}; name one: {path.name}:ARRAY")
+    if list(arrays) == [""]:
+        return ""
+    raise SceneError(f"{path} has no array of numbers with the axes y, x and band; it has {listing}")
+
+
+def _axes(array: zarr.Array[Any], path: Path) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Which axes of the array are rows, columns and (where there are some) bands; and notes."""
+    named = _dims(array)
+    if array.ndim not in (2, 3):
+        raise SceneError(f"{path} holds shape {array.shape}; expected y, x and band; store one time or level")
+    if not any(named):
+        return tuple(range(array.ndim)), ("dims have no names, read as y, x, band",)
+    words = [name.lower() for name in named]
+    found = [[at for at, word in enumerate(words) if word in known] for known in (ROWS, COLUMNS, BANDS)]
+    if any(len(places) != 1 for places in found[: array.ndim]) or (array.ndim == 2 and found[2]):
+        raise SceneError(f"{path} has dims {', '.join(named)}; expected y, x, band (or band, y, x); rename them")
+    return tuple(places[0] for places in found[: array.ndim]), ()
+
+
+def _dims(array: zarr.Array[Any]) -> list[str]:
+    """Names of the axes as v3 or xarray's v2 keeps them; empty where there are none."""
+    named = getattr(array.metadata, "dimension_names", None) or array.attrs.get("_ARRAY_DIMENSIONS")
+    return ["" if name is None else str(name) for name in named] if isinstance(named, list | tuple) else []
+
+
+def _source(
+    path: Path, array: zarr.Array[Any], order: tuple[int, ...], arrays: Mapping[str, Any], attributes: dict[str, Any],
+    notes: tuple[str, ...],
+) -> CubeSource:  # fmt: skip
+    shape = tuple(array.shape[axis] for axis in order) + ((1,) if len(order) == 2 else ())
+    packing = _packing(array.attrs)
+    kind = np.dtype(np.float32) if not packing.plain else array.dtype.newbyteorder("=")
+    lines, samples, bands = shape
+    own = "sweep" in attributes or attributes.get("kind") == "ingested cube"
+    void = attributes.get("nodata") if own else None
+    bad = _small(arrays, "bad", (samples, bands)) if own else None
+    return CubeSource(
+        name=path.name,
+        shape=(lines, samples, bands),
+        dtype=np.dtype(kind),
+        read=_reader(path, array, order, packing),
+        files=tuple(sorted(file for file in path.rglob("*") if file.is_file())),
+        lines=_line_facts(arrays, lines, own=own),
+        bands=_bands(arrays, array, order, bands),
+        dark=_small(arrays, "dark", (samples, bands)) if own else None,
+        white=_small(arrays, "white", (samples, bands)) if own else None,
+        panel=_small(arrays, "panel", (bands,)) if own else None,
+        bad=None if bad is None else bad.astype(np.bool_),
+        flat=_small(arrays, "flat", (samples, bands)) if own else None,
+        position=_position(arrays, lines) if attributes.get("by_mirror") is True else None,
+        nodata=void if void is not None else packing.fill if packing.plain else None,
+        root=path,
+        notes=notes,
+    )
+
+
+def _packing(attributes: Mapping[str, Any]) -> _Packing:
+    def number(name: str, default: float | None) -> float | None:
+        value = attributes.get(name)
+        return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else default
+
+    scale, offset = number("scale_factor", 1.0), number("add_offset", 0.0)
+    return _Packing(number("_FillValue", None), 1.0 if scale is None else scale, 0.0 if offset is None else offset)
+
+
+def _reader(path: Path, array: zarr.Array[Any], order: tuple[int, ...], packing: _Packing) -> ReadLines:
+    def read(start: int, stop: int) -> NDArray[Any]:
+        selection = tuple(slice(start, stop) if axis == order[0] else slice(None) for axis in range(array.ndim))
+        with _named(path):
+            block = np.transpose(np.asarray(array[selection]), order)
+        native = np.ascontiguousarray(block, block.dtype.newbyteorder("="))
+        if native.ndim == 2:
+            native = native[..., None]
+        if packing.plain:
+            return native
+        values = (native * packing.scale + packing.offset).astype(np.float32)
+        if packing.fill is not None:
+            values[native == packing.fill] = np.nan
+        return values
+
+    return read
+
+
+def _small(arrays: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
+    if name not in arrays or arrays[name].shape != shape:
+        return None
+    return np.asarray(arrays[name][...], np.float32)
+
+
+def _position(arrays: Mapping[str, Any], lines: int) -> NDArray[np.float64] | None:
+    x, y = (_small(arrays, f"mirror_{axis}", (lines,)) for axis in "xy")
+    return None if x is None or y is None else np.stack([x, y], axis=-1).astype(np.float64)
+
+
+def _line_facts(arrays: Mapping[str, Any], lines: int, *, own: bool) -> LineFacts:
+    def column(name: str) -> NDArray[Any] | None:
+        return np.asarray(arrays[name][...]) if own and name in arrays and arrays[name].shape == (lines,) else None
+
+    valid = column("valid_line")
+    everything = np.ones(lines, np.bool_) if valid is None else valid.astype(np.bool_)
+    return LineFacts(everything, column("time"), column("exposure_ms"), column("frame"))
+
+
+def _bands(arrays: Mapping[str, Any], array: zarr.Array[Any], order: tuple[int, ...], count: int) -> Bands:
+    """Wavelengths and widths of the coordinates that say them, in nm."""
+    named = _dims(array)
+    axis = named[order[2]] if len(order) == 3 and len(named) == 3 else ""
+    found = next((name for name in WAVELENGTHS if _is_line(arrays, name, count)), None)
+    if found is None and _is_line(arrays, axis, count):
+        about = arrays[axis].attrs
+        known = about.get("standard_name") in WAVELENGTHS or _unit(about) in NANOMETRES | MICROMETRES
+        found = axis if known else None
+    if found is None:
+        return Bands()
+    centres = np.asarray(arrays[found][...], np.float64)
+    unit = _unit(arrays[found].attrs)
+    scale = 1000.0 if unit in MICROMETRES or (unit not in NANOMETRES and centres.max() <= 20) else 1.0
+    said = f"in {unit}" if unit in NANOMETRES | MICROMETRES else "without a unit, read by their size"
+    widths = np.asarray(arrays["fwhm"][...], np.float64) * scale if _is_line(arrays, "fwhm", count) else None
+    return Bands(centres * scale, widths, unit, f"wavelengths from the array {found}, {said}")
+
+
+def _is_line(arrays: Mapping[str, Any], name: str, count: int) -> bool:
+    return name in arrays and arrays[name].shape == (count,) and arrays[name].dtype.kind in "uif"
+
+
+def _unit(attributes: Mapping[str, Any]) -> str:
+    return str(attributes.get("units", attributes.get("unit", ""))).strip().lower()

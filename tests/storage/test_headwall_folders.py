@@ -1,0 +1,140 @@
+"""Parts of a Headwall folder are one cube in order; gaps, cut files and references are found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+from storage.scan_files import open_cube_source
+
+NM = "wavelength units = nm\nwavelength = {\n400.0\n,500.0\n,600.0\n}\n"
+
+
+def write_part(
+    folder: Path, name: str, values: NDArray[Any], *, lines: int | None = None, more: str = NM, code: int = 12
+) -> None:
+    """Write (line, sample, band) values as the camera does: BIL without an ending, the header beside it."""
+    folder.mkdir(exist_ok=True)
+    promised = len(values) if lines is None else lines
+    (folder / f"{name}.hdr").write_text(
+        f"ENVI\n;Exposure (ms) = 4.5\nsamples = {values.shape[1]}\nlines = {promised}\nbands = {values.shape[2]}\n"
+        f"header offset = 0\nfile type = ENVI Standard\ndata type = {code}\ninterleave = bil\nbyte order = 0\n{more}"
+    )
+    (folder / name).write_bytes(values.transpose(0, 2, 1).tobytes())
+
+
+@pytest.fixture
+def lines() -> NDArray[np.uint16]:
+    """Numbers of 30 lines, (30, 4, 3) uint16."""
+    return np.arange(360, dtype=np.uint16).reshape(30, 4, 3)
+
+
+def test_parts_in_order_of_their_frames(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """Parts follow each other by number, not by letters; times come from the index of each, in both layouts."""
+    for first, last, between in ((0, 8, "\t"), (8, 20, " "), (20, 30, "\t")):
+        write_part(tmp_path, f"raw_{first}", lines[first:last])
+        rows = [f"{frame}{between}{1000 + 10 * frame}" for frame in range(first, last)]
+        (tmp_path / f"frameIndex_{first}.txt").write_text("\r\n".join([f"Frame#{between}Timestamp", *rows]))
+    source = open_cube_source(tmp_path)
+    assert (source.shape, source.dtype, source.lost_lines, source.notes) == ((30, 4, 3), np.uint16, 0, ())
+    np.testing.assert_array_equal(source.read(0, 30), lines)
+    np.testing.assert_array_equal(source.read(6, 22), lines[6:22])
+    assert source.lines.time_s is not None
+    np.testing.assert_allclose(source.lines.time_s, np.arange(30) * 1e-5)
+    np.testing.assert_array_equal(source.lines.frame, np.arange(30))
+    np.testing.assert_array_equal(source.lines.exposure_ms, np.full(30, 4.5))
+    np.testing.assert_array_equal(source.bands.wavelength_nm, [400, 500, 600])
+    assert len(source.files) == 9
+    assert source.lines.first_stamp_us == 1000
+
+
+def test_lines_in_no_file_are_flagged(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """A part that is cut off, or not there, leaves lines between; the last one's lost lines stand at the end."""
+    write_part(tmp_path, "raw_0", lines[:6], lines=10)
+    write_part(tmp_path, "raw_10", lines[10:20], lines=12)
+    source = open_cube_source(tmp_path)
+    missing = [6, 7, 8, 9, 20, 21]
+    assert source.shape[0] == 22
+    assert np.flatnonzero(~source.lines.valid).tolist() == missing
+    np.testing.assert_array_equal(source.read(0, 22)[source.lines.valid], lines[[*range(6), *range(10, 20)]])
+    assert not source.read(0, 22)[missing].any()
+    assert any("4 lines before raw_10 are in no file" in note for note in source.notes)
+
+
+def test_an_empty_part_is_left_out(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """A part that was opened when the capture died holds nothing; the rest is read."""
+    write_part(tmp_path, "raw_0", lines[:6])
+    write_part(tmp_path, "raw_6", lines[:0], lines=10)
+    source = open_cube_source(tmp_path)
+    assert source.shape[0] == 6
+    assert source.notes == ("raw_6 is empty and left out",)
+
+
+def test_references_found_by_name(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """Dark and white frames are averaged over their lines, whatever the capitals; flags win over them."""
+    write_part(tmp_path, "raw_0", lines)
+    write_part(tmp_path, "darkReference", np.stack([lines[0], lines[2]]), more="")
+    write_part(tmp_path, "WhiteReference_01", lines[5:6], more="")
+    source = open_cube_source(tmp_path)
+    np.testing.assert_array_equal(source.dark, lines[1])
+    np.testing.assert_array_equal(source.white, lines[5])
+    assert source.notes == ("dark frame from darkReference.hdr", "white frame from WhiteReference_01.hdr")
+    np.save(tmp_path / "d.npy", lines[9])
+    np.testing.assert_array_equal(open_cube_source(tmp_path, dark=tmp_path / "d.npy").dark, lines[9])
+
+
+def test_references_of_another_size_or_several(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """A frame that does not fit the cube is refused, and so are two of a kind."""
+    write_part(tmp_path, "raw_0", lines)
+    write_part(tmp_path, "darkReference", lines[:1, :2], more="")
+    with pytest.raises(SceneError, match=r"dark frame is \(2, 3\) \(sample, band\), .* is \(4, 3\)"):
+        open_cube_source(tmp_path)
+    write_part(tmp_path, "darkReference_2", lines[:1], more="")
+    with pytest.raises(SceneError, match=r"several dark frames .* name one with --dark"):
+        open_cube_source(tmp_path)
+    assert open_cube_source(tmp_path, dark=tmp_path / "darkReference_2.hdr").dark is not None
+
+
+def test_parts_that_do_not_fit(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """Parts of another size, of other wavelengths, or far behind the rest are no part of one cube."""
+    write_part(tmp_path / "size", "raw_0", lines)
+    write_part(tmp_path / "size", "raw_30", lines[:, :3])
+    write_part(tmp_path / "light", "raw_0", lines)
+    write_part(tmp_path / "light", "raw_30", lines, more=NM.replace("600", "700"))
+    write_part(tmp_path / "far", "raw_0", lines)
+    write_part(tmp_path / "far", "raw_99999999999", lines)
+    for name, words in (
+        ("size", "has frames of"),
+        ("light", "other wavelengths"),
+        ("far", "are in no file, more than"),
+    ):
+        with pytest.raises(SceneError, match=words):
+            open_cube_source(tmp_path / name)
+
+
+def test_folders_that_are_none(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """A folder without parts, a part without a header, and parts that are all empty each say so."""
+    with pytest.raises(
+        SceneError, match="is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files"
+    ):
+        open_cube_source(tmp_path)
+    write_part(tmp_path, "raw_0", lines[:0])
+    with pytest.raises(SceneError, match=r"every part of .* is empty"):
+        open_cube_source(tmp_path)
+    (tmp_path / "raw_0.hdr").unlink()
+    with pytest.raises(SceneError, match=r"expected one header raw_0\.hdr, found raw_0"):
+        open_cube_source(tmp_path)
+
+
+def test_real_references(real_data: Path) -> None:
+    """The frames of a real MV.X are found by their names, dark as integers and white as floats."""
+    dark = open_cube_source(real_data / "headwall_references" / "darkReference.bin")
+    white = open_cube_source(real_data / "headwall_references" / "whiteReference.hdr")
+    assert dark.shape == white.shape == (1, 1020, 301)
+    assert (dark.dtype, white.dtype) == (np.uint16, np.float32)
+    np.testing.assert_allclose(dark.lines.exposure_ms, [100.0033437])

@@ -1,0 +1,189 @@
+"""Zarr stores as scenes: this project's own, anyone's with known dims; what is not plain numbers is refused."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+import zarr
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+from pipeline.scan import Sweep
+from pipeline.source import Line, References
+from storage.cubes import RawCubeWriter, SweepHeader
+from storage.mosaics import MosaicWriter
+from storage.scan_files import open_cube_source
+from storage.scene_files import load_scene_file
+
+NM = np.array([450.0, 550.0, 650.0, 800.0, 900.0])
+
+
+def _dataset(cube: NDArray[Any], dims: tuple[str, ...], **about: Any) -> xr.Dataset:
+    order = [("y", "x", "band").index(dim) for dim in dims]
+    array = xr.DataArray(cube.transpose(order), dims=dims, name="reflectance")
+    return array.to_dataset().assign_coords(wavelength=("band", about.pop("nm", NM), about))
+
+
+@pytest.mark.parametrize("dims", [("y", "x", "band"), ("band", "y", "x")])
+@pytest.mark.parametrize("version", [2, 3])
+def test_xarray_datasets(tmp_path: Path, cube: NDArray[np.uint16], dims: tuple[str, ...], version: int) -> None:
+    """Either order of dims and either version of the format give the same scene, with the coordinate's wavelengths."""
+    path = tmp_path / "a.zarr"
+    _dataset(cube, dims, units="nm").to_zarr(path, zarr_format=version, consolidated=False)
+    scene = load_scene_file(path)
+    np.testing.assert_array_equal(scene.values, cube)
+    np.testing.assert_array_equal(scene.wavelength_nm, NM)
+    assert "wavelengths from the array wavelength, in nm" in scene.provenance
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("um", 1e-3), ("micrometers", 1e-3), ("", 1e-3), ("nanometers", 1.0)])
+def test_units_of_wavelengths(tmp_path: Path, cube: NDArray[np.uint16], unit: str, scale: float) -> None:
+    """Micrometres become nm; without a unit the size tells, and the provenance says so."""
+    _dataset(cube, ("y", "x", "band"), nm=NM * scale, units=unit).to_zarr(tmp_path / "a.zarr", consolidated=False)
+    scene = load_scene_file(tmp_path / "a.zarr")
+    np.testing.assert_allclose(scene.wavelength_nm, NM)
+    assert any("by their size" in note for note in scene.provenance) == (unit == "")
+
+
+def test_plain_arrays(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """An array by itself, in both versions, is y, x, band; two axes are one band."""
+    for version in (2, 3):
+        path = tmp_path / f"{version}.zarr"
+        zarr.create_array(path, data=cube, zarr_format=version)
+        scene = load_scene_file(path, wavelengths=NM.tolist())
+        np.testing.assert_array_equal(scene.values, cube)
+        assert "dims have no names, read as y, x, band" in scene.provenance
+    zarr.create_array(tmp_path / "flat.zarr", data=cube[..., 0])
+    assert load_scene_file(tmp_path / "flat.zarr", wavelengths=[550]).values.shape == (7, 9, 1)
+
+
+def test_packed_numbers(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Numbers packed with a scale, an offset and a fill value are read as what they mean."""
+    data = _dataset(np.where(cube > 4000, np.nan, cube * 0.5 + 1), ("y", "x", "band"), units="nm")
+    packing = {"dtype": "i2", "scale_factor": 0.5, "add_offset": 1.0, "_FillValue": -1}
+    data.to_zarr(tmp_path / "a.zarr", encoding={"reflectance": packing}, consolidated=False)
+    scene = load_scene_file(tmp_path / "a.zarr")
+    np.testing.assert_allclose(scene.values, np.where(cube > 4000, np.nan, cube * 0.5 + 1), rtol=1e-6)
+
+
+def test_several_arrays(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Of several cubes one must be named, and can be."""
+    data = _dataset(cube, ("y", "x", "band"), units="nm")
+    data.assign(other=data["reflectance"] + 1).to_zarr(tmp_path / "a.zarr", consolidated=False)
+    with pytest.raises(SceneError, match=r"several arrays .* name one: a\.zarr:ARRAY"):
+        load_scene_file(tmp_path / "a.zarr")
+    np.testing.assert_array_equal(load_scene_file(f"{tmp_path / 'a.zarr'}:other").values, cube + 1)
+    with pytest.raises(SceneError, match="has no array third; it has"):
+        load_scene_file(f"{tmp_path / 'a.zarr'}:third")
+
+
+@pytest.mark.parametrize(
+    ("dims", "words"),
+    [(("time", "a", "b"), "has dims time, a, b; expected y, x, band"), (("y", "x", "y2"), "has dims")],
+)
+def test_dims_that_are_not_known(
+    tmp_path: Path, cube: NDArray[np.uint16], dims: tuple[str, str, str], words: str
+) -> None:
+    """Dims of other names are not guessed at."""
+    xr.DataArray(cube, dims=dims, name="v").to_dataset().to_zarr(tmp_path / "a.zarr", consolidated=False)
+    with pytest.raises(SceneError, match=words):
+        load_scene_file(tmp_path / "a.zarr")
+
+
+def test_own_mosaic(tmp_path: Path) -> None:
+    """A mosaic of this project is the scene that it shows; what no line reached is missing."""
+    values = np.random.default_rng(0).random((8, 9, 5)).astype(np.float32).round(2)
+    values[2, 3] = np.nan
+    writer = MosaicWriter(tmp_path / "mosaic.zarr", (8, 9), NM, fwhm_nm=NM / 100)
+    writer.write_rows(0, values, np.ones((8, 9), np.float32))
+    scene = load_scene_file(tmp_path / "mosaic.zarr")
+    np.testing.assert_allclose(scene.values, values, rtol=3e-4)
+    assert scene.fwhm_nm is not None
+    np.testing.assert_allclose(scene.fwhm_nm, NM / 100)
+
+
+def test_own_raw_cube(tmp_path: Path) -> None:
+    """A raw cube of this project is read over its white panel; lines that cannot be used are missing."""
+    rng = np.random.default_rng(1)
+    shown = rng.uniform(0.1, 0.9, (6, 40, 5))
+    dark, light, panel = np.full((40, 5), 50.0), np.full((40, 5), 1050.0), np.full(5, 0.5)
+    raw = np.rint(dark + shown / panel * (light - dark)).astype(np.uint16)
+    sweep = Sweep("fine-0", "fine", "y", 0.0, 0.0, 6)
+    references = References(dark.astype(np.float32), light.astype(np.float32), panel.astype(np.float32))
+    with RawCubeWriter(tmp_path / "s0.zarr", SweepHeader(sweep, references, NM)) as cube:
+        cube.write([Line(i, raw[i], 0.0, 0.0, i * 0.1, 10.0, i != 3) for i in range(6)])
+    scene = load_scene_file(tmp_path / "s0.zarr")
+    assert np.isnan(scene.values[3]).all()
+    kept = [0, 1, 2, 4, 5]
+    np.testing.assert_allclose(scene.values[kept], shown[kept], atol=1e-3)
+    np.testing.assert_array_equal(open_cube_source(tmp_path / "s0.zarr").read(0, 6), raw)
+
+
+def _edit(path: Path, change: Any) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+class _Trap:
+    """Unpickled, it would leave a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("filters", [True, False])
+def test_pickle_is_never_loaded(tmp_path: Path, cube: NDArray[np.uint16], filters: bool) -> None:
+    """A store that asks for pickle, as filter or compressor, is refused before a chunk is read."""
+    path = tmp_path / "a.zarr"
+    zarr.create_array(path, data=cube, zarr_format=2, chunks=cube.shape, compressors=None)
+    (path / "0.0.0").write_bytes(pickle.dumps(_Trap(tmp_path / "trapped")))
+    key, value = ("filters", [{"id": "pickle"}]) if filters else ("compressor", {"id": "pickle"})
+    _edit(path / ".zarray", lambda content: content.update({key: value}))
+    with pytest.raises(SceneError, match="asks for the codec 'pickle', which is not read"):
+        load_scene_file(path, wavelengths=NM.tolist())
+    assert not (tmp_path / "trapped").exists()
+
+
+def test_codecs_within_shards_are_looked_at(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """A codec inside a shard's own list is refused like any other."""
+    path = tmp_path / "a.zarr"
+    zarr.create_array(path, data=cube, chunks=(7, 9, 5), shards=(7, 9, 5))
+
+    def change(content: dict[str, Any]) -> None:
+        content["codecs"][0]["configuration"]["codecs"].append({"name": "numcodecs.pickle", "configuration": {}})
+
+    _edit(path / "zarr.json", change)
+    with pytest.raises(SceneError, match=r"codec 'numcodecs\.pickle'"):
+        load_scene_file(path, wavelengths=NM.tolist())
+
+
+def test_claims_beyond_the_files(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Metadata that claim far more numbers than the store can hold are refused before anything is allocated."""
+    path = tmp_path / "a.zarr"
+    zarr.create_array(path, data=cube)
+    _edit(path / "zarr.json", lambda content: content.update(shape=[10**12, 9, 5]))
+    with pytest.raises(SceneError, match=r"claims \(1000000000000, 9, 5\) of uint16"):
+        load_scene_file(path, wavelengths=NM.tolist())
+
+
+def test_damaged_stores(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Torn metadata and flipped chunks are one message."""
+    path = tmp_path / "a.zarr"
+    zarr.create_array(path, data=cube)
+    chunk = next(file for file in path.rglob("*") if file.is_file() and file.name != "zarr.json")
+    chunk.write_bytes(chunk.read_bytes()[:5])
+    with pytest.raises(SceneError, match="cannot be read as Zarr"):
+        load_scene_file(path, wavelengths=NM.tolist())
+    (path / "zarr.json").write_text("{")
+    with pytest.raises(SceneError, match="cannot be read as Zarr"):
+        load_scene_file(path, wavelengths=NM.tolist())
