@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import os
 import sys
@@ -11,25 +10,11 @@ import traceback
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cyclopts import App, CycloptsError, Parameter
-from rich.console import Console
-from rich.markup import escape
+from cyclopts import CycloptsError, Parameter
 
+import flows.archive_verbs  # noqa: F401 - registers its verbs
+from flows.app import GOES_ON, app, parse_numbers, parse_wholes, say, split_list, stderr
 from pipeline.errors import PipelineError, SettingsError
-
-
-def _version() -> str:
-    return importlib.metadata.version("spectralzoom")
-
-
-app = App(
-    name="spectralzoom",
-    version=_version,
-    help="Survey a field: look coarsely at everything, finely where it changes the map.",
-    suppress_keyboard_interrupt=False,  # main says what an interrupted survey leaves
-)
-stderr = Console(stderr=True)
-GOES_ON = ("survey", "train")  # verbs that keep what they have done when they are interrupted
 
 
 @app.command
@@ -158,26 +143,6 @@ def tradeoff(
 
 
 @app.command
-def verify(archive: Path) -> int:
-    """Read every byte of an archive again and compare it with what was published.
-
-    Parameters
-    ----------
-    archive
-        The archive's folder.
-    """
-    from storage.archive import Archive
-
-    findings = Archive.open(archive, create=False, write=False).verify_all()
-    for finding in findings:
-        if finding.problem is not None:
-            _say(f"{finding.uri}: {finding.problem}")
-    bad = sum(finding.problem is not None for finding in findings)
-    stderr.print(f"{len(findings) - bad} of {len(findings)} stores and runs are as published", highlight=False)
-    return 1 if bad else 0
-
-
-@app.command
 def train(
     dataset: str,
     *,
@@ -239,37 +204,19 @@ def train(
     size = crop if crop is not None else FARM_CROP if dataset == "farm" else FRAME_CROP
     choices = {
         "labels": labels,
-        "bands": _wholes(bands, "--bands"),
-        "wavelengths": _numbers(wavelengths, "--wavelengths"),
+        "bands": parse_wholes(bands, "--bands"),
+        "wavelengths": parse_numbers(wavelengths, "--wavelengths"),
         "train_mask": train_mask,
-        "mask_classes": _wholes(mask_classes, "--mask-classes"),
+        "mask_classes": parse_wholes(mask_classes, "--mask-classes"),
     }
     request = TrainRequest(
-        dataset, out, _split(hold_out), validation, scenes, patch, factor, columns, positions=positions,
+        dataset, out, split_list(hold_out), validation, scenes, patch, factor, columns, positions=positions,
         choices=choices, settings=TrainingSettings(steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch),
     )  # fmt: skip
     record = run_train(request, stderr)
     if as_json:
         print(json.dumps(record, indent=2))
     return 0
-
-
-def _split(text: str | None) -> tuple[str, ...]:
-    return tuple(part.strip() for part in text.split(",") if part.strip()) if text else ()
-
-
-def _numbers(text: str | None, flag: str) -> list[float] | None:
-    try:
-        return None if text is None else [float(part) for part in _split(text)]
-    except ValueError:
-        raise SettingsError(f"{flag} expects numbers with commas, got {text!r}") from None
-
-
-def _wholes(text: str | None, flag: str) -> list[int] | None:
-    try:
-        return None if text is None else [int(part) for part in _split(text)]
-    except ValueError:
-        raise SettingsError(f"{flag} expects whole numbers with commas, got {text!r}") from None
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -280,10 +227,10 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         code = app(arguments, result_action="return_value", exit_on_error=False, print_error=False)
     except CycloptsError as error:
-        _say(f"{str(error).rstrip('.')}; see spectralzoom --help")
+        say(f"{str(error).rstrip('.')}; see spectralzoom --help")
         sys.exit(SettingsError.exit_code)
     except PipelineError as error:
-        _say(str(error))
+        say(str(error))
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         verb = next(iter(sys.argv[1:] if arguments is None else arguments), "")
@@ -293,13 +240,9 @@ def main(arguments: list[str] | None = None) -> None:
     except BrokenPipeError:
         sys.exit(1)
     except Exception as error:
-        _say(f"{type(error).__name__}: {error}; this is a defect of SpectralZoom: please report {_keep_traceback()}")
+        say(f"{type(error).__name__}: {error}; this is a defect of SpectralZoom: please report {_keep_traceback()}")
         sys.exit(1)
     sys.exit(code if isinstance(code, int) else 0)
-
-
-def _say(message: str) -> None:
-    stderr.print(f"[bold red]error[/]: {escape(message)}", highlight=False, soft_wrap=True)
 
 
 def _keep_traceback() -> Path:

@@ -1,0 +1,171 @@
+"""Verbs on an archive: what is in it, how it came about, is it whole, what can go, in and out of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from flows.app import app, parse_numbers, stderr
+
+
+@app.command
+def ls(archive: Path, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False) -> int:
+    """List the runs and stores of an archive: when, what of, how good, how large.
+
+    Parameters
+    ----------
+    archive
+        The archive's folder.
+    as_json
+        Print the list as JSON on stdout.
+    """
+    from flows.archive_commands import run_ls
+
+    return run_ls(archive, as_json=as_json)
+
+
+@app.command
+def explain(
+    archive: Path, product: str, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False
+) -> int:
+    """Show how a product came about, and what changed since the version before it.
+
+    Parameters
+    ----------
+    archive
+        The archive's folder.
+    product
+        Its address (stages/rectify/KEY), a key or its beginning, a run, or a product's name in the newest run
+        (class_map, mosaic).
+    as_json
+        Print the lineage as JSON on stdout.
+    """
+    from flows.archive_commands import run_explain
+
+    return run_explain(archive, product, as_json=as_json)
+
+
+@app.command
+def verify(
+    archive: Path,
+    *,
+    repair: Annotated[bool, Parameter(negative="")] = False,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+) -> int:
+    """Read every byte of an archive again and compare it with what was published.
+
+    Parameters
+    ----------
+    archive
+        The archive's folder.
+    repair
+        Make anew what is broken and what was made of it, by running the surveys again that name it.
+    as_json
+        Print what was found as JSON on stdout.
+    """
+    from flows.archive_commands import run_verify
+
+    return run_verify(archive, stderr, remake=repair, as_json=as_json)
+
+
+@app.command
+def gc(
+    archive: Path,
+    *,
+    keep_days: float = 1.0,
+    raw_too: Annotated[bool, Parameter(negative="")] = False,
+    dry_run: Annotated[bool, Parameter(negative="")] = False,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+) -> int:
+    """Remove what no run names and no named product rests on.
+
+    Parameters
+    ----------
+    archive
+        The archive's folder.
+    keep_days
+        Stores younger than this stay: a survey may be about to name them.
+    raw_too
+        Also raw lines of a rig, or ingested, that no run names; they cannot be had again.
+    dry_run
+        Only say what would go, and how many bytes.
+    as_json
+        Print what went as JSON on stdout.
+    """
+    from flows.archive_commands import run_gc
+
+    return run_gc(archive, stderr, keep_days=keep_days, raw_too=raw_too, dry_run=dry_run, as_json=as_json)
+
+
+@app.command
+def export(
+    archive: Path,
+    run: str | None = None,
+    *,
+    out: Annotated[Path, Parameter(name=("--out", "-o"))],
+    envi: Annotated[bool, Parameter(negative="")] = False,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+) -> int:
+    """Export a run: maps as cloud-optimised GeoTIFF, a STAC catalogue of them, and on request cubes as ENVI.
+
+    Parameters
+    ----------
+    archive
+        The archive's folder.
+    run
+        The run's name, a folder's below runs; the latest without one.
+    out
+        Folder to export into, beside the runs of the same archive that lie there.
+    envi
+        Also write the coarse mosaic and the raw sweeps as ENVI files.
+    as_json
+        Print what was written as JSON on stdout.
+    """
+    from flows.export_command import run_export
+
+    content = run_export(archive, run, out, envi, stderr)
+    if as_json:
+        print(json.dumps(content, indent=2))
+    return 0
+
+
+@app.command
+def ingest(
+    source: str,
+    archive: Path,
+    *,
+    name: str | None = None,
+    dark: str | None = None,
+    white: str | None = None,
+    wavelengths: str | None = None,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+) -> int:
+    """Store SOURCE in ARCHIVE as one cube that never changes; the same content is stored once.
+
+    Parameters
+    ----------
+    source
+        ENVI header or data file, folder of a Headwall camera, GeoTIFF, .mat, .npy, PNG, or Zarr store.
+    archive
+        The archive's folder; it is made where there is none.
+    name
+        What the cube is called; the file's or folder's name by default.
+    dark
+        Dark frame, ENVI or .npy, averaged over its lines; a Headwall folder's own by default.
+    white
+        White frame, likewise.
+    wavelengths
+        Centre wavelengths of all bands [nm], where the files do not say them: 660,800
+    as_json
+        Print what was stored as JSON on stdout.
+    """
+    from flows.ingest_command import IngestRequest, run_ingest
+
+    request = IngestRequest(source, archive, name, dark, white, parse_numbers(wavelengths, "--wavelengths"))
+    record = run_ingest(request, stderr)
+    if as_json:
+        print(json.dumps(record, indent=2))
+    return 0
