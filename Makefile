@@ -1,4 +1,4 @@
-# SpectralZoom: setup, survey, test, lint, bench, lock.
+# SpectralZoom: setup, survey, test, lint, bench, faults, lock.
 #   make survey ARCHIVE=/data/field7    make test PY=python3.12 VENV=/tmp/venv    make test PYTEST_ARGS="-x tests/pipeline"
 PY ?= python3
 VENV ?= .venv
@@ -11,7 +11,7 @@ BIN := $(VENV)/bin
 # The tools beneath are asked to send no analytics.
 export DO_NOT_TRACK = 1
 
-.PHONY: setup survey test lint bench lock
+.PHONY: setup survey test lint bench faults lock
 .DEFAULT_GOAL := setup
 
 setup: $(BIN)/.ok
@@ -38,6 +38,16 @@ lint: $(BIN)/.ok
 bench: $(BIN)/.ok
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks $(BENCH); crashed=$$?; \
 		OMP_NUM_THREADS=1 $(BIN)/spectralzoom tradeoff && exit $$crashed
+
+FAULTS ?= faults-archive
+
+# Minutes: kills, flipped bits and mutated headers by the hundred; the tests hold a quick part of each.
+faults: $(BIN)/.ok
+	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/faults/kills.py 100
+	$(BIN)/spectralzoom survey --scene farm --size 256x256 --no-controls --engine plain --out $(FAULTS)
+	PYTHONPATH=. $(BIN)/python tests/faults/flips.py $(FAULTS) 200
+	PYTHONPATH=. $(BIN)/python tests/faults/mutated_headers.py 10000
+	rm -rf $(FAULTS)
 
 # Names and versions only. A machine that is offered a CPU wheel of torch does not resolve the accelerator's packages:
 # their lines are kept as they are.
