@@ -124,7 +124,7 @@ def tradeoff(
     Parameters
     ----------
     stage
-        rectify or plan; all without one.
+        rectify, plan or store; all without one.
     out
         Folder for tradeoff.json and tradeoff.png.
     repeats

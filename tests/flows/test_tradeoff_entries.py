@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flows import tradeoff_budget
+from flows import tradeoff_budget, tradeoff_store
 from flows.tradeoff import measure_tradeoff
 from flows.tradeoff_line_model import LINE_MODEL
 from flows.tradeoff_overlap import OVERLAP, Seams
 from flows.tradeoff_resample import RESAMPLE, draw_waves, noise_levels
 from flows.tradeoff_scan_step import SCAN_STEP
+from flows.tradeoff_store import BITS, CODEC, SIZE
 from flows.tradeoff_tie_spacing import TIE_SPACING
 from pipeline.camera import LineCamera
 from pipeline.coverage import cheapest_full
@@ -97,3 +98,23 @@ def test_a_larger_budget_takes_more_seconds_and_draws_a_better_map(monkeypatch):
     assert 0.55 < half.price_s / full_s <= 0.6
     assert 0.95 < whole.price_s / full_s <= 1.0
     assert 0 < whole.error < half.error < 0.5
+
+
+def test_fewer_bits_are_smaller_and_change_more_of_the_map(monkeypatch):
+    """Kept bits of the mosaic: at eleven hardly a class changes, at three many do, in fewer bytes."""
+    monkeypatch.setattr(tradeoff_store, "SHAPE", (128, 192))
+    state = BITS.prepare(0)
+    judged = {kept: BITS.judge(state, kept, BITS.run(state, kept)) for kept in (23.0, 11.0, 3.0)}
+    sizes = {kept: SIZE.judge(state, kept, SIZE.run(state, kept)) for kept in judged}
+    assert judged[23.0] == 0
+    assert judged[11.0] < 2e-3 < judged[3.0]
+    assert sizes[3.0] < sizes[11.0] < sizes[23.0]
+
+
+def test_codecs_give_back_raw_lines_in_fewer_bytes(monkeypatch):
+    """Every codec but none stores a sample of uint16 in less than two bytes."""
+    monkeypatch.setattr(tradeoff_store, "SHAPE", (128, 192))
+    state = CODEC.prepare(0)
+    sizes = {codec: CODEC.judge(state, codec, CODEC.run(state, codec)) for codec in CODEC.settings}
+    assert all(size < 2 for codec, size in sizes.items() if codec != "none")
+    assert sizes["zstd-3"] < sizes["lz4-5"] < sizes["none"]
