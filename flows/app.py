@@ -22,7 +22,7 @@ app = App(
     suppress_keyboard_interrupt=False,  # main says what an interrupted survey leaves
 )
 stderr = Console(stderr=True)
-GOES_ON = ("survey", "train", "export")  # verbs that keep what they have done when they are interrupted
+GOES_ON = ("survey", "train", "export", "reprocess")  # verbs that keep what they have done when they are interrupted
 
 
 def say(message: str) -> None:

@@ -169,3 +169,72 @@ def ingest(
     if as_json:
         print(json.dumps(record, indent=2))
     return 0
+
+
+@app.command
+def compare(
+    archive: Path,
+    old: str,
+    new: str,
+    *,
+    out: Annotated[Path | None, Parameter(name=("--out", "-o"))] = None,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+) -> int:
+    """Compare two runs of one field: classes, where they differ, what was asked and spent, and a picture.
+
+    Parameters
+    ----------
+    archive
+        The archive's folder.
+    old, new
+        Runs A and B: names of folders below runs, `latest`, or `previous`, the one before it of the same field.
+    out
+        Folder for the picture; beside the archive without one.
+    as_json
+        Print the comparison as JSON on stdout.
+    """
+    from flows.compare_command import run_compare
+
+    return run_compare(archive, old, new, out, as_json=as_json)
+
+
+@app.command
+def reprocess(
+    archive: Path,
+    *,
+    since: str | None = None,
+    stage: str | None = None,
+    field: str | None = None,
+    failed: Annotated[bool, Parameter(negative="")] = False,
+    weights: Path | None = None,
+    dry_run: Annotated[bool, Parameter(negative="")] = False,
+    out: Annotated[Path | None, Parameter(name=("--out", "-o"))] = None,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+) -> int:
+    """Survey every field of an archive again: light is found there, only what has changed is made anew.
+
+    Parameters
+    ----------
+    archive
+        The archive's folder.
+    since
+        Only fields whose newest run is of this date (UTC) or later: 2026-05-01
+    stage
+        Only where this stage would be made anew: segment, draw_map
+    field
+        Only fields whose survey, scene file or newest run is called so; * stands for any letters.
+    failed
+        Only fields whose newest run is damaged or lacks stores; what `verify` finds in bytes is for its --repair.
+    weights
+        Other model weights for all of them.
+    dry_run
+        Only say what would run.
+    out
+        Folder for the summary, reprocess-TIME.json.
+    as_json
+        Print the summary as JSON on stdout.
+    """
+    from flows.reprocess_command import ReprocessRequest, run_reprocess
+
+    request = ReprocessRequest(archive, since, stage, field, failed, weights, dry_run, out)
+    return run_reprocess(request, stderr, as_json=as_json)

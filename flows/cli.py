@@ -111,6 +111,79 @@ def survey(
 
 
 @app.command
+def plan(
+    settings: Path | None = None,
+    *,
+    scene: str | None = None,
+    labels: str | None = None,
+    bands: str | None = None,
+    wavelengths: str | None = None,
+    out: str | None = None,
+    budget: str | None = None,
+    policy: str | None = None,
+    mask: str | None = None,
+    weights: str | None = None,
+    seed: str | None = None,
+    effects: str | None = None,
+    controls: bool | None = None,
+    kernel: str | None = None,
+    pointing_px: str | None = None,
+    size: str | None = None,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+) -> int:
+    """Tell what a survey would run: what is stored, what is to be made and why, and about how long it takes.
+
+    Nothing is captured or written. Give the settings that you would give to `survey`.
+
+    Parameters
+    ----------
+    settings
+        A survey's TOML file; flags win over it.
+    scene
+        `farm` (built in), or an image or cube file.
+    labels
+        File of class colours or numbers on the scene's pixels.
+    bands
+        Bands to use, from 0: 0,1
+    wavelengths
+        Their centre wavelengths [nm]: 660,800
+    out
+        Archive folder; `archive` by default. It need not be there yet.
+    budget
+        Seconds of coarse and fine capture over those of the full scan; 0.5 by default.
+    policy
+        Where to look twice: entropy, sobel, random or mask.
+    mask
+        Image of where to look twice, for the policy mask.
+    weights
+        Model weights (.safetensors).
+    seed
+        Of the scene `farm` and of all noise.
+    effects
+        auto, all, none, or names with commas.
+    controls
+        Also judge other placements of the same number of seats (needs labels).
+    kernel
+        How lines are read between samples: catmull-rom, bilinear or nearest.
+    pointing_px
+        How far off the mirror may point [px].
+    size
+        Of the scene `farm`, width x height: 1280x1024
+    as_json
+        Print the plan as JSON on stdout.
+    """
+    from flows.forecast_command import run_plan
+    from flows.settings import load_settings
+
+    flags = {
+        "scene": scene, "labels": labels, "bands": bands, "wavelengths": wavelengths, "out": out, "budget": budget,
+        "policy": policy, "mask": mask, "weights": weights, "seed": seed, "effects": effects, "controls": controls,
+        "kernel": kernel, "pointing_px": pointing_px, "size": size,
+    }  # fmt: skip
+    return run_plan(load_settings(settings, flags), as_json=as_json)
+
+
+@app.command
 def tradeoff(
     stage: str | None = None,
     *,

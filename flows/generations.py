@@ -1,0 +1,133 @@
+"""Fields of an archive, the newest run of each, and whether it is as the present code, weights and settings make it."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from functools import cache
+from importlib import resources
+from pathlib import Path, PurePath
+
+from flows.run import SHIPPED
+from flows.settings import BUILT_IN_SCENES, Settings, parse_settings
+from flows.stages import VERSIONS
+from flows.survey import STAGES
+from pipeline.errors import SettingsError
+from pipeline.simulator.farm import FARM_LAW
+from storage.keys import canonical_json
+from storage.lineage import Catalogue
+from storage.records import Run
+
+# what the light of a field depends on; surveys that agree in these are generations of one
+OF_THE_LIGHT = (
+    "scene", "bands", "wavelengths", "source", "seed", "effects", "size", "camera", "pointing_px", "pose",
+)  # fmt: skip
+WEIGHED = ("attend", "segment", "evaluate")  # stages of which the weights are a parameter
+
+
+@dataclass(frozen=True)
+class Generation:
+    """The newest run of one field."""
+
+    field: str  # what its survey is called
+    run: Run
+
+
+def newest_runs(catalogue: Catalogue) -> list[Generation]:
+    """The newest run of every field, oldest first; runs whose settings cannot be read are fields of their own."""
+    found: dict[str, Generation] = {}
+    for run in catalogue.runs:  # oldest first
+        name = str(run.receipt.get("survey") or run.facts.get("survey") or run.folder.name)
+        light = {key: run.settings.get(key) for key in OF_THE_LIGHT}
+        field = canonical_json([name, light if run.settings else run.uri])
+        found.pop(field, None)
+        found[field] = Generation(name, run)
+    return list(found.values())
+
+
+def is_called(generation: Generation, pattern: str) -> bool:
+    """Whether a field's survey, scene or run is called so; ``*`` stands for any letters."""
+    scene = str(generation.run.settings.get("scene", ""))
+    names = (generation.field, scene, PurePath(scene).name, generation.run.folder.name)
+    return any(fnmatch(name, pattern) for name in names)
+
+
+def asked_again(run: Run, out: Path, weights: Path | None) -> Settings:
+    """The settings of a run for another survey into the archive ``out``, with other weights if they are given.
+
+    Raises
+    ------
+    SettingsError, BudgetError : the run's settings cannot be read, or are not of this version.
+    """
+    if not run.settings:
+        raise SettingsError(f"the settings of {run.uri} cannot be read ({run.problem}); survey this field by hand")
+    known = {name: value for name, value in run.settings.items() if name in Settings.__dataclass_fields__}
+    return parse_settings({**known, "out": str(out), **({} if weights is None else {"weights": str(weights)})})
+
+
+def stale_stores(catalogue: Catalogue, uris: set[str], weights: str | None) -> set[str]:
+    """Stores that a survey would not find as it wants them: gone, damaged, of another version, of other weights."""
+    return {uri for uri in uris if _is_stale(catalogue, uri, weights)}
+
+
+def _is_stale(catalogue: Catalogue, uri: str, weights: str | None) -> bool:
+    store = catalogue.stores.get(uri)
+    if store is None or store.problem is not None or store.version != str(VERSIONS.get(store.ref.stage)):
+        return True
+    return store.ref.stage in WEIGHED and store.params.get("weights", weights) != weights
+
+
+def is_whole(catalogue: Catalogue, run: Run) -> bool:
+    """Whether run and stores are there, told from manifests alone, and none of its stages failed."""
+    stores = [catalogue.stores.get(uri) for uri in catalogue.named_and_below[run.uri]]
+    failed = any(row.get("state") == "failed" for row in run.stages)
+    return run.problem is None and not failed and all(one is not None and one.problem is None for one in stores)
+
+
+def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
+    """Whether its survey with these settings would find all that this run names or rests on, by versions and weights.
+
+    What lies in a scene's file is not looked at.
+    """
+    farm = settings.scene not in BUILT_IN_SCENES or str(run.receipt.get("scene")).startswith(FARM_LAW)
+    stale = stale_stores(catalogue, catalogue.named_and_below[run.uri], weights_key(settings))
+    return farm and not stale and is_whole(catalogue, run)
+
+
+def would_remake(catalogue: Catalogue, run: Run, stage: str, settings: Settings) -> bool:
+    """Whether a stage (a store's, such as segment, or a survey's, such as draw_map) would be made anew.
+
+    Told from versions and weights in the manifests; what new weights of another patch size change in the plan is not.
+    """
+    own = [
+        uri for uri in catalogue.named_and_below[run.uri] if uri.split("/")[1] == stage or stage in _called(run, uri)
+    ]
+    return bool(stale_stores(catalogue, set(own) | catalogue.ancestors(own), weights_key(settings)))
+
+
+def check_stage(stage: str) -> None:
+    """Raise SettingsError unless a stage is called so."""
+    known = sorted({*VERSIONS, *STAGES})
+    if stage not in known:
+        raise SettingsError(f"--stage {stage}: there is no such stage; there are {', '.join(known)}")
+
+
+def weights_key(settings: Settings) -> str | None:
+    """The beginning of the SHA-256 of the weights' file, as stages know it; None where it cannot be read."""
+    shipped = Path(str(resources.files("models") / "shipped" / SHIPPED))
+    path = shipped if settings.weights is None else Path(settings.weights)
+    try:
+        return _file_key(path, path.stat().st_mtime_ns, path.stat().st_size)
+    except OSError:
+        return None
+
+
+@cache
+def _file_key(path: Path, changed_ns: int, size: int) -> str:
+    """Read once for all fields, and again when the file has changed."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:20]
+
+
+def _called(run: Run, uri: str) -> set[str]:
+    return {str(row.get("name")) for row in run.stages if row.get("key") == uri.rpartition("/")[2]}

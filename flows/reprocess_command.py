@@ -1,0 +1,185 @@
+"""What `spectralzoom reprocess` does: the surveys of an archive again, each beside the one before it.
+
+What the archive holds is found by its key, raw light above all; only what new weights or newer stages change is made.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+
+from flows.archive_commands import DONE, FAILED, PARTLY
+from flows.figures import format_points, format_seconds
+from flows.generations import (
+    Generation,
+    asked_again,
+    check_stage,
+    is_called,
+    is_current,
+    is_whole,
+    newest_runs,
+    would_remake,
+)
+from flows.receipt import to_json
+from flows.settings import Settings
+from pipeline.errors import PipelineError, SettingsError
+from storage.archive import Archive
+from storage.lineage import Catalogue
+from storage.records import read_run
+from storage.whole_files import write_whole
+
+Survey = Callable[[Settings, Console], Path]  # settings in, the folder of the published run out
+STATES = ("ran", "would run", "skipped", "failed")
+
+
+@dataclass(frozen=True)
+class ReprocessRequest:
+    """Which fields, and with what."""
+
+    archive: Path
+    since: str | None = None  # ISO date (UTC); the newest run of the field is of this day or later
+    stage: str | None = None  # only where it would be made anew
+    field: str | None = None  # what survey, scene file or run is called; * for any letters
+    failed: bool = False  # only where the newest run is damaged or lacks stores
+    weights: Path | None = None
+    dry_run: bool = False
+    out: Path | None = None  # folder for reprocess-TIME.json
+
+
+def run_reprocess(
+    request: ReprocessRequest, console: Console, *, survey: Survey | None = None, as_json: bool = False
+) -> int:
+    """Survey again what was asked for; progress on ``console``, the summary on stdout and in ``out``.
+
+    Fields whose newest run is already as it would become are skipped: the same command goes on after an interruption.
+
+    Raises
+    ------
+    SettingsError : a date or stage that is none, or no field is called so.
+    ArchiveError : the archive cannot be read or written.
+    """
+    opened = Archive.open(request.archive, create=False, write=not request.dry_run)
+    catalogue = Catalogue.read(opened.root)
+    wanted = _chosen(catalogue, request, opened.root)
+    started = f"{datetime.now(UTC):%Y%m%dT%H%M%S}"
+    file = None if request.out is None or request.dry_run else request.out / f"reprocess-{started}.json"
+    rows: list[dict[str, Any]] = []
+    content = {"archive": str(opened.root), "started": started, "dry_run": request.dry_run, "fields": rows}
+    for number, generation in enumerate(wanted, 1):
+        told = f"{number} of {len(wanted)}: {generation.field} ({generation.run.folder.name})"
+        console.print(f"[bold]reprocess {escape(told)}[/]", highlight=False, soft_wrap=True)
+        rows.append(_again(catalogue, generation, request, console, survey or _survey))
+        console.print(escape(_words(rows[-1])), highlight=False, soft_wrap=True)
+        if file is not None:
+            write_whole(file, to_json(content))  # also of what was done before an interruption
+    if as_json:
+        sys.stdout.write(to_json(content))
+    else:
+        _show(content, file)
+    return _exit_code([row["state"] for row in rows])
+
+
+def _chosen(catalogue: Catalogue, request: ReprocessRequest, root: Path) -> list[Generation]:
+    """Newest runs of the fields that were asked for."""
+    if request.weights is not None and not request.weights.is_file():
+        raise SettingsError(f"--weights {request.weights}: there is no such file; give weights that train has written")
+    since = None if request.since is None else _moment(request.since)
+    fields = newest_runs(catalogue)
+    if request.field is not None:
+        names = ", ".join(dict.fromkeys(one.field for one in fields)) or "none"
+        fields = [one for one in fields if is_called(one, request.field)]
+        if not fields:
+            raise SettingsError(f"--field {request.field}: no field of this archive is called so; there are {names}")
+    if since is not None:
+        fields = [one for one in fields if _moment(one.run.created or "0001-01-01") >= since]
+    if request.failed:
+        fields = [one for one in fields if not is_whole(catalogue, one.run)]
+    if request.stage is not None:
+        check_stage(request.stage)
+        fields = [one for one in fields if _would_remake(catalogue, one, request, root)]
+    return fields
+
+
+def _would_remake(catalogue: Catalogue, one: Generation, request: ReprocessRequest, root: Path) -> bool:
+    try:
+        settings = asked_again(one.run, root, request.weights)
+    except PipelineError:
+        return True  # said when its turn comes
+    return would_remake(catalogue, one.run, str(request.stage), settings)
+
+
+def _moment(text: str) -> datetime:
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise SettingsError(f"--since expects a date such as 2026-05-01, got {text!r}") from None
+    return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+
+
+def _again(
+    catalogue: Catalogue, generation: Generation, request: ReprocessRequest, console: Console, survey: Survey
+) -> dict[str, Any]:
+    """One field surveyed again; an error is said in its row."""
+    run, begun = generation.run, time.perf_counter()
+    row: dict[str, Any] = {
+        "field": generation.field, "scene": run.settings.get("scene"), "old": run.folder.name, "new": None,
+        "state": "failed", "message": None, "miou_before": _miou(run.receipt), "miou_after": None, "seconds": None,
+    }  # fmt: skip
+    try:
+        settings = asked_again(run, run.folder.parents[1], request.weights)
+        if is_current(catalogue, run, settings):
+            return row | {"state": "skipped", "message": "is as it would become", "miou_after": row["miou_before"]}
+        if request.dry_run:
+            return row | {"state": "would run"}
+        folder = survey(settings, console)
+    except PipelineError as error:
+        return row | {"message": str(error), "seconds": time.perf_counter() - begun}
+    after, seconds = _miou(read_run(folder, {}).receipt), time.perf_counter() - begun
+    return row | {"new": folder.name, "state": "ran", "miou_after": after, "seconds": seconds}
+
+
+def _survey(settings: Settings, console: Console) -> Path:
+    from flows.survey_command import run_survey
+
+    return run_survey(settings, console).folder
+
+
+def _miou(receipt: Mapping[str, Any]) -> float | None:
+    accuracy = receipt.get("accuracy")
+    found = accuracy.get("miou") if isinstance(accuracy, Mapping) else None
+    return float(found) if isinstance(found, int | float) else None
+
+
+def _exit_code(states: Sequence[str]) -> int:
+    """Done, partly, or failed where every field did."""
+    failed = states.count("failed")
+    return DONE if not failed else FAILED if failed == len(states) else PARTLY
+
+
+def _words(row: Mapping[str, Any]) -> str:
+    """What became of one field, in one line."""
+    words = f"{row['field']} ({row['old']}) {row['state']}"
+    if row["state"] == "ran":
+        scores = [row["miou_before"], row["miou_after"]]
+        scored = f", mIoU {' to '.join(map(format_points, scores))}" if None not in scores else ""
+        return f"{words}: {row['new']}, {format_seconds(row['seconds'])}{scored}"
+    return words + (f": {row['message']}" if row["message"] else "")
+
+
+def _show(content: Mapping[str, Any], file: Path | None) -> None:
+    """Print the summary on stdout, a line a field."""
+    rows = content["fields"]
+    counts = {state: sum(row["state"] == state for row in rows) for state in STATES}
+    told = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
+    count = f"{len(rows)} field{'' if len(rows) == 1 else 's'}: {told}"
+    lines = [*map(_words, rows), count if rows else "no field matches: nothing to do"]
+    lines += [] if file is None or not rows else [f"  {file}"]
+    sys.stdout.write("\n".join(lines) + "\n")

@@ -1,0 +1,178 @@
+"""compare: two runs of one field, by laws on maps as chance made them and on the runs of real, tiny surveys."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from flows.compare_command import _pair_of, find_run, run_compare
+from flows.difference_picture import OTHER, SAME, MapPair, change_rgb, draw_difference
+from pipeline.errors import ArchiveError, SceneError, ShapeError
+from pipeline.grid import UNLABELLED
+from storage.archive import Archive
+from storage.class_maps import ClassMap
+from storage.lineage import Catalogue
+from tests.conftest import Survey, WeightsMaker
+
+POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 25.0, "tilt_deg": 50.0, "height_m": 14.0}
+
+
+@pytest.fixture(scope="module")
+def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> Path:
+    """An archive of two surveys of one scene with different budgets; not to be changed."""
+    folder = tmp_path_factory.mktemp("compared") / "archive"
+    for budget in ("0.8", "0.6"):
+        survey_png(folder, budget=budget)
+    return folder
+
+
+def _compared(capsys: pytest.CaptureFixture[str], *words: Any) -> dict[str, Any]:
+    capsys.readouterr()
+    assert run_compare(*words, as_json=True) == 0
+    content: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return content
+
+
+def _map(classes: np.ndarray[Any, Any], names: tuple[str, ...], seed: int = 0) -> ClassMap:
+    colours = np.random.default_rng(seed).integers(0, 256, (len(names), 3), dtype=np.uint8)
+    return ClassMap(np.asarray(classes, np.uint8), np.ones(classes.shape, np.float32), names, colours)
+
+
+def test_a_run_is_the_same_as_itself(surveyed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nothing differs, and every class agrees wholly."""
+    content = _compared(capsys, surveyed, "latest", "latest", tmp_path)
+    assert content["differing"] == {"pixels": 0, "share": 0.0, "pairs": 0}
+    assert (content["settings"], content["versions"], content["largest"]) == ([], [], [])
+    assert {row["iou"] for row in content["classes"]} == {1.0}
+    assert content["confidence"]["change"] == 0
+    assert run_compare(surveyed, "latest", "latest", tmp_path) == 0
+    assert "settings and versions are the same" in capsys.readouterr().out
+
+
+def test_two_budgets_are_told_apart(surveyed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Areas add up to the field, pairs to the pixels that differ, and the setting that was changed is named."""
+    content = _compared(capsys, surveyed, "previous", "latest", tmp_path)
+    assert content["settings"] == [{"name": "budget", "old": 0.8, "new": 0.6}]
+    for side in (0, 1):
+        assert sum(row["pixels"][side] for row in content["classes"]) == 96 * 128
+    assert sum(row["pixels"] for row in content["largest"]) == content["differing"]["pixels"] > 0
+    assert content["savings"]["lines"][0] > content["savings"]["lines"][1] > 0
+    assert content["a"]["miou"] != content["b"]["miou"]
+    with Image.open(content["picture"]) as picture:
+        assert picture.format == "PNG"
+        assert picture.width > 3 * 400
+    run_compare(surveyed, "previous", "latest", tmp_path)
+    out = capsys.readouterr().out
+    for words in ("budget", "time of capture", "IoU of A and B", "confidence", "compare-"):
+        assert words in out
+
+
+def test_swapping_the_runs_swaps_the_figures(
+    surveyed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And agreement stays."""
+    one, other = (
+        _compared(capsys, surveyed, *runs, tmp_path) for runs in (("previous", "latest"), ("latest", "previous"))
+    )
+    assert one["differing"] == other["differing"]
+    assert [(row["name"], row["pixels"], row["iou"]) for row in one["classes"]] == [
+        (row["name"], row["pixels"][::-1], row["iou"]) for row in other["classes"]
+    ]
+    assert {(row["from"], row["to"], row["pixels"]) for row in one["largest"]} == {
+        (row["to"], row["from"], row["pixels"]) for row in other["largest"]
+    }
+
+
+def test_the_picture_lies_beside_the_archive(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Named by both runs; the archive itself is left as it is."""
+    old, new = (path.name for path in Archive.open(surveyed).runs())
+    before = sorted(surveyed.rglob("*"))
+    content = _compared(capsys, surveyed, old, f"runs/{new}")
+    assert Path(content["picture"]) == surveyed.parent / f"compare-{old}-{new}.png"
+    assert sorted(surveyed.rglob("*")) == before
+
+
+def test_new_weights_and_hectares_are_told(
+    survey_png: Survey, make_weights: WeightsMaker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Weights by their content, and hectares where both runs have a map on the ground."""
+    small = {"pose": POSE, "map": {"resolution_m": 0.02}}
+    for names in (("class_0", "class_1", "class_2"), ("class_1", "class_0", "class_2", "more")):
+        survey_png(tmp_path / "archive", weights=str(make_weights(names=names)), **small)
+    content = _compared(capsys, tmp_path / "archive", "previous", "latest", tmp_path)
+    assert "weights" in {row["name"] for row in content["versions"]}
+    assert sum(row["ha"][1] for row in content["classes"]) > 0
+    run_compare(tmp_path / "archive", "previous", "latest", tmp_path)
+    assert "ha in B" in capsys.readouterr().out
+
+
+def test_runs_of_different_fields_are_refused(survey_png: Survey, scene_files: Path, tmp_path: Path) -> None:
+    """Also by `previous`, which looks for the same field."""
+    turned = tmp_path / "turned.png"
+    with Image.open(scene_files / "scene.png") as image:
+        image.transpose(Image.Transpose.ROTATE_180).save(turned)
+    for scene in (scene_files / "scene.png", turned):
+        survey_png(tmp_path / "archive", scene=str(scene), labels=None)
+    old, new = (path.name for path in Archive.open(tmp_path / "archive").runs())
+    with pytest.raises(SceneError, match=r"different fields.*turned\.png"):
+        run_compare(tmp_path / "archive", old, new)
+    with pytest.raises(ArchiveError, match="no run of the field"):
+        run_compare(tmp_path / "archive", "previous", "latest")
+    with pytest.raises(ArchiveError, match="there is no run nothing"):
+        run_compare(tmp_path / "archive", "nothing", "latest")
+
+
+def test_an_empty_archive_has_no_latest(tmp_path: Path) -> None:
+    """It says so."""
+    Archive.open(tmp_path)
+    with pytest.raises(ArchiveError, match="no run of this archive"):
+        find_run(Catalogue.read(tmp_path), "latest")
+
+
+def test_classes_are_matched_by_name() -> None:
+    """The same map under another order of names is the same map; a class that only one list has stays its own."""
+    classes = np.random.default_rng(3).integers(0, 3, (9, 7)).astype(np.uint8)
+    classes[0, 0] = UNLABELLED
+    order = np.full(256, UNLABELLED, np.uint8)
+    order[:3] = (2, 0, 1)
+    pair = _pair_of([_map(classes, ("a", "b", "c")), _map(order[classes], ("b", "c", "a", "d"))])
+    assert pair.maps.names == ("a", "b", "c", "d")
+    np.testing.assert_array_equal(pair.maps.old, pair.maps.new)
+    assert not pair.maps.pairs
+    assert np.trace(pair.joint) == classes.size
+
+
+def test_maps_of_different_sizes_are_refused() -> None:
+    """With both sizes."""
+    with pytest.raises(ShapeError, match=r"\(4, 4\) and \(4, 5\)"):
+        _pair_of([_map(np.zeros((4, width)), ("a",)) for width in (4, 5)])
+
+
+def test_changes_have_colours_of_their_own() -> None:
+    """The largest pairs each, the rest dark, what is the same light; pixels without a class count as a class."""
+    rng = np.random.default_rng(1)
+    names = tuple("abcdef")
+    old, new = (rng.integers(0, 6, (40, 50)).astype(np.uint8) for _ in range(2))
+    new[:2] = UNLABELLED
+    maps = _pair_of([_map(old, names), _map(new, names)]).maps
+    assert [count for *_, count in maps.pairs] == sorted((count for *_, count in maps.pairs), reverse=True)
+    picture = change_rgb(maps)
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 12
+    np.testing.assert_array_equal((picture == np.float32(SAME)).all(axis=-1), old == new)
+    assert (picture == np.float32(OTHER)).all(axis=-1).any()
+    assert (maps.name(0), maps.name(UNLABELLED)) == ("a", "no class")
+
+
+def test_wide_tall_and_equal_maps_are_drawn() -> None:
+    """Names with dollar signs are text."""
+    for shape in ((1, 90), (300, 8)):
+        zero = np.zeros(shape, np.uint8)
+        drawn = draw_difference(MapPair(zero, zero, ("a $x$_b",), np.zeros((1, 3), np.uint8), []), ("A", "B", "none"))
+        with Image.open(io.BytesIO(drawn)) as picture:
+            assert picture.format == "PNG"

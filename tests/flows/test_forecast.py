@@ -1,0 +1,185 @@
+"""The plan of a survey says beforehand what the survey then does, and changes nothing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.forecast import StageForecast, forecast
+from flows.forecast_command import run_plan
+from flows.settings import Settings, load_settings
+from flows.stages import VERSIONS
+from pipeline.errors import ArchiveError
+from pipeline.simulator.simulated import SimulatedSource
+from storage.archive import Archive
+
+WAITS = {"locate": "capture_coarse", "rectify": "locate", "attend": "rectify", "capture_fine": "attend"}
+ON_REQUEST = ["register_coarse", "register_fine", "ground"]
+
+
+@pytest.fixture(scope="module")
+def settings(scene_files: Path, weights: Path) -> Settings:
+    """Those of the small picture with labels, without an archive."""
+    flags = {"scene": scene_files / "scene.png", "labels": scene_files / "labels.png", "weights": weights}
+    given = {name: str(path) for name, path in flags.items()}
+    return load_settings(None, given | {"engine": "plain", "budget": "0.8", "controls": False})
+
+
+@pytest.fixture(scope="module")
+def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> tuple[Path, Any]:
+    """An archive with one survey of the small picture, not to be changed, and its receipt."""
+    out = tmp_path_factory.mktemp("surveyed")
+    return out, survey_png(out).receipt
+
+
+@pytest.fixture
+def archive(surveyed: tuple[Path, Any], tmp_path: Path) -> Path:
+    """A copy of that archive."""
+    return Path(shutil.copytree(surveyed[0], tmp_path / "archive"))
+
+
+def _plan(settings: Settings, out: Path, **changes: Any) -> dict[str, StageForecast]:
+    return {row.stage: row for row in forecast(replace(settings, out=str(out), **changes))}
+
+
+def _tree(root: Path) -> dict[str, tuple[int, int]]:
+    return {str(path): (path.stat().st_size, path.stat().st_mtime_ns) for path in root.rglob("*")}
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"kernel": "nearest"}, {"budget": 0.7}, {"policy": "sobel"}, {"seed": 5}], ids=str
+)
+def test_the_survey_does_what_the_plan_said(
+    settings: Settings, archive: Path, survey_png: Any, changes: dict[str, Any]
+) -> None:
+    """What is said to be cached or skipped is so, with the same key; what is to run or blocked is made."""
+    planned = _plan(settings, archive, **changes)
+    receipt = survey_png(archive, **changes).receipt
+    done = {stage["name"]: stage for stage in receipt["stages"]}
+    assert list(planned) == list(done)
+    for name, row in planned.items():
+        assert row.key in (None, done[name]["key"]), name
+        if row.state != "blocked":  # a store that waits may turn out to be there
+            assert row.state == done[name]["state"].replace("ran", "to run"), name
+    assert all(row.state in ("cached", "skipped") for row in _plan(settings, archive, **changes).values())
+
+
+def test_without_an_archive_the_plan_makes_none(settings: Settings, tmp_path: Path) -> None:
+    """The first capture is to run and has its key; what reads a store waits for it, by name; there is no estimate."""
+    planned = _plan(settings, tmp_path / "none")
+    assert not list(tmp_path.iterdir())
+    assert planned["capture_coarse"].state == "to run"
+    assert planned["capture_coarse"].why == "nothing stored yet"
+    assert planned["capture_coarse"].key is not None
+    assert planned["capture_coarse"].seconds is None
+    assert "no such store has a record" in planned["capture_coarse"].basis
+    assert [name for name, row in planned.items() if row.state == "skipped"] == ON_REQUEST
+    assert {name: planned[name].why for name in WAITS} == {name: f"waits for {on}" for name, on in WAITS.items()}
+
+
+def test_planning_leaves_an_archive_as_it_is(settings: Settings, archive: Path) -> None:
+    """Every file and folder, the spool of a broken capture of the same key too."""
+    key = _plan(settings, archive)["capture_coarse"].key
+    (archive / "spool" / str(key)).mkdir(parents=True)
+    (archive / "spool" / str(key) / "lines").write_bytes(b"light")
+    before = _tree(archive)
+    _plan(settings, archive)
+    _plan(settings, archive, seed=9)
+    assert _tree(archive) == before
+
+
+def test_no_light_is_simulated(settings: Settings, archive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not one line of the scene is asked for."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("the plan asked for light")
+
+    monkeypatch.setattr(SimulatedSource, "lines", refuse)
+    assert _plan(settings, archive, seed=9)["capture_coarse"].state == "to run"
+
+
+def test_the_reason_is_what_differs(settings: Settings, archive: Path, make_weights: Any) -> None:
+    """A parameter with both values, where it began for a store further down, and weights as such."""
+    planned = _plan(settings, archive, kernel="nearest")
+    assert planned["rectify"].why == "kernel: catmull-rom before, nearest now"
+    assert planned["attend"].why == "kernel of rectify: catmull-rom before, nearest now"
+    assert {(change.where, change.kind) for change in planned["attend"].changes} == {
+        ("attend", "input"), ("rectify", "parameter"),
+    }  # fmt: skip
+    other = _plan(settings, archive, weights=str(make_weights(layers=2)))
+    assert other["rectify"].state == "cached"
+    assert other["attend"].why == "other weights than in the newest store"
+
+
+def test_a_stage_of_another_version_is_made_again(
+    settings: Settings, archive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The reason names the version; the stage below is still read."""
+    monkeypatch.setitem(VERSIONS, "rectify", 99)
+    planned = _plan(settings, archive)
+    assert planned["locate"].state == "cached"
+    assert planned["rectify"].why.startswith("version: ")
+    assert planned["rectify"].why.endswith(" before, 99 now")
+
+
+def test_of_another_scene_nothing_is_stored(settings: Settings, archive: Path, scene_files: Path) -> None:
+    """Its light is new, and the estimate is scaled by the pixels of the scene that was surveyed."""
+    planned = _plan(settings, archive, scene="farm", size=(192, 96), labels=None, weights=None)
+    assert planned["capture_coarse"].why == "nothing stored yet of this scene"
+    mapped, record = planned["draw_map"], Archive(archive).refs("segment")[0]
+    cost = Archive(archive).cost(record)
+    assert cost is not None
+    assert mapped.seconds == pytest.approx(cost.wall_s * 192 * 96 / (128 * 96))
+    assert planned["rectify"].size == round(_size(archive, "rectify") * 192 * 96 / (128 * 96) * 270 / 3)
+
+
+def _size(archive: Path, stage: str) -> int:
+    opened = Archive(archive)
+    return opened.stored_bytes(opened.refs(stage)[0])
+
+
+def test_judging_with_controls_is_not_estimated_by_judging_without(settings: Settings, archive: Path) -> None:
+    """Controls scan the whole field: the record of a survey without them says nothing of that."""
+    row = _plan(settings, archive, controls=True)["evaluate"]
+    assert row.state == "to run"
+    assert row.why == "controls: False before, True now"
+    assert row.seconds is None
+
+
+def test_a_damaged_store_blocks_what_needs_it(settings: Settings, archive: Path) -> None:
+    """With the archive's own words, which say what to do."""
+    store = Archive(archive).refs("rectify")[0]
+    (store.path / "lines.json").unlink()
+    planned = _plan(settings, archive)
+    assert planned["rectify"].state == "blocked"
+    assert "verify --repair" in planned["rectify"].why
+    assert planned["attend"].why == "waits for rectify"
+
+
+def test_what_the_survey_refuses_the_plan_refuses(settings: Settings, tmp_path: Path) -> None:
+    """An archive that is a file."""
+    (tmp_path / "file").write_text("no archive")
+    with pytest.raises(ArchiveError, match="is a file"):
+        _plan(settings, tmp_path / "file")
+
+
+def test_plan_as_json_and_as_a_table(settings: Settings, archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One object with the sums of what is ahead; the table names every stage and says what is left to make."""
+    asked = replace(settings, out=str(archive), kernel="nearest")
+    assert run_plan(asked, as_json=True) == 0
+    content = json.loads(capsys.readouterr().out)
+    ahead = [row for row in content["stages"] if row["state"] in ("to run", "blocked")]
+    assert content["to_make"] == content["estimated"] == len(ahead) == 6
+    assert content["seconds"] == pytest.approx(sum(row["seconds"] for row in ahead))
+    assert content["bytes"] == sum(row["bytes"] for row in ahead)
+    assert run_plan(asked) == 0
+    shown = capsys.readouterr().out
+    assert all(row["stage"] in shown for row in content["stages"])
+    assert "6 stages to make, about" in shown
+    run_plan(replace(settings, out=str(archive)))
+    assert "everything is stored" in capsys.readouterr().out

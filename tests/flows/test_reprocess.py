@@ -1,0 +1,217 @@
+"""reprocess: fields of real, tiny surveys once more: what is found, what is made, what goes on after a break."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from flows import generations
+from flows.archive_commands import DONE, FAILED, PARTLY, run_verify
+from flows.reprocess_command import ReprocessRequest, _survey, run_reprocess
+from flows.settings import Settings
+from pipeline.errors import SettingsError, WeightsError
+from pipeline.simulator.farm import CLASSES
+from storage.archive import Archive
+from storage.lineage import Catalogue
+from tests.conftest import Survey, WeightsMaker
+from tests.storage.small_archive import flip
+
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, scene_files: Path) -> Path:
+    """Two fields, scene (two budgets) and turned, on an archive that is not to be changed."""
+    folder = tmp_path_factory.mktemp("reprocessed")
+    scenes = [folder / "turned.png", scene_files / "scene.png"]
+    with Image.open(scenes[1]) as image:
+        image.transpose(Image.Transpose.ROTATE_180).save(scenes[0])
+    for scene, budget in ((scenes[0], "0.8"), (scenes[1], "0.8"), (scenes[1], "0.7")):
+        survey_png(folder / "archive", scene=str(scene), labels=None, budget=budget)
+    return folder / "archive"
+
+
+@pytest.fixture
+def archive(surveyed: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(surveyed, tmp_path / "archive"))
+
+
+@pytest.fixture
+def other(make_weights: WeightsMaker) -> Path:
+    """Weights with other classes."""
+    return make_weights(names=("class_0", "class_1", "class_2", "more"))
+
+
+class Reprocess:
+    """Runs the command and reads its summary."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self.capsys = capsys
+
+    def __call__(self, archive: Path, code: int = DONE, survey: Any = None, **wishes: Any) -> list[dict[str, Any]]:
+        self.capsys.readouterr()
+        assert run_reprocess(ReprocessRequest(archive, **wishes), QUIET, survey=survey, as_json=True) == code
+        fields: list[dict[str, Any]] = json.loads(self.capsys.readouterr().out)["fields"]
+        return fields
+
+    def states(self, *words: Any, **wishes: Any) -> list[tuple[str, str]]:
+        """Field and state."""
+        return [(row["field"], row["state"]) for row in self(*words, **wishes)]
+
+
+@pytest.fixture
+def reprocess(capsys: pytest.CaptureFixture[str]) -> Reprocess:
+    """The command in this process."""
+    return Reprocess(capsys)
+
+
+def _captures(archive: Path) -> list[str]:
+    return [ref.uri for ref in Archive.open(archive).refs("capture")]
+
+
+def test_nothing_has_changed_and_nothing_runs(surveyed: Path, reprocess: Reprocess) -> None:
+    """The newest run of a field counts, whatever its budget."""
+    newest = Archive.open(surveyed).runs()[-1].name
+    rows = reprocess(surveyed)
+    assert [(row["field"], row["state"]) for row in rows] == [("turned", "skipped"), ("scene", "skipped")]
+    assert rows[1]["old"] == newest
+    assert len(Archive.open(surveyed).runs()) == 3
+
+
+def test_new_weights_make_a_generation_beside_the_old(archive: Path, other: Path, reprocess: Reprocess) -> None:
+    """The coarse light is found, old runs stay, and the same command again has nothing to do."""
+    before = [path.name for path in Archive.open(archive).runs()]
+    coarse = {run.products["raw_coarse"] for run in Catalogue.read(archive).runs}
+    rows = reprocess(archive, weights=other)
+    assert [row["state"] for row in rows] == ["ran", "ran"]
+    assert all(row["seconds"] > 0 for row in rows)
+    after = Catalogue.read(archive).runs
+    assert [run.folder.name for run in after] == before + [row["new"] for row in rows]
+    assert {run.products["raw_coarse"] for run in after} == coarse
+    assert [run.settings["budget"] for run in after[3:]] == [0.8, 0.7]
+    for run in after[3:]:
+        states = {row["name"]: row["state"] for row in run.stages}
+        assert (states["capture_coarse"], states["rectify"], states["draw_map"]) == ("cached", "cached", "ran")
+    assert reprocess.states(archive, weights=other) == [("turned", "skipped"), ("scene", "skipped")]
+    assert reprocess.states(archive) == [("turned", "skipped"), ("scene", "skipped")]
+    assert run_verify(archive, QUIET) == DONE
+
+
+def test_an_interrupted_run_goes_on(archive: Path, other: Path, reprocess: Reprocess, tmp_path: Path) -> None:
+    """What was done is known from the summary, and is not done again."""
+    done: list[Path] = []
+
+    def interrupted(settings: Settings, console: Console) -> Path:
+        if done:
+            raise KeyboardInterrupt
+        done.append(_survey(settings, console))
+        return done[0]
+
+    request = ReprocessRequest(archive, weights=other, out=tmp_path / "told")
+    with pytest.raises(KeyboardInterrupt):
+        run_reprocess(request, QUIET, survey=interrupted)
+    (file,) = (tmp_path / "told").iterdir()
+    assert [row["new"] for row in json.loads(file.read_text())["fields"]] == [done[0].name]
+    assert reprocess.states(archive, weights=other) == [("scene", "ran"), ("turned", "skipped")]
+
+
+def test_a_newer_stage_is_run_for_those_that_rest_on_an_older(
+    archive: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A raised version makes it and what follows anew, and `--stage` finds the fields; light is not captured again."""
+    assert reprocess(archive, stage="segment") == []
+    light = _captures(archive)
+    monkeypatch.setitem(generations.VERSIONS, "segment", generations.VERSIONS["segment"] + 1)
+    assert reprocess(archive, stage="rectify") == []
+    assert reprocess.states(archive, stage="draw_map", dry_run=True) == [
+        ("turned", "would run"),
+        ("scene", "would run"),
+    ]
+    assert reprocess.states(archive, stage="segment", field="turned") == [("turned", "ran")]
+    assert _captures(archive) == light
+    assert reprocess.states(archive) == [("scene", "ran"), ("turned", "skipped")]
+    assert _captures(archive) == light
+
+
+def test_one_field_fails_and_the_others_are_done(archive: Path, other: Path, reprocess: Reprocess) -> None:
+    """With the message in its row; where none works the exit code says so."""
+
+    def picky(settings: Settings, console: Console) -> Path:
+        if "turned" in settings.scene:
+            raise WeightsError("these do not fit")
+        return _survey(settings, console)
+
+    rows = reprocess(archive, PARTLY, survey=picky, weights=other)
+    assert [(row["state"], row["message"]) for row in rows] == [("failed", "these do not fit"), ("ran", None)]
+    assert reprocess.states(archive, FAILED, survey=picky, weights=other, field="turned") == [("turned", "failed")]
+
+
+def test_only_damaged_fields_are_surveyed_again(archive: Path, reprocess: Reprocess) -> None:
+    """`--failed`: a run that lacks a store is made whole by a newer one; what is damaged is left to verify --repair."""
+    assert reprocess(archive, failed=True) == []
+    newest = Catalogue.read(archive).runs[-1]
+    store = archive / newest.products["class_map"].rpartition("/")[0]
+    manifest = (store / "manifest.json").read_bytes()
+    (store / "manifest.json").unlink()
+    (row,) = reprocess(archive, FAILED, failed=True)
+    assert "verify --repair" in row["message"]
+    (store / "manifest.json").write_bytes(manifest)
+    shutil.rmtree(store)
+    assert reprocess.states(archive, failed=True) == [("scene", "ran")]
+    assert reprocess(archive, failed=True) == []
+
+
+def test_a_run_without_settings_is_told(archive: Path, reprocess: Reprocess) -> None:
+    """Damaged as it is, nobody knows what it asked for; the others are done."""
+    flip(Archive.open(archive).runs()[0] / "manifest.json", at=40)
+    rows = reprocess(archive, PARTLY)
+    assert sorted(row["state"] for row in rows) == ["failed", "skipped"]
+    assert any("cannot be read" in str(row["message"]) for row in rows)
+
+
+def test_fields_are_chosen(surveyed: Path, reprocess: Reprocess) -> None:
+    """By name, pattern or scene file, and by date; a name that is none is refused."""
+    for field in ("turned", "tur*", "turned.png"):
+        assert reprocess.states(surveyed, field=field) == [("turned", "skipped")]
+    assert len(reprocess(surveyed, since="2020-01-01")) == 2
+    assert reprocess(surveyed, since="2999-01-01") == []
+    for wishes, words in (
+        ({"field": "none"}, r"--field none.*turned, scene"),
+        ({"since": "spring"}, "--since expects a date"),
+        ({"stage": "wish"}, "--stage wish.*segment"),
+        ({"weights": Path("nowhere.safetensors")}, "there is no such file"),
+    ):
+        with pytest.raises(SettingsError, match=words):
+            run_reprocess(ReprocessRequest(surveyed, **wishes), QUIET)
+
+
+def test_a_dry_run_leaves_everything(surveyed: Path, other: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It says what would run, for people on stdout and its progress on the console."""
+    before = sorted(path for path in surveyed.rglob("*") if ".locks" not in path.parts)
+    told = io.StringIO()
+    assert run_reprocess(ReprocessRequest(surveyed, weights=other, dry_run=True), Console(file=told)) == DONE
+    out = capsys.readouterr().out
+    assert "2 fields: 2 would run" in out
+    assert "reprocess 1 of 2: turned" in told.getvalue()
+    assert sorted(path for path in surveyed.rglob("*") if ".locks" not in path.parts) == before
+
+
+def test_an_older_farm_law_is_not_current(tmp_path: Path, survey_png: Survey, make_weights: WeightsMaker,
+                                          reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    """The farm's light is made by rules that have a version of their own."""
+    weights = make_weights(tuple(np.linspace(450, 850, 6)), names=CLASSES)
+    survey_png(
+        tmp_path / "a", scene="farm", labels=None, weights=str(weights), size="192x128", bands="20,60,110,160,210,250"
+    )
+    assert reprocess.states(tmp_path / "a") == [("farm", "skipped")]
+    monkeypatch.setattr(generations, "FARM_LAW", "farm of tomorrow")
+    assert reprocess.states(tmp_path / "a", dry_run=True) == [("farm", "would run")]
