@@ -1,0 +1,126 @@
+"""Storage: our layout against plain zarr-python of the same arrays, the spool's share of a core, a survey run again."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import zarr
+from measure import Row, ratio, time_in_turn
+from numpy.typing import NDArray
+from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
+
+from pipeline.scan import Sweep
+from pipeline.source import Line, References
+from storage.cubes import RawCubeWriter, SweepHeader, open_raw_cube
+from storage.layout import SHARD_ROWS, image_spec
+from storage.spool import Spool
+
+LINES, SAMPLES, BANDS = 256, 640, 270
+SPOOLED, RATE_HZ = 640, 100.0
+ROUNDS = 3
+
+
+def rows() -> list[Row]:
+    """All figures, in a folder that is removed."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, raw = Path(name), _raw()
+        return [*_against_zarr(folder, raw), _spool(folder, raw), _warm(folder)]
+
+
+def _raw() -> NDArray[np.uint16]:
+    """Counts with shot noise on a smooth signal, (line, sample, band)."""
+    smooth = 1500 + 1000 * np.sin(np.linspace(0, 6, SAMPLES))[:, None] * np.cos(np.linspace(0, 3, BANDS))
+    rng = np.random.default_rng(0)
+    block = rng.poisson(np.broadcast_to(smooth, (SHARD_ROWS, SAMPLES, BANDS))).astype(np.uint16)
+    return np.concatenate([np.roll(block, turn, axis=1) for turn in range(LINES // SHARD_ROWS)])
+
+
+def _lines(raw: NDArray[np.uint16]) -> list[Line]:
+    return [Line(number, data, 0.0, 1e-4 * number, 0.1 * number, 100.0) for number, data in enumerate(raw)]
+
+
+def _against_zarr(folder: Path, raw: NDArray[np.uint16]) -> list[Row]:
+    """A raw cube written 64 lines at a time and read whole, by our writer and reader and by zarr alone."""
+    lines = _lines(raw)
+    frame = np.zeros((SAMPLES, BANDS), np.float32)
+    references = References(frame, frame + 1000, np.ones(BANDS, np.float32))
+    header = SweepHeader(Sweep("fine-0", "fine", "x", 0.0, 0.0, LINES), references, np.linspace(400, 1000, BANDS))
+    spec = image_spec(("line", "sample", "band"), raw.shape, "<u2")
+
+    def write_ours() -> None:
+        shutil.rmtree(folder / "ours.zarr", ignore_errors=True)
+        with RawCubeWriter(folder / "ours.zarr", header) as cube:
+            for first in range(0, LINES, SHARD_ROWS):
+                cube.write(lines[first : first + SHARD_ROWS])
+
+    def write_plain() -> None:
+        shutil.rmtree(folder / "plain.zarr", ignore_errors=True)
+        blosc = BloscCodec(cname="zstd", clevel=3, shuffle=BloscShuffle.bitshuffle, typesize=2)
+        array = zarr.create_array(
+            folder / "plain.zarr", shape=spec.shape, dtype="<u2", chunks=spec.chunk, shards=spec.shard,
+            compressors=(blosc, Crc32cCodec()),
+        )  # fmt: skip
+        for first in range(0, LINES, SHARD_ROWS):
+            array[first : first + SHARD_ROWS] = raw[first : first + SHARD_ROWS]
+
+    writes = time_in_turn({"ours": write_ours, "plain": write_plain}, ROUNDS)
+    plain = zarr.open_array(folder / "plain.zarr", mode="r")
+    cube = open_raw_cube(folder / "ours.zarr")
+    reads = time_in_turn({"ours": cube.read, "plain": lambda: plain[...]}, ROUNDS)
+    size = raw.nbytes / 1e6
+    found = []
+    for what, clocks in (("write", writes), ("read", reads)):
+        share = ratio(clocks, "plain", "ours")
+        found.append(Row(
+            f"{what} a raw cube of {size:.0f} MB: speed over plain zarr-python's", f"{share:.0%}", ">= 80 %",
+            share >= 0.8,
+            f"{size / clocks['ours'].wall_min_s:.0f} MB/s, plain {size / clocks['plain'].wall_min_s:.0f} MB/s",
+        ))  # fmt: skip
+    return found
+
+
+def _spool(folder: Path, raw: NDArray[np.uint16]) -> Row:
+    """Lines appended one by one as fast as the spool takes them; a rig brings one every 10 ms."""
+    lines = [Line(n, raw[n % LINES], 0.0, 0.0, n / RATE_HZ, 10.0) for n in range(SPOOLED)]
+    slowest = 0.0
+    with Spool.open(folder / "spool", SAMPLES, BANDS, header={"sweep": "bench"}) as spool:
+        began, cpu = time.perf_counter(), time.process_time()
+        for line in lines:
+            before = time.perf_counter()
+            spool.append(line)
+            slowest = max(slowest, time.perf_counter() - before)
+        spool.sync()
+        cpu, wall = time.process_time() - cpu, time.perf_counter() - began
+    share = cpu / SPOOLED * RATE_HZ
+    return Row(
+        f"spool, lines of {raw[0].nbytes / 1e3:.0f} KB at {RATE_HZ:.0f} Hz: share of one core", f"{share:.0%}",
+        "<= 20 %", share <= 0.2, f"{wall / SPOOLED * 1e3:.2f} ms a line, the slowest {slowest * 1e3:.0f} ms",
+    )  # fmt: skip
+
+
+def _warm(folder: Path) -> Row:
+    """A finished survey asked for again: what its stages take beside what they took."""
+    from rich.console import Console
+
+    from flows.run import open_run
+    from flows.settings import load_settings
+    from flows.survey import StageRunner, survey
+    from flows.survey_command import run_survey
+
+    flags = {"scene": "farm", "out": str(folder / "archive"), "engine": "plain", "controls": False}
+    settings = load_settings(None, flags)
+    first = {stage["name"]: stage for stage in run_survey(settings, Console(quiet=True)).receipt["stages"]}
+    runner = StageRunner(open_run(settings))
+    cpu = time.process_time()
+    survey(runner)
+    cpu = time.process_time() - cpu
+    before = sum(stage["cpu_s"] for stage in first.values() if stage["cpu_s"])
+    cached = all(record.state in ("cached", "skipped") for record in runner.records.values())
+    return Row(
+        "a finished survey's stages again, over their first run", f"{cpu / before:.1%}", "<= 1 %, nothing made",
+        cached and cpu <= 0.01 * before, f"{cpu * 1e3:.0f} ms of {before:.1f} s of processor",
+    )  # fmt: skip
