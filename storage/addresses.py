@@ -9,6 +9,7 @@ from pathlib import Path
 from storage.staging import MANIFEST_NAME, PART_SUFFIX, check_name
 
 STORE_URI = re.compile(r"stages/([^/\s]+)/([^/\s]+)")
+SECOND = len("20261120T101701")  # of a run's name: when it was begun
 
 
 @dataclass(frozen=True)
@@ -40,9 +41,12 @@ def published_stores(root: Path, stage: str | None = None) -> list[StageRef]:
 
 
 def published_runs(root: Path) -> list[Path]:
-    """Folders of the published runs, oldest first."""
-    found = sorted(path.parent for path in (root / "runs").glob(f"*/{MANIFEST_NAME}"))
-    return [path for path in found if not path.name.endswith(PART_SUFFIX)]
+    """Folders of the published runs, oldest first: by the second in their names, then by when they were written."""
+    manifests = [
+        path for path in (root / "runs").glob(f"*/{MANIFEST_NAME}") if not path.parent.name.endswith(PART_SUFFIX)
+    ]
+    ages = {path.parent: path.stat().st_mtime_ns for path in manifests}
+    return sorted(ages, key=lambda folder: (folder.name[:SECOND], ages[folder], folder.name))
 
 
 def without_manifest(root: Path) -> list[Path]:

@@ -279,3 +279,17 @@ def test_spools_outlive_processes_until_dropped(tmp_path: Path) -> None:
     assert (archive.spool_folder("k1") / "lines.bil").exists()
     archive.drop_spool("k1")
     assert list((tmp_path / "spool").iterdir()) == []
+
+
+def test_runs_of_one_second_are_listed_as_they_were_written(tmp_path: Path) -> None:
+    """Names in the order of the alphabet would put a later run before an earlier one."""
+    archive = Archive.open(tmp_path)
+    names = []
+    for name in ("zebra", "apple", "mango"):
+        with archive.new_run(name) as draft:
+            names.append(draft.id)
+    for number, name in enumerate(names):
+        same = f"20260101T000000-{name.rpartition('-')[2]}"
+        (tmp_path / "runs" / name).rename(tmp_path / "runs" / same)
+        os.utime(tmp_path / "runs" / same / "manifest.json", ns=(number, number))
+    assert [path.name.rpartition("-")[2] for path in archive.runs()] == ["zebra", "apple", "mango"]
