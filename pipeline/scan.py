@@ -14,7 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.errors import ShapeError
-from pipeline.mirror import camera_slope, direction_to_position, line_centre, scene_to_direction
+from pipeline.mirror import (
+    camera_slope,
+    direction_to_position,
+    direction_to_scene,
+    line_centre,
+    position_to_direction,
+    scene_to_direction,
+)
 from pipeline.vector_memory import count_loads
 
 Axis = Literal["x", "y"]
@@ -91,6 +98,24 @@ def line_positions(sweep: Sweep, camera: LineCamera) -> Floats:
 
 def _aim(sweep: Sweep, camera: LineCamera, scan_px: Floats) -> Floats:
     tangents = np.stack([np.full_like(scan_px, sweep.strip_px), scan_px], axis=-1) * camera.ifov_rad
+    return direction_to_position(scene_to_direction(tangents))
+
+
+def shifted_position(position: Floats, shift_px: Floats, camera: LineCamera) -> Floats:
+    """Give the mirror positions whose line centres lie ``shift_px`` beside those of ``position``.
+
+    Parameters
+    ----------
+    position
+        (..., 2) device X and Y.
+    shift_px
+        (..., 2) along the line and the scan; broadcasts. [px]
+
+    Raises
+    ------
+    PoseError : a position is beyond the rim, before or after the shift.
+    """
+    tangents = direction_to_scene(position_to_direction(position)) + shift_px * camera.ifov_rad
     return direction_to_position(scene_to_direction(tangents))
 
 

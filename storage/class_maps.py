@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,18 +53,25 @@ def write_class_map(path: Path, found: ClassMap) -> None:
     place = {} if found.grid is None else found.grid.attributes((y, x))
     names = {"class_names": list(found.names), "class_colours": np.asarray(found.colours).tolist()}
     group = create_group(path, "class map", {**place, **grid_record(found.grid), **names})
-    write_image(group, "classes", ("y", "x"), np.asarray(found.classes, np.uint8), {**_flags(found), **place})
+    write_image(
+        group,
+        "classes",
+        ("y", "x"),
+        np.asarray(found.classes, np.uint8),
+        {**class_flags(found.names, found.colours), **place},
+    )
     about = {"long_name": "probability of the class given", "units": "1", "valid_range": [0.0, 1.0], **place}
     write_image(group, "confidence", ("y", "x"), np.asarray(found.confidence, np.float32), about)
 
 
-def _flags(found: ClassMap) -> dict[str, Any]:
+def class_flags(names: Sequence[str], colours: NDArray[np.uint8]) -> dict[str, Any]:
+    """CF's flag attributes of an image of class indices."""
     return {
         "long_name": "class",
         "_FillValue": UNLABELLED,
-        "flag_values": list(range(len(found.names))),
-        "flag_meanings": " ".join("_".join(name.split()) for name in found.names),
-        "flag_colors": " ".join("#{:02x}{:02x}{:02x}".format(*colour) for colour in found.colours.tolist()),
+        "flag_values": list(range(len(names))),
+        "flag_meanings": " ".join("_".join(name.split()) for name in names),
+        "flag_colors": " ".join("#{:02x}{:02x}{:02x}".format(*colour) for colour in colours.tolist()),
     }
 
 

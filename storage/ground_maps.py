@@ -13,6 +13,7 @@ from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
 from pipeline.grid import UNLABELLED
+from storage.class_maps import class_flags
 from storage.georeference import ON_THE_MAP, load_geobox, map_attributes, write_map_coordinates
 from storage.layout import SHARD_COLUMNS, SHARD_ROWS, create_array, create_group, image_spec, open_group, read_array
 
@@ -50,7 +51,7 @@ class GroundMapWriter:
         write_map_coordinates(self._group, geobox)
         self._shape, self._legend = tuple(geobox.shape), legend
         dims, shape = ("y", "x"), self._shape
-        about_classes = {**class_flags(legend), **place, **ON_THE_MAP}
+        about_classes = {**class_flags(legend.names, legend.colours), **place, **ON_THE_MAP}
         self._classes = create_array(self._group, "classes", image_spec(dims, shape, "|u1"), about_classes)
         words = {"long_name": "probability of the class given", "units": "1", "valid_range": [0.0, 1.0]}
         words = {**words, **place, **ON_THE_MAP}
@@ -95,17 +96,6 @@ class GroundMapWriter:
             name: {"m2": m2, "ha": m2 / M2_PER_HECTARE, "share": m2 / total}
             for name, m2 in zip(self._legend.names, areas_m2.tolist(), strict=True)
         }
-
-
-def class_flags(legend: ClassLegend) -> dict[str, Any]:
-    """CF's flag attributes of a class map."""
-    return {
-        "long_name": "class",
-        "_FillValue": UNLABELLED,
-        "flag_values": list(range(len(legend.names))),
-        "flag_meanings": " ".join("_".join(name.split()) for name in legend.names),
-        "flag_colors": " ".join("#{:02x}{:02x}{:02x}".format(*colour) for colour in legend.colours.tolist()),
-    }
 
 
 def _check_place(rows: slice, columns: slice, shape: tuple[int, ...]) -> None:

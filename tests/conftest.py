@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -99,3 +100,12 @@ def survey_png(scene_files: Path, weights: Path) -> Survey:
         return run_survey(load_settings(None, given | flags), console or Console(quiet=True))
 
     return survey
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """Folder of the real data sets; tests that need it skip where it is absent."""
+    folder = Path(os.environ.get("SPECTRALZOOM_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no real data at {folder} (set SPECTRALZOOM_DATA)")
+    return folder

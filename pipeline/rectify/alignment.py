@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError, ShapeError
-from pipeline.mirror import direction_to_position, direction_to_scene, position_to_direction, scene_to_direction
 
 Floats = NDArray[np.float64]
 
@@ -68,24 +66,6 @@ class SweepShifts:
 def no_shifts(names: Sequence[str]) -> tuple[SweepShift, ...]:
     """Give corrections of nothing."""
     return tuple(SweepShift(name, np.zeros(2), np.zeros(2)) for name in names)
-
-
-def shifted_position(position: Floats, shift_px: Floats, camera: LineCamera) -> Floats:
-    """Give the mirror positions whose line centres lie ``shift_px`` beside those of ``position``.
-
-    Parameters
-    ----------
-    position
-        (..., 2) device X and Y.
-    shift_px
-        (..., 2) along the line and the scan; broadcasts. [px]
-
-    Raises
-    ------
-    PoseError : a position is beyond the rim, before or after the shift.
-    """
-    tangents = direction_to_scene(position_to_direction(position)) + shift_px * camera.ifov_rad
-    return direction_to_position(scene_to_direction(tangents))
 
 
 def solve_sweeps(

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
 from pipeline.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.rectify.alignment import shifted_position
 from pipeline.rectify.calibrate import calibrate
 from pipeline.rectify.lookup import track_lookup
 from pipeline.rectify.resample import resample
 from pipeline.rectify.tracks import Track, make_tracks
-from pipeline.scan import Axis, Sweep
+from pipeline.scan import Axis, Sweep, shifted_position
 from pipeline.source import References, SweepLines
 
 Floats = NDArray[np.float64]

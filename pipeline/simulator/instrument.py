@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.coverage import on_scene as on_scene
 from pipeline.mirror import mirror_throughput, position_to_normal
-from pipeline.rectify.alignment import shifted_position
-from pipeline.scan import Axis, Sweep, line_positions, sweep_positions
+from pipeline.scan import Axis, Sweep, line_positions, shifted_position, sweep_positions
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene, to_bands
 
 ALL_EFFECTS = frozenset({"slit", "smear", "throughput", "shot", "read"})

@@ -55,15 +55,6 @@ def opened(record: dict[str, Any]) -> xr.Dataset:
 
 
 @pytest.fixture
-def real_data() -> Path:
-    """Folder of the real data sets; tests that need it skip where it is absent."""
-    folder = Path(os.environ.get("SPECTRALZOOM_DATA", Path(__file__).parents[3] / "shared" / "data"))
-    if not folder.is_dir():
-        pytest.skip(f"no real data at {folder} (set SPECTRALZOOM_DATA)")
-    return folder
-
-
-@pytest.fixture
 def raw() -> NDArray[np.uint16]:
     """Numbers of 150 lines, more than two blocks, (150, 40, 3) uint16."""
     return np.random.default_rng(0).integers(0, 4096, (150, 40, 3), dtype=np.uint16)

@@ -10,8 +10,8 @@ import pytest
 from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.mirror import direction_to_scene, position_to_direction
-from pipeline.rectify.alignment import SweepShift, WindowShift, shifted_position, solve_sweeps
-from pipeline.scan import Sweep, line_positions
+from pipeline.rectify.alignment import SweepShift, WindowShift, solve_sweeps
+from pipeline.scan import Sweep, line_positions, shifted_position
 
 LINES = 3000
 NAMES = ("a", "b", "c", "d", "e")
