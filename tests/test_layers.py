@@ -28,6 +28,7 @@ OWNERS = {
     "zarr": ("storage",),
     "xarray": ("storage",),
     "dask": ("storage", "flows"),
+    "obstore": ("storage",),
     "serial": ("pipeline/rig",),
     "torch": ("models", "pipeline/rectify", "pipeline/simulator"),
 }
@@ -129,7 +130,8 @@ def test_packages_are_those_of_this_folder():
 def test_what_is_imported_is_declared():
     """Every package from outside that the source imports stands in pyproject.toml."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    wanted = project["dependencies"] + project["optional-dependencies"]["geo"]
+    extras = project["optional-dependencies"]
+    wanted = project["dependencies"] + extras["geo"] + extras["s3"]
     declared = {re.split(r"[\[<>=~! ]", item, maxsplit=1)[0].lower() for item in wanted}
     outside = {name.split(".")[0] for path in source_files() for name in imported(parse(path))}
     outside -= {*ROOMS, *sys.stdlib_module_names}
