@@ -1,4 +1,4 @@
-"""The raw cube of one sweep: (line, sample, band) uint16, with what is known of every line."""
+"""The raw cube of one sweep: (line, sample, band) uint16, with what is known of every line and a picture."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import dask.array as da
 import numpy as np
-import xarray as xr
 import zarr
 from numpy.typing import NDArray
 
@@ -30,6 +28,10 @@ from storage.layout import (
     write_bands,
     write_small,
 )
+from storage.quicklooks import LineThumbnail, Quicklook, quicklook_of, write_quicklook
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _LINE_COORDINATES = "time mirror_x mirror_y exposure_ms valid_line"
 _NO_VALUES = np.empty((0, 0, 0), np.float32)
@@ -77,7 +79,11 @@ class RawCubeWriter:
         about = {"long_name": "raw numbers of the camera", "units": "1", "coordinates": f"{bands} {_LINE_COORDINATES}"}
         spec = image_spec(("line", "sample", "band"), header.shape, "<u2")
         self._dn = create_array(self._group, "dn", spec, about)
-        _write_references(self._group, header.references)
+        known = header.references
+        _write_references(self._group, known)
+        self._seen = LineThumbnail(
+            header.shape, header.wavelength_nm, dark=known.dark, white=known.white, panel=known.panel
+        )
         self._waiting: list[Line] = []
         self._facts: list[tuple[float, float, float, float, bool]] = []
 
@@ -115,7 +121,7 @@ class RawCubeWriter:
                 self._flush()
 
     def close(self) -> None:
-        """Write what waits and the lines' coordinates.
+        """Write what waits, the lines' coordinates and the picture.
 
         Raises
         ------
@@ -128,11 +134,14 @@ class RawCubeWriter:
             )
         self._flush()
         _write_line_facts(self._group, self._facts, self._header.started)
+        write_quicklook(self._group, self._seen.finish())
 
     def _flush(self) -> None:
         if self._waiting:
             first = self._waiting[0].number
-            self._dn[first : first + len(self._waiting)] = np.stack([line.data for line in self._waiting])
+            block = np.stack([line.data for line in self._waiting])
+            self._dn[first : first + len(block)] = block
+            self._seen.add(first, block, np.array([line.valid for line in self._waiting], np.bool_))
             self._waiting.clear()
 
 
@@ -207,6 +216,10 @@ class RawCube:
         """Raw numbers of some lines and samples, (line, sample, band) uint16; decodes the chunks that hold them."""
         return read_array(self.group, "dn", (lines, samples))
 
+    def quicklook(self) -> Quicklook | None:
+        """A small picture of the sweep, its values over the white panel; None where it was stored without one."""
+        return quicklook_of(self.group)
+
 
 def open_raw_cube(path: Path) -> RawCube:
     """Open a sweep that :class:`RawCubeWriter` stored.
@@ -253,6 +266,9 @@ def open_reflectance(path: Path, *, saturated_dn: float) -> xr.DataArray:
     ------
     IncompleteStoreError : there is no sweep, it was not closed, or it is damaged; on computing, where a chunk is.
     """
+    import dask.array as da
+    import xarray as xr
+
     cube = open_raw_cube(path)
     lines, samples, bands = cube.shape
     starts = range(0, lines, SHARD_ROWS)

@@ -6,7 +6,7 @@
     cube.zarr/wavelength      (band,) nm, fwhm beside it; missing where nothing says them
     cube.zarr/valid_line      (line,) false for lines that no file holds whole; time, exposure_ms, frame where told
     cube.zarr/dark, white     (sample, band) reference frames, where there are some
-    cube.zarr/quicklook       (y, x, 3) for viewers; the same as quicklook.png beside the cube
+    cube.zarr/quicklook       (y, x, 3) uint8 for viewers; the same as quicklook.png beside the cube
 
 Attributes say where it came from: file names without folders, sizes, SHA-256, header texts, notes.
 """
@@ -24,11 +24,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from storage.cube_sources import BLOCK_LINES, CubeSource
-from storage.layout import create_array, create_group, image_spec, write_bands, write_image, write_small
+from storage.layout import create_array, create_group, image_spec, write_bands, write_small
+from storage.quicklooks import LineThumbnail, write_quicklook
 
 KIND = "ingested cube"
-QUICKLOOK_PX = 1024
-RGB_NM = (640.0, 550.0, 460.0)
 LONGEST_HEADER = 1 << 16  # characters of a header's text that are kept
 
 Report = Callable[[float], None]
@@ -71,16 +70,17 @@ def write_ingested_cube(
     coordinates = _write_coordinates(group, source)
     about = {"long_name": "numbers of the file", "units": "1", **({"coordinates": coordinates} if coordinates else {})}
     array = create_array(group, "values", image_spec(("line", "sample", "band"), source.shape, kind.str), about)
-    thumbnail = _Thumbnail(source)
+    thumbnail = LineThumbnail(
+        source.shape, source.bands.wavelength_nm, dark=source.dark, white=source.white, panel=source.panel
+    )
     for start, stop in _blocks(source):
         lines = source.read(start, stop)
         array[start:stop] = _stored(lines, kind, source.lines.valid[start:stop])
-        thumbnail.add(start, lines)
+        thumbnail.add(start, lines, source.lines.valid[start:stop])
         report(begin + (1 - begin) * stop / source.shape[0])
-    picture = thumbnail.picture()
-    about = {"long_name": "picture for viewers, red green blue"}
-    write_image(group, "quicklook", ("quicklook_y", "quicklook_x", "rgb"), picture, about)
-    Image.fromarray(picture).save(folder / "quicklook.png")
+    picture = thumbnail.finish()
+    write_quicklook(group, picture)
+    Image.fromarray(picture.image).save(folder / "quicklook.png")
 
 
 def stored_dtype(source: CubeSource, report: Report = lambda done: None) -> np.dtype[Any]:
@@ -171,47 +171,3 @@ def _write_references(group: zarr.Group, source: CubeSource) -> None:
     if source.position is not None:
         for name, axis in zip(("mirror_x", "mirror_y"), source.position.T, strict=True):
             write_small(group, name, ("line",), np.ascontiguousarray(axis), {"long_name": "mirror position"})
-
-
-class _Thumbnail:
-    """Every n-th pixel of three bands, gathered as lines pass."""
-
-    def __init__(self, source: CubeSource) -> None:
-        lines, samples, bands = source.shape
-        self._source = source
-        self._step = max(1, -(-max(lines, samples) // QUICKLOOK_PX))
-        self._bands = _three_bands(source.bands.wavelength_nm, bands)
-        self._rows: list[NDArray[np.float32]] = []
-
-    def add(self, start: int, lines: NDArray[Any]) -> None:
-        """Take what the picture needs of the lines from ``start`` on."""
-        rows = slice(-start % self._step, None, self._step)
-        part = np.asarray(lines[rows, :: self._step][..., self._bands], np.float32)
-        dark, white = self._source.dark, self._source.white
-        if dark is not None and white is not None:
-            level, light = (frame[:: self._step][:, self._bands] for frame in (dark, white))
-            with np.errstate(divide="ignore", invalid="ignore"):
-                part = (part - level) / (light - level)
-        part[~self._source.lines.valid[start : start + len(lines)][rows]] = np.nan
-        self._rows.append(part)
-
-    def picture(self) -> NDArray[np.uint8]:
-        """(y, x, 3), each band stretched from its 2nd to its 98th percentile; what is missing is black."""
-        image = np.concatenate(self._rows)
-        image[~np.isfinite(image)] = np.nan
-        out = np.zeros(image.shape, np.uint8)
-        for band in range(3):
-            plane = image[..., band]
-            known = plane[np.isfinite(plane)]
-            if known.size:
-                low, high = np.percentile(known, (2, 98))
-                span = high - low if high > low else 1.0
-                out[..., band] = np.nan_to_num(np.clip((plane - low) / span, 0, 1) * 255)
-        return out
-
-
-def _three_bands(wavelength_nm: NDArray[np.float64] | None, count: int) -> list[int]:
-    """Bands for red, green and blue: the nearest by wavelength, else spread over the file's order."""
-    if wavelength_nm is not None and np.isfinite(wavelength_nm).all():
-        return [int(np.abs(wavelength_nm - centre).argmin()) for centre in RGB_NM]
-    return [(count - 1) * share // 4 for share in (3, 2, 1)]

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import zarr
@@ -18,11 +18,14 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
 
 from pipeline.errors import IncompleteStoreError, ShapeError, WavelengthError
+from storage.archive_codec import MissingCodecError, allow_pcodec, missing_codec, pcodec
 
 CHUNK_PX = 32
 SHARD_ROWS = 64
 SHARD_COLUMNS = 640
 KEPT_BITS = 11
+
+Tier = Literal["live", "archive"]  # blosc: fast to write; pcodec: smaller, for what is seldom read
 
 _SPATIAL_CONVENTION = {
     "uuid": "689b58e2-cf7b-45e0-9fff-9cfc0883d6b4",
@@ -103,8 +106,13 @@ def _whole_chunks(size: int, chunk: int) -> int:
     return -(-size // chunk) * chunk
 
 
-def create_array(group: zarr.Group, name: str, spec: ArraySpec, attributes: Mapping[str, Any]) -> zarr.Array[Any]:
-    """Add an empty array: NaN where floating, 0 or ``_FillValue`` where not."""
+def create_array(
+    group: zarr.Group, name: str, spec: ArraySpec, attributes: Mapping[str, Any], *, tier: Tier = "live"
+) -> zarr.Array[Any]:
+    """Add an empty array: NaN where floating, 0 or ``_FillValue`` where not. Its numbers go through the tier's codecs.
+
+    The tier ``archive`` takes numbers of 16 bits and more.
+    """
     kind = np.dtype(spec.dtype)
     fill: Any = np.nan if kind.kind == "f" else attributes.get("_FillValue", 0)
     return group.create_array(
@@ -113,14 +121,19 @@ def create_array(group: zarr.Group, name: str, spec: ArraySpec, attributes: Mapp
         dtype=kind,
         chunks=tuple(max(size, 1) for size in spec.chunk),
         shards=None if spec.shard is None else tuple(max(size, 1) for size in spec.shard),
-        compressors=(
-            BloscCodec(cname="zstd", clevel=3, shuffle=BloscShuffle.bitshuffle, typesize=kind.itemsize),
-            Crc32cCodec(),
-        ),
         fill_value=bool(fill) if kind.kind == "b" else fill,
         dimension_names=spec.dims,
         attributes=dict(attributes),
+        **_codecs(tier, kind),
     )
+
+
+def _codecs(tier: Tier, kind: np.dtype[Any]) -> dict[str, Any]:
+    """What makes bytes of a chunk; its checksum always comes last."""
+    if tier == "archive":
+        return {"serializer": pcodec(), "compressors": (Crc32cCodec(),)}
+    blosc = BloscCodec(cname="zstd", clevel=3, shuffle=BloscShuffle.bitshuffle, typesize=kind.itemsize)
+    return {"compressors": (blosc, Crc32cCodec())}
 
 
 def write_small(
@@ -163,6 +176,7 @@ def open_group(path: Path) -> zarr.Group:
     ------
     IncompleteStoreError : there is none, or its metadata is damaged.
     """
+    allow_pcodec()
     try:
         return zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -193,6 +207,8 @@ def damage_named(where: str) -> Iterator[None]:
     """Turn what decoders raise on damaged bytes into an IncompleteStoreError that names the array."""
     try:
         yield
+    except MissingCodecError as error:
+        raise missing_codec(where, error) from error
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, IndexError) as error:
         raise IncompleteStoreError(f"{where} cannot be read: {error}; run verify on the archive") from error
 

@@ -22,6 +22,7 @@ from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.staging import MANIFEST_NAME, file_hash, files_below, sync_path
 
 FORMAT = 2
+PACKED = "packed"  # what a store was before its numbers went into a smaller codec
 CURE = "restore it from a copy, or run verify --repair on the archive"
 _DISTRIBUTIONS = ("spectralzoom", "numpy", "torch", "xarray", "zarr", "numcodecs")
 
@@ -33,7 +34,7 @@ class Cost:
     wall_s: float
     cpu_s: float
     work: float | None
-    size: int  # of the store's files [bytes]
+    size: int  # of the store's files as they were made [bytes]
 
 
 class Stopwatch:
@@ -58,18 +59,16 @@ class Stopwatch:
 
 
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
-    """Sync every file of a staged folder and write ``manifest.json`` with their hashes and sizes beside ``facts``."""
+    """Sync every file of a staged folder and write ``manifest.json`` with their hashes and sizes beside ``facts``.
+
+    When it was made and with which libraries are those of now, where ``facts`` does not say them.
+    """
     files: dict[str, dict[str, Any]] = {}
     for path in files_below(folder):
         sync_path(path)
         files[path.relative_to(folder).as_posix()] = {"sha256": file_hash(path), "size": path.stat().st_size}
-    content = {
-        **facts,
-        "created": datetime.now(UTC).isoformat(timespec="milliseconds"),
-        "libraries": library_versions(),
-        "files": files,
-        "format": FORMAT,
-    }
+    known = {"created": datetime.now(UTC).isoformat(timespec="milliseconds"), "libraries": library_versions()}
+    content = {**known, **facts, "files": files, "format": FORMAT}
     manifest = folder / MANIFEST_NAME
     manifest.write_text(_text(content | {"seal": _seal(content)}), encoding="utf-8")
     sync_path(manifest)
@@ -135,12 +134,56 @@ def cost_of(manifest: Mapping[str, Any]) -> Cost | None:
     if not isinstance(cost, Mapping):
         return None
     wall, cpu, work = (_amount(cost.get(name)) for name in ("wall_s", "cpu_s", "work"))
-    return None if wall is None or cpu is None else Cost(wall, cpu, work, listed_bytes(manifest))
+    return None if wall is None or cpu is None else Cost(wall, cpu, work, made_bytes(manifest))
 
 
 def listed_bytes(manifest: Mapping[str, Any]) -> int:
     """Size of all files that a manifest lists."""
     return sum(entry["size"] for entry in manifest["files"].values())
+
+
+def made_bytes(manifest: Mapping[str, Any]) -> int:
+    """Size of all files as they were first published: what packing saved later is no merit of the making."""
+    size = _packed(manifest).get("bytes_before")
+    return size if isinstance(size, int) and not isinstance(size, bool) else listed_bytes(manifest)
+
+
+def packed_facts(before: Mapping[str, Any], sha256: str, values: Mapping[str, str], codec: str) -> dict[str, Any]:
+    """Facts for the manifest of a store that holds the numbers of another in a smaller codec.
+
+    Parameters
+    ----------
+    before, sha256
+        The other's manifest, and the SHA-256 of its file, by which runs may know the store.
+    values
+        Hash of the decoded numbers, which both have, by the name of each cube.
+    """
+    kept = {name: value for name, value in before.items() if name not in ("files", "format", "seal", PACKED)}
+    entry = {
+        "manifests": [*packed_from(before), sha256],
+        "values": {**packed_values(before), **values},
+        "bytes_before": made_bytes(before),
+        "codec": codec,
+        "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
+    }
+    return kept | {PACKED: entry}
+
+
+def packed_from(manifest: Mapping[str, Any]) -> list[str]:
+    """SHA-256 of the manifests that a store had before it was packed, oldest first; none where it never was."""
+    found = _packed(manifest).get("manifests")
+    return [one for one in found if isinstance(one, str)] if isinstance(found, list) else []
+
+
+def packed_values(manifest: Mapping[str, Any]) -> dict[str, str]:
+    """Hash of the decoded numbers by the name of each cube that was packed."""
+    found = _packed(manifest).get("values")
+    return {name: str(value) for name, value in found.items()} if isinstance(found, dict) else {}
+
+
+def _packed(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
+    found = manifest.get(PACKED)
+    return found if isinstance(found, Mapping) else {}
 
 
 def check_files(folder: Path, *, hashes: bool) -> None:

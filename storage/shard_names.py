@@ -12,6 +12,8 @@ from typing import Any
 
 import zarr
 
+from storage.archive_codec import allow_pcodec
+
 WORDS = {"y": "rows", "x": "columns", "line": "lines", "sample": "samples", "band": "bands", "patch": "patches"}
 MOST_NAMED = 3
 _NO_ARRAY = (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError)
@@ -46,6 +48,7 @@ class Shard:
 
     def unreadable(self) -> list[tuple[slice, ...]]:
         """Chunks that fail their checksum or cannot be decoded; all of them where the file's index is damaged."""
+        allow_pcodec()
         array: zarr.Array[Any] = zarr.open_array(self.array, mode="r", zarr_format=3)
         return [box for box in self.chunks() if not _can_be_read(array, box)]
 

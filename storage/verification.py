@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+from pipeline.errors import IncompleteStoreError
 from storage.addresses import without_manifest
+from storage.archive_codec import MissingCodecError
 from storage.lineage import Catalogue
-from storage.manifests import broken_files, is_sealed, listed_bytes, manifest_sha256, try_manifest
+from storage.manifests import (
+    broken_files,
+    is_sealed,
+    listed_bytes,
+    manifest_sha256,
+    packed_from,
+    packed_values,
+    try_manifest,
+)
+from storage.packed_arrays import values_hash
 from storage.records import Run, Store
 from storage.shard_names import name_damage
 from storage.staging import MANIFEST_NAME
@@ -31,8 +42,14 @@ class Finding:
     kind: Kind = "whole"
 
 
-def verify_everything(root: Path, progress: Progress | None = None) -> list[Finding]:
-    """Check every store and run of an archive; a finding for each that is whole, and for each thing that is not."""
+def verify_everything(
+    root: Path, progress: Progress | None = None, problems_of: Callable[[Path], Iterator[str]] | None = None
+) -> list[Finding]:
+    """Check every store and run of an archive; a finding for each that is whole, and for each thing that is not.
+
+    ``problems_of`` reads one published folder again where its files lie elsewhere.
+    """
+    read_again = problems_of or _problems
     catalogue = Catalogue.read(root)
     places = [(uri, store.ref.path, store.size) for uri, store in catalogue.stores.items()]
     places += [(run.uri, run.folder, _bytes(run)) for run in catalogue.runs]
@@ -41,9 +58,11 @@ def verify_everything(root: Path, progress: Progress | None = None) -> list[Find
     for uri, path, size in places:
         if progress is not None:
             progress(uri, done / total)
-        problems = list(_problems(path)) + list(_identity_problems(catalogue, uri))
-        found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
         done += size
+        if not path.exists() and not catalogue.named_by(uri):
+            continue  # gc or a repair has cleared it away since
+        problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
+        found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
     return [*found, *_lost(root), *_missing(catalogue), *_left_aside(root)]
 
 
@@ -57,15 +76,32 @@ def _problems(folder: Path) -> Iterator[str]:
     if problem is not None:
         yield f"{MANIFEST_NAME} cannot be believed: {problem}"
         return
+    whole = True
     for name, problem in broken_files(folder, manifest, hashes=True):
+        whole = False
         yield f"{name} {problem}{name_damage(folder, name) if name in manifest['files'] else ''}"
+    if whole:
+        yield from _number_problems(folder, manifest)
+
+
+def _number_problems(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
+    """Cubes of a packed store whose numbers are not those that they had before (a missing codec raises)."""
+    for name, expected in packed_values(manifest).items():
+        try:
+            listed = any(file.startswith(f"{name}/") for file in manifest["files"])
+            if not listed or values_hash(folder / name) != expected:
+                yield f"{name} has other numbers than it had before it was packed"
+        except IncompleteStoreError as error:
+            if isinstance(error.__cause__, MissingCodecError):
+                raise
+            yield f"{name} cannot be read: {error}"
 
 
 def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
     """Whether a store is the one that its place and the runs say."""
     store = catalogue.stores.get(uri)
-    if store is None or store.problem is not None:
-        return
+    if store is None or store.problem is not None or not (store.ref.path / MANIFEST_NAME).is_file():
+        return  # which is told of already
     stated = f"stages/{store.facts.get('stage')}/{store.facts.get('key')}"
     if stated != uri:
         yield f"its {MANIFEST_NAME} is that of {stated}; move it back, or take it out of the archive"
@@ -75,12 +111,15 @@ def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
 
 
 def _doubter(catalogue: Catalogue, store: Store) -> Run | None:
-    """A run that knows another manifest, unless a run knows this one or the store was made anew since."""
+    """A run that knows another manifest, unless a run knows this one, or one that the store had before it was packed.
+
+    Nor is a store doubted that was made anew since.
+    """
     knowing = [run for run in catalogue.runs if store.ref.uri in run.recorded]
     if not knowing:
         return None
-    found = manifest_sha256(store.ref.path)
-    if any(run.recorded[store.ref.uri] == found for run in knowing):
+    own = {manifest_sha256(store.ref.path), *packed_from(store.facts)}
+    if any(run.recorded[store.ref.uri] in own for run in knowing):
         return None
     anew = is_sealed(store.facts) and all(store.created > run.created for run in knowing)
     return None if anew else knowing[-1]
