@@ -3,87 +3,43 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.panels import choose_bands
 from flows.run import SurveyRun
 from flows.stages import SEATS_AT_ONCE, Produce, captured, load_plan, write_json
+from flows.tones import choose_bands
 from pipeline.errors import ShapeError
-from pipeline.rectify.alignment import SweepShift, no_shifts
 from pipeline.rectify.line_cache import LineCache
-from pipeline.rectify.line_numbers import LineNumbers, number_lines
-from pipeline.rectify.placed import PixelGrid, Placed, place
+from pipeline.rectify.placed import PixelGrid
 from pipeline.rectify.region import read_seats
 from pipeline.rectify.ties import TieTable
 from pipeline.rectify.tracks import Track
 from storage.archive import StageRef
-from storage.cubes import RawCube
 from storage.layout import read_array
-from storage.lookups import open_lookup, path_digest, write_lookup
+from storage.lookups import path_digest, write_lookup
 from storage.mosaics import MosaicWriter
 from storage.patches import PatchWriter, open_patches
-from storage.tile_work import MosaicWork, Thumbnail, write_mosaic
+from storage.quicklooks import stretched
+from storage.sightings import Sighted, sight_sweeps
+from storage.tile_work import MosaicRecipe, Thumbnail, write_mosaic
 
 QUICKLOOK_PX = 512
 CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the memory
 
-Tables = Mapping[str, Sequence[tuple[Track, TieTable]]]
-
-
-@dataclass(frozen=True)
-class Sighted:
-    """One captured sweep, which of its lines may be believed, and its corrections."""
-
-    cube: RawCube
-    numbers: LineNumbers
-    shift: SweepShift
-    gain: NDArray[np.float32] | None
-
-    @property
-    def usable(self) -> NDArray[np.bool_]:
-        """(line,) valid lines with a time stamp and a position of their own."""
-        known = np.isfinite(self.cube.position.sum(axis=1))
-        usable: NDArray[np.bool_] = self.cube.valid_line & self.numbers.usable & known
-        return usable
-
-    @property
-    def shift_px(self) -> NDArray[np.float64]:
-        """(line, 2) pointing corrections along the line and the scan [px]."""
-        return self.shift.of_lines(len(self.cube.time_s))
-
-    def placed(self, run: SurveyRun, grid: PixelGrid | None = None) -> Placed:
-        """Find where its lines lie."""
-        return place(self.cube, run.camera, grid=grid, usable=self.usable, shift_px=self.shift_px, gain=self.gain)
-
-    def facts(self) -> dict[str, int]:
-        """Lines that were lost, sent twice, out of order or late."""
-        found = self.numbers
-        counts = {"lost": found.lost, "repeated": found.repeated, "backward": found.backward, "late": found.late}
-        return counts | {"invalid": int(np.count_nonzero(~self.cube.valid_line))}
-
 
 def sighted(run: SurveyRun, raw: StageRef, registration: StageRef | None) -> list[Sighted]:
     """Open the sweeps of a capture with what registration found of them."""
-    cubes = captured(raw)
-    shifts = {shift.name: shift for shift in no_shifts([cube.sweep.name for cube in cubes])}
-    gains: dict[str, NDArray[np.float32]] = {}
-    if registration is not None:
-        found = json.loads((registration.path / "registration.json").read_text())
-        for name, one in found["sweeps"].items():
-            shifts[name] = SweepShift(name, np.array(one["offset_px"]), np.array(one["drift_px_per_line"]))
-            if one["gain"] is not None:
-                gains[name] = np.array(one["gain"], np.float32)
-    frame_s = run.camera.frame_ms * 1e-3
-    return [
-        Sighted(cube, number_lines(cube.time_s, frame_s), shifts[cube.sweep.name], gains.get(cube.sweep.name))
-        for cube in cubes
-    ]
+    return sight_sweeps(captured(raw), _record(registration), run.camera)
+
+
+def _record(registration: StageRef | None) -> Path | None:
+    return None if registration is None else registration.path / "registration.json"
 
 
 def locate(run: SurveyRun, produce: Produce, raw: StageRef, *registration: StageRef) -> StageRef:
@@ -106,7 +62,7 @@ def locate(run: SurveyRun, produce: Produce, raw: StageRef, *registration: Stage
     def build(path: Path) -> None:
         tables: dict[str, list[tuple[Track, TieTable]]] = {}
         for number, one in enumerate(sweeps):
-            made = one.placed(run, grid).tracks
+            made = one.placed(run.camera, grid).tracks
             whole = [(track, table) for track, table in made if table is not None]
             # Where lines lie too unevenly for ties there is nothing to keep: such a sweep is looked up directly.
             tables[one.cube.sweep.name] = whole if len(whole) == len(made) else []
@@ -121,36 +77,23 @@ def rectify(run: SurveyRun, produce: Produce, raw: StageRef, lookup: StageRef, *
 
     def build(path: Path) -> None:
         grid = PixelGrid.of_scene(run.grid, run.grid.factor)
-        tables = open_lookup(lookup.path / "lookup.zarr")
-        sweeps = sighted(run, raw, _only(registration))
-        work = MosaicWork([_with_tables(run, one, tables) for one in sweeps], run.camera, grid, run.settings.kernel)
+        recipe = MosaicRecipe(
+            raw.path, run.camera, grid, run.settings.kernel,
+            lookup=lookup.path / "lookup.zarr", registration=_record(_only(registration)),
+        )  # fmt: skip
         writer = MosaicWriter(
             path / "mosaic.zarr", grid.shape, run.scene.wavelength_nm,
             fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(run.grid.factor),
         )  # fmt: skip
         colours, _ = choose_bands(run.scene.wavelength_nm)
         picture = Thumbnail(grid.shape, colours, QUICKLOOK_PX)
-        write_mosaic(work, writer, memory=run.settings.memory, seen=picture, report=run.report)
-        writer.write_quicklook(_preview(picture.image))
-        write_json(path / "lines.json", {one.cube.sweep.name: one.facts() for one in sweeps})
+        settings = run.settings
+        write_mosaic(recipe, writer, memory=settings.memory, crew=settings.crew, seen=picture, report=run.report)
+        writer.write_quicklook(stretched(picture.image).image)
+        write_json(path / "lines.json", {one.cube.sweep.name: one.facts() for one in recipe.sweeps()})
 
     params = {"grid": asdict(run.grid), "kernel": run.settings.kernel}
     return produce("rectify", build, params, [raw, lookup, *registration])
-
-
-def _with_tables(run: SurveyRun, one: Sighted, tables: Tables) -> Placed:
-    """A sweep with its stored tables; without, where its lines lie too unevenly for one."""
-    stored = tables.get(one.cube.sweep.name)
-    return Placed(one.cube, tuple(stored), one.gain) if stored else one.placed(run)
-
-
-def _preview(image: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Colours for viewers: 2-98 % of each band, (y, x, 3) uint8."""
-    seen = np.where(np.isfinite(image).any(axis=(0, 1)), image, 0)
-    low, high = np.nanpercentile(seen, (2, 98), axis=(0, 1))
-    scaled = np.clip((seen - low) / np.where(high > low, high - low, 1), 0, 1)
-    picture: NDArray[np.uint8] = np.nan_to_num(scaled * 255).astype(np.uint8)
-    return picture
 
 
 def cut_patches(
@@ -164,7 +107,7 @@ def cut_patches(
             path / "patches.zarr", ordered, run.grid.seat_origin(ordered), run.grid.patch,
             run.scene.wavelength_nm, fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(),
         )  # fmt: skip
-        sweeps = [one.placed(run) for one in sighted(run, raw, _only(registration))]
+        sweeps = [one.placed(run.camera) for one in sighted(run, raw, _only(registration))]
         cache = LineCache(run.settings.memory // CACHE_SHARE)
         for first in range(0, len(ordered), SEATS_AT_ONCE):
             seats = ordered[first : first + SEATS_AT_ONCE]

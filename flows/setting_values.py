@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from pipeline.errors import BudgetError, SettingsError
+from storage.block_work import Crew
 
 EFFECTS = ("slit", "smear", "throughput", "shot", "read")
 LEAST_MEMORY = 256 * 1024**2
@@ -111,6 +112,14 @@ def parse_memory(value: object, place: str) -> int:
     if count < LEAST_MEMORY:
         raise SettingsError(f"{place} must be at least {LEAST_MEMORY // 2**20}MiB, got {value!r} ({count} bytes)")
     return count
+
+
+def parse_scheduler(value: object, place: str) -> str:
+    """``threads``, ``processes``, or the address of a dask scheduler."""
+    try:
+        return Crew(parse_text(value, place)).scheduler
+    except SettingsError as error:
+        raise SettingsError(f"{place}: {error}") from None
 
 
 def parse_size(value: object, place: str) -> tuple[int, int]:

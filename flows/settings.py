@@ -17,6 +17,7 @@ from flows.setting_values import (
     parse_effects,
     parse_memory,
     parse_number,
+    parse_scheduler,
     parse_size,
     parse_switch,
     parse_text,
@@ -27,12 +28,14 @@ from pipeline.camera import LineCamera
 from pipeline.errors import PoseError, SettingsError
 from pipeline.ground import LIMITS, RigPose
 from pipeline.scan import CostModel
+from storage.block_work import Crew
 
 POLICIES = ("entropy", "sobel", "random", "mask")
 ENGINES = ("prefect", "plain")
 KERNELS = ("catmull-rom", "bilinear", "nearest")
 BUILT_IN_SCENES = ("farm",)
 BUILT_IN_SOURCES = ("sim", "rig")
+OF_THE_MACHINE = ("scheduler", "workers")  # no byte depends on them; a cluster of that day need not be there today
 _PATHS = ("scene", "labels", "source", "out", "mask", "weights")
 
 Parser = Callable[[object, str], object]
@@ -66,6 +69,8 @@ class Settings:
     controls: bool = True
     engine: Literal["prefect", "plain"] = "prefect"
     memory: int = 4 * 1024**3  # [bytes]
+    scheduler: str = "threads"  # who makes blocks: threads, processes, or tcp://host:port of a dask scheduler
+    workers: int | None = None  # blocks at a time; None is one a core. A scheduler elsewhere has its own
     kernel: Literal["catmull-rom", "bilinear", "nearest"] = "catmull-rom"
     pointing_px: float = 0.0  # how far off the mirror may point; above 0 sweeps overlap and their seams are registered
     size: tuple[int, int] | None = None  # (width, height) of the built-in scene [px]
@@ -73,6 +78,11 @@ class Settings:
     cost: CostModel = field(default_factory=CostModel)
     pose: RigPose | None = None  # without one nothing is put on the ground
     map: MapChoice = field(default_factory=MapChoice)
+
+    @property
+    def crew(self) -> Crew:
+        """Who does the work that is cut into blocks."""
+        return Crew(self.scheduler, self.workers)
 
     @property
     def shape(self) -> tuple[int, int] | None:
@@ -99,7 +109,7 @@ def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | 
     ------
     SettingsError, BudgetError : the first key that cannot be used, with its place and what it should be.
     """
-    table = {} if path is None else _anchor_paths(_read_toml(Path(path)), Path(path).parent)
+    table = {} if path is None else anchor_paths(_read_toml(Path(path)), Path(path).parent)
     origin = dict.fromkeys(_flatten(table), str(path))
     for key, value in _flatten(flags or {}).items():
         if value is not None:
@@ -209,7 +219,7 @@ def _read_toml(path: Path) -> dict[str, object]:
         raise SettingsError(f"{path} is not valid TOML: {error}") from None
 
 
-def _anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
+def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
     """Relative paths of a file's settings, made to start at the file's folder."""
     named = {*BUILT_IN_SCENES, *BUILT_IN_SOURCES}
     anchored = dict(table)
@@ -296,6 +306,8 @@ _SURVEY: dict[str, Parser] = {
     "controls": parse_switch,
     "engine": parse_choice(ENGINES),
     "memory": parse_memory,
+    "scheduler": parse_scheduler,
+    "workers": parse_whole(1, 1024, why="one process or thread each; leave it out for one a core"),
     "kernel": parse_choice(KERNELS),
     "pointing_px": parse_number(Span(0, 300, "px")),
     "size": parse_size,

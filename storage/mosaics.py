@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import ChunkError, ShapeError
@@ -13,6 +14,7 @@ from storage.layout import (
     AngularGrid,
     create_array,
     create_group,
+    damage_named,
     grid_of,
     grid_record,
     image_spec,
@@ -21,8 +23,8 @@ from storage.layout import (
     read_bands,
     round_bits,
     write_bands,
-    write_image,
 )
+from storage.quicklooks import Quicklook, write_quicklook
 
 BLOCK_VALUES = 1 << 16
 
@@ -55,6 +57,7 @@ class MosaicWriter:
         grid: AngularGrid | None = None,
     ) -> None:
         place = {} if grid is None else grid.attributes(shape)
+        self.path = path
         self.group = create_group(path, "mosaic", {**place, **grid_record(grid)})
         bands = write_bands(self.group, wavelength_nm, fwhm_nm)
         self._shape = (*shape, len(wavelength_nm))
@@ -62,6 +65,25 @@ class MosaicWriter:
         self._values = create_array(self.group, "values", image_spec(("y", "x", "band"), self._shape, "<f4"), about)
         about = {"long_name": "weight of the samples seen", "units": "1", **place}
         self._coverage = create_array(self.group, "coverage", image_spec(("y", "x"), shape, "<f4"), about)
+
+    @classmethod
+    def reopen(cls, path: Path) -> MosaicWriter:
+        """Go on writing tiles of a mosaic that another writer has begun, in this process or another.
+
+        Raises
+        ------
+        IncompleteStoreError : no mosaic has been begun there.
+        """
+        writer = cls.__new__(cls)
+        writer.path = path
+        with damage_named(str(path)):
+            writer.group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
+            values, coverage = (writer.group[name] for name in ("values", "coverage"))
+            if not isinstance(values, zarr.Array) or not isinstance(coverage, zarr.Array):
+                raise KeyError("values and coverage are no arrays")
+            y, x, bands = values.shape
+        writer._values, writer._coverage, writer._shape = values, coverage, (y, x, bands)
+        return writer
 
     @property
     def tile_shape(self) -> tuple[int, int]:
@@ -115,8 +137,7 @@ class MosaicWriter:
 
     def write_quicklook(self, image: NDArray[np.uint8]) -> None:
         """Store a small colour picture, (y, x, 3) uint8, beside the mosaic."""
-        about = {"long_name": "picture for viewers, red green blue"}
-        write_image(self.group, "quicklook", ("quicklook_y", "quicklook_x", "rgb"), image, about)
+        write_quicklook(self.group, Quicklook(image))
 
 
 def _rounded(values: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -26,6 +26,7 @@ from pipeline.grid import SceneGrid
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.scan import Sweep, line_positions
 from pipeline.source import Line, References
+from storage.block_work import Crew
 from storage.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.mosaics import MosaicWriter
 from storage.tile_work import MosaicWork, write_mosaic
@@ -90,7 +91,7 @@ def rectify(paths: list[Path], out: Path, grid: PixelGrid, memory: int, workers:
     placed = [place(open_raw_cube(path), CAMERA, grid=grid) for path in paths]
     wavelength_nm = open_raw_cube(paths[0]).wavelength_nm
     writer = MosaicWriter(out, grid.shape, wavelength_nm)
-    write_mosaic(MosaicWork(placed, CAMERA, grid), writer, memory=memory, workers=workers)
+    write_mosaic(MosaicWork(placed, CAMERA, grid), writer, memory=memory, crew=Crew(workers=workers))
 
 
 def measured(paths: list[Path], out: Path, grid: PixelGrid, memory: int, workers: int | None) -> Spent:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import signal
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,17 +15,18 @@ import pytest
 from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
 from pipeline.rectify.placed import PixelGrid, place
-from pipeline.rectify.tiles import Tile
 from pipeline.scan import Sweep, line_positions
 from pipeline.source import Line, References
+from storage.block_work import Crew
 from storage.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from storage.mosaics import MosaicWriter, load_mosaic
-from storage.tile_work import MosaicWork, Thumbnail, write_mosaic
+from storage.tile_work import MosaicRecipe, MosaicWork, Thumbnail, ThumbnailCut, write_mosaic
 
 CAMERA = LineCamera()
 BANDS = np.array([500.0, 600.0, 700.0])
 GRID = PixelGrid((-70.0, -420.0), 1, (140, 900))
-PLENTY = 2 * 2**30
+PLENTY = 4 * 2**30
+ONE, TWO, THREE = (Crew(workers=count) for count in (1, 2, 3))
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +43,39 @@ def cubes(tmp_path_factory: pytest.TempPathFactory) -> list[RawCube]:
     return [open_raw_cube(path) for path in sorted(folder.iterdir())]
 
 
+@dataclass(frozen=True)
+class KillOnce(ThumbnailCut):
+    """A cut that ends its process the first time, and leaves what an interrupted write leaves."""
+
+    folder: str = ""
+
+    def __call__(self, rows: slice, columns: slice, values: np.ndarray) -> np.ndarray:
+        """As a thumbnail's, once somebody was killed."""
+        if not (Path(self.folder) / "killed").exists():
+            (Path(self.folder) / "m.zarr" / "values" / "c.1234.partial").write_bytes(b"half")
+            (Path(self.folder) / "killed").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().__call__(rows, columns, values)
+
+
 class Whole:
     """A cube that can be read by whole lines alone."""
 
     def __init__(self, cube: RawCube) -> None:
         self.sweep, self.references, self.read = cube.sweep, cube.references, cube.read
         self.position, self.time_s, self.valid_line = cube.position, cube.time_s, cube.valid_line
+
+
+@pytest.fixture(scope="module")
+def processes() -> Iterator[Crew]:
+    """Two worker processes for all tests here."""
+    with Crew("processes", 2).open() as crew:
+        yield crew
+
+
+def recipe_of(cubes: list[RawCube]) -> MosaicRecipe:
+    """Both sweeps by the folder that they lie in."""
+    return MosaicRecipe(Path(str(cubes[0].group.store_path.store.root)).parent, CAMERA, GRID)
 
 
 def work_of(cubes: list[RawCube]) -> MosaicWork:
@@ -62,14 +94,14 @@ def digest_of(folder: Path) -> str:
 def test_workers_do_not_change_a_byte(tmp_path: Path, cubes: list[RawCube]) -> None:
     """One tile at a time in a plain loop, or three at once, the files are the same; cubes read whole give them too."""
     digests = set()
-    for workers in (1, 3):
-        path = tmp_path / f"{workers}.zarr"
-        budget = write_mosaic(work_of(cubes), MosaicWriter(path, GRID.shape, BANDS), memory=PLENTY, workers=workers)
-        assert budget.workers == workers
+    for crew in (ONE, THREE):
+        path = tmp_path / f"{crew.workers}.zarr"
+        budget = write_mosaic(work_of(cubes), MosaicWriter(path, GRID.shape, BANDS), memory=PLENTY, crew=crew)
+        assert budget.workers == crew.workers
         digests.add(digest_of(path))
     assert len(digests) == 1
     plain = MosaicWork([place(Whole(cube), CAMERA, grid=GRID) for cube in cubes], CAMERA, GRID)
-    write_mosaic(plain, MosaicWriter(tmp_path / "whole.zarr", GRID.shape, BANDS), memory=PLENTY, workers=1)
+    write_mosaic(plain, MosaicWriter(tmp_path / "whole.zarr", GRID.shape, BANDS), memory=PLENTY, crew=ONE)
     np.testing.assert_array_equal(load_mosaic(tmp_path / "whole.zarr").values, load_mosaic(tmp_path / "1.zarr").values)
 
 
@@ -78,13 +110,14 @@ def test_progress_and_tiles_are_told(tmp_path: Path, cubes: list[RawCube]) -> No
     seen: list[tuple[int, int]] = []
     shares: list[float] = []
 
-    def show(tile: Tile, values: np.ndarray) -> None:
-        assert values.shape == (tile.rows.stop - tile.rows.start, tile.columns.stop - tile.columns.start, 3)
-        seen.append((tile.rows.start, tile.columns.start))
+    class Watched(Thumbnail):
+        def put(self, rows: slice, columns: slice, part: np.ndarray) -> None:
+            assert part.shape == (rows.stop - rows.start, columns.stop - columns.start, 3)
+            seen.append((rows.start, columns.start))
 
     write_mosaic(
         work_of(cubes), MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS),
-        memory=PLENTY, workers=2, seen=show, report=shares.append,
+        memory=PLENTY, crew=TWO, seen=Watched(GRID.shape, [0, 1, 2], 900), report=shares.append,
     )  # fmt: skip
     assert sorted(seen) == [(y, x) for y in (0, 64, 128) for x in (0, 640)]
     assert shares == sorted(shares)
@@ -96,7 +129,7 @@ def test_thumbnail_is_every_nth_pixel(tmp_path: Path, cubes: list[RawCube], most
     """Whatever tiles it is made of, a thumbnail holds the mosaic's own pixels, at most so many a side."""
     thumbnail = Thumbnail(GRID.shape, [2, 0], most_px)
     path = tmp_path / "m.zarr"
-    write_mosaic(work_of(cubes), MosaicWriter(path, GRID.shape, BANDS), memory=PLENTY, workers=1, seen=thumbnail)
+    write_mosaic(work_of(cubes), MosaicWriter(path, GRID.shape, BANDS), memory=PLENTY, crew=ONE, seen=thumbnail)
     down, across = (-(-size // most_px) for size in GRID.shape)
     whole = load_mosaic(path).values[::down, ::across, ::-2]
     np.testing.assert_allclose(thumbnail.image, whole, rtol=3e-4)
@@ -106,8 +139,8 @@ def test_thumbnail_is_every_nth_pixel(tmp_path: Path, cubes: list[RawCube], most
 def test_memory_says_how_many_tiles_at_a_time(tmp_path: Path, cubes: list[RawCube]) -> None:
     """With memory for one tile only one is made at a time, whatever is allowed; a byte less and none is."""
     work = work_of(cubes)
-    least = write_mosaic(work, MosaicWriter(tmp_path / "a.zarr", GRID.shape, BANDS), memory=PLENTY, workers=1).projected
-    tight = write_mosaic(work, MosaicWriter(tmp_path / "b.zarr", GRID.shape, BANDS), memory=least, workers=4)
+    least = write_mosaic(work, MosaicWriter(tmp_path / "a.zarr", GRID.shape, BANDS), memory=PLENTY, crew=ONE).projected
+    tight = write_mosaic(work, MosaicWriter(tmp_path / "b.zarr", GRID.shape, BANDS), memory=least, crew=THREE)
     assert tight.workers == 1
     with pytest.raises(SettingsError, match=r"projected memory \d+ MiB exceeds --memory \d+ MiB: one tile of 64 x 640"):
         write_mosaic(work, MosaicWriter(tmp_path / "c.zarr", GRID.shape, BANDS), memory=least - 1)
@@ -116,10 +149,54 @@ def test_memory_says_how_many_tiles_at_a_time(tmp_path: Path, cubes: list[RawCub
 def test_an_error_in_a_tile_ends_the_work(tmp_path: Path, cubes: list[RawCube]) -> None:
     """What goes wrong in a worker is raised where the work was asked for."""
 
-    def fail(tile: Tile, values: np.ndarray) -> None:
-        raise ValueError(f"tile at {tile.columns.start}")
-
-    with pytest.raises(ValueError, match="tile at 0"):
+    thumbnail = Thumbnail(GRID.shape, [3], 100)  # a band too far
+    with pytest.raises(IndexError, match="index 3 is out of bounds"):
         write_mosaic(
-            work_of(cubes), MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS), memory=PLENTY, workers=2, seen=fail
+            work_of(cubes),
+            MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS),
+            memory=PLENTY,
+            crew=TWO,
+            seen=thumbnail,
         )
+
+
+def test_processes_write_the_same_bytes(tmp_path: Path, cubes: list[RawCube], processes: Crew) -> None:
+    """From one recipe threads and processes make the same files and the same thumbnail, nothing beside them."""
+    made = {}
+    for crew in (ONE, TWO, processes):
+        path, thumbnail = tmp_path / f"{crew.scheduler}{crew.workers}.part" / "m.zarr", Thumbnail(GRID.shape, [2], 50)
+        budget = write_mosaic(
+            recipe_of(cubes), MosaicWriter(path, GRID.shape, BANDS), memory=PLENTY, crew=crew, seen=thumbnail
+        )
+        assert (budget.workers, budget.processes) == (crew.workers, crew is processes)
+        made[crew] = digest_of(path), thumbnail.image.tobytes()
+    assert len({*made.values()}) == 1
+
+
+def test_a_worker_killed_between_tiles_changes_nothing(
+    tmp_path: Path, cubes: list[RawCube], processes: Crew, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """kill -9 of a process that makes tiles, with a shard half written: the mosaic is as an undisturbed one."""
+    folder = tmp_path / "key.part"
+    write_mosaic(recipe_of(cubes), MosaicWriter(tmp_path / "a.zarr", GRID.shape, BANDS), memory=PLENTY, crew=ONE)
+    kill = KillOnce((1, 1), (0,), str(folder))
+    monkeypatch.setattr("storage.tile_work.ThumbnailCut", lambda *about: kill)
+    writer = MosaicWriter(folder / "m.zarr", GRID.shape, BANDS)
+    write_mosaic(recipe_of(cubes), writer, memory=PLENTY, crew=processes, seen=Thumbnail(GRID.shape, [0], 900))
+    assert (folder / "killed").exists()
+    assert digest_of(folder / "m.zarr") == digest_of(tmp_path / "a.zarr")
+
+
+def test_processes_need_a_recipe(tmp_path: Path, cubes: list[RawCube], processes: Crew) -> None:
+    """Opened sweeps cannot be sent to other processes."""
+    with pytest.raises(TypeError, match="crew 'processes' needs a MosaicRecipe"):
+        write_mosaic(
+            work_of(cubes), MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS), memory=PLENTY, crew=processes
+        )
+
+
+def test_every_process_counts_against_the_memory(tmp_path: Path, cubes: list[RawCube]) -> None:
+    """Two processes and this one do not fit where one does; the message says what each takes."""
+    writer = MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS)
+    with pytest.raises(SettingsError, match=r"each of two processes 512 MiB; give at least --memory 1\d\d\d MiB"):
+        write_mosaic(recipe_of(cubes), writer, memory=2**30, crew=Crew("processes", 2))
