@@ -16,19 +16,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.field_work import FieldWork, region_params
+from flows.region_work import look_at, seat_columns
 from flows.run import SurveyRun
-from models.inference import Glance, glance, segment
-from models.policies import score_seats
+from models.inference import CoarseLook, Glance, read_glance
+from models.policies import SEEING_POLICIES, score_seats
+from models.regions import whole_field
 from pipeline.crop_rows import CropRows, find_rows
 from pipeline.orientation import compare_orientations
 from pipeline.planning import FinePlan, plan_fine
 from pipeline.scan import Sweep
 from storage.archive import StageRef, stage_key
 from storage.attention import Attention, write_attention
-from storage.class_maps import ClassMap, write_class_map
+from storage.class_maps import ClassNames, create_class_map
 from storage.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from storage.layout import SHARD_ROWS
-from storage.mosaics import load_mosaic
+from storage.mosaic_strips import mosaic_brightness
 from storage.patches import open_patches
 from storage.spool import Spool
 
@@ -90,8 +93,8 @@ def captured(ref: StageRef) -> list[RawCube]:
 
 
 def glance_at(run: SurveyRun, mosaic: StageRef) -> Glance:
-    """What the model says of a stored coarse mosaic alone."""
-    return glance(run.weights, load_mosaic(mosaic.path / "mosaic.zarr").values, run.scene.wavelength_nm, run.grid)
+    """What the model says of a stored coarse mosaic alone, the whole field at once: for those that hold it anyway."""
+    return read_glance(run.weights, look_at(run.weights, mosaic.path / "mosaic.zarr", whole_field(run.grid)))
 
 
 def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
@@ -99,12 +102,13 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
     settings = run.settings
 
     def build(path: Path) -> None:
-        scores = score_seats(settings.policy, glance_at(run, mosaic), seed=settings.seed, mask=run.mask)
-        run.report(0.5)
+        work = FieldWork.of(run)
+        scores = _scores(run, work, mosaic)
         plan = plan_fine(
             run.grid, run.camera, settings.cost, run.plan.along, scores,
             budget_s=run.plan.fine_s, margin_px=run.plan.margin_px, full=run.plan.full,
         )  # fmt: skip
+        work.check_memory(plan.seats, len(run.scene.wavelength_nm))  # before the rig goes back, not after
         rank = np.full(scores.shape, -1, np.int32)
         rank[plan.seats[np.argsort(-scores[plan.seats], kind="stable")]] = np.arange(len(plan.seats))
         shape = run.grid.seat_shape
@@ -128,13 +132,23 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
         "along": run.plan.along,
         "camera": asdict(run.camera),
         "cost": asdict(settings.cost),
+        **(region_params(run.grid) if settings.policy in SEEING_POLICIES else {}),
     }
     return produce("attend", build, params, [mosaic])
 
 
+def _scores(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:
+    """(seat,) worth of a fine look at each seat of the padded grid."""
+    policy = run.settings.policy
+    if policy in SEEING_POLICIES:
+        return work.score(policy, mosaic.path / "mosaic.zarr", lambda done: run.report(0.5 * done)).ravel()
+    nothing = np.empty((0, 0, 0), np.float32)
+    return score_seats(policy, Glance(run.grid, nothing, nothing), seed=run.settings.seed, mask=run.mask)
+
+
 def _crop_rows(mosaic: StageRef) -> CropRows:
     """Crop rows as the coarse mosaic shows them, all bands together."""
-    return find_rows(load_mosaic(mosaic.path / "mosaic.zarr").values.mean(axis=-1))
+    return find_rows(mosaic_brightness(mosaic.path / "mosaic.zarr"))
 
 
 def load_plan(attention: StageRef) -> FinePlan:
@@ -150,53 +164,22 @@ def load_orientation(attention: StageRef) -> dict[str, Any]:
     return found
 
 
-def patch_columns(run: SurveyRun, patches: StageRef, seen: Glance) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Seats and their normalised spectral columns, (seat, p, p, column), read a few patches at a time.
-
-    A mirror that looks beside the plan leaves pixels of a seat unseen: they take the columns of the coarse pixel over
-    them. A seat of which nothing was seen is left out.
-    """
+def patch_columns(run: SurveyRun, patches: StageRef, seen: CoarseLook) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Seats of the whole field and their normalised spectral columns, (seat, p, p, column); see ``seat_columns``."""
     store = open_patches(patches.path / "patches.zarr")
-    p, count, kept = run.grid.patch, len(store.seats), 0
-    seats, columns = np.empty(count, np.int64), np.empty((count, p, p, run.weights.basis.columns), np.float32)
-    for first in range(0, count, SEATS_AT_ONCE):
-        values = store.read(first, first + SEATS_AT_ONCE)
-        reached = np.asarray(np.isfinite(values).any(axis=-1), np.bool_)
-        some = np.asarray(reached.any(axis=(1, 2)), np.bool_)
-        part = slice(kept, kept := kept + int(some.sum()))
-        seats[part] = store.seats[first : first + len(values)][some]
-        columns[part] = run.weights.columns(values[some], run.scene.wavelength_nm)
-        _fill_unseen(columns[part], seats[part], reached[some], seen)
-    return seats[:kept], columns[:kept]
-
-
-def _fill_unseen(
-    columns: NDArray[np.float32], seats: NDArray[np.int64], reached: NDArray[np.bool_], seen: Glance
-) -> None:
-    """Put the columns of the coarse look, in place, where no line reached a pixel of a seat."""
-    pixel = np.arange(seen.grid.patch)
-    for patch, seat, there in zip(columns, seats, reached, strict=True):
-        if not there.all():
-            y, x = seen.grid.seat_origin(seat)[..., None] + pixel
-            coarse = seen.columns[np.ix_(y // seen.grid.factor, x // seen.grid.factor)]
-            patch[~there] = coarse[~there]
+    return seat_columns(run.weights, store, run.scene.wavelength_nm, seen, whole_field(run.grid))
 
 
 def draw_map(run: SurveyRun, produce: Produce, mosaic: StageRef, patches: StageRef) -> StageRef:
-    """Read coarse and fine patches together and draw the class map."""
+    """Read coarse and fine patches together and draw the class map, one region of the field after the other."""
 
     def build(path: Path) -> None:
-        seen = glance_at(run, mosaic)
-        seats, columns = patch_columns(run, patches, seen)
-        run.report(0.4)
-        drawn = segment(run.weights, seen, columns, seats)
-        weights = run.weights
-        found = ClassMap(
-            drawn.classes, drawn.confidence, weights.class_names, weights.class_colours, run.angular_grid()
-        )
-        write_class_map(path / "class_map.zarr", found)
+        out, legend = path / "class_map.zarr", ClassNames(run.weights.class_names, run.weights.class_colours)
+        create_class_map(out, (run.grid.height, run.grid.width), legend, grid=run.angular_grid())
+        FieldWork.of(run).draw(mosaic.path / "mosaic.zarr", patches.path / "patches.zarr", out, run.report)
 
-    return produce("segment", build, {"weights": run.weights_key, "grid": asdict(run.grid)}, [mosaic, patches])
+    params = {"weights": run.weights_key, "grid": asdict(run.grid), **region_params(run.grid)}
+    return produce("segment", build, params, [mosaic, patches])
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-from models.patches import BOTTOM, level_widths
-from models.segmenter import SegmenterConfig
+from models.sizes import BOTTOM, SegmenterConfig, level_widths
 from pipeline.grid import SceneGrid
 
 

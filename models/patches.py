@@ -8,17 +8,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
-from pipeline.errors import ShapeError
-
-BOTTOM = 4  # pixels a side at the lowest level of a patch
-
-
-def level_widths(width: int, patch: int) -> list[int]:
-    """Channels of each level, from full patch resolution down to ``BOTTOM`` px: width, 2 width, then 3 width."""
-    levels = (patch // BOTTOM).bit_length()
-    if patch < BOTTOM or patch != BOTTOM << (levels - 1):
-        raise ShapeError(f"a patch must be {BOTTOM} px times a power of two, got {patch}; choose 8, 16 or 32")
-    return [width * min(level + 1, 3) for level in range(levels)]
+from models.sizes import BOTTOM
+from models.sizes import level_widths as level_widths
 
 
 class ChannelNorm(nn.Module):

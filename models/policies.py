@@ -6,8 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import sobel
-from scipy.special import xlogy
 
 from models.inference import Glance
 from pipeline.errors import SettingsError, ShapeError
@@ -46,6 +44,8 @@ def score_seats(policy: str, seen: Glance, *, seed: int = 0, mask: NDArray[np.ge
 
 def pixel_entropy(probability: NDArray[np.floating]) -> NDArray[np.float64]:
     """Entropy over the last axis [nat]; a probability of 0 adds 0."""
+    from scipy.special import xlogy
+
     exact = probability.astype(np.float64)
     entropy: NDArray[np.float64] = -xlogy(exact, exact).sum(axis=-1)
     return entropy
@@ -56,6 +56,8 @@ def _entropy(seen: Glance) -> NDArray[np.float64]:
 
 
 def _edges(seen: Glance) -> NDArray[np.float64]:
+    from scipy.ndimage import sobel
+
     brightness = seen.columns.astype(np.float64).mean(axis=-1)
     down, across = (sobel(brightness, axis=axis, mode="nearest") for axis in (0, 1))
     edges: NDArray[np.float64] = np.hypot(down, across)
@@ -63,6 +65,7 @@ def _edges(seen: Glance) -> NDArray[np.float64]:
 
 
 _PIXEL_SCORES: dict[str, Callable[[Glance], NDArray[np.float64]]] = {"entropy": _entropy, "sobel": _edges}
+SEEING_POLICIES = tuple(_PIXEL_SCORES)  # the others take nothing of a glance but its grid
 
 
 def _seat_means(pixels: NDArray[np.float64], seen: Glance) -> Scores:

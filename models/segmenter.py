@@ -7,50 +7,17 @@ coarse patches (H/ps) x (W/ps), each p x p coarse px. J spectral columns, d toke
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
 from models.encoder import Encoder
-from models.patches import PatchHead, PatchStem, Residual, level_widths
-from models.tokens import Positions, TokenSet, code_1d, code_2d, paper_numbers
-from pipeline.errors import ShapeError
-
-MOST_CLASSES = 255  # maps are uint8 and 255 stands for unlabelled
-
-
-@dataclass(frozen=True)
-class SegmenterConfig:
-    """Sizes of a segmenter; everything needed to build it again. Raises ShapeError for sizes that do not fit."""
-
-    classes: int
-    columns: int = 24
-    patch: int = 16
-    factor: int = 4
-    width: int = 32
-    dim: int = 128
-    layers: int = 4
-    heads: int = 4
-    mlp_ratio: int = 3
-    positions: Positions = "2d"
-
-    def __post_init__(self) -> None:
-        if not 2 <= self.classes <= MOST_CLASSES:
-            raise ShapeError(f"a segmenter needs 2 to {MOST_CLASSES} classes, got {self.classes}")
-        for name in ("columns", "patch", "factor", "width", "dim", "layers", "heads", "mlp_ratio"):
-            if getattr(self, name) < 1:
-                raise ShapeError(f"{name} of a segmenter must be at least 1, got {getattr(self, name)}")
-        level_widths(self.width, self.patch)  # refuses a patch that cannot be halved down to the lowest level
-        if self.patch % self.factor:
-            raise ShapeError(f"patch {self.patch} must divide by the factor {self.factor}")
-        if self.dim % 4 or self.dim % self.heads:
-            raise ShapeError(f"token width {self.dim} must divide by 4 and by its {self.heads} heads")
-
-    def as_dict(self) -> dict[str, int | str]:
-        """Plain values for a checkpoint."""
-        return asdict(self)
+from models.patches import PatchHead, PatchStem, Residual
+from models.sizes import SegmenterConfig as SegmenterConfig
+from models.sizes import level_widths
+from models.tokens import TokenSet, code_1d, code_2d, paper_numbers
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
+from models.sizes import Positions as Positions
 from pipeline.errors import ShapeError
 
-Positions = Literal["2d", "paper"]
 LONGEST_PERIOD = 128.0  # seats; the shortest is 2
 
 

@@ -3,23 +3,37 @@
 from __future__ import annotations
 
 import json
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 
-from models.segmenter import Segmenter, SegmenterConfig
+from models.sizes import SegmenterConfig
 from models.spectral import Normalisation, SpectralBasis
 from pipeline.errors import WeightsError
 
+if TYPE_CHECKING:
+    import torch
+
+    from models.segmenter import Segmenter
+
 NORMALISATION = ("centre", "spread", "whitening")
 FORMAT = "spectralzoom-weights/1"
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a file of weights says of itself; to read that takes neither its tensors nor torch."""
+
+    config: SegmenterConfig
+    basis: SpectralBasis
+    class_names: tuple[str, ...]
+    record: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -52,6 +66,9 @@ class Weights:
 
 def save_weights(weights: Weights, path: Path) -> None:
     """Write the file by a temporary name and a rename, so that it is whole or absent."""
+    import torch
+    from safetensors.torch import save
+
     tensors = {name: value.detach().cpu().contiguous() for name, value in weights.segmenter.state_dict().items()}
     for name in NORMALISATION:
         tensors[f"normalisation.{name}"] = torch.from_numpy(getattr(weights.normalisation, name).copy())
@@ -84,27 +101,48 @@ def load_weights(path: Path) -> Weights:
     ------
     WeightsError : missing, damaged, of another format, or a tensor that does not fit its config (named).
     """
+    described = describe_weights(path)
+    with _opened(path, "pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+    return _assemble(path, described, tensors)
+
+
+def describe_weights(path: Path) -> Description:
+    """Read what a file of weights says of itself, in milliseconds.
+
+    Raises
+    ------
+    WeightsError : missing, cut short, of another format, or a description that is damaged.
+    """
     if not path.is_file():
         raise WeightsError(f"no weights at {path}; train some with: spectralzoom train DATASET -o {path.name}")
-    try:
-        with safe_open(path, framework="pt") as file:
-            about = json.loads((file.metadata() or {}).get("about", "{}"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-    except (SafetensorError, OSError, json.JSONDecodeError) as error:
-        raise WeightsError(f"{path} is not a readable safetensors file ({error}); train or copy it again") from error
+    with _opened(path, "np") as file:
+        about = json.loads((file.metadata() or {}).get("about", "{}"))
     if about.get("format") != FORMAT:
         raise WeightsError(f"{path} holds {about.get('format', 'no format mark')}, expected {FORMAT}; train it again")
-    return _assemble(path, about, tensors)
-
-
-def _assemble(path: Path, about: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Weights:
     try:
-        segmenter = Segmenter(SegmenterConfig(**about["config"]))
-        basis, names, record = SpectralBasis(**about["basis"]), tuple(about["class_names"]), dict(about["record"])
+        config, basis = SegmenterConfig(**about["config"]), SpectralBasis(**about["basis"])
+        names, record = tuple(about["class_names"]), dict(about["record"])
     except (KeyError, TypeError, ValueError) as error:
         raise WeightsError(f"{path}: its description is damaged ({error}); copy or train the file again") from error
-    if len(names) != segmenter.config.classes:
-        raise WeightsError(f"{path} names {len(names)} classes, its segmenter has {segmenter.config.classes}")
+    if len(names) != config.classes:
+        raise WeightsError(f"{path} names {len(names)} classes, its segmenter has {config.classes}")
+    return Description(config, basis, names, record)
+
+
+@contextmanager
+def _opened(path: Path, framework: str) -> Iterator[Any]:
+    try:
+        with safe_open(path, framework=framework) as file:
+            yield file
+    except (SafetensorError, OSError, json.JSONDecodeError) as error:
+        raise WeightsError(f"{path} is not a readable safetensors file ({error}); train or copy it again") from error
+
+
+def _assemble(path: Path, described: Description, tensors: dict[str, torch.Tensor]) -> Weights:
+    from models.segmenter import Segmenter
+
+    segmenter = Segmenter(described.config)
     parameters = segmenter.state_dict()
     expected = {name: tuple(value.shape) for name, value in parameters.items()} | _shapes_beside(segmenter.config)
     for name, shape in expected.items():
@@ -113,7 +151,10 @@ def _assemble(path: Path, about: dict[str, Any], tensors: dict[str, torch.Tensor
             raise WeightsError(f"{path}: tensor {name} should be {shape}, the file has {came}; train it again")
     segmenter.load_state_dict({name: tensors[name] for name in parameters})
     normalisation = Normalisation(*(tensors[f"normalisation.{name}"].numpy() for name in NORMALISATION))
-    return Weights(segmenter.eval(), basis, normalisation, names, tensors["class_colours"].numpy(), record)
+    return Weights(
+        segmenter.eval(), described.basis, normalisation, described.class_names, tensors["class_colours"].numpy(),
+        described.record,
+    )  # fmt: skip
 
 
 def _shapes_beside(config: SegmenterConfig) -> dict[str, tuple[int, ...]]:

@@ -8,18 +8,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
+from pipeline.errors import ChunkError, ShapeError
 from pipeline.grid import UNLABELLED
 from storage.layout import (
     AngularGrid,
+    create_array,
     create_group,
+    damage_named,
     grid_of,
     grid_record,
+    image_spec,
     open_group,
     read_array,
-    write_image,
 )
 
 
@@ -34,6 +37,14 @@ class ClassMap:
     grid: AngularGrid | None = None
 
 
+@dataclass(frozen=True)
+class ClassNames:
+    """What the classes of a map are called, and how they are drawn."""
+
+    names: tuple[str, ...]
+    colours: NDArray[np.uint8]  # (class, 3)
+
+
 def write_class_map(path: Path, found: ClassMap) -> None:
     """Store classes with their names and colours, and the confidence.
 
@@ -41,27 +52,74 @@ def write_class_map(path: Path, found: ClassMap) -> None:
     ------
     ShapeError : sizes differ, or a pixel has a class without a name.
     """
-    used = found.classes[found.classes != UNLABELLED]
-    if found.classes.shape != found.confidence.shape or len(found.colours) != len(found.names):
+    create_class_map(path, found.classes.shape, ClassNames(found.names, found.colours), grid=found.grid)
+    write_class_tile(path, (0, 0), found.classes, found.confidence)
+
+
+def create_class_map(
+    path: Path, shape: tuple[int, ...], legend: ClassNames, *, grid: AngularGrid | None = None
+) -> None:
+    """Begin a class map of (y, x) ``shape`` in which no pixel has a class yet.
+
+    Raises
+    ------
+    ShapeError : there are not as many colours as names.
+    """
+    if len(legend.colours) != len(legend.names):
         raise ShapeError(
-            f"classes {found.classes.shape} and confidence {found.confidence.shape}, {len(found.names)} names and "
-            f"{len(found.colours)} colours do not fit"
+            f"{len(legend.names)} names and {len(legend.colours)} colours do not fit; give each class both"
         )
-    if used.size and used.max() >= len(found.names):
-        raise ShapeError(f"class {int(used.max())} is in the map, but only {len(found.names)} classes have names")
-    y, x = found.classes.shape
-    place = {} if found.grid is None else found.grid.attributes((y, x))
-    names = {"class_names": list(found.names), "class_colours": np.asarray(found.colours).tolist()}
-    group = create_group(path, "class map", {**place, **grid_record(found.grid), **names})
-    write_image(
-        group,
-        "classes",
-        ("y", "x"),
-        np.asarray(found.classes, np.uint8),
-        {**class_flags(found.names, found.colours), **place},
-    )
+    y, x = shape
+    place = {} if grid is None else grid.attributes((y, x))
+    names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
+    group = create_group(path, "class map", {**place, **grid_record(grid), **names})
+    about = {**class_flags(legend.names, legend.colours), **place}
+    create_array(group, "classes", image_spec(("y", "x"), shape, "|u1"), about)
     about = {"long_name": "probability of the class given", "units": "1", "valid_range": [0.0, 1.0], **place}
-    write_image(group, "confidence", ("y", "x"), np.asarray(found.confidence, np.float32), about)
+    create_array(group, "confidence", image_spec(("y", "x"), shape, "<f4"), about)
+
+
+def write_class_tile(
+    path: Path, origin: tuple[int, int], classes: NDArray[np.integer], confidence: NDArray[np.floating]
+) -> None:
+    """Store (y, x) classes and confidence of whole shards from row and column ``origin`` on.
+
+    Threads and processes may write different tiles of one map at once.
+
+    Raises
+    ------
+    ShapeError : sizes differ, the tile does not fit the map, or a pixel has a class without a name.
+    ChunkError : the tile splits a shard.
+    IncompleteStoreError : there is no map.
+    """
+    with damage_named(str(path)):
+        group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
+        arrays = [array for name in ("classes", "confidence") if isinstance(array := group[name], zarr.Array)]
+        count = len(group.attrs["class_names"])  # type: ignore[arg-type]
+    used = classes[classes != UNLABELLED]
+    if used.size and used.max() >= count:
+        raise ShapeError(f"class {int(used.max())} is in the map, but only {count} classes have names")
+    place = _place_of(origin, classes.shape, arrays[0])
+    if classes.shape != confidence.shape:
+        raise ShapeError(
+            f"classes {classes.shape} and confidence {confidence.shape} do not fit; give both of each pixel"
+        )
+    for array, values in zip(arrays, (classes, confidence), strict=True):
+        array[place] = np.asarray(values, array.dtype)
+
+
+def _place_of(origin: tuple[int, int], shape: tuple[int, ...], array: zarr.Array[Any]) -> tuple[slice, ...]:
+    """Where a tile lies in the map, checked against the map's size and shards."""
+    place = tuple(slice(first, first + size) for first, size in zip(origin, shape, strict=True))
+    for word, part, size, shard in zip(("rows", "columns"), place, array.shape, array.shards or (), strict=True):
+        if part.start < 0 or part.stop > size:
+            raise ShapeError(f"{word} {part.start}:{part.stop} are not all in the class map of {array.shape} (y, x)")
+        if part.start % shard or (part.stop % shard and part.stop != size):
+            raise ChunkError(
+                f"{word} {part.start}:{part.stop} split the class map's shards of {shard} {word}; start and end at "
+                "their multiples"
+            )
+    return place
 
 
 def class_flags(names: Sequence[str], colours: NDArray[np.uint8]) -> dict[str, Any]:

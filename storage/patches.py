@@ -19,6 +19,7 @@ from storage.layout import (
     grid_record,
     open_group,
     read_array,
+    read_bands,
     round_bits,
     write_bands,
     write_small,
@@ -101,6 +102,17 @@ class PatchStore:
     def read(self, start: int, stop: int) -> NDArray[np.float32]:
         """Values of some patches, (patch, y, x, band) float32."""
         return read_array(self.group, "values", slice(start, stop))
+
+    def pick(self, entries: NDArray[np.integer]) -> NDArray[np.float32]:
+        """Values of the patches with these numbers in the store, ascending, (patch, y, x, band) float32."""
+        runs = np.split(entries, np.flatnonzero(np.diff(entries) != 1) + 1) if len(entries) else []
+        parts = [self.read(int(run[0]), int(run[-1]) + 1) for run in runs]
+        return np.concatenate(parts) if parts else self.read(0, 0)
+
+    @property
+    def wavelength_nm(self) -> NDArray[np.float64]:
+        """(band,) wavelengths of the values."""
+        return read_bands(self.group)[0]
 
 
 def open_patches(path: Path) -> PatchStore:

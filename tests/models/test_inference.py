@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 
 from models import inference
-from models.inference import Glance, glance, segment
+from models.inference import Glance, glance, look_coarsely, read_glance, segment
 from models.weights import Weights
 from pipeline.errors import ShapeError
 from pipeline.grid import SceneGrid
@@ -172,3 +173,40 @@ def test_mosaics_and_grids_that_do_not_fit_are_refused(tiny: Maker):
         glance(weights, np.zeros((9, 8, 9)), NM, SceneGrid(16, 16, 8, 2))
     with pytest.raises(ShapeError, match="patches of 8 px at a factor of 2, the grid has 16 px and 4"):
         glance(weights, np.zeros((4, 4, 9)), NM, SceneGrid(16, 16, 16, 4))
+
+
+@pytest.mark.parametrize("bands", [NM, NM[:3]])
+def test_a_look_in_strips_is_the_look_at_once(tiny: Maker, bands: np.ndarray):
+    """Rows of the mosaic that come some at a time give the very same columns, with bands for all of them or not."""
+    weights, grid = tiny(), SceneGrid(37, 53, 8, 2)
+    coarse = np.random.default_rng(0).uniform(0.1, 0.5, (*grid.coarse_shape, len(bands))).astype(np.float32)
+    whole = glance(weights, coarse, bands, grid)
+    parts = look_coarsely(weights, np.split(coarse, [1, 9]), bands, grid)
+    assert (parts.columns == whole.columns).all()
+    assert (read_glance(weights, parts).probability == whole.probability).all()
+
+
+@pytest.mark.parametrize("rows", [[7], [8, 1], []])
+def test_strips_that_do_not_make_the_mosaic_are_refused(tiny: Maker, rows: list[int]):
+    """Too few rows and too many are told with those expected."""
+    weights = tiny()
+    with pytest.raises(ShapeError, match=r"the scene grid expects \(8, 8\)"):
+        look_coarsely(weights, (np.zeros((count, 8, 9)) for count in rows), NM, SceneGrid(16, 16, 8, 2))
+
+
+@pytest.mark.parametrize("positions", ["2d", "paper"])
+def test_a_region_has_the_places_that_crops_have_in_training(tiny: Maker, positions: str):
+    """A look with an origin is read as the training's forward reads a crop with that origin."""
+    weights = tiny(positions=positions)
+    seen, fine = _look(weights, 32, 48)
+    moved, seats = replace(seen, origin=(12, 40)), np.array([5, 0, 17])
+    drawn, model = segment(weights, moved, fine[seats], seats), weights.segmenter
+    with torch.inference_mode():
+        columns = torch.from_numpy(seen.columns).permute(2, 0, 1)[None]
+        origin, numbers = torch.tensor([[12, 40]]), torch.from_numpy(seats)[None]
+        patches = torch.from_numpy(fine[seats]).permute(0, 3, 1, 2)[None]
+        coarse, detail = model(model.view(columns, origin), patches, numbers, origin)
+        confidence = model.composite(coarse, detail, numbers)[0].softmax(dim=0).max(dim=0).values.numpy()
+    assert np.abs(drawn.confidence - confidence).max() <= 1e-5
+    same = (drawn.confidence == segment(weights, seen, fine[seats], seats).confidence).all()
+    assert same == (positions == "paper")

@@ -15,7 +15,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from models.inference import glance
-from models.weights import FORMAT, Weights, load_weights, save_weights, with_record
+from models.weights import FORMAT, Weights, describe_weights, load_weights, save_weights, with_record
 from pipeline.errors import WeightsError
 from pipeline.grid import SceneGrid
 
@@ -189,3 +189,11 @@ def test_a_write_that_fails_leaves_the_old_file(tiny: Maker, saved: Path, monkey
     monkeypatch.undo()
     assert saved.read_bytes() == before
     assert [path.name for path in saved.parent.iterdir()] == ["w.safetensors"]
+
+
+def test_a_description_is_what_the_weights_say(saved: Path):
+    """Read without the tensors: sizes, basis, classes and record are those of the weights themselves."""
+    described, weights = describe_weights(saved), load_weights(saved)
+    assert described.config == weights.config
+    assert (described.basis, described.class_names) == (weights.basis, weights.class_names)
+    assert described.record == weights.record

@@ -1,0 +1,108 @@
+"""The model over a field on disk: its scores and its map, region by region, by whatever crew there is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.region_work import Drawing, Scoring, WeightsFile
+from flows.run import SurveyRun, weights_path
+from models.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions
+from pipeline.errors import SettingsError
+from pipeline.grid import SceneGrid
+from storage.block_work import Crew, run_blocks
+from storage.layout import SHARD_COLUMNS, SHARD_ROWS
+from storage.mosaic_strips import mosaic_wavelengths
+from storage.patches import open_patches
+from storage.tile_work import RESERVED_BYTES
+
+SHARD = (SHARD_ROWS, SHARD_COLUMNS)
+
+
+def region_params(grid: SceneGrid) -> dict[str, Any]:
+    """What the result depends on where a field is cut: nothing where it is read whole."""
+    return {} if len(plan_regions(grid, SHARD)) == 1 else {"regions": {"most_px": REGION_PX, "halo": HALO_CELLS}}
+
+
+@dataclass(frozen=True)
+class FieldWork:
+    """The model over one field: with which weights, in which regions, by whom, and within which memory."""
+
+    weights: WeightsFile
+    regions: Sequence[Region]
+    crew: Crew
+    memory: int  # of this process and those that it starts, together [bytes]
+
+    @staticmethod
+    def of(run: SurveyRun) -> FieldWork:
+        """Take from a survey what the regions of its field need."""
+        file = WeightsFile(weights_path(run.settings).resolve(), run.weights_key)
+        return FieldWork(file, plan_regions(run.grid, SHARD), run.settings.crew, run.settings.memory)
+
+    def score(self, policy: str, mosaic: Path, report: Callable[[float], None]) -> NDArray[np.float64]:
+        """Score every seat of the padded grid by the coarse mosaic alone, (seat_y, seat_x).
+
+        Raises
+        ------
+        SettingsError : not even one region at a time fits the memory.
+        """
+        crew, path = self.crew_for(np.empty(0, np.int64), len(mosaic_wavelengths(mosaic))), mosaic.resolve()
+        parts = run_blocks(Scoring(self.weights, path, policy), self.regions, crew, report=report, paths=[path])
+        scores = np.zeros(self.regions[0].field.seat_shape)
+        for region, part in zip(self.regions, parts, strict=True):
+            scores[region.kept_seats.rows, region.kept_seats.columns] = part
+        return scores
+
+    def draw(self, mosaic: Path, patches: Path, out: Path, report: Callable[[float], None]) -> None:
+        """Draw the class map into the store that was created at ``out``.
+
+        Raises
+        ------
+        SettingsError : not even one region at a time fits the memory.
+        """
+        store = open_patches(patches)
+        crew = self.crew_for(store.seats, len(store.wavelength_nm))
+        paths = mosaic.resolve(), patches.resolve(), out.resolve()
+        run_blocks(Drawing(self.weights, *paths), self.regions, crew, keep=False, report=report, paths=paths)
+
+    def check_memory(self, seats: NDArray[np.integer], bands: int) -> None:
+        """Refuse a memory in which no region with its part of these seats of the field can be read.
+
+        Raises
+        ------
+        SettingsError : not even one region at a time fits; names the least that does.
+        """
+        self.crew_for(seats, bands)
+
+    def crew_for(self, seats: NDArray[np.integer], bands: int) -> Crew:
+        """Give the crew, no larger than memory holds regions with their parts of these seats of the field.
+
+        Raises
+        ------
+        SettingsError : not even one region at a time fits the memory; names the least that does.
+        """
+        if self.crew.elsewhere:
+            return self.crew
+        region = most_bytes(self.weights.load().config, self.regions, seats, bands)
+        apart = not self.crew.shares_memory
+        each = region + RESERVED_BYTES * apart
+        least = RESERVED_BYTES + each
+        if least > self.memory:
+            y, x = (max(one.read.shape[axis] for one in self.regions) for axis in (0, 1))
+            raise SettingsError(
+                f"projected memory {_mib(least)} exceeds --memory {_mib(self.memory)}: reading a region of {y} x {x} "
+                f"px and {bands} bands with the fine patches that lie there takes {_mib(region)}, "
+                f"{'each of two processes' if apart else 'the process itself'} {_mib(RESERVED_BYTES)}; give at least "
+                f"--memory {_mib(least)}"
+            )
+        fits = (self.memory - RESERVED_BYTES) // each
+        return self.crew if fits >= self.crew.count else Crew(self.crew.scheduler, fits)
+
+
+def _mib(size: int) -> str:
+    return f"{-(-size // 2**20)} MiB"

@@ -1,0 +1,119 @@
+"""What the model does with one region of a field on disk: scores it, or draws its part of the map.
+
+A worker gets paths and numbers, opens what it needs, and keeps one region in memory: arrays never travel.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.inference import CoarseLook, look_coarsely, read_glance, segment
+from models.policies import score_seats
+from models.regions import Region
+from models.weights import Weights, load_weights
+from pipeline.errors import WeightsError
+from storage.class_maps import write_class_tile
+from storage.mosaic_strips import mosaic_strips, mosaic_wavelengths
+from storage.patches import PATCHES_A_SHARD, PatchStore, open_patches
+
+
+@dataclass(frozen=True)
+class WeightsFile:
+    """Weights by their path, and the hash that they had when the survey began."""
+
+    path: Path
+    key: str
+
+    def load(self) -> Weights:
+        """Read them, once a process. Raises WeightsError where the file has changed since."""
+        return _weights_at(self)
+
+
+@lru_cache(maxsize=1)
+def _weights_at(file: WeightsFile) -> Weights:
+    weights = load_weights(file.path)
+    if hashlib.sha256(file.path.read_bytes()).hexdigest()[:20] != file.key:
+        raise WeightsError(f"the weights {file.path} have changed since the survey began; start it again")
+    return weights
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """Scores seats by the glance at a region: what a worker needs for that."""
+
+    weights: WeightsFile
+    mosaic: Path
+    policy: str
+
+    def __call__(self, region: Region) -> NDArray[np.float64]:
+        """Scores of the seats that are kept, (seat_y, seat_x)."""
+        weights = self.weights.load()
+        seen = read_glance(weights, look_at(weights, self.mosaic, region))
+        return region.crop_seats(score_seats(self.policy, seen))
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Draws a region of the class map into its store: what a worker needs for that."""
+
+    weights: WeightsFile
+    mosaic: Path
+    patches: Path
+    out: Path
+
+    def __call__(self, region: Region) -> None:
+        """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
+        weights, store = self.weights.load(), open_patches(self.patches)
+        seen = look_at(weights, self.mosaic, region)
+        seats, columns = seat_columns(weights, store, store.wavelength_nm, seen, region)
+        drawn = segment(weights, seen, columns, seats)
+        origin = region.kept.top, region.kept.left
+        write_class_tile(self.out, origin, region.crop(drawn.classes), region.crop(drawn.confidence))
+
+
+def look_at(weights: Weights, mosaic: Path, region: Region) -> CoarseLook:
+    """Read the part of a stored coarse mosaic that a region needs, some rows at a time."""
+    strips = mosaic_strips(mosaic, region.coarse.rows, region.coarse.columns)
+    return look_coarsely(weights, strips, mosaic_wavelengths(mosaic), region.grid, origin=region.origin)
+
+
+def seat_columns(
+    weights: Weights, store: PatchStore, wavelength_nm: NDArray[np.float64], seen: CoarseLook, region: Region
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Numbers and normalised spectral columns (seat, p, p, column) of a region's patches, some read at a time.
+
+    A mirror that looks beside the plan leaves pixels of a seat unseen: they take the columns of the coarse pixel over
+    them. A seat of which nothing was seen is left out.
+    """
+    numbers = region.numbers_here(store.seats)
+    here = np.flatnonzero(numbers >= 0)
+    p, count, kept = region.field.patch, len(here), 0
+    seats, columns = np.empty(count, np.int64), np.empty((count, p, p, weights.basis.columns), np.float32)
+    for first in range(0, count, PATCHES_A_SHARD):
+        entries = here[first : first + PATCHES_A_SHARD]
+        values = store.pick(entries)
+        reached = np.asarray(np.isfinite(values).any(axis=-1), np.bool_)
+        some = np.asarray(reached.any(axis=(1, 2)), np.bool_)
+        part = slice(kept, kept := kept + int(some.sum()))
+        seats[part] = numbers[entries][some]
+        columns[part] = weights.columns(values[some], wavelength_nm)
+        _fill_unseen(columns[part], seats[part], reached[some], seen)
+    return seats[:kept], columns[:kept]
+
+
+def _fill_unseen(
+    columns: NDArray[np.float32], seats: NDArray[np.int64], reached: NDArray[np.bool_], seen: CoarseLook
+) -> None:
+    """Put the columns of the coarse look, in place, where no line reached a pixel of a seat."""
+    pixel = np.arange(seen.grid.patch)
+    for patch, seat, there in zip(columns, seats, reached, strict=True):
+        if not there.all():
+            y, x = seen.grid.seat_origin(seat)[..., None] + pixel
+            coarse = seen.columns[np.ix_(y // seen.grid.factor, x // seen.grid.factor)]
+            patch[~there] = coarse[~there]

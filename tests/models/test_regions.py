@@ -1,0 +1,107 @@
+"""Regions of a field: whole shards and coarse patches, nothing left out, nothing twice."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from models.regions import REGION_PX, Box, plan_regions, region_bytes, whole_field
+from models.sizes import SegmenterConfig
+from pipeline.errors import ShapeError
+from pipeline.grid import SceneGrid
+
+SHARD = (64, 640)
+FIELDS = [(700, 1300, 16, 4), (2561, 90, 32, 4), (1000, 2000, 8, 4), (130, 1921, 32, 2), (64, 641, 16, 1)]
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1024, 1280), (REGION_PX, REGION_PX), (REGION_PX - 3, 70)])
+@pytest.mark.parametrize("patch", [16, 32])
+def test_a_field_up_to_the_limit_is_one_region(size: tuple[int, int], patch: int):
+    """It is read whole, without a halo, at the origin of its own places."""
+    grid = SceneGrid(*size, patch, 4)
+    regions = plan_regions(grid, SHARD)
+    assert regions == [whole_field(grid)]
+    assert regions[0].grid == grid
+    assert regions[0].origin == (0, 0)
+    assert regions[0].coarse.shape == grid.coarse_shape
+    assert regions[0].kept_seats.shape == grid.seat_shape
+
+
+@pytest.mark.parametrize("side", [REGION_PX + 1, 4000, 10240])
+def test_a_larger_field_is_cut_evenly_below_the_limit(side: int):
+    """No region is above the limit, none below half of it."""
+    shapes = np.array([region.kept.shape for region in plan_regions(SceneGrid(side, side, 16, 4), SHARD)])
+    assert shapes.max() <= REGION_PX
+    assert shapes.min() >= REGION_PX // 4
+    assert len(shapes) == (-(-side // REGION_PX)) ** 2
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("halo", [0, 1, 3])
+def test_regions_cover_a_field_once(field: tuple[int, int, int, int], halo: int):
+    """Every pixel and every seat is kept by one region; borders inside are those of shards and coarse patches."""
+    grid = SceneGrid(*field)
+    pixels, seats = np.zeros((grid.height, grid.width), int), np.zeros(grid.seat_shape, int)
+    cell = grid.patch * grid.factor
+    for region in plan_regions(grid, SHARD, most_px=(64, 640), halo=halo):
+        pixels[region.kept.rows, region.kept.columns] += 1
+        seats[region.kept_seats.rows, region.kept_seats.columns] += 1
+        for (first, last), size, shard in zip(_edges(region.kept), pixels.shape, SHARD, strict=True):
+            assert first % shard == first % cell == 0
+            assert last == size or last % shard == last % cell == 0
+        for (first, last), (kept, end), size in zip(
+            _edges(region.read), _edges(region.kept), pixels.shape, strict=True
+        ):
+            assert (first, last) == (max(kept - halo * cell, 0), min(end + halo * cell, size))
+    assert (pixels == 1).all()
+    assert (seats == 1).all()
+
+
+def _edges(box: Box) -> tuple[tuple[int, int], tuple[int, int]]:
+    return (box.top, box.bottom), (box.left, box.right)
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_seats_lie_where_the_field_has_them(field: tuple[int, int, int, int]):
+    """A seat's first pixel in a region is its first pixel in the field; seats outside have no number."""
+    grid = SceneGrid(*field)
+    seats = np.arange(int(np.prod(grid.seat_shape)))
+    for region in plan_regions(grid, SHARD, most_px=(64, 640), halo=1):
+        numbers = region.numbers_here(seats)
+        inside = numbers >= 0
+        assert sorted(numbers[inside]) == list(range(int(np.prod(region.grid.seat_shape))))
+        origin = region.grid.seat_origin(numbers[inside]) + np.array([region.read.top, region.read.left])
+        assert (origin == grid.seat_origin(seats[inside])).all()
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_cropped_parts_make_the_field(field: tuple[int, int, int, int]):
+    """Images and seats that regions keep, put side by side, are those of the field."""
+    grid = SceneGrid(*field)
+    image = np.arange(grid.height * grid.width).reshape(grid.height, grid.width)
+    seats = np.arange(np.prod(grid.seat_shape)).reshape(grid.seat_shape)
+    for region in plan_regions(grid, SHARD, most_px=(64, 640), halo=2):
+        (top, left), (rows, columns) = region.origin, region.grid.seat_shape
+        kept = region.crop(image[region.read.rows, region.read.columns])
+        assert (kept == image[region.kept.rows, region.kept.columns]).all()
+        own = region.crop_seats(seats[top : top + rows, left : left + columns].ravel())
+        assert (own == seats[region.kept_seats.rows, region.kept_seats.columns]).all()
+
+
+def test_memory_is_that_of_a_region_not_of_the_field():
+    """Sixteen times the field takes what its largest region takes; patches add to it."""
+    config = SegmenterConfig(classes=3)
+    need = [
+        max(region_bytes(config, region, 1000, 270) for region in plan_regions(SceneGrid(side, side, 16, 4), SHARD))
+        for side in (REGION_PX, 3 * REGION_PX, 12 * REGION_PX)
+    ]
+    assert need[0] < need[1] == need[2] < 1.2 * need[0]
+    whole = whole_field(SceneGrid(640, 640, 16, 4))
+    assert region_bytes(config, whole, 500, 270) > region_bytes(config, whole, 0, 270) + 500 * 24 * 4 * 16**2
+
+
+@pytest.mark.parametrize(("most", "halo"), [((0, 640), 1), ((64, 640), -1)])
+def test_regions_that_cannot_be_are_refused(most: tuple[int, int], halo: int):
+    """A region without pixels or a negative halo is named."""
+    with pytest.raises(ShapeError, match="at least 1 px and a halo of at least 0"):
+        plan_regions(SceneGrid(640, 640, 16, 4), SHARD, most_px=most, halo=halo)
