@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from flows.settings import Settings
 from pipeline.coverage import cheapest_full, coarse_sweeps, with_margin
 from pipeline.errors import SettingsError
@@ -14,6 +16,7 @@ from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.tiles import plan_tiles
 from pipeline.scan import Axis, Sweep
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from pipeline.source import References
 from storage.layout import image_spec
 from storage.tile_work import MosaicWork, tile_budget
 
@@ -78,8 +81,18 @@ def check_memory(settings: Settings, source: SimulatedSource, grid: SceneGrid, p
     SettingsError : not even one tile at a time fits; names the least that does.
     """
     pixels = PixelGrid.of_scene(grid, grid.factor)
-    placed = [place(SimulatedSweep(source, sweep), settings.camera) for sweep in plan.coarse]
+    placed = [place(_PlannedSweep(source, sweep), settings.camera) for sweep in plan.coarse]
     rows, columns = image_spec(("y", "x"), pixels.shape, "<f4").shard or pixels.shape
     tiles = plan_tiles(placed, settings.camera, pixels, (rows, columns))
     work = MosaicWork(placed, settings.camera, pixels)
     tile_budget(work, tiles, (rows, columns), memory=settings.memory, workers=1)
+
+
+class _PlannedSweep(SimulatedSweep):
+    """The path of a sweep and the size of its lines, which is all that memory depends on; no light is asked for."""
+
+    @property
+    def references(self) -> References:
+        """Frames of a detector without a fault, as the simulated one is."""
+        white = np.ones((self.source.camera.samples // self.sweep.binning, len(self.source.wavelength_nm)), np.float32)
+        return References(dark=np.zeros_like(white), white=white, panel=white[0])

@@ -45,45 +45,47 @@ class _WaitsError(IncompleteStoreError):
 
 @dataclass(frozen=True)
 class _Awaited(StageRef):
-    """Where a store would be. There is nothing to read: whoever asks for its path has to wait for ``made_by``."""
+    """Where a store would be: whoever asks for its path, or for a key that is not known, waits for ``made_by``."""
 
     made_by: str
 
     def __getattribute__(self, name: str) -> Any:
-        if name == "path":
+        value = object.__getattribute__(self, name)
+        if name == "path" or (name == "key" and not value):
             raise _WaitsError(object.__getattribute__(self, "made_by"))
-        return object.__getattribute__(self, name)
+        return value
 
 
-class _LookedAt(Archive):
-    """An archive that stays as it is: the spool of a broken capture too."""
+@dataclass(frozen=True)
+class Forecast:
+    """What a survey would do, stage by stage in order, and why this machine would refuse to (None: it would not)."""
 
-    def drop_spool(self, key: str) -> None:
-        """Leave it."""
+    stages: list[StageForecast]
+    refused: str | None = None
 
 
-def forecast(settings: Settings) -> list[StageForecast]:
-    """Tell of every stage, in order, what a survey of these settings would do. Writes nothing.
+def forecast(settings: Settings) -> Forecast:
+    """Tell of every stage what a survey of these settings would do. Writes nothing.
 
     Raises
     ------
-    PipelineError : what the survey itself would refuse at its start.
+    PipelineError : what the survey itself would refuse at its start, but for a scene that this machine cannot hold.
     """
     with _opened(settings) as run:
         planner = Planner(run, Catalogue.read(run.archive.root))
         survey(planner)
-    return planner.rows
+    return Forecast(planner.rows, run.refused)
 
 
 @contextmanager
 def _opened(settings: Settings) -> Iterator[SurveyRun]:
     """The survey's context on its archive as it is; where there is none yet, on an empty one that goes away again."""
-    there = Path(settings.out)
     with tempfile.TemporaryDirectory(prefix="spectralzoom-plan-") as empty:
-        known = (there / "stages").is_dir() or there.is_file()
-        root = Archive.open(there, create=False, write=False).root if known else Path(empty)
-        run = open_run(replace(settings, out=empty))
-        yield replace(run, settings=settings, archive=_LookedAt(root))
+        archive = Archive(Path(empty), writes=False)
+        if Archive.is_there(settings.out):
+            archive = Archive.open(settings.out, create=False, write=False)
+        run = open_run(replace(settings, out=empty), planning=True)
+        yield replace(run, settings=settings, archive=archive)
 
 
 @dataclass
@@ -133,9 +135,6 @@ class Planner:
         self, stage: str, name: str, params: Mapping[str, Any], refs: Sequence[StageRef]
     ) -> tuple[StageForecast, StageRef]:
         """Find the store of these facts, or say why there is none."""
-        unknown = [ref.made_by for ref in refs if isinstance(ref, _Awaited) and not ref.key]
-        if unknown:
-            raise _WaitsError(", ".join(unknown))
         keys = [ref.key for ref in refs]
         key = stage_key(name, VERSIONS[name], params, keys)
         if stage == "capture_fine":

@@ -32,8 +32,12 @@ def run_plan(settings: Settings, *, as_json: bool = False) -> int:
 
 
 def plan_content(settings: Settings) -> dict[str, Any]:
-    """The forecast as plain tables, with sums of what is known (``estimated`` of ``to_make`` stages)."""
-    rows = forecast(settings)
+    """The forecast as plain tables, with sums of what is known (``estimated`` of ``to_make`` stages).
+
+    ``refused`` says why this machine would not begin the survey; None where it would.
+    """
+    found = forecast(settings)
+    rows = found.stages
     ahead = [row for row in rows if row.state in ("to run", "blocked")]
     return {
         "archive": settings.out,
@@ -42,6 +46,7 @@ def plan_content(settings: Settings) -> dict[str, Any]:
         "estimated": sum(row.seconds is not None for row in ahead),
         "seconds": _sum(ahead, "seconds"),
         "bytes": _sum(ahead, "size"),
+        "refused": found.refused,
     }
 
 
@@ -69,6 +74,8 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
         table.add_row(row["stage"], state, escape(_short(row["why"])), *figures)
     console.print(table)
     console.print(escape(_sentence(content)), highlight=False, soft_wrap=True)
+    if content["refused"] is not None:
+        console.print(f"[yellow]refused here[/]: {escape(content['refused'])}", highlight=False, soft_wrap=True)
 
 
 def _sentence(content: dict[str, Any]) -> str:

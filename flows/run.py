@@ -18,15 +18,17 @@ from numpy.typing import NDArray
 from flows.capture_plan import CapturePlan, check_memory, plan_capture
 from flows.settings import BUILT_IN_SCENES, Settings
 from flows.training_data import scene_of_file, unpack_mask
-from models.weights import Weights, load_weights
+from models.weights import Description, Weights, describe_weights, load_weights
 from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, SettingsError, WeightsError
 from pipeline.grid import UNLABELLED, SceneGrid
 from pipeline.ground import GroundView
 from pipeline.ground_grid import ground_grid
+from pipeline.once import Once
 from pipeline.simulator.farm import farm_scene
 from pipeline.simulator.instrument import ALL_EFFECTS
 from pipeline.simulator.pointing import PointingErrors
+from pipeline.simulator.raster import Light
 from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive import Archive
@@ -48,12 +50,13 @@ class SurveyRun:
     archive: Archive
     source: SimulatedSource
     scene: RasterScene
-    weights: Weights
+    described: Description  # what the weights say of themselves
+    load: Once[Weights]
     weights_key: str
     grid: SceneGrid
     plan: CapturePlan
-    labels: NDArray[np.uint8] | None  # to judge by: trained pixels taken out
     notes: tuple[str, ...] = ()
+    refused: str | None = None  # why this machine would refuse the survey; it is planned nevertheless
     report: Report = field(default=lambda done: None)
 
     @property
@@ -65,6 +68,16 @@ class SurveyRun:
     def name(self) -> str:
         """What the survey is called: its scene."""
         return Path(self.scene.name).stem
+
+    @property
+    def weights(self) -> Weights:
+        """The weights, read when they are first asked for."""
+        return self.load()
+
+    @cached_property
+    def labels(self) -> NDArray[np.uint8] | None:
+        """What to judge by, (y, x) in the weights' classes: trained pixels taken out. Draws the scene."""
+        return _judged_labels(self.scene, self.described)
 
     @cached_property
     def mask(self) -> NDArray[np.generic] | None:
@@ -86,8 +99,10 @@ class SurveyRun:
         }
 
 
-def open_run(settings: Settings) -> SurveyRun:
+def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     """Open everything that a survey needs; the archive last, so that bad input leaves no trace of itself.
+
+    With ``planning`` a scene that this machine cannot hold is no error: ``refused`` of the run says so.
 
     Raises
     ------
@@ -95,13 +110,21 @@ def open_run(settings: Settings) -> SurveyRun:
     """
     if settings.source != "sim":
         raise SettingsError(f"--source {settings.source}: this version has the simulated source only; use --source sim")
-    path = _weights_path(settings)
-    weights = load_weights(path)
+    path = weights_path(settings)
+    described, load = describe_weights(path), Once(lambda: load_weights(path))
+    if not planning:
+        load()  # refuses tensors that do not fit
+    refused = _refusal(settings)
+    if refused is not None and not planning:
+        raise SettingsError(refused)
     scene, notes = _open_scene(settings)
-    labels, label_notes = _judged_labels(scene, weights)
-    grid = SceneGrid(*scene.shape, weights.config.patch, weights.config.factor)
+    if not planning:  # what the rig would find there: no stage's work
+        scene.raster.drawn()
+        scene.light()
+    label_notes = _check_labels(scene, described)
+    grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
     plan = plan_capture(settings, grid)
-    band_notes = _check_bands(scene, weights, path)
+    band_notes = _check_bands(scene, described, path)
     if settings.mask is not None:
         _check_mask(settings.mask, scene.shape)
     effects = _chosen_effects(settings.effects)
@@ -110,8 +133,8 @@ def open_run(settings: Settings) -> SurveyRun:
     _check_pose(settings, scene.shape)
     key = hashlib.sha256(path.read_bytes()).hexdigest()[:20]
     return SurveyRun(
-        settings, Archive.open(settings.out), source, scene, weights, key, grid, plan, labels,
-        (*notes, *band_notes, *label_notes),
+        settings, Archive.open(settings.out), source, scene, described, load, key, grid, plan,
+        (*notes, *band_notes, *label_notes), refused,
     )  # fmt: skip
 
 
@@ -154,20 +177,23 @@ def _open_farm(settings: Settings) -> RasterScene:
     if settings.shape is None:
         farm = farm_scene(settings.seed, camera=settings.camera)
     else:
-        _check_machine(settings.shape)
         farm = farm_scene(settings.seed, shape=settings.shape, camera=settings.camera)
     return farm if settings.bands is None else _some_bands(farm, settings.bands)
 
 
-def _check_machine(shape: tuple[int, int]) -> None:
-    """Refuse a farm that this machine cannot hold, before it tries."""
-    needed = shape[0] * shape[1] * FARM_BYTES_PER_PX
+def _refusal(settings: Settings) -> str | None:
+    """Why this machine cannot hold the farm of the settings, before it tries; None where it can."""
+    if settings.scene not in BUILT_IN_SCENES or settings.shape is None:
+        return None
+    height, width = settings.shape
+    needed = height * width * FARM_BYTES_PER_PX
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed > there:
-        raise SettingsError(
-            f"--size {shape[1]}x{shape[0]}: a survey of such a farm takes about {needed / 1e9:.0f} GB of memory,"
-            f" this machine has {there / 1e9:.0f}; take a smaller one"
-        )
+    if needed <= there:
+        return None
+    return (
+        f"--size {width}x{height}: a survey of such a farm takes about {needed / 1e9:.0f} GB of memory,"
+        f" this machine has {there / 1e9:.0f}; take a smaller one"
+    )
 
 
 def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
@@ -178,15 +204,20 @@ def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
     return replace(
         scene,
         key=f"{scene.key}/only={','.join(map(str, bands))}",
-        electrons=scene.electrons[:, chosen],
+        light=Once(lambda: Light(scene.electrons[:, chosen], scene.panel_electrons[chosen])),
         panel=scene.panel[chosen],
-        panel_electrons=scene.panel_electrons[chosen],
         wavelength_nm=scene.wavelength_nm[chosen],
         fwhm_nm=None if scene.fwhm_nm is None else scene.fwhm_nm[chosen],
     )
 
 
-def _weights_path(settings: Settings) -> Path:
+def weights_path(settings: Settings) -> Path:
+    """Where the weights of a survey lie: those that come with the house for its own scenes.
+
+    Raises
+    ------
+    SettingsError : none were given for a scene of one's own.
+    """
     if settings.weights is not None:
         return Path(settings.weights)
     if settings.scene not in BUILT_IN_SCENES:
@@ -197,7 +228,7 @@ def _weights_path(settings: Settings) -> Path:
     return Path(str(resources.files("models") / "shipped" / SHIPPED))
 
 
-def _check_bands(scene: RasterScene, weights: Weights, path: Path) -> tuple[str, ...]:
+def _check_bands(scene: RasterScene, weights: Description, path: Path) -> tuple[str, ...]:
     _, reached = weights.basis.matrix(scene.wavelength_nm)
     if not reached.any():
         low, high = weights.basis.low_nm, weights.basis.high_nm
@@ -216,24 +247,33 @@ def _check_mask(mask: str, shape: tuple[int, int]) -> None:
         raise SceneError(f"--mask {mask} is {values.shape[:2]} px (y, x), the scene is {shape}; give one of its size")
 
 
-def _judged_labels(scene: RasterScene, weights: Weights) -> tuple[NDArray[np.uint8] | None, tuple[str, ...]]:
-    """Labels in the order of the weights' classes, without the pixels that the weights were trained on."""
-    if scene.labels is None:
-        return None, ()
+def _check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
+    """Refuse labels of classes that the weights do not know, and say what judging by the others is worth."""
+    if not scene.labelled:
+        return ()
     missing = [name for name in scene.class_names if name not in weights.class_names]
     if missing:
         known = ", ".join(weights.class_names)
         raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; use weights for these")
+    split = weights.record.get("split", {})
+    if scene.key in split.get("pixels", {}):
+        return ("accuracy is counted on the labelled pixels that the weights were not trained on",)
+    if scene.key in split.get("train", {}).values():
+        return ("the weights were trained on this scene: its accuracy says nothing of other fields",)
+    return ()
+
+
+def _judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8] | None:
+    """Labels in the order of the weights' classes, without the pixels that the weights were trained on."""
+    if scene.labels is None:
+        return None
     order = np.full(256, UNLABELLED, np.uint8)
     order[: len(scene.class_names)] = [weights.class_names.index(name) for name in scene.class_names]
     labels = order[scene.labels]
-    split = weights.record.get("split", {})
-    if scene.key in split.get("pixels", {}):
-        labels[unpack_mask(split["pixels"][scene.key], scene.shape)] = UNLABELLED
-        return labels, ("accuracy is counted on the labelled pixels that the weights were not trained on",)
-    if scene.key in split.get("train", {}).values():
-        return labels, ("the weights were trained on this scene: its accuracy says nothing of other fields",)
-    return labels, ()
+    trained = weights.record.get("split", {}).get("pixels", {}).get(scene.key)
+    if trained is not None:
+        labels[unpack_mask(trained, scene.shape)] = UNLABELLED
+    return labels
 
 
 def now() -> str:

@@ -2,41 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 from flows.run import SurveyRun
-from flows.stages import captured
+from flows.survey_extent import Extent, Unit
 from pipeline.errors import PipelineError
+from pipeline.grid import SceneGrid
+from storage.cubes import open_raw_cube
 from storage.lineage import Catalogue
+from storage.manifests import Cost
 from storage.records import Store
 
 
 @dataclass(frozen=True)
 class Part:
-    """A stage's stores in the archive, and what their cost grows with: the first unit that is known of both."""
+    """A stage's stores in the archive, and the units of `Extent` that its seconds and its bytes grow with."""
 
     stage: str
-    units: tuple[str, ...]
+    unit: Unit
     inputs: int | None = None  # tells apart stages of one name
-    by_bands: bool = True
+    size: Unit | None = None  # the same as for seconds
 
 
-FINE = ("fine samples", "fine seconds")
 PARTS = {
-    "capture_coarse": Part("capture", ("coarse samples",), 0),
-    "register_coarse": Part("register", ("coarse samples",), 1),
-    "locate": Part("locate", ("coarse pixels",), by_bands=False),
-    "rectify": Part("rectify", ("pixels",)),
-    "attend": Part("attend", ("pixels",), by_bands=False),
-    "capture_fine": Part("capture", FINE, 1),
-    "register_fine": Part("register", FINE, 2),
-    "cut_patches": Part("patches", FINE),
-    "draw_map": Part("segment", ("pixels",), by_bands=False),
-    "ground": Part("ground", ("pixels",), by_bands=False),
-    "evaluate": Part("evaluate", ("pixels",)),
+    "capture_coarse": Part("capture", "coarse values", 0),
+    "register_coarse": Part("register", "coarse values", 1),
+    "locate": Part("locate", "coarse pixels"),
+    "rectify": Part("rectify", "mosaic values"),
+    "attend": Part("attend", "pixels"),
+    "capture_fine": Part("capture", "fine values", 1),
+    "register_fine": Part("register", "fine values", 2),
+    "cut_patches": Part("patches", "patch values"),
+    "draw_map": Part("segment", "operations of the map", size="pixels"),
+    "ground": Part("ground", "pixels"),
+    "evaluate": Part("evaluate", "operations of a glance", size="surveys"),
 }
+MOST_RECORDS = 5  # of a stage that are looked into
+APART = 2.0  # times the work of another: then the two tell what starting takes
+CONTROLS_UNIT: Unit = "scene values"  # judging with controls scans the whole field
 
 
 class PastCosts:
@@ -44,28 +50,32 @@ class PastCosts:
 
     def __init__(self, catalogue: Catalogue, run: SurveyRun) -> None:
         self._catalogue, self._run = catalogue, run
-        height, width = run.grid.coarse_shape
-        self._work: dict[str, float] = {
-            "pixels": run.grid.height * run.grid.width,
-            "coarse pixels": height * width,
-            "coarse samples": run.camera.samples * sum(sweep.lines for sweep in run.plan.coarse),
-            "fine seconds": run.plan.fine_s,
-            "bands": len(run.scene.wavelength_nm),
-        }
+        self._extent = Extent(
+            run.described.config, run.grid, run.camera, run.settings.cost, run.plan.along,
+            len(run.scene.wavelength_nm), sum(sweep.lines for sweep in run.plan.coarse),
+        )  # fmt: skip
+        self._fine_lines: int | None = None
 
     def plan_fine(self, lines: int) -> None:
-        """Take note of how many lines the fine pass has; before that its seconds have to do."""
-        self._work["fine samples"] = self._run.camera.samples * lines
+        """Take note of how many lines the fine pass has; before that they are what its seconds are likely to buy."""
+        self._fine_lines = lines
 
     def stored(self, stage: str) -> list[Store]:
         """Whole stores of a stage, newest first."""
         part = PARTS[stage]
         found = [
             store
-            for store in self._catalogue.stores.values()
-            if store.ref.stage == part.stage and store.problem is None and part.inputs in (None, len(store.inputs))
+            for store in self._by_stage.get(part.stage, [])
+            if store.problem is None and part.inputs in (None, len(store.inputs))
         ]
         return sorted(found, key=lambda store: store.created, reverse=True)
+
+    @cached_property
+    def _by_stage(self) -> dict[str, list[Store]]:
+        found: dict[str, list[Store]] = {}
+        for store in self._catalogue.stores.values():
+            found.setdefault(store.ref.stage, []).append(store)
+        return found
 
     def of_scene(self, store: Store) -> bool:
         """Whether a store is of the run's scene, or of none: a lookup is of a path."""
@@ -75,31 +85,77 @@ class PastCosts:
     def estimate(self, stage: str) -> tuple[float | None, int | None, str]:
         """Seconds and bytes by the newest record, of this scene if there is one, and what they come from.
 
-        The record is scaled by the stage's unit of work, and by bands where the stage reads them all. None and None
-        where there is no record, or it does not tell how much work it was.
+        The record is scaled by the stage's unit of work; where there is a second one of a much larger or smaller
+        survey, what both spent on starting is told apart first. None and None where there is no record, or none that
+        tells how much work it was.
         """
-        part = PARTS[stage]
         records = [store for store in self.stored(stage) if store.cost is not None and self._alike(store)]
-        record = next((store for store in records if self.of_scene(store)), next(iter(records), None))
-        if record is None or record.cost is None:
+        if not records:
             return None, None, "no such store has a record of what it took"
-        then = self._work_then(record)
-        unit = next((unit for unit in part.units if then.get(unit) and unit in self._work), None)
-        if unit is None or (part.by_bands and not then.get("bands")):
-            return None, None, f"{record.ref.uri} does not tell how much work it was"
-        times = self._work[unit] / then[unit] * (self._work["bands"] / then["bands"] if part.by_bands else 1)
-        basis = f"{record.ref.uri} times {times:.3g}, by {unit}{' and bands' if part.by_bands else ''}"
-        return record.cost.wall_s * times, round(record.cost.size * times), basis
+        unit = CONTROLS_UNIT if stage == "evaluate" and self._run.settings.controls else PARTS[stage].unit
+        known = self._known(sorted(records, key=lambda store: not self.of_scene(store)), unit)
+        if not known:
+            return None, None, f"{records[0].ref.uri} does not tell how much work it was"
+        seconds = self._line(known, unit, [cost.wall_s for _, cost, _ in known])
+        size = self._line(known, PARTS[stage].size or unit, [cost.size for _, cost, _ in known])
+        address, first, _ = known[0]
+        rest = "" if len(known) == 1 else f", and {known[1][0]}"
+        times = seconds / first.wall_s if first.wall_s else 0.0
+        return seconds, round(size), f"{address} times {times:.3g}, by {unit}{rest}"
+
+    def _known(self, records: Sequence[Store], unit: Unit) -> list[tuple[str, Cost, Extent]]:
+        """The first record that tells how much work it was, and the first of those that were much more or less."""
+        known: list[tuple[str, Cost, Extent]] = []
+        for record in records[:MOST_RECORDS]:
+            try:
+                then = self._extent_then(record)
+                work, first = then.work(unit), known[0][2].work(unit) if known else 0.0
+            except (LookupError, TypeError, ValueError, OSError, PipelineError):  # of a version with other parameters
+                continue
+            if record.cost is not None and work and (not known or not 1 / APART < work / first < APART):
+                known.append((record.ref.uri, record.cost, then))
+            if len(known) == 2:
+                break
+        return known
+
+    def _line(self, known: Sequence[tuple[str, Cost, Extent]], unit: Unit, took: Sequence[float]) -> float:
+        """What this run takes: the first record by its work, less what starting took where two records tell it."""
+        works = [then.work(unit) for _, _, then in known]
+        return scaled_cost(works, took, self._extent_like(known[0][2]).work(unit))
 
     def _alike(self, store: Store) -> bool:
         """Controls are many times the work of judging a map alone."""
         return store.ref.stage != "evaluate" or store.params.get("controls") == self._run.settings.controls
 
-    def _work_then(self, record: Store) -> dict[str, float]:
-        try:
-            return _work_of(self._below(record))
-        except (KeyError, TypeError, ValueError):  # of a version with other parameters
-            return {}
+    def _extent_like(self, then: Extent) -> Extent:
+        """This run, with the fine pass's lines as planned, else as many as its seconds buy in runs as long as then."""
+        if self._fine_lines is not None:
+            return replace(self._extent, fine_lines=self._fine_lines)
+        plan = self._run.plan
+        most = sum(sweep.lines for sweep in plan.full)
+        return self._extent.buying(plan.fine_s, run_lines=then.run_lines, most=most)
+
+    def _extent_then(self, record: Store) -> Extent:
+        """How much a survey was, as far as a store and those that it rests on tell by their parameters."""
+        below = self._below(record)
+        captures = {bool(store.inputs): store for store in below if store.ref.stage == "capture"}
+        own = self._extent
+        if record.ref.stage == "locate":  # is of a path, and of no field: its own grid is that of coarse pixels
+            height, width = record.params["grid"]["shape"]
+            factor = own.grid.factor
+            return replace(own, grid=SceneGrid(height * factor, width * factor, own.grid.patch, factor))
+        grids = [store.params["grid"] for store in below if "patch" in store.params.get("grid", {})]
+        coarse, fine = captures[False].params["sweeps"], captures[True].params["sweeps"] if True in captures else None
+        return replace(
+            own,
+            grid=SceneGrid(**grids[0]) if grids else own.grid,
+            camera=replace(own.camera, samples=captures[False].params["camera"]["samples"]),
+            along=coarse[0]["along"],
+            bands=_bands_of(captures[False]),
+            coarse_lines=_lines(coarse),
+            fine_lines=None if fine is None else _lines(fine),
+            fine_runs=None if fine is None else len(fine),
+        )
 
     def _below(self, store: Store) -> list[Store]:
         """A store and all that it rests on."""
@@ -108,29 +164,24 @@ class PastCosts:
         return [store, *(stores[uri] for uri in sorted(below) if uri in stores)]
 
 
-def _work_of(stores: Sequence[Store]) -> dict[str, float]:
-    """How much work a survey was, by unit, as far as a store and those that it rests on tell by their parameters."""
-    found: dict[str, float] = {}
-    for store in stores:
-        params: dict[str, Any] = store.params
-        grid: Mapping[str, Any] = params.get("grid", {})
-        if store.ref.stage == "capture":
-            name = "fine samples" if store.inputs else "coarse samples"
-            found[name] = params["camera"]["samples"] * sum(sweep["lines"] for sweep in params["sweeps"])
-            found |= _bands_of(store)
-        if "patch" in grid:
-            found["pixels"] = grid["height"] * grid["width"]
-        if store.ref.stage == "locate":
-            found["coarse pixels"] = grid["shape"][0] * grid["shape"][1]
-        if "fine_s" in params:
-            found["fine seconds"] = params["fine_s"]
-    return found
+def scaled_cost(works: Sequence[float], took: Sequence[float], wanted: float) -> float:
+    """What ``wanted`` takes by what one or two amounts of work took: in proportion to the first, but for the start.
+
+    The start is where the line through both meets no work: none below 0, and at most half of what the larger one took,
+    for two noisy records say little of it.
+    """
+    start = 0.0
+    if len(works) == 2 and works[0] != works[1]:
+        slope = (took[1] - took[0]) / (works[1] - works[0])
+        start = min(max(took[0] - slope * works[0], 0.0), max(took) / 2)
+        start = start if start < took[0] else 0.0
+    return start + (took[0] - start) * wanted / works[0]
 
 
-def _bands_of(capture: Store) -> dict[str, float]:
-    """Bands of a stored capture, if it has a sweep that can be opened."""
-    try:
-        cubes = captured(capture.ref)
-        return {"bands": len(cubes[0].wavelength_nm)} if cubes else {}
-    except (PipelineError, OSError):
-        return {}
+def _lines(sweeps: Sequence[dict[str, Any]]) -> int:
+    return sum(int(sweep["lines"]) for sweep in sweeps)
+
+
+def _bands_of(capture: Store) -> int:
+    """Bands of a stored capture, by the first of its sweeps."""
+    return len(open_raw_cube(min(capture.ref.path.glob("*.zarr"))).wavelength_nm)

@@ -14,6 +14,7 @@ RigError               a device (or the spool behind it) failed                 
 ArchiveError           the archive cannot be read or written                       1
 ChunkError             a region that splits stored chunks                          1
 IncompleteStoreError   a store without a valid manifest, or one that fails it      1
+WorkerError            processes that work for this one died or went away          1
 =====================  ==========================================================  ========
 """
 
@@ -72,3 +73,7 @@ class ChunkError(PipelineError, ValueError):
 
 class IncompleteStoreError(PipelineError, LookupError):
     """A store has no valid manifest, or its content does not match it."""
+
+
+class WorkerError(PipelineError, RuntimeError):
+    """Processes that work for this one died, or their scheduler went away."""

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from odc.geo.geobox import GeoBox
 
 from pipeline.errors import PoseError, ShapeError
 from pipeline.grid import UNLABELLED
 from pipeline.ground import LEAST_SINK, ROWS_AT_ONCE, GroundView, pixel_places
 from pipeline.projection import MapFrame, map_crs
 from pipeline.rectify.resample import resample
+
+if TYPE_CHECKING:  # half a second to import, for maps alone
+    from odc.geo.geobox import GeoBox
 
 Floats = NDArray[np.float64]
 
@@ -113,6 +116,8 @@ def ground_grid(
     PoseError : no ray of the field meets the ground, the CRS does not suit the place, or the grid would have far more
         pixels than the scene.
     """
+    from odc.geo.geobox import GeoBox
+
     frame = MapFrame(view, map_crs(view.pose, epsg))
     if not view.count_ground(scene_shape):
         raise PoseError(

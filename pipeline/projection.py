@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
 
 from pipeline.errors import PoseError
 from pipeline.ground import GroundView, RigPose
+
+if TYPE_CHECKING:
+    from pyproj import CRS, Transformer
 
 Floats = NDArray[np.float64]
 
@@ -41,6 +43,9 @@ def map_crs(pose: RigPose, epsg: int | None = None) -> CRS:
     ------
     PoseError : no such code, not a projected CRS in metres, or the rig stands outside the area it is made for.
     """
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
     code = default_epsg(pose) if epsg is None else epsg
     hint = f"leave epsg out for EPSG:{default_epsg(pose)}"
     try:
@@ -112,6 +117,8 @@ class MapFrame:
 
     @cached_property
     def _around_foot(self) -> Transformer:
+        from pyproj import Transformer
+
         pose = self.view.pose
         return Transformer.from_pipeline(
             "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84"
@@ -121,6 +128,8 @@ class MapFrame:
 
     @cached_property
     def _on_map(self) -> Transformer:
+        from pyproj import Transformer
+
         return Transformer.from_crs(WGS84, self.crs, always_xy=True)
 
 

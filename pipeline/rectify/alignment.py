@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from pipeline.errors import SettingsError, ShapeError
 
@@ -165,6 +164,8 @@ def _half(lines: int) -> float:
 
 def _robust(system: Floats, measured: Floats, error: Floats) -> Floats:
     """Least squares with soft L1 loss; weak priors settle what the windows leave open."""
+    from scipy.optimize import least_squares
+
     width = system.shape[1]
     prior = np.diag(np.tile([1 / OFFSET_PRIOR_PX] * 2 + [1 / DRIFT_PRIOR_PX] * 2, width // 4))
     whole = np.vstack([system / error[:, None], prior])

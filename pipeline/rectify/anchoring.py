@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve1d
 
 from pipeline.camera import LineCamera
 from pipeline.coverage import field_px
@@ -70,6 +69,8 @@ def anchor_sweep(
 
 def _compare(image: PlacedImage, grid: SceneGrid, mosaic: NDArray[np.floating], reach_px: float) -> PairShift:
     """Compare a sweep with the mosaic under it."""
+    from scipy.ndimage import convolve1d
+
     along_px, scan_px = _box(image, grid, reach_px)
     if not (len(along_px) and len(scan_px)):
         return _nothing(reach_px)

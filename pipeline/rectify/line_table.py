@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from pipeline.rectify.kernels import Kernel, Rows, Windows, outer_index, taps_of, tensor_rows, weighted_rows
+
+if TYPE_CHECKING:
+    import torch
 
 Values: TypeAlias = NDArray[np.float32] | NDArray[np.uint16]
 
@@ -47,6 +49,8 @@ class Damage:
         ``total`` (n,) is the weight on usable samples; unusable elements have entered the sums as 0. Tells of each
         point whether it has a value in any band.
         """
+        import torch
+
         share = np.empty((len(at), len(self.bands)), np.float32)
         weighted_rows(self.usable, torch.from_numpy(self.kind[index.numpy()]), weight, share)
         point, column = _places(np.abs(share - total[:, None]) > ROUNDING)  # few: the rest is divided as samples are
@@ -97,6 +101,8 @@ class LineTable:
         self, placed: Windows, out: NDArray[np.float32], share: NDArray[np.float32], at: Rows | None = None
     ) -> None:
         """Points (the block's ``at``, or all) whose windows lie on usable samples altogether."""
+        import torch
+
         index, weight = placed.flat_index(self.shape), placed.joint_weight()
         weighted_rows(self.terms, index, weight, out, at)
         share[... if at is None else at] = 1
@@ -108,6 +114,8 @@ class LineTable:
 
     def _read_partial(self, placed: Windows, out: NDArray[np.float32], share: NDArray[np.float32], at: Rows) -> None:
         """Points that miss taps: NaN and 0 where they fail, else what is there, renormalised."""
+        import torch
+
         out[at], share[at] = np.nan, 0
         near = np.flatnonzero(placed.touches(self.shape))
         flat, joint = self._usable_taps(placed.chosen(near))
@@ -139,6 +147,8 @@ class LineTable:
 
 def table_for(values: Values, valid: NDArray[np.bool_], kernel: Kernel) -> LineTable:
     """Make lines (line, sample, band), valid by sample or by element, ready for one kernel."""
+    import torch
+
     taps = taps_of(kernel)
     lines, samples, bands = values.shape
     rows: NDArray[Any] = np.ascontiguousarray(values).reshape(lines * samples, bands)
@@ -161,6 +171,8 @@ def _apart(
 
     Those are 0 in the rows given back, for sums; NaN for a kernel of one tap, which copies.
     """
+    import torch
+
     complete: NDArray[np.bool_] = np.all(valid, axis=2)
     lacking = np.flatnonzero(~complete)
     missing = ~valid.reshape(rows.shape)[lacking]

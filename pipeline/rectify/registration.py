@@ -8,9 +8,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft2, next_fast_len, rfft2
-from scipy.ndimage import convolve1d, maximum_filter, minimum_filter
-from skimage.registration import phase_cross_correlation
 
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.rectify.resample import kernel_taps
@@ -178,6 +175,8 @@ def _correlate(first: Floats, second: Floats, reach: int) -> tuple[Floats, Float
 
     Shifts with too little in common, or without variance there, get a correlation of -1.
     """
+    from scipy.fft import irfft2, next_fast_len, rfft2
+
     size = [next_fast_len(n + min(reach, n), real=True) for n in first.shape]
     spectra = []
     for image in (first, second):
@@ -206,6 +205,8 @@ def _correlate(first: Floats, second: Floats, reach: int) -> tuple[Floats, Float
 
 def _candidates(correlation: Floats) -> Iterator[NDArray[np.intp]]:
     """Integer shifts (2,) of the highest peaks, best first, none within another's lobe."""
+    from scipy.ndimage import maximum_filter
+
     reach = correlation.shape[0] // 2
     # The window is as wide as a lobe: noise on a broad peak makes no second one.
     peaks = np.argwhere((correlation == maximum_filter(correlation, 2 * int(LOBE_PX) + 1)) & (correlation > -1))
@@ -215,6 +216,8 @@ def _candidates(correlation: Floats) -> Iterator[NDArray[np.intp]]:
 
 def _refine(first: Floats, second: Floats, integer: NDArray[np.intp]) -> _Fit | None:
     """Least squares around an integer shift; None where too little is common or it does not settle near by."""
+    from scipy.ndimage import minimum_filter
+
     for _ in range(REALIGNMENTS):
         one, other = _crops(first, second, integer)
         both = np.isfinite(one) & np.isfinite(other)
@@ -242,6 +245,8 @@ def _crops(first: Floats, second: Floats, integer: NDArray[np.intp]) -> tuple[Fl
 
 def _phase_shift(one: Floats, other: Floats) -> Floats:
     """Shift by phase correlation under a Hann window [2], not normalised: noise has all phases alike."""
+    from skimage.registration import phase_cross_correlation
+
     window = np.outer(*(np.hanning(size + 2)[1:-1] for size in one.shape))
     shift, *_ = phase_cross_correlation(  # type: ignore[no-untyped-call]
         one * window, other * window, normalization=None, upsample_factor=UPSAMPLE
@@ -292,6 +297,8 @@ def _slopes(image: Floats, kept: NDArray[np.bool_]) -> Floats:
 
 def _smoothed(image: Floats) -> Floats:
     """Damp what is too fine to interpolate, and noise."""
+    from scipy.ndimage import convolve1d
+
     for axis in (0, 1):
         image = convolve1d(image, SMOOTHING, axis=axis, mode="nearest")
     return image

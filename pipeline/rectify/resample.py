@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
@@ -34,6 +33,8 @@ def gather(
     -------
     (n, component) float32. A point's result does not depend on the other points of the call.
     """
+    import torch
+
     rows, columns, components = planes.shape
     table = tensor_rows(np.ascontiguousarray(planes, np.float32).reshape(rows * columns, components))
     out = np.empty((len(y), components), np.float32)

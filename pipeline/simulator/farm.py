@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.errors import SceneError
+from pipeline.once import Once
 from pipeline.simulator.farm_fields import CLASSES, SOWINGS, Canvas, Ground, Mixture, grass, hard_track, paint_parcel
 from pipeline.simulator.farm_layout import (
     Band,
@@ -49,8 +50,9 @@ from pipeline.simulator.farm_layout import (
     stream,
     visible_area,
 )
+from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.scene import RasterScene
-from pipeline.simulator.spectra import PANEL_REFLECTANCE, spectral_library
+from pipeline.simulator.spectra import MATERIALS, PANEL_REFLECTANCE, band_centres, spectral_library
 
 FARM_LAW = "farm@1"
 
@@ -72,7 +74,7 @@ CLASS_COLOURS = np.array(
 def farm_scene(
     seed: int, shape: tuple[int, int] = (1024, 1280), bands: int = 270, camera: LineCamera | None = None
 ) -> RasterScene:
-    """Draw a farm: the same seed, shape and bands give the same scene, bit for bit.
+    """Give a farm: the same seed, shape and bands give the same scene, bit for bit. It is drawn when first looked at.
 
     Parameters
     ----------
@@ -97,21 +99,24 @@ def farm_scene(
     if seed < 0 or min(shape) < 1:
         raise SceneError(f"the farm needs a seed >= 0 and a shape of at least 1 x 1 px, got seed {seed}, shape {shape}")
     seen_by = camera or LineCamera()
-    library = spectral_library(bands)
-    planes, labels = _draw(seed, shape)
+    wavelength, fwhm = band_centres(bands)
     return RasterScene(
         name="farm",
         key=f"{FARM_LAW}/seed={seed}/shape={shape[0]}x{shape[1]}/bands={bands}/full_well={seen_by.full_well_e:g}",
-        planes=planes,
-        electrons=library.electrons(seen_by),
+        raster=Raster((*shape, len(MATERIALS)), labelled=True, draw=lambda: _draw(seed, shape)),
+        light=Once(lambda: _light(bands, seen_by)),
         panel=np.full(bands, PANEL_REFLECTANCE, np.float32),
-        panel_electrons=library.panel_electrons(seen_by),
-        wavelength_nm=library.wavelength_nm.copy(),
-        fwhm_nm=library.fwhm_nm.copy(),
-        labels=labels,
+        wavelength_nm=wavelength,
+        fwhm_nm=fwhm,
         class_names=CLASSES,
         class_colours=CLASS_COLOURS.copy(),
     )
+
+
+def _light(bands: int, camera: LineCamera) -> Light:
+    """What the camera makes of each material and of the white panel."""
+    library = spectral_library(bands)
+    return Light(library.electrons(camera), library.panel_electrons(camera))
 
 
 def _draw(seed: int, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, ShapeError
+from pipeline.once import Once
 from pipeline.rectify.resample import gather
+from pipeline.simulator.raster import Light, Raster
 
 DEFAULT_EXPOSURE_MS = 100.0  # the exposure at which Scene.electrons is stated
 WELL_SHARE = 0.6  # of the full well, filled by the bright end of a scene without a radiance law
@@ -63,41 +65,69 @@ class RasterScene:
 
     ``planes`` is (y, x, component) float32 and ``electrons`` (component, band), or (band,) where each band has its own
     plane. Labels are (y, x) uint8 with 255 for unlabelled. ``filled_px`` counts pixels that came without a value.
+    Planes, labels and electrons may be made when they are first asked for; all else is known at once.
     """
 
     name: str
     key: str
-    planes: NDArray[np.float32]
-    electrons: NDArray[np.float32]
+    raster: Raster
+    light: Once[Light]
     panel: NDArray[np.float32]
-    panel_electrons: NDArray[np.float32]
     wavelength_nm: NDArray[np.float64]
     fwhm_nm: NDArray[np.float64] | None = None
-    labels: NDArray[np.uint8] | None = None
     class_names: tuple[str, ...] = ()
     class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
     filled_px: int = 0
 
     def __post_init__(self) -> None:
-        bands = len(self.wavelength_nm)
-        if self.planes.ndim != 3 or 0 in self.planes.shape:
-            raise SceneError(f"scene {self.name} must be (y, x, component) and not empty, got {self.planes.shape}")
-        wanted = {(self.planes.shape[2], bands)} | ({(bands,)} if bands == self.planes.shape[2] else set())
-        if self.electrons.shape not in wanted:
+        if self.light.is_made():
+            self._checked_light()
+        self._check_bands("panel", self.panel)
+
+    def _checked_light(self) -> Light:
+        light, bands, components = self.light(), len(self.wavelength_nm), self.raster.shape[2]
+        wanted = {(components, bands)} | ({(bands,)} if bands == components else set())
+        if light.electrons.shape not in wanted:
             raise ShapeError(
-                f"scene {self.name}: electrons {self.electrons.shape} do not map {self.planes.shape[2]} components "
+                f"scene {self.name}: electrons {light.electrons.shape} do not map {components} components "
                 f"to {bands} bands"
             )
-        for what in ("panel", "panel_electrons"):
-            if getattr(self, what).shape != (bands,):
-                raise ShapeError(f"scene {self.name}: {what} {getattr(self, what).shape}, expected ({bands},)")
-        if self.labels is not None and self.labels.shape != self.shape:
-            raise SceneError(f"scene {self.name} is {self.shape} px, its labels {self.labels.shape}; crop or pad one")
+        self._check_bands("panel_electrons", light.panel_electrons)
+        return light
+
+    def _check_bands(self, what: str, values: NDArray[np.float32]) -> None:
+        if values.shape != self.wavelength_nm.shape:
+            raise ShapeError(f"scene {self.name}: {what} {values.shape}, expected ({len(self.wavelength_nm)},)")
 
     @property
     def shape(self) -> tuple[int, int]:
         """(y, x) size [px]."""
-        return self.planes.shape[0], self.planes.shape[1]
+        return self.raster.shape[:2]
+
+    @property
+    def electrons(self) -> NDArray[np.float32]:
+        """(component, band) electrons at the default exposure per unit of component; (band,) means a diagonal."""
+        return self._checked_light().electrons
+
+    @property
+    def panel_electrons(self) -> NDArray[np.float32]:
+        """(band,) electrons that the white panel gives at the default exposure."""
+        return self._checked_light().panel_electrons
+
+    @property
+    def planes(self) -> NDArray[np.float32]:
+        """(y, x, component) how much of each component a pixel has."""
+        return self.raster.drawn()[0]
+
+    @property
+    def labelled(self) -> bool:
+        """Whether there are labels; draws nothing."""
+        return self.raster.labelled
+
+    @property
+    def labels(self) -> NDArray[np.uint8] | None:
+        """(y, x) classes, 255 for unlabelled; None without any."""
+        return self.raster.drawn()[1] if self.labelled else None
 
     def sample(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float32]:
         """Give the components at points, (n,) rows and columns [px] -> (n, component) float32."""
@@ -150,6 +180,8 @@ def raster_from_values(
     """
     if values.ndim != 3 or 0 in values.shape:
         raise SceneError(f"scene {name} must be (y, x, band) and not empty, got {values.shape}")
+    if labels is not None and labels.shape != values.shape[:2]:
+        raise SceneError(f"scene {name} is {values.shape[:2]} px, its labels {labels.shape}; crop or pad one")
     planes = np.ascontiguousarray(values, dtype=np.float32)
     bright = _bright_value(planes, name)
     planes, filled = _fill_by_median(planes)
@@ -157,13 +189,16 @@ def raster_from_values(
     return RasterScene(
         name=name,
         key=key or content_key(planes),
-        planes=planes,
-        electrons=np.full(bands, WELL_SHARE * camera.full_well_e / bright, np.float32),
+        raster=Raster.of(planes, labels),
+        light=Once.of(
+            Light(
+                np.full(bands, WELL_SHARE * camera.full_well_e / bright, np.float32),
+                np.full(bands, camera.full_well_e, np.float32),
+            )
+        ),
         panel=np.full(bands, bright / WELL_SHARE, np.float32),
-        panel_electrons=np.full(bands, camera.full_well_e, np.float32),
         wavelength_nm=np.asarray(wavelength_nm, np.float64),
         fwhm_nm=fwhm_nm,
-        labels=labels,
         class_names=class_names,
         class_colours=np.zeros((0, 3), np.uint8) if class_colours is None else class_colours,
         filled_px=filled,

@@ -106,6 +106,18 @@ class SpectralLibrary:
         return (PANEL_REFLECTANCE * self.light * FILL * camera.full_well_e).astype(np.float32)
 
 
+def band_centres(bands: int) -> tuple[Spectrum, Spectrum]:
+    """Centres and widths of ``bands`` equally spaced bands from 400 to 1000 nm, (band,) each [nm].
+
+    Raises
+    ------
+    WavelengthError : fewer than 2 bands.
+    """
+    if bands < 2:
+        raise WavelengthError(f"the farm's spectra need at least 2 bands from 400 to 1000 nm, got {bands}")
+    return np.linspace(FIRST_NM, LAST_NM, bands), np.full(bands, FWHM_NM)
+
+
 @lru_cache(maxsize=16)
 def spectral_library(bands: int) -> SpectralLibrary:
     """Compute every material in ``bands`` equally spaced Gaussian bands from 400 to 1000 nm (arrays are read-only).
@@ -114,10 +126,7 @@ def spectral_library(bands: int) -> SpectralLibrary:
     ------
     WavelengthError : fewer than 2 bands.
     """
-    if bands < 2:
-        raise WavelengthError(f"the farm's spectra need at least 2 bands from 400 to 1000 nm, got {bands}")
-    wavelength = np.linspace(FIRST_NM, LAST_NM, bands)
-    fwhm = np.full(bands, FWHM_NM)
+    wavelength, fwhm = band_centres(bands)
     response = band_response(wavelength, fwhm) * (_photons() * _quantum_efficiency())
     light = response.sum(axis=1)
     reflectance = _reflectance_1nm() @ response.T / light

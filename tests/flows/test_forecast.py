@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,9 +14,11 @@ import pytest
 
 from flows.forecast import StageForecast, forecast
 from flows.forecast_command import run_plan
+from flows.run import open_run
 from flows.settings import Settings, load_settings
+from flows.stage_costs import scaled_cost
 from flows.stages import VERSIONS
-from pipeline.errors import ArchiveError
+from pipeline.errors import ArchiveError, SettingsError
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive import Archive
 
@@ -44,7 +48,7 @@ def archive(surveyed: tuple[Path, Any], tmp_path: Path) -> Path:
 
 
 def _plan(settings: Settings, out: Path, **changes: Any) -> dict[str, StageForecast]:
-    return {row.stage: row for row in forecast(replace(settings, out=str(out), **changes))}
+    return {row.stage: row for row in forecast(replace(settings, out=str(out), **changes)).stages}
 
 
 def _tree(root: Path) -> dict[str, tuple[int, int]]:
@@ -128,14 +132,61 @@ def test_a_stage_of_another_version_is_made_again(
 
 
 def test_of_another_scene_nothing_is_stored(settings: Settings, archive: Path, scene_files: Path) -> None:
-    """Its light is new, and the estimate is scaled by the pixels of the scene that was surveyed."""
+    """Its light is new, and the estimate is scaled by exactly the work there is more of."""
     planned = _plan(settings, archive, scene="farm", size=(192, 96), labels=None, weights=None)
     assert planned["capture_coarse"].why == "nothing stored yet of this scene"
-    mapped, record = planned["draw_map"], Archive(archive).refs("segment")[0]
+    times = 192 * 96 / (128 * 96) * 270 / 3  # pixels and bands
+    record = Archive(archive).refs("rectify")[0]
     cost = Archive(archive).cost(record)
     assert cost is not None
-    assert mapped.seconds == pytest.approx(cost.wall_s * 192 * 96 / (128 * 96))
-    assert planned["rectify"].size == round(_size(archive, "rectify") * 192 * 96 / (128 * 96) * 270 / 3)
+    assert planned["rectify"].seconds == pytest.approx(cost.wall_s * times)
+    assert planned["rectify"].size == round(cost.size * times)
+    assert planned["rectify"].basis == f"{record.uri} times {times:.3g}, by mosaic values"
+    assert planned["draw_map"].size == round(_size(archive, "segment") * 192 / 128)
+    assert planned["evaluate"].size == _size(archive, "evaluate")
+
+
+def test_two_records_tell_what_starting_takes() -> None:
+    """One alone is scaled by the work; on the line of two lies a third, whichever comes first; noise is held back."""
+    assert scaled_cost([10.0], [3.0], 40.0) == 12.0
+    for order in (slice(None), slice(None, None, -1)):
+        assert scaled_cost([10.0, 30.0][order], [3.0, 7.0][order], 100.0) == pytest.approx(1 + 0.2 * 100)
+    assert scaled_cost([10.0, 30.0], [3.0, 12.0], 100.0) == 30.0  # dearer than in proportion: no start below 0
+    assert scaled_cost([30.0, 10.0], [3.0, 2.9], 60.0) == pytest.approx(1.5 + 1.5 * 2)  # hardly dearer: half is start
+    assert scaled_cost([10.0, 30.0], [1.0, 3.5], 0.0) == 0.0
+
+
+def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
+    settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither its ground nor its spectra; the plan says what the survey says when it refuses."""
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("the plan looked at the field")
+
+    monkeypatch.setattr("pipeline.simulator.farm._draw", refuse)
+    monkeypatch.setattr("pipeline.simulator.farm._light", refuse)
+    monkeypatch.setattr("flows.run.os.sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**21}[name])
+    asked = replace(settings, scene="farm", size=(10240, 10240), labels=None, weights=None, out=str(tmp_path / "a"))
+    found = forecast(asked)
+    assert [row.stage for row in found.stages if row.state == "to run"] == ["capture_coarse"]
+    assert [row.stage for row in found.stages if row.state == "skipped"] == ON_REQUEST
+    with pytest.raises(SettingsError, match="this machine has 9; take a smaller one") as refused:
+        open_run(asked)
+    assert found.refused == str(refused.value)
+    assert run_plan(asked) == 0
+    assert f"refused here: {refused.value}" in capsys.readouterr().out
+    run_plan(asked, as_json=True)
+    assert json.loads(capsys.readouterr().out)["refused"] == str(refused.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_plan_loads_neither_torch_nor_figures_nor_maps() -> None:
+    """They take seconds: who needs one imports it in the function that does."""
+    heavy = {"torch", "matplotlib", "xarray", "odc.geo", "rasterio", "scipy", "pandas", "prefect", "distributed"}
+    code = "import sys, flows.cli, flows.forecast_command; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not heavy & set(done.stdout.split())
 
 
 def _size(archive: Path, stage: str) -> int:

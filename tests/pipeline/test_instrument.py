@@ -9,8 +9,10 @@ import pytest
 
 from pipeline.camera import LineCamera, look
 from pipeline.mirror import direction_to_scene, mirror_throughput, position_to_normal, reflect
+from pipeline.once import Once
 from pipeline.scan import Sweep, line_positions, sweep_positions
 from pipeline.simulator.instrument import ALL_EFFECTS, expected_lines
+from pipeline.simulator.raster import Light
 from pipeline.simulator.scene import RasterScene, raster_from_values
 
 CAMERA = LineCamera()
@@ -101,7 +103,7 @@ def test_line_does_not_depend_on_its_block() -> None:
 def test_diagonal_and_full_electrons_agree() -> None:
     """A diagonal given as a vector gives what the matrix gives."""
     scene = scene_of(np.random.default_rng(2).random((20, 50, 4)))
-    full = replace(scene, electrons=np.diag(scene.electrons))
+    full = replace(scene, light=Once.of(Light(np.diag(scene.electrons), scene.panel_electrons)))
     lines = [expected_lines(s, CAMERA, SWEEP, range(10, 14)) for s in (scene, full)]
     np.testing.assert_allclose(lines[0], lines[1], rtol=1e-5)
 

@@ -13,11 +13,13 @@ from pipeline.camera import LineCamera
 from pipeline.coverage import coarse_sweeps, full_sweeps
 from pipeline.errors import SettingsError
 from pipeline.grid import SceneGrid
+from pipeline.once import Once
 from pipeline.rectify.alignment import no_shifts
 from pipeline.rectify.overlaps import BroadSweep, PlacedImage, broad_bands, overlap_windows, places_seen
 from pipeline.rectify.seams import Registration, measure_windows, place_images, register_sweeps
 from pipeline.scan import Axis, Sweep, line_positions, points_of_scan, sweep_to_scene
 from pipeline.simulator.pointing import PointingErrors
+from pipeline.simulator.raster import Light
 from pipeline.simulator.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
@@ -152,7 +154,7 @@ def test_saturated_samples_are_left_out(factor: int):
     values = np.full((GRID.height, GRID.width, 1), 1.0)
     values[100:140, 120:180] = 2.0  # 60 % of the full well
     scene = raster_from_values(values, CAMERA, name="t", wavelength_nm=np.array([600.0]))
-    bright = replace(scene, electrons=scene.electrons * 2.4)
+    bright = replace(scene, light=Once.of(Light(scene.electrons * 2.4, scene.panel_electrons)))
     sweep = Sweep("s", "fine", "x", 0.0, -40.0, 80 // factor, factor, factor)
     broad = BroadSweep.read(SimulatedSweep(SimulatedSource(bright, CAMERA, 0, frozenset()), sweep), CAMERA)
     middle = broad.image.shape[0] // 2, broad.image.shape[1] // 2

@@ -1,0 +1,40 @@
+"""A value that is made when it is first asked for, and then kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from threading import Lock
+from typing import Generic, TypeVar
+
+Value = TypeVar("Value")
+
+
+class Once(Generic[Value]):
+    """Calls ``make`` once, by whichever thread asks first, while the others wait; a ``make`` that fails is asked again.
+
+    Equal to nothing but itself: what it will hold is not known before.
+    """
+
+    def __init__(self, make: Callable[[], Value]) -> None:
+        self._make: Callable[[], Value] | None = make
+        self._made: list[Value] = []
+        self._lock = Lock()
+
+    @staticmethod
+    def of(value: Value) -> Once[Value]:
+        """Hold a value that is there already."""
+        once = Once(lambda: value)
+        once()
+        return once
+
+    def is_made(self) -> bool:
+        """Whether the value is there."""
+        return bool(self._made)
+
+    def __call__(self) -> Value:
+        """Give the value, making it the first time."""
+        with self._lock:
+            if self._make is not None:
+                self._made.append(self._make())
+                self._make = None  # what it was made from may go
+            return self._made[0]

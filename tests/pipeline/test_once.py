@@ -1,0 +1,51 @@
+"""A value that is made when it is first asked for."""
+
+from __future__ import annotations
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from pipeline.once import Once
+
+
+def test_a_value_is_made_once_whoever_asks() -> None:
+    """Threads that ask at the same time get the same value, of one making."""
+    made: list[object] = []
+    together = threading.Barrier(8)
+
+    def make() -> object:
+        made.append(object())
+        return made[-1]
+
+    once = Once(make)
+
+    def ask(_: int) -> object:
+        together.wait()
+        return once()
+
+    assert not once.is_made()
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(ask, range(8)))
+    assert once.is_made()
+    assert len(made) == 1
+    assert all(value is made[0] for value in found)
+
+
+def test_what_fails_is_asked_for_again() -> None:
+    """An error reaches who asked, and the next one tries anew; nothing is a value too."""
+    tries = iter([ValueError("not yet"), None])
+
+    def make() -> None:
+        one = next(tries)
+        if one is not None:
+            raise one
+
+    once: Once[None] = Once(make)
+    with pytest.raises(ValueError, match="not yet"):
+        once()
+    assert not once.is_made()
+    once()
+    assert once.is_made()
+    assert Once.of(None).is_made()
