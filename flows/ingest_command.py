@@ -19,7 +19,7 @@ from storage.scan_files import open_cube_source, with_wavelengths
 from storage.staging import check_name, file_hash
 
 STAGE = "ingest"
-VERSION = 1
+VERSION = 2
 TITLES = {"read": "reading the files", STAGE: "storing the cube"}
 
 
@@ -28,7 +28,7 @@ class IngestRequest:
     """What to ingest, as the flags say it."""
 
     source: str
-    archive: Path
+    archive: str | Path
     name: str | None = None
     dark: str | None = None
     white: str | None = None
@@ -104,6 +104,7 @@ def _key(request: IngestRequest, source: CubeSource, files: Sequence[SourceFile]
         "references": [source.dark, source.white],
         "wavelength_nm": None if centres is None else centres.tolist(),
         "fwhm_nm": None if widths is None else widths.tolist(),
+        **({"numbers_in_names": source.by_names} if source.by_names else {}),
     }
 
 

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from storage.staging import MANIFEST_NAME, PART_SUFFIX, check_name
+from storage.staging import MANIFEST_NAME, PART_SUFFIX, check_name, is_name
 
 STORE_URI = re.compile(r"stages/([^/\s]+)/([^/\s]+)")
 SECOND = len("20261120T101701")  # of a run's name: when it was begun
@@ -63,4 +63,6 @@ def without_manifest(root: Path) -> list[Path]:
 def in_text(text: str) -> str | None:
     """The store's address that a text such as ``stages/rectify/<key>/mosaic.zarr`` begins with, or None."""
     found = STORE_URI.match(text)
-    return None if found is None else found.group(0)
+    if found is None or not all(is_name(part) for part in found.groups()):  # stages/../.. leads out of the archive
+        return None
+    return found.group(0)

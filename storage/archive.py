@@ -8,7 +8,8 @@
     .aside/<stage>/<key>/     what a repair under way puts back where it cannot be remade
     .locks/                   held while something is made
 
-A folder whose name ends in ``.part`` is not finished: whoever makes the same thing next removes it.
+A folder whose name ends in ``.part`` is not finished: whoever makes the same thing next removes it. An archive in a
+bucket (`storage.object_archive`) has the same addresses.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from storage.addresses import StageRef, published_runs, published_stores, store_at
-from storage.archive_folder import open_folder
+from storage.archive_folder import is_folder_archive, open_folder
 from storage.keys import plain, stage_key
 from storage.lineage import rests_on
 from storage.manifests import (
@@ -30,13 +31,23 @@ from storage.manifests import (
     Stopwatch,
     check_files,
     cost_of,
-    listed_bytes,
+    made_bytes,
     manifest_sha256,
     read_manifest,
     write_manifest,
 )
-from storage.run_folders import RunDraft
-from storage.staging import PART_SUFFIX, check_name, refusals, remove_tree, rename_into_place, retire, take_lock
+from storage.object_places import is_remote, need_obstore
+from storage.run_folders import RunDraft, date_of_store
+from storage.staging import (
+    PART_SUFFIX,
+    bytes_below,
+    check_name,
+    refusals,
+    remove_tree,
+    rename_into_place,
+    retire,
+    take_lock,
+)
 from storage.verification import Finding, Progress, verify_everything
 
 __all__ = ["Archive", "Cost", "Finding", "RunDraft", "StageRef", "StagedStore", "stage_key"]
@@ -54,22 +65,58 @@ class StagedStore:
 class Archive:
     """A folder of immutable stores. Kill the process anywhere: what has a final name is whole."""
 
-    def __init__(self, root: Path) -> None:
-        self.root = root
+    in_bucket = False  # whether `root` is a working copy alone
+
+    def __init__(self, root: Path, *, writes: bool = True) -> None:
+        self.root, self.writes = root, writes
 
     @classmethod
     def open(cls, root: str | Path, *, create: bool = True, write: bool = True) -> Archive:
-        """Open an archive, or make it where ``create``.
+        """Open an archive, a folder or ``s3://bucket/prefix``, or make it where ``create``.
 
         Raises
         ------
         ArchiveError : the path is a file, is not there, or does not let itself be written to (``write``).
+        SettingsError : an address on S3 that is none.
         """
+        if is_remote(root):
+            need_obstore(root)
+            from storage.object_archive import open_object_archive
+
+            return open_object_archive(root, create=create, write=write)
         path = Path(root).absolute()
         open_folder(path, create=create, write=write)
-        return cls(path)
+        return cls(path, writes=write)
+
+    @staticmethod
+    def is_there(root: str | Path) -> bool:
+        """Whether there is something to open: an archive, or a file that will be refused."""
+        if is_remote(root):
+            need_obstore(root)
+            from storage.object_archive import is_object_archive
+
+            return is_object_archive(root)
+        return is_folder_archive(Path(root))
+
+    @property
+    def name(self) -> str:
+        """What a person gives to open it again."""
+        return str(self.root)
+
+    @property
+    def around(self) -> Path:
+        """Folder in which what belongs beside the archive is put."""
+        return self.root.parent
 
     # --- stages -------------------------------------------------------------------------------------------------------
+
+    def ref(self, stage: str, key: str) -> StageRef:
+        """Address of a store, whether it is there or not."""
+        return store_at(self.root, stage, key)
+
+    def locate(self, address: str) -> Path:
+        """Where on this machine a product lies by its address relative to the archive, as a receipt gives it."""
+        return self.root / address
 
     def find(self, stage: str, key: str) -> StageRef | None:
         """The published store, or None. Sizes are compared with the manifest, content only by :meth:`verify`.
@@ -105,21 +152,26 @@ class Archive:
         ------
         ArchiveError : the disk refuses; the message names the path and what to do.
         """
-        ref = store_at(self.root, stage, key)
+        ref = self.ref(stage, key)
+        final = self.root / ref.uri
         facts = {"stage": stage, "key": key, "version": version, "params": plain(params or {}), "inputs": plain(inputs)}
         with refusals(self.root, "write to the archive"), self._locked(f"{stage}-{key}"):
             done = self.find(stage, key) is not None
-            part = ref.path.with_name(key + PART_SUFFIX)
+            part = final.with_name(key + PART_SUFFIX)
             remove_tree(part)
             part.mkdir(parents=True)
             try:
                 watch = Stopwatch()
                 yield StagedStore(part, ref, done)
                 if not done:
-                    write_manifest(part, facts | {"cost": watch.cost(work)})
-                    rename_into_place(part, ref.path)
+                    facts |= {"cost": watch.cost(work), "created": date_of_store(self.root, ref.uri)}
+                    write_manifest(part, facts)
+                    self._put_in_place(part, final)
             finally:
                 remove_tree(part)
+
+    def _put_in_place(self, part: Path, final: Path) -> None:
+        rename_into_place(part, final)
 
     def produce(
         self,
@@ -146,11 +198,11 @@ class Archive:
 
     def manifest(self, ref: StageRef) -> dict[str, Any]:
         """What is known of a store: stage, key, version, params, inputs, cost, created, libraries, files."""
-        return read_manifest(ref.path)
+        return read_manifest(self.root / ref.uri)
 
     def stored_bytes(self, ref: StageRef) -> int:
-        """Size of a store's files by its manifest."""
-        return listed_bytes(self.manifest(ref))
+        """Size of a store's files by its manifest, as they were made: the same before it was packed and after."""
+        return made_bytes(self.manifest(ref))
 
     def cost(self, ref: StageRef) -> Cost | None:
         """What the making of a store took, by its manifest; None for stores of before this was recorded."""
@@ -158,11 +210,12 @@ class Archive:
 
     def manifest_hash(self, ref: StageRef) -> str:
         """SHA-256 of a store's manifest.json, and so of every byte of the store."""
-        return manifest_sha256(ref.path)
+        return manifest_sha256(self.root / ref.uri)
 
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
         """`manifest_hash` by address, of stores and of all they rest on, for ``RunDraft.publish(rests_on=...)``."""
-        return {ref.uri: manifest_sha256(ref.path) for ref in rests_on(self.root, refs)}
+        plain = [store_at(self.root, ref.stage, ref.key) for ref in refs]
+        return {ref.uri: manifest_sha256(ref.path) for ref in rests_on(self.root, plain)}
 
     def refs(self, stage: str | None = None) -> list[StageRef]:
         """Every published store (of one stage), by stage and key."""
@@ -224,6 +277,17 @@ class Archive:
                     release()
         return removed
 
+    def size_of(self, uri: str) -> int:
+        """Bytes of all files of a store."""
+        return bytes_below(self.root / uri)
+
+    def leftovers(self, keep_days: float) -> dict[str, int]:
+        """What broken-off uploads left in a bucket for ``keep_days``: address and bytes; nothing in a folder."""
+        return {}
+
+    def drop_leftover(self, uri: str) -> None:
+        """Remove one of `leftovers`."""
+
     # --- runs and spools ----------------------------------------------------------------------------------------------
 
     def new_run(self, name: str) -> RunDraft:
@@ -267,9 +331,10 @@ class Archive:
         return folder
 
     def drop_spool(self, key: str) -> None:
-        """Remove a spool whose lines are published."""
+        """Remove a spool whose lines are published; an archive opened for reading keeps it."""
         check_name(key)
-        remove_tree(self.root / "spool" / key)
+        if self.writes:
+            remove_tree(self.root / "spool" / key)
 
     def _lock_path(self, name: str) -> Path:
         return self.root / ".locks" / f"{name}.lock"

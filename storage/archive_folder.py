@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pipeline.errors import ArchiveError
-from storage.staging import refusals
+from storage.staging import refusals, sync_path
 
 
 def open_folder(path: Path, *, create: bool, write: bool) -> None:
@@ -30,6 +30,11 @@ def open_folder(path: Path, *, create: bool, write: bool) -> None:
             raise ArchiveError(f"cannot read the archive {path}: permission is denied; change the folder's rights")
 
 
+def is_folder_archive(path: Path) -> bool:
+    """Whether a path is an archive's folder, or a file, which `open_folder` refuses."""
+    return (path / "stages").is_dir() or path.is_file()
+
+
 @contextmanager
 def _any_refusal(path: Path) -> Iterator[None]:
     """At the door whatever the system answers means that this is no place for an archive."""
@@ -43,8 +48,10 @@ def _any_refusal(path: Path) -> Iterator[None]:
 
 def _make_and_probe(path: Path, *, create: bool, write: bool) -> None:
     try:
-        if create:
+        if create and not (path / "stages").is_dir():
             (path / "stages").mkdir(parents=True, exist_ok=True)
+            for named in (path, path.parent):
+                sync_path(named)
     except (FileExistsError, NotADirectoryError) as error:
         raise ArchiveError(
             f"{error.filename} is or lies below a file, expected a folder; choose another --out"

@@ -65,6 +65,7 @@ class CubeSource:
     nodata: float | None = None
     headers: Mapping[str, str] = field(default_factory=dict)  # file name -> its text
     root: Path | None = None  # of a store whose files' names count, too
+    by_names: tuple[tuple[int, ...], ...] = ()  # numbers in the files' names, where lines or times follow from them
     notes: tuple[str, ...] = ()
 
     @property

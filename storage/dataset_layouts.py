@@ -13,7 +13,6 @@ Neither set was at hand: both readers are tested on small files made in these la
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,10 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.grid import UNLABELLED
+from storage.array_files import variable_names
 from storage.labels import Labels, load_labels
-from storage.raster_files import NEAR_INFRARED_NM, RGB_NM, Raster, is_hdf_mat, load_raster
+from storage.raster_files import load_raster
+from storage.rasters import NEAR_INFRARED_NM, RGB_NM, Raster
 from storage.wavelengths import BandWavelengths
 
 HYKO_LABELS = "label_Semantic Classes for Urban Scenes"
@@ -91,10 +92,7 @@ def _hyko_frame(path: Path) -> Layout | None:
 def _variables(path: Path) -> set[str]:
     """Names in a .mat file, without reading their arrays; none where it is damaged (whoever reads it says how)."""
     try:
-        if is_hdf_mat(path):
-            with importlib.import_module("h5py").File(path, "r") as file:
-                return set(file)
-        return {name for name, _, _ in importlib.import_module("scipy.io").whosmat(path)}
+        return variable_names(path)
     except Exception:  # decoders raise anything at all on damaged bytes
         return set()
 

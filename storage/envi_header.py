@@ -27,6 +27,8 @@ DATA_TYPES = {
 NANOMETRES = {"nm", "nanometer", "nanometers", "nanometre", "nanometres"}
 MICROMETRES = {"um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"}
 UNSAID = {"", "unknown"}
+# of these a header describes another kind of file than plain numbers
+OTHER_FILES = ("tiff", "jpeg", "jp2", "png", "bmp", "hdf", "netcdf", "nitf", "virtual", "meta")
 
 _BRACE = re.compile(r"[{}]")
 _SIGN = re.compile(r"[=:]")
@@ -61,6 +63,8 @@ def load_envi_header(path: Path) -> EnviHeader:
     SceneError : there is no such file, or it is no ENVI header that can be used; the message says why.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise SceneError(f"{path} is no file; name an ENVI header")
         if path.stat().st_size > LARGEST_HEADER:
             raise SceneError(f"{path} has {path.stat().st_size} bytes, too many for a header; name the .hdr file")
         content = path.read_bytes()
@@ -88,13 +92,14 @@ def parse_envi_header(text: str, where: str = "the header") -> EnviHeader:
 
     Raises
     ------
-    SceneError : it does not begin with ENVI (ArcGIS headers do not), or a size, type or interleave is missing or
-        impossible.
+    SceneError : it does not begin with ENVI (ArcGIS headers do not), a size, type or interleave is missing or
+        impossible, or it says that its file holds more than plain numbers (compressed, with bytes between frames).
     """
     notes: list[str] = []
     fields, settings = _split(text, where, notes)
     samples, bands = (_whole(fields, key, where, least=1) for key in ("samples", "bands"))
     kind = fields.get("file type", "ENVI Standard")
+    _refuse_layouts(fields, kind, where)
     channels = samples if "spectral library" in kind.lower() else bands
     wavelength, scale = _wavelengths(fields, channels, notes)
     return EnviHeader(
@@ -216,6 +221,21 @@ def _data_type(fields: Mapping[str, str], where: str, notes: list[str]) -> np.dt
     if order > 1:
         raise SceneError(f"{where}: byte order = {order}, expected 0 (little endian) or 1 (big endian); correct it")
     return np.dtype(("<", ">")[order] + DATA_TYPES[code])
+
+
+def _refuse_layouts(fields: Mapping[str, str], kind: str, where: str) -> None:
+    """Refuse files whose numbers do not simply follow each other: they would be read as other numbers."""
+    if _number(fields.get("file compression", "0")) != 0:
+        raise SceneError(f"{where}: file compression = {fields['file compression']!r}, expected 0; unpack the file")
+    for key in ("major frame offsets", "minor frame offsets"):
+        words = [word for word in re.split(r"[,\s]+", fields.get(key, "")) if word]
+        if any(_number(word) != 0 for word in words):
+            raise SceneError(
+                f"{where}: {key} = {fields[key]!r} puts bytes between frames, which is not read; store them without"
+            )
+    other = next((word for word in OTHER_FILES if word in kind.lower()), None)
+    if other is not None:
+        raise SceneError(f"{where}: file type = {kind!r}, expected plain numbers (ENVI Standard); name the file itself")
 
 
 def _interleave(fields: Mapping[str, str], bands: int, where: str, notes: list[str]) -> str:

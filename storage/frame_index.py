@@ -8,8 +8,9 @@ ends; frames may be missing or listed twice. Tested on small files made in these
 from __future__ import annotations
 
 import re
+from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ from pipeline.errors import SceneError
 LONGEST_LINE = 1000  # characters; a frame's line has about 25
 _LARGEST = 2**62
 _WHOLE = re.compile(r"-?\d{1,19}")
+_BETWEEN_COLUMNS = re.compile(r"[\t,;]+|\s{2,}")  # where a heading has such; a single space may stand in a name
+_MS = {"us": 1e-3, "µs": 1e-3, "μs": 1e-3, "microseconds": 1e-3, "s": 1e3, "sec": 1e3, "seconds": 1e3}
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,16 @@ class LineTimes:
     notes: tuple[str, ...]
 
 
+@dataclass
+class _Rows:
+    """Lines of an index, as they stand in it."""
+
+    frame: array[int] = field(default_factory=lambda: array("q"))
+    stamp: array[int] = field(default_factory=lambda: array("q"))
+    exposure_ms: array[float] | None = None
+    odd: int = 0  # lines that are no frame
+
+
 def load_frame_index(path: Path) -> FrameIndex:
     """Read one index. Lines that are no frame are passed over and counted; of a frame listed twice the first counts.
 
@@ -51,35 +64,35 @@ def load_frame_index(path: Path) -> FrameIndex:
     """
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
-            heading, rows, odd = _rows(iter(lambda: file.readline(LONGEST_LINE), ""))
+            rows = _rows(iter(lambda: file.readline(LONGEST_LINE), ""))
     except OSError as error:
         raise SceneError(f"{path} cannot be read: {error}; take it away to go on without times") from error
-    if not rows:
+    if not rows.frame:
         raise SceneError(f"{path} lists no frame, expected lines of number and microseconds; take it away or repair it")
-    numbers, first = np.unique(np.array([row[0] for row in rows], np.int64), return_index=True)
-    notes = [f"{path.name}: {odd} lines are no frames"] if odd else []
-    if len(numbers) < len(rows):
-        notes.append(f"{path.name}: {len(rows) - len(numbers)} frames are listed twice, the first counts")
-    column = _exposure_column(heading)
-    exposures = None if column is None else np.array([_number(row[1], column) for row in rows])[first]
-    stamps = np.array([row[2] for row in rows], np.int64)[first]
+    numbers, first = np.unique(np.array(rows.frame, np.int64), return_index=True)
+    notes = [f"{path.name}: {rows.odd} lines are no frames"] if rows.odd else []
+    if len(numbers) < len(rows.frame):
+        notes.append(f"{path.name}: {len(rows.frame) - len(numbers)} frames are listed twice, the first counts")
+    exposures = None if rows.exposure_ms is None else np.array(rows.exposure_ms)[first]
+    stamps = np.array(rows.stamp, np.int64)[first]
     if (np.diff(stamps) < 0).any():
         notes.append(f"{path.name}: time goes back {np.count_nonzero(np.diff(stamps) < 0)} times")
     return FrameIndex(numbers, stamps, exposures, tuple(notes))
 
 
-def times_of_lines(index: FrameIndex, first_frame: int, lines: int) -> LineTimes:
+def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 0) -> LineTimes:
     """Give each of a file's ``lines`` its frame and time.
 
     Lines are frames in order, the first of them ``first_frame`` (the number in the file's name). Where as many frames
-    are listed as there are lines, they are its lines whatever their numbers: the camera dropped those missing. An index
-    whose numbers begin at 0 in a later file counts from that file's start.
+    are listed as there are lines, they are its lines whatever their numbers: the camera dropped those missing. So they
+    are where as many are listed as there were lines before the file lost its last ``lost`` ones. An index whose numbers
+    begin at 0 in a later file counts from that file's start.
     """
-    if len(index.frame) == lines:
-        exposure = np.full(lines, np.nan) if index.exposure_ms is None else index.exposure_ms
-        dropped = int(index.frame[-1] - index.frame[0]) + 1 - lines
+    if len(index.frame) in (lines, lines + lost):
+        exposure = np.full(lines, np.nan) if index.exposure_ms is None else index.exposure_ms[:lines]
+        dropped = int(index.frame[-1] - index.frame[0]) + 1 - len(index.frame)
         notes = (f"{dropped} frames between the first and the last were dropped by the camera",) if dropped else ()
-        return LineTimes(index.frame, index.stamp_us, exposure, notes)
+        return LineTimes(index.frame[:lines], index.stamp_us[:lines], exposure, notes)
     origin = 0 if index.frame[0] == 0 else first_frame
     found = LineTimes(np.full(lines, -1), np.full(lines, -1), np.full(lines, np.nan), ())
     place = index.frame - origin
@@ -97,27 +110,36 @@ def _count_notes(inside: NDArray[np.bool_], lines: int) -> tuple[str, ...]:
     return (*notes, *([f"the frame index lists {beyond} frames beyond the lines"] if beyond else []))
 
 
-def _rows(lines: Iterator[str]) -> tuple[list[str], list[tuple[int, list[str], int]], int]:
-    """Heading, (frame, words, stamp) of each frame, and how many lines are neither."""
-    heading: list[str] = []
-    rows: list[tuple[int, list[str], int]] = []
-    odd = 0
+def _rows(lines: Iterator[str]) -> _Rows:
+    """Numbers of all lines that are frames; other lines are counted."""
+    rows = _Rows()
+    column, scale = None, 1.0
     for number, line in enumerate(lines):
         words = [word for word in re.split(r"[\t ,;]+", line.strip()) if word]
         if len(words) >= 2 and all(_WHOLE.fullmatch(word) for word in words[:2]):
             frame, stamp = int(words[0]), int(words[1])
             if 0 <= frame < _LARGEST and 0 <= stamp < _LARGEST:
-                rows.append((frame, words, stamp))
+                rows.frame.append(frame)
+                rows.stamp.append(stamp)
+                if rows.exposure_ms is not None and column is not None:
+                    rows.exposure_ms.append(_number(words, column) * scale)
                 continue
         if number == 0:
-            heading = [word.lower() for word in re.split(r"\t|,|;| {2,}|(?<=\S) (?=\S)", line.strip()) if word]
+            column, scale = _exposure_column(line.strip().lower())
+            rows.exposure_ms = None if column is None else array("d")
         elif words:
-            odd += 1
-    return heading, rows, odd
+            rows.odd += 1
+    return rows
 
 
-def _exposure_column(heading: list[str]) -> int | None:
-    return next((column for column, word in enumerate(heading) if column > 1 and word.startswith("exposure")), None)
+def _exposure_column(heading: str) -> tuple[int | None, float]:
+    """Which column holds exposures, and what one of its units is in ms; they are ms where nothing is said."""
+    titles = [word for word in _BETWEEN_COLUMNS.split(heading) if word]
+    if len(titles) < 2:
+        titles = heading.split()
+    column = next((at for at, word in enumerate(titles) if at > 1 and word.strip().startswith("exposure")), None)
+    unit = "" if column is None else re.sub(r"^exposure[^(\[]*[(\[]?|[)\]\s]+$", "", titles[column].strip())
+    return column, _MS.get(unit, 1.0)
 
 
 def _number(words: list[str], column: int) -> float:

@@ -17,11 +17,11 @@ from storage.addresses import StageRef, without_manifest
 from storage.archive import Archive
 from storage.lineage import Catalogue
 from storage.records import Store
-from storage.staging import MANIFEST_NAME, PART_SUFFIX, check_name, files_below, refusals, remove_tree, take_lock
+from storage.staging import MANIFEST_NAME, PART_SUFFIX, bytes_below, check_name, refusals, remove_tree, take_lock
 
 DAY_S = 86400.0
 IN_USE = "somebody is using the archive: run gc again when it is free"
-What = Literal["store", "spool", "unfinished"]
+What = Literal["store", "spool", "unfinished", "upload"]
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,8 @@ def clear_up(
         for number, removal in enumerate(plan.removals):
             if progress is not None:
                 progress(removal, number / len(plan.removals))
-            if (removal.what != "store" or obstacle is None) and _remove(archive, removal):
+            held = (removal.what == "store" and obstacle is not None) or (removal.what == "upload" and not alone)
+            if not held and _remove(archive, removal):
                 gone.append(removal)
     return Clearance(tuple(gone), plan.kept, obstacle)
 
@@ -106,10 +107,13 @@ def plan_clearance(
     obstacle = _obstacle(archive.root, catalogue, named | set(kept))
     gone = [] if obstacle else [uri for uri in catalogue.stores if uri not in named and uri not in kept]
     removals = [
-        Removal(uri, "store", _bytes_below(archive.root / uri), "no run names it")
-        for uri in reversed(catalogue.inputs_first(gone))
+        Removal(uri, "store", archive.size_of(uri), "no run names it") for uri in reversed(catalogue.inputs_first(gone))
     ]
-    return Clearance((*removals, *_spools(archive, catalogue), *_unfinished(archive.root)), kept, obstacle)
+    uploads = [
+        Removal(uri, "upload", size, "it was never published") for uri, size in archive.leftovers(keep_days).items()
+    ]
+    rest = (*_spools(archive, catalogue), *_unfinished(archive.root))
+    return Clearance((*removals, *uploads, *rest), kept, obstacle)
 
 
 def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bool, now: datetime) -> dict[str, str]:
@@ -122,6 +126,10 @@ def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bo
             kept[uri] = f"younger than {keep_days:g} days"
         elif not raw_too and catalogue.is_only_copy(uri):
             kept[uri] = "raw lines that cannot be had again; --raw-too removes them"
+    # What was made of them is younger still: by its dates it can be older only where the clock was set back.
+    younger = [uri for uri, store in catalogue.stores.items() if _age_days(store, now) < keep_days]
+    for uri in catalogue.dependents(younger) - named:
+        kept.setdefault(uri, f"made of what is younger than {keep_days:g} days")
     return kept
 
 
@@ -157,7 +165,7 @@ def _spools(archive: Archive, catalogue: Catalogue) -> list[Removal]:
     """Spools whose lines are published."""
     published = {store.ref.key for store in catalogue.stores.values() if store.problem is None}
     return [
-        Removal(f"spool/{path.name}", "spool", _bytes_below(path), "its lines are published")
+        Removal(f"spool/{path.name}", "spool", bytes_below(path), "its lines are published")
         for path in sorted((archive.root / "spool").glob("*"))
         if path.name in published
     ]
@@ -166,7 +174,7 @@ def _spools(archive: Archive, catalogue: Catalogue) -> list[Removal]:
 def _unfinished(root: Path) -> list[Removal]:
     parts = [*root.glob(f"stages/*/*{PART_SUFFIX}"), *root.glob(f"runs/*{PART_SUFFIX}")]
     return [
-        Removal(path.relative_to(root).as_posix(), "unfinished", _bytes_below(path), "whoever made it is gone")
+        Removal(path.relative_to(root).as_posix(), "unfinished", bytes_below(path), "whoever made it is gone")
         for path in sorted(parts)
         if _is_free(root, path)
     ]
@@ -191,6 +199,9 @@ def _remove(archive: Archive, removal: Removal) -> bool:
     if removal.what == "store":
         _, stage, key = removal.uri.split("/")
         return archive.discard(StageRef(stage, key, archive.root / removal.uri), wait=False)
+    if removal.what == "upload":
+        archive.drop_leftover(removal.uri)
+        return True
     path = archive.root / removal.uri
     if removal.what == "spool":
         check_name(path.name)
@@ -204,11 +215,4 @@ def _remove(archive: Archive, removal: Removal) -> bool:
         remove_tree(path)
     finally:
         release()
-    return True
-
-
-def _bytes_below(folder: Path) -> int:
-    """Bytes of a folder's files, as far as they are there."""
-    sizes = [path.lstat().st_size for path in files_below(folder) if path.exists()]
-    manifest = folder / MANIFEST_NAME
-    return sum(sizes) + (manifest.stat().st_size if manifest.is_file() else 0)
+    return not path.exists()  # what does not let itself be removed is not gone

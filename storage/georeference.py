@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 import zarr
-from odc.geo.crs import CRS
-from odc.geo.geobox import GeoBox
-from odc.geo.xr import xr_crs_coord
 
 from pipeline.errors import PoseError
 from storage.layout import damage_named, open_group, write_small
+
+if TYPE_CHECKING:  # half a second to import, for maps alone
+    from odc.geo.crs import CRS
+    from odc.geo.geobox import GeoBox
 
 GRID_MAPPING = "spatial_ref"
 # on every image: CF's link to the grid mapping, and the same as a coordinate, so that plain xarray takes it for one
@@ -57,6 +57,8 @@ def map_attributes(geobox: GeoBox) -> dict[str, Any]:
 
 def write_map_coordinates(group: zarr.Group, geobox: GeoBox) -> None:
     """Store ``x``, ``y`` and the grid mapping ``spatial_ref`` of a map, as CF wants them."""
+    from odc.geo.xr import xr_crs_coord
+
     for name in ("x", "y"):
         about = {
             "standard_name": f"projection_{name}_coordinate",
@@ -84,6 +86,9 @@ def load_geobox(path: Path) -> GeoBox | None:
     """
     if GRID_MAPPING not in open_group(path):
         return None
+    import odc.geo.xr  # noqa: F401 - registers the accessor
+    import xarray as xr
+
     with damage_named(f"the grid of {path}"), xr.open_zarr(path, consolidated=False) as content:
         geobox: GeoBox | None = content.odc.geobox
         if geobox is None or geobox.crs is None:

@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
 from pipeline.grid import UNLABELLED
 from storage.class_maps import class_flags
 from storage.georeference import ON_THE_MAP, load_geobox, map_attributes, write_map_coordinates
 from storage.layout import SHARD_COLUMNS, SHARD_ROWS, create_array, create_group, image_spec, open_group, read_array
+
+if TYPE_CHECKING:
+    from odc.geo.geobox import GeoBox
 
 BLOCK = (4 * SHARD_ROWS, 2 * SHARD_COLUMNS)  # (y, x) px to write at a time: whole shards
 M2_PER_HECTARE = 10_000.0

@@ -15,6 +15,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from storage.cube_sources import MOST_MISSING
-from storage.envi_cubes import EnviCube, open_envi_cube
+from storage.envi_cubes import EnviCube, find_envi_pair, open_envi_cube
 from storage.frame_index import LineTimes, load_frame_index, times_of_lines
 
 _PART = re.compile(r"raw_(\d{1,12})(\.[A-Za-z]{1,4})?", re.IGNORECASE)
@@ -52,6 +53,7 @@ class PartedCube:
     times: LineTimes | None
     index_files: tuple[Path, ...]
     notes: tuple[str, ...]
+    by_names: tuple[tuple[int, ...], ...] = ()  # of parts and indices, where lines or times follow from their names
 
     def valid_lines(self) -> NDArray[np.bool_]:
         """(line,) lines that a file holds whole."""
@@ -73,7 +75,7 @@ class PartedCube:
 
 def is_headwall_folder(folder: Path) -> bool:
     """Whether a folder holds parts of a cube as the camera names them."""
-    return any(_PART.fullmatch(entry.name) for entry in folder.iterdir())
+    return any(_PART.fullmatch(entry.name) and entry.is_file() for entry in folder.iterdir())
 
 
 def open_parts(folder: Path) -> PartedCube:
@@ -89,8 +91,8 @@ def open_parts(folder: Path) -> PartedCube:
     opened: list[tuple[int, EnviCube]] = []
     notes: list[str] = []
     for number, header in _headers(folder).items():
-        data = header.with_suffix("")
-        if data.is_file() and data.stat().st_size == 0:
+        _, data = find_envi_pair(header)
+        if data.stat().st_size == 0:
             notes.append(f"{data.name} is empty and left out")
             continue
         opened.append((number, open_envi_cube(header)))
@@ -188,19 +190,25 @@ def _lost_at_end(parts: Sequence[Part], notes: list[str]) -> int:
 
 def _with_times(folder: Path, numbers: Sequence[int], parts: Sequence[Part], notes: list[str]) -> PartedCube:
     lines = parts[-1].stop + _lost_at_end(parts, notes)
-    found = {int(match[1]): entry for entry in folder.iterdir() if (match := _INDEX.fullmatch(entry.name))}
+    entries = [entry for entry in folder.iterdir() if entry.is_file()]
+    found = {int(match[1]): entry for entry in entries if (match := _INDEX.fullmatch(entry.name))}
     used = {number: found[number] for number in numbers if number in found}
+    names = (tuple(numbers), tuple(used))
+    told_by_name = any(before.stop != after.start for before, after in pairwise(parts))
     if not used:
-        return PartedCube(tuple(parts), lines, None, (), tuple(notes))
+        return PartedCube(tuple(parts), lines, None, (), tuple(notes), names if told_by_name else ())
     times = LineTimes(np.full(lines, -1), np.full(lines, -1), np.full(lines, np.nan), ())
     for number, part in zip(numbers, parts, strict=True):
         if number not in used:
             notes.append(f"there is no frame index for {part.cube.path.name}")
             continue
         index = load_frame_index(used[number])
-        own = times_of_lines(index, number, len(part.cube.values))
+        own = times_of_lines(index, number, len(part.cube.values), part.cube.lost_lines)
+        told_by_name = told_by_name or len(index.frame) != len(part.cube.values)
         for whole, piece in ((times.frame, own.frame), (times.stamp_us, own.stamp_us)):
             whole[part.start : part.stop] = piece
         times.exposure_ms[part.start : part.stop] = own.exposure_ms
         notes.extend((*index.notes, *(f"{used[number].name}: {note}" for note in own.notes)))
-    return PartedCube(tuple(parts), lines, times, tuple(used.values()), tuple(notes))
+    told_by_name = told_by_name or len(used) < len(numbers)
+    index_files = tuple(used.values())
+    return PartedCube(tuple(parts), lines, times, index_files, tuple(notes), names if told_by_name else ())

@@ -27,8 +27,8 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
         return _store(catalogue, "/".join(parts[:3]))
     if parts[0] == "runs" and len(parts) > 1:
         return _run(catalogue, parts[1])
-    if len(parts) == 2 and f"stages/{text}" in catalogue.stores:
-        return f"stages/{text}"
+    if len(parts) == 2 and any(uri.startswith(f"stages/{parts[0]}/") for uri in catalogue.stores):
+        return _store(catalogue, "/".join(("stages", *parts)))
     runs = [run for run in catalogue.runs if run.folder.name == text]
     return runs[0] if runs else _named(catalogue, text)
 
@@ -36,8 +36,11 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
 def _store(catalogue: Catalogue, uri: str) -> str:
     if uri in catalogue.stores:
         return uri
-    stage = uri.split("/")[1]
-    there = sorted(one for one in catalogue.stores if one.startswith(f"stages/{stage}/"))
+    _, stage, key = uri.split("/")
+    begun = [one for one in catalogue.stores if len(key) >= SHORTEST and one.startswith(uri)]
+    if len(begun) == 1:
+        return begun[0]
+    there = sorted(begun or (one for one in catalogue.stores if one.startswith(f"stages/{stage}/")))
     hint = f"there is {_some(there)}" if there else "there is no store of this stage; see ls"
     lost = " (its folder is there, but has lost its manifest: run verify)" if uri in catalogue.lost else ""
     raise ArchiveError(f"there is no store {uri} in this archive{lost}; {hint}")

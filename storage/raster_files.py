@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import math
 import re
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,32 +14,19 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import SceneError
+from storage.array_files import NAMED_ENDINGS, load_named, load_npy
+from storage.declared_sizes import DEFLATE_RATIO, check_claim, check_memory
 from storage.envi_cubes import open_envi_cube
+from storage.rasters import GREY_NM, RGB_NM, Raster
+from storage.tiff_files import TIFF_ENDINGS, read_tiff
 from storage.wavelengths import BandWavelengths
 
-RGB_NM = (640.0, 550.0, 460.0)
-NEAR_INFRARED_NM = 800.0
-GREY_NM = 550.0
-
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")
-TIFF_ENDINGS = (".tif", ".tiff")
-NAMED_ENDINGS = (".mat", ".npz")  # hold several arrays: FILE:VARIABLE picks one
 SCENE_ENDINGS = (*IMAGE_ENDINGS, *TIFF_ENDINGS, ".npy", *NAMED_ENDINGS, ".hdr")
 
+_FORMATS = ("PNG", "JPEG", "BMP")  # whatever the ending says; Pillow's others may run programs
+_BYTES = {"I": 4, "F": 4, "I;16": 2, "I;16L": 2, "I;16B": 2}  # a number, by Pillow's mode; 1 in the others
 _WITH_VARIABLE = re.compile(r"^(?P<path>.+\.(?:mat|npz|zarr)):(?P<variable>[^/\\:]+)$", re.IGNORECASE)
-
-
-@dataclass(frozen=True)
-class Raster:
-    """One array as it stands in its file: (y, x) or (y, x, band), numbers of any kind."""
-
-    values: NDArray[Any]
-    assumed_nm: tuple[float, ...] | None = None  # what the file's colours suggest, band by band
-    nodata: float | None = None
-    notes: tuple[str, ...] = ()
-    indices: NDArray[np.uint8] | None = None  # (y, x) of an image that numbers its colours
-    known: BandWavelengths | None = None  # what the file says of its bands
-    files: tuple[Path, ...] = ()  # that it was read from, where that is more than the one named
 
 
 def split_variable(address: str | Path) -> tuple[Path, str | None]:
@@ -83,13 +68,12 @@ def _read(path: Path, ending: str, variable: str | None, dims: int) -> Raster:
     if ending in IMAGE_ENDINGS:
         return _read_image(path)
     if ending in TIFF_ENDINGS:
-        return _read_tiff(path)
+        return read_tiff(path)
     if ending == ".npy":
-        return Raster(np.load(path, mmap_mode="r", allow_pickle=False))
+        return Raster(load_npy(path))
     if ending == ".hdr":
         return _read_envi(path)
-    arrays = _npz_arrays(path) if ending == ".npz" else _mat_arrays(path, variable)
-    return Raster(_pick(arrays, path, variable, dims))
+    return Raster(load_named(path, variable, dims))
 
 
 def _read_envi(path: Path) -> Raster:
@@ -115,11 +99,20 @@ def _check_numbers(values: NDArray[Any], path: Path) -> None:
 def _read_image(path: Path) -> Raster:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # mosaics are large on purpose
-        with Image.open(path) as image:
+        with Image.open(path, formats=_FORMATS) as image:
+            _check_image(path, image)
             image.load()
             if _is_deep_colour(path):
                 return _read_deep_colour(path)
             return _from_pillow(image)
+
+
+def _check_image(path: Path, image: Image.Image) -> None:
+    """Refuse a size that the file's bytes cannot mean, or that takes more memory than there is."""
+    claimed = math.prod(image.size) * len(image.getbands()) * _BYTES.get(image.mode, 1)
+    if image.format != "JPEG":  # which may say that blocks without end are alike
+        check_claim(path, claimed, path.stat().st_size, DEFLATE_RATIO)
+    check_memory(path, 3 * claimed)
 
 
 def _is_deep_colour(path: Path) -> bool:
@@ -150,7 +143,7 @@ def _from_pillow(image: Image.Image) -> Raster:
         colours = np.asarray(image.convert("RGB"))
         notes = ("colours looked up in the image's palette",)
         return Raster(colours, RGB_NM, notes=notes, indices=np.asarray(image))
-    if image.mode in ("CMYK", "YCbCr", "LAB", "HSV"):
+    if image.mode in ("CMYK", "YCbCr", "LAB", "HSV", "PA"):
         return Raster(np.asarray(image.convert("RGB")), RGB_NM, notes=(f"converted from {image.mode} to RGB",))
     values = np.asarray(image)
     return _colours(values, alpha=image.mode in ("LA", "RGBA", "La", "RGBa"))
@@ -165,170 +158,3 @@ def _colours(values: NDArray[Any], alpha: bool) -> Raster:
     if values.ndim == 2:
         return Raster(values, (GREY_NM,), notes=notes)
     return Raster(values, RGB_NM if values.shape[2] == 3 else None, notes=notes)
-
-
-# --- TIFF -------------------------------------------------------------------------------------------------------------
-
-
-def _read_tiff(path: Path) -> Raster:
-    try:
-        rasterio = importlib.import_module("rasterio")
-    except ImportError:
-        return _read_plain_tiff(path)
-    with _tiff(rasterio, path) as file:
-        planes, nodata = file.read(), file.nodata
-        keep, assumed, notes = _named_bands([kind.name for kind in file.colorinterp])
-    return Raster(np.moveaxis(planes, 0, -1)[..., keep], assumed, nodata, notes)
-
-
-def open_tiff_rows(path: Path) -> TiffRows | None:
-    """Open a TIFF to be read some rows at a time; None where rasterio, which can do so, is not installed.
-
-    Raises
-    ------
-    SceneError : the file is missing or damaged.
-    """
-    try:
-        rasterio = importlib.import_module("rasterio")
-    except ImportError:
-        return None
-    if not path.is_file():
-        raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
-    with _tiff(rasterio, path) as file:
-        keep, assumed, notes = _named_bands([kind.name for kind in file.colorinterp])
-        kind = np.result_type(*(file.dtypes[band] for band in keep))
-        return TiffRows(path, (file.height, file.width, len(keep)), kind, tuple(keep), assumed, file.nodata, notes)
-
-
-@dataclass(frozen=True)
-class TiffRows:
-    """A TIFF, opened: (y, x, band) of ``dtype``, without its alpha channel."""
-
-    path: Path
-    shape: tuple[int, int, int]
-    dtype: np.dtype[Any]
-    bands: tuple[int, ...]  # of the file, counted from 0
-    assumed_nm: tuple[float, ...] | None
-    nodata: float | None
-    notes: tuple[str, ...]
-
-    def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Rows ``start`` to ``stop`` (SceneError where they are damaged)."""
-        rasterio = importlib.import_module("rasterio")
-        with _tiff(rasterio, self.path) as file:
-            rows = rasterio.windows.Window(0, start, self.shape[1], stop - start)
-            planes = file.read([band + 1 for band in self.bands], window=rows)
-        return np.ascontiguousarray(np.moveaxis(planes, 0, -1), self.dtype)
-
-
-@contextmanager
-def _tiff(rasterio: Any, path: Path) -> Iterator[Any]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # a scene lies on the camera's grid
-        try:
-            with rasterio.open(path) as file:
-                yield file
-        except rasterio.errors.RasterioError as error:
-            raise SceneError(f"{path} cannot be read as TIFF: {error}; is it damaged?") from error
-
-
-def _named_bands(names: list[str]) -> tuple[list[int], tuple[float, ...] | None, tuple[str, ...]]:
-    """Which bands are kept (alpha is not), their wavelengths, and notes.
-
-    Wavelengths are assumed only where the file names its bands red, green and blue, or grey.
-    """
-    keep = [index for index, name in enumerate(names) if name != "alpha"]
-    notes = ("alpha channel dropped",) if len(keep) < len(names) else ()
-    kinds = [names[index] for index in keep]
-    assumed: tuple[float, ...] | None = None
-    if kinds[:3] == ["red", "green", "blue"] and len(kinds) == 3:
-        assumed = RGB_NM
-    elif kinds[:3] == ["red", "green", "blue"] and len(kinds) == 4 and kinds[3] in ("undefined", "nir"):
-        assumed = (*RGB_NM, NEAR_INFRARED_NM)
-    elif kinds in (["gray"], ["palette"]):
-        assumed = (GREY_NM,)
-    return keep, assumed, notes
-
-
-def _read_plain_tiff(path: Path) -> Raster:
-    try:
-        tifffile = importlib.import_module("tifffile")
-    except ImportError as error:
-        raise SceneError(
-            f"{path} is a TIFF, which needs rasterio; pip install 'spectralzoom[geo]', or save it as .npy"
-        ) from error
-    with tifffile.TiffFile(path) as file:
-        page = file.pages[0]
-        series = file.series[0]
-        values, axes = series.asarray(), series.axes
-        rgb, extra = page.photometric.name == "RGB", [kind.name for kind in page.extrasamples or ()]
-        nodata = page.tags.valueof(42113)
-    if values.ndim == 3 and axes.index("Y") == 1:
-        values = np.moveaxis(values, 0, -1)
-    count = 1 if values.ndim == 2 else values.shape[2]
-    names = ["red", "green", "blue"] if rgb else ["gray"]
-    names += ["alpha" if "ALPHA" in kind else "undefined" for kind in extra]
-    names += ["undefined"] * (count - len(names))
-    void = None if nodata is None else float(nodata)
-    keep, assumed, notes = _named_bands(names[:count])
-    return Raster(values.reshape(*values.shape[:2], count)[..., keep], assumed, void, notes)
-
-
-# --- files with several arrays ----------------------------------------------------------------------------------------
-
-
-def _npz_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
-
-
-def is_hdf_mat(path: Path) -> bool:
-    """Whether a .mat file is of version 7.3, which is HDF5 behind 512 bytes of MATLAB's own."""
-    with path.open("rb") as file:
-        head = file.read(520)
-    return b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:])
-
-
-def _mat_arrays(path: Path, wanted: str | None) -> dict[str, NDArray[Any]]:
-    """All arrays of numbers; only the one wanted, where it is there."""
-    if is_hdf_mat(path):
-        return _hdf_arrays(path)
-    read = importlib.import_module("scipy.io").loadmat
-    content = {} if wanted is None else read(path, variable_names=[wanted])
-    if wanted is None or wanted not in content:
-        content = read(path)
-    arrays = {name: value for name, value in content.items() if isinstance(value, np.ndarray)}
-    return {name: value for name, value in arrays.items() if value.dtype.kind in "buifc"}
-
-
-def _hdf_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    try:
-        h5py = importlib.import_module("h5py")
-    except ImportError as error:
-        raise SceneError(f"{path} is MATLAB 7.3, which needs h5py; pip install h5py, or save it with -v7") from error
-    with h5py.File(path, "r") as file:
-        # MATLAB counts axes from the other end than HDF5
-        return {name: np.asarray(file[name]).T for name in file if _is_own(file, name, h5py)}
-
-
-def _is_own(file: Any, name: str, h5py: Any) -> bool:
-    """Whether a name is a data set of numbers kept in this very file: others may lead anywhere on the disk."""
-    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-        return False
-    item = file[name]
-    return isinstance(item, h5py.Dataset) and not item.external and not item.is_virtual and item.dtype.kind in "buifc"
-
-
-def _pick(arrays: dict[str, NDArray[Any]], path: Path, variable: str | None, dims: int) -> NDArray[Any]:
-    listing = ", ".join(f"{name} {value.shape}" for name, value in arrays.items()) or "none"
-    if variable is not None:
-        if variable not in arrays:
-            raise SceneError(f"{path} has no array {variable}; it has {listing}")
-        return arrays[variable]
-    for wanted in (dims, 5 - dims):
-        fitting = [name for name, value in arrays.items() if value.ndim == wanted and value.size > 1]
-        if len(fitting) == 1:
-            return arrays[fitting[0]]
-        if fitting:
-            break
-    raise SceneError(f"{path} has no single array with {dims} axes; it has {listing}; name one: {path.name}:VARIABLE")

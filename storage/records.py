@@ -16,6 +16,7 @@ from storage.manifests import Cost, cost_of, listed_bytes, try_manifest
 from storage.staging import MANIFEST_NAME, file_hash
 
 RECEIPT = "receipt.json"
+MANIFEST_HASH = "manifest_sha256"  # in a receipt's stages: SHA-256 of the manifest.json of the store that each left
 RESTS_ON = "rests_on"  # in a run's manifest: address of a store -> SHA-256 of its manifest.json
 
 
@@ -82,8 +83,10 @@ class Run:
 
     @property
     def recorded(self) -> dict[str, str]:
-        """SHA-256 of the manifests that it rests on, as it knew them."""
-        found = {**_table(self.receipt.get(RESTS_ON)), **_table(self.facts.get(RESTS_ON))}
+        """SHA-256 of the manifests that it rests on, as it knew them: by its stages, and by its own manifest."""
+        told = {_text(row.get("key")): row.get(MANIFEST_HASH) for row in self.stages}
+        by_stage = {uri: told[key] for uri in self.names if (key := uri.rpartition("/")[2]) in told}
+        found = {**by_stage, **_table(self.receipt.get(RESTS_ON)), **_table(self.facts.get(RESTS_ON))}
         return {uri: value for uri, value in found.items() if isinstance(value, str) and in_text(uri) == uri}
 
     @property

@@ -94,6 +94,10 @@ def repair(
     ------
     ArchiveError : somebody else uses the archive, or the disk refuses.
     """
+    if archive.in_bucket:
+        from storage.object_repairs import repair_objects
+
+        return repair_objects(archive, findings, rerun, versions=versions)
     with archive.in_use(alone=True) as alone, refusals(archive.root, "repair the archive"):
         if not alone:
             raise ArchiveError(f"{archive.root} is in use; run verify --repair again when the survey there has ended")
@@ -103,7 +107,7 @@ def repair(
             _set_aside(archive.root, uri)
     done = Repaired(plan)
     try:
-        succeeded = _run_again(plan.surveys, rerun, done)
+        succeeded = run_again(plan.surveys, rerun, done)
     except BaseException:
         put_back(archive.root)
         raise
@@ -133,6 +137,8 @@ def _hopeless(catalogue: Catalogue, uri: str, versions: Mapping[str, int | str] 
     store, stage = catalogue.stores.get(uri), uri.split("/")[1]
     if catalogue.is_only_copy(uri):
         return "raw lines that cannot be had again: restore them from a copy; the chunks not named can still be read"
+    if uri in catalogue.lost and versions is not None and stage not in versions:
+        return f"there is no stage {stage}, so nothing tells what it was: take it out of the archive"
     made = "" if store is None else store.version
     if versions is not None and made and str(versions.get(stage)) != made:
         now = versions.get(stage, "none")
@@ -149,7 +155,8 @@ def _settings_text(run: Run) -> str:
     return canonical_json(asked) if asked else ""
 
 
-def _run_again(surveys: Sequence[tuple[Run, dict[str, Any]]], rerun: Rerun, done: Repaired) -> set[str]:
+def run_again(surveys: Sequence[tuple[Run, dict[str, Any]]], rerun: Rerun, done: Repaired) -> set[str]:
+    """Run surveys again; gives the canonical settings of those that succeeded, and keeps what the others said."""
     succeeded: set[str] = set()
     for run, settings in surveys:
         try:

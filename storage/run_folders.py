@@ -3,13 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from storage.addresses import published_runs
 from storage.keys import plain
 from storage.manifests import write_manifest
-from storage.staging import check_name, refusals, remove_tree, rename_into_place
+from storage.records import read_run
+from storage.staging import MANIFEST_NAME, check_name, refusals, remove_tree, rename_into_place
+
+
+def date_of_store(root: Path, uri: str) -> str:
+    """When a store is made: now, or just after the last run that knows one of this address, if the clock was set back.
+
+    By its date `verify` tells a store that was made anew from one whose manifest somebody wrote.
+    """
+    now = datetime.now(UTC)
+    folders = published_runs(root)
+    if any((folder / MANIFEST_NAME).stat().st_mtime >= now.timestamp() for folder in folders):
+        runs = (read_run(folder, {}) for folder in folders)
+        for known in (run.created for run in runs if uri in run.recorded):
+            try:
+                now = max(now, datetime.fromisoformat(known) + timedelta(milliseconds=1))
+            except (ValueError, TypeError, OverflowError):
+                continue  # it does not say when it was published
+    return now.isoformat(timespec="milliseconds")
 
 
 class RunDraft:

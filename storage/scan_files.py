@@ -16,8 +16,9 @@ from storage.dataset_layouts import find_layout
 from storage.envi_cubes import DATA_ENDINGS, find_envi_pair, open_envi_cube
 from storage.envi_header import EnviHeader
 from storage.headwall_folders import PartedCube, find_reference, is_headwall_folder, one_part, open_parts
-from storage.raster_files import SCENE_ENDINGS, TIFF_ENDINGS, TiffRows, load_raster, open_tiff_rows, split_variable
+from storage.raster_files import SCENE_ENDINGS, load_raster, split_variable
 from storage.scene_toml import SceneSettings, find_scene_settings
+from storage.tiff_files import TIFF_ENDINGS, TiffRows, open_tiff_rows
 from storage.wavelengths import BandWavelengths, settle_wavelengths
 from storage.zarr_scenes import find_zarr_store, open_zarr_cube
 
@@ -72,9 +73,7 @@ def open_cube_source(
 def with_wavelengths(source: CubeSource, stated: Sequence[float]) -> CubeSource:
     """The same cube with wavelengths as a flag says them [nm], one a band (WavelengthError where they do not fit)."""
     path, count = Path(source.name), source.shape[2]
-    found = settle_wavelengths(
-        path, range(count), count, stated=stated, settings=find_scene_settings(path), assumed_nm=None
-    )
+    found = settle_wavelengths(path, range(count), count, stated=stated, settings=SceneSettings(), assumed_nm=None)
     return replace(source, bands=Bands(found.centre_nm, None, "nm", found.origin))
 
 
@@ -162,6 +161,7 @@ def _parted_source(
         nodata=first.nodata,
         headers={header.name: _text(header) for header in headers},
         notes=whole.notes,
+        by_names=whole.by_names,
     )
 
 

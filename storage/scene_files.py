@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,8 +17,10 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from storage.cube_sources import BLOCK_LINES, scene_lines
 from storage.dataset_layouts import find_layout
+from storage.declared_sizes import machine_bytes
 from storage.labels import Labels, load_labels
-from storage.raster_files import Raster, load_raster, split_variable
+from storage.raster_files import load_raster, split_variable
+from storage.rasters import Raster
 from storage.scan_files import is_scan, known_bands, open_cube_source
 from storage.scene_toml import ClassValue, SceneSettings, find_scene_settings
 from storage.staging import file_hash
@@ -119,7 +120,7 @@ def load_scan(address: str | Path) -> Raster:
     """
     source = open_cube_source(address)
     needed = 8 * math.prod(source.shape)  # as float32, and once more while the scene is made
-    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    there = machine_bytes()
     if needed > there:
         raise SceneError(
             f"{address} is a cube of {source.shape}: as a scene it takes about {needed / 1e9:.0f} GB of memory, this "

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from pipeline.errors import RigError
 from pipeline.source import Line
 from storage.keys import plain
+from storage.staging import sync_path
 
 SYNC_LINES = 64
 FORMAT = "spectralzoom line spool 1"
@@ -82,6 +83,8 @@ class Spool:
                 )
             if found is None:
                 spool._begin()
+                for named in (folder, folder.parent, folder.parent.parent):  # lines need their files' names
+                    sync_path(named)
             spool.recover()
             spool._write_envi_header()
         return spool

@@ -34,9 +34,14 @@ _ADVICE = {
 log = logging.getLogger(__name__)
 
 
+def is_name(name: str) -> bool:
+    """Whether this can be one folder's or file's name in an archive."""
+    return _NAME.fullmatch(name) is not None and not name.endswith(PART_SUFFIX)
+
+
 def check_name(name: str) -> None:
     """Refuse what cannot be one folder's or file's name in an archive (ArchiveError)."""
-    if not _NAME.fullmatch(name) or name.endswith(PART_SUFFIX):
+    if not is_name(name):
         raise ArchiveError(f"{name!r} cannot be a name in an archive; use letters, digits, '_', '-' and '.'")
 
 
@@ -70,6 +75,7 @@ def retire(path: Path) -> None:
     if path.exists():
         away = path.with_name(f"{path.name}-{secrets.token_hex(4)}{PART_SUFFIX}")
         path.rename(away)
+        sync_path(path.parent)  # or a power cut leaves the name, and not the files
         remove_tree(away)
 
 
@@ -84,6 +90,7 @@ def sync_path(path: Path) -> None:
 
 def rename_into_place(part: Path, final: Path) -> None:
     """Give a finished folder its final name, for good."""
+    sync_path(final.parent.parent)  # the parent may be new: without its own name what it holds is lost
     part.rename(final)
     sync_path(final.parent)
 
@@ -91,6 +98,13 @@ def rename_into_place(part: Path, final: Path) -> None:
 def files_below(folder: Path) -> list[Path]:
     """Every file under a folder but its manifest, in a fixed order."""
     return sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / MANIFEST_NAME)
+
+
+def bytes_below(folder: Path) -> int:
+    """Bytes of a folder's files, as far as they are there."""
+    sizes = [path.lstat().st_size for path in files_below(folder) if path.exists()]
+    manifest = folder / MANIFEST_NAME
+    return sum(sizes) + (manifest.stat().st_size if manifest.is_file() else 0)
 
 
 def file_hash(path: Path) -> str:
@@ -117,8 +131,14 @@ def take_lock(path: Path, *, wait: bool = True, shared: bool = False) -> Callabl
                 return None
             if _is_still(descriptor, path):
                 if not shared:  # else another may hold it yet
-                    held.callback(path.unlink, missing_ok=True)  # called before the lock is let go
+                    held.callback(_drop_name, path)  # called before the lock is let go
                 return held.pop_all().close
+
+
+def _drop_name(path: Path) -> None:
+    """Take a lock's file away; where the disk refuses it stays, and holds nobody up."""
+    with suppress(OSError):
+        path.unlink()
 
 
 def _is_still(descriptor: int, path: Path) -> bool:

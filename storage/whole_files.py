@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from pipeline.errors import ArchiveError
 from storage.staging import PART_SUFFIX, refusals, remove_tree, sync_path
 
 _PREFIX = ".export-"
@@ -21,10 +23,10 @@ def written_aside(folder: Path, names: Sequence[str]) -> Iterator[Path]:
 
     Raises
     ------
-    ArchiveError : the disk refuses; the message names the folder and what to do.
+    ArchiveError : the folder is or lies below a file, or the disk refuses; the message names it and what to do.
     """
     with refusals(folder, "export to"):
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         with tempfile.TemporaryDirectory(prefix=_PREFIX, suffix=PART_SUFFIX, dir=folder) as aside:
             yield Path(aside)
             for name in names:
@@ -34,6 +36,31 @@ def written_aside(folder: Path, names: Sequence[str]) -> Iterator[Path]:
             for name in names:
                 (Path(aside) / name).replace(folder / name)
             sync_path(folder)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder to export to, if it is not there (ArchiveError: it is or lies below a file)."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise ArchiveError(f"{folder} is or lies below a file, expected a folder; choose another --out") from error
+
+
+def new_file(folder: Path, stem: str, suffix: str) -> Path:
+    """Take a name that nothing in ``folder`` has: ``stem``, or ``stem-2`` and so on; an empty file keeps it.
+
+    Raises
+    ------
+    ArchiveError : the folder is or lies below a file, or the disk refuses.
+    """
+    with refusals(folder, "export to"):
+        make_folder(folder)
+        for number in itertools.count(1):
+            path = folder / f"{stem}{f'-{number}' if number > 1 else ''}{suffix}"
+            with suppress(FileExistsError):
+                path.touch(exist_ok=False)
+                return path
+    raise AssertionError("numbers do not end")
 
 
 def write_whole(path: Path, content: str) -> None:

@@ -7,18 +7,20 @@ refused, so that reading data never runs what it brings.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import math
+import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import zarr
 
 from pipeline.errors import SceneError
+from storage.declared_sizes import MOST_RATIO, check_memory
+from storage.zarr_chunks import check_chunks
 
 METADATA = ("zarr.json", ".zarray", ".zgroup")
 LARGEST_METADATA = 1 << 24  # bytes
-MOST_RATIO = 10_000  # numbers may take this many times the bytes of their store
 CODECS = {
     "blosc", "zstd", "gzip", "zlib", "bz2", "lzma", "lz4", "bytes", "transpose", "sharding_indexed", "crc32", "crc32c",
     "adler32", "fletcher32", "jenkins_lookup3", "shuffle", "delta", "fixedscaleoffset", "quantize", "bitround",
@@ -61,17 +63,44 @@ def _codecs(content: object) -> Iterator[str]:
                 yield from _codecs(codec.get("configuration") if isinstance(codec, dict) else None)
 
 
+def check_links(path: Path) -> None:
+    """Refuse what leads out of the store, or is neither file nor folder (SceneError): reading it may never end."""
+    home = path.resolve()
+    for place, folders, files in os.walk(path):
+        for name in (*folders, *files):
+            entry = Path(place, name)
+            if entry.is_symlink() and not entry.resolve().is_relative_to(home):
+                raise SceneError(f"{entry} is a link out of the store, which is not followed; copy what it leads to")
+        odd = next((name for name in files if not Path(place, name).is_file()), None)
+        if odd is not None:
+            raise SceneError(f"{Path(place, odd)} is no file; take it out of the store")
+
+
 def check_size(array: zarr.Array[Any], path: Path, name: str) -> None:
     """Refuse an array that claims more than its bytes can mean, before any of it is asked for (SceneError)."""
     folder = path / name
     stored = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    claimed = array.dtype.itemsize * int(np.prod(array.shape, dtype=object))
-    chunk = array.dtype.itemsize * int(np.prod(array.chunks, dtype=object))
+    claimed, chunk = (array.dtype.itemsize * math.prod(sizes) for sizes in (array.shape, array.chunks))
     if max(claimed, chunk) > max(stored, 1) * MOST_RATIO:
         raise SceneError(
             f"{folder} claims {array.shape} of {array.dtype} in chunks of {array.chunks}, and {stored} bytes lie on "
             "the disk; copy it again"
         )
+
+
+def check_packing(array: zarr.Array[Any], path: Path, name: str) -> None:
+    """Refuse an array with chunks that would unpack to more than they may (SceneError)."""
+    folder = path / name
+    about = next(file for file in (folder / "zarr.json", folder / ".zarray") if file.is_file())
+    check_chunks(folder, _read_json(about), array.chunks, array.dtype.itemsize)
+
+
+def check_blocks(array: zarr.Array[Any], path: Path, parts: Sequence[int]) -> None:
+    """Refuse an array of which ``parts`` of each axis, in whole chunks, do not fit the memory (SceneError)."""
+    numbers = 1
+    for size, chunk, part in zip(array.shape, array.chunks, parts, strict=True):
+        numbers *= min(-(-part // chunk) + 1, -(-size // chunk)) * chunk
+    check_memory(path, numbers * array.dtype.itemsize)
 
 
 def open_options(path: Path) -> dict[str, Any]:

@@ -5,6 +5,8 @@ What a store says of itself is judged before it is opened (:mod:`storage.zarr_me
 
 from __future__ import annotations
 
+import base64
+import struct
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,14 +18,26 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.cube_sources import Bands, CubeSource, LineFacts, ReadLines
-from storage.envi_header import MICROMETRES, NANOMETRES
-from storage.zarr_metadata import METADATA, check_metadata, check_size, open_options
+from storage.archive_codec import allow_pcodec
+from storage.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, ReadLines
+from storage.envi_header import MICROMETRES, NANOMETRES, UNSAID
+from storage.zarr_metadata import (
+    METADATA,
+    check_blocks,
+    check_links,
+    check_metadata,
+    check_packing,
+    check_size,
+    open_options,
+)
 
 ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing")
 COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitude", "easting")
 BANDS = ("band", "bands", "wavelength", "wavelengths", "channel", "channels", "spectral")
 WAVELENGTHS = ("wavelength", "wavelengths", "radiation_wavelength")
+METRES = {"m", "meter", "meters", "metre", "metres"}
+SMALL = ("fwhm", "dark", "white", "panel", "bad", "flat", "mirror_x", "mirror_y", "valid_line", "time", "exposure_ms",
+         "frame")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -59,14 +73,19 @@ def open_zarr_cube(path: Path, variable: str | None = None) -> CubeSource:
         claims to hold far more than lies on the disk.
     """
     with _named(path):
+        check_links(path)
         check_metadata(path)
+        allow_pcodec()
         node = zarr.open(path, mode="r", **open_options(path))
         group = node if isinstance(node, zarr.Group) else None
         arrays: dict[str, Any] = dict(node.arrays()) if isinstance(node, zarr.Group) else {"": node}
         name = _chosen(arrays, variable, path)
         array = arrays[name]
-        check_size(array, path, name)
+        for used in [name, *sorted({*SMALL, *WAVELENGTHS, *_dims(array)} & set(arrays) - {name})]:
+            check_size(arrays[used], path, used)
+            check_packing(arrays[used], path, used)
         order, notes = _axes(array, path)
+        check_blocks(array, path, [BLOCK_LINES if axis == order[0] else size for axis, size in enumerate(array.shape)])
         attributes = {} if group is None else dict(group.attrs)
         return _source(path, array, order, arrays, attributes, notes)
 
@@ -123,7 +142,7 @@ def _source(
     notes: tuple[str, ...],
 ) -> CubeSource:  # fmt: skip
     shape = tuple(array.shape[axis] for axis in order) + ((1,) if len(order) == 2 else ())
-    packing = _packing(array.attrs)
+    packing = _packing(array)
     kind = np.dtype(np.float32) if not packing.plain else array.dtype.newbyteorder("=")
     lines, samples, bands = shape
     own = "sweep" in attributes or attributes.get("kind") == "ingested cube"
@@ -149,13 +168,25 @@ def _source(
     )
 
 
-def _packing(attributes: Mapping[str, Any]) -> _Packing:
-    def number(name: str, default: float | None) -> float | None:
-        value = attributes.get(name)
-        return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else default
+def _packing(array: zarr.Array[Any]) -> _Packing:
+    scale, offset = _real(array.attrs.get("scale_factor")), _real(array.attrs.get("add_offset"))
+    return _Packing(_fill(array), 1.0 if scale is None else scale, 0.0 if offset is None else offset)
 
-    scale, offset = number("scale_factor", 1.0), number("add_offset", 0.0)
-    return _Packing(number("_FillValue", None), 1.0 if scale is None else scale, 0.0 if offset is None else offset)
+
+def _real(value: object) -> float | None:
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _fill(array: zarr.Array[Any]) -> float | None:
+    """The number that stands for none, wherever xarray has put it: floats of v3 in base64, all of v2 as fill value."""
+    stated = array.attrs.get("_FillValue", array.attrs.get("missing_value"))
+    if isinstance(stated, str) and array.dtype.kind == "f":
+        (number,) = struct.unpack("<d", base64.standard_b64decode(stated))
+        return float(number)
+    kept = array.dtype.kind in "buif" and array.fill_value is not None
+    if stated is None and kept and "_ARRAY_DIMENSIONS" in array.attrs:
+        return float(array.fill_value)
+    return _real(stated)
 
 
 def _reader(path: Path, array: zarr.Array[Any], order: tuple[int, ...], packing: _Packing) -> ReadLines:
@@ -197,7 +228,7 @@ def _line_facts(arrays: Mapping[str, Any], lines: int, *, own: bool) -> LineFact
 
 
 def _bands(arrays: Mapping[str, Any], array: zarr.Array[Any], order: tuple[int, ...], count: int) -> Bands:
-    """Wavelengths and widths of the coordinates that say them, in nm."""
+    """Wavelengths and widths of the coordinates that say them, in nm; none in another unit than one of length."""
     named = _dims(array)
     axis = named[order[2]] if len(order) == 3 and len(named) == 3 else ""
     found = next((name for name in WAVELENGTHS if _is_line(arrays, name, count)), None)
@@ -209,10 +240,23 @@ def _bands(arrays: Mapping[str, Any], array: zarr.Array[Any], order: tuple[int, 
         return Bands()
     centres = np.asarray(arrays[found][...], np.float64)
     unit = _unit(arrays[found].attrs)
-    scale = 1000.0 if unit in MICROMETRES or (unit not in NANOMETRES and centres.max() <= 20) else 1.0
-    said = f"in {unit}" if unit in NANOMETRES | MICROMETRES else "without a unit, read by their size"
-    widths = np.asarray(arrays["fwhm"][...], np.float64) * scale if _is_line(arrays, "fwhm", count) else None
+    scale = _scale(unit, float(centres.max()))
+    if scale is None or not (np.isfinite(centres) & (centres > 0)).all():
+        return Bands(units=unit)
+    said = f"in {unit}" if unit not in UNSAID else "without a unit, read by their size"
+    widths = np.asarray(arrays["fwhm"][...], np.float64) if _is_line(arrays, "fwhm", count) else None
+    if widths is not None:
+        own = _unit(arrays["fwhm"].attrs)
+        widths = widths * (scale if own in UNSAID else _scale(own, 0.0) or np.nan)
+        widths = widths if (widths > 0).all() else None
     return Bands(centres * scale, widths, unit, f"wavelengths from the array {found}, {said}")
+
+
+def _scale(unit: str, largest: float) -> float | None:
+    """What one of the unit is in nm; where none is said, micrometres or nm by the size; None of other units."""
+    if unit in UNSAID:
+        return 1000.0 if largest <= 20 else 1.0
+    return 1.0 if unit in NANOMETRES else 1000.0 if unit in MICROMETRES else 1e9 if unit in METRES else None
 
 
 def _is_line(arrays: Mapping[str, Any], name: str, count: int) -> bool:

@@ -110,6 +110,10 @@ def test_overviews_of_classes_hold_classes(tmp_path: Path) -> None:
     four = values.reshape(650, 2, 550, 2).swapaxes(1, 2).reshape(650, 550, 4)
     alike = (four == four[..., :1]).all(axis=-1)
     np.testing.assert_array_equal(coarse[alike], four[alike][:, 0])
+    for number in range(3):  # three of the four: neither their mean nor that of their colours
+        most = (four == number).sum(axis=-1) == 3
+        assert most.any()
+        assert (coarse[most] == number).all()
 
 
 def test_confidence_of_overviews_leaves_out_what_is_not_known(tmp_path: Path) -> None:
@@ -122,7 +126,7 @@ def test_confidence_of_overviews_leaves_out_what_is_not_known(tmp_path: Path) ->
         assert (file.read(1) == 0.25).all()
 
 
-@pytest.mark.parametrize("shape", [FEW, (700, 600)])
+@pytest.mark.parametrize("shape", [FEW, (512, 512), (513, 40), (700, 600)])
 def test_an_image_of_nothing_is_whole_too(tmp_path: Path, shape: tuple[int, int]) -> None:
     """Where every pixel is nodata the file still has its pixels and its layout."""
     image = CogImage(shape, "float32", Place.on_map(on_map(shape)), ("confidence",), np.nan)

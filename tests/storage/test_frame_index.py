@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -86,3 +87,33 @@ def test_numbers_that_begin_anew(tmp_path: Path) -> None:
     """An index of a later part that counts from 0 counts from the part's own start."""
     index = load_frame_index(_index(tmp_path, "f t\n0 10\n1 20\n"))
     assert times_of_lines(index, 2000, 3).stamp_us.tolist() == [10, 20, -1]
+
+
+def test_a_file_that_lost_its_last_lines(tmp_path: Path) -> None:
+    """The index of a file that was whole still tells its lines in order, where frames had been dropped before."""
+    index = load_frame_index(_index(tmp_path, "f t\n0 10\n1 20\n3 40\n4 50\n"))
+    times = times_of_lines(index, 0, 3, lost=1)
+    assert times.frame.tolist() == [0, 1, 3]
+    assert times.stamp_us.tolist() == [10, 20, 40]
+
+
+@pytest.mark.parametrize(
+    ("heading", "ms"),
+    [("Frame Number\tTime Stamp\tExposure (ms)\tGain", 4.5), ("Frame#, Time, Exposure (us), Gain", 0.0045),
+     ("frame  time  exposure [s]  gain", 4500), ("frame time exposure gain", 4.5)],
+)  # fmt: skip
+def test_titles_of_several_words(tmp_path: Path, heading: str, ms: float) -> None:
+    """Spaces within a title do not shift the columns, and the title's unit counts."""
+    between = "\t" if "\t" in heading else "," if "," in heading else " "
+    index = load_frame_index(_index(tmp_path, f"{heading}\n" + between.join(("0", "10", "4.5", "7", "8")) + "\n"))
+    assert index.exposure_ms is not None
+    np.testing.assert_allclose(index.exposure_ms, [ms])
+
+
+def test_a_long_index_takes_little_memory(tmp_path: Path) -> None:
+    """Reading an index takes a few times the bytes of its file, not what lists of its words would."""
+    path = _index(tmp_path, "f\tt\n" + "".join(f"{n}\t{1600000000000000 + 40000 * n}\n" for n in range(50_000)))
+    tracemalloc.start()
+    assert len(load_frame_index(path).frame) == 50_000
+    assert tracemalloc.get_traced_memory()[1] < 4 * path.stat().st_size
+    tracemalloc.stop()

@@ -74,7 +74,9 @@ def test_spools_of_published_captures_and_dead_parts_go(tmp_path: Path) -> None:
     (tmp_path / "stages" / "rectify" / "dead.part").mkdir()
     (tmp_path / "stages" / "rectify" / "dead.part" / "half").write_bytes(b"y" * 10)
     with archive.publish("rectify", "living") as staged:
+        planned = clear_up(archive, keep_days=0, dry_run=True)
         found = clear_up(archive, keep_days=0)
+        assert planned == found
         assert staged.path.is_dir()
     assert {(one.uri, one.what, one.size) for one in found.removals} == {
         (f"spool/{small.raw.key}", "spool", 100),
@@ -82,6 +84,42 @@ def test_spools_of_published_captures_and_dead_parts_go(tmp_path: Path) -> None:
     }
     assert [path.name for path in (tmp_path / "spool").iterdir()] == ["underway"]
     assert not (tmp_path / "stages" / "rectify" / "dead.part").exists()
+
+
+def test_a_stray_file_among_the_runs_holds_nothing_up(tmp_path: Path) -> None:
+    """It names nothing; a folder there might have."""
+    archive = Archive.open(tmp_path)
+    small_survey(archive, named=False)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "notes.txt").write_text("mine")
+    assert len(clear_up(archive, keep_days=0).removals) == 3
+    assert (tmp_path / "runs" / "notes.txt").exists()
+
+
+def test_a_spool_stays_while_its_capture_may_be_in_need_of_it(tmp_path: Path) -> None:
+    """Held by whoever publishes its lines, or where what was published of them is damaged."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive)
+    (archive.spool_folder(small.raw.key) / "lines.bil").write_bytes(b"x")
+    with archive.publish("capture", small.raw.key):
+        assert clear_up(archive).removals == ()
+    manifest = (small.raw.path / "manifest.json").read_bytes()
+    flip(small.raw.path / "manifest.json", at=30)
+    assert clear_up(archive).removals == ()
+    (small.raw.path / "manifest.json").write_bytes(manifest)
+    assert [removal.what for removal in clear_up(archive).removals] == ["spool"]
+
+
+def test_what_does_not_let_itself_be_removed_is_not_told_as_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk refuses: the next gc tries again."""
+    archive = Archive.open(tmp_path)
+    (tmp_path / "stages/segment/aaaa.part").mkdir(parents=True)
+    with monkeypatch.context() as broken:
+        broken.setattr("storage.garbage.remove_tree", lambda path: None)
+        assert clear_up(archive).removals == ()
+    assert [removal.uri for removal in clear_up(archive).removals] == ["stages/segment/aaaa.part"]
 
 
 def test_nothing_goes_while_somebody_uses_the_archive(tmp_path: Path) -> None:

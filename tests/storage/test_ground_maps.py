@@ -82,7 +82,9 @@ def test_a_class_without_a_name_and_a_block_that_does_not_fit_are_refused(tmp_pa
         writer.write_block(slice(0, 64), slice(0, 90), np.full_like(classes, 2), confidence, picture)
 
 
-@pytest.mark.parametrize(("rows", "words"), [((10, 74), "rows 10:74"), ((0, 40), "rows 0:40"), ((64, 128), "64:128")])
+@pytest.mark.parametrize(
+    ("rows", "words"), [((10, 74), "rows 10:74"), ((0, 40), "rows 0:40"), ((64, 128), "64:128"), ((32, 64), "32:64")]
+)
 def test_blocks_that_split_shards_are_refused(tmp_path: Path, rows: tuple[int, int], words: str) -> None:
     """A shard written twice by halves would lose one; the message says where to start and end."""
     writer = begin(tmp_path / "a.zarr")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -138,3 +139,48 @@ def test_real_references(real_data: Path) -> None:
     assert dark.shape == white.shape == (1, 1020, 301)
     assert (dark.dtype, white.dtype) == (np.uint16, np.float32)
     np.testing.assert_allclose(dark.lines.exposure_ms, [100.0033437])
+
+
+def test_times_of_a_part_that_is_cut_off(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """Frames that the camera dropped do not shift the times of a file that lost its end afterwards."""
+    write_part(tmp_path, "raw_0", lines[:6], lines=8)
+    frames = [0, 1, 4, 5, 6, 7, 8, 9]
+    (tmp_path / "frameIndex_0.txt").write_text("f\tt\n" + "".join(f"{frame}\t{10 * frame}\n" for frame in frames))
+    source = open_cube_source(tmp_path)
+    assert source.lines.frame is not None
+    assert source.lines.frame.tolist() == [0, 1, 4, 5, 6, 7, -1, -1]
+
+
+def test_numbers_in_names_count_where_lines_follow_from_them(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """Parts that follow each other are what they hold; a gap, or a frame looked up by number, is where names say."""
+    for folder, names in (("whole", (0, 5, 10)), ("early", (0, 7, 12)), ("late", (0, 5, 12))):
+        for number, first in zip(names, (0, 5, 10), strict=True):
+            write_part(tmp_path / folder, f"raw_{number}", lines[first : first + 5])
+    found = {name: open_cube_source(tmp_path / name) for name in ("whole", "early", "late")}
+    assert found["whole"].by_names == ()
+    assert found["early"].shape == found["late"].shape
+    assert found["early"].by_names != found["late"].by_names
+    (tmp_path / "whole" / "frameIndex_5.txt").write_text("f\tt\n" + "".join(f"{n}\t{n}\n" for n in range(5)))
+    assert open_cube_source(tmp_path / "whole").by_names == ((0, 5, 10), (5,))
+
+
+def test_an_empty_part_of_any_ending_is_left_out(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """A part without a byte is left out, whatever its data file is called."""
+    write_part(tmp_path, "raw_0", lines[:5])
+    write_part(tmp_path, "raw_5", lines[5:10])
+    (tmp_path / "raw_5").unlink()
+    (tmp_path / "raw_5.bin").touch()
+    source = open_cube_source(tmp_path)
+    assert (source.shape[0], source.notes) == (5, ("raw_5.bin is empty and left out",))
+
+
+def test_what_is_no_file_is_no_part(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
+    """Folders and pipes with the names of parts and indices are passed over; none of them is waited for."""
+    write_part(tmp_path, "raw_0", lines[:5])
+    (tmp_path / "raw_5").mkdir()
+    os.mkfifo(tmp_path / "frameIndex_0.txt")
+    assert open_cube_source(tmp_path).shape[0] == 5
+    os.mkfifo(tmp_path / "pipe.hdr")
+    (tmp_path / "pipe").touch()
+    with pytest.raises(SceneError, match="is no file; name an ENVI header"):
+        open_cube_source(tmp_path / "pipe.hdr")

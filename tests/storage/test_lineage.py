@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import pytest
@@ -123,6 +124,26 @@ def test_versions_and_libraries_count_as_changes(tmp_path: Path) -> None:
     ]
 
 
+def test_raw_lines_of_which_nobody_says_where_they_come_from_are_the_only_copy(tmp_path: Path) -> None:
+    """The simulator's say so, by a run or by their own parameters; one run of a rig is enough against all others."""
+    archive = Archive.open(tmp_path)
+    for key, params in (("bare", {}), ("light", {"effects": []}), ("rig", {"effects": [], "source": "rig"})):
+        with archive.publish("capture", key, params=params):
+            pass
+    with archive.publish("rectify", "mosaic"):
+        pass
+
+    def only() -> list[str]:
+        catalogue = Catalogue.read(tmp_path)
+        return [uri.rpartition("/")[2] for uri in catalogue.stores if catalogue.is_only_copy(uri)]
+
+    assert only() == ["bare", "rig"]
+    archive.new_run("a").publish(settings={"source": "sim"}, products=["stages/capture/bare", "stages/capture/light"])
+    assert only() == ["rig"]
+    archive.new_run("b").publish(settings={"source": "rig"}, products=["stages/capture/bare"])
+    assert only() == ["bare", "rig"]
+
+
 def test_nested_parameters_have_dotted_names() -> None:
     """Lists of tables by number, lists of numbers as one value."""
     assert flatten({"a": {"b": 1}, "s": [{"x": 1}, {"x": 2}], "l": [1, 2], "e": {}}) == {
@@ -143,6 +164,51 @@ def test_products_go_by_many_names(tmp_path: Path) -> None:
         found = find_product(catalogue, text)
         assert isinstance(found, Run)
         assert found.folder == small.run
+
+
+def test_a_stage_narrows_the_beginning_of_a_key(tmp_path: Path) -> None:
+    """With and without the word stages; what is still two keys is refused with both."""
+    archive = Archive.open(tmp_path)
+    for stage, key in (("rectify", "abcd1"), ("segment", "abcd1"), ("segment", "abcd2"), ("segment", "abce3")):
+        with archive.publish(stage, key):
+            pass
+    catalogue = Catalogue.read(tmp_path)
+    for text in ("rectify/abcd", "stages/rectify/abcd", "stages/rectify/abcd1"):
+        assert find_product(catalogue, text) == "stages/rectify/abcd1"
+    assert find_product(catalogue, "abce") == "stages/segment/abce3"
+    with pytest.raises(ArchiveError, match=r"no store stages/segment/abcd .*there is .*abcd1, stages/segment/abcd2$"):
+        find_product(catalogue, "segment/abcd")
+    with pytest.raises(ArchiveError, match="abcd begins 3 keys"):
+        find_product(catalogue, "abcd")
+    with pytest.raises(ArchiveError, match="no store stages/rectify/abc "):
+        find_product(catalogue, "rectify/abc")
+    archive.discard(catalogue.stores["stages/rectify/abcd1"].ref)
+    with pytest.raises(ArchiveError, match="'abc' is no product, key or run"):
+        find_product(Catalogue.read(tmp_path), "abc")
+
+
+def test_a_products_name_is_of_the_newest_run_that_can_be_read(tmp_path: Path) -> None:
+    """A damaged one after it does not hide it."""
+    archive = Archive.open(tmp_path)
+    made = [small_survey(archive, seed=seed) for seed in range(3)]
+    assert find_product(Catalogue.read(tmp_path), "class_map") == made[2].map.uri
+    assert made[2].run is not None
+    flip(made[2].run / "receipt.json")
+    assert find_product(Catalogue.read(tmp_path), "class_map") == made[1].map.uri
+
+
+def test_a_version_before_is_of_the_same_scene_and_can_be_read(tmp_path: Path) -> None:
+    """The newest of those; a store that says no scene may be of any."""
+    archive = Archive.open(tmp_path)
+    for key, params in (("old1", {}), ("old2", {"scene": "a"}), ("bad1", {"scene": "a"}), ("oth1", {"scene": "b"}),
+                        ("new1", {"scene": "a"})):  # fmt: skip
+        time.sleep(0.01)
+        with archive.publish("segment", key, params=params):
+            pass
+    flip(tmp_path / "stages/segment/bad1/manifest.json", at=30)
+    catalogue = Catalogue.read(tmp_path)
+    before = [version_before(catalogue, f"stages/segment/{key}") for key in ("new1", "oth1", "old2", "old1")]
+    assert [one and one.ref.key for one in before] == ["old2", "old1", "old1", None]
 
 
 @pytest.mark.parametrize(
@@ -171,6 +237,39 @@ def test_a_damaged_receipt_names_what_its_manifest_recorded(tmp_path: Path) -> N
     assert run.receipt == {}
     assert run.problem is not None
     assert run.names == {small.raw.uri, small.mosaic.uri, small.map.uri}
+
+
+def test_a_receipt_that_reads_well_but_has_changed_is_not_believed(tmp_path: Path) -> None:
+    """One digit of it is another."""
+    small = small_survey(Archive.open(tmp_path))
+    assert small.run is not None
+    receipt = small.run / "receipt.json"
+    receipt.write_text(receipt.read_text().replace('"seed": 0', '"seed": 7'))
+    (run,) = Catalogue.read(tmp_path).runs
+    assert (run.receipt, run.settings) == ({}, {})
+    assert "receipt.json has changed since it was published" in str(run.problem)
+
+
+def test_a_run_names_the_stores_of_its_stages(tmp_path: Path) -> None:
+    """Receipts of before name some by their keys alone."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive, named=False)
+    with archive.new_run("farm") as draft:
+        draft.write_file("receipt.json", json.dumps({"stages": [{"name": "draw_map", "key": small.map.key}]}))
+    catalogue = Catalogue.read(tmp_path)
+    assert catalogue.runs[0].names == {small.map.uri}
+    assert [run.uri for run in catalogue.named_by(small.raw.uri)] == [catalogue.runs[0].uri]
+
+
+def test_settings_are_those_of_the_manifest_where_it_has_any(tmp_path: Path) -> None:
+    """They are there even where the receipt is damaged."""
+    archive = Archive.open(tmp_path)
+    with archive.new_run("farm") as draft:
+        draft.write_file("receipt.json", json.dumps({"settings": {"seed": 1}}))
+        draft.publish(settings={"seed": 2})
+    assert Catalogue.read(tmp_path).runs[0].settings == {"seed": 2}
+    flip(archive.runs()[0] / "receipt.json")
+    assert Catalogue.read(tmp_path).runs[0].settings == {"seed": 2}
 
 
 def test_a_run_that_is_no_table_is_borne(tmp_path: Path) -> None:

@@ -132,6 +132,60 @@ def test_a_repair_broken_off_is_put_back_first(tmp_path: Path) -> None:
     assert _moments(archive) == before
 
 
+def test_nothing_that_was_set_aside_is_lost_by_the_next_repair(tmp_path: Path) -> None:
+    """Also what no run names yet: it comes back before anything else is done; what was made again since stays."""
+    archive = Archive.open(tmp_path)
+    small, other = small_survey(archive), small_survey(archive, seed=1, named=False)
+    for ref in (other.map, other.mosaic):
+        aside = tmp_path / ".aside" / ref.stage / ref.key
+        aside.parent.mkdir(parents=True)
+        ref.path.rename(aside)
+    again = small_survey(archive, seed=1, named=False)
+    made = archive.manifest_hash(again.map)
+    archive.discard(again.mosaic)
+    flip(small.map.path / "data.bin")
+    _repair(archive)
+    assert archive.manifest_hash(again.map) == made
+    assert other.mosaic.path.exists()
+    assert _bad(archive) == []
+
+
+def test_one_survey_is_run_again_once(tmp_path: Path) -> None:
+    """However many runs asked for the same, whatever they noted and wherever the archive lay."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive)
+    for more in ({"notes": ["dull"]}, {"out": "elsewhere"}):
+        asked = {"seed": 0, "kernel": "bilinear", "source": "sim", "scene": "farm", "budget": 0.5, **more}
+        archive.new_run("farm").publish(settings=asked, rests_on=archive.manifest_hashes([small.map]))
+    flip(small.mosaic.path / "data.bin")
+    ran: list[str] = []
+    repair(archive, archive.verify_all(), lambda settings: ran.append(settings["kernel"]), versions=VERSIONS)
+    assert ran == ["bilinear"]
+
+
+def test_a_run_that_lost_its_manifest_is_left_to_people(tmp_path: Path) -> None:
+    """Nothing vouches for what its receipt says."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive)
+    assert small.run is not None
+    (small.run / "manifest.json").unlink()
+    done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
+    assert not done.complete
+    assert "run that survey again by hand" in done.failed[f"runs/{small.run.name}"]
+    assert small.run.exists()
+
+
+def test_stores_of_runs_that_cannot_tell_their_settings_stay(tmp_path: Path) -> None:
+    """Nobody knows how to ask for them."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive, named=False)
+    archive.new_run("farm").publish(rests_on=archive.manifest_hashes([small.map]))
+    flip(small.mosaic.path / "data.bin")
+    done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
+    assert "cannot be read: run that survey again by hand" in done.plan.hopeless[small.mosaic.uri]
+    assert _bad(archive) == [small.mosaic.uri]
+
+
 def test_what_no_run_names_is_dropped(tmp_path: Path) -> None:
     """Nobody asks for it: it is made again by whoever does."""
     archive = Archive.open(tmp_path)
@@ -141,6 +195,21 @@ def test_what_no_run_names_is_dropped(tmp_path: Path) -> None:
     assert done.complete
     assert set(done.dropped) == {small.mosaic.uri, small.map.uri}
     assert _bad(archive) == []
+
+
+def test_what_was_never_of_the_archive_is_not_thrown_away(tmp_path: Path) -> None:
+    """A folder in the place of a stage that is none, whoever laid it there."""
+    archive = Archive.open(tmp_path)
+    notes = tmp_path / "stages" / "mine" / "notes.txt"
+    small_survey(archive)
+    notes.parent.mkdir()
+    notes.mkdir()
+    (notes / "a.txt").write_text("mine")
+    done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
+    assert (notes / "a.txt").read_text() == "mine"
+    assert done.dropped == []
+    assert "there is no stage mine" in done.plan.hopeless["stages/mine/notes.txt"]
+    assert not done.complete
 
 
 def test_stores_of_a_version_no_longer_made_stay(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 import shutil
+import time
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ import pytest
 from pipeline.errors import IncompleteStoreError
 from storage.archive import Archive, StageRef
 from storage.layout import create_group, open_group, read_array, write_image, write_small
+from storage.manifests import _seal, _text
+from storage.records import MANIFEST_HASH
 from storage.shard_names import find_shard, name_damage
 from tests.storage.small_archive import flip, small_survey
 
@@ -156,6 +159,55 @@ def test_a_store_made_anew_is_not_doubted(tmp_path: Path) -> None:
     assert _found(archive) == {}
 
 
+def test_what_is_gone_is_told_once(tmp_path: Path) -> None:
+    """However many runs name it; and by what was made of it where no run does."""
+    archive = Archive.open(tmp_path)
+    small, other = small_survey(archive), small_survey(archive, seed=1, named=False)
+    small_survey(archive)
+    for ref in (small.mosaic, other.mosaic):
+        archive.discard(ref)
+    gone = [one for one in archive.verify_all() if one.kind == "missing"]
+    assert [one.uri for one in gone] == [small.mosaic.uri, other.mosaic.key]
+    assert f"is not there, but {other.map.uri} was made of it" in str(gone[1].problem)
+
+
+def test_one_run_that_knows_a_manifest_vouches_for_it(tmp_path: Path) -> None:
+    """Another that knew an earlier one does not count against it; without the first it does, if it is younger."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive, named=False)
+    for _ in range(2):
+        time.sleep(0.01)
+        archive.new_run("doubts").publish(rests_on={small.map.uri: "0" * 64})
+    assert "has changed since runs/" in _found(archive)[small.map.uri][0]
+    archive.new_run("knows").publish(rests_on=archive.manifest_hashes([small.map]))
+    assert _found(archive) == {}
+
+
+def test_a_store_older_than_one_of_its_doubters_is_doubted(tmp_path: Path) -> None:
+    """It cannot have been made anew since."""
+    archive = Archive.open(tmp_path)
+    key = small_survey(Archive.open(tmp_path / "elsewhere"), named=False).map.uri
+    archive.new_run("before").publish(rests_on={key: "0" * 64})
+    time.sleep(0.01)
+    small_survey(archive, named=False)
+    assert _found(archive) == {}
+    time.sleep(0.01)
+    archive.new_run("after").publish(rests_on={key: "0" * 64})
+    assert list(_found(archive)) == [key]
+
+
+def test_what_is_cleared_away_meanwhile_is_no_damage(tmp_path: Path) -> None:
+    """gc may run beside it; what a run names must be there."""
+    archive = Archive.open(tmp_path)
+    named, other = small_survey(archive), small_survey(archive, seed=1, named=False)
+
+    def clear(ref: StageRef) -> list[str]:
+        return [one.uri for one in archive.verify_all(lambda uri, done: archive.discard(ref) and None) if one.problem]
+
+    assert clear(other.map) == []
+    assert clear(named.map) == [named.map.uri]
+
+
 def test_progress_goes_by_bytes(tmp_path: Path) -> None:
     """From nothing to nearly all, store by store."""
     archive = Archive.open(tmp_path)
@@ -165,3 +217,28 @@ def test_progress_goes_by_bytes(tmp_path: Path) -> None:
     assert len(seen) == 4
     assert [done for _, done in seen] == sorted(done for _, done in seen)
     assert seen[0][1] == 0.0 < seen[-1][1] < 1.0
+
+
+def test_a_manifest_written_anew_is_told_by_the_receipt(tmp_path: Path) -> None:
+    """A manifest with other facts and a seal that fits is not the one that the run's stages name: verify says so."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive, named=False)
+    row = {"name": "rectify", "key": small.mosaic.key, "state": "ran"}
+    rows = [
+        row | {MANIFEST_HASH: archive.manifest_hash(small.mosaic)},
+        {"name": "ground", "key": "", MANIFEST_HASH: None},
+    ]
+    with archive.new_run("farm") as draft:
+        draft.write_file("receipt.json", json.dumps({"survey": "farm", "stages": rows}))
+        run = draft.publish(survey="farm")
+    assert _found(archive) == {}
+    path = small.mosaic.path / "manifest.json"
+    content = json.loads(path.read_text())
+    del content["seal"]
+    content["params"]["kernel"] = "nearest"
+    path.write_text(_text(content | {"seal": _seal(content)}))
+    told = _found(archive)
+    assert list(told) == [small.mosaic.uri]
+    assert told[small.mosaic.uri] == [
+        f"its manifest.json has changed since runs/{run.name} was published (its SHA-256 differs)"
+    ]

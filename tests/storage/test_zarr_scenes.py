@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
+import struct
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +14,9 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
+from google_crc32c import value as crc32c
 from numpy.typing import NDArray
+from zarr.codecs import BloscCodec, ZstdCodec
 
 from pipeline.errors import SceneError
 from pipeline.scan import Sweep
@@ -70,6 +75,32 @@ def test_packed_numbers(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
     data.to_zarr(tmp_path / "a.zarr", encoding={"reflectance": packing}, consolidated=False)
     scene = load_scene_file(tmp_path / "a.zarr")
     np.testing.assert_allclose(scene.values, np.where(cube > 4000, np.nan, cube * 0.5 + 1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("packing", [{"dtype": "f4"}, {"dtype": "i2", "scale_factor": 0.5, "add_offset": 1.0}])
+def test_void_numbers_as_xarray_keeps_them(
+    tmp_path: Path, cube: NDArray[np.uint16], version: int, packing: dict[str, Any]
+) -> None:
+    """The number that stands for none is found in both versions, of floats and of whole numbers."""
+    data = _dataset(np.where(cube > 4000, np.nan, cube * 0.5 + 1), ("y", "x", "band"), units="nm")
+    encoding: Any = {"reflectance": {**packing, "_FillValue": -9999}}
+    data.to_zarr(tmp_path / "a.zarr", encoding=encoding, zarr_format=version, consolidated=False)
+    scene = load_scene_file(tmp_path / "a.zarr")
+    np.testing.assert_allclose(scene.values, np.where(cube > 4000, np.nan, cube * 0.5 + 1), rtol=1e-6)
+
+
+def test_other_units_of_wavelengths(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Metres become nm, widths have a unit of their own; wavenumbers are not taken for lengths."""
+    data = _dataset(cube, ("y", "x", "band"), nm=NM * 1e-9, units="m")
+    data = data.assign_coords(fwhm=("band", NM / 100, {"units": "nm"}))
+    data.to_zarr(tmp_path / "a.zarr", consolidated=False)
+    scene = load_scene_file(tmp_path / "a.zarr")
+    np.testing.assert_allclose(scene.wavelength_nm, NM)
+    assert scene.fwhm_nm is not None
+    np.testing.assert_allclose(scene.fwhm_nm, NM / 100)
+    _dataset(cube, ("y", "x", "band"), nm=1e7 / NM, units="cm-1").to_zarr(tmp_path / "b.zarr", consolidated=False)
+    assert open_cube_source(tmp_path / "b.zarr").bands.wavelength_nm is None
 
 
 def test_several_arrays(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
@@ -187,3 +218,92 @@ def test_damaged_stores(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
     (path / "zarr.json").write_text("{")
     with pytest.raises(SceneError, match="cannot be read as Zarr"):
         load_scene_file(path, wavelengths=NM.tolist())
+
+
+def test_links_out_of_a_store(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Chunks, arrays and metadata that are links to elsewhere, or pipes, are refused before one is read."""
+    (tmp_path / "secret").mkdir()
+    (tmp_path / "secret" / "key").write_bytes(b"secret")
+    path = tmp_path / "a.zarr"
+    zarr.create_array(path, data=cube)
+    chunk = next(file for file in path.rglob("*") if file.is_file() and file.name != "zarr.json")
+    whole = chunk.read_bytes()
+    for target in (tmp_path / "secret" / "key", Path("../../../../secret/key"), Path("/dev/zero"), tmp_path / "none"):
+        chunk.unlink()
+        chunk.symlink_to(target)
+        with pytest.raises(SceneError, match="is a link out of the store"):
+            open_cube_source(path)
+    chunk.unlink()
+    os.mkfifo(chunk)
+    with pytest.raises(SceneError, match="is no file; take it out of the store"):
+        open_cube_source(path)
+    chunk.unlink()
+    chunk.write_bytes(whole)
+    (path / "more").symlink_to(tmp_path / "secret")
+    with pytest.raises(SceneError, match="is a link out of the store"):
+        open_cube_source(path)
+    (path / "more").unlink()
+    (tmp_path / "linked.zarr").symlink_to(path)
+    np.testing.assert_array_equal(open_cube_source(tmp_path / "linked.zarr").read(0, 7), cube)
+
+
+def test_names_in_consolidated_metadata_are_not_followed(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Arrays are those that lie in the store, whatever its consolidated metadata list, and names are no paths."""
+    path, other = tmp_path / "a.zarr", tmp_path / "other.zarr"
+    for version in (2, 3):
+        zarr.open_group(other, mode="w", zarr_format=version).create_array("cube", data=cube + 1)
+        zarr.open_group(path, mode="w", zarr_format=version).create_array("cube", data=cube)
+        about = json.loads((other / "cube" / {2: ".zarray", 3: "zarr.json"}[version]).read_text())
+        if version == 2:
+            listed = {".zgroup": {"zarr_format": 2}, "../other.zarr/cube/.zarray": about}
+            (path / ".zmetadata").write_text(json.dumps({"zarr_consolidated_format": 1, "metadata": listed}))
+        else:
+            said = {"kind": "inline", "must_understand": False, "metadata": {"../other.zarr/cube": about}}
+            _edit(path / "zarr.json", lambda content, said=said: content.update(consolidated_metadata=said))
+        np.testing.assert_array_equal(open_cube_source(path).read(0, 7), cube)
+    for name in ("../other.zarr/cube", "..", "/etc"):
+        with pytest.raises(SceneError, match=r"there is no file|has no array"):
+            open_cube_source(f"{path}:{name}")
+
+
+def test_coordinates_that_claim_too_much(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """Small arrays beside the cube are judged like the cube."""
+    _dataset(cube, ("y", "x", "band"), units="nm").to_zarr(tmp_path / "a.zarr", consolidated=False)
+
+    def change(content: dict[str, Any]) -> None:
+        content["chunk_grid"]["configuration"]["chunk_shape"] = [10**12]
+
+    _edit(tmp_path / "a.zarr" / "wavelength" / "zarr.json", change)
+    with pytest.raises(SceneError, match="wavelength claims"):
+        open_cube_source(tmp_path / "a.zarr")
+
+
+def test_blocks_beyond_the_memory(tmp_path: Path, cube: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What reading some lines takes is held against the machine's memory, and chunks are read whole."""
+    zarr.create_array(tmp_path / "a.zarr", data=cube, chunks=cube.shape)
+    monkeypatch.setattr("storage.declared_sizes.machine_bytes", lambda: cube.nbytes - 1)
+    with pytest.raises(SceneError, match="reading it takes about"):
+        open_cube_source(tmp_path / "a.zarr")
+
+
+@pytest.mark.parametrize("sharded", [False, True])
+@pytest.mark.parametrize("codec", [BloscCodec(), ZstdCodec()])
+def test_chunks_that_would_fill_the_memory(tmp_path: Path, cube: NDArray[np.uint16], codec: Any, sharded: bool) -> None:
+    """A chunk that unpacks to more numbers than it may hold is refused before it is unpacked, in shards, too."""
+    more: Any = {"shards": cube.shape} if sharded else {}
+    array = zarr.create_array(
+        tmp_path / "a.zarr", shape=cube.shape, dtype="u2", chunks=cube.shape, compressors=codec, **more
+    )
+    array[:] = cube
+    np.testing.assert_array_equal(open_cube_source(tmp_path / "a.zarr").read(0, 7), cube)
+    bomb = zarr.create_array(tmp_path / "b.zarr", shape=(1 << 25,), dtype="u1", chunks=(1 << 25,), compressors=codec)
+    bomb[:] = 1
+    packed = (tmp_path / "b.zarr" / "c" / "0").read_bytes()
+    chunk = next(file for file in (tmp_path / "a.zarr").rglob("*") if file.is_file() and file.name != "zarr.json")
+    index = struct.pack("<QQ", 0, len(packed))
+    chunk.write_bytes(packed + index + struct.pack("<I", crc32c(index)) if sharded else packed)
+    tracemalloc.start()
+    with pytest.raises(SceneError, match="would unpack to 33554432 bytes, a chunk has 630; it is damaged"):
+        open_cube_source(tmp_path / "a.zarr")
+    assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    tracemalloc.stop()

@@ -1,0 +1,112 @@
+"""What the documentation of STAC's extensions asks of the fields that are written here, in schemas made by hand.
+
+The extensions' own schemas lie on a server and come with no package. These hold what their documentation says of the
+fields that an export writes: names, types, ranges, which belong together. They do not hold: fields that are not
+written here, collections' summaries, and whatever the official schemas say beyond their documentation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import jsonschema
+
+NUMBER, TEXT = {"type": "number"}, {"type": "string", "minLength": 1}
+MICROMETRES = {"type": "number", "exclusiveMinimum": 0, "maximum": 100}
+CLASS = {
+    "type": "object",
+    "required": ["value", "name"],
+    "additionalProperties": False,
+    "properties": {
+        "value": {"type": "integer"},
+        "name": {"type": "string", "pattern": "^[0-9A-Za-z_-]+$"},
+        "title": TEXT,
+        "description": TEXT,
+        "color_hint": {"type": "string", "pattern": "^[0-9A-Fa-f]{6}$"},
+    },
+}
+FIELDS: Mapping[str, Mapping[str, Any]] = {
+    "proj:code": {"type": ["string", "null"], "pattern": "^[A-Za-z0-9_]+:[A-Za-z0-9_]+$"},
+    "proj:wkt2": {"type": ["string", "null"], "pattern": r"^[A-Z]+CRS\["},
+    "proj:shape": {"type": "array", "items": {"type": "integer", "minimum": 1}, "minItems": 2, "maxItems": 2},
+    "proj:transform": {"type": "array", "items": NUMBER, "anyOf": [{"minItems": n, "maxItems": n} for n in (6, 9)]},
+    "proj:bbox": {"type": "array", "items": NUMBER, "anyOf": [{"minItems": n, "maxItems": n} for n in (4, 6)]},
+    "processing:level": {"enum": ["RAW", "L0", "L1", "L2", "L3", "L4"]},
+    "processing:lineage": TEXT,
+    "processing:software": {"type": "object", "minProperties": 1, "additionalProperties": {"type": "string"}},
+    "hsi:wavelength_min": MICROMETRES,
+    "hsi:wavelength_max": MICROMETRES,
+    "eo:center_wavelength": MICROMETRES,
+    "eo:full_width_half_max": MICROMETRES,
+    "classification:classes": {"type": "array", "items": CLASS, "minItems": 1, "uniqueItems": True},
+}
+PREFIXES = {
+    "proj": "projection/v2.0.0", "processing": "processing/v1.2.0", "hsi": "hsi/v1.0.0", "eo": "eo/v2.0.0",
+    "classification": "classification/v2.0.0",
+}  # fmt: skip
+PLACES = {  # where the fields of each extension may stand in an item
+    "proj": {"properties", "asset"},
+    "processing": {"properties", "asset"},
+    "hsi": {"properties"},
+    "eo": {"properties", "asset", "band"},
+    "classification": {"properties", "asset", "band"},
+}
+
+
+def extension_problems(item: Mapping[str, Any]) -> list[str]:
+    """What is wrong with the fields of extensions in one item; empty where nothing."""
+    return list(_problems(item))
+
+
+def _problems(item: Mapping[str, Any]) -> Iterator[str]:
+    used = set()
+    for place, kind, table in _tables(item):
+        for name in table:
+            prefix, sign, _ = name.partition(":")
+            if not sign:
+                continue
+            used.add(prefix)
+            if name not in FIELDS:
+                yield f"{place}: {name} is no field that is known"
+            elif kind not in PLACES[prefix]:
+                yield f"{place}: {name} does not belong there"
+            else:
+                checker = jsonschema.Draft7Validator(FIELDS[name])
+                yield from (f"{place}: {name}: {error.message}" for error in checker.iter_errors(table[name]))
+        yield from (f"{place}: {text}" for text in _together(table))
+    stated = {prefix for prefix, name in PREFIXES.items() if _uri(name) in item["stac_extensions"]}
+    if stated != used or len(stated) != len(item["stac_extensions"]):
+        yield f"stac_extensions names {sorted(stated)}, used are {sorted(used)}"
+
+
+def _uri(name: str) -> str:
+    return f"https://stac-extensions.github.io/{name}/schema.json"
+
+
+def _tables(item: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    yield "properties", "properties", item["properties"]
+    for key, asset in item["assets"].items():
+        yield key, "asset", asset
+        for number, band in enumerate(asset.get("bands", ())):
+            yield f"{key}, band {number}", "band", band
+
+
+def _together(table: Mapping[str, Any]) -> Iterator[str]:
+    """Fields that need each other."""
+    low, high = table.get("hsi:wavelength_min"), table.get("hsi:wavelength_max")
+    if (low is None) != (high is None):
+        yield "hsi:wavelength_min and hsi:wavelength_max are needed both"
+    elif low is not None and high is not None and low > high:
+        yield f"wavelengths go from {low} to {high}"
+    if "proj:bbox" in table and table.get("proj:code") is None and table.get("proj:wkt2") is None:
+        yield "proj:bbox without a CRS"
+    box, transform, shape = (table.get(f"proj:{name}") for name in ("bbox", "transform", "shape"))
+    if box and transform and shape and len(transform) >= 6 and len(shape) == 2:
+        (a, _, c, _, e, f), (rows, columns) = transform[:6], shape
+        corners = [min(c, c + a * columns), min(f, f + e * rows), max(c, c + a * columns), max(f, f + e * rows)]
+        if any(abs(one - other) > 1e-6 * max(abs(one), 1) for one, other in zip(box, corners, strict=True)):
+            yield f"proj:bbox {box} is not that of transform and shape, {corners}"
+    values = [entry.get("value") for entry in table.get("classification:classes", ())]
+    if len(set(values)) < len(values):
+        yield "two classes have one value"

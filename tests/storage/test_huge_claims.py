@@ -1,0 +1,297 @@
+"""Files that claim more than they hold, or would run or fetch something: one clear error, and little memory."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import struct
+import tracemalloc
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipeline.errors import SceneError
+from storage.raster_files import load_raster
+from storage.scan_files import open_cube_source
+
+FEW = 8 << 20  # bytes: what libraries take when they are first used
+
+
+@contextmanager
+def little_memory(most: int = FEW) -> Iterator[None]:
+    """Fails where more is asked for within."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < most
+    finally:
+        tracemalloc.stop()
+
+
+def npy_header(shape: tuple[int, ...], kind: str = "<u2") -> bytes:
+    """A .npy header, without any number after it."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": kind, "fortran_order": False, "shape": shape})
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("packed", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_packs_that_claim_too_much(tmp_path: Path, packed: int) -> None:
+    """A shape beyond the member's bytes is refused before it is allocated."""
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", packed) as pack:
+        pack.writestr("cube.npy", npy_header((100_000, 1000, 1000)) + bytes(100))
+    with little_memory(), pytest.raises(SceneError, match="claims 200000000000 bytes of numbers"):
+        load_raster(tmp_path / "a.npz", dims=3)
+
+
+def test_packs_that_would_fill_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zeros packed a thousand times are held against the machine's memory, by what the pack says of them."""
+    shape = (1000, 1000, 20)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as pack, pack.open("cube.npy", "w") as member:
+        member.write(npy_header(shape, "|u1"))
+        for _ in range(shape[2]):
+            member.write(bytes(1000 * 1000))
+    assert (tmp_path / "a.npz").stat().st_size < 30_000
+    monkeypatch.setattr("storage.declared_sizes.machine_bytes", lambda: 10_000_000)
+    with (
+        little_memory(),
+        pytest.raises(SceneError, match=r"reading it takes about 0\.0 GB of memory, this machine has"),
+    ):
+        load_raster(tmp_path / "a.npz", dims=3)
+
+
+def test_only_the_array_wanted_is_read(tmp_path: Path) -> None:
+    """What lies beside the cube in a pack is not unpacked: not numbers, not objects."""
+    cube = np.ones((3, 4, 5), np.uint8)
+    np.savez_compressed(tmp_path / "a.npz", cube=cube, large=np.zeros((6000, 6000), np.uint8), what={"a": 1})
+    scipy.io.savemat(tmp_path / "a.mat", {"cube": cube, "large": np.zeros((6000, 6000), np.uint8)}, do_compression=True)
+    for name in ("a.npz", "a.mat"):
+        with little_memory():
+            np.testing.assert_array_equal(load_raster(tmp_path / name, dims=3).values, cube)
+
+
+def test_a_pack_that_is_called_an_array(tmp_path: Path) -> None:
+    """A pack with the ending .npy says what it is."""
+    np.savez(tmp_path / "a.npz", cube=np.ones((3, 4, 5)))
+    (tmp_path / "a.npz").rename(tmp_path / "a.npy")
+    with pytest.raises(SceneError, match=r"a pack of several arrays; call it \.npz"):
+        load_raster(tmp_path / "a.npy", dims=3)
+
+
+class _Trap:
+    """Unpickled, it would leave a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.path,)
+
+
+def test_pickles_in_arrays_and_packs(tmp_path: Path) -> None:
+    """What only unpickling could read is never read, whatever file it stands in."""
+    trap = pickle.dumps(_Trap(tmp_path / "trapped"))
+    (tmp_path / "bare.npy").write_bytes(trap)
+    (tmp_path / "object.npy").write_bytes(npy_header((2, 2, 2), "|O") + trap)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as pack:
+        pack.writestr("cube.npy", npy_header((2, 2, 2), "|O") + trap)
+        pack.writestr("cube.pkl", trap)
+    (tmp_path / "bare.mat").write_bytes(trap)
+    for name in ("bare.npy", "object.npy", "a.npz", "a.npz:cube", "bare.mat"):
+        with pytest.raises(SceneError, match=r"Python objects|cannot be read|has no array"):
+            open_cube_source(tmp_path / name)
+    assert not (tmp_path / "trapped").exists()
+
+
+def nested_cells(depth: int) -> bytes:
+    """A variable of MATLAB 5: a cell in a cell in a cell."""
+    inside = b""
+    for _ in range(depth):
+        flags = struct.pack("<IIII", 6, 8, 1, 0)
+        body = flags + struct.pack("<IIii", 5, 8, 1, 1) + struct.pack("<II", 1, 0) + inside
+        inside = struct.pack("<II", 14, len(body)) + body
+    return inside
+
+
+def test_nested_cells_are_not_entered(tmp_path: Path) -> None:
+    """Cells within cells without end, packed into a few KB, are passed over like all that is no numbers."""
+    scipy.io.savemat(tmp_path / "a.mat", {"cube": np.ones((3, 4, 5), np.uint8)})
+    packed = zlib.compress(nested_cells(20_000))
+    whole = (tmp_path / "a.mat").read_bytes()
+    (tmp_path / "a.mat").write_bytes(whole + struct.pack("<II", 15, len(packed)) + packed)
+    np.testing.assert_array_equal(load_raster(tmp_path / "a.mat", dims=3).values, 1)
+
+
+def test_mat_arrays_that_claim_too_much(tmp_path: Path) -> None:
+    """Axes beyond what the file can hold are refused, in both versions; so are arrays never written."""
+    scipy.io.savemat(tmp_path / "a.mat", {"cube": np.ones((3, 4, 5), np.uint8)})
+    whole = (tmp_path / "a.mat").read_bytes()
+    sizes = struct.pack("<iii", 3, 4, 5)
+    assert sizes in whole
+    (tmp_path / "a.mat").write_bytes(whole.replace(sizes, struct.pack("<iii", 30_000, 40_000, 50_000)))
+    with h5py.File(tmp_path / "b.mat", "w", userblock_size=512) as file:
+        file.create_dataset("cube", (10**4, 10**4, 10**4), np.uint16, chunks=(64, 64, 64))
+    for name in ("a.mat", "b.mat"):
+        with little_memory(), pytest.raises(SceneError, match="bytes of numbers, and"):
+            load_raster(tmp_path / name, dims=3)
+
+
+def test_text_and_cells_of_matlab_are_no_arrays(tmp_path: Path) -> None:
+    """Text, which MATLAB 7.3 keeps as numbers, is not taken for an image beside the labels."""
+    labels = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    with h5py.File(tmp_path / "a.mat", "w", userblock_size=512) as file:
+        file["labels"] = labels.T
+        file["note"] = np.frombuffer(b"w\0h\0y\0", np.uint16)[:, None]
+        file["note"].attrs["MATLAB_class"] = b"char"
+        file["cells"] = np.array([[file["labels"].ref] * 2] * 2, h5py.ref_dtype)
+    np.testing.assert_array_equal(load_raster(tmp_path / "a.mat", dims=2).values, labels)
+
+
+def png(width: int, height: int, packed: bytes) -> bytes:
+    """A grey PNG of any claimed size."""
+    chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)), (b"IDAT", packed), (b"IEND", b"")]
+    parts = [
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in chunks
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+@pytest.mark.parametrize("side", [12_000, 25_000, 2**31 - 1])
+def test_images_that_claim_too_much(tmp_path: Path, side: int) -> None:
+    """A PNG and a bitmap of a few bytes do not get the memory of the size that they claim."""
+    (tmp_path / "a.png").write_bytes(png(side, side, zlib.compress(bytes(2000))))
+    Image.new("L", (2, 2)).save(tmp_path / "a.bmp")
+    head = bytearray((tmp_path / "a.bmp").read_bytes())
+    head[18:26] = struct.pack("<ii", side, side)
+    (tmp_path / "a.bmp").write_bytes(head)
+    for name in ("a.png", "a.bmp"):
+        with little_memory(), pytest.raises(SceneError, match=r"bytes of numbers, and|cannot be read"):
+            load_raster(tmp_path / name, dims=3)
+
+
+def test_images_beyond_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A size that the file could mean is held against the machine's memory."""
+    for name in ("a.png", "a.jpg", "a.bmp"):
+        Image.new("RGB", (1000, 1000)).save(tmp_path / name)
+    monkeypatch.setattr("storage.declared_sizes.machine_bytes", lambda: 1_000_000)
+    for name in ("a.png", "a.jpg", "a.bmp"):
+        with pytest.raises(SceneError, match="reading it takes about"):
+            load_raster(tmp_path / name, dims=3)
+
+
+def test_programs_that_are_called_images(tmp_path: Path) -> None:
+    """PostScript is no image here: showing it would mean to run it."""
+    (tmp_path / "a.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\nshowpage\n")
+    with pytest.raises(SceneError, match=r"a\.png cannot be read as \.png: cannot identify image file"):
+        load_raster(tmp_path / "a.png", dims=3)
+
+
+VRT = """<VRTDataset rasterXSize="4" rasterYSize="3"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>
+<SourceFilename relativeToVRT="1">secret.tif</SourceFilename><SourceBand>1</SourceBand></SimpleSource></VRTRasterBand>
+</VRTDataset>"""
+
+
+def test_lists_of_other_files_are_no_tiff(tmp_path: Path) -> None:
+    """Other formats of GDAL's may name any file or server: with the ending of a TIFF they are not opened."""
+    pytest.importorskip("rasterio")
+    tifffile = pytest.importorskip("tifffile")
+    tifffile.imwrite(tmp_path / "secret.tif", np.full((3, 4), 7, np.uint8))
+    (tmp_path / "a.tif").write_text(VRT)
+    with pytest.raises(SceneError, match=r"a\.tif cannot be read as TIFF"):
+        open_cube_source(tmp_path / "a.tif")
+
+
+def hollow_tiff(path: Path, side: int, tile: int) -> None:
+    """A TIFF that says its size, and holds nothing."""
+    entries = [(256, 4, side), (257, 4, side), (258, 3, 8), (259, 3, 1), (262, 3, 1), (277, 3, 1), (322, 4, tile),
+               (323, 4, tile), (324, 4, 0), (325, 4, 0)]  # fmt: skip
+    body = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in entries)
+    path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(entries)) + body + bytes(4))
+
+
+@pytest.mark.parametrize(("side", "tile"), [(2_000_000_000, 2_000_000_000), (60_000, 60_000), (1_000_000, 512)])
+@pytest.mark.parametrize("plain", [False, True])
+def test_tiffs_that_claim_too_much(
+    tmp_path: Path, side: int, tile: int, plain: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A TIFF of a few bytes with the size of a country is refused, by either reader."""
+    pytest.importorskip("tifffile")
+    if plain:
+        monkeypatch.setattr("storage.tiff_files.open_tiff_rows", lambda path: None)
+    else:
+        pytest.importorskip("rasterio")
+    hollow_tiff(tmp_path / "a.tif", side, tile)
+    with little_memory(), pytest.raises(SceneError, match=r"bytes of numbers, and|cannot be read"):
+        load_raster(tmp_path / "a.tif", dims=3)
+
+
+@pytest.mark.parametrize("compression", [None, "zlib"])
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.9, 0.999])
+def test_tiffs_that_are_cut_off(tmp_path: Path, compression: str | None, share: float) -> None:
+    """A TIFF that ends too early is refused when its missing rows are asked for, not filled."""
+    pytest.importorskip("rasterio")
+    tifffile = pytest.importorskip("tifffile")
+    values = np.random.default_rng(0).integers(1, 255, (200, 100), dtype=np.uint8)
+    tifffile.imwrite(tmp_path / "a.tif", values, compression=compression, rowsperstrip=16)
+    whole = (tmp_path / "a.tif").read_bytes()
+    (tmp_path / "a.tif").write_bytes(whole[: int(len(whole) * share)])
+    with pytest.raises(SceneError, match="cannot be read as TIFF"):
+        open_cube_source(tmp_path / "a.tif").read(0, 200)
+
+
+def test_images_of_one_size_in_a_tiff_are_bands(tmp_path: Path) -> None:
+    """Pages are bands, in order, by rows and as a whole; pages of several sizes are not, and a note says so."""
+    pytest.importorskip("rasterio")
+    tifffile = pytest.importorskip("tifffile")
+    values = np.random.default_rng(0).integers(0, 4096, (7, 9, 5), dtype=np.uint16)
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for band in range(5):
+            file.write(values[..., band], contiguous=False)
+    source = open_cube_source(tmp_path / "a.tif")
+    np.testing.assert_array_equal(source.read(0, 7), values)
+    np.testing.assert_array_equal(source.read(3, 5), values[3:5])
+    np.testing.assert_array_equal(load_raster(tmp_path / "a.tif", dims=3).values, values)
+    assert source.notes == ("5 images of one size in the file are taken as its bands",)
+    assert source.bands.wavelength_nm is None
+    with tifffile.TiffWriter(tmp_path / "b.tif") as file:
+        file.write(values[..., 0], contiguous=False)
+        file.write(values[:3, :4, 0], contiguous=False)
+    other = open_cube_source(tmp_path / "b.tif")
+    np.testing.assert_array_equal(other.read(0, 7), values[..., :1])
+    assert other.notes == ("the first of 2 images in the file, which are of several kinds",)
+
+
+def envi(path: Path, values: NDArray[Any], offset: int, lines: int) -> bytes:
+    """Write a BIL cube after ``offset`` bytes; gives the data file's bytes."""
+    path.with_suffix(".hdr").write_text(
+        f"ENVI\nsamples = {values.shape[1]}\nlines = {lines}\nbands = {values.shape[2]}\ndata type = 12\n"
+        f"interleave = bil\nbyte order = 0\nheader offset = {offset}\n"
+    )
+    return bytes(offset) + values.transpose(0, 2, 1).astype("<u2").tobytes()
+
+
+def test_envi_cut_off_at_every_byte(tmp_path: Path) -> None:
+    """Wherever a cube ends, in its offset, in a line or at one: its whole lines are kept and the rest is counted."""
+    values = np.random.default_rng(0).integers(0, 4096, (5, 3, 2), dtype=np.uint16)
+    whole = envi(tmp_path / "a.dat", values, 10, 5)
+    for size in range(len(whole) + 1):
+        (tmp_path / "a.dat").write_bytes(whole[:size])
+        held = max(size - 10, 0) // 12
+        if held == 0:
+            with pytest.raises(SceneError, match=f"holds {max(size - 10, 0)} bytes after an offset of 10, no whole"):
+                open_cube_source(tmp_path / "a.hdr")
+            continue
+        source = open_cube_source(tmp_path / "a.hdr")
+        assert (source.shape, source.lost_lines) == ((5, 3, 2), 5 - held)
+        np.testing.assert_array_equal(source.read(0, held), values[:held])
+        assert not source.read(held, 5).any()

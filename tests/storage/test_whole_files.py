@@ -1,0 +1,122 @@
+"""Files that people take away appear whole, replace their forerunners whole, or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import ArchiveError
+from storage import whole_files
+from storage.whole_files import new_file, remove_leftovers, write_whole, written_aside
+
+
+def _files(folder: Path) -> dict[str, str]:
+    return {path.name: path.read_text() for path in folder.iterdir()}
+
+
+def test_files_appear_together_and_replace_the_old(tmp_path: Path) -> None:
+    """In a folder that need not be there; what else lies in it stays."""
+    folder = tmp_path / "a" / "b"
+    for text in ("old", "new"):
+        with written_aside(folder, ["x", "y"]) as aside:
+            assert aside.parent == folder
+            for name in ("x", "y", "scrap"):
+                (aside / name).write_text(text)
+        (folder / "mine").write_text("mine")
+    assert _files(folder) == {"x": "new", "y": "new", "mine": "mine"}
+
+
+def test_a_block_that_fails_leaves_the_old(tmp_path: Path) -> None:
+    """Whatever it had written."""
+    write_whole(tmp_path / "x", "old")
+
+    def fail() -> None:
+        with written_aside(tmp_path, ["x"]) as aside:
+            (aside / "x").write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert _files(tmp_path) == {"x": "old"}
+
+
+def test_what_was_not_written_is_an_error_and_the_old_stays(tmp_path: Path) -> None:
+    """No name is given before all files are there."""
+    write_whole(tmp_path / "x", "old")
+    with pytest.raises(FileNotFoundError), written_aside(tmp_path, ["x", "y"]) as aside:
+        (aside / "x").write_text("new")
+    assert _files(tmp_path) == {"x": "old"}
+
+
+def test_old_and_new_files_are_never_mixed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed at any rename, there are no files of the second name beside a first of another time."""
+    for name in ("x", "y"):
+        (tmp_path / name).write_text("old")
+    true, seen = Path.replace, []
+
+    def watched(self: Path, target: Path) -> Path:
+        seen.append(_files_only(tmp_path))
+        return true(self, target)
+
+    monkeypatch.setattr(Path, "replace", watched)
+    with written_aside(tmp_path, ["x", "y"]) as aside:
+        for name in ("x", "y"):
+            (aside / name).write_text("new")
+    assert seen == [{"x": "old"}, {"x": "new"}]
+    assert _files(tmp_path) == {"x": "new", "y": "new"}
+
+
+def _files_only(folder: Path) -> dict[str, str]:
+    return {path.name: path.read_text() for path in folder.iterdir() if path.is_file()}
+
+
+def test_every_file_is_synced_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the folder after the last."""
+    events: list[str] = []
+    monkeypatch.setattr(whole_files, "sync_path", lambda path: events.append(f"sync {Path(path).name}"))
+    true = Path.replace
+
+    def replace(self: Path, target: Path) -> Path:
+        events.append(f"name {self.name}")
+        return true(self, target)
+
+    monkeypatch.setattr(Path, "replace", replace)
+    with written_aside(tmp_path / "out", ["x", "y"]) as aside:
+        for name in ("x", "y"):
+            (aside / name).write_text("new")
+    assert events == ["sync x", "sync y", "name x", "name y", "sync out"]
+
+
+def test_a_file_where_the_folder_should_be_is_refused(tmp_path: Path) -> None:
+    """Also where it lies above, and with a relative path; the file is left as it is."""
+    (tmp_path / "mine").write_text("mine")
+    here = Path(os.path.relpath(tmp_path / "mine"))
+    for folder in (tmp_path / "mine", tmp_path / "mine" / "below", here):
+        for write in (lambda: write_whole(folder / "x", ""), lambda: new_file(folder, "x", "")):  # noqa: B023
+            with pytest.raises(ArchiveError, match="is or lies below a file, expected a folder; choose another --out"):
+                write()
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_a_full_disk_is_told(tmp_path: Path) -> None:
+    """With what to do, and nothing left."""
+    with pytest.raises(ArchiveError, match="the disk is full"), written_aside(tmp_path, ["x"]) as aside:
+        raise OSError(errno.ENOSPC, "No space left on device", str(aside / "x"))
+    assert _files(tmp_path) == {}
+
+
+def test_names_are_taken_once(tmp_path: Path) -> None:
+    """The second asker gets the next number."""
+    made = [new_file(tmp_path / "out", "told", ".json").name for _ in range(3)]
+    assert made == ["told.json", "told-2.json", "told-3.json"]
+
+
+def test_leftovers_of_killed_writers_go_and_nothing_else(tmp_path: Path) -> None:
+    """Other people's folders stay, even those that end alike."""
+    for name in (".export-abc.part", "mine.part", ".export-mine"):
+        (tmp_path / name).mkdir()
+    remove_leftovers(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".export-mine", "mine.part"]
