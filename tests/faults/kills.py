@@ -39,8 +39,12 @@ def stored(archive: Path) -> dict[str, dict[str, str]]:
 
 def main(kills: int, seed: int = 0) -> int:
     """Print the table; 1 where anything was lost or wrong."""
-    rng = random.Random(seed)
-    folder = Path(tempfile.mkdtemp(prefix="kills-"))
+    with tempfile.TemporaryDirectory(prefix="kills-") as name:
+        return kill_surveys(Path(name), kills, random.Random(seed))
+
+
+def kill_surveys(folder: Path, kills: int, rng: random.Random) -> int:
+    """Kill surveys in a folder, print the table; 1 where anything was lost or wrong."""
     began = time.monotonic()
     assert start(folder / "undisturbed").wait() == 0, "the undisturbed survey failed"
     whole_s = time.monotonic() - began

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import os
 import random
 import signal
-import subprocess
-import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,33 +14,10 @@ import pytest
 
 from storage.archive import Archive
 from storage.class_maps import load_class_map
+from tests.faults.nursery import Nursery
 
-ROOT = Path(__file__).parents[2]
 KILLS = 6
 MOMENTS = [(number + random.Random(number).random()) / KILLS for number in range(KILLS)]  # of the time it takes
-
-# Imports once, then runs each command in a child of its own and kills it after a while: a start costs seconds.
-NURSERY = """
-import json, os, signal, sys, time
-import flows.engine, flows.publish, flows.survey_command
-from flows.cli import main
-for request in sys.stdin:
-    words, delay = json.loads(request)
-    began = time.monotonic()
-    child = os.fork()
-    if child == 0:
-        silence = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(silence, 1), os.dup2(silence, 2)
-        try:
-            main(words)
-        except SystemExit as end:
-            os._exit(end.code)
-    if delay is not None:
-        time.sleep(delay)
-        os.kill(child, signal.SIGKILL)
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    print(json.dumps([code, time.monotonic() - began]), flush=True)
-"""
 
 Runner = Callable[[Path, float | None], tuple[int, float]]
 
@@ -57,23 +31,23 @@ class Whole:
 
 
 @pytest.fixture(scope="module")
-def run(scene_files: Path, weights: Path) -> Iterator[Runner]:
+def run(scene_files: Path, weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runner]:
     """Survey into a folder and kill it after some seconds (None: never); gives exit code and seconds."""
-    words = ["survey", "--scene", "scene.png", "--labels", "labels.png", "--weights", str(weights), "--engine", "plain"]
-    command, environment = [sys.executable, "-c", NURSERY], {**os.environ, "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(
-        command, cwd=scene_files, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as nursery:
-        assert nursery.stdin is not None
-        assert nursery.stdout is not None
+    words = [
+        "survey", "--scene", str(scene_files / "scene.png"), "--labels", str(scene_files / "labels.png"),
+        "--weights", str(weights), "--engine", "plain", "--budget", "0.8",
+    ]  # fmt: skip
+    with Nursery(tmp_path_factory.mktemp("nursery")) as nursery:
 
         def survey(out: Path, delay: float | None) -> tuple[int, float]:
-            print(json.dumps([[*words, "--budget", "0.8", "--out", str(out)], delay]), file=nursery.stdin, flush=True)
-            code, seconds = json.loads(nursery.stdout.readline())
-            return code, seconds
+            child = nursery.start([*words, "--out", str(out)])
+            if delay is not None:
+                time.sleep(delay)
+                child.kill()
+            ended = child.wait()
+            return ended.code, ended.seconds
 
         yield survey
-        nursery.stdin.close()
 
 
 @pytest.fixture(scope="module")

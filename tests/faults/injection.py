@@ -1,0 +1,163 @@
+"""Faults put into a process from the inside: calls of the system that are refused, clocks that are wrong.
+
+Every function here is called once, in a process that does nothing else and ends soon: nothing is put back.
+"""
+
+from __future__ import annotations
+
+import _pyio  # type: ignore[import-not-found]
+import builtins
+import datetime
+import errno
+import io
+import os
+import random
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+WATCHED = (
+    "open", "write", "fsync", "fdatasync", "rename", "replace", "link", "mkdir", "unlink", "rmdir", "truncate",
+    "ftruncate",
+)  # fmt: skip
+_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
+
+
+def refuse(root: str, at: int, number: int, *, lasting: bool = False, log: str | None = None) -> None:
+    """Let the ``at``-th call (from 1) that changes something below ``root`` fail with error ``number``.
+
+    With ``lasting`` so do all later ones; ``at`` 0 refuses nothing. A write that is refused has written its first half.
+    ``log`` is written to when a call is refused, and with ``at`` 0 after every one: how many there were, and which.
+    """
+    _install(_Watch(Path(root).absolute(), at, number, lasting, log))
+
+
+def fill_disk(root: str, at: int) -> None:
+    """Take all that is left of the disk of ``root`` just before the ``at``-th call that changes something below it."""
+    watch = _Watch(Path(root).absolute(), at, 0, False, None)
+    watch.fill = Path(root).absolute().parent / "ballast"
+    _install(watch)
+
+
+def _install(watch: _Watch) -> None:
+    for name in WATCHED:
+        setattr(os, name, watch.around(name, getattr(os, name)))
+    # The io module calls the system from C, its twin in Python goes through os: so every library's files are seen.
+    builtins.open = io.open = _pyio.open
+
+
+class _Watch:
+    """Counts calls, from any thread."""
+
+    fill: Path | None = None  # file to fill the disk with, instead of refusing
+
+    def __init__(self, root: Path, at: int, number: int, lasting: bool, log: str | None) -> None:
+        self._root, self._at, self._number, self._lasting = str(root), at, number, lasting
+        self._lock, self._count = threading.Lock(), 0
+        self._write = os.write
+        self._log = None if log is None else os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+
+    def around(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        """The call, with the fault before it."""
+
+        def guarded(*given: Any, **named: Any) -> Any:
+            path = self._path(name, given, named)
+            due = path is not None and self._due(name, path)
+            if due and self.fill is not None:
+                _fill(self.fill)
+            elif due:
+                if name == "write" and len(given[1]) > 1:
+                    call(given[0], memoryview(given[1])[: len(given[1]) // 2])
+                raise OSError(self._number, os.strerror(self._number), *(() if name in _ON_FILES else (path,)))
+            return call(*given, **named)
+
+        return guarded
+
+    def _path(self, name: str, given: tuple[Any, ...], named: dict[str, Any]) -> str | None:
+        """What is changed, or None where nothing below the root is."""
+        if name == "open" and not (given[1] if len(given) > 1 else named.get("flags", 0)) & _WRITING:
+            return None
+        first = given[0]
+        try:
+            if isinstance(first, int):
+                path = str(Path(f"/proc/self/fd/{first}").readlink())
+            elif named.get("dir_fd") is not None:
+                path = str(Path(f"/proc/self/fd/{named['dir_fd']}").readlink() / os.fsdecode(first))
+            else:
+                path = str(Path(os.fsdecode(first)).absolute())
+        except OSError:
+            return None
+        if name == "mkdir" and Path(path).is_dir():
+            return None  # answered before anything is written
+        return path if path.startswith(self._root) else None
+
+    def _due(self, name: str, path: str) -> bool:
+        with self._lock:
+            self._count += 1
+            due = self._at > 0 and (self._count >= self._at if self._lasting else self._count == self._at)
+            if self._log is not None and (due or self._at == 0):
+                self._write(self._log, f"{self._count} {name} {path}\n".encode())
+        return due
+
+
+def _fill(ballast: Path) -> None:
+    """Write zeros until the disk takes no more."""
+    with io.FileIO(str(ballast), "w") as file:
+        size = 1 << 20
+        while size:
+            try:
+                file.write(bytes(size))
+            except OSError:
+                size //= 2  # the last page takes what a larger piece could not
+
+
+_ON_FILES = {"write", "fsync", "fdatasync", "ftruncate"}  # errors of these carry no name
+
+
+def wrong_clock(shift_s: float, *, jumps_s: float = 0.0, frozen: bool = False, seed: int = 0) -> None:
+    """Let this process see another time of day: shifted, jumping by up to ``jumps_s`` at each look, or standing."""
+    real, chance, began = time.time, random.Random(seed), time.time()
+
+    def now() -> float:
+        return (began if frozen else real()) + shift_s + chance.uniform(-jumps_s, jumps_s)
+
+    class Wrong(datetime.datetime):
+        """A datetime whose now is wrong."""
+
+        @classmethod
+        def now(cls, tz: datetime.tzinfo | None = None) -> datetime.datetime:  # type: ignore[override]
+            return _DATETIME.fromtimestamp(now(), tz)
+
+        @classmethod
+        def utcnow(cls) -> datetime.datetime:  # type: ignore[override]
+            return _DATETIME.fromtimestamp(now(), datetime.UTC).replace(tzinfo=None)
+
+    for module in list(sys.modules.values()):
+        if getattr(module, "__dict__", {}).get("datetime") is _DATETIME:
+            module.datetime = Wrong  # type: ignore[attr-defined]
+    for name in ("gmtime", "localtime"):
+        setattr(time, name, _or_now(getattr(time, name), now))
+    time.time = now
+    time.time_ns = lambda: int(now() * 1e9)
+
+
+_DATETIME = datetime.datetime
+
+
+def _or_now(call: Callable[[float], time.struct_time], now: Callable[[], float]) -> Callable[..., time.struct_time]:
+    return lambda seconds=None: call(now() if seconds is None else seconds)
+
+
+def errors_by_name() -> dict[str, int]:
+    """The refusals that are tried."""
+    return {name: getattr(errno, name) for name in ("EACCES", "EROFS", "EIO", "ENOSPC", "EDQUOT")}
+
+
+def logged_calls(log: Path) -> list[tuple[int, str, str]]:
+    """What `refuse` wrote into its log: number, name and path of calls."""
+    lines = log.read_text().splitlines() if log.exists() else []
+    parts = (line.split(" ", 2) for line in lines)
+    return [(int(count), name, path) for count, name, path in parts]

@@ -1,0 +1,233 @@
+"""What a capture loses when it dies: ``python tests/faults/lost_lines.py 400``.
+
+A killed process loses nothing that it had written: the system has it. When the power fails, a file is what the disk
+was last asked to keep, and of what came after anything: cut off, zeros, other bytes, in one file and not in the other.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from pipeline.source import Line
+from storage.spool import SYNC_LINES, Spool
+from tests.faults.fault_table import Clock, Row
+
+SAMPLES, BANDS = 20, 7
+LINES = 5 * SYNC_LINES + 13
+KILLS, CUTS = 20, 400
+HEADER = {"sweep": "a"}
+FATES = ("as written", "cut off", "cut short", "zeros", "other bytes", "some pages")
+
+WRITER = """
+import os, sys
+from pathlib import Path
+from storage.spool import Spool
+from tests.faults.lost_lines import BANDS, HEADER, SAMPLES, line
+with Spool.open(Path(sys.argv[1]), SAMPLES, BANDS, header=HEADER) as spool:
+    while True:
+        spool.append(line(spool.count))
+        os.write(1, spool.count.to_bytes(8, "little"))
+"""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A capture at one moment: how many lines it has appended, and bytes of both files, as written and as synced."""
+
+    appended: int
+    written: tuple[int, int]
+    synced: tuple[int, int]
+
+
+@dataclass
+class Losses:
+    """What came of killing and of cutting the power."""
+
+    lost: Counter[int] = field(default_factory=Counter)  # lines -> how often so many were lost
+    wrong: list[str] = field(default_factory=list)
+
+    def words(self) -> str:
+        """The figures."""
+        each = sorted(self.lost.elements()) or [0]
+        at = [each[len(each) * share // 100] for share in (50, 90)]
+        return (
+            f"lines lost: none in {self.lost[0]}, median {at[0]}, 9 of 10 at most {at[1]}, at most {each[-1]};"
+            f" {len(self.wrong)} wrong{': ' + '; '.join(self.wrong[:3]) if self.wrong else ''}"
+        )
+
+
+def line(number: int) -> Line:
+    """The line of this number, always the same."""
+    data = np.random.default_rng(number).integers(0, 4096, (SAMPLES, BANDS), dtype=np.uint16)
+    return Line(number, data, 0.0, 1e-3 * number, 0.01 * number, 10.0)
+
+
+def fill(spool: Spool, upto: int) -> None:
+    """Go on with a capture up to so many lines."""
+    while spool.count < upto:
+        spool.append(line(spool.count))
+
+
+def record(folder: Path) -> list[Moment]:
+    """Capture undisturbed, and note what was appended and synced before and after each line and each sync."""
+    moments: list[Moment] = []
+    paths = (folder / "lines.bil", folder / "lines.index")
+    synced, real = [0, 0], os.fdatasync
+    appended = 0
+
+    def note() -> None:
+        sizes = (paths[0].stat().st_size, paths[1].stat().st_size)
+        moments.append(Moment(appended, sizes, (synced[0], synced[1])))
+
+    def watched(descriptor: int) -> None:
+        note()
+        real(descriptor)
+        for number, path in enumerate(paths):
+            if os.path.samestat(os.fstat(descriptor), path.stat()):
+                synced[number] = path.stat().st_size
+        note()
+
+    os.fdatasync = watched  # type: ignore[assignment]
+    try:
+        with Spool.open(folder, SAMPLES, BANDS, header=HEADER) as spool:
+            for number in range(LINES):
+                spool.append(line(number))
+                appended = number + 1
+                note()
+    finally:
+        os.fdatasync = real
+    return moments
+
+
+def cut_power(whole: Path, moment: Moment, folder: Path, chance: random.Random) -> str:
+    """Make what a disk may hold after the power failed at a moment; says what became of either file's last bytes."""
+    fates = []
+    for number, name in enumerate(("lines.bil", "lines.index")):
+        content = (whole / name).read_bytes()[: moment.written[number]]
+        fate = chance.choice(FATES)
+        (folder / name).write_bytes(_left(content, moment.synced[number], fate, chance))
+        fates.append(fate)
+    return " and ".join(fates)
+
+
+def _left(content: bytes, synced: int, fate: str, chance: random.Random) -> bytes:
+    """One file after the power failed: the bytes that were synced, and something for those that were not."""
+    safe, rest = content[:synced], content[synced:]
+    if fate == "cut off":
+        return safe
+    if fate == "cut short":
+        return safe + rest[: chance.randint(0, len(rest))]
+    if fate == "zeros":
+        return safe + bytes(len(rest))
+    if fate == "other bytes":
+        return safe + chance.randbytes(len(rest))
+    if fate == "some pages":  # whole blocks of the disk arrive in any order
+        blocks = [rest[start : start + 512] for start in range(0, len(rest), 512)]
+        return safe + b"".join(block if chance.random() < 0.5 else bytes(len(block)) for block in blocks)
+    return content
+
+
+def try_power(cuts: int, folder: Path, seed: int = 0) -> Losses:
+    """Cut the power at random moments of one capture, and go on from what each leaves."""
+    chance, found = random.Random(seed), Losses()
+    moments = record(folder / "whole")
+    truth = _contents(folder / "whole")
+    for number in range(cuts):
+        moment, place = chance.choice(moments), folder / str(number)
+        place.mkdir()
+        fates = cut_power(folder / "whole", moment, place, chance)
+        wrong = list(_go_on(place, moment.appended, found))
+        if _contents(place) != truth:
+            wrong.append("not the undisturbed bytes after going on")
+        found.wrong += [f"{moment.appended} lines, {fates}: {one}" for one in wrong]
+    return found
+
+
+def _go_on(place: Path, appended: int, found: Losses) -> Iterator[str]:
+    """Open what is left, compare each line, append the rest."""
+    with Spool.open(place, SAMPLES, BANDS, header=HEADER) as spool:
+        found.lost[max(appended - spool.count, 0)] += 1
+        if appended - spool.count > SYNC_LINES:
+            yield f"{appended - spool.count} lines lost"
+        kept = [one for block in spool.blocks() for one in block]
+        yield from (f"line {one.number} is another" for one in kept if not _same(one, line(one.number)))
+        fill(spool, LINES)
+
+
+def try_kills(kills: int, folder: Path, seed: int = 0) -> Losses:
+    """Kill captures at random moments, and compare what they had appended with what is there."""
+    chance, found = random.Random(seed), Losses()
+    root = Path(__file__).resolve().parents[2]
+    command = [sys.executable, "-c", WRITER]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    for number in range(kills):
+        place = folder / f"killed-{number}"
+        with subprocess.Popen([*command, str(place)], cwd=root, env=environment, stdout=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            told = process.stdout.read(8)  # the first line is there
+            time.sleep(chance.uniform(0.0, 0.1))
+            process.send_signal(signal.SIGKILL)
+            told += process.stdout.read()
+        appended = len(told) // 8
+        with Spool.open(place, SAMPLES, BANDS, header=HEADER) as spool:
+            found.lost[max(appended - spool.count, 0)] += 1
+            kept = [one for block in spool.blocks() for one in block]
+            if appended > spool.count:
+                found.wrong.append(f"{appended - spool.count} of {appended} lines lost")
+            found.wrong += [f"line {one.number} is another" for one in kept if not _same(one, line(one.number))]
+    return found
+
+
+def _same(one: Line, other: Line) -> bool:
+    return np.array_equal(one.data, other.data) and _facts(one) == _facts(other)
+
+
+def _facts(one: Line) -> tuple[Any, ...]:
+    return one.number, one.mirror_x, one.mirror_y, one.time_s, one.exposure_ms, one.valid
+
+
+def _contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def rows(quick: bool = False) -> list[Row]:
+    """Captures killed, and captures whose power failed."""
+    found = []
+    with tempfile.TemporaryDirectory(prefix="lost-") as name:
+        clock, kills = Clock(), 3 if quick else KILLS
+        killed = try_kills(kills, Path(name))
+        found.append(Row(
+            "capture killed", "SIGKILL of the process that appends lines", kills, "no appended line lost",
+            killed.words(), not killed.wrong, clock.seconds,
+        ))  # fmt: skip
+        clock, cuts = Clock(), 40 if quick else CUTS
+        cut = try_power(cuts, Path(name))
+        found.append(Row(
+            "power fails in a capture", "both files as of the last fdatasync, what came later cut off, zeroed, "
+            "garbled or kept, each in its own way", cuts, f"at most {SYNC_LINES} lines lost, the capture goes on to "
+            "the same bytes", cut.words(), not cut.wrong, clock.seconds,
+        ))  # fmt: skip
+    return found
+
+
+if __name__ == "__main__":
+    CUTS = int(sys.argv[1]) if len(sys.argv) > 1 else CUTS
+    results = rows()
+    for row in results:
+        print(f"{row.fault}: {row.count} times; {row.found}")
+    sys.exit(0 if all(row.met for row in results) else 1)

@@ -1,0 +1,126 @@
+"""Several processes write one archive at once: ``python tests/faults/many_writers.py 10``.
+
+The same survey two and four times; surveys that share their first stages; and one that is killed in the middle while
+others wait for what it was making.
+"""
+
+from __future__ import annotations
+
+import random
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from storage.archive import Archive
+from tests.faults.fault_table import Clock, Row
+from tests.faults.nursery import Ended, Nursery
+from tests.faults.small_survey import Stored, Subject, prepare, problems, stored, words
+
+ROUNDS = 10
+OTHER = ("--policy", "sobel")  # shares the coarse look, the lookup and the mosaic
+
+
+@dataclass
+class Writings:
+    """What came of writing together."""
+
+    archives: int = 0
+    waited: int = 0  # processes that were given what another made
+    wrong: list[str] = field(default_factory=list)
+
+    def words(self, rounds: int) -> str:
+        """The figures."""
+        return (
+            f"{rounds} archives, {self.waited} times one was given what another made;"
+            f" {len(self.wrong)} wrong{': ' + '; '.join(self.wrong[:3]) if self.wrong else ''}"
+        )
+
+
+def write_together(subject: Subject, out: Path, commands: Sequence[tuple[str, ...]], truth: Stored, found: Writings,
+                   chance: random.Random, *, kill: bool = False) -> None:  # fmt: skip
+    """Start surveys within a moment of each other, kill the first half-way where asked, and look at the archive."""
+    children = []
+    for more in commands:
+        children.append(subject.nursery.start(words(out, *more)))
+        time.sleep(chance.uniform(0.0, 0.1))
+    wrong: list[str] = []
+    if kill:
+        time.sleep(chance.uniform(0.0, subject.whole_s))
+        children[0].kill()
+    ended = [child.wait() for child in children]
+    found.waited += sum("waiting for another run" in one.text or _was_given(one) for one in ended)
+    wrong += [f"exit {one.code}: {one.message[-200:]}" for one in ended[int(kill) :] if one.code != 0]
+    if kill:
+        wrong += [f"killed, but exit {one.code}" for one in ended[:1] if one.code not in (0, -9)]
+    wrong += problems(out)
+    now = stored(out)
+    if now != truth:
+        odd = sorted(uri for uri in {*now, *truth} if now.get(uri) != truth.get(uri))
+        wrong.append(f"other than undisturbed: {', '.join(odd)}")
+    runs = len(Archive.open(out, create=False, write=False).runs())
+    good = sum(one.code == 0 for one in ended)
+    if runs != good:
+        wrong.append(f"{runs} runs are listed, {good} ended well")
+    found.wrong += wrong
+    found.wrong += _left(out, killed=kill)
+    shutil.rmtree(out)
+
+
+def _was_given(one: Ended) -> bool:
+    """Whether a survey found a stage made that it had begun to ask for: some ran, some were cached."""
+    return "% cached" in one.text and "% ran" in one.text
+
+
+def _left(out: Path, *, killed: bool) -> list[str]:
+    """Folders that nobody works on any more; those of a killed process the next run reclaims."""
+    if killed:
+        Archive.open(out).reclaim()
+    parts = [path.relative_to(out).as_posix() for path in out.rglob("*.part")]
+    spools = [path.relative_to(out).as_posix() for path in (out / "spool").glob("*")]
+    return [f"{name} was left" for name in (*parts, *spools)]
+
+
+def rows(quick: bool = False) -> list[Row]:
+    """Two and four of the same survey, surveys that share stages, and one killed while others wait."""
+    rounds = 1 if quick else ROUNDS
+    with tempfile.TemporaryDirectory(prefix="writers-") as name, Nursery(Path(name)) as nursery:
+        subject = prepare(nursery)
+        both = dict(subject.truth)
+        other = nursery.run(words(subject.folder / "other", *OTHER))
+        assert other.code == 0, other.text
+        both |= stored(subject.folder / "other")
+        cases = [
+            ("two writers", "the same survey twice at once", ((), ()), subject.truth, False),
+            ("four writers", "the same survey four times at once", ((), (), (), ()), subject.truth, False),
+            ("shared stages", "two surveys that begin alike at once, each twice", ((), OTHER, (), OTHER), both, False),
+            ("a writer killed", "SIGKILL of the first of three at a random moment", ((), (), ()), subject.truth, True),
+        ]  # fmt: skip
+        return [_row(subject, case, rounds) for case in (cases[::3] if quick else cases)]
+
+
+def _row(
+    subject: Subject, case: tuple[str, str, tuple[tuple[str, ...], ...], Stored, bool], rounds: int, seed: int = 0
+) -> Row:
+    fault, injected, commands, truth, kill = case
+    clock, found, chance = Clock(), Writings(), random.Random(seed)
+    for number in range(rounds):
+        out = subject.folder / f"{fault.replace(' ', '-')}-{number}"
+        write_together(subject, out, commands, truth, found, chance, kill=kill)
+    demanded = "every other one exit 0" if kill else "exit 0 each"
+    return Row(
+        fault, injected, rounds, f"{demanded}, one copy of each store, same bytes, a run listed for each, nothing left",
+        found.words(rounds), not found.wrong, clock.seconds,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    ROUNDS = int(sys.argv[1]) if len(sys.argv) > 1 else ROUNDS
+    results = rows()
+    print("\n".join(f"{row.fault}: {row.found}" for row in results))
+    sys.exit(0 if all(row.met for row in results) else 1)

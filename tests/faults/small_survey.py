@@ -1,0 +1,104 @@
+"""The survey that faults are tried on: small enough to take a second, with every stage that stores something."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from models.weights import save_weights
+from storage.archive import Archive
+from tests.conftest import RGB_NM, patchy_scene, random_weights
+from tests.faults.injection import logged_calls
+from tests.faults.nursery import Ended, Nursery
+
+Stored = dict[str, dict[str, str]]  # address of a store -> SHA-256 of each of its files
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A survey to disturb, a nursery to run it in, and what an undisturbed one left."""
+
+    nursery: Nursery
+    truth: Stored
+    whole_s: float
+
+    @property
+    def folder(self) -> Path:
+        """Where archives and scratch files go."""
+        return self.nursery.folder
+
+
+def words(out: Path, *more: str) -> list[str]:
+    """The survey's command into an archive; flags given later win."""
+    return [
+        "survey", "--scene", "scene.png", "--labels", "labels.png", "--weights", "weights.safetensors",
+        "--engine", "plain", "--no-controls", "--budget", "0.8", "--out", str(out), *more,
+    ]  # fmt: skip
+
+
+def prepare(nursery: Nursery) -> Subject:
+    """Write scene, labels and weights into the nursery's folder, and survey once undisturbed."""
+    folder = nursery.folder
+    values, labels = patchy_scene((96, 128), 3, seed=1)
+    Image.fromarray(values.astype(np.uint8)).save(folder / "scene.png")
+    Image.fromarray(labels).save(folder / "labels.png")
+    save_weights(random_weights(RGB_NM), folder / "weights.safetensors")
+    ended = nursery.run(words(folder / "undisturbed"))
+    assert ended.code == 0, f"the undisturbed survey failed: {ended.text}"
+    return Subject(nursery, stored(folder / "undisturbed"), ended.seconds)
+
+
+def changing_calls(subject: Subject) -> list[tuple[int, str, Path]]:
+    """Every call by which an undisturbed survey changes its archive: number, name, and path below the archive."""
+    out, log = subject.folder / "counted", subject.folder / "counted.calls"
+    ended = subject.nursery.run(words(out), "refuse", root=str(out), at=0, number=0, log=str(log))
+    assert ended.code == 0, ended.text
+    calls = [(number, name, Path(path).relative_to(out)) for number, name, path in logged_calls(log)]
+    shutil.rmtree(out)
+    log.unlink()
+    return calls
+
+
+def stored(archive: Path) -> Stored:
+    """Hash of every file of every published store, by address; nothing where there is no archive yet."""
+    if not (archive / "stages").is_dir():
+        return {}
+    opened = Archive.open(archive, create=False, write=False)
+    return {
+        ref.uri: {name: entry["sha256"] for name, entry in opened.manifest(ref)["files"].items()}
+        for ref in opened.refs()
+    }
+
+
+def problems(archive: Path) -> list[str]:
+    """What `verify` finds; nothing where there is no archive yet."""
+    if not (archive / "stages").is_dir():
+        return []
+    opened = Archive.open(archive, create=False, write=False)
+    return [f"{finding.uri} {finding.problem}" for finding in opened.verify_all() if finding.problem is not None]
+
+
+def wrong_after_fault(subject: Subject, archive: Path, before: Stored | None = None) -> list[str]:
+    """What is not as it should be where something failed: damage, stores that are lost, stores that are other."""
+    now = stored(archive)
+    return [
+        *problems(archive),
+        *(f"{uri} was lost" for uri in set(before or {}) - set(now)),
+        *(f"{uri} is other than undisturbed" for uri, files in now.items() if subject.truth.get(uri) != files),
+    ]
+
+
+def wrong_after_rerun(subject: Subject, archive: Path, ended: Ended, *, runs: int | None = None) -> list[str]:
+    """What is not as it should be where the same command was run again: everything is there, nothing else is."""
+    if ended.code != 0:
+        return [f"the rerun failed: {ended.message}"]
+    left = [path.relative_to(archive).as_posix() for path in archive.rglob("*.part")]
+    found = [*wrong_after_fault(subject, archive, subject.truth), *(f"{name} was left" for name in left)]
+    if any((archive / "spool").glob("*")):
+        found.append("a spool was left")
+    there = len(Archive.open(archive, create=False, write=False).runs())
+    return found + ([f"{there} runs are listed, expected {runs}"] if runs not in (None, there) else [])

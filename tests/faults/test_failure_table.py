@@ -1,0 +1,103 @@
+"""A quick part of the failure table; the whole is ``python tests/faults``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from tests.faults import clocks, disk_full, lost_lines, many_writers, refused_writes, small_survey, spool_rate
+from tests.faults.fault_table import Row, markdown_table, plain_table
+from tests.faults.nursery import Nursery
+from tests.faults.small_survey import Subject, changing_calls, prepare, stored, words
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Subject]:
+    """A small survey to disturb."""
+    with Nursery(tmp_path_factory.mktemp("faults")) as nursery:
+        yield prepare(nursery)
+
+
+def test_disk_full_under_spool_manifest_and_run(subject: Subject) -> None:
+    """One message, an archive that verifies, and a rerun on a larger disk that is bit-identical."""
+    mounted = disk_full.can_mount()
+    found = disk_full.fill_at_places(subject, 1, mounted=mounted, some=disk_full.QUICK)
+    assert found.wrong == []
+    assert set(found.met_at) == set(disk_full.QUICK)
+    assert found.told == len(disk_full.QUICK)
+
+
+def test_writes_refused_at_random_calls(subject: Subject) -> None:
+    """Wherever in a survey, by whichever library, and whether once or for good."""
+    found = refused_writes.refuse_places(subject, 4, seed=3)
+    assert found.wrong == []
+    assert found.told >= 3
+    assert found.places > 500
+
+
+def test_refused_writes_are_counted_in_zarr_too(subject: Subject) -> None:
+    """Else nothing would be refused where most is written."""
+    names = {name for _, name, _ in changing_calls(subject)}
+    assert {"open", "write", "fsync", "fdatasync", "mkdir", "rename", "replace", "unlink"} <= names
+
+
+def test_two_writers_and_one_killed(subject: Subject) -> None:
+    """The others end well, with one copy of everything."""
+    found = many_writers.Writings()
+    for number, kill in enumerate((False, True)):
+        out = subject.folder / f"together-{number}"
+        many_writers.write_together(subject, out, ((), ()), subject.truth, found, Random(number), kill=kill)
+    assert found.wrong == []
+
+
+@pytest.mark.parametrize("fault", list(clocks.CASES))
+def test_clock_set_back(subject: Subject, fault: str, tmp_path: Path) -> None:
+    """Nothing is made twice, doubted, cleared away or put in another's place."""
+    case, names, _ = clocks.CASES[fault]
+    assert case(subject, tmp_path / "a", clocks.WRONG[names[-1]]) == []
+
+
+def test_power_fails_in_a_capture(tmp_path: Path) -> None:
+    """At most the lines since the last sync are lost, and the capture goes on to the same bytes."""
+    found = lost_lines.try_power(60, tmp_path, seed=1)
+    assert found.wrong == []
+    assert 0 < max(found.lost) <= 64
+
+
+def test_capture_killed(tmp_path: Path) -> None:
+    """No line that was appended is lost."""
+    found = lost_lines.try_kills(2, tmp_path, seed=1)
+    assert found.wrong == []
+    assert set(found.lost) == {0}
+
+
+def test_spool_at_a_cameras_pace(tmp_path: Path) -> None:
+    """Two seconds of the paper's line; how fast the machine is has no part in it, only that nothing is lost."""
+    pace = spool_rate.keep_pace(tmp_path, 2.0)
+    assert pace.lines == 200
+    assert pace.kept == pace.lines - pace.dropped
+
+
+def test_a_fault_that_is_not_survived_is_seen(subject: Subject) -> None:
+    """The judges find damage: a store of other bytes, one that is lost, and an error without advice."""
+    out = subject.folder / "damaged"
+    subject.nursery.run(words(out))
+    before = stored(out)
+    first = next(
+        path for path in sorted((out / "stages" / "segment").rglob("*")) if path.is_file() and path.suffix == ""
+    )
+    first.write_bytes(first.read_bytes()[:-1])
+    wrong = small_survey.wrong_after_fault(subject, out, {**before, "stages/segment/gone": {}})
+    assert any("bytes, expected" in one for one in wrong)
+    assert any("was lost" in one for one in wrong)
+    assert not subject.nursery.run(["survey", "--scene", "nowhere.png", "--out", str(out)]).told
+
+
+def test_the_table_has_every_row(tmp_path: Path) -> None:
+    """Also as Markdown, where what is not met says so."""
+    rows = [Row("a", "by hand", 3, "nothing", "0 wrong", True, 1.4), Row("b", "x | y", 1, "z", "1 wrong", False, 2.0)]
+    assert plain_table(rows).splitlines()[-1].split() == ["b", "x", "|", "y", "1", "z", "1", "wrong", "NO", "2"]
+    assert "| b | x \\| y | 1 | z | 1 wrong | NO | 2 |" in markdown_table(rows)
