@@ -14,6 +14,7 @@ from flows.archive_contents import contents, explanation, verdict
 from flows.archive_tables import show_clearance, show_contents, show_explanation, show_repair, show_verdict
 from flows.progress import StageProgress
 from flows.receipt import to_json
+from pipeline.errors import SettingsError
 from storage.archive import Archive
 from storage.garbage import Removal, clear_up
 from storage.repair import Repaired, Rerun, put_back, repair
@@ -23,7 +24,7 @@ DONE, FAILED, PARTLY = 0, 1, 3
 PIPED_WIDTH = 120
 
 
-def run_ls(archive: Path, *, as_json: bool = False) -> int:
+def run_ls(archive: str | Path, *, as_json: bool = False) -> int:
     """List runs and stores of an archive on stdout."""
     content = contents(Archive.open(archive, create=False, write=False))
     _put_out(content, show_contents, as_json=as_json)
@@ -31,7 +32,7 @@ def run_ls(archive: Path, *, as_json: bool = False) -> int:
 
 
 def run_gc(
-    archive: Path, console: Console, *, keep_days: float = 1.0, raw_too: bool = False, dry_run: bool = False,
+    archive: str | Path, console: Console, *, keep_days: float = 1.0, raw_too: bool = False, dry_run: bool = False,
     as_json: bool = False,
 ) -> int:  # fmt: skip
     """Remove what no run names; progress on ``console``, what went (or would go) on stdout."""
@@ -43,7 +44,7 @@ def run_gc(
 
         done = clear_up(opened, keep_days=keep_days, raw_too=raw_too, dry_run=dry_run, progress=progress)
     content = {
-        "archive": str(opened.root),
+        "archive": opened.name,
         "dry_run": dry_run,
         "bytes": done.size,
         "removals": [asdict(removal) for removal in done.removals],
@@ -54,7 +55,7 @@ def run_gc(
     return DONE if done.obstacle is None else PARTLY
 
 
-def run_explain(archive: Path, product: str, *, as_json: bool = False) -> int:
+def run_explain(archive: str | Path, product: str, *, as_json: bool = False) -> int:
     """Tell on stdout how a product came about, and what changed since the version before."""
     opened = Archive.open(archive, create=False, write=False)
     _put_out(explanation(opened, product), show_explanation, as_json=as_json)
@@ -62,14 +63,14 @@ def run_explain(archive: Path, product: str, *, as_json: bool = False) -> int:
 
 
 def run_verify(
-    archive: Path, console: Console, *, remake: bool = False, rerun: Rerun | None = None, as_json: bool = False
+    archive: str | Path, console: Console, *, remake: bool = False, rerun: Rerun | None = None, as_json: bool = False
 ) -> int:
     """Read an archive again; with ``remake`` have what is broken made anew by ``rerun`` (settings in, a run out)."""
     opened = Archive.open(archive, create=False, write=remake)
     if remake:
         with opened.in_use(alone=True) as alone:
             if alone:
-                put_back(opened.root)  # what a repair that was killed had set aside
+                _put_back(opened)
     findings = _read_again(opened, console)
     bad = [finding for finding in findings if finding.problem is not None]
     content = verdict(opened, findings, _versions() if bad else {})
@@ -86,12 +87,31 @@ def run_verify(
     return DONE if done.complete and not stray else PARTLY if done.remade or done.dropped else FAILED
 
 
+def _put_back(archive: Archive) -> None:
+    """What a repair that was killed had set aside."""
+    if archive.in_bucket:
+        from storage.object_repairs import put_back_objects
+
+        put_back_objects(archive)
+    else:
+        put_back(archive.root)
+
+
+def check_outside(out: Path, archive: Archive) -> Path:
+    """The folder ``out`` whole, if it does not lie in the archive, where nothing else belongs (SettingsError)."""
+    folder = out.resolve()
+    if folder.is_relative_to(archive.root.resolve()):
+        raise SettingsError(f"--out {folder} lies in the archive, where nothing else belongs; choose another folder")
+    return folder
+
+
 def _survey_again(archive: Archive, console: Console) -> Rerun:
     def rerun(settings: dict[str, Any]) -> None:
-        from flows.settings import parse_settings
+        from flows.settings import OF_THE_MACHINE, parse_settings
         from flows.survey_command import run_survey
 
-        run_survey(parse_settings({**settings, "out": str(archive.root)}), console)
+        here = {**settings, "out": archive.name, **dict.fromkeys(OF_THE_MACHINE)}
+        run_survey(parse_settings(here), console)
 
     return rerun
 

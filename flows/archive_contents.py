@@ -26,8 +26,8 @@ def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
     for store in sorted(catalogue.stores.values(), key=lambda store: (store.ref.stage, store.created, store.ref.key)):
         stages.setdefault(store.ref.stage, []).append(_store_row(catalogue, store, moment))
     return {
-        "archive": str(archive.root),
-        "runs": [_run_row(catalogue, run) for run in catalogue.runs],
+        "archive": archive.name,
+        "runs": [{**_run_row(catalogue, run), "age_s": _age_s(run.created, moment)} for run in catalogue.runs],
         "stages": stages,
         "bytes": sum(store.size for store in catalogue.stores.values()),
         "lost": list(catalogue.lost),
@@ -64,19 +64,22 @@ def _run_state(catalogue: Catalogue, run: Run, below: Iterable[str]) -> str:
 
 
 def _store_row(catalogue: Catalogue, store: Store, now: datetime) -> dict[str, Any]:
-    try:
-        age: float | None = (now - datetime.fromisoformat(store.created)).total_seconds()
-    except (ValueError, TypeError):
-        age = None
     return {
         "key": store.ref.key,
         "version": store.version,
         "created": store.created,
-        "age_s": age,
+        "age_s": _age_s(store.created, now),
         "bytes": store.size,
         "runs": len(catalogue.named_by(store.ref.uri)),
         "problem": store.problem,
     }
+
+
+def _age_s(created: str, now: datetime) -> float | None:
+    try:
+        return (now - datetime.fromisoformat(created)).total_seconds()
+    except (ValueError, TypeError):
+        return None
 
 
 def explanation(archive: Archive, product: str) -> dict[str, Any]:
@@ -92,11 +95,11 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
         below = set[str]().union(*(catalogue.ancestors([uri]) for uri in found.names))
         shown: set[str] = set()
         trees = [_tree(catalogue, uri, shown, ()) for uri in sorted(found.names - below)]
-        row = {**_run_row(catalogue, found), "problem": found.problem, "command": command(found.settings)}
-        return {"archive": str(archive.root), "product": found.uri, "run": row, "lineage": trees}
+        row = {**_run_row(catalogue, found), "problem": found.problem, "command": command(found.settings, archive.name)}
+        return {"archive": archive.name, "product": found.uri, "run": row, "lineage": trees}
     this, before = catalogue.stores[found], version_before(catalogue, found)
     return {
-        "archive": str(archive.root),
+        "archive": archive.name,
         "product": found,
         "runs": [run.uri for run in catalogue.named_by(found)],
         "lineage": [_tree(catalogue, found, set(), ())],
@@ -141,7 +144,7 @@ def verdict(archive: Archive, findings: list[Finding], versions: Mapping[str, in
     places = {finding.uri for finding in findings if finding.kind in ("whole", "broken")}
     broken = {finding.uri for finding in bad if finding.kind == "broken"}
     content: dict[str, Any] = {
-        "archive": str(archive.root),
+        "archive": archive.name,
         "checked": len(places),
         "whole": len(places - broken),
         "problems": [asdict(finding) for finding in bad],
@@ -150,14 +153,20 @@ def verdict(archive: Archive, findings: list[Finding], versions: Mapping[str, in
         plan = plan_repair(archive, bad, versions=versions)
         content["to_remake"] = list(plan.remade)
         content["hopeless"] = plan.hopeless
-        content["surveys"] = [{"run": run.uri, "command": command(settings)} for run, settings in plan.surveys]
+        content["surveys"] = [
+            {"run": run.uri, "command": command(settings, archive.name)} for run, settings in plan.surveys
+        ]
     return content
 
 
-def command(settings: Mapping[str, Any]) -> str:
-    """The command that asks for these settings, as far as flags can say it; empty where they are not known."""
+def command(settings: Mapping[str, Any], out: str) -> str:
+    """The command that asks for these settings in the archive ``out``, as far as flags can say it; empty without any.
+
+    The archive may have been moved since: what its receipt calls ``out`` is not said.
+    """
     if not settings:
         return ""
+    settings = {**settings, "out": out}
     from flows.settings import Settings
 
     defaults = Settings().to_dict()

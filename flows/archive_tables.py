@@ -23,12 +23,12 @@ DAY_S = 86400.0
 
 def show_contents(content: dict[str, Any], console: Console) -> None:
     """Print what `ls` found."""
-    runs = _table("Runs", "run", "when", "scene", "seed", "budget", "mIoU", "size", "state")
+    runs = _table("Runs", "run", "scene", "seed", "budget", "mIoU", "size", "age", "state", left=2)
     for run in content["runs"]:
         miou = run["miou"] if isinstance(run["miou"], int | float) else None
         runs.add_row(
-            escape(run["id"]), _when(run["created"]), escape(_file_name(run["scene"])), _plain(run["seed"]),
-            _plain(run["budget"]), format_points(miou), format_bytes(run["bytes"]), _state(run["state"]),
+            escape(run["id"]), escape(_file_name(run["scene"])), _plain(run["seed"]), _plain(run["budget"]),
+            format_points(miou), format_bytes(run["bytes"]), _age(run["age_s"]), _state(run["state"]),
         )  # fmt: skip
     console.print(runs if content["runs"] else "no runs")
     stores = _table("Stores", "stage", "key", "version", "size", "age", "runs that name it")
@@ -162,7 +162,10 @@ def _when(created: str) -> str:
 def _age(seconds: float | None) -> str:
     if seconds is None:
         return DASH
-    return f"{seconds / DAY_S:.0f} days" if seconds >= 2 * DAY_S else format_seconds(max(seconds, 0))
+    for unit, word in ((DAY_S, "days"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= 2 * unit:
+            return f"{seconds // unit:.0f} {word}"
+    return format_seconds(max(seconds, 0))
 
 
 def _state(state: str) -> str:

@@ -12,13 +12,13 @@ from flows.app import app, parse_numbers, stderr
 
 
 @app.command
-def ls(archive: Path, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False) -> int:
+def ls(archive: str, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False) -> int:
     """List the runs and stores of an archive: when, what of, how good, how large.
 
     Parameters
     ----------
     archive
-        The archive's folder.
+        The archive's folder, or s3://bucket/prefix.
     as_json
         Print the list as JSON on stdout.
     """
@@ -29,14 +29,14 @@ def ls(archive: Path, *, as_json: Annotated[bool, Parameter(name="--json", negat
 
 @app.command
 def explain(
-    archive: Path, product: str, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False
+    archive: str, product: str, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False
 ) -> int:
     """Show how a product came about, and what changed since the version before it.
 
     Parameters
     ----------
     archive
-        The archive's folder.
+        The archive's folder, or s3://bucket/prefix.
     product
         Its address (stages/rectify/KEY), a key or its beginning, a run, or a product's name in the newest run
         (class_map, mosaic).
@@ -50,7 +50,7 @@ def explain(
 
 @app.command
 def verify(
-    archive: Path,
+    archive: str,
     *,
     repair: Annotated[bool, Parameter(negative="")] = False,
     as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
@@ -60,7 +60,7 @@ def verify(
     Parameters
     ----------
     archive
-        The archive's folder.
+        The archive's folder, or s3://bucket/prefix.
     repair
         Make anew what is broken and what was made of it, by running the surveys again that name it.
     as_json
@@ -73,7 +73,7 @@ def verify(
 
 @app.command
 def gc(
-    archive: Path,
+    archive: str,
     *,
     keep_days: float = 1.0,
     raw_too: Annotated[bool, Parameter(negative="")] = False,
@@ -85,7 +85,7 @@ def gc(
     Parameters
     ----------
     archive
-        The archive's folder.
+        The archive's folder, or s3://bucket/prefix.
     keep_days
         Stores younger than this stay: a survey may be about to name them.
     raw_too
@@ -101,8 +101,37 @@ def gc(
 
 
 @app.command
-def export(
+def pack(
     archive: Path,
+    *,
+    older_than: float = 30.0,
+    dry_run: Annotated[bool, Parameter(negative="")] = False,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+) -> int:
+    """Store old raw sweeps in fewer bytes: the same numbers, in a codec that takes longer to write.
+
+    The codec (pcodec) is no part of the Zarr specification: zarr-python reads it where numcodecs and pcodec are
+    installed, other Zarr programs may not.
+
+    Parameters
+    ----------
+    archive
+        The archive's folder, or s3://bucket/prefix.
+    older_than
+        Only sweeps and ingested cubes that were stored so many days ago.
+    dry_run
+        Only say what would be packed.
+    as_json
+        Print what was packed as JSON on stdout.
+    """
+    from flows.pack_command import run_pack
+
+    return run_pack(archive, stderr, older_than=older_than, dry_run=dry_run, as_json=as_json)
+
+
+@app.command
+def export(
+    archive: str,
     run: str | None = None,
     *,
     out: Annotated[Path, Parameter(name=("--out", "-o"))],
@@ -114,9 +143,9 @@ def export(
     Parameters
     ----------
     archive
-        The archive's folder.
+        The archive's folder, or s3://bucket/prefix.
     run
-        The run's name, a folder's below runs; the latest without one.
+        The run's name, a folder's below runs, or `latest`, as without one.
     out
         Folder to export into, beside the runs of the same archive that lie there.
     envi
@@ -135,7 +164,7 @@ def export(
 @app.command
 def ingest(
     source: str,
-    archive: Path,
+    archive: str,
     *,
     name: str | None = None,
     dark: str | None = None,
@@ -150,7 +179,7 @@ def ingest(
     source
         ENVI header or data file, folder of a Headwall camera, GeoTIFF, .mat, .npy, PNG, or Zarr store.
     archive
-        The archive's folder; it is made where there is none.
+        The archive's folder, or s3://bucket/prefix; it is made where there is none.
     name
         What the cube is called; the file's or folder's name by default.
     dark
@@ -172,8 +201,42 @@ def ingest(
 
 
 @app.command
+def statistics(
+    archive: str,
+    product: str = "mosaic",
+    *,
+    every_band: Annotated[bool, Parameter(name="--all", negative="")] = False,
+    scheduler: str = "threads",
+    workers: int | None = None,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+) -> int:
+    """Count every band of a stored cube: finite share, extremes, percentiles, mean and standard deviation.
+
+    Parameters
+    ----------
+    archive
+        The archive's folder.
+    product
+        Its address, a key or its beginning, or a product's name in the newest run (mosaic, raw_coarse).
+    every_band
+        Show every band, not a dozen of them.
+    scheduler
+        Who counts: `threads`, `processes`, or a dask scheduler elsewhere, tcp://host:port
+    workers
+        Rows of shards at a time; one a core by default.
+    as_json
+        Print all bands as JSON on stdout.
+    """
+    from flows.statistics_command import run_statistics
+    from storage.block_work import Crew
+
+    crew = Crew(scheduler, workers)
+    return run_statistics(archive, product, stderr, crew=crew, every_band=every_band, as_json=as_json)
+
+
+@app.command
 def compare(
-    archive: Path,
+    archive: str,
     old: str,
     new: str,
     *,
@@ -185,7 +248,7 @@ def compare(
     Parameters
     ----------
     archive
-        The archive's folder.
+        The archive's folder, or s3://bucket/prefix.
     old, new
         Runs A and B: names of folders below runs, `latest`, or `previous`, the one before it of the same field.
     out
@@ -200,13 +263,15 @@ def compare(
 
 @app.command
 def reprocess(
-    archive: Path,
+    archive: str,
     *,
     since: str | None = None,
     stage: str | None = None,
     field: str | None = None,
     failed: Annotated[bool, Parameter(negative="")] = False,
     weights: Path | None = None,
+    scheduler: str = "threads",
+    workers: int | None = None,
     dry_run: Annotated[bool, Parameter(negative="")] = False,
     out: Annotated[Path | None, Parameter(name=("--out", "-o"))] = None,
     as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
@@ -216,7 +281,7 @@ def reprocess(
     Parameters
     ----------
     archive
-        The archive's folder.
+        The archive's folder, or s3://bucket/prefix.
     since
         Only fields whose newest run is of this date (UTC) or later: 2026-05-01
     stage
@@ -227,14 +292,20 @@ def reprocess(
         Only fields whose newest run is damaged or lacks stores; what `verify` finds in bytes is for its --repair.
     weights
         Other model weights for all of them.
+    scheduler
+        Who makes blocks: `threads`, `processes`, or a dask scheduler elsewhere, tcp://host:port
+    workers
+        Blocks at a time; one a core by default.
     dry_run
         Only say what would run.
     out
-        Folder for the summary, reprocess-TIME.json.
+        Folder for the summary, reprocess-TIME.json; without one beside the archive, where anything was to be done.
     as_json
         Print the summary as JSON on stdout.
     """
     from flows.reprocess_command import ReprocessRequest, run_reprocess
+    from storage.block_work import Crew
 
-    request = ReprocessRequest(archive, since, stage, field, failed, weights, dry_run, out)
+    crew = Crew(scheduler, workers)
+    request = ReprocessRequest(archive, since, stage, field, failed, weights, dry_run, out, crew)
     return run_reprocess(request, stderr, as_json=as_json)

@@ -37,6 +37,8 @@ def survey(
     controls: bool | None = None,
     engine: str | None = None,
     memory: str | None = None,
+    scheduler: str | None = None,
+    workers: str | None = None,
     kernel: str | None = None,
     pointing_px: str | None = None,
     size: str | None = None,
@@ -60,7 +62,7 @@ def survey(
     source
         `sim`, the simulated rig.
     out
-        Archive folder; `archive` by default.
+        Archive: a folder, or s3://bucket/prefix; `archive` by default.
     budget
         Seconds of coarse and fine capture over those of the full scan, above 0 and at most 1; 0.5 by default.
     policy
@@ -81,6 +83,10 @@ def survey(
         `prefect`, or `plain` where no server can start.
     memory
         Sizes the blocks in which the controls scan the whole field: 4GiB by default.
+    scheduler
+        Who makes tiles and reads regions: `threads`, `processes`, or a dask scheduler elsewhere, tcp://host:port
+    workers
+        Blocks at a time; one a core by default.
     kernel
         How lines are read between samples: catmull-rom (default), bilinear, or nearest, which mixes no spectra.
     pointing_px
@@ -99,7 +105,7 @@ def survey(
         "scene": scene, "labels": labels, "bands": bands, "wavelengths": wavelengths, "source": source, "out": out,
         "budget": budget, "policy": policy, "mask": mask, "weights": weights, "rounds": rounds, "seed": seed,
         "effects": effects, "controls": controls, "engine": engine, "memory": memory, "kernel": kernel,
-        "pointing_px": pointing_px, "size": size,
+        "pointing_px": pointing_px, "size": size, "scheduler": scheduler, "workers": workers,
         "camera.exposure_ms": exposure_ms,
     }  # fmt: skip
     published = run_survey(load_settings(settings, flags), stderr)
@@ -126,6 +132,8 @@ def plan(
     seed: str | None = None,
     effects: str | None = None,
     controls: bool | None = None,
+    scheduler: str | None = None,
+    workers: str | None = None,
     kernel: str | None = None,
     pointing_px: str | None = None,
     size: str | None = None,
@@ -148,7 +156,7 @@ def plan(
     wavelengths
         Their centre wavelengths [nm]: 660,800
     out
-        Archive folder; `archive` by default. It need not be there yet.
+        Archive: a folder, or s3://bucket/prefix; `archive` by default. It need not be there yet.
     budget
         Seconds of coarse and fine capture over those of the full scan; 0.5 by default.
     policy
@@ -163,6 +171,8 @@ def plan(
         auto, all, none, or names with commas.
     controls
         Also judge other placements of the same number of seats (needs labels).
+    scheduler, workers
+        As for `survey`; nothing is started.
     kernel
         How lines are read between samples: catmull-rom, bilinear or nearest.
     pointing_px
@@ -178,7 +188,7 @@ def plan(
     flags = {
         "scene": scene, "labels": labels, "bands": bands, "wavelengths": wavelengths, "out": out, "budget": budget,
         "policy": policy, "mask": mask, "weights": weights, "seed": seed, "effects": effects, "controls": controls,
-        "kernel": kernel, "pointing_px": pointing_px, "size": size,
+        "kernel": kernel, "pointing_px": pointing_px, "size": size, "scheduler": scheduler, "workers": workers,
     }  # fmt: skip
     return run_plan(load_settings(settings, flags), as_json=as_json)
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from flows.archive_commands import PIPED_WIDTH, check_outside
 from flows.comparison_table import SAVINGS, change_words, panel_words, show_comparison
 from flows.difference_picture import MapPair, draw_difference
 from flows.receipt import to_json
@@ -28,24 +29,24 @@ from storage.whole_files import written_aside
 
 LARGEST_PAIRS = 10
 NOT_ASKED = ("notes", "out")  # of a receipt's settings
-PIPED_WIDTH = 120
 
 
-def run_compare(archive: Path, old: str, new: str, out: Path | None = None, *, as_json: bool = False) -> int:
+def run_compare(archive: str | Path, old: str, new: str, out: Path | None = None, *, as_json: bool = False) -> int:
     """Compare run ``old`` (A) with run ``new`` (B) on stdout; the picture goes to ``out``, or beside the archive.
 
     Raises
     ------
     ArchiveError : there is no such run, or it cannot be read.
     SceneError, ShapeError : the runs are of different fields.
+    SettingsError : ``out`` lies in the archive.
     """
     opened = Archive.open(archive, create=False, write=False)
+    folder = opened.around if out is None else check_outside(out, opened)
     catalogue = Catalogue.read(opened.root)
     runs = (find_run(catalogue, old), find_run(catalogue, new))
     _check_same_field(*runs)
-    pair = _pair_of([_class_map(catalogue, opened.root, run) for run in runs])
+    pair = _pair_of([_class_map(catalogue, opened, run) for run in runs])
     content = _comparison(catalogue, runs, pair)
-    folder = opened.root.parent if out is None else out
     name = f"compare-{runs[0].folder.name}-{runs[1].folder.name}.png"
     words = [*(panel_words(side) for side in (content["a"], content["b"])), change_words(content["differing"])]
     with written_aside(folder, [name]) as aside:
@@ -82,9 +83,18 @@ def find_run(catalogue: Catalogue, text: str) -> Run:
 
 def _is_same_field(old: Run, new: Run) -> bool:
     """By the scene's key without its bands, or by the scene's file, which may show the field as it is now."""
-    keys = [str(run.receipt.get("scene", run.uri)).split("/bands=")[0].split("/only=")[0] for run in (old, new)]
     files = [run.settings.get("scene") for run in (old, new)]
-    return keys[0] == keys[1] or (files[0] == files[1] and files[0] not in (None, *BUILT_IN_SCENES))
+    same_file = files[0] == files[1] and files[0] not in (None, *BUILT_IN_SCENES)
+    return _field_key(old) == _field_key(new) or same_file
+
+
+def _field_key(run: Run) -> str:
+    return str(run.receipt.get("scene", run.uri)).split("/bands=")[0].split("/only=")[0]
+
+
+def _field_words(run: Run) -> str:
+    scene = run.settings.get("scene")
+    return str(_field_key(run) if scene in (None, *BUILT_IN_SCENES) else scene)
 
 
 def _check_same_field(old: Run, new: Run) -> None:
@@ -92,16 +102,16 @@ def _check_same_field(old: Run, new: Run) -> None:
         if "class_map" not in run.products:
             raise ArchiveError(f"{run.uri} has no class map to compare: {run.problem or 'it left none'}; see verify")
     if not _is_same_field(old, new):
-        fields = (f"{run.uri} is of {run.settings.get('scene')}, seed {run.settings.get('seed')}" for run in (old, new))
+        fields = (f"{run.uri} is of {_field_words(run)}" for run in (old, new))
         raise SceneError(f"these runs are of different fields: {', '.join(fields)}; give two runs of one field")
 
 
-def _class_map(catalogue: Catalogue, root: Path, run: Run) -> ClassMap:
+def _class_map(catalogue: Catalogue, archive: Archive, run: Run) -> ClassMap:
     address = run.products["class_map"]
     store = in_text(address)
     if store not in catalogue.stores or catalogue.stores[store].problem is not None:
         raise ArchiveError(f"the class map {address} of {run.uri} is missing or damaged; run verify --repair")
-    return load_class_map(root / address)
+    return load_class_map(archive.locate(address))
 
 
 class _Pair:

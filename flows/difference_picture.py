@@ -47,10 +47,11 @@ def draw_difference(maps: MapPair, titles: Sequence[str]) -> bytes:
     with mpl.rc_context({"text.parse_math": False}):  # names may hold dollar signs
         figure = Figure(figsize=(3 * PANEL_IN, tall + 0.6 + 0.17 * rows), dpi=DPI, layout="constrained")
         FigureCanvasAgg(figure)
-        thin = slice(None, None, -(-max(height, width) // MOST_PX))
+        step = -(-max(height, width) // MOST_PX)
+        thin = slice(None, None, step)
         palette = class_palette(len(maps.names), maps.colours)
-        drawn = replace(maps, old=maps.old[thin, thin], new=maps.new[thin, thin])
-        pictures = (class_rgb(drawn.old, palette), class_rgb(drawn.new, palette), change_rgb(drawn))
+        seen = [class_rgb(found[thin, thin], palette) for found in (maps.old, maps.new)]
+        pictures = (*seen, change_rgb(thin_changes(maps, step)))
         for axes, picture, title, words in zip(figure.subplots(1, 3), pictures, TITLES, titles, strict=True):
             axes.imshow(picture, interpolation="nearest")
             axes.set_title(f"{title}\n{words}", fontsize=9, loc="left")
@@ -59,6 +60,20 @@ def draw_difference(maps: MapPair, titles: Sequence[str]) -> bytes:
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png")
     return buffer.getvalue()
+
+
+def thin_changes(maps: MapPair, step: int) -> MapPair:
+    """One pixel of every ``step`` x ``step``: one that differs where there is any, so that no change is left out."""
+    height, width = maps.old.shape
+    beyond = ((0, -height % step), (0, -width % step))
+    blocks = [
+        np.pad(found, beyond).reshape(-(-height // step), step, -(-width // step), step).swapaxes(1, 2)
+        for found in (maps.old, maps.new)
+    ]
+    old, new = (block.reshape(*block.shape[:2], step * step) for block in blocks)
+    place = (old != new).argmax(axis=-1)[..., None]
+    old, new = (np.take_along_axis(found, place, axis=-1)[..., 0] for found in (old, new))
+    return replace(maps, old=old, new=new)
 
 
 def change_rgb(maps: MapPair) -> NDArray[np.float32]:

@@ -98,7 +98,7 @@ def _may_help(task: Any, run: Any, state: Any) -> bool:
 
 def _ref(runner: StageRunner, uri: str) -> StageRef:
     _, stage, key = uri.split("/")
-    return StageRef(stage, key, runner.run.archive.root / uri)
+    return runner.run.archive.ref(stage, key)
 
 
 @contextmanager

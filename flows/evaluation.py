@@ -1,6 +1,8 @@
 """Judging a map by labels: its own accuracy, and what no detail, all detail and other placements would have given.
 
-A stage like the others, but outside the survey's savings: it looks at the whole scene in full and needs labels.
+A stage like the others, but outside the survey's savings: it looks at the whole scene in full and needs labels. Labels
+come with simulated fields alone, which memory holds as well: columns and maps are of the whole field, and the model
+reads it as one region however large it is.
 """
 
 from __future__ import annotations
@@ -37,8 +39,10 @@ def evaluate(
     run: SurveyRun, produce: Produce, mosaic: StageRef, patches: StageRef, class_map: StageRef, *pointing: StageRef
 ) -> StageRef | None:
     """Judge the map by the labels, and what other placements would have given. Not part of the survey's own cost."""
-    if run.labels is None:
+    if not run.scene.labelled:
         return None
+    inputs = [mosaic, patches, class_map, *pointing]
+    _wait_for(inputs)
     off = _map_offset(run, pointing)
     labels = _moved(run, off)
 
@@ -62,7 +66,13 @@ def evaluate(
         "kernel": run.settings.kernel,
         **run.source_key(),
     }
-    return produce("evaluate", build, params, [mosaic, patches, class_map, *pointing])
+    return produce("evaluate", build, params, inputs)
+
+
+def _wait_for(inputs: Sequence[StageRef]) -> None:
+    """Let a plan stop here where a key is not known yet: for its own the labels have to be drawn."""
+    for ref in inputs:
+        _ = ref.key
 
 
 def _map_offset(run: SurveyRun, pointing: Sequence[StageRef]) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
+from flows.archive_commands import check_outside
 from flows.export_catalogue import (
     NOT_PLACED,
     Export,
@@ -21,7 +22,7 @@ from flows.export_catalogue import (
     name_stores,
 )
 from flows.export_layers import map_layers, open_exported
-from pipeline.errors import ArchiveError, PipelineError, SettingsError
+from pipeline.errors import ArchiveError, PipelineError
 from storage.archive import Archive
 from storage.cog_files import need_rasterio, write_cog
 from storage.cubes import open_raw_cube
@@ -36,7 +37,7 @@ from storage.whole_files import remove_leftovers
 ENVI_NUMBERS = "application/octet-stream"
 
 
-def run_export(archive: Path, run: str | None, out: Path, envi: bool, console: Console) -> dict[str, Any]:
+def run_export(archive: str | Path, run: str | None, out: Path, envi: bool, console: Console) -> dict[str, Any]:
     """Export a run (the latest without a name) into ``out``, beside others that lie there, and print what was written.
 
     Returns
@@ -52,9 +53,7 @@ def run_export(archive: Path, run: str | None, out: Path, envi: bool, console: C
     need_rasterio()
     need_pystac()
     opened = open_exported(Archive.open(archive, create=False, write=False), run)
-    out = out.resolve()
-    if out.is_relative_to(opened.archive.root.resolve()):
-        raise SettingsError(f"--out {out} lies in the archive, where nothing else belongs; choose another folder")
+    out = check_outside(out, opened.archive)
     about = describe_collection(opened)
     with _writing(out), _alone_in(out):
         check_owner(out, about.id)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,18 +14,20 @@ from odc.geo.geobox import GeoBox
 
 from flows.ground_stage import coarse_colours
 from flows.receipt import Receipt, check_receipt
-from pipeline.errors import IncompleteStoreError, SettingsError
+from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from pipeline.grid import UNLABELLED
 from storage.archive import Archive, StageRef
 from storage.cog_files import ANGULAR, CogImage, Place
 from storage.georeference import load_geobox
 from storage.ground_maps import ClassLegend
 from storage.layout import grid_of
+from storage.records import RECEIPT, read_run
 from storage.stac_fields import classes
 from storage.stored_images import StoredImage, open_image
 
 Rows = Iterator[tuple[int, NDArray[Any]]]
 RGB = ("red", "green", "blue")
+LATEST = "latest"
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class ExportedRun:
         ref = self.archive.find(stage, key)
         if ref is None:
             raise IncompleteStoreError(
-                f"the {product} of run {self.id} should lie in {uri} of {self.archive.root} and does not; run its "
+                f"the {product} of run {self.id} should lie in {uri} of {self.archive.name} and does not; run its "
                 "survey again, or restore the store from a copy"
             )
         return ref
@@ -65,7 +66,7 @@ class ExportedRun:
         """Where a product lies that every finished run has (IncompleteStoreError: this one has not)."""
         if self.store(product) is None:
             raise IncompleteStoreError(f"the run {self.id} has no {product}: it did not finish; export another run")
-        return self.archive.root / self.receipt["products"][product]
+        return self.archive.locate(self.receipt["products"][product])
 
     def sweeps(self) -> list[Path]:
         """Stores of the raw sweeps, coarse ones first."""
@@ -84,7 +85,7 @@ class ExportedRun:
 
 
 def open_exported(archive: Archive, name: str | None) -> ExportedRun:
-    """Open a run by its name, the latest without one.
+    """Open a run by its name or address, the latest without one.
 
     Raises
     ------
@@ -93,17 +94,19 @@ def open_exported(archive: Archive, name: str | None) -> ExportedRun:
     """
     runs = archive.runs()
     if not runs:
-        raise SettingsError(f"{archive.root} has no published run; survey into it first")
-    folder = runs[-1] if name is None else next((run for run in runs if run.name == name), None)
+        raise SettingsError(f"{archive.name} has no published run; survey into it first")
+    called = LATEST if name is None else name.rstrip("/").removeprefix("runs/")
+    folder = runs[-1] if called == LATEST else next((run for run in runs if run.name == called), None)
     if folder is None:
         known = ", ".join(run.name for run in runs[-5:])
-        raise SettingsError(f"{archive.root} has no run {name!r}; its latest are {known}")
+        raise SettingsError(f"{archive.name} has no run {name!r}; its latest are {known}")
+    run = read_run(folder, {})
+    if run.problem is not None:
+        raise IncompleteStoreError(f"{folder} is damaged: {run.problem}; run verify on the archive")
     try:
-        receipt = check_receipt(json.loads((folder / "receipt.json").read_text(encoding="utf-8")))
-    except (OSError, ValueError) as error:
-        raise IncompleteStoreError(
-            f"{folder / 'receipt.json'} cannot be read: {error}; run verify on the archive"
-        ) from error
+        receipt = check_receipt(run.receipt)
+    except ShapeError as error:
+        raise IncompleteStoreError(f"{folder / RECEIPT} is no survey's: {error}; export another run") from error
     return ExportedRun(archive, folder, receipt)
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from fnmatch import fnmatch
+from fnmatch import fnmatchcase
 from functools import cache
 from importlib import resources
 from pathlib import Path, PurePath
 
 from flows.run import SHIPPED
-from flows.settings import BUILT_IN_SCENES, Settings, parse_settings
+from flows.settings import BUILT_IN_SCENES, OF_THE_MACHINE, Settings, parse_settings
 from flows.stages import VERSIONS
 from flows.survey import STAGES
 from pipeline.errors import SettingsError
@@ -50,10 +50,10 @@ def is_called(generation: Generation, pattern: str) -> bool:
     """Whether a field's survey, scene or run is called so; ``*`` stands for any letters."""
     scene = str(generation.run.settings.get("scene", ""))
     names = (generation.field, scene, PurePath(scene).name, generation.run.folder.name)
-    return any(fnmatch(name, pattern) for name in names)
+    return any(fnmatchcase(name, pattern.replace("[", "[[]").replace("?", "[?]")) for name in names)
 
 
-def asked_again(run: Run, out: Path, weights: Path | None) -> Settings:
+def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
     """The settings of a run for another survey into the archive ``out``, with other weights if they are given.
 
     Raises
@@ -62,7 +62,8 @@ def asked_again(run: Run, out: Path, weights: Path | None) -> Settings:
     """
     if not run.settings:
         raise SettingsError(f"the settings of {run.uri} cannot be read ({run.problem}); survey this field by hand")
-    known = {name: value for name, value in run.settings.items() if name in Settings.__dataclass_fields__}
+    here = {*Settings.__dataclass_fields__} - {*OF_THE_MACHINE}
+    known = {name: value for name, value in run.settings.items() if name in here}
     return parse_settings({**known, "out": str(out), **({} if weights is None else {"weights": str(weights)})})
 
 
@@ -116,7 +117,11 @@ def check_stage(stage: str) -> None:
 def weights_key(settings: Settings) -> str | None:
     """The beginning of the SHA-256 of the weights' file, as stages know it; None where it cannot be read."""
     shipped = Path(str(resources.files("models") / "shipped" / SHIPPED))
-    path = shipped if settings.weights is None else Path(settings.weights)
+    return file_key(shipped if settings.weights is None else Path(settings.weights))
+
+
+def file_key(path: Path) -> str | None:
+    """The beginning of a file's SHA-256; None where it cannot be read."""
     try:
         return _file_key(path, path.stat().st_mtime_ns, path.stat().st_size)
     except OSError:

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.panels import choose_bands, develop, stretch
 from flows.run import SurveyRun
 from flows.stages import Produce
+from flows.tones import choose_bands, develop, stretch
 from pipeline.ground import GroundView
 from pipeline.ground_grid import GroundGrid, classes_at, ground_grid, image_at, map_blocks
 from storage.archive import StageRef

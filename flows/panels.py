@@ -9,70 +9,20 @@ from matplotlib.colors import hsv_to_rgb, to_rgb
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
+from flows.tones import choose_bands as choose_bands
+from flows.tones import develop as develop
+from flows.tones import stretch as stretch
 from pipeline.grid import UNLABELLED
 
 INK = "#22241f"
 MUTED = "#6a6d64"
 UNLABELLED_COLOUR = (0.86, 0.86, 0.84)
 HALO: list[patheffects.AbstractPathEffect] = [patheffects.withStroke(linewidth=3, foreground="black")]
-_RGB_NM = (640.0, 550.0, 460.0)
-_FAR_NM = 60.0
 # Okabe and Ito (2008), then Paul Tol's muted scheme (2021) without near twins: told apart by colour-blind readers
 _SAFE = (
     "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#F0E442", "#0072B2", "#CC79A7", "#882255", "#44AA99", "#332288",
     "#999933", "#DDCC77", "#AA4499", "#117733", "#88CCEE", "#CC6677",
 )  # fmt: skip
-
-
-MID_GREY = 0.42
-
-
-def choose_bands(wavelength_nm: NDArray[np.floating]) -> tuple[tuple[int, int, int], str]:
-    """Bands to show as red, green, blue, and a caption: those nearest 640, 550, 460 nm, else false colour or grey."""
-    waves = np.asarray(wavelength_nm, np.float64)
-    nearest = [int(np.argmin(np.abs(waves - target))) for target in _RGB_NM]
-    off = max(abs(waves[band] - target) for band, target in zip(nearest, _RGB_NM, strict=True))
-    if len(set(nearest)) == 3 and off <= _FAR_NM:
-        return _caption_bands(nearest, waves, "true colour")
-    order = np.argsort(waves, kind="stable")
-    if len(waves) == 1:
-        return (0, 0, 0), f"grey, {waves[0]:.0f} nm"
-    picked = [int(order[-1]), int(order[(len(order) - 1) // 2]), int(order[0])]
-    return _caption_bands(picked, waves, "false colour")
-
-
-def _caption_bands(bands: list[int], waves: NDArray[np.float64], kind: str) -> tuple[tuple[int, int, int], str]:
-    red, green, blue = bands
-    return (red, green, blue), f"{kind}, {waves[red]:.0f} / {waves[green]:.0f} / {waves[blue]:.0f} nm"
-
-
-def stretch(image: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Each band's 2nd to 98th percentile to 0..1, (y, x, band) float32; NaN becomes light grey, a flat band black."""
-    values = np.asarray(image, np.float32)
-    shown = np.full(values.shape, 0.86, np.float32)
-    for band in range(values.shape[-1]):
-        plane = values[..., band]
-        known = np.isfinite(plane)
-        if known.any():
-            low, high = np.percentile(plane[known], (2, 98))
-            span = high - low if high > low else np.inf
-            shown[..., band] = np.where(known, np.clip((plane - low) / span, 0, 1), 0.86)
-    return shown
-
-
-def develop(image: NDArray[np.generic], field: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Scene values as a photograph, (y, x, 3) float32 0..1: one scale for all bands, so that colours stay true.
-
-    White is the 99th percentile of ``field``; mid tones are lifted (power 0.45 to 1) until its median is medium grey.
-    """
-    known = np.asarray(field, np.float32)
-    known = known[np.isfinite(known)]
-    if not known.size or not (white := float(np.percentile(known, 99))) > 0:
-        return stretch(image)
-    middle = float(np.clip(np.median(known) / white, 1e-3, 0.999))
-    power = float(np.clip(np.log(MID_GREY) / np.log(middle), 0.45, 1.0))
-    values = np.asarray(image, np.float32)
-    return np.where(np.isfinite(values), np.clip(values / white, 0, 1) ** power, np.float32(0.86))
 
 
 def grey_of(image: NDArray[np.floating]) -> NDArray[np.float32]:

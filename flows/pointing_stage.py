@@ -41,7 +41,7 @@ def register_coarse(run: SurveyRun, produce: Produce, raw: StageRef) -> StageRef
         run.report(0.4)
         found = register_sweeps(broad, run.camera, prior_px=prior)
         run.report(0.8)
-        placed = [replace(one, shift=found.of(one.cube.sweep.name)).placed(run) for one in sweeps]
+        placed = [replace(one, shift=found.of(one.cube.sweep.name)).placed(run.camera) for one in sweeps]
         write_json(path / RECORD, _seams_record(found, _gains(run, found, placed)))
 
     return produce("register", build, {"prior_px": prior, "pass": "coarse"}, [raw])

@@ -23,6 +23,7 @@ from flows.quicklook import QuicklookData, draw_quicklook
 from flows.receipt import Header, Receipt, build_receipt, to_json
 from flows.report import Picture, write_report
 from flows.run import SurveyRun, now
+from flows.settings import anchor_paths
 from flows.stages import SEATS_AT_ONCE, captured, load_plan
 from flows.survey import Products, StageRunner
 from models.cost import MultiplyAdds, multiply_adds
@@ -35,8 +36,8 @@ from storage.attention import load_attention
 from storage.class_maps import ClassMap, load_class_map
 from storage.cubes import RawCube
 from storage.ground_maps import load_ground_map
-from storage.mosaics import load_mosaic
 from storage.patches import open_patches
+from storage.stored_images import open_image
 
 LIBRARIES = ("spectralzoom", "numpy", "torch", "zarr", "xarray", "prefect")
 VARIANTS = {
@@ -94,7 +95,7 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
     header = Header(
         run.name, run.source.name, run.scene.key, run.settings.seed, started, now(),
         _versions(),
-        {**run.settings.to_dict(), "notes": list(run.notes)},
+        {**anchor_paths(run.settings.to_dict(), Path.cwd()), "notes": list(run.notes)},  # to be asked for from anywhere
     )  # fmt: skip
     return build_receipt(
         header, runner.records.values(), savings, _addresses(products, folder),
@@ -212,7 +213,13 @@ def _by_strip(cubes: list[RawCube]) -> list[RawCube]:
 
 
 def _calibrated(run: SurveyRun, cube: RawCube, bands: list[int]) -> NDArray[np.float32]:
-    """Some bands of a sweep's lines in scene values; NaN where a sample looked past the scene."""
+    """Some bands of a sweep in scene values, by its stored picture alone; NaN where a sample looked past the scene."""
+    seen = cube.quicklook()
+    if seen is not None and list(seen.bands) == bands:
+        thin = slice(None, None, seen.step)
+        picture = seen.values()
+        picture[~on_scene(run.scene.shape, run.camera, cube.sweep)[thin, thin] | ~cube.valid_line[thin, None]] = np.nan
+        return picture
     position = np.where(cube.valid_line[:, None], cube.position, np.nan)  # what an invalid line reports may be anything
     values = reflectance(cube.read()[..., bands], of_bands(cube.references, bands), position=position)
     values[~on_scene(run.scene.shape, run.camera, cube.sweep)] = np.nan
@@ -221,7 +228,8 @@ def _calibrated(run: SurveyRun, cube: RawCube, bands: list[int]) -> NDArray[np.f
 
 def _both_scales(run: SurveyRun, products: Products, bands: list[int]) -> NDArray[np.float32]:
     """The coarse mosaic at the scene's size with the fine patches laid in, (y, x, 3)."""
-    coarse = load_mosaic(products.mosaic.path / "mosaic.zarr").values[..., bands]
+    rows = open_image(products.mosaic.path / "mosaic.zarr", "values").rows()
+    coarse = np.concatenate([values[..., bands] for _, values in rows])  # never all bands of all rows at once
     s, p = run.grid.factor, run.grid.patch
     canvas = np.repeat(np.repeat(coarse, s, axis=0), s, axis=1)[: run.grid.height, : run.grid.width].copy()
     store = open_patches(products.patches.path / "patches.zarr")

@@ -111,6 +111,7 @@ class StageRecord:
     peak_rss_bytes: int | None = None
     bytes_in: int | None = None
     bytes_out: int | None = None
+    manifest_sha256: str | None = None  # of the store that the stage left; receipts of before have none
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,13 @@ _SPLIT_FIELDS = ("glance", "score", "encode", "decode")
 _STAGE_FIELDS = ("name", "key", "state", "wall_s", "cpu_s", "peak_rss_bytes", "bytes_in", "bytes_out")
 _EFFECT_FIELDS = ("name", "state", "variant", "bound", "measured", "cost_s", "why")
 _HEADER_FIELDS = ("survey", "source", "scene", "seed", "started", "finished", "versions", "settings")
-_MEASURED_FIELDS = ("wall_s", "cpu_s", "peak_rss_bytes")
+_OF_ONE_RUN = (
+    "wall_s",
+    "cpu_s",
+    "peak_rss_bytes",
+    "state",
+    "manifest_sha256",
+)  # what another run of the same seed has otherwise
 _STATES = ("ran", "cached", "skipped", "failed")
 
 
@@ -240,13 +247,14 @@ def _plain(value: object) -> object:
 def comparable(receipt: Receipt) -> dict[str, Any]:
     """What two runs of the same seed and settings must agree on.
 
-    Without times, memory, the archive's place, whether a stage was read or made, the size of the evaluation (which
-    holds times, in more digits or fewer), and the addresses of the products (their names stay).
+    Without times, memory, the archive's place, whether a stage was read or made, hashes of manifests (which hold their
+    times), the size of the evaluation (which holds times, in more digits or fewer), and the addresses of the products
+    (their names stay).
     """
     same: dict[str, Any] = {key: value for key, value in receipt.items() if key not in ("started", "finished")}
     same["settings"] = {key: value for key, value in receipt["settings"].items() if key != "out"}
     same["stages"] = [
-        _without(stage, (*_MEASURED_FIELDS, "state", *(("bytes_out",) if stage["name"] == "evaluate" else ())))
+        _without(stage, (*_OF_ONE_RUN, *(("bytes_out",) if stage["name"] == "evaluate" else ())))
         for stage in receipt["stages"]
     ]
     same["savings"] = _without(receipt["savings"], ("segment_wall_s",))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,13 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from flows.archive_commands import DONE, FAILED, PARTLY
+from flows.archive_commands import DONE, FAILED, PARTLY, check_outside
 from flows.figures import format_points, format_seconds
 from flows.generations import (
     Generation,
     asked_again,
     check_stage,
+    file_key,
     is_called,
     is_current,
     is_whole,
@@ -32,9 +33,10 @@ from flows.receipt import to_json
 from flows.settings import Settings
 from pipeline.errors import PipelineError, SettingsError
 from storage.archive import Archive
+from storage.block_work import THREADS, Crew
 from storage.lineage import Catalogue
 from storage.records import read_run
-from storage.whole_files import write_whole
+from storage.whole_files import new_file, write_whole
 
 Survey = Callable[[Settings, Console], Path]  # settings in, the folder of the published run out
 STATES = ("ran", "would run", "skipped", "failed")
@@ -44,42 +46,54 @@ STATES = ("ran", "would run", "skipped", "failed")
 class ReprocessRequest:
     """Which fields, and with what."""
 
-    archive: Path
+    archive: str | Path
     since: str | None = None  # ISO date (UTC); the newest run of the field is of this day or later
     stage: str | None = None  # only where it would be made anew
     field: str | None = None  # what survey, scene file or run is called; * for any letters
     failed: bool = False  # only where the newest run is damaged or lacks stores
     weights: Path | None = None
     dry_run: bool = False
-    out: Path | None = None  # folder for reprocess-TIME.json
+    out: Path | None = None  # folder for reprocess-TIME.json; beside the archive without one
+    crew: Crew = THREADS  # who makes blocks; what the old runs were made by need not be there
 
 
 def run_reprocess(
     request: ReprocessRequest, console: Console, *, survey: Survey | None = None, as_json: bool = False
 ) -> int:
-    """Survey again what was asked for; progress on ``console``, the summary on stdout and in ``out``.
+    """Survey again what was asked for; progress on ``console``, the summary on stdout and in a file.
 
     Fields whose newest run is already as it would become are skipped: the same command goes on after an interruption.
+    The file is there before the first field is begun, and its ``finished`` is null until all have been.
 
     Raises
     ------
-    SettingsError : a date or stage that is none, or no field is called so.
-    ArchiveError : the archive cannot be read or written.
+    SettingsError : a date or stage that is none, no field is called so, or ``out`` lies in the archive.
+    ArchiveError : the archive cannot be read or written, or there is no room for the summary.
     """
     opened = Archive.open(request.archive, create=False, write=not request.dry_run)
+    folder = opened.around if request.out is None else check_outside(request.out, opened)
     catalogue = Catalogue.read(opened.root)
-    wanted = _chosen(catalogue, request, opened.root)
-    started = f"{datetime.now(UTC):%Y%m%dT%H%M%S}"
-    file = None if request.out is None or request.dry_run else request.out / f"reprocess-{started}.json"
+    wanted = _chosen(catalogue, request, opened.name)
     rows: list[dict[str, Any]] = []
-    content = {"archive": str(opened.root), "started": started, "dry_run": request.dry_run, "fields": rows}
-    for number, generation in enumerate(wanted, 1):
-        told = f"{number} of {len(wanted)}: {generation.field} ({generation.run.folder.name})"
-        console.print(f"[bold]reprocess {escape(told)}[/]", highlight=False, soft_wrap=True)
-        rows.append(_again(catalogue, generation, request, console, survey or _survey))
-        console.print(escape(_words(rows[-1])), highlight=False, soft_wrap=True)
-        if file is not None:
-            write_whole(file, to_json(content))  # also of what was done before an interruption
+    content: dict[str, Any] = {
+        "archive": opened.name, "started": f"{datetime.now(UTC):%Y%m%dT%H%M%S}", "finished": None,
+        "dry_run": request.dry_run, "asked": _asked(request), "fields": rows,
+    }  # fmt: skip
+    file = None
+    if wanted and not request.dry_run:
+        file = new_file(folder, f"reprocess-{content['started']}", ".json")
+        write_whole(file, to_json(content))
+    with request.crew.open():  # one start of its workers for all fields
+        for number, generation in enumerate(wanted, 1):
+            told = f"{number} of {len(wanted)}: {generation.field} ({generation.run.folder.name})"
+            console.print(f"[bold]reprocess {escape(told)}[/]", highlight=False, soft_wrap=True)
+            rows.append(_again(catalogue, generation, request, console, survey or _survey))
+            console.print(escape(_words(rows[-1])), highlight=False, soft_wrap=True)
+            if file is not None:
+                write_whole(file, to_json(content))  # also of what was done before an interruption
+    content["finished"] = f"{datetime.now(UTC):%Y%m%dT%H%M%S}"
+    if file is not None:
+        file = _end_summary(file, content, wanted=request.out is not None)
     if as_json:
         sys.stdout.write(to_json(content))
     else:
@@ -87,7 +101,25 @@ def run_reprocess(
     return _exit_code([row["state"] for row in rows])
 
 
-def _chosen(catalogue: Catalogue, request: ReprocessRequest, root: Path) -> list[Generation]:
+def _end_summary(file: Path, content: Mapping[str, Any], *, wanted: bool) -> Path | None:
+    """Write the whole summary; where there was nothing to do and nobody asked for the file, take it away."""
+    if not wanted and all(row["state"] == "skipped" for row in content["fields"]):
+        file.unlink(missing_ok=True)
+        return None
+    write_whole(file, to_json(content))
+    return file
+
+
+def _asked(request: ReprocessRequest) -> dict[str, Any]:
+    """What was asked for, as it can be told years later: the weights by their content too."""
+    weights = None if request.weights is None else str(request.weights.absolute())
+    return {
+        "since": request.since, "stage": request.stage, "field": request.field, "failed": request.failed,
+        "weights": weights, "weights_key": None if weights is None else file_key(Path(weights)),
+    }  # fmt: skip
+
+
+def _chosen(catalogue: Catalogue, request: ReprocessRequest, out: str) -> list[Generation]:
     """Newest runs of the fields that were asked for."""
     if request.weights is not None and not request.weights.is_file():
         raise SettingsError(f"--weights {request.weights}: there is no such file; give weights that train has written")
@@ -104,13 +136,13 @@ def _chosen(catalogue: Catalogue, request: ReprocessRequest, root: Path) -> list
         fields = [one for one in fields if not is_whole(catalogue, one.run)]
     if request.stage is not None:
         check_stage(request.stage)
-        fields = [one for one in fields if _would_remake(catalogue, one, request, root)]
+        fields = [one for one in fields if _would_remake(catalogue, one, request, out)]
     return fields
 
 
-def _would_remake(catalogue: Catalogue, one: Generation, request: ReprocessRequest, root: Path) -> bool:
+def _would_remake(catalogue: Catalogue, one: Generation, request: ReprocessRequest, out: str) -> bool:
     try:
-        settings = asked_again(one.run, root, request.weights)
+        settings = asked_again(one.run, out, request.weights)
     except PipelineError:
         return True  # said when its turn comes
     return would_remake(catalogue, one.run, str(request.stage), settings)
@@ -134,7 +166,8 @@ def _again(
         "state": "failed", "message": None, "miou_before": _miou(run.receipt), "miou_after": None, "seconds": None,
     }  # fmt: skip
     try:
-        settings = asked_again(run, run.folder.parents[1], request.weights)
+        settings = asked_again(run, str(request.archive), request.weights)
+        settings = replace(settings, scheduler=request.crew.scheduler, workers=request.crew.workers)
         if is_current(catalogue, run, settings):
             return row | {"state": "skipped", "message": "is as it would become", "miou_after": row["miou_before"]}
         if request.dry_run:
@@ -181,5 +214,5 @@ def _show(content: Mapping[str, Any], file: Path | None) -> None:
     told = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
     count = f"{len(rows)} field{'' if len(rows) == 1 else 's'}: {told}"
     lines = [*map(_words, rows), count if rows else "no field matches: nothing to do"]
-    lines += [] if file is None or not rows else [f"  {file}"]
+    lines += [] if file is None else [f"  {file}"]
     sys.stdout.write("\n".join(lines) + "\n")

@@ -148,7 +148,8 @@ class StageRunner:
         wall, cpu, peak = meter.read() if state == "ran" else (None, None, None)
         bytes_in = sum(size(given) for given in inputs)
         key, bytes_out = ("", 0) if ref is None else (ref.key, size(ref))
-        return StageRecord(stage, key, state, wall, cpu, peak, bytes_in, bytes_out)
+        known = None if ref is None else self.run.archive.manifest_hash(ref)
+        return StageRecord(stage, key, state, wall, cpu, peak, bytes_in, bytes_out, known)
 
 
 class _Meter:

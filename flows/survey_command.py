@@ -25,12 +25,15 @@ def run_survey(settings: Settings, console: Console) -> Published:
         run.archive.reclaim()  # what a killed run left half made
     for note in run.notes:
         console.print(f"[dim]note: {escape(note)}[/]", highlight=False)
-    with run.archive.in_use():
+    with run.archive.in_use(), settings.crew.open():
         published = _survey_and_publish(run, settings, console, started)
     print_table(published.receipt, console)
     console.print(escape(headline(published.receipt, published.looked_twice)), highlight=False)
     for sentence in sentences(published.receipt):
         console.print(escape(sentence), highlight=False)
+    if run.archive.in_bucket:
+        address = f"{run.archive.name}/runs/{published.folder.name}"
+        console.print(f"  {escape(address)}, and on this machine", highlight=False, soft_wrap=True)
     for name in ("report.html", "quicklook.png", "receipt.json"):
         console.print(f"  {escape(str(published.folder / name))}", highlight=False, soft_wrap=True)
     return published

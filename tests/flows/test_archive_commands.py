@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import shlex
 import shutil
+import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -13,11 +15,14 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from flows import archive_tables
 from flows.archive_commands import DONE, FAILED, PARTLY, run_explain, run_gc, run_ls, run_verify
 from flows.archive_contents import command, contents
+from flows.figures import DASH
 from flows.settings import load_settings
 from pipeline.errors import ArchiveError
 from storage.archive import Archive
+from storage.lineage import Catalogue
 from tests.conftest import Survey
 from tests.storage.small_archive import flip, small_survey
 
@@ -63,11 +68,38 @@ def test_ls_shows_runs_and_stores(surveyed: Path, capsys: pytest.CaptureFixture[
     assert "2 runs, 13 stores" in out
 
 
+def test_of_many_stores_the_newest_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """And how many older ones there are; those that are missing are not counted as there."""
+    archive = Archive.open(tmp_path)
+    for number in range(archive_tables.MOST_ROWS + 2):
+        with archive.publish("segment", f"key{number:02d}", inputs=["gone"]):
+            pass
+        time.sleep(0.002)
+    run_ls(tmp_path)
+    out = capsys.readouterr().out
+    assert "and 2 older" in out
+    assert ("key01" in out, "key02" in out, "key21" in out) == (False, True, True)
+    content = _json(capsys, lambda: run_verify(tmp_path, QUIET, as_json=True), FAILED)
+    assert content["checked"] == content["whole"] == archive_tables.MOST_ROWS + 2
+
+
 def test_ages_are_told_in_days(surveyed: Path) -> None:
     """And a clock that was set back gives no error."""
     for days in (3, -3):
         content = contents(Archive.open(surveyed), datetime.now(UTC) + timedelta(days=days))
         assert content["stages"]["rectify"][0]["age_s"] == pytest.approx(days * 86400, abs=1000)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [
+        (None, DASH), (-5, "0.00 s"), (59, "59 s"), (119, "119 s"), (120, "2 min"), (7199, "119 min"), (7200, "2 h"),
+        (2 * 86400 - 1, "47 h"), (2 * 86400, "2 days"), (4000 * 86400.0, "4000 days"),
+    ],
+)  # fmt: skip
+def test_ages_are_short(seconds: float | None, words: str) -> None:
+    """One number and one unit."""
+    assert archive_tables._age(seconds) == words
 
 
 def test_an_empty_and_a_damaged_archive_are_listed(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -204,6 +236,26 @@ def test_verify_says_what_it_could_not_repair(archive: Path, capsys: pytest.Capt
     assert [ref.uri for ref in opened.refs()] == before
 
 
+def test_a_repair_that_could_do_some_of_it_says_so(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What is not of the archive is left to people, and so is raw light of a rig: done in part."""
+    opened = Archive.open(archive)
+    flip(opened.refs("rectify")[0].path / "lines.json")
+    (archive / "stages" / "notes.txt").write_text("mine")
+    content = _json(capsys, lambda: run_verify(archive, QUIET, as_json=True), FAILED)
+    assert content["checked"] - content["whole"] == 1
+    content = _json(capsys, lambda: run_verify(archive, QUIET, remake=True, as_json=True), PARTLY)
+    assert content["repair"]["complete"]
+    (archive / "stages" / "notes.txt").unlink()
+    with opened.publish("ingest", "cube") as staged:
+        (staged.path / "data.bin").write_bytes(b"light")
+    for path in (opened.refs("rectify")[0].path / "lines.json", archive / "stages/ingest/cube/data.bin"):
+        flip(path)
+    content = _json(capsys, lambda: run_verify(archive, QUIET, remake=True, as_json=True), PARTLY)
+    assert "restore them from a copy" in content["repair"]["hopeless"]["stages/ingest/cube"]
+    content = _json(capsys, lambda: run_verify(archive, QUIET, remake=True, as_json=True), FAILED)
+    assert [one["uri"] for one in content["problems"]] == ["stages/ingest/cube"]
+
+
 def test_progress_is_told_on_the_console(surveyed: Path) -> None:
     """Not on stdout, which is for the answer."""
     told = io.StringIO()
@@ -214,6 +266,41 @@ def test_progress_is_told_on_the_console(surveyed: Path) -> None:
 def test_commands_ask_for_the_settings_again(tmp_path: Path) -> None:
     """Only what differs from the defaults; tables are pointed at."""
     flags = {"scene": "farm", "size": "640x512", "bands": "3,4", "controls": False, "camera.exposure_ms": 50}
-    told = command({**load_settings(None, flags).to_dict(), "notes": ["x"]})
+    told = command({**load_settings(None, flags).to_dict(), "notes": ["x"]}, "archive")
     assert told == ("spectralzoom survey --bands 3,4 --no-controls --size 640x512  (with [camera] as in its receipt)")
-    assert command({}) == ""
+    assert command({}, "archive") == ""
+
+
+def test_commands_name_the_archive_in_hand(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Not where it lay when the survey ran: pasted, they work on what was asked about."""
+    moved = archive.rename(archive.with_name("moved away"))
+    run = Archive.open(moved).runs()[0]
+    told = [_json(capsys, lambda: run_explain(moved, run.name, as_json=True))["run"]["command"]]
+    flip(run / "quicklook.png")
+    told += [one["command"] for one in _json(capsys, lambda: run_verify(moved, QUIET, as_json=True), FAILED)["surveys"]]
+    assert len(told) == 2
+    for words in map(shlex.split, told):
+        assert words[words.index("--out") + 1] == str(moved)
+
+
+def test_an_archive_surveyed_by_relative_paths_is_repaired_from_anywhere(
+    tmp_path: Path, survey_png: Survey, scene_files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A receipt tells whole paths; what was asked for from one folder can be asked for from another."""
+    monkeypatch.chdir(scene_files)
+    survey_png(tmp_path / "archive", scene="scene.png", labels="labels.png")
+    (drawn,) = Archive.open(tmp_path / "archive").refs("segment")
+    flip(drawn.path / "class_map.zarr/zarr.json")
+    monkeypatch.chdir(tmp_path)
+    assert run_verify(tmp_path / "archive", QUIET, remake=True) == DONE
+    for run in Catalogue.read(tmp_path / "archive").runs:
+        assert run.settings["scene"] == str(scene_files / "scene.png")
+        assert (run.settings["source"], run.settings["mask"]) == ("sim", None)
+
+
+def test_tables_of_a_plain_archive_fit_a_narrow_terminal(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """80 columns, into a pipe as well."""
+    run_ls(surveyed)
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= 80
+    assert "age" in out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.compare_command import _pair_of, find_run, run_compare
-from flows.difference_picture import OTHER, SAME, MapPair, change_rgb, draw_difference
-from pipeline.errors import ArchiveError, SceneError, ShapeError
+from flows.compare_command import _classes, _confidence, _pair_of, find_run, run_compare
+from flows.difference_picture import OTHER, SAME, MapPair, change_rgb, draw_difference, thin_changes
+from pipeline.errors import ArchiveError, SceneError, SettingsError, ShapeError
 from pipeline.grid import UNLABELLED
 from storage.archive import Archive
 from storage.class_maps import ClassMap
 from storage.lineage import Catalogue
+from storage.records import Run
 from tests.conftest import Survey, WeightsMaker
+from tests.storage.small_archive import flip
 
 POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 25.0, "tilt_deg": 50.0, "height_m": 14.0}
 
@@ -128,6 +131,51 @@ def test_runs_of_different_fields_are_refused(survey_png: Survey, scene_files: P
         run_compare(tmp_path / "archive", "nothing", "latest")
 
 
+def test_what_sets_two_farms_apart_is_told(tmp_path: Path) -> None:
+    """Seed and size stand in what a built-in scene is called by; its bands are of the camera."""
+    archive = Archive.open(tmp_path)
+    for size in ("96x64", "96x96"):
+        receipt = {"scene": f"farm@1/seed=0/shape={size}/bands=9", "settings": {"scene": "farm", "seed": 0}}
+        with archive.new_run("farm") as draft:
+            draft.write_file("receipt.json", json.dumps(receipt | {"products": {"class_map": "stages/segment/aaaa/m"}}))
+    old, new = (path.name for path in archive.runs())
+    with pytest.raises(SceneError, match=r"shape=96x64, runs/.*shape=96x96;"):
+        run_compare(tmp_path, old, new)
+
+
+def test_a_map_that_cannot_be_believed_is_not_compared(surveyed: Path, tmp_path: Path) -> None:
+    """Though its numbers can still be read."""
+    archive = Path(shutil.copytree(surveyed, tmp_path / "archive"))
+    address = Catalogue.read(archive).runs[-1].products["class_map"]
+    flip(archive / address.rpartition("/")[0] / "manifest.json", at=40)
+    with pytest.raises(ArchiveError, match=r"the class map .* is missing or damaged; run verify --repair"):
+        run_compare(archive, "previous", "latest", tmp_path)
+
+
+def test_previous_is_the_run_just_before(tmp_path: Path) -> None:
+    """Of the same field, whatever lies between; runs without a map do not count."""
+    archive = Archive.open(tmp_path)
+    made = []
+    for seed, product in ((0, "class_map"), (0, "class_map"), (0, "plan"), (1, "class_map"), (0, "class_map")):
+        receipt = {"scene": f"farm@1/seed={seed}", "settings": {"scene": "farm", "seed": seed}}
+        with archive.new_run("farm") as draft:
+            draft.write_file("receipt.json", json.dumps(receipt | {"products": {product: "stages/segment/aaaa/m"}}))
+            made.append(draft.id)
+    catalogue = Catalogue.read(tmp_path)
+    assert [find_run(catalogue, text).folder.name for text in ("latest", "previous")] == [made[4], made[1]]
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused(surveyed: Path, tmp_path: Path) -> None:
+    """And is left as it is."""
+    (tmp_path / "mine").write_text("mine")
+    with pytest.raises(SettingsError, match="lies in the archive, where nothing else belongs"):
+        run_compare(surveyed, "previous", "latest", surveyed / "runs")
+    for out in (tmp_path / "mine", tmp_path / "mine" / "below"):
+        with pytest.raises(ArchiveError, match=r"mine.* is or lies below a file, expected a folder; choose another"):
+            run_compare(surveyed, "previous", "latest", out)
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
 def test_an_empty_archive_has_no_latest(tmp_path: Path) -> None:
     """It says so."""
     Archive.open(tmp_path)
@@ -141,11 +189,36 @@ def test_classes_are_matched_by_name() -> None:
     classes[0, 0] = UNLABELLED
     order = np.full(256, UNLABELLED, np.uint8)
     order[:3] = (2, 0, 1)
-    pair = _pair_of([_map(classes, ("a", "b", "c")), _map(order[classes], ("b", "c", "a", "d"))])
+    pair = _pair_of([_map(classes, ("a", "b", "c")), _map(order[classes], ("b", "c", "a", "d"), seed=1)])
     assert pair.maps.names == ("a", "b", "c", "d")
+    np.testing.assert_array_equal(pair.maps.colours[:3], _map(classes, ("a", "b", "c")).colours)
     np.testing.assert_array_equal(pair.maps.old, pair.maps.new)
     assert not pair.maps.pairs
     assert np.trace(pair.joint) == classes.size
+
+
+def test_hectares_are_told_where_both_runs_have_them() -> None:
+    """One map on the ground alone has nothing beside it."""
+    pair = _pair_of([_map(np.zeros((2, 2)), ("a",)) for _ in range(2)])
+    posed, bare = (
+        Run(Path("x"), {}, receipt, None, frozenset()) for receipt in ({"ground": {"areas_ha": {"a": 2.5}}}, {})
+    )
+    assert ["ha" in row for runs in ((posed, bare), (bare, posed), (bare, bare)) for row in _classes(runs, pair)] == [
+        False
+    ] * 3
+    (row,) = _classes((posed, posed), pair)
+    assert (row["ha"], row["pixels"], row["iou"]) == ([2.5, 2.5], [4, 4], 1.0)
+
+
+def test_confidence_is_compared_where_both_have_a_class() -> None:
+    """Means, change from A to B, and the share that rose; none where there is nothing to compare."""
+    old, new = (np.array(values, np.float32) for values in ([0.5, 0.5, np.nan, 0.5, 0.9], [0.75, 0.5, 1, np.nan, 0.95]))
+    found = _confidence(old, new)
+    assert found["a"] == pytest.approx(1.9 / 3)
+    assert found["b"] == pytest.approx(2.2 / 3)
+    assert found["change"] == pytest.approx(0.1)
+    assert found["rose"] == pytest.approx(2 / 3)
+    assert set(_confidence(old[2:3], new[2:3]).values()) == {None}
 
 
 def test_maps_of_different_sizes_are_refused() -> None:
@@ -167,6 +240,21 @@ def test_changes_have_colours_of_their_own() -> None:
     np.testing.assert_array_equal((picture == np.float32(SAME)).all(axis=-1), old == new)
     assert (picture == np.float32(OTHER)).all(axis=-1).any()
     assert (maps.name(0), maps.name(UNLABELLED)) == ("a", "no class")
+
+
+@pytest.mark.parametrize(("step", "shape"), [(1, (6, 9)), (3, (2, 3)), (4, (2, 3)), (20, (1, 1))])
+def test_no_change_is_left_out_of_a_thinned_picture(step: int, shape: tuple[int, int]) -> None:
+    """A block shows a change where it holds any, with both of its classes, and else its first pixel."""
+    old = np.arange(54, dtype=np.uint8).reshape(6, 9) % 5
+    new = old.copy()
+    new[4, 8] = 7
+    maps = thin_changes(MapPair(old, new, tuple("abcdefgh"), np.zeros((8, 3), np.uint8), [(4, 7, 1)]), step)
+    assert maps.old.shape == maps.new.shape == shape
+    (place,) = np.argwhere(maps.old != maps.new)
+    assert tuple(place) == (4 // step, 8 // step)
+    assert (maps.old[tuple(place)], maps.new[tuple(place)]) == (old[4, 8], 7)
+    if step == 3:
+        np.testing.assert_array_equal(maps.old[0], old[0, ::3])
 
 
 def test_wide_tall_and_equal_maps_are_drawn() -> None:

@@ -25,6 +25,7 @@ from storage.archive import Archive
 from storage.cog_files import cog_problems
 from storage.envi_cubes import open_envi_cube
 from storage.stac_items import stac_problems
+from tests.storage.stac_rules import extension_problems
 
 rasterio = pytest.importorskip("rasterio", reason="exports are written with rasterio, of the extra [geo]")
 pystac = pytest.importorskip("pystac", reason="exports are described with pystac, of the extra [geo]")
@@ -206,6 +207,7 @@ def test_the_catalogue_is_valid_and_leads_to_every_file(exports: list[Exported])
     assert [item.id for item in items] == [done.id for done in exports]
     for done, item in zip(exports, items, strict=True):
         assert stac_problems(done.item()) == []
+        assert extension_problems(done.item()) == []
         for asset in item.assets.values():
             target = Path(str(asset.get_absolute_href()))
             assert (target / "zarr.json").is_file() if "zarr" in asset.media_type else target.is_file()
@@ -279,6 +281,22 @@ def test_places_that_cannot_be_written_are_refused(posed: Exported, tmp_path: Pa
             run_export(posed.archive, None, out, envi=False, console=QUIET)
     assert (tmp_path / "file").read_text() == "mine"
     assert all(finding.problem is None for finding in Archive.open(posed.archive).verify_all())
+
+
+def test_a_run_goes_by_the_names_that_other_verbs_give_it(posed: Exported, tmp_path: Path) -> None:
+    """Its address, with a slash or without, and latest."""
+    for run in (f"runs/{posed.id}", f"{posed.id}/", "latest"):
+        assert run_export(posed.archive, run, tmp_path / "out", envi=False, console=QUIET)["run"] == posed.id
+
+
+def test_a_changed_receipt_is_not_believed(posed: Exported, tmp_path: Path) -> None:
+    """Readable as it is: what it says is not what was published."""
+    archive = tmp_path / "field-a"
+    shutil.copytree(posed.archive, archive)
+    receipt = archive / "runs" / posed.id / "receipt.json"
+    receipt.write_text(receipt.read_text().replace('"seed": 1', '"seed": 2', 1))
+    with pytest.raises(IncompleteStoreError, match=r"is damaged: receipt.json has changed .*run verify"):
+        run_export(archive, posed.id, tmp_path / "out", envi=False, console=QUIET)
 
 
 @pytest.mark.parametrize("package", ["rasterio", "pystac"])

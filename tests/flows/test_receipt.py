@@ -53,7 +53,7 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         }
     ]
     stages = [
-        StageRecord("capture", "ab12", "ran", wall, wall, 10**9, 0, 10**8),
+        StageRecord("capture", "ab12", "ran", wall, wall, 10**9, 0, 10**8, f"{wall:064}"),  # a manifest holds times
         StageRecord("rectify", "cd34", "cached"),
     ]
     header = Header(

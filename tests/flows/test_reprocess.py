@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import io
 import json
 import shutil
+import time
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +21,7 @@ from flows import generations
 from flows.archive_commands import DONE, FAILED, PARTLY, run_verify
 from flows.reprocess_command import ReprocessRequest, _survey, run_reprocess
 from flows.settings import Settings
-from pipeline.errors import SettingsError, WeightsError
+from pipeline.errors import ArchiveError, SettingsError, WeightsError
 from pipeline.simulator.farm import CLASSES
 from storage.archive import Archive
 from storage.lineage import Catalogue
@@ -194,6 +198,23 @@ def test_fields_are_chosen(surveyed: Path, reprocess: Reprocess) -> None:
             run_reprocess(ReprocessRequest(surveyed, **wishes), QUIET)
 
 
+def test_a_date_counts_from_its_first_moment_in_utc(
+    surveyed: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wherever the clock on the wall is, and the moment itself included."""
+    newest = Catalogue.read(surveyed).runs[-1].created
+    monkeypatch.setenv("TZ", "UTC-14")
+    time.tzset()
+    try:
+        for since in (newest, newest.removesuffix("+00:00")):
+            assert reprocess.states(surveyed, since=since) == [("scene", "skipped")]
+        later = (datetime.fromisoformat(newest) + timedelta(milliseconds=1)).isoformat()
+        assert reprocess(surveyed, since=later) == []
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+
+
 def test_a_dry_run_leaves_everything(surveyed: Path, other: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It says what would run, for people on stdout and its progress on the console."""
     before = sorted(path for path in surveyed.rglob("*") if ".locks" not in path.parts)
@@ -202,7 +223,103 @@ def test_a_dry_run_leaves_everything(surveyed: Path, other: Path, capsys: pytest
     out = capsys.readouterr().out
     assert "2 fields: 2 would run" in out
     assert "reprocess 1 of 2: turned" in told.getvalue()
+    assert list(surveyed.parent.glob("reprocess-*")) == []
     assert sorted(path for path in surveyed.rglob("*") if ".locks" not in path.parts) == before
+
+
+def test_the_summary_tells_what_was_asked_and_what_became_of_it(
+    archive: Path, other: Path, tmp_path: Path, reprocess: Reprocess
+) -> None:
+    """Beside the archive, there before the first field is begun, and never in another's place."""
+
+    def read(settings: Settings, console: Console) -> Path:
+        told = json.loads(next(tmp_path.glob("reprocess-*.json")).read_text())
+        seen.append((told["finished"], [row["state"] for row in told["fields"]]))
+        raise WeightsError("no")
+
+    seen: list[Any] = []
+    reprocess(archive, FAILED, survey=read, weights=other, field="*n*")
+    assert seen == [(None, []), (None, ["failed"])]
+    (file,) = tmp_path.glob("reprocess-*.json")
+    told = json.loads(file.read_text())
+    assert told["finished"] >= told["started"]
+    assert (told["archive"], told["dry_run"]) == (str(archive), False)
+    asked = told["asked"]
+    assert (asked["field"], asked["since"], asked["stage"], asked["failed"]) == ("*n*", None, None, False)
+    assert asked["weights"] == str(other)
+    assert asked["weights_key"] == hashlib.sha256(other.read_bytes()).hexdigest()[:20]
+    for _ in range(3):
+        assert len(reprocess(archive, out=tmp_path / "told")) == 2
+    assert len(list((tmp_path / "told").iterdir())) == 3
+    assert {row["state"] for row in reprocess(archive)} == {"skipped"}  # nothing to tell, and nobody asked for a file
+    assert list(tmp_path.glob("reprocess-*.json")) == [file]
+
+
+def test_a_place_that_cannot_hold_the_summary_is_refused_first(
+    archive: Path, other: Path, tmp_path: Path, reprocess: Reprocess
+) -> None:
+    """Before anything is surveyed."""
+    (tmp_path / "mine").write_text("mine")
+    with pytest.raises(SettingsError, match="lies in the archive, where nothing else belongs"):
+        run_reprocess(ReprocessRequest(archive, weights=other, out=archive / "runs"), QUIET)
+    request = ReprocessRequest(archive, weights=other, out=tmp_path / "mine")
+    with pytest.raises(ArchiveError, match="expected a folder; choose another --out"):
+        run_reprocess(request, QUIET, survey=lambda settings, console: pytest.fail("surveyed"))
+
+
+def test_a_stage_is_made_anew_with_what_it_rests_on(
+    surveyed: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a newer mosaic come a newer map and the same raw light."""
+    monkeypatch.setitem(generations.VERSIONS, "rectify", generations.VERSIONS["rectify"] + 1)
+    assert len(reprocess(surveyed, stage="segment", dry_run=True)) == 2
+    assert reprocess(surveyed, stage="capture_coarse", dry_run=True) == []
+
+
+def test_a_run_is_current_only_where_all_of_it_is_there(archive: Path) -> None:
+    """With its own folder and without a stage that failed; what it asked for stands in its manifest too."""
+    run = Catalogue.read(archive).runs[-1]
+    settings = generations.asked_again(run, archive, None)
+    assert generations.is_current(Catalogue.read(archive), run, settings)
+    failed = {**run.receipt, "stages": [*run.stages[:-1], {**run.stages[-1], "state": "failed"}]}
+    assert not generations.is_whole(Catalogue.read(archive), dataclasses.replace(run, receipt=failed))
+    flip(run.folder / "receipt.json")
+    damaged = Catalogue.read(archive).runs[-1]
+    assert generations.asked_again(damaged, archive, None) == settings
+    assert not generations.is_current(Catalogue.read(archive), damaged, settings)
+
+
+def test_runs_that_do_not_tell_what_they_asked_for_are_fields_of_their_own(tmp_path: Path) -> None:
+    """Nobody knows whether one took the place of the other."""
+    archive = Archive.open(tmp_path)
+    for asked in ({}, {}, {"seed": 1}, {"seed": 2}, {"seed": 1, "budget": 0.4}):
+        archive.new_run("farm").publish(survey="farm", settings=asked)
+    runs = Catalogue.read(tmp_path).runs
+    assert [one.run for one in generations.newest_runs(Catalogue.read(tmp_path))] == [runs[n] for n in (0, 1, 3, 4)]
+
+
+def test_only_the_star_stands_for_other_letters(surveyed: Path) -> None:
+    """Brackets and question marks are themselves, as in the names of files."""
+    (one, _) = generations.newest_runs(Catalogue.read(surveyed))
+    odd = dataclasses.replace(one, field="field[1]?.png")
+    for pattern in ("field[1]?.png", "*[1]*", "*"):
+        assert generations.is_called(odd, pattern)
+    for pattern in ("field1?.png", "fiel?[1]?.png", "Field*"):
+        assert not generations.is_called(odd, pattern)
+
+
+def test_fields_of_one_file_name_are_told_apart(
+    tmp_path: Path, survey_png: Survey, scene_files: Path, monkeypatch: pytest.MonkeyPatch, reprocess: Reprocess
+) -> None:
+    """Two folders with a scene.png each: relative paths alone would take them for one field."""
+    (tmp_path / "b").mkdir()
+    with Image.open(scene_files / "scene.png") as image:
+        image.transpose(Image.Transpose.ROTATE_180).save(tmp_path / "b" / "scene.png")
+    for folder in (scene_files, tmp_path / "b"):
+        monkeypatch.chdir(folder)
+        survey_png(tmp_path / "archive", scene="scene.png", labels=None)
+    monkeypatch.chdir(tmp_path)
+    assert reprocess.states(tmp_path / "archive") == [("scene", "skipped")] * 2
 
 
 def test_an_older_farm_law_is_not_current(tmp_path: Path, survey_png: Survey, make_weights: WeightsMaker,

@@ -160,6 +160,8 @@ def test_memory_reads_units(text, count):
     [
         ({"memory": "four"}, "such as 4GiB"),
         ({"memory": "4"}, "at least 256MiB"),
+        ({"scheduler": "dask"}, "'scheduler': .* threads, processes, or the address of a dask scheduler such as tcp:"),
+        ({"workers": 0}, "a whole number from 1 to 1024, got 0; one process or thread each"),
         ({"rounds": 2}, "rounds' must be 1, got 2; this version"),
         ({"seed": -1}, "whole number from 0"),
         ({"seed": 1.0}, "whole number from 0"),

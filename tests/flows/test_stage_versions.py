@@ -1,7 +1,9 @@
 """A stage's code does not change without its version: what an archive holds would otherwise pass for the new result.
 
-After a change, either raise the stage's number in ``flows.stages.VERSIONS`` or, where the change has no effect on what
-the stage writes, keep it; then record the code as it is:  python tests/flows/test_stage_versions.py
+After a change, either raise the stage's number in ``flows.stages.VERSIONS`` (that of ingest in its command) or, where
+the change has no effect on what the stage writes, keep it; then record the code as it is:
+
+    python tests/flows/test_stage_versions.py
 """
 
 from __future__ import annotations
@@ -13,46 +15,57 @@ from pathlib import Path
 
 import pytest
 
-from flows.stages import VERSIONS
+from flows import ingest_command, stages
+
+VERSIONS = {**stages.VERSIONS, ingest_command.STAGE: ingest_command.VERSION}
 
 ROOT = Path(__file__).parents[2]
 RECORD = Path(__file__).with_name("stage_digests.json")
 GEOMETRY = ("pipeline/camera.py", "pipeline/mirror.py", "pipeline/scan.py", "pipeline/coverage.py", "pipeline/grid.py",
             "pipeline/vector_memory.py")  # fmt: skip
 RECTIFY = (*GEOMETRY, "pipeline/rectify")
-READ = ("models/spectral.py", "models/tokens.py", "models/encoder.py", "models/patches.py", "models/segmenter.py",
-        "models/inference.py", "models/weights.py", "pipeline/grid.py")  # fmt: skip
+READ = ("models/spectral.py", "models/sizes.py", "models/tokens.py", "models/encoder.py", "models/patches.py",
+        "models/segmenter.py", "models/inference.py", "models/regions.py", "models/weights.py", "pipeline/grid.py",
+        "flows/region_work.py", "storage/mosaic_strips.py")  # fmt: skip
 PLANNING = ("pipeline/planning.py", "pipeline/runs.py", "pipeline/covering.py", "pipeline/spending.py",
             "pipeline/strips.py", "pipeline/orientation.py", "pipeline/crop_rows.py")  # fmt: skip
 GATHER = ("pipeline/rectify/resample.py", "pipeline/rectify/kernels.py", "pipeline/rectify/line_table.py",
           "pipeline/rectify/alignment.py")  # fmt: skip
+READERS = ("storage/scan_files.py", "storage/envi_header.py", "storage/envi_cubes.py", "storage/headwall_folders.py",
+           "storage/frame_index.py", "storage/zarr_scenes.py", "storage/raster_files.py", "storage/rasters.py",
+           "storage/tiff_files.py", "storage/array_files.py", "storage/mat_files.py", "storage/dataset_layouts.py",
+           "storage/wavelengths.py", "storage/scene_toml.py")  # fmt: skip
 SOURCES = {
     "capture": (*GEOMETRY, *GATHER, "pipeline/simulator", "storage/cubes.py"),
-    "register": (*RECTIFY, "flows/pointing_stage.py"),
-    "locate": (*RECTIFY, "storage/lookups.py"),
-    "rectify": (*RECTIFY, "storage/mosaics.py", "storage/tile_work.py"),
-    "attend": (*READ, *PLANNING, "models/policies.py", "storage/attention.py"),
-    "patches": (*RECTIFY, "pipeline/strips.py", "storage/patches.py"),
-    "segment": (*READ, "storage/class_maps.py"),
+    "register": (*RECTIFY, "storage/sightings.py", "flows/pointing_stage.py"),
+    "locate": (*RECTIFY, "storage/sightings.py", "storage/lookups.py"),
+    "rectify": (*RECTIFY, "storage/sightings.py", "storage/mosaics.py", "storage/mosaic_work.py",
+                "storage/tile_work.py"),
+    "attend": (*READ, *PLANNING, "flows/field_work.py", "models/policies.py", "storage/attention.py"),
+    "patches": (*RECTIFY, "pipeline/strips.py", "storage/sightings.py", "storage/patches.py"),
+    "segment": (*READ, "flows/field_work.py", "storage/class_maps.py"),
     "ground": ("pipeline/ground.py", "pipeline/ground_grid.py", "pipeline/projection.py", *GATHER,
-               "storage/georeference.py", "storage/ground_maps.py", "flows/ground_stage.py", "flows/panels.py"),
+               "storage/georeference.py", "storage/ground_maps.py", "flows/ground_stage.py", "flows/panels.py",
+               "flows/tones.py"),
     "evaluate": (*READ, *RECTIFY, *PLANNING, "models/controls.py", "models/metrics.py", "models/policies.py",
                  "pipeline/savings.py", "pipeline/selection.py", "flows/evaluation.py", "flows/full_look.py"),
+    "ingest": (*READERS, "storage/cube_sources.py", "storage/ingested_cubes.py"),
 }  # fmt: skip
 STAGES_FILE, PLACEMENT = "flows/stages.py", "flows/placement.py"
 FUNCTIONS: dict[str, dict[str, tuple[str, ...]]] = {  # of files that several stages share
     "capture": {STAGES_FILE: ("_capture", "_capture_sweep")},
-    "register": {PLACEMENT: ("Sighted", "sighted"), STAGES_FILE: ("captured",)},
-    "locate": {PLACEMENT: ("Sighted", "sighted", "locate"), STAGES_FILE: ("captured",)},
-    "rectify": {PLACEMENT: ("Sighted", "sighted", "rectify", "_with_tables", "_preview"), STAGES_FILE: ("captured",)},
-    "attend": {STAGES_FILE: ("glance_at", "attend", "_crop_rows")},
+    "register": {PLACEMENT: ("sighted",), STAGES_FILE: ("captured",)},
+    "locate": {PLACEMENT: ("sighted", "locate"), STAGES_FILE: ("captured",)},
+    "rectify": {PLACEMENT: ("rectify", "_record")},
+    "attend": {STAGES_FILE: ("attend", "_scores", "_crop_rows")},
     "patches": {
-        PLACEMENT: ("Sighted", "sighted", "cut_patches", "_along_scan"),
+        PLACEMENT: ("sighted", "cut_patches", "_along_scan"),
         STAGES_FILE: ("load_plan", "captured"),
     },
-    "segment": {STAGES_FILE: ("glance_at", "patch_columns", "draw_map")},
+    "segment": {STAGES_FILE: ("draw_map",)},
     "ground": {},
     "evaluate": {STAGES_FILE: ("glance_at", "patch_columns")},
+    "ingest": {"flows/ingest_command.py": ("hash_files", "_opened", "_key")},
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,6 +78,10 @@ def test_receipt_has_every_field(farm: Done) -> None:
     assert [name for name, state in states.items() if state == "ran"] == STAGES
     ran = [stage for stage in receipt["stages"] if stage["state"] == "ran"]
     assert all(stage["wall_s"] > 0 and stage["peak_rss_bytes"] > 0 for stage in ran)
+    for stage in ran:
+        (manifest,) = farm.archive.glob(f"stages/*/{stage['key']}/manifest.json")
+        assert stage["manifest_sha256"] == hashlib.sha256(manifest.read_bytes()).hexdigest()
+    assert all(stage["manifest_sha256"] is None for stage in receipt["stages"] if stage["state"] == "skipped")
     assert set(receipt["accuracy"]["controls"]) == {"entropy", "sobel", "random"}
     assert 0 <= receipt["accuracy"]["miou"] <= 1
     assert {row["name"] for row in receipt["effects"]} >= {"slit", "smear", "shot", "read", "quantisation"}
