@@ -11,14 +11,15 @@ from __future__ import annotations
 
 import logging
 import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from datetime import datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from pipeline.errors import ArchiveError
 from storage.addresses import StageRef, in_text, store_at
-from storage.archive import Archive, StagedStore
+from storage.archive import Archive
 from storage.archive_folder import open_folder
 from storage.manifests import check_files
 from storage.object_copies import KNOWN, WorkingCopy
@@ -26,8 +27,9 @@ from storage.object_leases import Lease, take_lease
 from storage.object_places import UnreachableError, connect, parse_place
 from storage.object_refs import RemoteRef, RemoteRun
 from storage.object_stores import Objects
+from storage.object_transfers import BEGUN
 from storage.run_folders import RunDraft
-from storage.staging import rename_into_place, retire
+from storage.staging import refusals
 from storage.verification import Finding, Progress
 
 MARK = "archive.json"  # at the prefix: here is an archive
@@ -73,52 +75,25 @@ class ObjectArchive(Archive):
         IncompleteStoreError : it is there, but its manifest is damaged, or a file that is nowhere else.
         """
         ref = self.ref(stage, key)
-        if self.copy.is_known(ref.uri):
-            return ref
-        if not self._while_answering(lambda: self.copy.look_up(ref.uri), False) and not self._folder(ref).exists():
-            return None
-        self._send(ref)
+        folder = self.root / ref.uri
+        if not self.copy.is_whole(ref.uri) and not self._while_answering(lambda: self.copy.look_up(ref.uri), False):
+            if not folder.exists() or self.copy.is_known(ref.uri):  # cleared away there, or not to be had now
+                return None
+            check_files(folder, hashes=False)
+        self._send(ref.uri)
         return ref
 
-    def _send(self, ref: StageRef) -> None:
-        """Upload a store that waits; without its upload it has to be whole here."""
-        if not self.copy.is_known(ref.uri):
-            check_files(self._folder(ref), hashes=False)
-            if self.writes:
-                self._while_answering(lambda: self.copy.send(ref.uri), None)
-
-    def _folder(self, ref: StageRef) -> Path:
-        return self.root / ref.uri
-
-    @contextmanager
-    def publish(
-        self,
-        stage: str,
-        key: str,
-        *,
-        version: int | str = 1,
-        params: Mapping[str, Any] | None = None,
-        inputs: Sequence[str] | Mapping[str, str] = (),
-        work: float | None = None,
-    ) -> Iterator[StagedStore]:
-        """Give a folder to write into; when the block ends well publish it here, then in the bucket.
-
-        Raises
-        ------
-        UnreachableError : the bucket refuses or does not answer; the store is kept, and uploaded by the next run.
-            Within `in_use` this is said at the end of it.
-        """
-        with super().publish(stage, key, version=version, params=params, inputs=inputs, work=work) as staged:
-            yield staged
-        if not staged.done:
-            self._send(staged.ref)
-            if self._lease is not None:
-                self._while_answering(self._lease.renew, None)
+    def _send(self, uri: str) -> None:
+        """Upload a store that waits; within `in_use` a bucket that does not answer is told of at the end of it."""
+        if self.writes and not self.copy.is_known(uri):
+            self._while_answering(lambda: self.copy.send(uri), None)
 
     def _put_in_place(self, part: Path, final: Path) -> None:
-        if self.copy.is_known(final.relative_to(self.root).as_posix()):  # brought meanwhile by another process here
-            retire(final)
-        rename_into_place(part, final)
+        uri = final.relative_to(self.root).as_posix()
+        self.copy.put_in_place(part, uri)
+        self._send(uri)
+        if self._lease is not None:
+            self._while_answering(self._lease.renew, None)
 
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
         """`manifest_hash` by address, of stores and of all they rest on, each of which is in the bucket then."""
@@ -148,9 +123,11 @@ class ObjectArchive(Archive):
         UnreachableError : at the end, where the bucket stopped answering: all is kept here, and what to do is said.
         """
         with super().in_use(alone=alone) as free:
-            lease = take_lease(self.objects, self.root, alone=alone) if free and self.trouble is None else None
+            lease = self._take_lease(alone=alone) if free and self.trouble is None else None
             outer, self._lease = self._lease, lease or self._lease
             try:
+                if alone and lease is not None:  # what others have published since this was opened counts
+                    self.copy.forget_all_but(self.copy.mirror())
                 yield free and (lease is not None or (self.trouble is not None and not alone))
             finally:
                 self._lease = outer
@@ -159,8 +136,24 @@ class ObjectArchive(Archive):
                         lease.end()
         if self.trouble is not None:
             raise UnreachableError(
-                f"{self.trouble}; what was made is kept in {self.root}: the same command uploads it and goes on"
+                f"{self.trouble}; what was made is kept in {self.root}: the same command uploads it and goes on",
+                passing=self.trouble.passing,
             )
+
+    def _take_lease(self, *, alone: bool) -> Lease | None:
+        with refusals(self.root, "write to the working copy"):
+            try:
+                return take_lease(self.objects, self.root, alone=alone)
+            except UnreachableError as error:
+                if alone or not error.passing:
+                    raise
+                self.go_on_without(error)
+                return None
+
+    def go_on_without(self, error: UnreachableError) -> None:
+        """Ask nothing of the bucket any more, but work on in the working copy."""
+        self.trouble = error
+        log.warning("%s; going on in %s", error, self.root)
 
     def _while_answering(self, work: Callable[[], Result], otherwise: Result) -> Result:
         """Do what needs the bucket; while the archive is in use, go on without it once it does not answer."""
@@ -171,20 +164,35 @@ class ObjectArchive(Archive):
         except UnreachableError as error:
             if self._lease is None:
                 raise
-            self.trouble = error
-            log.warning("%s; going on in %s", error, self.root)
+            self.go_on_without(error)
             return otherwise
+
+    def now(self) -> datetime:
+        """Time by the clock that dates the objects, as far as a lease tells it."""
+        return super().now() if self._lease is None or self._lease.taken is None else self._lease.taken
+
+    def catch_up(self, *, send: bool, mirror: bool) -> None:
+        """Upload what waits here where ``send``; bring manifests and receipts, and forget what is gone, where asked."""
+        if send and self.copy.waiting():
+            with self.in_use():  # or gc elsewhere may take what of it is there for an upload that was broken off
+                self.copy.send_waiting()
+        if mirror:
+            found = self.copy.mirror()
+            with super().in_use(alone=True) as free:
+                if free:  # or somebody here may be reading what would be forgotten
+                    self.copy.forget_all_but(found)
 
     # --- runs ---------------------------------------------------------------------------------------------------------
 
     def _begin_run(self, run_id: str) -> RunDraft | None:
+        claim = secrets.token_hex(8).encode()
+        standing = self._while_answering(lambda: self.objects.claim(f"runs/{run_id}/{BEGUN}", claim), None)
+        if self.trouble is not None:  # a name that nobody else takes meanwhile
+            run_id = f"{run_id}-{claim.decode()}"
+        elif standing != claim:  # another machine began a run of this name
+            return None
         draft = super()._begin_run(run_id)
         if draft is None:
-            return None
-        claim = secrets.token_hex(8).encode()
-        standing = self._while_answering(lambda: self.objects.claim(f"runs/{run_id}/begun", claim), claim)
-        if standing != claim:  # another machine began a run of this name
-            draft.abandon()
             return None
         run = RemoteRun(run_id, draft.folder, self.root, draft.abandon)
         run.send = self._send_run
@@ -202,12 +210,18 @@ class ObjectArchive(Archive):
         return verify_objects(self.objects, progress)
 
     def size_of(self, uri: str) -> int:
-        """Bytes of a store by its manifest."""
-        _, stage, key = uri.split("/")
-        return self.stored_bytes(store_at(self.root, stage, key))
+        """Bytes of all objects of a store."""
+        return sum(one.size for one in self.objects.listing(uri).values())
+
+    def lost_runs(self) -> list[str]:
+        """Addresses of runs in the bucket of which there are files, but no manifest, neither there nor here."""
+        from storage.object_checks import find_lost_runs
+
+        here = {f"runs/{folder.name}" for folder in self.runs()}
+        return [uri for uri in find_lost_runs(self.objects.listing("runs")) if uri not in here]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
-        """What uploads that were broken off left in the bucket for ``keep_days``: address and bytes."""
+        """What was broken off and has been in the bucket for ``keep_days``: address and bytes."""
         from storage.object_checks import find_leftovers
 
         return find_leftovers(self.objects, keep_days)
@@ -231,23 +245,23 @@ def open_object_archive(text: str | Path, *, create: bool = True, write: bool = 
     place = parse_place(text)
     root, objects = place.working_copy(), Objects(place, connect(place))
     archive = ObjectArchive(root, objects, writes=write)
+    can_go_on = create and write and (root / KNOWN).is_dir()
     try:
-        if create:
-            _begin(objects)
-        elif objects.read(MARK) is None:
-            raise ArchiveError(f"{place.url} is not there; check the name, or make an archive with survey --out")
+        _find_mark(objects, create=create)
+        _open_working_copy(root)
+        archive.catch_up(send=write, mirror=not create)
     except UnreachableError as error:
-        if not (create and write and error.passing and (root / KNOWN).is_dir()):
+        if not (can_go_on and error.passing):
             raise
-        archive.trouble = error
-        log.warning("%s; going on in %s", error, root)
-    open_folder(root, create=True, write=True)
-    (root / KNOWN).mkdir(exist_ok=True)
-    if write and archive.trouble is None:
-        archive.copy.send_waiting()
-    if not create:
-        archive.copy.mirror()
+        _open_working_copy(root)
+        archive.go_on_without(error)
     return archive
+
+
+def _open_working_copy(root: Path) -> None:
+    open_folder(root, create=True, write=True)
+    with refusals(root, "write to the working copy"):
+        (root / KNOWN).mkdir(exist_ok=True)
 
 
 def is_object_archive(text: str | Path) -> bool:
@@ -256,10 +270,21 @@ def is_object_archive(text: str | Path) -> bool:
     return Objects(place, connect(place)).read(MARK) is not None
 
 
-def _begin(objects: Objects) -> None:
-    """Write the mark that makes a prefix an archive, and see that the store lets nobody overwrite it."""
-    if objects.create(MARK, MARK_TEXT) and objects.create(MARK, MARK_TEXT):
-        raise ArchiveError(
-            f"{objects.place.url}: this store ignores conditional puts (If-None-Match), without which two surveys "
-            "would overwrite each other; use one that has them"
-        )
+def _find_mark(objects: Objects, *, create: bool) -> None:
+    """See that a prefix has the mark that makes it an archive; where ``create``, write it if need be.
+
+    A store that lets anybody overwrite it is refused.
+    """
+    name = objects.place.url
+    if create and objects.create(MARK, MARK_TEXT):
+        if objects.create(MARK, MARK_TEXT):
+            raise ArchiveError(
+                f"{name}: this store ignores conditional puts (If-None-Match), without which two surveys would "
+                "overwrite each other; use one that has them"
+            )
+        return
+    found = objects.read(MARK)
+    if found is None:
+        raise ArchiveError(f"{name} is not there; check the name, or make an archive with survey --out")
+    if found != MARK_TEXT:
+        raise ArchiveError(f"{name}/{MARK} is not as expected: what answers is no archive, or one of a later version")

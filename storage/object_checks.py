@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from storage.manifests import try_manifest
+from storage.object_leases import FOLDER as LEASES
 from storage.object_stores import Listed, Objects, some_at_a_time
-from storage.object_transfers import ATTEMPT, files_at, is_address
+from storage.object_transfers import ATTEMPT, BEGUN, WITHDRAWN, files_at, is_address
 from storage.records import RECEIPT
 from storage.shard_names import name_damage
-from storage.staging import MANIFEST_NAME
+from storage.staging import MANIFEST_NAME, refusals
 from storage.verification import Finding, Progress, verify_everything
 
 DAY_S = 86400.0
+_BEGUN = re.compile(rf"(runs/[^/]+)/{BEGUN}")
 
 
 def verify_objects(objects: Objects, progress: Progress | None = None) -> list[Finding]:
@@ -24,16 +28,39 @@ def verify_objects(objects: Objects, progress: Progress | None = None) -> list[F
     Nothing is taken from a working copy: manifests and receipts are fetched again, into a folder that goes away.
     """
     there = objects.listing()
-    with tempfile.TemporaryDirectory(prefix="spectralzoom-verify-") as name:
-        root = Path(name)
+    with _unpacked() as root:
         (root / "stages").mkdir()
         published = [path.removesuffix(f"/{MANIFEST_NAME}") for path in there if _is_manifest(path)]
         some_at_a_time(lambda uri: _lay_out(objects, root, uri), published)
 
         def problems(folder: Path) -> Iterator[str]:
-            yield from _problems(objects, there, root, folder.relative_to(root).as_posix())
+            uri = folder.relative_to(root).as_posix()
+            text = (folder / MANIFEST_NAME).read_bytes()
+            found = list(_problems(objects, there, folder, files_at(uri, text)))
+            if found and objects.read(f"{uri}/{MANIFEST_NAME}") == text:  # else it was cleared away since, or made anew
+                yield from found
 
-        return verify_everything(root, progress, problems)
+        return [*verify_everything(root, progress, problems), *_broken_off(objects, there)]
+
+
+@contextmanager
+def _unpacked() -> Iterator[Path]:
+    with (
+        tempfile.TemporaryDirectory(prefix="spectralzoom-verify-") as name,
+        refusals(Path(name), "read manifests into"),
+    ):
+        yield Path(name)
+
+
+def _broken_off(objects: Objects, there: Mapping[str, Listed]) -> Iterator[Finding]:
+    """What a repair left withdrawn, and runs without a manifest, unless somebody may be about to upload it."""
+    for path in there:
+        if path.startswith(f"{WITHDRAWN}/"):
+            yield Finding(path, "a repair was broken off; run verify --repair again", "stray")
+    if not any(path.startswith(f"{LEASES}/") for path in there):
+        for uri in find_lost_runs(there):
+            if objects.read(f"{uri}/{MANIFEST_NAME}") is None:
+                yield Finding(uri, f"{MANIFEST_NAME} is missing, or its upload was broken off", "broken")
 
 
 def _is_manifest(path: str) -> bool:
@@ -52,17 +79,16 @@ def _lay_out(objects: Objects, root: Path, uri: str) -> None:
         (root / uri / RECEIPT).write_bytes(receipt)
 
 
-def _problems(objects: Objects, there: Mapping[str, Listed], root: Path, uri: str) -> Iterator[str]:
-    """What is wrong with one published folder, object by object."""
-    manifest, problem = try_manifest(root / uri)
+def _problems(objects: Objects, there: Mapping[str, Listed], folder: Path, place: str) -> Iterator[str]:
+    """What is wrong with one published folder, whose files lie at ``place``, object by object."""
+    manifest, problem = try_manifest(folder)
     if problem is not None:
         yield f"{MANIFEST_NAME} cannot be believed: {problem}"
         return
-    place = files_at(uri, (root / uri / MANIFEST_NAME).read_bytes())
     for name, entry in manifest["files"].items():
         problem = _object_problem(objects, there, f"{place}/{name}", entry)
         if problem is not None:
-            yield f"{name} {problem}{_damage(objects, root / uri, place, name)}"
+            yield f"{name} {problem}{_damage(objects, folder, place, name)}"
     extra = {path.removeprefix(f"{place}/") for path in there if path.startswith(f"{place}/")} - set(manifest["files"])
     yield from (f"{name} is not in the manifest: take it out of the archive" for name in sorted(extra))
 
@@ -90,23 +116,39 @@ def _damage(objects: Objects, folder: Path, place: str, name: str) -> str:
     return name_damage(folder, name)
 
 
-def find_leftovers(objects: Objects, keep_days: float) -> dict[str, int]:
-    """Folders of files that no manifest publishes and that are older than ``keep_days``, with their bytes.
+def find_lost_runs(there: Iterable[str]) -> list[str]:
+    """Runs of which there are files, but no manifest: it was lost, or their upload was broken off."""
+    found = {folder.rpartition("/")[0] for path in there if (folder := _attempt(path)) and path.startswith("runs/")}
+    return sorted(uri for uri in found - {path.removesuffix(f"/{MANIFEST_NAME}") for path in there} if is_address(uri))
 
-    Ages are told from the store's own dates, up to the youngest object: the lease of whoever clears up.
+
+def find_leftovers(objects: Objects, keep_days: float) -> dict[str, int]:
+    """Files of stores that no manifest publishes, and runs that were but begun, older than ``keep_days``; their bytes.
+
+    What a repair has withdrawn is published yet. Ages are told from the store's own dates, up to the youngest object:
+    the lease of whoever clears up.
     """
     there = objects.listing()
     now = max((one.changed for one in there.values()), default=None)
-    attempts: dict[str, list[Listed]] = {}
-    for path, one in there.items():
-        if (folder := _attempt(path)) is not None:
-            attempts.setdefault(folder, []).append(one)
     found: dict[str, int] = {}
-    for folder, files in sorted(attempts.items()):
+    for folder, files in sorted(_parts(there).items()):
         assert now is not None
         age = (now - max(one.changed for one in files)).total_seconds()
         if age >= keep_days * DAY_S and not _is_published(objects, there, folder):
             found[folder] = sum(one.size for one in files)
+    return found
+
+
+def _parts(there: Mapping[str, Listed]) -> dict[str, list[Listed]]:
+    """Folders of one upload's files, but those of lost runs, and runs of which nothing but their beginning is there."""
+    lost, found = find_lost_runs(there), dict[str, list[Listed]]()
+    more = {"/".join(path.split("/")[:2]) for path in there if not path.endswith(f"/{BEGUN}")}
+    begun = {named[1] for path in there if (named := _BEGUN.fullmatch(path))} - more
+    for path, one in there.items():
+        run = path.removesuffix(f"/{BEGUN}")
+        folder = run if run in begun else _attempt(path)
+        if folder is not None and folder.rpartition("/")[0] not in lost:
+            found.setdefault(folder, []).append(one)
     return found
 
 
@@ -119,7 +161,6 @@ def _attempt(path: str) -> str | None:
 
 def _is_published(objects: Objects, there: Mapping[str, Listed], folder: str) -> bool:
     uri = folder.rpartition("/")[0]
-    if f"{uri}/{MANIFEST_NAME}" not in there:
-        return False
-    text = objects.read(f"{uri}/{MANIFEST_NAME}")
-    return text is not None and files_at(uri, text) == folder
+    manifests = [name for name in (f"{uri}/{MANIFEST_NAME}", f"{WITHDRAWN}/{uri}/{MANIFEST_NAME}") if name in there]
+    texts = [text for name in manifests if (text := objects.read(name)) is not None]
+    return any(files_at(uri, text) == folder for text in texts)

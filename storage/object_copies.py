@@ -6,23 +6,35 @@ asked for, and a file of another size than its manifest says is fetched again.
 
 from __future__ import annotations
 
-import hashlib
+import logging
 import secrets
-from collections.abc import Callable, Iterable, Iterator
+import shutil
+from collections.abc import Container, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import NoReturn
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.addresses import published_runs, published_stores
 from storage.lineage import Catalogue
-from storage.manifests import check_files, manifest_sha256, read_manifest, try_manifest
+from storage.manifests import manifest_sha256, read_manifest, try_manifest, write_manifest
 from storage.object_stores import Objects, some_at_a_time
-from storage.object_transfers import fetch_folder, is_address, is_here, lay_manifest, send_folder
-from storage.records import RECEIPT, read_run
-from storage.staging import MANIFEST_NAME, refusals, retire, sync_path, take_lock
+from storage.object_transfers import aside_in, fetch_folder, is_address, is_here, lay_manifest, send_folder
+from storage.records import RECEIPT, RESTS_ON, read_run
+from storage.staging import (
+    MANIFEST_NAME,
+    refusals,
+    remove_tree,
+    rename_into_place,
+    retire,
+    sync_path,
+    take_lock,
+)
 
 KNOWN = ".known"  # address -> SHA-256 of the manifest that stands in the bucket
+
+log = logging.getLogger(__name__)
 
 
 class WorkingCopy:
@@ -33,17 +45,21 @@ class WorkingCopy:
 
     # --- one store ----------------------------------------------------------------------------------------------------
 
+    def is_whole(self, uri: str) -> bool:
+        """Whether all of a store is here, by its manifest and the sizes of its files."""
+        return try_manifest(self.root / uri)[1] is None and is_here(self.root / uri)
+
     def look_up(self, uri: str) -> bool:
-        """Ask the bucket for a store that is not here, or is damaged here; whether its manifest is here then.
+        """Ask the bucket for a store that is not whole here; whether it stands there, and its manifest is here then.
 
         Raises
         ------
         IncompleteStoreError : the manifest that stands in the bucket is damaged.
         """
-        if try_manifest(self.root / uri)[1] is not None:
-            dated = self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")
-            if dated is None:
-                return False
+        dated = self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")
+        if dated is None:
+            return False
+        with self._alone(uri):
             self._take(uri, *dated)
             read_manifest(self.root / uri)
         return True
@@ -55,8 +71,7 @@ class WorkingCopy:
         ------
         IncompleteStoreError : a file of it is not as it was published.
         """
-        check_files(self.root / uri, hashes=False)
-        with self._alone(f"send-{uri}"):
+        with self._alone(uri):
             if self.is_known(uri):
                 return
             ours = (self.root / uri / MANIFEST_NAME).read_bytes()
@@ -66,11 +81,35 @@ class WorkingCopy:
                 self._take(uri, *dated)
 
     def fetch(self, uri: str) -> None:
-        """Have a store or run here whole; of one of which nothing is known, a reader says what it finds."""
+        """Have a store or run here whole; of one of which nothing is known, a reader says what it finds.
+
+        Raises
+        ------
+        IncompleteStoreError : an object of it is missing or has changed, or all of it was removed since.
+        """
         folder = self.root / uri
-        if (folder / MANIFEST_NAME).is_file() and not is_here(folder):
-            with refusals(self.root, "fetch into the working copy"), self._alone(f"fetch-{uri}"):
+        if not (folder / MANIFEST_NAME).is_file() or is_here(folder):
+            return
+        with self._alone(uri):
+            try:
                 fetch_folder(self.objects, self.root, uri)
+            except IncompleteStoreError:
+                dated = self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")
+                if dated is not None and dated[0] == (folder / MANIFEST_NAME).read_bytes():
+                    raise
+                if dated is None:
+                    self._give_up(uri)
+                self._take(uri, *dated)  # cleared away, and made again since
+                fetch_folder(self.objects, self.root, uri)
+
+    def put_in_place(self, part: Path, uri: str) -> None:
+        """Give a store that was made here its name, unless another process has brought it from the bucket meanwhile."""
+        with self._alone(uri):
+            if self.is_whole(uri):
+                remove_tree(part)
+            else:
+                retire(self.root / uri)
+                rename_into_place(part, self.root / uri)
 
     def remove(self, uri: str) -> None:
         """Take a store out of the bucket, its manifest first."""
@@ -89,52 +128,76 @@ class WorkingCopy:
         standing = some_at_a_time(lambda uri: self.objects.read_dated(f"{uri}/{MANIFEST_NAME}"), wanted)
         for uri, dated in zip(wanted, standing, strict=True):
             if dated is not None:
-                if hashlib.sha256(dated[0]).hexdigest() != manifest_sha256(self.root / uri):
+                with self._alone(uri):
                     self._take(uri, *dated)
-                self._note(uri)
-            elif is_here(self.root / uri):
+            elif self.is_whole(uri):
                 self._mark(uri).unlink(missing_ok=True)
                 self.send(uri)
             else:
-                self._forget(uri)
-                url = self.objects.place.url
-                raise IncompleteStoreError(f"{url}/{uri} was removed meanwhile; run again, and it is made again")
+                self._give_up(uri)
 
     # --- all of it ----------------------------------------------------------------------------------------------------
 
     def send_run(self, uri: str) -> None:
-        """Upload a run, and before it whatever it rests on that is not known to be in the bucket.
+        """Upload a run, whose stores are in the bucket.
 
         Raises
         ------
         ArchiveError : another run of this name is there.
         """
-        rests_on = read_run(self.root / uri, {}).recorded
-        self.ensure(one for one in rests_on if not self.is_known(one))
         if send_folder(self.objects, uri, self.root / uri) != (self.root / uri / MANIFEST_NAME).read_bytes():
             raise ArchiveError(f"{self.objects.place.url}/{uri} is another run than {self.root / uri}: move yours away")
         self._note(uri)
 
-    def send_waiting(self) -> None:
-        """Upload what an earlier run could not: stores first, then runs."""
+    def waiting(self) -> list[str]:
+        """What an earlier run could not upload: stores, then runs."""
         stores = [ref.uri for ref in published_stores(self.root)]
         runs = [f"runs/{folder.name}" for folder in published_runs(self.root)]
-        for work, uris in ((self.send, stores), (self.send_run, runs)):
-            for uri in uris:
-                if not self.is_known(uri) and try_manifest(self.root / uri)[1] is None:
-                    work(uri)
+        return [uri for uri in (*stores, *runs) if not self.is_known(uri) and try_manifest(self.root / uri)[1] is None]
 
-    def mirror(self) -> None:
-        """Bring the manifests of all stores and runs, and the receipts; forget what was cleared away in the bucket.
+    def send_waiting(self) -> None:
+        """Upload what is `waiting`; what is damaged, or rests on what is nowhere any more, is told of and stays."""
+        for uri in self.waiting():
+            try:
+                if uri.startswith("runs/"):
+                    self.ensure(read_run(self.root / uri, {}).recorded)
+                    self._record_anew(uri)
+                    self.send_run(uri)
+                else:
+                    self.send(uri)
+            except IncompleteStoreError as error:
+                log.warning("%s/%s waits for its upload, which is not possible: %s", self.root, uri, error)
 
-        What a run names is not: it was lost there, and may be restored from here.
-        """
+    def _record_anew(self, uri: str) -> None:
+        """Let a run name the manifests that stand now: while it waited, others may have published the same stores."""
+        facts, recorded = read_manifest(self.root / uri), read_run(self.root / uri, {}).recorded
+        found = {one: manifest_sha256(self.root / one) for one in recorded}
+        if found == recorded:
+            return
+        with aside_in(self.root) as aside:
+            shutil.copytree(self.root / uri, aside / "run")
+            kept = {name: value for name, value in facts.items() if name not in ("files", "seal", "format")}
+            write_manifest(aside / "run", kept | {RESTS_ON: found})
+            text = (aside / "run" / MANIFEST_NAME).read_bytes()
+        written = (self.root / uri / MANIFEST_NAME).stat().st_mtime
+        lay_manifest(self.root, uri, text, datetime.fromtimestamp(written, UTC))
+
+    def mirror(self) -> set[str]:
+        """Bring the manifests of all stores and runs, and the receipts; gives what there is in the bucket."""
         stages = [f"stages/{stage}" for stage in self.objects.children("stages")]
         found = {f"{folder}/{name}" for folder in (*stages, "runs") for name in self.objects.children(folder)}
-        some_at_a_time(self._mirror_one, filter(is_address, sorted(found)))
+        with refusals(self.root, "write to the working copy"):
+            some_at_a_time(self._mirror_one, filter(is_address, sorted(found)))
+        return found
+
+    def forget_all_but(self, found: Container[str]) -> None:
+        """Forget stores that were cleared away in the bucket; nobody may be reading them.
+
+        What a run names is not forgotten: it was lost there, and may be restored from here.
+        """
         here = Catalogue.read(self.root)
-        for uri in here.stores.keys() - found:
-            if self.is_known(uri) and not here.named_by(uri) and not here.is_only_copy(uri):
+        for uri in here.stores:
+            if uri not in found and self.is_known(uri) and not here.named_by(uri) and not here.is_only_copy(uri):
                 self._forget(uri)
 
     def _mirror_one(self, uri: str) -> None:
@@ -144,7 +207,8 @@ class WorkingCopy:
                 return
             waits = try_manifest(self.root / uri)[1] is None  # another of the same key, for its upload
             if not waits or (self.root / uri / MANIFEST_NAME).read_bytes() == dated[0]:
-                self._take(uri, *dated)
+                with self._alone(uri):
+                    self._take(uri, *dated)
         if uri.startswith("runs/"):
             with suppress(IncompleteStoreError):  # whoever reads it says so
                 fetch_folder(self.objects, self.root, uri, [RECEIPT])
@@ -159,9 +223,10 @@ class WorkingCopy:
             return False
 
     def _take(self, uri: str, manifest: bytes, changed: datetime) -> None:
-        with refusals(self.root, "write to the working copy"):
+        """Have the manifest that stands in the bucket here, and known as such unless it is damaged."""
+        if try_manifest(self.root / uri)[1] is not None or (self.root / uri / MANIFEST_NAME).read_bytes() != manifest:
             lay_manifest(self.root, uri, manifest, changed)
-        if try_manifest(self.root / uri)[1] is None:
+        if not self.is_known(uri) and try_manifest(self.root / uri)[1] is None:
             self._note(uri)
 
     def _note(self, uri: str) -> None:
@@ -175,14 +240,28 @@ class WorkingCopy:
         self._mark(uri).unlink(missing_ok=True)
         retire(self.root / uri)
 
+    def _give_up(self, uri: str) -> NoReturn:
+        """Say of what is neither whole here nor in the bucket that it is gone; a store can be made again then."""
+        if not self.is_known(uri) and (self.root / uri).exists():
+            raise IncompleteStoreError(
+                f"{self.root / uri} is damaged and was never uploaded: restore it from a copy, or move it away and run "
+                "again"
+            )
+        if not uri.startswith("runs/"):
+            self._forget(uri)
+        url = self.objects.place.url
+        raise IncompleteStoreError(f"{url}/{uri} was removed meanwhile; run again, and it is made again")
+
     def _mark(self, uri: str) -> Path:
         return self.root / KNOWN / uri
 
     @contextmanager
-    def _alone(self, name: str) -> Iterator[None]:
-        release: Callable[[], None] | None = take_lock(self.root / ".locks" / f"{name.replace('/', '-')}.lock")
-        try:
-            yield
-        finally:
-            if release is not None:
-                release()
+    def _alone(self, uri: str) -> Iterator[None]:
+        """Let nobody else change what lies here at an address; a disk that refuses says so in words."""
+        with refusals(self.root, "write to the working copy"):
+            release = take_lock(self.root / ".locks" / f"copy-{uri.replace('/', '-')}.lock")
+            try:
+                yield
+            finally:
+                if release is not None:
+                    release()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable
+from datetime import datetime, timedelta
 from pathlib import Path
 
 from pipeline.errors import ArchiveError
@@ -27,6 +28,7 @@ class Lease:
 
     def __init__(self, objects: Objects, name: str, unlock: Callable[[], None]) -> None:
         self._objects, self._name, self._unlock, self._since = objects, name, unlock, time.monotonic()
+        self.taken: datetime | None = None  # by the store's clock, rounded up: it tells whole seconds
 
     def renew(self) -> None:
         """Write it again, now and then: called whenever something is published."""
@@ -53,12 +55,12 @@ def take_lease(objects: Objects, root: Path, *, alone: bool) -> Lease | None:
     """
     end_dead_leases(objects, root)
     name = f"{'alone' if alone else 'shared'}-{secrets.token_hex(8)}"
-    unlock = take_lock(_lock(root, name), wait=False)
-    assert unlock is not None  # the name is new
+    unlock = take_lock(_lock(root, name))  # waits, if for that of another who looks whether somebody is behind it
+    assert unlock is not None
     lease, until = Lease(objects, f"{FOLDER}/{name}", unlock), time.monotonic() + WAIT_S
     try:
         objects.create(f"{FOLDER}/{name}", b"taken")
-        while others := _others(objects, name, alone=alone):
+        while others := _others(objects, lease, name, alone=alone):
             if alone:
                 lease.end()
                 return None
@@ -74,13 +76,14 @@ def take_lease(objects: Objects, root: Path, *, alone: bool) -> Lease | None:
     return lease
 
 
-def _others(objects: Objects, name: str, *, alone: bool) -> list[str]:
+def _others(objects: Objects, lease: Lease, name: str, *, alone: bool) -> list[str]:
     """Leases of others that stand against one's own."""
     found = objects.listing(FOLDER)
     own = found.pop(f"{FOLDER}/{name}", None)
     if own is None:  # taken away as dead, while a clock jumped or this machine slept: not held any more
         objects.create(f"{FOLDER}/{name}", b"taken again")
         return [f"{FOLDER}/{name}"]
+    lease.taken = own.changed + timedelta(seconds=1)
     fresh = [other for other, one in found.items() if (own.changed - one.changed).total_seconds() < LIFE_S]
     return sorted(other for other in fresh if alone or other.startswith(f"{FOLDER}/alone-"))
 

@@ -20,9 +20,10 @@ from urllib.parse import urlsplit
 from pipeline.errors import ArchiveError, SettingsError
 
 if TYPE_CHECKING:
-    from obstore.store import ClientConfig, RetryConfig, S3Config, S3Store
+    from obstore.store import BackoffConfig, ClientConfig, RetryConfig, S3Config, S3Store
 
-RETRIES = 6  # of one request, waiting twice as long each time: some ten seconds in all
+RETRIES = 6  # of one request, after waits that grow up to threefold: some ten seconds in all
+BACKOFF: BackoffConfig = {"init_backoff": timedelta(seconds=0.5), "max_backoff": timedelta(seconds=8), "base": 3}
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _ADDRESS = re.compile(r"s3:/+([^/]*)/*(.*)")  # also as a path has it, which makes one slash of two
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
@@ -36,19 +37,25 @@ _MEANINGS = {  # what a store's answer begins with or holds -> what it means and
     "AuthorizationHeaderMalformed": "the bucket is in another region: set AWS_REGION",
     "PermanentRedirect": "the bucket is in another region: set AWS_REGION",
     "301 Moved": "the bucket is in another region: set AWS_REGION",
+    "redirect without LOCATION": "the bucket is in another region: set AWS_REGION",
     "AccessDenied": "access is denied: check the credentials and the bucket's policy (get, put, list, delete)",
     "403 Forbidden": "access is denied: check the credentials and the bucket's policy (get, put, list, delete)",
     "401 Unauthorized": "access is denied: check the credentials",
     "error sending request": "it cannot be reached: check the network and AWS_ENDPOINT_URL",
     "timed out": "it does not answer in time: check the network and AWS_ENDPOINT_URL",
+    "response body error": "its answer was broken off: check the network",
+    "501 Not Implemented": "it lacks what an archive needs (conditional puts, listing): use another store",
+    "status code: 5": "it has trouble of its own, or is asked too much: run again later",
 }
-_PASSING = ("error sending request", "timed out")
+_PASSING = ("error sending request", "timed out", "response body error", "status code: 5")
 
 
 class UnreachableError(ArchiveError):
     """A bucket that refuses, or does not answer. ``passing``: it may answer later, with nothing changed here."""
 
-    passing = False
+    def __init__(self, message: str, *, passing: bool = False) -> None:
+        super().__init__(message)
+        self.passing = passing
 
 
 @dataclass(frozen=True)
@@ -75,8 +82,11 @@ class ObjectPlace:
 
 
 def is_remote(root: str | Path) -> bool:
-    """Whether an archive's name is an address on S3, and no folder's."""
-    return _ADDRESS.fullmatch(str(root)) is not None
+    """Whether an archive's name is an address on S3, and no folder's (SettingsError: it is one of another kind)."""
+    found = _ADDRESS.fullmatch(str(root)) is not None
+    if "://" in str(root) and not found:
+        raise SettingsError(f"{str(root)!r} is no place for an archive; expected a folder, or s3://bucket/prefix")
+    return found
 
 
 def parse_place(text: str | Path) -> ObjectPlace:
@@ -94,6 +104,8 @@ def parse_place(text: str | Path) -> ObjectPlace:
             f"{str(text)!r} is no archive on S3; expected s3://bucket/prefix, the bucket in small letters, digits, '-' "
             "and '.', the prefix in letters, digits and '_.=+-'"
         )
+    if "stages" in parts:
+        raise SettingsError(f"{str(text)!r} lies in an archive's folder stages, where nothing else belongs")
     return ObjectPlace(bucket, prefix, _endpoint())
 
 
@@ -137,7 +149,7 @@ def connect(place: ObjectPlace, inside: str = "") -> S3Store:
 
     http = place.endpoint is not None and place.endpoint.startswith("http://")
     client: ClientConfig = {"allow_http": http, "connect_timeout": "5s", "read_timeout": "60s", "timeout": "15min"}
-    retry: RetryConfig = {"max_retries": RETRIES, "retry_timeout": timedelta(minutes=2)}
+    retry: RetryConfig = {"max_retries": RETRIES, "retry_timeout": timedelta(minutes=2), "backoff": BACKOFF}
     prefix = f"{place.prefix}/{inside}".strip("/")
     config: S3Config = {} if place.endpoint is None else {"endpoint": place.endpoint}
     try:
@@ -158,10 +170,11 @@ def answers_of(place: ObjectPlace) -> Iterator[None]:
             raise
         text = str(error)
         meaning = next((words for sign, words in _MEANINGS.items() if sign in text), _first_line(error))
+        if "invalid path" in text:
+            meaning += "; take it out of the bucket: nothing in an archive is called so"
         at = "" if place.endpoint is None else f" at {place.endpoint}"
-        refusal = UnreachableError(f"{place.url}{at}: {meaning}")
-        refusal.passing = any(sign in text for sign in _PASSING)
-        raise refusal from error
+        passing = any(sign in text for sign in _PASSING) and "501 Not" not in text
+        raise UnreachableError(f"{place.url}{at}: {meaning}", passing=passing) from error
 
 
 def _first_line(error: BaseException) -> str:

@@ -8,17 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from pipeline.errors import ArchiveError, IncompleteStoreError
+from pipeline.errors import ArchiveError
 from storage.archive import Archive
 from storage.lineage import Catalogue
-from storage.manifests import check_files, read_manifest
+from storage.manifests import file_problem, try_manifest
 from storage.object_archive import ObjectArchive
-from storage.object_transfers import files_at
+from storage.object_transfers import WITHDRAWN, files_at
 from storage.repair import Repaired, Rerun, plan_repair, run_again
 from storage.staging import MANIFEST_NAME, retire
 from storage.verification import Finding
-
-WITHDRAWN = ".withdrawn"
 
 
 def repair_objects(
@@ -77,23 +75,26 @@ def _put_back(archive: ObjectArchive, uri: str) -> bool:
 
 
 def _cure(archive: ObjectArchive, uri: str) -> bool:
-    """Write what is broken of a store or run again, if the working copy has all of it as it was published."""
+    """Write what is broken of a store or run again, if the working copy has it as it was published.
+
+    False where that is not what is wrong with it.
+    """
     folder, objects = archive.root / uri, archive.objects
-    if not archive.copy.is_known(uri):
+    manifest, problem = try_manifest(folder)
+    if problem is not None or not archive.copy.is_known(uri):
         return False
-    try:
-        check_files(folder, hashes=True)
-        files = read_manifest(folder)["files"]
-    except IncompleteStoreError:
+    ours, standing = (folder / MANIFEST_NAME).read_bytes(), objects.read(f"{uri}/{MANIFEST_NAME}")
+    place, files = files_at(uri, ours), manifest["files"]
+    broken = [name for name, entry in files.items() if not _is_whole(archive, f"{place}/{name}", entry["sha256"])]
+    if standing not in (None, ours) and len(broken) == len(files):  # ours was cleared away, and another made since
         return False
-    ours = (folder / MANIFEST_NAME).read_bytes()
-    place = files_at(uri, ours)
-    for name, entry in files.items():
-        if not _is_whole(archive, f"{place}/{name}", entry["sha256"]):
-            objects.write(f"{place}/{name}", folder / name)
-    if objects.read(f"{uri}/{MANIFEST_NAME}") != ours:  # ours was published, and nothing else can have been since
+    if any(file_problem(folder / name, files[name], hashes=True) is not None for name in broken):
+        return False
+    for name in broken:
+        objects.write(f"{place}/{name}", folder / name)
+    if standing != ours:
         objects.write(f"{uri}/{MANIFEST_NAME}", ours)
-    return True
+    return bool(broken) or standing != ours
 
 
 def _is_whole(archive: ObjectArchive, name: str, sha256: str) -> bool:

@@ -11,8 +11,9 @@ import hashlib
 import os
 import re
 import secrets
+import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
@@ -24,6 +25,9 @@ from storage.staging import MANIFEST_NAME, check_name, remove_tree, retire, sync
 ATTEMPT_LETTERS = 16
 ATTEMPT = re.compile(rf"[0-9a-f]{{{ATTEMPT_LETTERS}}}")
 ASIDE = ".fetch"  # in the working copy: what is being fetched
+DEAD_S = 86400.0  # what was being fetched so long ago is of a process that was killed
+BEGUN = "begun"  # in a run's folder in the bucket: its name is taken
+WITHDRAWN = ".withdrawn"  # in the bucket: manifests that a repair under way has taken away
 
 
 def attempt_of(manifest: bytes) -> str:
@@ -82,7 +86,7 @@ def fetch_folder(objects: Objects, root: Path, uri: str, only: Iterable[str] | N
     waiting = [name for name, entry in wanted.items() if _size(folder / name) != entry["size"]]
     if not waiting:
         return
-    with _aside(root) as aside:
+    with aside_in(root) as aside:
 
         def fetch(name: str) -> None:
             objects.fetch(f"{place}/{name}", folder / name, wanted[name]["sha256"], aside / secrets.token_hex(8))
@@ -104,7 +108,7 @@ def lay_manifest(root: Path, uri: str, manifest: bytes, changed: datetime) -> No
     """
     folder = root / uri
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with _aside(root) as aside:
+    with aside_in(root) as aside:
         made = aside / folder.name
         made.mkdir()
         (made / MANIFEST_NAME).write_bytes(manifest)
@@ -128,8 +132,13 @@ def _lists_the_same(one: Path, other: Path) -> bool:
 
 
 @contextmanager
-def _aside(root: Path) -> Iterator[Path]:
-    folder = root / ASIDE / f"{os.getpid()}-{secrets.token_hex(4)}"
+def aside_in(root: Path) -> Iterator[Path]:
+    """Give a folder of the working copy for what is not whole yet, and take it away again."""
+    for old in (root / ASIDE).glob("*"):
+        with suppress(FileNotFoundError):
+            if time.time() - old.stat().st_mtime > DEAD_S:
+                remove_tree(old)
+    folder = root / ASIDE / secrets.token_hex(8)
     folder.mkdir(parents=True)
     try:
         yield folder

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from storage.object_archive import ObjectArchive
 
 BUCKET = "surveys"
 KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_REGION": "us-east-1"}
@@ -44,3 +48,15 @@ def bucket(s3_server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> s
         monkeypatch.setenv(name, value)
     monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "work"))
     return f"s3://{BUCKET}/archive-{next(_numbers)}"
+
+
+@pytest.fixture
+def machine(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., ObjectArchive]:
+    """Open the bucket's archive as a machine, by its name, with a working copy of its own."""
+    from storage.object_archive import open_object_archive
+
+    def open_as(name: str, *, create: bool = True, write: bool = True) -> ObjectArchive:
+        monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / name))
+        return open_object_archive(bucket, create=create, write=write)
+
+    return open_as

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
+
 from flows.publish import Published
 from flows.survey import STAGES
 from pipeline.errors import SceneError

@@ -3,71 +3,30 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
+
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from storage import object_places
 from storage.addresses import StageRef
 from storage.archive import Archive
 from storage.garbage import IN_USE, clear_up
-from storage.layout import create_group, read_array, write_image
+from storage.layout import create_group, write_image
 from storage.lineage import Catalogue
-from storage.object_archive import ObjectArchive, open_object_archive
-from storage.object_groups import open_remote_group
 from storage.object_places import UnreachableError, is_remote, parse_place
 from storage.object_stores import AT_ONCE, Objects, some_at_a_time
 from tests.storage.small_archive import small_survey
-
-Machine = Callable[..., ObjectArchive]
-FIRST, SECOND = "first", "second"  # two machines, by the folder of their working copies
-
-
-@pytest.fixture
-def machine(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
-    """Open the bucket's archive as a machine with a working copy of its own."""
-
-    def open_as(name: str, *, create: bool = True, write: bool = True) -> ObjectArchive:
-        monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / name))
-        return open_object_archive(bucket, create=create, write=write)
-
-    return open_as
-
-
-def make(archive: Archive, content: bytes = b"light", **params: int) -> tuple[StageRef, bool]:
-    """Make (or find) a store of two files."""
-
-    def build(path: Path) -> None:
-        (path / "deep").mkdir()
-        (path / "deep" / "a.bin").write_bytes(content)
-        (path / "b.json").write_text("{}")
-
-    return archive.produce("rectify", build, version=1, params=params)
-
-
-def rot(archive: ObjectArchive, name: str, at: int = -1) -> None:
-    """Let one bit of an object flip."""
-    content = bytearray(archive.objects.read(name) or b"")
-    content[at] ^= 4
-    archive.objects.write(name, bytes(content))
-
-
-def object_of(archive: ObjectArchive, ref: StageRef, file: str) -> str:
-    """The object that holds a file of a store."""
-    return next(name for name in archive.objects.listing(ref.uri) if name.endswith(f"/{file}"))
-
-
-def problems(archive: Archive) -> list[str]:
-    """What verify finds."""
-    return [f"{one.uri} {one.problem}" for one in archive.verify_all() if one.problem is not None]
+from tests.storage.small_bucket import FIRST, SECOND, Machine, make, object_of, problems, rot
 
 
 def test_a_store_is_found_and_fetched_elsewhere(machine: Machine) -> None:
@@ -341,22 +300,6 @@ def test_a_lost_working_copy_costs_nothing_but_time(machine: Machine) -> None:
     assert (found.path / "deep" / "a.bin").read_bytes() == b"light"
 
 
-def test_one_patch_is_read_where_it_lies(machine: Machine) -> None:
-    """zarr-python over obstore opens a published store in the bucket; nothing comes into the working copy."""
-    image = np.arange(128 * 96 * 3, dtype=np.uint16).reshape(128, 96, 3)
-
-    def build(path: Path) -> None:
-        write_image(create_group(path / "mosaic.zarr", "m", {}), "values", ("y", "x", "band"), image, {})
-
-    ref, _ = machine(FIRST).produce("rectify", build, version=1, params={})
-    other = machine(SECOND)
-    group = open_remote_group(other.objects, f"{ref.uri}/mosaic.zarr")
-    np.testing.assert_array_equal(read_array(group, "values", np.s_[64:96, 32:64]), image[64:96, 32:64])
-    assert not (other.root / ref.uri / "mosaic.zarr").exists()
-    with pytest.raises(IncompleteStoreError, match="is not there"):
-        open_remote_group(other.objects, "stages/rectify/nothing/mosaic.zarr")
-
-
 def test_a_published_store_opens_with_plain_zarr(bucket: str, machine: Machine) -> None:
     """Without SpectralZoom: the manifest's hash tells the folder, zarr and obstore do the rest."""
     import hashlib
@@ -409,3 +352,48 @@ def test_a_missing_bucket_or_archive_is_one_clear_error(bucket: str) -> None:
     with pytest.raises(ArchiveError, match="is not there; check the name"):
         Archive.open(f"{bucket}-none", create=False)
     assert not Archive.is_there(f"{bucket}-none")
+
+
+@pytest.mark.parametrize("text", ["gs://bucket/x", "http://host/x", "S3://bucket/x"])
+def test_addresses_of_other_kinds_are_no_folders(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are refused, and no folder is made that is called so."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SettingsError, match=r"expected a folder, or s3://bucket/prefix"):
+        Archive.open(text)
+    with pytest.raises(SettingsError, match=r"expected a folder, or s3://bucket/prefix"):
+        Archive.is_there(text)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("answer", "words", "passing"),
+    [
+        ("Server returned non-2xx status code: 503 Service Unavailable: SlowDown", "run again later", True),
+        ("HTTP error: request or response body error", "broken off", True),
+        ("Server returned non-2xx status code: 501 Not Implemented: ", "lacks what an archive needs", False),
+        ("Received redirect without LOCATION", "set AWS_REGION", False),
+        ('Encountered object with invalid path: Path "x//y"', 'Path "x//y"; take it out of the bucket', False),
+        ("The AWS Access Key Id does not exist: InvalidAccessKeyId", "check AWS_ACCESS_KEY_ID", False),
+    ],
+)
+def test_what_a_store_answers_is_told_in_words(bucket: str, answer: str, words: str, passing: bool) -> None:
+    """What may pass by itself is told from what somebody has to change."""
+    from obstore.exceptions import GenericError
+
+    with pytest.raises(UnreachableError, match=re.escape(words)) as told, object_places.answers_of(parse_place(bucket)):
+        raise GenericError(answer)
+    assert told.value.passing is passing
+
+
+@pytest.mark.parametrize("create", [True, False])
+def test_what_has_another_mark_is_no_archive(bucket: str, machine: Machine, create: bool) -> None:
+    """Such as a network's page for guests, which answers everything, or an archive of a later version."""
+    machine(FIRST).objects.write("archive.json", b"<html>welcome</html>")
+    with pytest.raises(ArchiveError, match=r"archive\.json is not as expected"):
+        Archive.open(bucket, create=create)
+
+
+def test_no_archive_is_made_among_the_stores_of_another(bucket: str) -> None:
+    """What lies there would be taken for the other's, and cleared away."""
+    with pytest.raises(SettingsError, match="lies in an archive's folder stages"):
+        Archive.open(f"{bucket}/stages")
