@@ -25,7 +25,7 @@ STAGE = "pack"
 
 
 def run_pack(
-    archive: Path, console: Console, *, older_than: float = 30.0, dry_run: bool = False, as_json: bool = False
+    archive: str | Path, console: Console, *, older_than: float = 30.0, dry_run: bool = False, as_json: bool = False
 ) -> int:
     """Pack raw stores older than so many days; progress on ``console``, what was packed (or would be) on stdout.
 

@@ -21,6 +21,7 @@ from pipeline.errors import WeightsError
 from storage.class_maps import write_class_tile
 from storage.mosaic_strips import mosaic_strips, mosaic_wavelengths
 from storage.patches import PATCHES_A_SHARD, PatchStore, open_patches
+from storage.tile_work import let_tiles_go
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class Scoring:
 
     def __call__(self, region: Region) -> NDArray[np.float64]:
         """Scores of the seats that are kept, (seat_y, seat_x)."""
+        let_tiles_go()
         weights = self.weights.load()
         seen = read_glance(weights, look_at(weights, self.mosaic, region))
         return region.crop_seats(score_seats(self.policy, seen))
@@ -69,6 +71,7 @@ class Drawing:
 
     def __call__(self, region: Region) -> None:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
+        let_tiles_go()
         weights, store = self.weights.load(), open_patches(self.patches)
         seen = look_at(weights, self.mosaic, region)
         seats, columns = seat_columns(weights, store, store.wavelength_nm, seen, region)

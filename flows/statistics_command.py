@@ -63,13 +63,13 @@ def run_statistics(
 
 
 def band_rows(table: BandTable) -> list[dict[str, Any]]:
-    """Figures of each band by name; None where no value is finite."""
+    """Figures of each band by name; None where no value is finite, or nothing says the wavelength."""
     columns = {
         "min": table.low, **{f"p{percent:g}": found for percent, found in table.percentiles.items()},
         "max": table.high, "mean": table.mean, "std": table.std,
     }  # fmt: skip
     return [
-        {"band": band, "wavelength_nm": float(nm), "finite": int(table.finite[band])}
+        {"band": band, "wavelength_nm": _known(nm), "finite": int(table.finite[band])}
         | {name: _known(column[band]) for name, column in columns.items()}
         for band, nm in enumerate(table.wavelength_nm)
     ]
@@ -107,7 +107,7 @@ def _show(content: dict[str, Any], console: Console, every_band: bool) -> None:
         row = rows[number]
         share = row["finite"] / content["pixels"] if content["pixels"] else math.nan
         table.add_row(
-            str(row["band"]), f"{row['wavelength_nm']:.4g}", f"{share:.1%}", *(_figure(row[name]) for name in FIGURES)
+            str(row["band"]), _figure(row["wavelength_nm"]), f"{share:.1%}", *(_figure(row[name]) for name in FIGURES)
         )
     console.print(table)
     shown = f"{count} of {len(rows)} bands, all with --all" if count < len(rows) else f"{len(rows)} bands"

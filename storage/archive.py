@@ -22,7 +22,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from storage.addresses import StageRef, published_runs, published_stores, store_at
+from storage.addresses import StageRef, published_runs, published_stores, store_at, without_manifest
 from storage.archive_folder import is_folder_archive, open_folder
 from storage.keys import plain, stage_key
 from storage.lineage import rests_on
@@ -277,9 +277,19 @@ class Archive:
                     release()
         return removed
 
+    def now(self) -> datetime:
+        """Time by the clock that tells how old stores are."""
+        return datetime.now(UTC)
+
     def size_of(self, uri: str) -> int:
         """Bytes of all files of a store."""
         return bytes_below(self.root / uri)
+
+    def lost_runs(self) -> list[str]:
+        """Addresses of runs whose manifest is gone, so that nothing tells what they name."""
+        return [
+            f"runs/{path.name}" for path in without_manifest(self.root) if path.parent.name == "runs" and path.is_dir()
+        ]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
         """What broken-off uploads left in a bucket for ``keep_days``: address and bytes; nothing in a folder."""

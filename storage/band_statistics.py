@@ -21,7 +21,7 @@ from storage.layout import damage_named, open_group, read_array, read_bands
 from storage.value_bins import KEPT, count_bins, merge_bins, percentile
 
 PERCENTILES = (2.0, 50.0, 98.0)
-ARRAYS = ("values", "dn", "data")  # of a mosaic, of a raw sweep, of an ingested cube
+ARRAYS = ("values", "dn")  # of a mosaic or an ingested cube, of a raw sweep
 
 _NONE = np.empty(0, np.int64)
 
@@ -80,7 +80,7 @@ class BandPart:
 class BandTable:
     """Statistics of the bands of one product, (band,) each; NaN where no value is finite."""
 
-    wavelength_nm: Floats
+    wavelength_nm: Floats  # NaN where nothing says them
     pixels: int
     finite: NDArray[np.int64]
     low: Floats
@@ -120,13 +120,13 @@ def product_statistics(
     Parameters
     ----------
     stores
-        Mosaics, raw sweeps or ingested cubes with the same bands. Lines that a sweep marks as not valid do not count.
+        Mosaics, raw sweeps or ingested cubes with the same bands. Lines that are marked as not valid do not count.
     array
         Name of the (y, x, band) or (line, sample, band) array in them; by default the one that such stores have.
 
     Returns
     -------
-    Percentiles are off by at most 1/512 of their value; the rest is exact to rounding.
+    Percentiles are values at their ranks, none between two, off by at most 1/512; the rest is exact to rounding.
 
     Raises
     ------
@@ -135,9 +135,9 @@ def product_statistics(
     """
     if not stores:
         raise ShapeError("expected at least one store with a cube, got none")
-    waves = [read_bands(open_group(path))[0] for path in stores]
+    waves = [_wavelengths(path, array) for path in stores]
     for path, wave in zip(stores, waves, strict=True):
-        if not np.array_equal(wave, waves[0]):
+        if not np.array_equal(wave, waves[0], equal_nan=True):
             raise ShapeError(f"{path} has other bands than {stores[0]}; ask for them one by one")
     found = [strip for path in stores for strip in plan_strips(path.absolute(), array)]
     strips = [replace(strip, number=number) for number, strip in enumerate(found)]
@@ -192,7 +192,7 @@ def count_strip(strip: Strip) -> BandPart:
     cube, group = _cube(strip.store, strip.array), open_group(strip.store)
     rows = slice(strip.first, strip.stop)
     valid = None
-    if strip.array == "dn" and "valid_line" in group:
+    if strip.array in ("dn", "values") and "valid_line" in group:
         valid = read_array(group, "valid_line", rows).astype(bool)
     total = None
     for first in range(0, cube.shape[1], (cube.shards or cube.chunks)[1]):
@@ -218,6 +218,14 @@ class _InOrder:
         while self._next in self._early:
             self.total = self.total.merged(self._early.pop(self._next))
             self._next += 1
+
+
+def _wavelengths(store: Path, array: str | None) -> Floats:
+    """(band,) wavelengths [nm], NaN for a cube whose file did not say them."""
+    group = open_group(store)
+    if "wavelength" in group:
+        return read_bands(group)[0]
+    return np.full(_cube(store, array or _cube_name(group) or ARRAYS[0]).shape[2], np.nan)
 
 
 def _cube(store: Path, name: str) -> zarr.Array[Any]:

@@ -11,6 +11,7 @@ import pickle
 import re
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import dask.threaded
 from dask.callbacks import Callback
 
-from pipeline.errors import SettingsError
+from pipeline.errors import SettingsError, WorkerError
 from storage.staging import PART_SUFFIX
 
 if TYPE_CHECKING:
@@ -101,6 +102,7 @@ def run_blocks(
     """Call ``make`` with every item, each in a dask task of its own.
 
     They are begun in order, none more than a few before the oldest unfinished one: neighbours share what they read.
+    The first error is raised once no block is being made any more: none writes after that.
 
     Parameters
     ----------
@@ -135,7 +137,11 @@ def run_blocks(
         return ended.results
     check_sendable("work", make)
     with crew.open():
-        _team_of(crew, paths).run(make, items, ended)
+        try:
+            _team_of(crew, paths).run(make, items, ended)
+        except WorkerError:
+            _dismiss(crew)
+            raise
     for folder in paths:
         if any(part.endswith(PART_SUFFIX) for part in folder.parts):
             _remove_unfinished(folder)
@@ -181,8 +187,12 @@ def _run_on_threads(
 
     graph = block_graph(block, len(items), workers)
     told = Callback(posttask=lambda key, number, *about: ended(number, made.pop(number)))  # type: ignore[no-untyped-call]
-    with told:
-        dask.threaded.get(graph, list(graph), num_workers=workers)
+    pool = ThreadPoolExecutor(workers)
+    try:
+        with told:
+            dask.threaded.get(graph, list(graph), pool=pool)
+    finally:
+        pool.shutdown(cancel_futures=True)  # dask would leave the others at work after an error
 
 
 def block_graph(block: Callable[..., int], count: int, workers: int) -> dict[str, tuple[Any, ...]]:
@@ -254,3 +264,12 @@ def _team_of(crew: Crew, paths: Sequence[Path]) -> Team:
     if crew.elsewhere:
         team.check(paths)
     return team
+
+
+def _dismiss(crew: Crew) -> None:
+    """Let workers go that cannot be relied on any more: whoever needs the open crew next gets others."""
+    with _guard:
+        held = _kept[crew]
+        team, held.team = held.team, None
+    if team is not None:
+        team.close()

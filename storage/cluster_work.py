@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
-import platform
 import signal
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
-from contextlib import ExitStack, contextmanager
-from importlib.metadata import PackageNotFoundError, version
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,14 +19,14 @@ import dask
 
 from pipeline.errors import SettingsError, WorkerError
 from storage.block_work import Crew, check_sendable
+from storage.worker_facts import ONE_THREAD, about_here, check_facts, versions_here
 
 ANSWER_S = 5.0  # a scheduler that is there answers at once
+LOOK_S, MOST_WAIT_S = 0.02, 60.0  # how often, and how long at most, blocks are waited for that nobody wants any more
 AHEAD = 2  # blocks sent to a worker: one in the making, one waiting
-ROOMS = ("pipeline", "models", "storage", "flows")  # blocks of regions are made in flows
-LIBRARIES = ("numpy", "zarr", "numcodecs", "torch", "distributed")
 # one thread of arithmetic a worker, and freed memory kept: large arrays cost more page faults than arithmetic
 _ENVIRONMENT = {
-    "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
+    **ONE_THREAD,
     "MALLOC_MMAP_THRESHOLD_": f"{2**30}", "MALLOC_TRIM_THRESHOLD_": f"{2**31 - 1}", "MALLOC_TOP_PAD_": f"{2**26}",
 }  # fmt: skip
 _QUIET = {
@@ -64,14 +62,14 @@ class Team:
         from dask.distributed import wait
 
         waited: Callable[..., Any] = wait
-        window, name = AHEAD * self._threads(), f"block-{uuid4().hex}"
+        window, name = AHEAD * self._threads(), f"block-{uuid4().hex}-"
         running: dict[Any, int] = {}
         sent = 0
         try:
             while running or sent < len(items):
                 while sent < len(items) and sent - min(running.values(), default=sent) < window:
                     check_sendable("item", items[sent])
-                    running[self._client.submit(make, items[sent], key=f"{name}-{sent}")] = sent
+                    running[self._client.submit(make, items[sent], key=f"{name}{sent}")] = sent
                     sent += 1
                 try:
                     with self._client.as_current():
@@ -79,12 +77,25 @@ class Team:
                 except TimeoutError:
                     self._threads()  # a block may take long; a team without workers never ends one
                     continue
+                except CancelledError:
+                    raise self._gone() from None
                 for future in sorted(done, key=running.__getitem__):
                     ended(running[future], self._result(future))
                     del running[future]
-        finally:
-            if running:
-                self._client.cancel(list(running), force=True)
+        except BaseException as error:
+            self._take_back(list(running), name, wait=isinstance(error, Exception))
+            raise
+
+    def _take_back(self, futures: Sequence[Any], name: str, *, wait: bool) -> None:
+        """Cancel blocks, and ``wait`` until nobody makes one of them any more and could write."""
+        end = time.monotonic() + MOST_WAIT_S * wait
+        with suppress(OSError, RuntimeError, CancelledError):  # nobody is there any more
+            self._client.cancel(futures, force=True)
+            while time.monotonic() < end and any(self._client.run(is_making, name).values()):
+                time.sleep(LOOK_S)
+
+    def _gone(self) -> WorkerError:
+        return WorkerError(f"{self._name}: the scheduler is gone; the same command goes on once it is there again")
 
     def _result(self, future: Any) -> Any:
         """What a block gave, or why it did not."""
@@ -98,9 +109,7 @@ class Team:
                 "were they out of memory? use fewer --workers, or --scheduler threads"
             ) from None
         except CancelledError:
-            raise WorkerError(
-                f"{self._name}: the scheduler is gone; the same command goes on once it is there again"
-            ) from None
+            raise self._gone() from None
 
     def _threads(self) -> int:
         """Blocks that can be made at a time."""
@@ -117,59 +126,33 @@ class Team:
         return max(1, sum(int(one["nthreads"]) for one in workers.values()))
 
     def check(self, paths: Sequence[Path]) -> None:
-        """Ask every worker for its versions and what it sees in some folders.
+        """Ask the scheduler and every worker for their versions, and workers for their threads and some folders.
 
         Raises
         ------
-        SettingsError : a worker differs from this process; names the worker, both values and what to do.
+        SettingsError : one differs from this process; names it, both values and what to do.
+        WorkerError : a worker was lost meanwhile.
         """
         self._threads()
         folders = [str(path.absolute()) for path in paths]
-        mine = about_here(folders)
         try:
+            leader: Mapping[str, str] = self._client.run_on_scheduler(versions_here)
             theirs: Mapping[str, Mapping[str, str]] = self._client.run(about_here, folders)
-        except (ImportError, AttributeError) as error:
+        except OSError as error:
+            raise WorkerError(f"{self._name}: a worker was lost ({error}); the same command goes on") from None
+        except Exception as error:  # of any type: what cannot be unpickled there comes back as text
             raise SettingsError(
-                f"{self._name}: a worker cannot import SpectralZoom ({error}); install the same version there, or use "
-                "--scheduler processes"
+                f"{self._name}: the scheduler or a worker cannot import SpectralZoom ({error}); install the same "
+                "version there, or use --scheduler processes"
             ) from None
+        check_facts(f"{self._name}: the scheduler", leader, versions_here())
         for worker, facts in theirs.items():
-            for what, expected in mine.items():
-                if facts.get(what) != expected:
-                    raise SettingsError(
-                        f"{self._name}: worker {worker} has {what} {facts.get(what)}, expected {expected} as here; "
-                        + (_SAME_FILES if what in folders else "install the same there")
-                    )
+            check_facts(f"{self._name}: worker {worker}", facts, {**about_here(folders), **ONE_THREAD})
 
 
-_SAME_FILES = "workers must see the same files under the same path: put the archive on a disk that all of them mount"
-
-
-def about_here(folders: Sequence[str]) -> dict[str, str]:
-    """What this process runs, and what it sees in some folders, by name."""
-    facts = {"python": platform.python_version(), "spectralzoom": _code_digest()}
-    for name in LIBRARIES:
-        try:
-            facts[name] = version(name)
-        except PackageNotFoundError:
-            facts[name] = "missing"
-    return facts | {folder: _seen(Path(folder)) for folder in folders}
-
-
-def _code_digest() -> str:
-    """Hash of the source that blocks run: a version number does not tell one checkout from another."""
-    root, found = Path(__file__).parents[1], hashlib.sha256()
-    for path in sorted(path for room in ROOMS for path in (root / room).rglob("*.py")):
-        found.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
-    return f"of code {found.hexdigest()[:12]}"
-
-
-def _seen(folder: Path) -> str:
-    """What a folder holds, in a few letters."""
-    if not folder.is_dir():
-        return "not there"
-    names = sorted(path.name for path in folder.iterdir())
-    return f"with {len(names)} names ({hashlib.sha256(repr(names).encode()).hexdigest()[:8]})"
+def is_making(name: str, dask_worker: Any) -> bool:
+    """Whether a worker, which dask gives, is at a block whose key begins like this."""
+    return any(str(task.key).startswith(name) for task in dask_worker.state.executing)
 
 
 def start(workers: int) -> Team:
@@ -261,10 +244,12 @@ def _environment_restored() -> Iterator[None]:
 @contextmanager
 def _quiet_logs() -> Iterator[None]:
     """Hold back what dask logs of lost connections: it is said once, by an error."""
-    logger = logging.getLogger("distributed")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
+    loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client")]  # each has a level of its own
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
     try:
         yield
     finally:
-        logger.setLevel(level)
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

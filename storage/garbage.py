@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from pipeline.errors import SettingsError
-from storage.addresses import StageRef, without_manifest
+from storage.addresses import StageRef
 from storage.archive import Archive
 from storage.lineage import Catalogue
 from storage.records import Store
@@ -101,10 +101,10 @@ def plan_clearance(
         raise SettingsError(f"--keep-days {keep_days}: expected a number of days, 0 or more")
     catalogue = Catalogue.read(archive.root)
     named = set[str]().union(*(catalogue.named_and_below[run.uri] for run in catalogue.runs))
-    spared = _spared(catalogue, named, keep_days, raw_too, now or datetime.now(UTC))
+    spared = _spared(catalogue, named, keep_days, raw_too, now or archive.now())
     below = catalogue.ancestors(spared) & set(catalogue.stores) - named
     kept = dict.fromkeys(below, "what stays was made of it") | spared
-    obstacle = _obstacle(archive.root, catalogue, named | set(kept))
+    obstacle = _obstacle(archive, catalogue, named | set(kept))
     gone = [] if obstacle else [uri for uri in catalogue.stores if uri not in named and uri not in kept]
     removals = [
         Removal(uri, "store", archive.size_of(uri), "no run names it") for uri in reversed(catalogue.inputs_first(gone))
@@ -144,11 +144,10 @@ def _age_days(store: Store, now: datetime) -> float:
     return (now.timestamp() - made) / DAY_S
 
 
-def _obstacle(root: Path, catalogue: Catalogue, staying: set[str]) -> str | None:
+def _obstacle(archive: Archive, catalogue: Catalogue, staying: set[str]) -> str | None:
     """Why it cannot be told what may go, where a receipt or a manifest that would tell is damaged or gone."""
-    for path in without_manifest(root):
-        if path.parent.name == "runs" and path.is_dir():
-            return f"no store is removed: runs/{path.name} has lost its {MANIFEST_NAME} and does not tell what it names"
+    for uri in archive.lost_runs():
+        return f"no store is removed: {uri} has lost its {MANIFEST_NAME} and does not tell what it names"
     for run in catalogue.runs:
         if run.problem is not None and not run.recorded:
             return f"no store is removed: {run.uri} does not tell what it rests on ({run.problem})"

@@ -190,6 +190,13 @@ def read_array(group: zarr.Group, name: str, selection: Any = ...) -> NDArray[An
     ------
     IncompleteStoreError : there is no such array, or a checksum says that its bytes have changed.
     """
+    try:
+        return _read_array(group, name, selection)
+    except IncompleteStoreError:  # perhaps the store was packed between its description and its numbers
+        return _read_array(group, name, selection)
+
+
+def _read_array(group: zarr.Group, name: str, selection: Any) -> NDArray[Any]:
     with damage_named(f"{group.store_path}/{name}"):
         array = group[name]
         if not isinstance(array, zarr.Array):

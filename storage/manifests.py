@@ -201,7 +201,7 @@ def broken_files(folder: Path, manifest: Mapping[str, Any], *, hashes: bool) -> 
     """Give name and problem of every file that is not as the manifest lists it; with ``hashes`` also extra ones."""
     listed = manifest["files"]
     for name, entry in listed.items():
-        problem = _file_problem(folder / name, entry, hashes=hashes)
+        problem = file_problem(folder / name, entry, hashes=hashes)
         if problem is not None:
             yield name, problem
     if hashes:
@@ -214,7 +214,8 @@ def _is_file(path: Path) -> bool:
     return path.is_symlink() or path.is_file()
 
 
-def _file_problem(path: Path, entry: Mapping[str, Any], *, hashes: bool) -> str | None:
+def file_problem(path: Path, entry: Mapping[str, Any], *, hashes: bool) -> str | None:
+    """What is not as the manifest's ``entry`` says of a file, in words that follow its name; None where it is whole."""
     try:
         if hashes and path.is_symlink():
             return "is a link, expected a file"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.layout import SHARD_ROWS, open_group, read_array, read_bands
+from storage.layout import SHARD_ROWS, damage_named, open_group, read_array, read_bands
 
 
 def mosaic_strips(path: Path, rows: slice = slice(None), columns: slice = slice(None)) -> Iterator[NDArray[np.float32]]:
@@ -19,8 +19,8 @@ def mosaic_strips(path: Path, rows: slice = slice(None), columns: slice = slice(
     IncompleteStoreError : the mosaic is missing or damaged.
     """
     group = open_group(path)
-    height = len(read_array(group, "coverage", (slice(None), slice(0, 1))))
-    first, last, _ = rows.indices(height)
+    with damage_named(f"{path}/values"):
+        first, last, _ = rows.indices(group["values"].shape[0])  # type: ignore[union-attr]
     while first < last:
         below = min((first // SHARD_ROWS + 1) * SHARD_ROWS, last)
         yield read_array(group, "values", (slice(first, below), columns))

@@ -1,4 +1,4 @@
-"""What a person means by a product: an address, a key or the beginning of one, a run, or a name in the newest run."""
+"""What a person means by a product: an address, a key or its beginning, a run or `latest`, a name in the newest run."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from storage.records import Run
 from storage.staging import check_name
 
 SHORTEST = 4  # letters of a key
+LATEST = "latest"  # the newest run
 
 
 def find_product(catalogue: Catalogue, text: str) -> str | Run:
@@ -29,8 +30,8 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
         return _run(catalogue, parts[1])
     if len(parts) == 2 and any(uri.startswith(f"stages/{parts[0]}/") for uri in catalogue.stores):
         return _store(catalogue, "/".join(("stages", *parts)))
-    runs = [run for run in catalogue.runs if run.folder.name == text]
-    return runs[0] if runs else _named(catalogue, text)
+    runs = [run for run in catalogue.runs if text in (run.folder.name, LATEST)]
+    return runs[-1] if runs else _named(catalogue, text)
 
 
 def _store(catalogue: Catalogue, uri: str) -> str:
@@ -71,7 +72,12 @@ def _named(catalogue: Catalogue, text: str) -> str:
     if keys:
         raise ArchiveError(f"{text} begins {len(keys)} keys: {_some(keys)}; give more of it")
     near = difflib.get_close_matches(text, products, n=1)
-    known = f"did you mean {near[0]}?" if near else f"products of the newest run: {', '.join(products) or 'none'}"
+    if near:
+        known = f"did you mean {near[0]}?"
+    elif products:
+        known = f"products of the newest run: {', '.join(products)}"
+    else:
+        known = f"no run has products; there is {_some(sorted(catalogue.stores)) or 'nothing in it'}"
     raise ArchiveError(f"{text!r} is no product, key or run of this archive; {known}")
 
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -80,7 +80,12 @@ def plan_packing(archive: Archive, *, older_than: float = 30.0, now: datetime | 
     Raises
     ------
     SettingsError : ``older_than`` is negative or no number.
+    ArchiveError : the archive is in a bucket.
     """
+    if archive.in_bucket:
+        raise ArchiveError(
+            f"{archive.name} is in a bucket, where no store can change: copy it to a disk, pack it there"
+        )
     if not (math.isfinite(older_than) and older_than >= 0):
         raise SettingsError(f"--older-than {older_than}: expected a number of days, 0 or more")
     moment = now or datetime.now(UTC)
@@ -102,10 +107,6 @@ def pack(
     SettingsError : ``older_than`` is negative or no number.
     ArchiveError : the disk refuses, or cannot exchange two folders in one step; the archive is in a bucket.
     """
-    if archive.in_bucket:
-        raise ArchiveError(
-            f"{archive.name} is in a bucket, where no store can change: copy it to a disk, pack it there"
-        )
     with refusals(archive.root, "pack the archive"):
         plan = plan_packing(archive, older_than=older_than, now=now)
         total, done = sum(one.before for one in plan if one.state == "to pack") or 1, 0
@@ -189,15 +190,23 @@ def _exchange_packed(ref: StageRef, one: Packing, report: Callable[[float], None
     part = _part(ref)
     remove_tree(part)
     values = _write_packed(ref.path, part, report)
-    facts = packed_facts(
-        read_manifest(ref.path), manifest_sha256(ref.path), values, f"{PCODEC_NAME} level {PCODEC_LEVEL}"
-    )
-    write_manifest(part, facts)
-    after = listed_bytes(read_manifest(part))
+    before = read_manifest(ref.path)
+    write_manifest(part, packed_facts(before, manifest_sha256(ref.path), values, f"{PCODEC_NAME} level {PCODEC_LEVEL}"))
+    made = read_manifest(part)
+    _check_copies(ref.path, before["files"], made["files"])
+    after = listed_bytes(made)
     if after > (1 - LEAST_SAVED) * one.before:
         return replace(one, state="skipped", why=f"would save less than {LEAST_SAVED:.0%}")
     exchange(part, ref.path)
     return replace(one, state="packed", after=after)
+
+
+def _check_copies(store: Path, before: Mapping[str, Any], made: Mapping[str, Any]) -> None:
+    """Refuse to seal files that changed on their way (IncompleteStoreError); those of the packed arrays are new."""
+    arrays = tuple(f"{cube.name}/{_name(cube)}/" for cube in sorted(store.glob("*.zarr")) if _cube_why_not(cube) == "")
+    for name in sorted(set(before) | set(made)):
+        if not name.startswith(arrays) and before.get(name) != made.get(name):
+            raise IncompleteStoreError(f"{store / name} changed while it was copied; check the disk, pack again")
 
 
 def _write_packed(store: Path, part: Path, report: Callable[[float], None]) -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from pipeline.rectify.alignment import SweepShift, no_shifts
 from pipeline.rectify.line_numbers import LineNumbers, number_lines
 from pipeline.rectify.placed import PixelGrid, Placed, place
 from storage.cubes import RawCube
+from storage.stored_tables import read_table
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def sight_sweeps(cubes: Sequence[RawCube], registration: Path | None, camera: Li
     shifts = {shift.name: shift for shift in no_shifts([cube.sweep.name for cube in cubes])}
     gains: dict[str, NDArray[np.float32]] = {}
     if registration is not None:
-        for name, one in json.loads(registration.read_text())["sweeps"].items():
+        for name, one in read_table(registration)["sweeps"].items():
             shifts[name] = SweepShift(name, np.array(one["offset_px"]), np.array(one["drift_px_per_line"]))
             if one["gain"] is not None:
                 gains[name] = np.array(one["gain"], np.float32)

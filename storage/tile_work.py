@@ -17,7 +17,7 @@ from pipeline.errors import SettingsError
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.region import Reaches, column_reach, mosaic_tile
 from pipeline.rectify.tiles import Tile, cache_bytes, plan_tiles, tile_bytes
-from storage.block_work import THREADS, Crew, count_cores, run_blocks
+from storage.block_work import THREADS, Crew, run_blocks
 from storage.mosaic_work import MosaicRecipe as MosaicRecipe
 from storage.mosaic_work import MosaicWork as MosaicWork
 from storage.mosaics import MosaicWriter
@@ -105,10 +105,7 @@ def write_mosaic(
     """
     opened = work.open() if isinstance(work, MosaicRecipe) else work
     tiles = plan_tiles(opened.placed, opened.camera, opened.grid, writer.tile_shape)
-    budget = tile_budget(
-        opened, tiles, writer.tile_shape, memory=memory, workers=1 if crew.elsewhere else crew.count,
-        processes=not crew.shares_memory,
-    )  # fmt: skip
+    budget = tile_budget(opened, tiles, writer.tile_shape, memory=memory, crew=crew)
 
     def show(rows: slice, columns: slice, part: NDArray[np.float32] | None) -> None:
         if seen is not None and part is not None:
@@ -153,7 +150,12 @@ class _Opened:
 
     def __init__(self, work: MosaicWork, writer: MosaicWriter, cache: LineCache, cut: ThumbnailCut | None) -> None:
         self._work, self._writer, self._cache, self._cut = work, writer, cache, cut
-        self._reach = lru_cache(maxsize=2)(self._column_reach)  # tiles go down the columns
+
+        @lru_cache(maxsize=2)  # tiles go down the columns; a method of this object would keep it alive
+        def reach(start: int, stop: int) -> Reaches:
+            return column_reach(work.placed, work.camera, work.grid, slice(start, stop))
+
+        self._reach = reach
 
     def tile(self, tile: Tile) -> NDArray[np.float32] | None:
         """Make and write a planned tile."""
@@ -163,9 +165,6 @@ class _Opened:
         """Make and write the tile there; what sweeps show of the columns is found once for all rows."""
         return self._make(rows, columns, self._reach(columns.start, columns.stop))
 
-    def _column_reach(self, start: int, stop: int) -> Reaches:
-        return column_reach(self._work.placed, self._work.camera, self._work.grid, slice(start, stop))
-
     def _make(self, rows: slice, columns: slice, reach: Reaches) -> NDArray[np.float32] | None:
         work = self._work
         values, coverage = mosaic_tile(
@@ -174,6 +173,11 @@ class _Opened:
         part = None if self._cut is None else self._cut(rows, columns, values).copy()
         self._writer.write_tile(rows.start, columns.start, values, coverage)
         return part
+
+
+def let_tiles_go() -> None:
+    """Give back the memory of the last mosaic's raw lines in this process, whose work goes on with something else."""
+    _opened.cache_clear()
 
 
 @lru_cache(maxsize=1)
@@ -188,16 +192,16 @@ def tile_budget(
     tile_shape: tuple[int, int],
     *,
     memory: int,
-    workers: int | None,
-    processes: bool = False,
+    crew: Crew = THREADS,
 ) -> TileBudget:
-    """Choose how many tiles to make at a time: as many as are allowed and memory holds.
+    """Choose how many tiles to make at a time: as many as are allowed and memory holds; elsewhere memory is no matter.
 
     Raises
     ------
     SettingsError : not even one tile at a time fits the memory.
     """
-    most = max(1, min(count_cores() if workers is None else workers, len(tiles)))
+    processes = not crew.shares_memory
+    most = max(1, min(1 if crew.elsewhere else crew.count, len(tiles)))
     bands = len(work.placed[0].lines.references.panel) if work.placed else 1
     one = tile_bytes(tile_shape, bands)
     budgets = (
@@ -205,7 +209,7 @@ def tile_budget(
         for count in range(most, 0, -1)
     )
     for budget in budgets:
-        if budget.projected <= memory:
+        if crew.elsewhere or budget.projected <= memory:
             return budget
     least = budget
     raise SettingsError(

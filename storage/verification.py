@@ -62,8 +62,17 @@ def verify_everything(
         if not path.exists() and not catalogue.named_by(uri):
             continue  # gc or a repair has cleared it away since
         problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
+        if problems and _packed_since(catalogue, uri):  # its files and its manifest changed together
+            catalogue = Catalogue.read(root)
+            problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
         found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
     return [*found, *_lost(root), *_missing(catalogue), *_left_aside(root)]
+
+
+def _packed_since(catalogue: Catalogue, uri: str) -> bool:
+    """Whether a store was packed after the catalogue was read."""
+    store = catalogue.stores.get(uri)
+    return store is not None and packed_from(try_manifest(store.ref.path)[0]) != packed_from(store.facts)
 
 
 def _bytes(run: Run) -> int:

@@ -112,6 +112,20 @@ def test_work_travels_as_paths(surveyed: tuple[SurveyRun, Path]) -> None:
     assert (there(region) == scoring(work.regions[0])).all()
 
 
+def test_a_worker_at_regions_keeps_no_tiles(
+    surveyed: tuple[SurveyRun, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it held for the mosaic is given back before a region is read: the memory was promised once."""
+    run, stages = surveyed
+    let_go: list[bool] = []
+    monkeypatch.setattr("flows.region_work.let_tiles_go", lambda: let_go.append(True))
+    work = _work(run, Crew(workers=1), 1)
+    work.score("entropy", _store(stages, "rectify/*/mosaic.zarr"), lambda done: None)
+    assert len(let_go) == 2
+    _draw(work, run, stages, tmp_path / "m.zarr")
+    assert len(let_go) == 4
+
+
 @pytest.mark.parametrize(("crew", "words"), [(Crew(), "the process itself"), (Crew("processes"), "each of two proc")])
 def test_too_little_memory_is_refused_before_the_work(
     surveyed: tuple[SurveyRun, Path], tmp_path: Path, crew: Crew, words: str

@@ -13,8 +13,19 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from pipeline.errors import IncompleteStoreError, ShapeError
-from storage.band_statistics import PERCENTILES, BandPart, plan_strips, product_statistics, tabulate
+from storage.band_statistics import (
+    PERCENTILES,
+    BandPart,
+    Strip,
+    _InOrder,
+    cube_stores,
+    plan_strips,
+    product_statistics,
+    tabulate,
+)
 from storage.block_work import Crew
+from storage.cube_sources import CubeSource, LineFacts
+from storage.ingested_cubes import write_ingested_cube
 from storage.mosaics import MosaicWriter
 from storage.value_bins import RELATIVE_WIDTH, bins_of, edges_of
 
@@ -127,6 +138,20 @@ def test_every_crew_finds_the_same(mosaic: Path, processes: Crew) -> None:
     assert found[0].finite.tolist() == [150 * 700 - 70 * 100] * 4
 
 
+def test_the_last_digit_does_not_depend_on_who_was_faster() -> None:
+    """Strips are merged in their order, in whatever order they end."""
+    rng = np.random.default_rng(7)
+    parts = [BandPart.of(rng.normal(10**number, 1, (17, 4))) for number in range(9)]
+    found = set()
+    for order in (range(9), reversed(range(9)), rng.permutation(9)):
+        merged = _InOrder(4)
+        for number in order:
+            merged.take(Strip(Path(), "values", 0, 0, int(number)), parts[number])
+        table = tabulate(merged.total, NM)
+        found.add(table.mean.tobytes() + table.std.tobytes())
+    assert len(found) == 1
+
+
 def test_several_stores_count_together(mosaic: Path) -> None:
     """The sweeps of a capture are one product: pixels add up, and bands must be the same."""
     assert product_statistics([mosaic, mosaic]).pixels == 2 * SHAPE[0] * SHAPE[1]
@@ -134,6 +159,20 @@ def test_several_stores_count_together(mosaic: Path) -> None:
     MosaicWriter(other, (8, 8), NM + 1)
     with pytest.raises(ShapeError, match=r"other.zarr has other bands than .*mosaic.zarr; ask for them one by one"):
         product_statistics([mosaic, other])
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.float32])
+def test_lines_that_a_file_did_not_hold_do_not_count(tmp_path: Path, kind: type[np.generic]) -> None:
+    """An ingested cube marks them, and has zeros there where there is no NaN; its wavelengths may not be known."""
+    values = np.full((70, 50, 3), 1000, kind)
+    valid = np.arange(70) < 60
+    source = CubeSource("a.npy", values.shape, values.dtype, lambda a, b: values[a:b], (), LineFacts(valid))
+    write_ingested_cube(tmp_path, source, [], name="a")
+    found = product_statistics(cube_stores(tmp_path))
+    assert (found.low.tolist(), found.mean.tolist()) == ([1000.0] * 3, [1000.0] * 3)
+    assert (found.finite.tolist(), found.pixels) == ([60 * 50] * 3, 70 * 50)
+    assert np.isnan(found.wavelength_nm).all()
+    assert product_statistics(2 * cube_stores(tmp_path)).pixels == 2 * found.pixels
 
 
 def test_what_is_no_cube_is_refused(mosaic: Path, tmp_path: Path) -> None:

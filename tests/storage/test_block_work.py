@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -20,7 +21,7 @@ from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError, ShapeError, WorkerError
 from pipeline.rectify.placed import PixelGrid
 from pipeline.rectify.tiles import plan_tiles
-from storage import cluster_work
+from storage import cluster_work, worker_facts
 from storage.band_statistics import plan_strips
 from storage.block_work import Crew, block_graph, count_cores, run_blocks
 from storage.mosaics import MosaicWriter
@@ -139,11 +140,15 @@ def test_a_killed_worker_costs_only_time(tmp_path: Path, processes: Crew) -> Non
 
 
 def test_a_block_that_kills_its_workers_is_one_error() -> None:
-    """Where every try kills the worker, the error says so and what to do."""
-    with pytest.raises(
-        WorkerError, match=r"2 worker processes: workers died .* in the same block.*--scheduler threads"
-    ):
-        run_blocks(die, range(3), PROCESSES)
+    """Where every try kills the worker, the error says so and what to do; a crew kept open gets other workers."""
+    with Crew("processes", 1).open() as crew:
+        (before, _), *_ = run_blocks(threads_here, [0], crew)
+        with pytest.raises(
+            WorkerError, match=r"1 worker processes: workers died .* in the same block.*--scheduler threads"
+        ):
+            run_blocks(die, range(3), crew)
+        (after, _), *_ = run_blocks(threads_here, [0], crew)
+        assert before != after
 
 
 @pytest.mark.parametrize("scheduler", ["thread", "tcp://", "tcp://host", "http://host:80", "tcp://host:port"])
@@ -185,21 +190,140 @@ def test_workers_that_see_other_files_are_refused(
     elsewhere: Crew, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A folder that differs there is named, with what both see and what to do; nothing is made."""
-    monkeypatch.setattr(cluster_work, "_seen", lambda folder: "with 7 names")
+    monkeypatch.setattr(worker_facts, "_seen", lambda folder: "with 7 names")
     with pytest.raises(
         SettingsError, match=rf"worker tcp:.* has {tmp_path} with 0 names .*, expected with 7 names .*mount"
     ):
         run_blocks(square, [1], elsewhere, paths=[tmp_path])
 
 
-def test_workers_of_another_version_are_refused(elsewhere: Crew, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def other_versions(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
+    """Somebody who may change what this process takes for its own versions."""
+    worker_facts.versions_here.cache_clear()
+    yield monkeypatch
+    worker_facts.versions_here.cache_clear()
+
+
+def test_workers_of_another_version_are_refused(elsewhere: Crew, other_versions: pytest.MonkeyPatch) -> None:
     """Other code or another numpy there would give other bytes: the first that differs is named."""
-    monkeypatch.setattr(cluster_work, "version", lambda name: "0.1")
+    other_versions.setattr(worker_facts, "version", lambda name: "0.1")
     with pytest.raises(SettingsError, match=r"has numpy \d.*, expected 0.1 as here; install the same there"):
         run_blocks(square, [1], elsewhere)
-    monkeypatch.setattr(cluster_work, "_code_digest", lambda: "of code abc")
+    worker_facts.versions_here.cache_clear()
+    other_versions.setattr(worker_facts, "_code_digest", lambda: "of code abc")
     with pytest.raises(SettingsError, match=r"has spectralzoom of code \w+, expected of code abc as here"):
         run_blocks(square, [1], elsewhere)
+
+
+def test_workers_still_run_what_they_began_with(other_versions: pytest.MonkeyPatch) -> None:
+    """Files that changed on the disk since are not what a process runs."""
+    before = worker_facts.versions_here()
+    other_versions.setattr(worker_facts, "_code_digest", lambda: "of code abc")
+    assert worker_facts.versions_here() == before
+
+
+def test_workers_with_several_threads_of_arithmetic_are_refused() -> None:
+    """Sums of several threads are rounded otherwise: other bytes under the same key."""
+    expected = {**worker_facts.about_here([]), **worker_facts.ONE_THREAD}
+    with pytest.raises(SettingsError, match=r"worker 1 has OMP_NUM_THREADS 4, expected 1 in its environment"):
+        worker_facts.check_facts("worker 1", expected | {"OMP_NUM_THREADS": "4"}, expected)
+
+
+def test_a_scheduler_that_lacks_the_program_is_refused(elsewhere: Crew, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scheduler opens what it passes on to workers."""
+    monkeypatch.setattr(cluster_work, "versions_here", _not_there)
+    with pytest.raises(SettingsError, match=r"the scheduler or a worker cannot import SpectralZoom \(.*no storage"):
+        run_blocks(square, [1], elsewhere)
+
+
+def _not_there() -> None:
+    raise ModuleNotFoundError("no storage")
+
+
+STALE_S = 0.6
+
+
+def fail_or_write(folder: Path, number: int) -> None:
+    """Fail in block 0 while block 1 is still to write."""
+    if number == 0:
+        while not (folder / "begun").exists():
+            time.sleep(0.01)
+        raise ShapeError("no 0")
+    (folder / "begun").touch()
+    time.sleep(STALE_S)
+    (folder / f"late {number}").touch()
+
+
+@pytest.mark.parametrize("scheduler", ["threads", "processes"])
+def test_nobody_writes_after_an_error(tmp_path: Path, processes: Crew, scheduler: str) -> None:
+    """Once an error is raised whoever asked may take the folder away: no block comes back to it, none is begun."""
+    crew = processes if scheduler == "processes" else Crew(workers=2)
+    with pytest.raises(ShapeError, match="no 0"):
+        run_blocks(partial(fail_or_write, tmp_path), range(6), crew)
+    left = sorted(path.name for path in tmp_path.iterdir())
+    time.sleep(2 * STALE_S)
+    assert sorted(path.name for path in tmp_path.iterdir()) == left
+
+
+GONE = """
+import subprocess, sys, time
+from contextlib import suppress
+from pipeline.errors import PipelineError, WorkerError
+from storage import cluster_work
+from storage.block_work import Crew, run_blocks
+from tests.storage.test_block_work import nap
+
+def dask(*words):
+    command = [sys.executable, "-m", f"distributed.cli.dask_{words[0]}", *words[1:], "--no-dashboard"]
+    return subprocess.Popen(command, stderr=subprocess.DEVNULL)
+
+def begin(crew):
+    started = dask("scheduler", "--host", crew.scheduler), dask("worker", crew.scheduler, "--nthreads", "1")
+    while True:
+        with suppress(PipelineError):
+            run_blocks(nap, range(1), crew)
+            return started
+        time.sleep(0.1)
+
+def end(started):
+    for one in started:
+        one.terminate()
+        one.wait()
+
+if __name__ == "__main__":
+    cluster_work.ANSWER_S = 1.0
+    with Crew(sys.argv[1]).open() as crew:
+        started = begin(crew)
+        try:
+            run_blocks(nap, range(9), crew, each=lambda number, result: started[0].kill())
+        except WorkerError as error:
+            print(error)
+        end(started)
+        started = begin(crew)
+        print(run_blocks(nap, range(3), crew))
+        end(started)
+"""
+
+
+def nap(number: int) -> int:
+    """A short block."""
+    time.sleep(0.05)
+    return number
+
+
+def test_a_scheduler_that_goes_away_is_one_error(tmp_path: Path) -> None:
+    """In the middle of the work: one message, no traceback of dask's; one that comes back serves the same crew."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    (script := tmp_path / "gone.py").write_text(GONE)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run(
+        [sys.executable, str(script), address], env=environment, capture_output=True, text=True, timeout=60, check=True
+    )
+    gone = f"--scheduler {address}: the scheduler is gone; the same command goes on once it is there again"
+    assert done.stdout.splitlines() == [gone, "[0, 1, 2]"]
+    assert done.stderr == ""
 
 
 INTERRUPTED = """

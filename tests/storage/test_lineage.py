@@ -166,6 +166,24 @@ def test_products_go_by_many_names(tmp_path: Path) -> None:
         assert found.folder == small.run
 
 
+def test_the_latest_run_goes_by_that_name(tmp_path: Path) -> None:
+    """As export and compare have it."""
+    archive = Archive.open(tmp_path)
+    small_survey(archive)
+    second = small_survey(archive).run
+    found = find_product(Catalogue.read(tmp_path), "latest")
+    assert isinstance(found, Run)
+    assert found.folder == second
+
+
+def test_without_a_run_stores_are_offered(tmp_path: Path) -> None:
+    """An archive of ingested cubes alone has no products, but addresses."""
+    with Archive.open(tmp_path).publish("ingest", "abcd1"):
+        pass
+    with pytest.raises(ArchiveError, match=r"no run has products; there is stages/ingest/abcd1$"):
+        find_product(Catalogue.read(tmp_path), "mosaic")
+
+
 def test_a_stage_narrows_the_beginning_of_a_key(tmp_path: Path) -> None:
     """With and without the word stages; what is still two keys is refused with both."""
     archive = Archive.open(tmp_path)

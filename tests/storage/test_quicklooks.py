@@ -96,6 +96,18 @@ def test_lines_make_one_picture_however_they_come(tmp_path: Path) -> None:
         np.testing.assert_array_equal(other.image, pictures[0].image)
 
 
+def test_a_long_cube_is_thinned_evenly_across_blocks() -> None:
+    """Every fifth line of all lines, not of each block of 64 anew."""
+    lines = np.arange(4200, dtype=np.uint16)[:, None, None] * np.ones((1, 2, 3), np.uint16)
+    seen = LineThumbnail(lines.shape, None)
+    for start in range(0, len(lines), 64):
+        block = lines[start : start + 64]
+        seen.add(start, block, np.ones(len(block), np.bool_))
+    found = seen.finish()
+    assert found.step == 5
+    np.testing.assert_array_equal(found.image, stretched(lines[::5, ::5].astype(np.float32)).image)
+
+
 def test_one_scale_keeps_colours_true() -> None:
     """Grey stays grey, whatever the bands hold elsewhere; a scale for each band colours it."""
     image = np.random.default_rng(2).uniform(0, 1, (40, 40, 3)) * (0.2, 0.5, 0.1)

@@ -14,16 +14,18 @@ import warnings
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
+import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.scan import Sweep
 from pipeline.source import Line, References
-from storage import folder_exchange, layout, packed_arrays, repacking
+from storage import folder_exchange, layout, manifests, packed_arrays, repacking
 from storage.archive import Archive, StageRef
 from storage.archive_codec import PCODEC_NAME
 from storage.cube_sources import CubeSource, LineFacts
@@ -192,6 +194,83 @@ def test_a_damaged_store_gets_no_new_seal(archive: Archive) -> None:
     assert "fine-1.zarr/time/c/0 has changed since it was published" in one.why
     assert archive.manifest_hash(ref) == before
     assert not list(ref.path.parent.glob("*.part"))
+
+
+@pytest.mark.parametrize("name", ["fine-0.zarr/time/c/0", "fine-1.zarr/zarr.json"])
+def test_a_file_that_changes_on_its_way_gets_no_seal(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """Between its check and its copy, or in the copy: the store stays as it is."""
+    (ref,) = archive.refs()
+    before, copy = archive.manifest_hash(ref), shutil.copyfile
+
+    def spoiling(path: Path, to: Path) -> None:
+        copy(path, to)
+        if path == ref.path / name:
+            to.write_bytes(to.read_bytes() + b" ")
+
+    monkeypatch.setattr(shutil, "copyfile", spoiling)
+    (one,) = pack(archive, older_than=0).stores
+    assert one.state == "failed"
+    assert f"{name} changed while it was copied" in one.why
+    assert archive.manifest_hash(ref) == before
+    assert not list(ref.path.parent.glob("*.part"))
+
+
+def test_verify_does_not_doubt_what_is_packed_meanwhile(archive: Archive) -> None:
+    """Neither a store that is packed before it is read again, nor one that is packed while it is read."""
+    _capture(archive, seed=2)
+    states: list[str] = []
+
+    def progress(uri: str, done: float) -> None:
+        if uri.startswith("stages/") and not states:
+            states.extend(one.state for one in pack(archive, older_than=0).stores)
+
+    assert [one.problem for one in archive.verify_all(progress) if one.problem is not None] == []
+    assert states == ["packed", "packed"]
+
+
+def test_verify_reads_a_store_again_that_was_exchanged_under_it(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it had read of the store before does not count against the store after."""
+    (ref,) = archive.refs()
+    packed: list[int] = []
+    hashed = manifests.file_hash
+
+    def packing(path: Path) -> str:
+        digest = hashed(path)
+        if path == ref.path / "fine-1.zarr/dn/c/0/0/0" and not packed:
+            packed.append(0)
+            packed[0] = pack(Archive.open(archive.root), older_than=0).saved
+        return digest
+
+    monkeypatch.setattr(manifests, "file_hash", packing)
+    assert _problems(archive) == []
+    assert packed[0] > 0
+
+
+def test_a_reader_whose_store_is_packed_under_it_reads_the_same(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even between an array's description and its numbers; damage is still told."""
+    (ref,) = archive.refs()
+    cube = open_raw_cube(ref.path / "fine-0.zarr")
+    before, read = cube.read(), zarr.Array.__getitem__
+    states: list[str] = []
+
+    def packing(array: zarr.Array[Any], place: object) -> object:
+        if array.basename == "dn" and not states:
+            states.append("")
+            states.extend(one.state for one in pack(archive, older_than=0).stores)
+        return read(array, place)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(zarr.Array, "__getitem__", packing)
+    np.testing.assert_array_equal(cube.read(), before)
+    assert states == ["", "packed"]
+    flip(ref.path / "fine-0.zarr/dn/c/0/0/0")
+    with pytest.raises(IncompleteStoreError, match="dn cannot be read"):
+        cube.read()
 
 
 def test_what_does_not_read_back_is_not_swapped_in(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -399,6 +478,16 @@ def test_progress_goes_up_to_all_of_it(archive: Archive) -> None:
     assert seen[-1] == pytest.approx(1.0)
     assert {one.state for one in done.stores} == {"packed"}
     assert done.saved == sum(one.before - (one.after or 0) for one in done.stores)
+
+
+@pytest.mark.parametrize("verb", [pack, plan_packing])
+def test_an_archive_in_a_bucket_is_refused(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch, verb: Callable[[Archive], object]
+) -> None:
+    """By what would only look, too: nothing there can be packed."""
+    monkeypatch.setattr(archive, "in_bucket", True)
+    with pytest.raises(ArchiveError, match="is in a bucket, where no store can change: copy it to a disk"):
+        verb(archive)
 
 
 def test_another_process_at_a_store_leaves_it(archive: Archive) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import signal
+import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +16,22 @@ import pytest
 from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
 from pipeline.rectify.placed import PixelGrid, place
+from pipeline.rectify.tiles import plan_tiles
 from pipeline.scan import Sweep, line_positions
 from pipeline.source import Line, References
+from storage import tile_work
 from storage.block_work import Crew
 from storage.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from storage.mosaics import MosaicWriter, load_mosaic
-from storage.tile_work import MosaicRecipe, MosaicWork, Thumbnail, ThumbnailCut, write_mosaic
+from storage.tile_work import (
+    MosaicRecipe,
+    MosaicWork,
+    Thumbnail,
+    ThumbnailCut,
+    TileMaker,
+    tile_budget,
+    write_mosaic,
+)
 
 CAMERA = LineCamera()
 BANDS = np.array([500.0, 600.0, 700.0])
@@ -193,6 +204,36 @@ def test_processes_need_a_recipe(tmp_path: Path, cubes: list[RawCube], processes
         write_mosaic(
             work_of(cubes), MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS), memory=PLENTY, crew=processes
         )
+
+
+def test_each_process_keeps_the_lines_of_one_tile(cubes: list[RawCube]) -> None:
+    """Two processes keep each what one thread keeps; two threads share what both need."""
+    work = work_of(cubes)
+    tiles = plan_tiles(work.placed, CAMERA, GRID, (64, 640))
+    kept = [
+        tile_budget(work, tiles, (64, 640), memory=PLENTY, crew=crew).cache for crew in (ONE, TWO, Crew("processes", 2))
+    ]
+    assert kept[2] == kept[0] < kept[1]
+
+
+def test_a_worker_lets_tiles_go(tmp_path: Path, cubes: list[RawCube]) -> None:
+    """Raw lines are kept from tile to tile of a mosaic, and no longer than the process is at tiles."""
+    writer = MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS)
+    maker = TileMaker(recipe_of(cubes), writer.path, 2**24)
+    maker((slice(0, 64), slice(0, 640)))
+    lines = weakref.ref(tile_work._opened(maker)._cache)
+    assert lines() is not None
+    tile_work.let_tiles_go()
+    assert lines() is None
+
+
+def test_memory_of_workers_elsewhere_is_not_counted(tmp_path: Path, cubes: list[RawCube]) -> None:
+    """They lie on other machines; here the least memory refuses nothing."""
+    work, elsewhere = work_of(cubes), Crew("tcp://127.0.0.1:9")
+    tiles = plan_tiles(work.placed, CAMERA, GRID, (64, 640))
+    assert tile_budget(work, tiles, (64, 640), memory=1, crew=elsewhere).workers == 1
+    with pytest.raises(SettingsError, match="exceeds --memory 1 MiB"):
+        tile_budget(work, tiles, (64, 640), memory=1, crew=ONE)
 
 
 def test_every_process_counts_against_the_memory(tmp_path: Path, cubes: list[RawCube]) -> None:
