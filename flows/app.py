@@ -1,10 +1,14 @@
-"""The command line's one application, and how verbs speak and read lists."""
+"""The command line's one application, what its verbs have in common, and how they speak and read lists."""
 
 from __future__ import annotations
 
 import importlib.metadata
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
 
-from cyclopts import App
+from cyclopts import App, Parameter
 from rich.console import Console
 from rich.markup import escape
 
@@ -22,12 +26,28 @@ app = App(
     suppress_keyboard_interrupt=False,  # main says what an interrupted survey leaves
 )
 stderr = Console(stderr=True)
+ArchiveName = Annotated[str, Parameter(help="The archive's folder, or s3://bucket/prefix.")]
+AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print one JSON object on stdout.")]
+Switch = Annotated[bool, Parameter(negative="")]  # off unless given
+OutFile = Annotated[Path, Parameter(name=("--out", "-o"))]
+OutFolder = Annotated[Path | None, Parameter(name=("--out", "-o"))]
+Scheduler = Annotated[
+    str, Parameter(help="Who works: `threads`, `processes`, or a dask scheduler elsewhere, tcp://host:port")
+]
+Workers = Annotated[int | None, Parameter(help="Blocks of the field at a time; one a core by default.")]
 GOES_ON = ("survey", "train", "export", "reprocess")  # verbs that keep what they have done when they are interrupted
 
 
 def say(message: str) -> None:
     """Print an error on stderr, as one message."""
     stderr.print(f"[bold red]error[/]: {escape(message)}", highlight=False, soft_wrap=True)
+
+
+def print_json(content: Mapping[str, object]) -> None:
+    """Print one object on stdout; numbers that are not finite become null."""
+    from flows.receipt import to_json
+
+    sys.stdout.write(to_json(content))
 
 
 def split_list(text: str | None) -> tuple[str, ...]:

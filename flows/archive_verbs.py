@@ -2,46 +2,43 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
-from flows.app import app, parse_numbers, stderr
+from flows.app import (
+    ArchiveName,
+    AsJson,
+    OutFile,
+    OutFolder,
+    Scheduler,
+    Switch,
+    Workers,
+    app,
+    parse_numbers,
+    print_json,
+    stderr,
+)
 
 
 @app.command
-def ls(archive: str, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False) -> int:
-    """List the runs and stores of an archive: when, what of, how good, how large.
-
-    Parameters
-    ----------
-    archive
-        The archive's folder, or s3://bucket/prefix.
-    as_json
-        Print the list as JSON on stdout.
-    """
+def ls(archive: ArchiveName, *, as_json: AsJson = False) -> int:
+    """List the runs and stores of an archive: when, what of, how good, how large."""
     from flows.archive_commands import run_ls
 
     return run_ls(archive, as_json=as_json)
 
 
 @app.command
-def explain(
-    archive: str, product: str, *, as_json: Annotated[bool, Parameter(name="--json", negative="")] = False
-) -> int:
+def explain(archive: ArchiveName, product: str, *, as_json: AsJson = False) -> int:
     """Show how a product came about, and what changed since the version before it.
 
     Parameters
     ----------
-    archive
-        The archive's folder, or s3://bucket/prefix.
     product
-        Its address (stages/rectify/KEY), a key or its beginning, a run, or a product's name in the newest run
-        (class_map, mosaic).
-    as_json
-        Print the lineage as JSON on stdout.
+        Its address (stages/rectify/KEY), a key or its beginning, a run's name or `latest`, or a product's name in the
+        newest run (class_map, mosaic).
     """
     from flows.archive_commands import run_explain
 
@@ -50,21 +47,17 @@ def explain(
 
 @app.command
 def verify(
-    archive: str,
+    archive: ArchiveName,
     *,
-    repair: Annotated[bool, Parameter(negative="")] = False,
-    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+    repair: Switch = False,
+    as_json: AsJson = False,
 ) -> int:
     """Read every byte of an archive again and compare it with what was published.
 
     Parameters
     ----------
-    archive
-        The archive's folder, or s3://bucket/prefix.
     repair
         Make anew what is broken and what was made of it, by running the surveys again that name it.
-    as_json
-        Print what was found as JSON on stdout.
     """
     from flows.archive_commands import run_verify
 
@@ -73,27 +66,23 @@ def verify(
 
 @app.command
 def gc(
-    archive: str,
+    archive: ArchiveName,
     *,
     keep_days: float = 1.0,
-    raw_too: Annotated[bool, Parameter(negative="")] = False,
-    dry_run: Annotated[bool, Parameter(negative="")] = False,
-    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+    raw_too: Switch = False,
+    dry_run: Switch = False,
+    as_json: AsJson = False,
 ) -> int:
     """Remove what no run names and no named product rests on.
 
     Parameters
     ----------
-    archive
-        The archive's folder, or s3://bucket/prefix.
     keep_days
         Stores younger than this stay: a survey may be about to name them.
     raw_too
         Also raw lines of a rig, or ingested, that no run names; they cannot be had again.
     dry_run
         Only say what would go, and how many bytes.
-    as_json
-        Print what went as JSON on stdout.
     """
     from flows.archive_commands import run_gc
 
@@ -102,11 +91,11 @@ def gc(
 
 @app.command
 def pack(
-    archive: Path,
+    archive: ArchiveName,
     *,
     older_than: float = 30.0,
-    dry_run: Annotated[bool, Parameter(negative="")] = False,
-    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+    dry_run: Switch = False,
+    as_json: AsJson = False,
 ) -> int:
     """Store old raw sweeps in fewer bytes: the same numbers, in a codec that takes longer to write.
 
@@ -115,14 +104,10 @@ def pack(
 
     Parameters
     ----------
-    archive
-        The archive's folder, or s3://bucket/prefix.
     older_than
         Only sweeps and ingested cubes that were stored so many days ago.
     dry_run
         Only say what would be packed.
-    as_json
-        Print what was packed as JSON on stdout.
     """
     from flows.pack_command import run_pack
 
@@ -131,46 +116,42 @@ def pack(
 
 @app.command
 def export(
-    archive: str,
+    archive: ArchiveName,
     run: str | None = None,
     *,
-    out: Annotated[Path, Parameter(name=("--out", "-o"))],
-    envi: Annotated[bool, Parameter(negative="")] = False,
-    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+    out: OutFile,
+    envi: Switch = False,
+    as_json: AsJson = False,
 ) -> int:
     """Export a run: maps as cloud-optimised GeoTIFF, a STAC catalogue of them, and on request cubes as ENVI.
 
     Parameters
     ----------
-    archive
-        The archive's folder, or s3://bucket/prefix.
     run
         The run's name, a folder's below runs, or `latest`, as without one.
     out
         Folder to export into, beside the runs of the same archive that lie there.
     envi
         Also write the coarse mosaic and the raw sweeps as ENVI files.
-    as_json
-        Print what was written as JSON on stdout.
     """
     from flows.export_command import run_export
 
     content = run_export(archive, run, out, envi, stderr)
     if as_json:
-        print(json.dumps(content, indent=2))
+        print_json(content)
     return 0
 
 
 @app.command
 def ingest(
     source: str,
-    archive: str,
+    archive: ArchiveName,
     *,
     name: str | None = None,
     dark: str | None = None,
     white: str | None = None,
     wavelengths: str | None = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+    as_json: AsJson = False,
 ) -> int:
     """Store SOURCE in ARCHIVE as one cube that never changes; the same content is stored once.
 
@@ -178,8 +159,6 @@ def ingest(
     ----------
     source
         ENVI header or data file, folder of a Headwall camera, GeoTIFF, .mat, .npy, PNG, or Zarr store.
-    archive
-        The archive's folder, or s3://bucket/prefix; it is made where there is none.
     name
         What the cube is called; the file's or folder's name by default.
     dark
@@ -188,44 +167,34 @@ def ingest(
         White frame, likewise.
     wavelengths
         Centre wavelengths of all bands [nm], where the files do not say them: 660,800
-    as_json
-        Print what was stored as JSON on stdout.
     """
     from flows.ingest_command import IngestRequest, run_ingest
 
     request = IngestRequest(source, archive, name, dark, white, parse_numbers(wavelengths, "--wavelengths"))
     record = run_ingest(request, stderr)
     if as_json:
-        print(json.dumps(record, indent=2))
+        print_json(record)
     return 0
 
 
 @app.command
 def statistics(
-    archive: str,
+    archive: ArchiveName,
     product: str = "mosaic",
     *,
     every_band: Annotated[bool, Parameter(name="--all", negative="")] = False,
-    scheduler: str = "threads",
-    workers: int | None = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+    scheduler: Scheduler = "threads",
+    workers: Workers = None,
+    as_json: AsJson = False,
 ) -> int:
     """Count every band of a stored cube: finite share, extremes, percentiles, mean and standard deviation.
 
     Parameters
     ----------
-    archive
-        The archive's folder.
     product
         Its address, a key or its beginning, or a product's name in the newest run (mosaic, raw_coarse).
     every_band
         Show every band, not a dozen of them.
-    scheduler
-        Who counts: `threads`, `processes`, or a dask scheduler elsewhere, tcp://host:port
-    workers
-        Rows of shards at a time; one a core by default.
-    as_json
-        Print all bands as JSON on stdout.
     """
     from flows.statistics_command import run_statistics
     from storage.block_work import Crew
@@ -236,25 +205,23 @@ def statistics(
 
 @app.command
 def compare(
-    archive: str,
+    archive: ArchiveName,
     old: str,
     new: str,
     *,
-    out: Annotated[Path | None, Parameter(name=("--out", "-o"))] = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+    out: OutFolder = None,
+    as_json: AsJson = False,
 ) -> int:
     """Compare two runs of one field: classes, where they differ, what was asked and spent, and a picture.
 
     Parameters
     ----------
-    archive
-        The archive's folder, or s3://bucket/prefix.
-    old, new
-        Runs A and B: names of folders below runs, `latest`, or `previous`, the one before it of the same field.
+    old
+        Run A: its name, a folder's below runs, `latest`, or `previous`, the one before it of the same field.
+    new
+        Run B, likewise.
     out
         Folder for the picture; beside the archive without one.
-    as_json
-        Print the comparison as JSON on stdout.
     """
     from flows.compare_command import run_compare
 
@@ -263,25 +230,23 @@ def compare(
 
 @app.command
 def reprocess(
-    archive: str,
+    archive: ArchiveName,
     *,
     since: str | None = None,
     stage: str | None = None,
     field: str | None = None,
-    failed: Annotated[bool, Parameter(negative="")] = False,
+    failed: Switch = False,
     weights: Path | None = None,
-    scheduler: str = "threads",
-    workers: int | None = None,
-    dry_run: Annotated[bool, Parameter(negative="")] = False,
-    out: Annotated[Path | None, Parameter(name=("--out", "-o"))] = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+    scheduler: Scheduler = "threads",
+    workers: Workers = None,
+    dry_run: Switch = False,
+    out: OutFolder = None,
+    as_json: AsJson = False,
 ) -> int:
     """Survey every field of an archive again: light is found there, only what has changed is made anew.
 
     Parameters
     ----------
-    archive
-        The archive's folder, or s3://bucket/prefix.
     since
         Only fields whose newest run is of this date (UTC) or later: 2026-05-01
     stage
@@ -292,16 +257,10 @@ def reprocess(
         Only fields whose newest run is damaged or lacks stores; what `verify` finds in bytes is for its --repair.
     weights
         Other model weights for all of them.
-    scheduler
-        Who makes blocks: `threads`, `processes`, or a dask scheduler elsewhere, tcp://host:port
-    workers
-        Blocks at a time; one a core by default.
     dry_run
         Only say what would run.
     out
         Folder for the summary, reprocess-TIME.json; without one beside the archive, where anything was to be done.
-    as_json
-        Print the summary as JSON on stdout.
     """
     from flows.reprocess_command import ReprocessRequest, run_reprocess
     from storage.block_work import Crew

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -85,7 +85,7 @@ def check_memory(settings: Settings, source: SimulatedSource, grid: SceneGrid, p
     rows, columns = image_spec(("y", "x"), pixels.shape, "<f4").shard or pixels.shape
     tiles = plan_tiles(placed, settings.camera, pixels, (rows, columns))
     work = MosaicWork(placed, settings.camera, pixels)
-    tile_budget(work, tiles, (rows, columns), memory=settings.memory, workers=1)
+    tile_budget(work, tiles, (rows, columns), memory=settings.memory, crew=replace(settings.crew, workers=1))
 
 
 class _PlannedSweep(SimulatedSweep):

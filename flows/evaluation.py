@@ -7,7 +7,6 @@ reads it as one region however large it is.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -33,6 +32,7 @@ from pipeline.simulator.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive import StageRef
 from storage.class_maps import load_class_map
+from storage.stored_tables import read_table
 
 
 def evaluate(
@@ -189,5 +189,4 @@ def _figures(run: SurveyRun, counts: NDArray[np.int64]) -> dict[str, Any]:
 
 def load_accuracy(evaluated: StageRef) -> dict[str, Any]:
     """Read the figures of an evaluation."""
-    result: dict[str, Any] = json.loads((evaluated.path / "accuracy.json").read_text())
-    return result
+    return read_table(evaluated.path / "accuracy.json")

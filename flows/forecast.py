@@ -173,4 +173,10 @@ def _in_words(changes: Sequence[Change], stage: str) -> str:
     if first.name == "weights":
         return f"other weights than in the newest store{where}{more}"
     name = "version" if first.kind == "version" else first.name
-    return f"{name}{where}: {first.old} before, {first.new} now{more}"
+    return f"{name}{where}: {_shown(first.old)} before, {_shown(first.new)} now{more}"
+
+
+def _shown(value: object) -> str:
+    """A value as a person writes it: lists with commas, nothing as none."""
+    parts = value if isinstance(value, list) else [value]
+    return ", ".join("none" if part is None else str(part) for part in parts) or "none"

@@ -18,6 +18,7 @@ from flows.receipt import to_json
 from flows.settings import Settings
 
 PIPED_WIDTH = 120
+MOST_LETTERS = 250  # of a reason
 COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow", "skipped": "dim"}
 
 
@@ -90,4 +91,4 @@ def _sentence(content: dict[str, Any]) -> str:
 
 
 def _short(text: str) -> str:
-    return text if len(text) <= 160 else f"{text[:157]}..."
+    return text if len(text) <= MOST_LETTERS else f"{text[: MOST_LETTERS - 3]}..."

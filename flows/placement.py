@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -27,6 +26,7 @@ from storage.mosaics import MosaicWriter
 from storage.patches import PatchWriter, open_patches
 from storage.quicklooks import stretched
 from storage.sightings import Sighted, sight_sweeps
+from storage.stored_tables import read_table
 from storage.tile_work import MosaicRecipe, Thumbnail, write_mosaic
 
 QUICKLOOK_PX = 512
@@ -140,5 +140,4 @@ def _only(registration: Sequence[StageRef]) -> StageRef | None:
 
 def line_facts(mosaic: StageRef) -> dict[str, dict[str, Any]]:
     """Read, by sweep, how many lines were lost, repeated, out of order, late or invalid."""
-    found: dict[str, dict[str, Any]] = json.loads((mosaic.path / "lines.json").read_text())
-    return found
+    return read_table(mosaic.path / "lines.json")

@@ -5,7 +5,6 @@ Nothing runs where the settings believe the mirror (``pointing_px = 0``).
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -25,6 +24,7 @@ from pipeline.rectify.placed import Placed
 from pipeline.rectify.seams import Registration, SeamWindow, register_sweeps
 from storage.archive import StageRef
 from storage.mosaics import load_mosaic
+from storage.stored_tables import read_table
 
 RECORD = "registration.json"
 
@@ -121,5 +121,4 @@ def _anchors_record(anchors: Sequence[Anchor]) -> dict[str, Any]:
 
 def load_registration(registration: StageRef) -> dict[str, Any]:
     """Read what was found: by sweep the offset, drift and gain; the held sweep, those untied, and every window."""
-    found: dict[str, Any] = json.loads((registration.path / RECORD).read_text())
-    return found
+    return read_table(registration.path / RECORD)

@@ -16,7 +16,8 @@ from typing import Any
 
 from flows.figures import DASH, format_bytes, format_percent, format_points, format_seconds
 from flows.finding_words import sentences
-from flows.receipt import COST_LABELS, Accuracy, Receipt, Saving, Savings, control_seats, headline
+from flows.receipt import Accuracy, Receipt, Saving, Savings
+from flows.receipt_table import COST_LABELS, control_seats, headline
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
@@ -17,27 +16,23 @@ from numpy.typing import NDArray
 
 from flows.capture_plan import CapturePlan, check_memory, plan_capture
 from flows.settings import BUILT_IN_SCENES, Settings
-from flows.training_data import scene_of_file, unpack_mask
+from flows.survey_scene import check_labels, check_mask, farm_refusal, judged_labels, open_scene
 from models.weights import Description, Weights, describe_weights, load_weights
 from pipeline.camera import LineCamera
-from pipeline.errors import SceneError, SettingsError, WeightsError
-from pipeline.grid import UNLABELLED, SceneGrid
+from pipeline.errors import SettingsError, WeightsError
+from pipeline.grid import SceneGrid
 from pipeline.ground import GroundView
 from pipeline.ground_grid import ground_grid
 from pipeline.once import Once
-from pipeline.simulator.farm import farm_scene
 from pipeline.simulator.instrument import ALL_EFFECTS
 from pipeline.simulator.pointing import PointingErrors
-from pipeline.simulator.raster import Light
 from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive import Archive
 from storage.layout import AngularGrid
 from storage.raster_files import load_raster
-from storage.scene_files import load_scene_file
 
 SHIPPED = "farm.safetensors"
-FARM_BYTES_PER_PX = 570  # peak of a survey of 2560 x 2560 px without controls, 3.76 GB
 
 Report = Callable[[float], None]  # how far a stage is, 0..1
 
@@ -77,7 +72,7 @@ class SurveyRun:
     @cached_property
     def labels(self) -> NDArray[np.uint8] | None:
         """What to judge by, (y, x) in the weights' classes: trained pixels taken out. Draws the scene."""
-        return _judged_labels(self.scene, self.described)
+        return judged_labels(self.scene, self.described)
 
     @cached_property
     def mask(self) -> NDArray[np.generic] | None:
@@ -114,19 +109,19 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     described, load = describe_weights(path), Once(lambda: load_weights(path))
     if not planning:
         load()  # refuses tensors that do not fit
-    refused = _refusal(settings)
+    refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
-    scene, notes = _open_scene(settings)
+    scene, notes = open_scene(settings)
     if not planning:  # what the rig would find there: no stage's work
         scene.raster.drawn()
         scene.light()
-    label_notes = _check_labels(scene, described)
+    label_notes = check_labels(scene, described)
     grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
     plan = plan_capture(settings, grid)
     band_notes = _check_bands(scene, described, path)
     if settings.mask is not None:
-        _check_mask(settings.mask, scene.shape)
+        check_mask(settings.mask, scene.shape)
     effects = _chosen_effects(settings.effects)
     source = SimulatedSource(scene, settings.camera, settings.seed, effects, pointing=_pointing(settings))
     check_memory(settings, source, grid, plan)
@@ -159,58 +154,6 @@ def _chosen_effects(text: str) -> frozenset[str]:
     return frozenset() if text == "none" else frozenset(name.strip() for name in text.split(","))
 
 
-def _open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
-    if settings.scene in BUILT_IN_SCENES:
-        return _open_farm(settings), ()
-    file = load_scene_file(
-        settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths
-    )
-    scene = scene_of_file(file, settings.camera)
-    filled = (f"{scene.filled_px} pixels without a value were given their band's median",) if scene.filled_px else ()
-    return scene, (*file.provenance, *filled)
-
-
-def _open_farm(settings: Settings) -> RasterScene:
-    for name, value in {"labels": settings.labels, "wavelengths": settings.wavelengths}.items():
-        if value is not None:
-            raise SettingsError(f"--{name} is for scene files; the scene 'farm' brings its own")
-    if settings.shape is None:
-        farm = farm_scene(settings.seed, camera=settings.camera)
-    else:
-        farm = farm_scene(settings.seed, shape=settings.shape, camera=settings.camera)
-    return farm if settings.bands is None else _some_bands(farm, settings.bands)
-
-
-def _refusal(settings: Settings) -> str | None:
-    """Why this machine cannot hold the farm of the settings, before it tries; None where it can."""
-    if settings.scene not in BUILT_IN_SCENES or settings.shape is None:
-        return None
-    height, width = settings.shape
-    needed = height * width * FARM_BYTES_PER_PX
-    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed <= there:
-        return None
-    return (
-        f"--size {width}x{height}: a survey of such a farm takes about {needed / 1e9:.0f} GB of memory,"
-        f" this machine has {there / 1e9:.0f}; take a smaller one"
-    )
-
-
-def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
-    """The same field seen by a camera with some of the bands."""
-    count, chosen = len(scene.wavelength_nm), list(bands)
-    if not all(0 <= band < count for band in bands):
-        raise SettingsError(f"--bands {bands}: the scene 'farm' has bands 0 to {count - 1}")
-    return replace(
-        scene,
-        key=f"{scene.key}/only={','.join(map(str, bands))}",
-        light=Once(lambda: Light(scene.electrons[:, chosen], scene.panel_electrons[chosen])),
-        panel=scene.panel[chosen],
-        wavelength_nm=scene.wavelength_nm[chosen],
-        fwhm_nm=None if scene.fwhm_nm is None else scene.fwhm_nm[chosen],
-    )
-
-
 def weights_path(settings: Settings) -> Path:
     """Where the weights of a survey lie: those that come with the house for its own scenes.
 
@@ -239,41 +182,6 @@ def _check_bands(scene: RasterScene, weights: Description, path: Path) -> tuple[
     if reached.all():
         return ()
     return (f"the bands reach {reached.sum()} of the weights' {len(reached)} spectral columns: expect a poorer map",)
-
-
-def _check_mask(mask: str, shape: tuple[int, int]) -> None:
-    values = load_raster(mask, dims=2).values
-    if values.shape[:2] != shape:
-        raise SceneError(f"--mask {mask} is {values.shape[:2]} px (y, x), the scene is {shape}; give one of its size")
-
-
-def _check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
-    """Refuse labels of classes that the weights do not know, and say what judging by the others is worth."""
-    if not scene.labelled:
-        return ()
-    missing = [name for name in scene.class_names if name not in weights.class_names]
-    if missing:
-        known = ", ".join(weights.class_names)
-        raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; use weights for these")
-    split = weights.record.get("split", {})
-    if scene.key in split.get("pixels", {}):
-        return ("accuracy is counted on the labelled pixels that the weights were not trained on",)
-    if scene.key in split.get("train", {}).values():
-        return ("the weights were trained on this scene: its accuracy says nothing of other fields",)
-    return ()
-
-
-def _judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8] | None:
-    """Labels in the order of the weights' classes, without the pixels that the weights were trained on."""
-    if scene.labels is None:
-        return None
-    order = np.full(256, UNLABELLED, np.uint8)
-    order[: len(scene.class_names)] = [weights.class_names.index(name) for name in scene.class_names]
-    labels = order[scene.labels]
-    trained = weights.record.get("split", {}).get("pixels", {}).get(scene.key)
-    if trained is not None:
-        labels[unpack_mask(trained, scene.shape)] = UNLABELLED
-    return labels
 
 
 def now() -> str:

@@ -116,8 +116,9 @@ def parse_memory(value: object, place: str) -> int:
 
 def parse_scheduler(value: object, place: str) -> str:
     """``threads``, ``processes``, or the address of a dask scheduler."""
+    text = parse_text(value, place)
     try:
-        return Crew(parse_text(value, place)).scheduler
+        return Crew(text).scheduler
     except SettingsError as error:
         raise SettingsError(f"{place}: {error}") from None
 

@@ -34,6 +34,7 @@ from storage.layout import SHARD_ROWS
 from storage.mosaic_strips import mosaic_brightness
 from storage.patches import open_patches
 from storage.spool import Spool
+from storage.stored_tables import read_table
 
 VERSIONS = {
     "capture": 2, "register": 2, "locate": 2, "rectify": 3, "attend": 4, "patches": 3, "segment": 3, "ground": 2,
@@ -153,15 +154,14 @@ def _crop_rows(mosaic: StageRef) -> CropRows:
 
 def load_plan(attention: StageRef) -> FinePlan:
     """Read the plan of an attention store."""
-    plan = json.loads((attention.path / "plan.json").read_text())
+    plan = read_table(attention.path / "plan.json")
     kept = {"sweeps": [Sweep(**sweep) for sweep in plan["sweeps"]], "seats": np.array(plan["seats"], np.intp)}
     return FinePlan(**(plan | kept))
 
 
 def load_orientation(attention: StageRef) -> dict[str, Any]:
     """Read what the other orientation of the line would have shown, and which way crop rows run."""
-    found: dict[str, Any] = json.loads((attention.path / "orientation.json").read_text())
-    return found
+    return read_table(attention.path / "orientation.json")
 
 
 def patch_columns(run: SurveyRun, patches: StageRef, seen: CoarseLook) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

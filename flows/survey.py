@@ -42,7 +42,7 @@ TITLES = {
     "cut_patches": "fine patches",
     "draw_map": "class map",
     "ground": "map on the ground",
-    "evaluate": "controls (not part of the survey)",
+    "evaluate": "accuracy (not part of the survey)",
 }
 
 

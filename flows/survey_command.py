@@ -8,7 +8,7 @@ from rich.markup import escape
 from flows.finding_words import sentences
 from flows.progress import StageProgress
 from flows.publish import Published, publish_run
-from flows.receipt import headline, print_table
+from flows.receipt_table import headline, print_table
 from flows.run import SurveyRun, now, open_run
 from flows.settings import Settings
 from flows.survey import TITLES, Products, StageRunner, survey

@@ -21,7 +21,7 @@ from models.segmenter import Segmenter, SegmenterConfig
 from models.spectral import Normalisation, SpectralBasis
 from models.weights import Weights, save_weights
 from storage.labels import default_colour
-from tests.object_server import bucket, s3_server  # noqa: F401 - fixtures
+from tests.object_server import bucket, machine, s3_server  # noqa: F401 - fixtures
 
 RGB_NM = (640.0, 550.0, 460.0)
 CLASSES = ("class_0", "class_1", "class_2")  # as a label file of the numbers 0..2 names them

@@ -14,7 +14,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from storage.archive import Archive
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from tests.faults.small_survey import problems, stored
 
 BANDS = ",".join(str(band) for band in range(4, 268, 8)[:32])
 SURVEY = ("--scene", "farm", "--size", "256x256", "--bands", BANDS, "--seed", "5", "--budget", "0.8",
@@ -26,15 +28,6 @@ def start(archive: Path) -> subprocess.Popen[bytes]:
     """Begin the survey in a process of its own."""
     command = [sys.executable, "-m", "flows.cli", "survey", *SURVEY, "--out", str(archive)]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
-
-def stored(archive: Path) -> dict[str, dict[str, str]]:
-    """Hash of every file of every published store, by address."""
-    opened = Archive.open(archive, create=False, write=False)
-    return {
-        ref.uri: {name: entry["sha256"] for name, entry in opened.manifest(ref)["files"].items()}
-        for ref in opened.refs()
-    }
 
 
 def main(kills: int, seed: int = 0) -> int:
@@ -57,7 +50,7 @@ def kill_surveys(folder: Path, kills: int, rng: random.Random) -> int:
         finished = process.wait() == 0
         if (archive / "stages").is_dir():
             now = stored(archive)
-            damaged += sum(f.problem is not None for f in Archive.open(archive, create=False, write=False).verify_all())
+            damaged += len(problems(archive))
             lost += len(set(before) - set(now))
             wrong += sum(truth.get(uri) != files for uri, files in now.items())
             before = now

@@ -7,21 +7,20 @@ from __future__ import annotations
 
 import os
 import random
-import signal
 import sys
 import tempfile
 import time
 import tracemalloc
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.errors import PipelineError
 from storage.envi_header import parse_envi_header
 from storage.scan_files import open_cube_source
+from tests.faults.time_limit import at_most
 
 LONGEST_S = 30  # then it counts as hanging
 LARGEST_DATA = 200_000  # bytes
@@ -43,10 +42,6 @@ HAND_MADE = (
     "ENVI\nsamples = 1\nlines = 1000000000000\nbands = 1\ndata type = 1\ninterleave = bsq\n",
     "ENVI\nsamples = 1000000000000\nlines = 3\nbands = 1000000\ndata type = 5\ninterleave = bip\n",
 )  # fmt: skip
-
-
-class TookTooLongError(Exception):
-    """A header kept its reader busy."""
 
 
 @dataclass
@@ -148,7 +143,7 @@ def _try_one(header: Path, number: int, outcomes: Outcomes) -> None:
     tracemalloc.start()
     begun = time.monotonic()
     try:
-        with _at_most(LONGEST_S):
+        with at_most(LONGEST_S):
             source = open_cube_source(header)
             held = source.shape[0] - source.lost_lines
             source.read(0, min(held, 64))
@@ -166,20 +161,6 @@ def _try_one(header: Path, number: int, outcomes: Outcomes) -> None:
     outcomes.most_bytes = max(outcomes.most_bytes, peak - size)
     if peak > allowed:
         outcomes.wrong.append(f"{number}: {peak} bytes of memory for {size} of data")
-
-
-@contextmanager
-def _at_most(seconds: int) -> Iterator[None]:
-    def ring(signum: int, frame: FrameType | None) -> None:
-        raise TookTooLongError(f"more than {seconds} s")
-
-    before = signal.signal(signal.SIGALRM, ring)
-    signal.alarm(seconds)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
 
 
 def real_headers() -> Path | None:

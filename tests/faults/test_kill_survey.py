@@ -15,6 +15,7 @@ import pytest
 from storage.archive import Archive
 from storage.class_maps import load_class_map
 from tests.faults.nursery import Nursery
+from tests.faults.small_survey import problems
 
 KILLS = 6
 MOMENTS = [(number + random.Random(number).random()) / KILLS for number in range(KILLS)]  # of the time it takes
@@ -63,11 +64,6 @@ def class_map(out: Path) -> np.ndarray:
     """The one class map of an archive."""
     (ref,) = Archive.open(out).refs("segment")
     return load_class_map(ref.path / "class_map.zarr").classes
-
-
-def problems(out: Path) -> list[str]:
-    """What `verify` finds."""
-    return [finding.problem for finding in Archive.open(out).verify_all() if finding.problem]
 
 
 @pytest.mark.parametrize("moment", MOMENTS)

@@ -97,6 +97,11 @@ REFUSED = {
         "--memory 300MiB --budget 1",
         "exceeds --memory 300 MiB: .* give at least --memory 5.. MiB",
     ),
+    "memory for no process": (
+        2,
+        "--memory 900MiB --budget 1 --scheduler processes",
+        "exceeds --memory 900 MiB: .* each of two processes 512 MiB; give at least --memory 10.. MiB",
+    ),
     "mirror off by a line": (
         2,
         "--pointing-px 200 --budget 1",

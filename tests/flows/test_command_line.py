@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows import cli
+from flows.app import app, print_json
+from flows.settings import _SURVEY, _TABLES
+from flows.survey_flags import IN_TABLES
 
 ONE_THREAD = """
 import os, sys
@@ -24,3 +33,43 @@ def test_numpy_computes_on_one_thread_whatever_the_shell_says() -> None:
     command = [sys.executable, "-c", ONE_THREAD]
     ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stdout.split()[-1]) == (0, "1"), ended.stderr
+
+
+def _flags(verb: str) -> dict[str, str | None]:
+    """What a verb takes, and what its help says of each."""
+    found = app[verb].assemble_argument_collection(parse_docstring=True)
+    return {argument.name: argument.parameter.help for argument in found if argument.name != "*"}
+
+
+@pytest.mark.parametrize("verb", ["survey", "plan"])
+def test_a_survey_can_be_planned_by_its_own_words(verb: str) -> None:
+    """Every setting that is in no table has its flag, in both verbs."""
+    assert {f"--{name.replace('_', '-')}" for name in {*_SURVEY, *IN_TABLES} - set(_TABLES)} <= set(_flags(verb))
+
+
+@pytest.mark.parametrize("verb", [verb for verb in app if not verb.startswith("-")])
+def test_every_flag_says_what_it_is(verb: str) -> None:
+    """Nobody has to guess."""
+    assert [name for name, words in _flags(verb).items() if not words] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["survy"], 'Unknown command "survy". Did you mean "survey"?; see spectralzoom --help'),
+        (["survey", "--budgt", "1"], "Unknown option: --budgt. Did you mean --budget?; see spectralzoom survey --help"),
+    ],
+)
+def test_a_wrong_word_is_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """With the nearest right one, and where all of them stand; no list that is cut off."""
+    with pytest.raises(SystemExit) as ended:
+        cli.main(words)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == f"error: {message}\n"
+
+
+def test_printed_json_is_json(capsys: pytest.CaptureFixture[str]) -> None:
+    """What is not finite has no place in it."""
+    content: dict[str, Any] = {"a": float("nan"), "b": [1.5, float("inf")], "name": "ü"}
+    print_json(content)
+    assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail) == {"a": None, "b": [1.5, None], "name": "ü"}

@@ -17,7 +17,7 @@ from pipeline.rectify.illumination import LightRatio
 from pipeline.simulator.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
-from storage.archive import StageRef
+from storage.archive import Archive, StageRef
 
 OFF = np.array([2.2, -1.4])  # along the line and the scan [px]
 
@@ -34,13 +34,21 @@ def test_labels_move_to_where_the_map_shows_them(along: str, down: int, right: i
         assert moved[row, column] == (labels[at] if known else UNLABELLED)
 
 
+def _registration(archive: Path, record: dict[str, Any]) -> StageRef:
+    """A published registration."""
+
+    def build(path: Path) -> None:
+        (path / "registration.json").write_text(json.dumps(record))
+
+    return Archive.open(archive).produce("register", build, version=1, params={})[0]
+
+
 def test_controls_look_where_the_map_does(tmp_path: Path) -> None:
     """The offset is that of the sweep which registration held, and controls scan with the same one everywhere."""
     scene = raster_from_values(np.ones((8, 8, 1)), LineCamera(), name="t", wavelength_nm=np.array([500.0]))
     errors = PointingErrors(9.0, 0.0, 4)
     run: Any = SimpleNamespace(source=SimulatedSource(scene, LineCamera(), pointing=errors))
-    (tmp_path / "registration.json").write_text(json.dumps({"reference": "coarse-3"}))
-    off = evaluation._map_offset(run, [StageRef("register", "k", tmp_path)])
+    off = evaluation._map_offset(run, [_registration(tmp_path, {"reference": "coarse-3"})])
     np.testing.assert_array_equal(off, errors.offset("coarse-3"))
     assert evaluation._sure_source(run, off).pointing == CommonOffset((float(off[0]), float(off[1])))
     assert (evaluation._map_offset(run, []) == 0).all()
@@ -61,10 +69,9 @@ def test_brighter_sweep_is_turned_down(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_corrections_are_read_as_they_were_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Offset, drift and gain of a sweep reach its placing unchanged; a sweep that is not named has none."""
     record = {"a": {"offset_px": [1.0, -2.0], "drift_px_per_line": [0.5, 0.0], "gain": [0.5, 2.0]}}
-    (tmp_path / "registration.json").write_text(json.dumps({"sweeps": record}))
+    ref = _registration(tmp_path, {"sweeps": record})
     cubes = [SimpleNamespace(sweep=SimpleNamespace(name=name), time_s=np.arange(3.0)) for name in "ab"]
     monkeypatch.setattr(placement, "captured", lambda _: cubes)
-    ref = StageRef("register", "k", tmp_path)
     run: Any = SimpleNamespace(camera=LineCamera())
     one, other = placement.sighted(run, ref, ref)
     np.testing.assert_array_equal(one.shift_px, [[0.5, -2.0], [1.0, -2.0], [1.5, -2.0]])

@@ -18,7 +18,7 @@ from flows.run import open_run
 from flows.settings import Settings, load_settings
 from flows.stage_costs import scaled_cost
 from flows.stages import VERSIONS
-from pipeline.errors import ArchiveError, SettingsError
+from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive import Archive
 
@@ -112,6 +112,8 @@ def test_the_reason_is_what_differs(settings: Settings, archive: Path, make_weig
     planned = _plan(settings, archive, kernel="nearest")
     assert planned["rectify"].why == "kernel: catmull-rom before, nearest now"
     assert planned["attend"].why == "kernel of rectify: catmull-rom before, nearest now"
+    effects = _plan(settings, archive, effects="none")["capture_coarse"].why
+    assert effects == "effects: read, shot, slit, smear, throughput before, none now"
     assert {(change.where, change.kind) for change in planned["attend"].changes} == {
         ("attend", "input"), ("rectify", "parameter"),
     }  # fmt: skip
@@ -166,7 +168,9 @@ def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
 
     monkeypatch.setattr("pipeline.simulator.farm._draw", refuse)
     monkeypatch.setattr("pipeline.simulator.farm._light", refuse)
-    monkeypatch.setattr("flows.run.os.sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**21}[name])
+    monkeypatch.setattr(
+        "storage.declared_sizes.os.sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**21}[name]
+    )
     asked = replace(settings, scene="farm", size=(10240, 10240), labels=None, weights=None, out=str(tmp_path / "a"))
     found = forecast(asked)
     assert [row.stage for row in found.stages if row.state == "to run"] == ["capture_coarse"]
@@ -234,3 +238,16 @@ def test_plan_as_json_and_as_a_table(settings: Settings, archive: Path, capsys: 
     assert "6 stages to make, about" in shown
     run_plan(replace(settings, out=str(archive)))
     assert "everything is stored" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("change", [('"', "x"), ("1", "2")], ids=["no JSON", "another number"])
+def test_a_damaged_plan_of_sweeps_blocks_what_reads_it(
+    settings: Settings, archive: Path, survey_png: Any, change: tuple[str, str]
+) -> None:
+    """The plan says so and goes on; the survey stops there with one message, and captures nothing by it."""
+    (path,) = archive.glob("stages/attend/*/plan.json")
+    path.write_text(path.read_text().replace(*change))
+    fine = _plan(settings, archive)["capture_fine"]
+    assert (fine.state, "plan.json has changed" in fine.why) == ("blocked", True)
+    with pytest.raises(IncompleteStoreError, match=r"plan\.json has changed.*verify --repair"):
+        survey_png(archive)

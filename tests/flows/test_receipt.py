@@ -18,10 +18,9 @@ from flows.receipt import (
     build_receipt,
     check_receipt,
     comparable,
-    headline,
-    print_table,
     to_json,
 )
+from flows.receipt_table import headline, print_table
 from flows.settings import Settings
 from pipeline.errors import ShapeError
 
@@ -174,6 +173,7 @@ def test_headline_is_one_paragraph_with_the_figures():
     text = headline(make_receipt(), 0.23)
     assert text.startswith("The camera looked twice at 23 % of the field. Capture took 104 s instead of 209 s")
     assert "75.0 of 100" in text
+    assert headline(make_receipt(), 0.0).startswith("The camera looked twice at nothing: no run of fine lines fits")
     assert "truth" not in headline(make_receipt(labels=False))
 
 

@@ -84,6 +84,16 @@ def test_example_in_the_project_is_valid():
     assert replace(found, out=Settings.out) == Settings()
 
 
+def test_example_lists_every_setting():
+    """Those without a default, and whole tables, stand in comments."""
+    lines = [line.removeprefix("# ") for line in EXAMPLE.read_text(encoding="utf-8").splitlines()]
+    named = {line.partition("=")[0].strip() for line in lines if "=" in line}
+    assert {item.name for item in fields(Settings)} - set(settings_module._TABLES) <= named
+    for name, (_, spans) in settings_module._TABLES.items():
+        assert f"[{name}]" in lines
+        assert set(spans) <= named, name
+
+
 @pytest.mark.parametrize(
     ("line", "near"),
     [
@@ -256,3 +266,10 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
         pointing_px=slew,
     )
     assert parse_settings(settings.to_dict()) == settings
+
+
+@pytest.mark.parametrize("value", ["", 3])
+def test_a_scheduler_that_is_no_text_is_named_once(value):
+    """A setting stands once in its message."""
+    with pytest.raises(SettingsError, match=r"^'scheduler' must be text that is not empty"):
+        parse_settings({"scheduler": value})

@@ -1,0 +1,118 @@
+"""What a survey looks at: its scene, opened by the settings, with the labels and the mask that lie on its pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.settings import BUILT_IN_SCENES, Settings
+from flows.training_data import scene_of_file, unpack_mask
+from models.weights import Description
+from pipeline.errors import SceneError, SettingsError
+from pipeline.grid import UNLABELLED
+from pipeline.once import Once
+from pipeline.simulator.farm import farm_scene
+from pipeline.simulator.raster import Light
+from pipeline.simulator.scene import RasterScene
+from storage.declared_sizes import machine_bytes
+from storage.raster_files import load_raster
+from storage.scene_files import load_scene_file
+
+FARM_BYTES_PER_PX = 570  # peak of a survey of 2560 x 2560 px without controls, 3.76 GB
+
+
+def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
+    """Open the settings' scene, and say what was assumed of it.
+
+    Raises
+    ------
+    SceneError, WavelengthError : the file cannot be used.
+    SettingsError : what was given does not go with a built-in scene.
+    """
+    if settings.scene in BUILT_IN_SCENES:
+        return _open_farm(settings), ()
+    file = load_scene_file(
+        settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths
+    )
+    scene = scene_of_file(file, settings.camera)
+    filled = (f"{scene.filled_px} pixels without a value were given their band's median",) if scene.filled_px else ()
+    return scene, (*file.provenance, *filled)
+
+
+def _open_farm(settings: Settings) -> RasterScene:
+    for name, value in {"labels": settings.labels, "wavelengths": settings.wavelengths}.items():
+        if value is not None:
+            raise SettingsError(f"--{name} is for scene files; the scene 'farm' brings its own")
+    if settings.shape is None:
+        farm = farm_scene(settings.seed, camera=settings.camera)
+    else:
+        farm = farm_scene(settings.seed, shape=settings.shape, camera=settings.camera)
+    return farm if settings.bands is None else _some_bands(farm, settings.bands)
+
+
+def farm_refusal(settings: Settings) -> str | None:
+    """Why this machine cannot hold the farm of the settings, before it tries; None where it can."""
+    if settings.scene not in BUILT_IN_SCENES or settings.shape is None:
+        return None
+    height, width = settings.shape
+    needed = height * width * FARM_BYTES_PER_PX
+    there = machine_bytes()
+    if needed <= there:
+        return None
+    return (
+        f"--size {width}x{height}: a survey of such a farm takes about {needed / 1e9:.0f} GB of memory,"
+        f" this machine has {there / 1e9:.0f}; take a smaller one"
+    )
+
+
+def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
+    """The same field seen by a camera with some of the bands."""
+    count, chosen = len(scene.wavelength_nm), list(bands)
+    if not all(0 <= band < count for band in bands):
+        raise SettingsError(f"--bands {','.join(map(str, bands))}: the scene 'farm' has bands 0 to {count - 1}")
+    return replace(
+        scene,
+        key=f"{scene.key}/only={','.join(map(str, bands))}",
+        light=Once(lambda: Light(scene.electrons[:, chosen], scene.panel_electrons[chosen])),
+        panel=scene.panel[chosen],
+        wavelength_nm=scene.wavelength_nm[chosen],
+        fwhm_nm=None if scene.fwhm_nm is None else scene.fwhm_nm[chosen],
+    )
+
+
+def check_mask(mask: str, shape: tuple[int, int]) -> None:
+    """Refuse a mask file that is no image of this (y, x) size (SceneError)."""
+    values = load_raster(mask, dims=2).values
+    if values.shape[:2] != shape:
+        raise SceneError(f"--mask {mask} is {values.shape[:2]} px (y, x), the scene is {shape}; give one of its size")
+
+
+def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
+    """Refuse labels of classes that the weights do not know (SceneError); say what judging by the others is worth."""
+    if not scene.labelled:
+        return ()
+    missing = [name for name in scene.class_names if name not in weights.class_names]
+    if missing:
+        known = ", ".join(weights.class_names)
+        raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; use weights for these")
+    split = weights.record.get("split", {})
+    if scene.key in split.get("pixels", {}):
+        return ("accuracy is counted on the labelled pixels that the weights were not trained on",)
+    if scene.key in split.get("train", {}).values():
+        return ("the weights were trained on this scene: its accuracy says nothing of other fields",)
+    return ()
+
+
+def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8] | None:
+    """Labels in the order of the weights' classes, without the pixels that the weights were trained on."""
+    if scene.labels is None:
+        return None
+    order = np.full(256, UNLABELLED, np.uint8)
+    order[: len(scene.class_names)] = [weights.class_names.index(name) for name in scene.class_names]
+    labels = order[scene.labels]
+    trained = weights.record.get("split", {}).get("pixels", {}).get(scene.key)
+    if trained is not None:
+        labels[unpack_mask(trained, scene.shape)] = UNLABELLED
+    return labels

@@ -1,0 +1,128 @@
+"""Small files of every kind that is ingested, to be mutated: one cube, as each format keeps it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from storage.envi_writer import EnviFile, write_envi
+
+SHAPE = (20, 12, 5)
+
+
+def _cube() -> Any:
+    return np.random.default_rng(0).integers(0, 4096, SHAPE, dtype=np.uint16)
+
+
+def _envi(folder: Path) -> str:
+    wavelengths = np.linspace(400, 800, SHAPE[2])
+    write_envi(folder / "a.hdr", EnviFile(SHAPE, "<u2", "bil", wavelengths), [(0, _cube())])
+    return "a.hdr"
+
+
+def _headwall(folder: Path) -> str:
+    for first in (0, 10):
+        write_envi(folder / "part.hdr", EnviFile((10, *SHAPE[1:]), "<u2"), [(0, _cube()[first : first + 10])])
+        (folder / "part.hdr").rename(folder / f"raw_{first}.hdr")
+        (folder / "part.img").rename(folder / f"raw_{first}")
+        rows = "".join(f"{frame}\t{1000 + 10 * frame}\n" for frame in range(first, first + 10))
+        (folder / f"frameIndex_{first}.txt").write_text("Frame#\tTimestamp\n" + rows)
+    write_envi(folder / "darkReference.hdr", EnviFile((1, *SHAPE[1:]), "<u2"), [(0, _cube()[:1] // 8)])
+    return "."
+
+
+def _npy(folder: Path) -> str:
+    np.save(folder / "a.npy", _cube())
+    return "a.npy"
+
+
+def _npz(folder: Path) -> str:
+    np.savez(folder / "a.npz", cube=_cube(), more=np.arange(9))
+    return "a.npz"
+
+
+def _npz_packed(folder: Path) -> str:
+    np.savez_compressed(folder / "a.npz", cube=_cube(), more=np.arange(9))
+    return "a.npz"
+
+
+def _mat(folder: Path, **how: Any) -> str:
+    from scipy.io import savemat
+
+    savemat(folder / "a.mat", {"cube": _cube(), "name": "x", "cell": np.array([1, "a"], object)}, **how)
+    return "a.mat"
+
+
+def _mat_hdf(folder: Path) -> str:
+    import h5py
+
+    with h5py.File(folder / "a.mat", "w", userblock_size=512) as file:
+        file.create_dataset("cube", data=_cube().T, chunks=(5, 6, 10), compression="gzip")
+        file["more"] = np.arange(9)
+    return "a.mat"
+
+
+def _png(folder: Path) -> str:
+    Image.fromarray((_cube()[..., :3] >> 4).astype(np.uint8)).save(folder / "a.png")
+    return "a.png"
+
+
+def _deep_png(folder: Path) -> str:
+    import cv2
+
+    cv2.imwrite(str(folder / "a.png"), _cube()[..., :3])
+    return "a.png"
+
+
+def _image(folder: Path, name: str) -> str:
+    Image.fromarray((_cube()[..., :3] >> 4).astype(np.uint8)).save(folder / name)
+    return name
+
+
+def _tiff(folder: Path, **how: Any) -> str:
+    from tifffile import imwrite
+
+    imwrite(folder / "a.tif", _cube(), photometric="minisblack", planarconfig="contig", **how)
+    return "a.tif"
+
+
+def _pages(folder: Path) -> str:
+    from tifffile import imwrite
+
+    imwrite(folder / "a.tif", np.moveaxis(_cube(), -1, 0), photometric="minisblack", compression="zlib")
+    return "a.tif"
+
+
+def _zarr(folder: Path, version: int) -> str:
+    import zarr
+
+    group = zarr.open_group(folder / "a.zarr", mode="w", zarr_format=2 if version == 2 else 3)
+    more: Any = {} if version == 2 else {"shards": (20, 12, 5), "dimension_names": ("y", "x", "band")}
+    group.create_array("cube", data=_cube(), chunks=(10, 12, 5), **more)
+    group.create_array("wavelength", data=np.linspace(400, 800, SHAPE[2])).attrs["units"] = "nm"
+    return "a.zarr"
+
+
+FORMATS: dict[str, Callable[[Path], str]] = {
+    "ENVI": _envi,
+    "Headwall folder": _headwall,
+    ".npy": _npy,
+    ".npz": _npz,
+    ".npz packed": _npz_packed,
+    ".mat v5": lambda folder: _mat(folder),
+    ".mat v7": lambda folder: _mat(folder, do_compression=True),
+    ".mat v7.3": _mat_hdf,
+    "PNG": _png,
+    "PNG 16 bit": _deep_png,
+    "JPEG": lambda folder: _image(folder, "a.jpg"),
+    "BMP": lambda folder: _image(folder, "a.bmp"),
+    "TIFF strips": lambda folder: _tiff(folder, rowsperstrip=4),
+    "TIFF tiles": lambda folder: _tiff(folder, tile=(16, 16), compression="zlib"),
+    "TIFF pages": _pages,
+    "Zarr v2": lambda folder: _zarr(folder, 2),
+    "Zarr v3": lambda folder: _zarr(folder, 3),
+}
