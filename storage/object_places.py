@@ -148,7 +148,7 @@ def connect(place: ObjectPlace, inside: str = "") -> S3Store:
     from obstore.store import S3Store
 
     http = place.endpoint is not None and place.endpoint.startswith("http://")
-    client: ClientConfig = {"allow_http": http, "connect_timeout": "5s", "read_timeout": "60s", "timeout": "15min"}
+    client: ClientConfig = {"allow_http": http, "connect_timeout": "5s", "read_timeout": "30s", "timeout": "15min"}
     retry: RetryConfig = {"max_retries": RETRIES, "retry_timeout": timedelta(minutes=2), "backoff": BACKOFF}
     prefix = f"{place.prefix}/{inside}".strip("/")
     config: S3Config = {} if place.endpoint is None else {"endpoint": place.endpoint}
