@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from models.sizes import BOTTOM, SegmenterConfig, level_widths
+from models.vgg_sizes import saliency_multiply_adds
 from pipeline.grid import SceneGrid
 
 
@@ -24,7 +25,10 @@ class MultiplyAdds:
         return self.glance + self.score + self.encode + self.decode
 
 
-SCORE_PER_PIXEL = {"entropy": 2, "sobel": 19, "mask": 0, "random": 0}  # per coarse pixel; entropy also per class
+SCORE_PER_PIXEL = {  # per coarse pixel; entropy also per class
+    "entropy": 2, "margin": 4, "sobel": 19, "saliency": 75, "spectral-residual": 120,
+    "random": 0, "stratified": 0, "centre": 0, "uniform": 0, "mask": 0,
+}  # fmt: skip
 
 
 def multiply_adds(config: SegmenterConfig, grid: SceneGrid, seats: int, bands: int, policy: str | None) -> MultiplyAdds:
@@ -41,8 +45,15 @@ def multiply_adds(config: SegmenterConfig, grid: SceneGrid, seats: int, bands: i
     glance = cells * stem + _transformer(config, cells) + _grid(config, cells, 0) + cells * _coarse_decoder(config)
     if policy is None:
         return MultiplyAdds(0, 0, encode, decode)
+    return MultiplyAdds(glance, _score(config, policy, (rows * p, columns * p)), encode, decode)
+
+
+def _score(config: SegmenterConfig, policy: str, coarse: tuple[int, int]) -> int:
+    """The policy over (y, x) coarse pixels; VGG19 reads some more around them."""
+    if policy == "vgg-static":
+        return saliency_multiply_adds(coarse, config.columns)
     per_pixel = SCORE_PER_PIXEL[policy] + (config.classes if policy == "entropy" else 0)
-    return MultiplyAdds(glance, per_pixel * cells * p * p, encode, decode)
+    return per_pixel * coarse[0] * coarse[1]
 
 
 def _levels(config: SegmenterConfig) -> list[tuple[int, int]]:

@@ -73,3 +73,29 @@ def gap_closed(reached: float, none: float, all_seats: float) -> float | None:
     """Share of the way from no fine seat to every fine seat; None where that way is under one point."""
     way = all_seats - none
     return None if not abs(way) >= 0.01 else (reached - none) / way
+
+
+def frequency_weighted_iou(counts: NDArray[np.int64]) -> float:
+    """Mean of the classes' IoU by how many pixels carry their label; NaN when nothing is labelled."""
+    support = counts.sum(axis=1)
+    held = support > 0
+    return float(np.average(iou_per_class(counts)[held], weights=support[held])) if held.any() else float("nan")
+
+
+def miou_over_frames(frames: NDArray[np.int64]) -> float:
+    """`miou_i`: each frame's own mean IoU, then the mean over frames that have one, (frame, class, class) counts."""
+    return _mean_of_known(np.array([mean_iou(counts) for counts in frames]))
+
+
+def miou_over_frame_classes(frames: NDArray[np.int64]) -> float:
+    """`miou_c`: each class's mean IoU over the frames that hold it, then the mean over classes; (frame, class, class).
+
+    A large object counts as much as a small one, which the counts of the whole data set do not allow for.
+    """
+    each = np.array([iou_per_class(counts) for counts in frames]).reshape(len(frames), -1)
+    return _mean_of_known(np.array([_mean_of_known(column) for column in each.T]))
+
+
+def _mean_of_known(values: NDArray[np.float64]) -> float:
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if known.size else float("nan")

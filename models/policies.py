@@ -1,4 +1,8 @@
-"""Attention policies: how much a fine look at each seat is worth, judged from the glance alone."""
+"""Attention policies: how much a fine look at each seat is worth, judged from the glance alone.
+
+One table of those that need neither training nor weights of their own; what stands out in an image is measured in
+`models.saliency`, and what lies where in `models.spacing`.
+"""
 
 from __future__ import annotations
 
@@ -7,34 +11,53 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from models.inference import Glance
+from models.inference import CoarseLook, Glance
+from models.saliency import fine_grained, spectral_residual
+from models.spacing import centre_scores, random_scores, stratified_scores, uniform_scores
 from pipeline.errors import SettingsError, ShapeError
+from pipeline.grid import SceneGrid
 
 Scores = NDArray[np.float64]
-POLICIES = ("entropy", "sobel", "random", "mask")
+POLICIES = (
+    "entropy", "margin", "sobel", "saliency", "spectral-residual", "random", "stratified", "centre", "uniform", "mask",
+    "vgg-static",
+)  # fmt: skip
 
 
-def score_seats(policy: str, seen: Glance, *, seed: int = 0, mask: NDArray[np.generic] | None = None) -> Scores:
+def score_seats(
+    policy: str,
+    seen: Glance,
+    *,
+    seed: int = 0,
+    mask: NDArray[np.generic] | None = None,
+    network: NetworkScore | None = None,
+) -> Scores:
     """Score every seat of the padded grid, (seats,) float64; a seat counts by the share of it that lies on the scene.
 
     Parameters
     ----------
     policy
-        ``entropy`` of the glance's classes, ``sobel`` edges of the coarse image (the paper's ED), ``random`` by
-        ``seed``, or ``mask``: a given (y, x) image of the scene's size (the paper's fixed attention policy), in which
-        NaN counts as 0.
+        By the glance's classes: ``entropy``, or ``margin``, 1 less what the likeliest is ahead of the next. By the
+        coarse image: ``sobel`` edges (the paper's ED), ``saliency`` (fine-grained) or ``spectral-residual``. By place:
+        ``random`` and ``stratified``, by ``seed``, the ``centre`` first, or ``uniform``, a grid. Or ``mask``: a given
+        (y, x) image of the scene's size (the paper's fixed attention policy), in which NaN counts as 0.
+        Or ``vgg-static``, the paper's SA: the greatest saliency of the seat's coarse pixels to ``network``.
 
     Raises
     ------
-    SettingsError : an unknown policy, or ``mask`` without a mask.
+    SettingsError : an unknown policy, ``mask`` without a mask, or saliency without OpenCV's contrib modules.
     ShapeError : a mask of another size than the scene's.
     """
-    if policy == "random":
-        scores = np.random.default_rng([seed, 0x5EA7]).random(seen.grid.seat_shape)
+    if policy in _PLACE_SCORES:
+        scores = _PLACE_SCORES[policy](seen.grid, seed)
     elif policy == "mask":
         scores = _mask_scores(seen, mask)
     elif policy in _PIXEL_SCORES:
         scores = _seat_means(_PIXEL_SCORES[policy](seen), seen)
+    elif policy in _IMAGE_SCORES:
+        scores = _seat_means(_on_the_scene(_IMAGE_SCORES[policy], seen), seen)
+    elif policy in NETWORK_POLICIES:
+        scores = _network_scores(seen, network)
     else:
         raise SettingsError(f"unknown policy {policy!r}; choose one of {', '.join(POLICIES)}")
     share = seen.grid.valid_share()
@@ -55,6 +78,13 @@ def _entropy(seen: Glance) -> NDArray[np.float64]:
     return pixel_entropy(seen.probability)
 
 
+def _margin(seen: Glance) -> NDArray[np.float64]:
+    ranked = np.sort(seen.probability.astype(np.float64), axis=-1)  # NaN comes last and stays NaN
+    second = ranked[..., -2] if ranked.shape[-1] > 1 else 0.0
+    margin: NDArray[np.float64] = 1.0 - (ranked[..., -1] - second)
+    return margin
+
+
 def _edges(seen: Glance) -> NDArray[np.float64]:
     from scipy.ndimage import sobel
 
@@ -64,8 +94,33 @@ def _edges(seen: Glance) -> NDArray[np.float64]:
     return edges
 
 
-_PIXEL_SCORES: dict[str, Callable[[Glance], NDArray[np.float64]]] = {"entropy": _entropy, "sobel": _edges}
-SEEING_POLICIES = tuple(_PIXEL_SCORES)  # the others take nothing of a glance but its grid
+def _on_the_scene(measure: ImageScore, seen: Glance) -> NDArray[np.float64]:
+    """Measure the part of the coarse image that lies on the scene; beyond it nothing stands out."""
+    y, x = seen.grid.coarse_shape
+    pixels = np.zeros(seen.columns.shape[:2])
+    pixels[:y, :x] = measure(seen.columns[:y, :x])
+    return pixels
+
+
+ImageScore = Callable[[NDArray[np.floating]], NDArray[np.float64]]
+_PIXEL_SCORES: dict[str, Callable[[Glance], NDArray[np.float64]]] = {
+    "entropy": _entropy,
+    "margin": _margin,
+    "sobel": _edges,
+}
+_IMAGE_SCORES: dict[str, ImageScore] = {"saliency": fine_grained, "spectral-residual": spectral_residual}
+_PLACE_SCORES: dict[str, Callable[[SceneGrid, int], Scores]] = {
+    "random": random_scores,
+    "stratified": stratified_scores,
+    "centre": centre_scores,
+    "uniform": uniform_scores,
+}
+NetworkScore = Callable[[CoarseLook], NDArray[np.float64]]  # (y, x) of the padded coarse grid
+NETWORK_POLICIES = ("vgg-static",)  # by the coarse image alone, through a network of the user's
+# by what lies around each pixel: a large field may be scored in parts
+SEEING_POLICIES = (*_PIXEL_SCORES, *NETWORK_POLICIES)
+IMAGE_POLICIES = tuple(_IMAGE_SCORES)  # by the coarse image of the whole field at once; the glance is not needed
+SEEDED_POLICIES = ("random", "stratified")
 
 
 def _seat_means(pixels: NDArray[np.float64], seen: Glance) -> Scores:
@@ -84,6 +139,18 @@ def _scene_share(size: tuple[int, int], factor: int, shape: tuple[int, ...]) -> 
     down, across = (np.clip(px / factor - np.arange(n), 0.0, 1.0) for px, n in zip(size, shape, strict=True))
     share: NDArray[np.float64] = down[:, None] * across[None, :]
     return share
+
+
+def _network_scores(seen: Glance, network: NetworkScore | None) -> Scores:
+    """The greatest of the coarse pixels of each seat that lie on the scene, as the paper pools."""
+    if network is None:
+        raise SettingsError("the policy 'vgg-static' needs --vgg FILE, the weights of VGG19")
+    grid, cells = seen.grid, seen.grid.patch // seen.grid.factor
+    pixels = network(seen)
+    there = _scene_share((grid.height, grid.width), grid.factor, pixels.shape) > 0
+    rows, columns = grid.seat_shape
+    greatest: Scores = np.where(there, pixels, 0.0).reshape(rows, cells, columns, cells).max(axis=(1, 3))
+    return greatest
 
 
 def _mask_scores(seen: Glance, mask: NDArray[np.generic] | None) -> Scores:

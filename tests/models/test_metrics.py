@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import random
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,10 +12,13 @@ from hypothesis import strategies as st
 from models.metrics import (
     average_accuracy,
     confusion,
+    frequency_weighted_iou,
     gap_closed,
     iou_per_class,
     kappa,
     mean_iou,
+    miou_over_frame_classes,
+    miou_over_frames,
     overall_accuracy,
 )
 from pipeline.errors import ShapeError
@@ -113,3 +118,24 @@ def test_a_gap_of_less_than_a_point_is_not_closed():
     assert gap_closed(0.8, 0.5, 0.7) == pytest.approx(1.5)
     assert gap_closed(0.505, 0.5, 0.509) is None
     assert gap_closed(0.5, float("nan"), 0.7) is None
+
+
+def test_means_over_frames_by_hand():
+    """A class in one frame alone counts as much as the other in `miou_c`, by its pixels' IoU in `miou`."""
+    large, small = np.array([[8, 0], [0, 0]]), np.array([[2, 2], [1, 1]])
+    frames = np.stack([large, small, np.zeros((2, 2), np.int64)])
+    alone = (2 / 5 + 1 / 4) / 2
+    assert miou_over_frames(frames) == pytest.approx((1 + alone) / 2)
+    assert miou_over_frame_classes(frames) == pytest.approx(((1 + 2 / 5) / 2 + 1 / 4) / 2)
+    assert frequency_weighted_iou(large + small) == pytest.approx((12 * 10 / 13 + 2 * 1 / 4) / 14)
+
+
+@given(st.lists(PAIRS, min_size=1, max_size=4), st.randoms(use_true_random=False))
+def test_the_order_of_frames_does_not_matter(frames: list[list[tuple[int, int]]], order: random.Random):
+    """Means over frames are the same in any order, 1 for perfect maps, and NaN where nothing is labelled."""
+    counts = np.stack([confusion(*_maps(frame), 4) for frame in frames])
+    moved = np.stack(order.sample(list(counts), len(counts)))
+    for mean in (miou_over_frames, miou_over_frame_classes):
+        assert mean(moved) == pytest.approx(mean(counts), nan_ok=True)
+        perfect = mean(np.stack([np.diag(one.sum(axis=1)) for one in counts]))
+        assert perfect == 1 if counts.any() else np.isnan(perfect)

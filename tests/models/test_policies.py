@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from models.inference import Glance
-from models.policies import pixel_entropy, score_seats
+from models.policies import NETWORK_POLICIES, POLICIES, pixel_entropy, score_seats
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.grid import SceneGrid
+from pipeline.selection import select_seats
 
 
 def _glance(height: int = 32, width: int = 48, patch: int = 8, factor: int = 2) -> Glance:
@@ -72,24 +73,65 @@ def test_a_mask_may_hold_numbers_that_are_not_finite():
     assert (np.delete(scores, [0, 2, 5]) == 1).all()
 
 
-@pytest.mark.parametrize("policy", ["entropy", "sobel", "mask", "random"])
-@pytest.mark.parametrize("size", [(37, 53), (1, 1), (8, 8), (33, 16)])
+@pytest.mark.parametrize("policy", [policy for policy in POLICIES if policy not in NETWORK_POLICIES])
+@pytest.mark.parametrize("size", [(37, 53), (1, 1), (8, 8), (33, 16), (1, 40)])
 def test_seats_off_the_scene_are_worth_nothing(policy: str, size: tuple[int, int]):
     """One finite score a seat of the padded grid; what lies wholly off the scene scores 0."""
     seen = _glance(*size)
+    seen.columns[...] = np.random.default_rng(3).random(seen.columns.shape)
     scores = score_seats(policy, seen, mask=np.ones(size))
+    assert (score_seats(policy, seen, mask=np.ones(size)) == scores).all()
+    assert scores.dtype == np.float64
     assert scores.shape == (np.prod(seen.grid.seat_shape),)
     assert np.isfinite(scores).all()
     assert not scores[seen.grid.valid_share().ravel() == 0].any()
 
 
-@pytest.mark.parametrize("policy", ["entropy", "mask"])
+def test_margin_is_how_little_the_likeliest_is_ahead():
+    """1 where two classes are level, 0 where one is sure, and 1 less the difference between; order does not count."""
+    seen = _glance()
+    seen.probability[...] = [1, 0, 0, 0]
+    seen.probability[:4, :4] = [0.25, 0.5, 0.125, 0.125]  # the seat at row 0, column 0
+    seen.probability[4:8, 8:12] = [0, 0.5, 0.5, 0]
+    expected = np.zeros((4, 6))
+    expected[0, 0], expected[1, 2] = 0.75, 1.0
+    assert score_seats("margin", seen).reshape(4, 6).tolist() == expected.tolist()
+    seen.probability[...] = seen.probability[..., ::-1].copy()
+    assert score_seats("margin", seen).reshape(4, 6).tolist() == expected.tolist()
+
+
+def test_margin_of_one_class_and_of_none():
+    """With a single class nothing is unsure; a probability that is not a number is passed on, to be chosen last."""
+    seen = _glance()
+    alone = Glance(seen.grid, seen.columns, np.ones_like(seen.probability[..., :1]))
+    assert not score_seats("margin", alone).any()
+    seen.probability[0, 0, 1] = np.nan
+    scores = score_seats("margin", seen)
+    assert np.isnan(scores[0])
+    assert (scores[1:] == 1).all()
+    assert 0 not in select_seats(scores, 23).seats
+
+
+@pytest.mark.parametrize("policy", ["saliency", "spectral-residual"])
+def test_saliency_looks_at_what_differs(policy: str):
+    """One odd seat on a noisy ground scores highest, and what lies off the scene changes nothing."""
+    seen = _glance(120, 90, factor=4)
+    seen.columns[...] = 0.5 + 0.01 * np.random.default_rng(4).random(seen.columns.shape)
+    seen.columns[10:12, 12:14] = 0.9  # the seat at row 5, column 6
+    scores = score_seats(policy, seen)
+    assert np.argmax(scores) == 5 * seen.grid.seat_shape[1] + 6
+    seen.columns[30:], seen.columns[:, 23:] = 9.0, np.nan
+    assert (score_seats(policy, seen) == scores).all()
+
+
+@pytest.mark.parametrize("policy", ["entropy", "margin", "mask"])
 @pytest.mark.parametrize("factor", [1, 2, 4])
 def test_a_border_seat_is_worth_its_share(policy: str, factor: int):
     """On a scene alike everywhere a seat scores in proportion to its pixels on the scene."""
     seen = _glance(37, 53, factor=factor)
     scores = score_seats(policy, seen, mask=np.full((37, 53), np.log(4)))
-    assert scores == pytest.approx(np.log(4) * seen.grid.valid_share().ravel(), abs=1e-6)
+    level = 1 if policy == "margin" else np.log(4)
+    assert scores == pytest.approx(level * seen.grid.valid_share().ravel(), abs=1e-6)
 
 
 def test_what_lies_off_the_scene_does_not_count():
@@ -101,7 +143,7 @@ def test_what_lies_off_the_scene_does_not_count():
 
 def test_policies_and_masks_that_do_not_fit_are_refused():
     """The messages name the policies there are, the flag that is missing, and both sizes."""
-    with pytest.raises(SettingsError, match="unknown policy 'best'; choose one of entropy, sobel"):
+    with pytest.raises(SettingsError, match="unknown policy 'best'; choose one of entropy, margin, sobel"):
         score_seats("best", _glance())
     with pytest.raises(SettingsError, match="needs --mask"):
         score_seats("mask", _glance())

@@ -1,0 +1,155 @@
+"""Which frames `spectralzoom evaluate` judges weights on, and what the weights see of them: what training saw."""
+
+from __future__ import annotations
+
+import hashlib
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.survey_scene import check_labels, judged_labels
+from flows.training_data import TrainingData, farm_data, open_training_data
+from models.examples import normalised, observe
+from models.inference import Glance, glance_of_columns
+from models.weights import Description, Weights, describe_weights, load_weights
+from pipeline.camera import LineCamera
+from pipeline.errors import SceneError, SettingsError, WeightsError
+from pipeline.grid import SceneGrid
+from pipeline.simulator.scene import RasterScene
+
+FARM_TEST_SEED = 300_000  # of farm scenes to judge on: neither trained on, nor validated on, nor shown
+FARM_TEST_SCENES = 4
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Weights to judge: the file's name, what it says of itself, and a hash of its bytes."""
+
+    path: Path
+    described: Description
+    key: str
+
+    def load(self) -> Weights:
+        """Read the tensors."""
+        return load_weights(self.path)
+
+    @property
+    def camera(self) -> LineCamera:
+        """The camera that training looked through."""
+        known = self.described.record.get("camera")
+        return LineCamera(**known) if isinstance(known, dict) else LineCamera()
+
+    def trained_on(self, scene: RasterScene) -> bool:
+        """Whether labels of the scene taught these weights; not so where a mask kept some of its pixels out."""
+        split = self.described.record.get("split", {})
+        return scene.key in split.get("train", {}).values() and scene.key not in split.get("pixels", {})
+
+
+@dataclass(frozen=True)
+class Look:
+    """One frame as certain weights see it."""
+
+    name: str
+    seen: Glance
+    fine: NDArray[np.float32]  # (seat, p, p, column) normalised, every seat of the padded grid
+    labels: NDArray[np.uint8]  # (y, x) in the weights' classes
+    bands: int
+    picture: NDArray[np.float32]  # (y, x, column) as seen, not normalised
+
+
+def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
+    """Describe the weights; none of their tensors is read yet.
+
+    Raises
+    ------
+    SettingsError : none given, or weights that are not seeds of one another: other sizes or classes.
+    WeightsError : a file that cannot be read.
+    """
+    if not paths:
+        raise SettingsError("evaluate needs --weights FILE; train some with: spectralzoom train DATASET -o FILE")
+    found = [Candidate(path, describe_weights(path), _file_key(path)) for path in paths]
+    first = found[0].described
+    for other in found[1:]:
+        described = other.described
+        if (described.config, described.class_names) != (first.config, first.class_names):
+            raise SettingsError(
+                f"{other.path} differs from {found[0].path} in sizes or classes; several --weights are seeds of one "
+                "training: evaluate different ones one by one"
+            )
+    keys = [one.key for one in found]
+    if len(set(keys)) < len(keys):
+        raise SettingsError("the same weights are given twice in --weights, which would count as two seeds")
+    return found
+
+
+def _file_key(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    except OSError as error:
+        raise WeightsError(f"cannot read {path}: {error.strerror}") from error
+
+
+def open_frames(
+    dataset: str, frames: tuple[str, ...], scenes: int | None, camera: LineCamera, choices: dict[str, Any]
+) -> TrainingData:
+    """Name the frames to judge on; ``train`` of what comes holds them all, whoever was trained on them.
+
+    Raises
+    ------
+    SettingsError : a choice that does not go with the data set.
+    SceneError : no scene, or a name that it has not.
+    """
+    if dataset != "farm":
+        data = open_training_data(dataset, 0, scenes, camera, **choices)
+        return _only(dataset, data, frames)
+    open_training_data("farm", 0, 1, camera, **choices)  # refuses choices that are for files
+    count = FARM_TEST_SCENES if scenes is None else scenes
+    if count < 1:
+        raise SettingsError(f"--scenes must be at least 1, got {count}")
+    seeds = tuple(str(FARM_TEST_SEED + number) for number in range(count))
+    return _only(dataset, TrainingData(farm_data(0, 0, camera).law, seeds, (), (), camera), frames)
+
+
+def _only(dataset: str, data: TrainingData, frames: tuple[str, ...]) -> TrainingData:
+    unknown = [name for name in frames if name not in data.train]
+    if unknown:
+        raise SceneError(f"{dataset} has no frame {', '.join(unknown)}; it has {', '.join(data.train)}")
+    names = tuple(name for name in data.train if not frames or name in frames)
+    return TrainingData(data.law, names, (), (), data.camera, data.files)
+
+
+def check_frame(scene: RasterScene, described: Description) -> None:
+    """Refuse a frame that these weights cannot be judged on.
+
+    Raises
+    ------
+    SceneError : no labels, or of a class that the weights do not know.
+    """
+    if scene.labels is None:
+        raise SceneError(
+            f"frame {scene.name} has no labels, and a map is judged by labels: give --labels or a scene.toml"
+        )
+    check_labels(scene, described)
+
+
+def look_at(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> Look:
+    """Look at a frame with the camera of the training; the noise follows from the seed and the frame's name."""
+    config = weights.config
+    grid = SceneGrid(*scene.shape, config.patch, config.factor)
+    rng = np.random.default_rng([seed, 0xE7A1, zlib.crc32(name.encode())])
+    observed = observe(scene, camera, grid, weights.basis, rng)
+    _, reached = weights.basis.matrix(scene.wavelength_nm)
+    example = normalised(observed, weights.normalisation, reached)
+    labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))
+    assert labels is not None  # check_frame
+    rows, across = grid.seat_shape
+    p, columns = config.patch, config.columns
+    cells = example.fine.reshape(rows, p, across, p, columns).transpose(0, 2, 1, 3, 4).reshape(-1, p, p, columns)
+    return Look(
+        name, glance_of_columns(weights, example.coarse, grid), cells.astype(np.float32), labels,
+        len(scene.wavelength_nm), observed.fine[: grid.height, : grid.width],
+    )  # fmt: skip

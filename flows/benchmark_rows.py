@@ -1,0 +1,180 @@
+"""One frame judged by one set of weights: every policy at every share of the seats, as counts that add up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.benchmark_frames import Look
+from models.boundary import boundary_counts
+from models.controls import RANDOM_DRAWS
+from models.cost import SCORE_PER_PIXEL, multiply_adds
+from models.inference import segment
+from models.metrics import confusion, iou_per_class, mean_iou
+from models.placement_metrics import average_precision, gain_sums, oracle_gain, rank_correlation, top_seats
+from models.policies import score_seats
+from models.weights import Weights
+from pipeline.camera import LineCamera
+from pipeline.coverage import cheapest_full, coarse_sweeps
+from pipeline.errors import PoseError
+from pipeline.grid import UNLABELLED
+from pipeline.planning import price_of_seats
+from pipeline.savings import BYTES_PER_SAMPLE
+from pipeline.scan import CostModel
+from pipeline.selection import frame_seats
+
+ORACLE = "oracle"
+Seats = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What to try on every frame."""
+
+    shares: tuple[float, ...]  # of the valid seats, above 0 and below 1: none and all are always there
+    policies: tuple[str, ...]  # without the oracle, which is always there
+    seed: int = 0
+
+    @property
+    def every_policy(self) -> tuple[str, ...]:
+        """Policies and the oracle."""
+        return (*self.policies, ORACLE)
+
+
+@dataclass(frozen=True)
+class Placing:
+    """Scores of one policy; ``draw`` tells random ones apart."""
+
+    policy: str
+    draw: int
+    scores: NDArray[np.float64]
+
+
+def placings(trial: Trial, look: Look, weights: Weights) -> list[Placing]:
+    """Scores of every policy, of several random placements, and of the oracle."""
+    found = []
+    for policy in trial.policies:
+        for draw in range(RANDOM_DRAWS if policy == "random" else 1):
+            seed = trial.seed + 1000 * (draw + 1)
+            found.append(Placing(policy, draw, score_seats(policy, look.seen, seed=seed)))
+    return [*found, Placing(ORACLE, 0, oracle_gain(weights, look.seen, look.fine, look.labels))]
+
+
+def judge_frame(
+    trial: Trial, look: Look, weights: Weights, report: Callable[[float], None] = lambda done: None
+) -> dict[str, Any]:
+    """Judge the map of every row; what comes is plain lists and numbers, and `flows.benchmark_summary` adds it up."""
+    grid = look.seen.grid
+    valid = grid.valid_seats()
+    placed = placings(trial, look, weights)
+    gain = placed[-1].scores
+    wanted = list(_wanted(trial, placed, look))
+    rows = []
+    for number, (policy, draw, share, seats) in enumerate(wanted):
+        row = {"policy": policy, "draw": draw, "share": share, "seats": len(seats)}
+        row |= _drawn(look, weights, seats)
+        row |= _cost(look, weights, seats, policy)
+        row["gain"], row["best_gain"] = gain_sums(gain, seats, valid)
+        row["ap_top"] = _ap_top(placed, policy, draw, gain, seats, valid)
+        rows.append(row)
+        report((number + 1) / len(wanted))
+    return {
+        "frame": look.name,
+        "shape": [grid.height, grid.width],
+        "seats": len(valid),
+        "rows": rows,
+        "ranking": [_ranking(one, gain, valid) for one in placed],
+        "positive_seats": int((gain[valid] > 0).sum()),
+    }
+
+
+def _wanted(trial: Trial, placed: list[Placing], look: Look) -> Iterator[tuple[str, int, float, Seats]]:
+    """(policy, draw, share, seats) of each row."""
+    allowed = look.seen.grid.valid_share().ravel() > 0
+    yield "none", 0, 0.0, np.empty(0, np.intp)
+    yield "all", 0, 1.0, np.flatnonzero(allowed)
+    for one in placed:
+        for share in trial.shares:
+            yield one.policy, one.draw, share, frame_seats(one.scores, share, allowed).seats
+
+
+def _drawn(look: Look, weights: Weights, seats: Seats) -> dict[str, Any]:
+    """Counts of the whole map, of the captured seats alone, and near borders; and the frame's own mean IoU."""
+    classes = weights.config.classes
+    drawn = segment(weights, look.seen, look.fine[seats], seats).classes
+    inside = np.where(captured_px(look, seats), look.labels, np.uint8(UNLABELLED))
+    whole = confusion(look.labels, drawn, classes)
+    return {
+        "counts": whole.tolist(),
+        "inside": confusion(inside, drawn, classes).tolist(),
+        "boundary": boundary_counts(look.labels, drawn, classes).tolist(),
+        "miou": _or_none(mean_iou(whole)),
+        "per_class_iou": [_or_none(iou) for iou in iou_per_class(whole)],
+    }
+
+
+def captured_px(look: Look, seats: Seats) -> NDArray[np.bool_]:
+    """Pixels of the scene that lie in captured seats, (y, x)."""
+    grid = look.seen.grid
+    chosen = np.zeros(grid.seat_shape, bool)
+    chosen.ravel()[seats] = True
+    full = chosen.repeat(grid.patch, axis=0).repeat(grid.patch, axis=1)
+    return full[: grid.height, : grid.width]
+
+
+def _cost(look: Look, weights: Weights, seats: Seats, policy: str) -> dict[str, Any]:
+    """Samples with those of the coarse pass, their bytes, and multiply-adds (`none` and `all`: the map alone)."""
+    grid = look.seen.grid
+    samples = float(grid.valid_share().ravel()[seats].sum() * grid.patch**2 + np.prod(grid.coarse_shape))
+    known = {"none": None, "all": None, ORACLE: "random"}.get(policy, policy)  # the oracle scores by labels
+    adds = None
+    if known is None or known in SCORE_PER_PIXEL:
+        adds = multiply_adds(weights.config, grid, len(seats), look.bands, known).total
+    return {"samples": samples, "bytes": samples * look.bands * BYTES_PER_SAMPLE, "multiply_adds": adds}
+
+
+def _ap_top(
+    placed: list[Placing], policy: str, draw: int, gain: NDArray[np.float64], seats: Seats, valid: Seats
+) -> float | None:
+    """Average precision of the scores against as many of the oracle's best seats."""
+    one = next((one for one in placed if (one.policy, one.draw) == (policy, draw)), None)
+    return None if one is None else _or_none(average_precision(one.scores[valid], top_seats(gain[valid], len(seats))))
+
+
+def _ranking(one: Placing, gain: NDArray[np.float64], valid: Seats) -> dict[str, Any]:
+    return {
+        "policy": one.policy,
+        "draw": one.draw,
+        "ap_gain": _or_none(average_precision(one.scores[valid], gain[valid] > 0)),
+        "spearman": _or_none(rank_correlation(one.scores[valid], gain[valid])),
+    }
+
+
+def capture_seconds(
+    trial: Trial, look: Look, weights: Weights, camera: LineCamera, cost: CostModel
+) -> dict[str, Any] | None:
+    """What the rig takes for the same seats [s], by the cost model: runs of lines and coarse pass, beside full.
+
+    None where the field is beyond the mirror's range. The full scan is taken where it is cheaper.
+    """
+    grid = look.seen.grid
+    try:
+        along, _, full_s = cheapest_full(grid, camera, cost)
+        coarse_s = cost.seconds(coarse_sweeps(grid, camera, along), camera)
+        found = []
+        for policy, draw, share, seats in _wanted(trial, placings(trial, look, weights), look):
+            if draw or policy in ("none", "all"):
+                continue
+            lines, seconds = price_of_seats(grid, camera, cost, along, seats).least if len(seats) else (0, 0.0)
+            found.append({"policy": policy, "share": share, "lines": lines, "seconds": coarse_s + seconds})
+    except PoseError:
+        return None
+    return {"frame": look.name, "none": coarse_s, "full": full_s, "rows": found}
+
+
+def _or_none(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)

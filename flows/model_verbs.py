@@ -1,0 +1,78 @@
+"""Verbs on weights: how good they are, and what that costs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from flows.app import AsJson, OutFolder, app, parse_numbers, parse_wholes, split_list, stderr
+
+
+@app.command
+def evaluate(
+    dataset: str,
+    *,
+    weights: Annotated[tuple[Path, ...], Parameter(negative="")],
+    out: OutFolder = None,
+    shares: str | None = None,
+    policies: str | None = None,
+    frames: str | None = None,
+    scenes: int | None = None,
+    seed: int = 0,
+    draws: int = 2000,
+    timed_frames: int = 2,
+    labels: str | None = None,
+    bands: str | None = None,
+    wavelengths: str | None = None,
+    as_json: AsJson = False,
+) -> int:
+    """Judge WEIGHTS on the frames of DATASET that they were not trained on: accuracy, intervals, placement, costs.
+
+    With a folder, frames that were judged are kept in it: the same command goes on where it was stopped.
+
+    Parameters
+    ----------
+    dataset
+        `farm`, a folder of labelled scenes, or one scene file.
+    weights
+        A file of weights. Several are seeds of one training: mean and spread.
+    out
+        Folder for evaluation.json, the plot (evaluation.png) and pictures of the worst and the best frame.
+    shares
+        Shares of the seats to try, with commas; 0.05,0.1,0.15,0.2,0.35 by default. None and all are always there.
+    policies
+        Placements to try, with commas; entropy,sobel,random by default. The oracle is always there.
+    frames
+        Names of the frames to judge on, with commas; all by default.
+    scenes
+        How many scenes of the built-in farm; 4 by default.
+    seed
+        Of noise, random placements and the bootstrap.
+    draws
+        Of the bootstrap.
+    timed_frames
+        How many frames to time, and to price the capture of; 0 leaves both out.
+    labels
+        For one scene: its labels.
+    bands
+        For one scene: bands to use, from 0.
+    wavelengths
+        For one scene: wavelengths of its bands [nm].
+    """
+    from flows.benchmark_work import SHARES, USUAL, EvaluateRequest
+    from flows.evaluate_command import run_evaluate
+
+    choices = {
+        "labels": labels,
+        "bands": parse_wholes(bands, "--bands"),
+        "wavelengths": parse_numbers(wavelengths, "--wavelengths"),
+    }
+    given = parse_numbers(shares, "--shares")
+    request = EvaluateRequest(
+        dataset, weights, out, SHARES if given is None else tuple(given), split_list(policies) or USUAL,
+        split_list(frames), scenes, seed, draws, timed_frames, choices=choices,
+    )  # fmt: skip
+    run_evaluate(request, stderr, as_json=as_json)
+    return 0

@@ -1,0 +1,68 @@
+"""Fitting tensors trained on photographs to other bands, another patch size, another number of positions."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812 - its usual name
+from numpy.typing import NDArray
+from torch import Tensor
+
+from models.spectral import REACH, SpectralBasis
+
+RGB_NM = (650.0, 550.0, 450.0)
+
+
+def rgb_response(basis: SpectralBasis) -> NDArray[np.float32]:
+    """How much each spectral column says of red, green and blue (650, 550, 450 nm), (3, column), rows summing to 1.
+
+    A colour outside the basis takes its nearest end: data without blue show red there.
+    """
+    centres = np.linspace(basis.low_nm, basis.high_nm, basis.columns)
+    wanted = np.clip(RGB_NM, basis.low_nm, basis.high_nm)
+    distance = np.abs(wanted[:, None] - centres[None, :]) / basis.spacing_nm
+    bump = np.where(distance <= REACH, np.exp(-0.5 * (distance / 0.5) ** 2), 0.0)
+    return np.asarray(bump / bump.sum(axis=1, keepdims=True), np.float32)
+
+
+def map_rgb_kernel(kernel: Tensor, response: NDArray[np.floating]) -> Tensor:
+    """Kernel (out, 3, y, x) over colours -> (out, column, y, x), the sum over colours of weight times response.
+
+    It says of the columns what the old one says of the colours mixed from them; grey of all columns is grey.
+    """
+    return torch.einsum("ocyx,cj->ojyx", kernel, torch.as_tensor(np.asarray(response), dtype=kernel.dtype))
+
+
+def resize_patch_kernel(kernel: Tensor, size: tuple[int, int]) -> Tensor:
+    """Kernel (out, in, y, x) of patches -> the same for patches of ``size``.
+
+    Its answer to a patch enlarged bilinearly is the old one to the patch itself: the pseudo-inverse of enlarging.
+    """
+    rows, columns = kernel.shape[2:]
+    pixels = torch.eye(rows * columns, dtype=torch.float64).reshape(-1, 1, rows, columns)
+    enlarge = F.interpolate(pixels, size=size, mode="bilinear", align_corners=False).reshape(rows * columns, -1)
+    fitted = kernel.double().reshape(-1, rows * columns) @ torch.linalg.pinv(enlarge).T
+    resized: Tensor = fitted.reshape(*kernel.shape[:2], *size).to(kernel.dtype)
+    return resized
+
+
+def resize_positions(positions: Tensor, tokens: int, extra: tuple[int, int]) -> Tensor | None:
+    """Position codes (1, extra + G^2, d) -> (1, tokens, d) by bicubic interpolation; None where a grid is not square.
+
+    Parameters
+    ----------
+    extra
+        Codes before the grid's own (class token, distillation token): in the file, and wanted. Wanted ones beyond
+        those of the file are zero.
+    """
+    came, wanted = extra
+    old, new = math.isqrt(max(positions.shape[1] - came, 0)), math.isqrt(max(tokens - wanted, 0))
+    if old < 1 or new < 1 or old**2 + came != positions.shape[1] or new**2 + wanted != tokens:
+        return None
+    grid = positions[:, came:].reshape(1, old, old, -1).permute(0, 3, 1, 2)
+    fitted = F.interpolate(grid, size=(new, new), mode="bicubic", align_corners=False)
+    lead = torch.zeros(1, wanted, positions.shape[2], dtype=positions.dtype)
+    lead[:, : min(came, wanted)] = positions[:, : min(came, wanted)]
+    return torch.cat([lead, fitted.permute(0, 2, 3, 1).reshape(1, new * new, -1)], dim=1)

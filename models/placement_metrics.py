@@ -1,0 +1,128 @@
+"""How well seats were placed, against the seats whose fine look lowers the loss most. Uses labels: evaluation only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.inference import PATCHES_AT_ONCE, Glance
+from models.weights import Weights
+from pipeline.grid import UNLABELLED
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
+Values = NDArray[np.floating]
+
+
+def oracle_gain(
+    weights: Weights, seen: Glance, fine: NDArray[np.floating], labels: NDArray[np.uint8]
+) -> NDArray[np.float64]:
+    """Loss with no fine seat minus loss with all of them, (seat,) [nat], mean over a seat's pixels.
+
+    The loss is the cross-entropy of the labelled pixels; others, and those beside the scene, add 0 to the mean.
+    Clipped to -5..5; negative where the fine look makes the map worse.
+
+    Parameters
+    ----------
+    fine
+        (seat, p, p, column) normalised columns of every seat of the padded grid.
+    labels
+        (y, x) class indices of the scene's own size, 255 unlabelled.
+    """
+    grid, p = seen.grid, seen.grid.patch
+    full = np.full(grid.padded_shape, UNLABELLED, np.uint8)
+    full[: grid.height, : grid.width] = labels
+    rows, columns = grid.seat_shape
+    truth = full.reshape(rows, p, columns, p).swapaxes(1, 2).reshape(-1, p, p)
+    gain = np.zeros(len(truth))
+    for seats, before, after in _logits_of_seats(weights, seen, fine):
+        gain[seats] = (_losses(before, truth[seats]) - _losses(after, truth[seats])).sum(axis=(1, 2)) / p**2
+    return np.clip(gain, -MOST_GAIN, MOST_GAIN)
+
+
+def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Cross-entropy of each pixel, (seat, class, y, x) and (seat, y, x) -> (seat, y, x); 0 where unlabelled."""
+    from scipy.special import logsumexp
+
+    labelled = truth != UNLABELLED
+    index = np.where(labelled, truth, 0).astype(np.intp)[:, None]
+    exact = logits.astype(np.float64)
+    loss = logsumexp(exact, axis=1) - np.take_along_axis(exact, index, axis=1)[:, 0]
+    return np.where(labelled, loss, 0.0)
+
+
+def _logits_of_seats(
+    weights: Weights, seen: Glance, fine: NDArray[np.floating]
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]]:
+    """Numbers and class logits of some seats at a time: by the glance alone, and with every valid seat captured."""
+    import torch
+
+    model, valid = weights.segmenter.eval(), seen.grid.valid_seats()
+    chunks = [valid[first : first + PATCHES_AT_ONCE] for first in range(0, len(valid), PATCHES_AT_ONCE)]
+    with torch.inference_mode():
+        view = model.view(torch.from_numpy(seen.columns).permute(2, 0, 1)[None].contiguous())
+        described = [model.stem(_patches(fine, chunk), coarse=False) for chunk in chunks]
+        tokens = torch.cat([token for _, token in described])[None]
+        numbers = torch.from_numpy(valid.astype(np.int64))[None]
+        grid = model.encode(view, tokens, numbers)
+        canvas = model.coarse_canvas(view, grid)
+        alone = torch.from_numpy(seen.probability).permute(2, 0, 1)[None].clamp_min(1e-30).log()
+        for chunk, (features, _) in zip(chunks, described, strict=True):
+            number = torch.from_numpy(chunk.astype(np.int64))[None]
+            context = model.seat_context(grid, number)[0]
+            after = model.decode_fine(features, context, model.canvas_windows(canvas, number))
+            before = model.canvas_windows(alone, number)
+            yield chunk, before.numpy(), after.numpy()
+
+
+def _patches(fine: NDArray[np.floating], seats: NDArray[np.intp]) -> Tensor:
+    import torch
+
+    return torch.from_numpy(np.nan_to_num(np.asarray(fine[seats], np.float32), nan=0.0)).permute(0, 3, 1, 2)
+
+
+def gain_sums(gain: Values, chosen: NDArray[np.integer], valid: NDArray[np.integer]) -> tuple[float, float]:
+    """Gain of the chosen seats, and of as many of the best valid ones; add frames up before dividing."""
+    best = np.sort(gain[valid])[::-1][: len(chosen)]
+    return float(gain[chosen].sum()), float(best.sum())
+
+
+def captured_gain(bought: float, best: float) -> float | None:
+    """Share of the best seats' gain that the chosen ones have; None where there is none to be had."""
+    return bought / best if best > 0 else None
+
+
+def average_precision(score: Values, positive: NDArray[np.bool_]) -> float:
+    """Mean precision at each positive, from the best score down; equal scores by number, NaN last.
+
+    NaN where nothing is positive.
+    """
+    if not positive.any():
+        return float("nan")
+    worth = np.where(np.isnan(score), -np.inf, score)
+    hits = positive[np.argsort(-worth, kind="stable")]
+    precision = np.cumsum(hits) / np.arange(1, len(hits) + 1)
+    return float(precision[hits].mean())
+
+
+def top_seats(gain: Values, count: int) -> NDArray[np.bool_]:
+    """Which of the seats are the ``count`` with the most gain, equal ones by number, (seat,)."""
+    best = np.zeros(len(gain), bool)
+    best[np.argsort(-gain, kind="stable")[:count]] = True
+    return best
+
+
+def rank_correlation(score: Values, gain: Values) -> float:
+    """Spearman's correlation, equal values sharing their mean rank; NaN where either is flat."""
+    from scipy.stats import rankdata
+
+    if len(score) < 2:
+        return float("nan")
+    first, second = (rankdata(values) - (len(values) + 1) / 2 for values in (score, gain))
+    spread = float(np.sqrt((first**2).sum() * (second**2).sum()))
+    return float((first * second).sum() / spread) if spread > 0 else float("nan")

@@ -1,0 +1,167 @@
+"""Putting tensors of other networks into one of ours: by name and shape, with a report of what became of each.
+
+Known layouts: timm and DeiT vision transformers, Segmenter checkpoints (their encoder is the timm one under
+``encoder.``) and VGG19.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from models.kernel_fits import map_rgb_kernel, resize_patch_kernel, resize_positions
+from models.state_files import read_state
+from models.vgg import VggFeatures, common_names
+from models.vgg_sizes import VggSizes
+from pipeline.errors import WeightsError
+
+PATCHES, POSITIONS = "patch_embed.proj.weight", "pos_embed"
+TOKENS = ("cls_token", "dist_token")
+_UNUSED = {
+    "head": "a classifier of photographs",
+    "head_dist": "a classifier of photographs",
+    "classifier": "a classifier of photographs",
+    "pre_logits": "a classifier of photographs",
+    "decoder": "a decoder for its own classes",
+    "decode_head": "a decoder for its own classes",
+}
+
+
+@dataclass
+class LoadReport:
+    """What became of each tensor of a file, by its name there; and what of the module nothing came for."""
+
+    matched: list[str] = field(default_factory=list)
+    resized: dict[str, str] = field(default_factory=dict)  # name -> how
+    skipped: dict[str, str] = field(default_factory=dict)  # name -> why
+    missing: list[str] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        """One line with the counts and the reasons."""
+        counts = f"{len(self.matched)} tensors matched, {len(self.resized)} resized, {len(self.skipped)} skipped"
+        reasons = sorted(set(self.skipped.values()))
+        return counts + (f" ({'; '.join(reasons[:3])}{'; ...' if len(reasons) > 3 else ''})" if reasons else "")
+
+
+def load_into(
+    module: nn.Module,
+    state: Mapping[str, Tensor],
+    *,
+    names: Mapping[str, str] | None = None,
+    response: NDArray[np.floating] | None = None,
+) -> LoadReport:
+    """Put every tensor that has a place into ``module``, in place; nothing is changed where none has.
+
+    Parameters
+    ----------
+    state
+        Named tensors as `models.state_files.read_state` gives them.
+    names
+        Beginnings of names, of the file to the module's own, ``*`` standing for one number:
+        ``{"blocks.*.attn.qkv": "layers.*.qkv"}``. The first that fits counts; other names stay as they are.
+    response
+        (3, band): mixes the bands to colours, for a module that reads bands instead of colours.
+
+    Raises
+    ------
+    WeightsError : nothing fits; names what was found.
+    """
+    places, report = module.state_dict(), LoadReport()
+    extra = tuple(sum(token in holder for token in TOKENS) for holder in ({_plain(n) for n in state}, set(places)))
+    found: dict[str, Tensor] = {}
+    for name, value in state.items():
+        target = _renamed(_plain(name), names or {})
+        if target not in places:
+            head = _plain(name).split(".")[0]
+            report.skipped[name] = _UNUSED.get(head, f"no place for {head}")
+            continue
+        fitted, how = _fit(_plain(name), value, places[target].shape, response, (extra[0], extra[1]))
+        if fitted is None:
+            report.skipped[name] = how
+            continue
+        found[target] = fitted
+        if how:
+            report.resized[name] = how
+        else:
+            report.matched.append(name)
+    report.missing = [name for name in places if name not in found]
+    if not found:
+        raise WeightsError(_nothing_fits(state, report))
+    module.load_state_dict(found, strict=False)
+    return report
+
+
+def _plain(name: str) -> str:
+    """A Segmenter's encoder has the names of timm below ``encoder.``, mmseg's ``backbone.``."""
+    return name.removeprefix("encoder.").removeprefix("backbone.")
+
+
+def _renamed(name: str, names: Mapping[str, str]) -> str:
+    for old, new in names.items():
+        fits = re.match(re.escape(old).replace(r"\*", r"(\d+)") + r"(?=\.|$)", name)
+        if fits:
+            numbers = iter(fits.groups())
+            return re.sub(r"\*", lambda _, numbers=numbers: next(numbers), new) + name[fits.end() :]  # type: ignore[misc]
+    return name
+
+
+def _fit(
+    name: str,
+    value: Tensor,
+    shape: torch.Size,
+    response: NDArray[np.floating] | None,
+    extra: tuple[int, int],
+) -> tuple[Tensor | None, str]:
+    """The tensor in its new shape with how it was resized (nothing if it was not), or None with the reason."""
+    if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
+        return None, "values that are not finite numbers"
+    fitted: Tensor | None = value
+    if name == PATCHES and value.dim() == len(shape) == 4:
+        fitted = _fit_patches(value, shape, response)
+    elif name == POSITIONS and value.dim() == len(shape) == 3 and (value.shape != shape or extra[0] != extra[1]):
+        fitted = resize_positions(value, shape[1], extra)
+    if fitted is None or fitted.shape != shape:
+        return None, f"{tuple(value.shape)} does not fit {tuple(shape)}"
+    return fitted, "" if fitted is value else f"{tuple(value.shape)} to {tuple(shape)}"
+
+
+def _fit_patches(value: Tensor, shape: torch.Size, response: NDArray[np.floating] | None) -> Tensor:
+    fitted = value
+    if shape[1] != 3 and value.shape[1] == 3 and response is not None and response.shape == (3, shape[1]):
+        fitted = map_rgb_kernel(value, response)
+    return fitted if value.shape[2:] == shape[2:] else resize_patch_kernel(fitted, (shape[2], shape[3]))
+
+
+def _nothing_fits(state: Mapping[str, Tensor], report: LoadReport) -> str:
+    shown = ", ".join(f"{name} {tuple(value.shape)}" for name, value in list(state.items())[:4])
+    reasons = "; ".join(sorted(set(report.skipped.values()))[:3])
+    found = f"found {shown or 'nothing'} ({reasons})"
+    return f"none of {len(state)} tensors fits the network: {found}; use weights made for it"
+
+
+def load_vgg(path: Path, sizes: VggSizes | None = None) -> tuple[VggFeatures, LoadReport]:
+    """Read VGG19's convolutions: torchvision's file, the stack alone, or the normalised variant.
+
+    Raises
+    ------
+    WeightsError : as `read_state`, or a convolution is missing or of another size: another network, such as VGG16.
+    """
+    network = VggFeatures(sizes)
+    state = read_state(path)
+    try:
+        report = load_into(network, common_names(state, network.sizes))
+    except WeightsError as error:
+        raise WeightsError(f"{path} is no VGG19: {error}") from error
+    if report.missing:
+        raise WeightsError(
+            f"{path} lacks {len(report.missing)} of {len(network.state_dict())} tensors of VGG19's convolutions, the"
+            f" first {report.missing[0]} ({report}); give VGG19 without batch normalisation"
+        )
+    return network.requires_grad_(False).eval(), report

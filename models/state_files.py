@@ -1,0 +1,137 @@
+"""Files of other people's weights: read as plain tensors, never as Python objects that could run code."""
+
+from __future__ import annotations
+
+import pickle
+import struct
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from pipeline.errors import WeightsError
+
+WRAPPERS = ("model", "state_dict", "model_state_dict", "model_ema", "module")
+DAMAGED = (  # what the readers raise over bytes that are not what they should be
+    SafetensorError, RuntimeError, EOFError, OSError, ValueError, TypeError, LookupError, AttributeError,
+    AssertionError, BadZipFile, struct.error, MemoryError,
+)  # fmt: skip
+PREFIX = "module."  # what training on several devices puts before every name
+
+
+def read_state(path: Path) -> dict[str, Tensor]:
+    """Read named tensors of a ``.safetensors`` file or of one that torch saved; wrappers around them are opened.
+
+    Raises
+    ------
+    WeightsError : missing, cut short, no tensors in it, or it holds Python objects, which are refused unread.
+    """
+    if not path.is_file():
+        raise WeightsError(f"no file of weights at {path}; give the path of a .safetensors or .pth file")
+    return unwrap_state(_read(path), str(path))
+
+
+def _read(path: Path) -> object:
+    try:
+        if path.suffix == ".safetensors":
+            return load_file(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of other pickles than its own: it refuses what it does not know
+            return torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        if "weights_only" in str(error).lower() or "unsupported" in str(error).lower():
+            raise WeightsError(
+                f"{path} holds more than tensors, or is none of torch's files; Python objects are never loaded, they"
+                " can run code: save the state dict alone, as .safetensors or with torch.save"
+            ) from error
+        raise WeightsError(f"{path} is damaged or no file of weights ({_first_line(error)}); copy it again") from error
+    except DAMAGED as error:
+        raise WeightsError(f"{path} is damaged or no file of weights ({_first_line(error)}); copy it again") from error
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:120] or type(error).__name__
+
+
+def unwrap_state(content: object, place: str) -> dict[str, Tensor]:
+    """Give the named tensors inside ``model``, ``state_dict`` and the like, without prefixes of parallel training.
+
+    Raises
+    ------
+    WeightsError : no named tensors; says what there is instead.
+    """
+    inside = content
+    while isinstance(inside, Mapping):
+        tensors = {str(name): value for name, value in inside.items() if isinstance(value, Tensor)}
+        if tensors:
+            every = all(name.startswith(PREFIX) for name in tensors)
+            return {name.removeprefix(PREFIX) if every else name: value for name, value in tensors.items()}
+        inside = next((inside[name] for name in WRAPPERS if name in inside), None)
+    found = ", ".join(map(str, list(content)[:5])) if isinstance(content, Mapping) else type(content).__name__
+    raise WeightsError(f"{place} has no named tensors, it has: {found or 'nothing'}; give a state dict")
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What the ``variant.yml`` beside a Segmenter checkpoint says: sizes that the shapes of tensors do not tell."""
+
+    backbone: str
+    patch: int
+    dim: int
+    layers: int
+    heads: int
+    classes: int
+    decoder: str
+
+
+def read_variant(checkpoint: Path) -> Variant:
+    """Read ``variant.yml`` beside a Segmenter checkpoint.
+
+    Raises
+    ------
+    WeightsError : it is missing, damaged, or lacks an entry (named).
+    """
+    path = checkpoint.with_name("variant.yml")
+    try:
+        net = _nested_values(path.read_text(encoding="utf-8"))["net_kwargs"]
+        return Variant(
+            str(net["backbone"]), int(net["patch_size"]), int(net["d_model"]), int(net["n_layers"]),
+            int(net["n_heads"]), int(net["n_cls"]), str(net["decoder"]["name"]),
+        )  # fmt: skip
+    except FileNotFoundError:
+        raise WeightsError(
+            f"no variant.yml beside {checkpoint}; copy it there, it says how many heads it has"
+        ) from None
+    except KeyError as error:
+        raise WeightsError(f"{path} lacks {error}; copy the file that came with {checkpoint.name}") from None
+    except (OSError, UnicodeDecodeError, TypeError, ValueError) as error:
+        raise WeightsError(f"cannot use {path} ({_first_line(error)}); copy the one of {checkpoint.name}") from error
+
+
+def _nested_values(text: str) -> dict[str, Any]:
+    """Names and plain values of YAML's indented tables, ``{a: b}`` on one line included; nothing else of YAML."""
+    root: dict[str, Any] = {}
+    open_tables = [(-1, root)]
+    for line in text.splitlines():
+        name, colon, value = line.partition(":")
+        if not colon or name.lstrip().startswith(("#", "-")):
+            continue
+        indent, value = len(name) - len(name.lstrip()), value.strip()
+        while open_tables[-1][0] >= indent:
+            open_tables.pop()
+        inner: dict[str, Any] = {}
+        if value.startswith("{") and value.endswith("}"):
+            inner = {
+                key.strip(): item.strip() for key, _, item in (part.partition(":") for part in value[1:-1].split(","))
+            }
+        open_tables[-1][1][name.strip()] = inner if inner or not value else value
+        if not value:
+            open_tables.append((indent, inner))
+    return root

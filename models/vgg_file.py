@@ -1,0 +1,58 @@
+"""The file of VGG19 that a survey was given: found and named without torch, read once a process."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from models.vgg_sizes import VGG_FROM
+from pipeline.errors import SettingsError, WeightsError
+
+if TYPE_CHECKING:
+    from models.pretrained import LoadReport
+    from models.vgg import VggFeatures
+    from models.vgg_saliency import VggSaliency
+    from models.weights import Weights
+
+
+@dataclass(frozen=True)
+class VggFile:
+    """A file of VGG19 by its path, and the hash that it had when the survey began."""
+
+    path: Path
+    key: str
+
+    @staticmethod
+    def found(path: Path) -> VggFile:
+        """Take the file as it is now. Raises SettingsError where there is none, saying what could stand there."""
+        if not path.is_file():
+            raise SettingsError(f"no file {path}; --vgg takes {VGG_FROM}")
+        return VggFile(path.resolve(), _hash(path))
+
+    def report(self) -> LoadReport:
+        """What was taken from it. Raises WeightsError: another network, damaged, or changed since."""
+        return _network_at(self)[1]
+
+    def saliency(self, weights: Weights) -> VggSaliency:
+        """Give the policy for looks with the columns of ``weights``. Raises WeightsError as `report`."""
+        from models.vgg_saliency import VggSaliency, colours_of
+
+        return VggSaliency(_network_at(self)[0], colours_of(weights))
+
+
+def _hash(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:20]
+
+
+@lru_cache(maxsize=1)
+def _network_at(file: VggFile) -> tuple[VggFeatures, LoadReport]:
+    from models.pretrained import load_vgg
+
+    loaded = load_vgg(file.path)
+    if _hash(file.path) != file.key:
+        raise WeightsError(f"the VGG19 {file.path} has changed since the survey began; start it again")
+    return loaded
