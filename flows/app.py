@@ -35,7 +35,13 @@ Scheduler = Annotated[
     str, Parameter(help="Who works: `threads`, `processes`, or a dask scheduler elsewhere, tcp://host:port")
 ]
 Workers = Annotated[int | None, Parameter(help="Blocks of the field at a time; one a core by default.")]
-GOES_ON = ("survey", "train", "export", "reprocess")  # verbs that keep what they have done when they are interrupted
+GOES_ON = (
+    "survey",
+    "train",
+    "evaluate",
+    "export",
+    "reprocess",
+)  # verbs that keep what they have done when they are interrupted
 
 
 def say(message: str) -> None:

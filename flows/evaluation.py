@@ -157,10 +157,11 @@ def _segment_seconds(run: SurveyRun, seen: Glance, patches: StageRef, columns: N
     (seats, own), settings = patch_columns(run, patches, seen), run.settings
     valid = run.grid.valid_seats()
     every = columns[valid]
+    network = None if run.vgg is None else run.vgg.saliency(run.weights)
 
     def look_choose_draw() -> None:
         looked = glance_of_columns(run.weights, seen.columns, run.grid)
-        score_seats(settings.policy, looked, seed=settings.seed, mask=run.mask)
+        score_seats(settings.policy, looked, seed=settings.seed, mask=run.mask, network=network)
         segment(run.weights, looked, own, seats)
 
     return {

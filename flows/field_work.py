@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 
 from flows.region_work import Drawing, Scoring, WeightsFile
 from flows.run import SurveyRun, weights_path
-from models.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions
+from models.policies import IMAGE_POLICIES
+from models.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field
+from models.vgg_file import VggFile
+from models.vgg_sizes import saliency_bytes
 from pipeline.errors import SettingsError
 from pipeline.grid import SceneGrid
 from storage.block_work import Crew, run_blocks
@@ -22,6 +25,7 @@ from storage.patches import open_patches
 from storage.tile_work import RESERVED_BYTES
 
 SHARD = (SHARD_ROWS, SHARD_COLUMNS)
+IMAGE_BYTES = 128  # a coarse pixel, of what a policy of the whole image holds at once beside the columns
 
 
 def region_params(grid: SceneGrid) -> dict[str, Any]:
@@ -37,26 +41,50 @@ class FieldWork:
     regions: Sequence[Region]
     crew: Crew
     memory: int  # of this process and those that it starts, together [bytes]
+    vgg: VggFile | None = None  # for the policy vgg-static
 
     @staticmethod
     def of(run: SurveyRun) -> FieldWork:
         """Take from a survey what the regions of its field need."""
         file = WeightsFile(weights_path(run.settings).resolve(), run.weights_key)
-        return FieldWork(file, plan_regions(run.grid, SHARD), run.settings.crew, run.settings.memory)
+        return FieldWork(file, plan_regions(run.grid, SHARD), run.settings.crew, run.settings.memory, run.vgg)
 
     def score(self, policy: str, mosaic: Path, report: Callable[[float], None]) -> NDArray[np.float64]:
         """Score every seat of the padded grid by the coarse mosaic alone, (seat_y, seat_x).
 
+        A policy that sees the image as a whole gets the field as one region, whatever its size.
+
         Raises
         ------
-        SettingsError : not even one region at a time fits the memory.
+        SettingsError : not even one region at a time, or not the whole image that such a policy needs, fits the memory.
         """
-        crew, path = self.crew_for(np.empty(0, np.int64), len(mosaic_wavelengths(mosaic))), mosaic.resolve()
-        parts = run_blocks(Scoring(self.weights, path, policy), self.regions, crew, report=report, paths=[path])
+        if policy in IMAGE_POLICIES:
+            return self._score_image(policy, mosaic.resolve(), report)
+        beside = max(saliency_bytes(region.coarse.shape) for region in self.regions) if self.vgg else 0
+        crew = self.crew_for(np.empty(0, np.int64), len(mosaic_wavelengths(mosaic)), beside=beside)
+        path = mosaic.resolve()
+        work, paths = Scoring(self.weights, path, policy, self.vgg), [path, *([self.vgg.path] if self.vgg else [])]
+        parts = run_blocks(work, self.regions, crew, report=report, paths=paths)
         scores = np.zeros(self.regions[0].field.seat_shape)
         for region, part in zip(self.regions, parts, strict=True):
             scores[region.kept_seats.rows, region.kept_seats.columns] = part
         return scores
+
+    def _score_image(self, policy: str, mosaic: Path, report: Callable[[float], None]) -> NDArray[np.float64]:
+        """Score by the coarse image of the whole field: one block of work, and no reading by the model."""
+        grid, crew = self.regions[0].field, self.crew
+        y, x = grid.padded_shape
+        image = (2 * 4 * self.weights.load().config.columns + IMAGE_BYTES) * (y * x // grid.factor**2)
+        least = RESERVED_BYTES * (1 if crew.shares_memory else 2) + image
+        if least > self.memory and not crew.elsewhere:
+            raise SettingsError(
+                f"projected memory {_mib(least)} exceeds --memory {_mib(self.memory)}: the policy {policy!r} sees the "
+                f"coarse image of the field as a whole, which takes {_mib(image)}; give at least --memory "
+                f"{_mib(least)}, or choose a policy that does not, such as entropy"
+            )
+        work = Scoring(self.weights, mosaic, policy)
+        (scores,) = run_blocks(work, [whole_field(grid)], crew, report=report, paths=[mosaic])
+        return np.asarray(scores, np.float64)
 
     def draw(self, mosaic: Path, patches: Path, out: Path, report: Callable[[float], None]) -> None:
         """Draw the class map into the store that was created at ``out``.
@@ -79,8 +107,10 @@ class FieldWork:
         """
         self.crew_for(seats, bands)
 
-    def crew_for(self, seats: NDArray[np.integer], bands: int) -> Crew:
+    def crew_for(self, seats: NDArray[np.integer], bands: int, *, beside: int = 0) -> Crew:
         """Give the crew, no larger than memory holds regions with their parts of these seats of the field.
+
+        ``beside`` each region lie so many bytes more.
 
         Raises
         ------
@@ -88,7 +118,7 @@ class FieldWork:
         """
         if self.crew.elsewhere:
             return self.crew
-        region = most_bytes(self.weights.load().config, self.regions, seats, bands)
+        region = most_bytes(self.weights.load().config, self.regions, seats, bands) + beside
         apart = not self.crew.shares_memory
         each = region + RESERVED_BYTES * apart
         least = RESERVED_BYTES + each

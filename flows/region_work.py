@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from models.inference import CoarseLook, look_coarsely, read_glance, segment
-from models.policies import score_seats
+from models.inference import CoarseLook, Glance, look_coarsely, read_glance, segment
+from models.policies import IMAGE_POLICIES, NETWORK_POLICIES, score_seats
 from models.regions import Region
+from models.vgg_file import VggFile
 from models.weights import Weights, load_weights
 from pipeline.errors import WeightsError
 from storage.class_maps import write_class_tile
@@ -51,13 +52,16 @@ class Scoring:
     weights: WeightsFile
     mosaic: Path
     policy: str
+    vgg: VggFile | None = None
 
     def __call__(self, region: Region) -> NDArray[np.float64]:
         """Scores of the seats that are kept, (seat_y, seat_x)."""
         let_tiles_go()
         weights = self.weights.load()
-        seen = read_glance(weights, look_at(weights, self.mosaic, region))
-        return region.crop_seats(score_seats(self.policy, seen))
+        look = look_at(weights, self.mosaic, region)
+        seen = unread(look) if self.policy in IMAGE_POLICIES + NETWORK_POLICIES else read_glance(weights, look)
+        network = None if self.vgg is None else self.vgg.saliency(weights)
+        return region.crop_seats(score_seats(self.policy, seen, network=network))
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,11 @@ class Drawing:
         drawn = segment(weights, seen, columns, seats)
         origin = region.kept.top, region.kept.left
         write_class_tile(self.out, origin, region.crop(drawn.classes), region.crop(drawn.confidence))
+
+
+def unread(look: CoarseLook) -> Glance:
+    """Stand in for the glance where nothing but the coarse image is asked for."""
+    return Glance(look.grid, look.columns, np.empty((0, 0, 0), np.float32), origin=look.origin)
 
 
 def look_at(weights: Weights, mosaic: Path, region: Region) -> CoarseLook:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from flows.capture_plan import CapturePlan, check_memory, plan_capture
 from flows.settings import BUILT_IN_SCENES, Settings
 from flows.survey_scene import check_labels, check_mask, farm_refusal, judged_labels, open_scene
+from models.vgg_file import VggFile
 from models.weights import Description, Weights, describe_weights, load_weights
 from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError, WeightsError
@@ -79,6 +80,11 @@ class SurveyRun:
         """The mask of policy ``mask``, (y, x) or (y, x, channel)."""
         return None if self.settings.mask is None else load_raster(self.settings.mask, dims=2).values
 
+    @cached_property
+    def vgg(self) -> VggFile | None:
+        """VGG19 for the policy ``vgg-static``."""
+        return None if self.settings.vgg is None else VggFile.found(Path(self.settings.vgg))
+
     def angular_grid(self, factor: int = 1) -> AngularGrid:
         """Where pixels of ``factor`` fine px lie."""
         return AngularGrid(self.camera.ifov_rad, self.scene.shape, factor)
@@ -123,14 +129,23 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     if settings.mask is not None:
         check_mask(settings.mask, scene.shape)
     effects = _chosen_effects(settings.effects)
+    vgg_notes = _check_vgg(settings, planning=planning)
     source = SimulatedSource(scene, settings.camera, settings.seed, effects, pointing=_pointing(settings))
     check_memory(settings, source, grid, plan)
     _check_pose(settings, scene.shape)
     key = hashlib.sha256(path.read_bytes()).hexdigest()[:20]
     return SurveyRun(
         settings, Archive.open(settings.out), source, scene, described, load, key, grid, plan,
-        (*notes, *band_notes, *label_notes), refused,
+        (*notes, *band_notes, *vgg_notes, *label_notes), refused,
     )  # fmt: skip
+
+
+def _check_vgg(settings: Settings, *, planning: bool) -> tuple[str, ...]:
+    """Refuse a file that is no VGG19 (when planning: one that is not there), and say what was taken from it."""
+    if settings.vgg is None:
+        return ()
+    file = VggFile.found(Path(settings.vgg))
+    return () if planning else (f"VGG19 from {file.path.name}: {file.report()}",)
 
 
 def _pointing(settings: Settings) -> PointingErrors | None:

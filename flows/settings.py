@@ -24,19 +24,23 @@ from flows.setting_values import (
     parse_wavelengths,
     parse_whole,
 )
+from models.vgg_sizes import VGG_FROM
 from pipeline.camera import LineCamera
 from pipeline.errors import PoseError, SettingsError
 from pipeline.ground import LIMITS, RigPose
 from pipeline.scan import CostModel
 from storage.block_work import Crew
 
-POLICIES = ("entropy", "sobel", "random", "mask")
+POLICIES = (
+    "entropy", "margin", "sobel", "saliency", "spectral-residual", "random", "stratified", "centre", "uniform", "mask",
+    "vgg-static",
+)  # fmt: skip
 ENGINES = ("prefect", "plain")
 KERNELS = ("catmull-rom", "bilinear", "nearest")
 BUILT_IN_SCENES = ("farm",)
 BUILT_IN_SOURCES = ("sim", "rig")
 OF_THE_MACHINE = ("scheduler", "workers")  # no byte depends on them; a cluster of that day need not be there today
-_PATHS = ("scene", "labels", "source", "out", "mask", "weights")
+_PATHS = ("scene", "labels", "source", "out", "mask", "vgg", "weights")
 
 Parser = Callable[[object, str], object]
 
@@ -62,6 +66,7 @@ class Settings:
     budget: float = 0.5  # seconds of coarse and fine capture over those of the full scan, 0 < b <= 1
     policy: str = "entropy"
     mask: str | None = None
+    vgg: str | None = None  # VGG19's weights, for policy vgg-static
     weights: str | None = None
     rounds: int = 1
     seed: int = 0
@@ -188,6 +193,10 @@ def _check_together(settings: Settings, origin: Mapping[str, str]) -> None:
         wants = "policy 'mask' needs a mask file" if settings.mask is None else "a mask is used by policy 'mask' only"
         got = f"policy = {settings.policy!r}, mask = {settings.mask!r}"
         raise SettingsError(f"{wants}: got {got}; give both or neither")
+    if settings.policy == "vgg-static" and settings.vgg is None:
+        raise SettingsError(f"policy 'vgg-static' needs --vgg FILE, {VGG_FROM}")
+    if settings.policy != "vgg-static" and settings.vgg is not None:
+        raise SettingsError(f"a vgg file is for policy 'vgg-static', got policy = {settings.policy!r}; leave --vgg out")
     bands, wavelengths = settings.bands, settings.wavelengths
     if bands is not None and wavelengths is not None and len(bands) != len(wavelengths):
         raise SettingsError(
@@ -299,6 +308,7 @@ _SURVEY: dict[str, Parser] = {
     "budget": parse_budget,
     "policy": parse_choice(POLICIES),
     "mask": parse_text,
+    "vgg": parse_text,
     "weights": parse_text,
     "rounds": parse_whole(1, 1, why="this version looks twice at most: one coarse look, one round of detail"),
     "seed": parse_whole(0, 2**63 - 1),

@@ -20,7 +20,7 @@ from flows.field_work import FieldWork, region_params
 from flows.region_work import look_at, seat_columns
 from flows.run import SurveyRun
 from models.inference import CoarseLook, Glance, read_glance
-from models.policies import SEEING_POLICIES, score_seats
+from models.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_seats
 from models.regions import whole_field
 from pipeline.crop_rows import CropRows, find_rows
 from pipeline.orientation import compare_orientations
@@ -125,7 +125,7 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
         "weights": run.weights_key,
         "grid": asdict(run.grid),
         "policy": settings.policy,
-        "seed": settings.seed if settings.policy == "random" else None,
+        "seed": settings.seed if settings.policy in SEEDED_POLICIES else None,
         "mask": None if run.mask is None else digest(run.mask),
         "fine_s": run.plan.fine_s,
         "overlap_px": run.plan.overlap_px,
@@ -134,6 +134,7 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
         "camera": asdict(run.camera),
         "cost": asdict(settings.cost),
         **(region_params(run.grid) if settings.policy in SEEING_POLICIES else {}),
+        **({} if run.vgg is None else {"vgg": run.vgg.key}),
     }
     return produce("attend", build, params, [mosaic])
 
@@ -141,7 +142,7 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
 def _scores(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:
     """(seat,) worth of a fine look at each seat of the padded grid."""
     policy = run.settings.policy
-    if policy in SEEING_POLICIES:
+    if policy in SEEING_POLICIES + IMAGE_POLICIES:
         return work.score(policy, mosaic.path / "mosaic.zarr", lambda done: run.report(0.5 * done)).ravel()
     nothing = np.empty((0, 0, 0), np.float32)
     return score_seats(policy, Glance(run.grid, nothing, nothing), seed=run.settings.seed, mask=run.mask)

@@ -29,9 +29,12 @@ class SurveyFlags:
     budget: str | None = None
     """Seconds of coarse and fine capture over those of the full scan, above 0 and at most 1; 0.5 by default."""
     policy: str | None = None
-    """Where to look twice: entropy (default), sobel, random or mask."""
+    """Where to look twice: entropy (default), margin, sobel, saliency, spectral-residual, random, stratified, centre,
+    uniform, mask or vgg-static."""
     mask: str | None = None
     """Image of where to look twice, for the policy mask."""
+    vgg: str | None = None
+    """Weights of VGG19, for the policy vgg-static."""
     weights: str | None = None
     """Model weights (.safetensors); those for `farm` are built in."""
     rounds: str | None = None
