@@ -24,7 +24,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from tests.faults.fault_table import Clock, Row
-from tests.faults.injection import errors_by_name
+from tests.faults.injection import errors_by_name, label
 from tests.faults.nursery import ROOT, Ended, Nursery
 from tests.faults.small_survey import Subject, changing_calls, prepare, words, wrong_after_fault, wrong_after_rerun
 
@@ -81,42 +81,28 @@ def grow(folder: Path) -> None:
     subprocess.run(["mount", "-o", f"remount,size={LARGE}", str(folder)], check=True)
 
 
-def label(path: Path) -> str | None:
-    """What a file of an archive belongs to: a stage's store or manifest, the spool, the run; None for locks."""
-    first, *rest = path.parts or ("",)
-    if first not in ("spool", "stages", "runs"):
-        return None
-    if first == "spool" or len(rest) < 2:
-        return "spool" if first == "spool" else None
-    name = "run" if first == "runs" else rest[0]
-    return f"{name} manifest" if rest[-1] == "manifest.json" else name
-
-
-def places_by_label(subject: Subject) -> dict[str, list[int]]:
-    """Numbers of the calls that open or write a file, by what it belongs to."""
-    found: dict[str, list[int]] = {}
-    for number, call, path in changing_calls(subject):
-        if call in ("open", "write") and (name := label(path)) is not None:
-            found.setdefault(name, []).append(number)
-    return found
+def openings_by_label(subject: Subject) -> dict[str, int]:
+    """How many files are opened to be written, by what they belong to."""
+    labels = (label(path) for _, call, path in changing_calls(subject) if call == "open")
+    return dict(Counter(name for name in labels if name is not None))
 
 
 def fill_at_places(subject: Subject, each: int, *, mounted: bool, some: tuple[str, ...] = (), seed: int = 0) -> Fills:
     """Fill the disk ``each`` times while each kind (or some) is written, and run again on a larger one."""
     found, chance = Fills(), random.Random(seed)
-    for name, places in places_by_label(subject).items():
+    for name, count in openings_by_label(subject).items():
         if some and name not in some:
             continue
-        for at in sorted(chance.sample(places, min(each, len(places)))):
-            disk = subject.folder / f"disk-{at}"
+        for at in sorted(chance.sample(range(1, count + 1), min(each, count))):
+            disk = subject.folder / f"disk-{name}-{at}".replace(" ", "-")
             if mounted:
                 with small_disk(disk, LARGE // 8):
-                    ended = subject.nursery.run(words(disk / "a"), "fill_disk", root=str(disk / "a"), at=at)
+                    ended = subject.nursery.run(words(disk / "a"), "fill_disk", root=str(disk / "a"), at=at, kind=name)
                     _judge(subject, disk / "a", ended, name, found)
             else:
                 number = errors_by_name()["ENOSPC"]
                 ended = subject.nursery.run(
-                    words(disk / "a"), "refuse", root=str(disk / "a"), at=at, number=number, lasting=True
+                    words(disk / "a"), "refuse", root=str(disk / "a"), at=at, number=number, lasting=True, kind=name
                 )
                 _judge(subject, disk / "a", ended, name, found)
                 shutil.rmtree(disk)

@@ -26,20 +26,37 @@ WATCHED = (
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 
 
-def refuse(root: str, at: int, number: int, *, lasting: bool = False, log: str | None = None) -> None:
+def refuse(
+    root: str, at: int, number: int, *, lasting: bool = False, log: str | None = None, kind: str | None = None
+) -> None:
     """Let the ``at``-th call (from 1) that changes something below ``root`` fail with error ``number``.
 
     With ``lasting`` so do all later ones; ``at`` 0 refuses nothing. A write that is refused has written its first half.
     ``log`` is written to when a call is refused, and with ``at`` 0 after every one: how many there were, and which.
+    With a ``kind`` only calls count that open a file of it, see `label`.
     """
-    _install(_Watch(Path(root).absolute(), at, number, lasting, log))
+    watch = _Watch(Path(root).absolute(), at, number, lasting, log)
+    watch.kind = kind
+    _install(watch)
 
 
-def fill_disk(root: str, at: int) -> None:
-    """Take all that is left of the disk of ``root`` just before the ``at``-th call that changes something below it."""
+def fill_disk(root: str, at: int, kind: str) -> None:
+    """Take all that is left of the disk of ``root`` just before the ``at``-th file of a ``kind`` is opened to write."""
     watch = _Watch(Path(root).absolute(), at, 0, False, None)
+    watch.kind = kind
     watch.fill = Path(root).absolute().parent / "ballast"
     _install(watch)
+
+
+def label(path: Path) -> str | None:
+    """What a file of an archive belongs to: a stage's store or manifest, the spool, the run; None for locks."""
+    first, *rest = path.parts or ("",)
+    if first not in ("spool", "stages", "runs"):
+        return None
+    if first == "spool" or len(rest) < 2:
+        return "spool" if first == "spool" else None
+    name = "run" if first == "runs" else rest[0]
+    return f"{name} manifest" if rest[-1] == "manifest.json" else name
 
 
 def _install(watch: _Watch) -> None:
@@ -53,6 +70,7 @@ class _Watch:
     """Counts calls, from any thread."""
 
     fill: Path | None = None  # file to fill the disk with, instead of refusing
+    kind: str | None = None  # of the files whose opening counts; None counts every call
 
     def __init__(self, root: Path, at: int, number: int, lasting: bool, log: str | None) -> None:
         self._root, self._at, self._number, self._lasting = str(root), at, number, lasting
@@ -96,8 +114,10 @@ class _Watch:
 
     def _due(self, name: str, path: str) -> bool:
         with self._lock:
-            self._count += 1
-            due = self._at > 0 and (self._count >= self._at if self._lasting else self._count == self._at)
+            begun = self._lasting and 0 < self._at <= self._count
+            counts = self.kind is None or (name == "open" and label(Path(path).relative_to(self._root)) == self.kind)
+            self._count += counts
+            due = begun or (counts and self._count == self._at)
             if self._log is not None and (due or self._at == 0):
                 self._write(self._log, f"{self._count} {name} {path}\n".encode())
         return due
