@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 
@@ -120,16 +120,11 @@ BITS = register(
     )
 )
 SIZE = register(
-    Tradeoff(
-        stage="store",
+    replace(
+        BITS,
         knob="kept bits, size",
         error="bytes stored a sample",
-        unit="px*band",
         reference="the coarse mosaic, float32, rounded to so many bits",
-        settings=KEPT_BITS,
-        prepare=_prepare,
-        run=_write_rounded,
         judge=_rounded_bytes,
-        work=lambda state, _bits: float(state.mosaic.size),
     )
 )

@@ -14,8 +14,6 @@ import struct
 import subprocess
 import sys
 import tempfile
-import time
-import tracemalloc
 from collections import Counter
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -23,12 +21,9 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from pipeline.errors import PipelineError
-from storage.scan_files import open_cube_source
 from tests.faults.cube_files import FORMATS
-from tests.faults.time_limit import at_most
+from tests.faults.reading import try_reading
 
-LONGEST_S = 30  # then it counts as hanging
 BATCH = 500  # mutations a process
 RATIO = 1100  # zlib's: files that pack numbers may hold this many times their bytes
 SPARE_BYTES = 24 << 20  # what libraries take when they are first used
@@ -131,27 +126,15 @@ def try_files(count: int, seed: int = 0) -> dict[str, Tally]:
 
 def try_one(address: Path, size: int, tally: Tally, called: str) -> None:
     """Open one source and read its first and last lines."""
-    tracemalloc.start()
-    begun = time.monotonic()
-    try:
-        with at_most(LONGEST_S):
-            source = open_cube_source(address)
-            lines = source.shape[0]
-            source.read(0, min(lines, 64))
-            source.read(max(lines - 64, 0), lines)
-        tally.read += 1
-    except PipelineError as error:
-        tally.refused += 1
-        if not str(error) or "Traceback" in str(error):
-            tally.wrong.append(f"{called}: an error without words")
-    except BaseException as error:
-        tally.wrong.append(f"{called}: {type(error).__name__}: {str(error)[:200]}")
-    tally.slowest_s = max(tally.slowest_s, time.monotonic() - begun)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    tally.most_bytes = max(tally.most_bytes, peak)
-    if peak > SPARE_BYTES + RATIO * size:
-        tally.wrong.append(f"{called}: {peak} bytes of memory for a file of {size}")
+    found = try_reading(address)
+    tally.read += found.refused is None and found.wrong is None
+    tally.refused += found.refused is not None
+    tally.slowest_s = max(tally.slowest_s, found.seconds)
+    tally.most_bytes = max(tally.most_bytes, found.peak_bytes)
+    if found.wrong is not None:
+        tally.wrong.append(f"{called}: {found.wrong}")
+    if found.peak_bytes > SPARE_BYTES + RATIO * size:
+        tally.wrong.append(f"{called}: {found.peak_bytes} bytes of memory for a file of {size}")
 
 
 # --- the full run -----------------------------------------------------------------------------------------------------

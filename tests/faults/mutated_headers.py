@@ -9,8 +9,6 @@ import os
 import random
 import sys
 import tempfile
-import time
-import tracemalloc
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,10 +17,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.errors import PipelineError
 from storage.envi_header import parse_envi_header
-from storage.scan_files import open_cube_source
-from tests.faults.time_limit import at_most
+from tests.faults.reading import try_reading
 
-LONGEST_S = 30  # then it counts as hanging
 LARGEST_DATA = 200_000  # bytes
 SPARE_BYTES = 1 << 20  # what Python itself takes, whatever the files hold
 TIMES_HEADER = 80  # a header's text becomes lines, fields, words and numbers
@@ -140,27 +136,16 @@ def try_headers(count: int, folder: Path | None, seed: int = 0) -> Outcomes:
 def _try_one(header: Path, number: int, outcomes: Outcomes) -> None:
     size = header.with_suffix(".bin").stat().st_size
     allowed = SPARE_BYTES + size * 4 + header.stat().st_size * TIMES_HEADER
-    tracemalloc.start()
-    begun = time.monotonic()
-    try:
-        with at_most(LONGEST_S):
-            source = open_cube_source(header)
-            held = source.shape[0] - source.lost_lines
-            source.read(0, min(held, 64))
-            source.read(max(held - 64, 0), held)
-        outcomes.read += 1
-    except PipelineError as error:
-        outcomes.refused[type(error).__name__] += 1
-        if not str(error) or "Traceback" in str(error):
-            outcomes.wrong.append(f"{number}: an error without words")
-    except BaseException as error:
-        outcomes.wrong.append(f"{number}: {type(error).__name__}: {error}")
-    outcomes.slowest_s = max(outcomes.slowest_s, time.monotonic() - begun)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    outcomes.most_bytes = max(outcomes.most_bytes, peak - size)
-    if peak > allowed:
-        outcomes.wrong.append(f"{number}: {peak} bytes of memory for {size} of data")
+    found = try_reading(header)
+    outcomes.read += found.refused is None and found.wrong is None
+    if found.refused is not None:
+        outcomes.refused[found.refused] += 1
+    if found.wrong is not None:
+        outcomes.wrong.append(f"{number}: {found.wrong}")
+    outcomes.slowest_s = max(outcomes.slowest_s, found.seconds)
+    outcomes.most_bytes = max(outcomes.most_bytes, found.peak_bytes - size)
+    if found.peak_bytes > allowed:
+        outcomes.wrong.append(f"{number}: {found.peak_bytes} bytes of memory for {size} of data")
 
 
 def real_headers() -> Path | None:
