@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from flows.survey_scene import check_labels, judged_labels
 from flows.training_data import TrainingData, farm_data, open_training_data
 from models.examples import normalised, observe
-from models.inference import Glance, glance_of_columns
-from models.weights import Description, Weights, describe_weights, load_weights
+from models.inference import CoarseLook, Glance, glance_of_columns
+from models.weights import AnyWeights, Description, Weights, describe_weights, load_any_weights
 from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, SettingsError, WeightsError
 from pipeline.grid import SceneGrid
@@ -33,9 +33,9 @@ class Candidate:
     described: Description
     key: str
 
-    def load(self) -> Weights:
+    def load(self) -> AnyWeights:
         """Read the tensors."""
-        return load_weights(self.path)
+        return load_any_weights(self.path)
 
     @property
     def camera(self) -> LineCamera:
@@ -50,15 +50,22 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Look:
-    """One frame as certain weights see it."""
+class Sight:
+    """One frame in the columns of certain weights of any design."""
 
     name: str
-    seen: Glance
+    seen: CoarseLook
     fine: NDArray[np.float32]  # (seat, p, p, column) normalised, every seat of the padded grid
     labels: NDArray[np.uint8]  # (y, x) in the weights' classes
     bands: int
     picture: NDArray[np.float32]  # (y, x, column) as seen, not normalised
+
+
+@dataclass(frozen=True)
+class Look(Sight):
+    """One frame as certain weights see it, with their glance."""
+
+    seen: Glance
 
 
 def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
@@ -71,9 +78,19 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     """
     if not paths:
         raise SettingsError("evaluate needs --weights FILE; train some with: spectralzoom train DATASET -o FILE")
-    found = [Candidate(path, describe_weights(path), _file_key(path)) for path in paths]
+    found = [Candidate(path, describe_weights(path), file_key(path)) for path in paths]
     first = found[0].described
+    for one in found:
+        if one.described.config.preset != "two-scale":
+            raise SettingsError(
+                f"{one.path} holds the control {one.described.config.preset!r}; give it as --control, beside --weights "
+                "of two scales"
+            )
     for other in found[1:]:
+        if other.camera != found[0].camera:
+            raise SettingsError(
+                f"{other.path} was trained through another camera than {found[0].path}; evaluate them one by one"
+            )
         described = other.described
         if (described.config, described.class_names) != (first.config, first.class_names):
             raise SettingsError(
@@ -86,7 +103,8 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     return found
 
 
-def _file_key(path: Path) -> str:
+def file_key(path: Path) -> str:
+    """Name a file by its bytes; WeightsError where it cannot be read."""
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
     except OSError as error:
@@ -137,7 +155,14 @@ def check_frame(scene: RasterScene, described: Description) -> None:
 
 
 def look_at(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> Look:
-    """Look at a frame with the camera of the training; the noise follows from the seed and the frame's name."""
+    """Look at a frame with the camera of the training, and glance at it with the weights."""
+    sight = sight_of(scene, name, weights, camera, seed)
+    seen = glance_of_columns(weights, sight.seen.columns, sight.seen.grid)
+    return Look(name, seen, sight.fine, sight.labels, sight.bands, sight.picture)
+
+
+def sight_of(scene: RasterScene, name: str, weights: AnyWeights, camera: LineCamera, seed: int) -> Sight:
+    """Give a frame in the columns of weights; the noise follows from the seed and the frame's name."""
     config = weights.config
     grid = SceneGrid(*scene.shape, config.patch, config.factor)
     rng = np.random.default_rng([seed, 0xE7A1, zlib.crc32(name.encode())])
@@ -149,7 +174,7 @@ def look_at(scene: RasterScene, name: str, weights: Weights, camera: LineCamera,
     rows, across = grid.seat_shape
     p, columns = config.patch, config.columns
     cells = example.fine.reshape(rows, p, across, p, columns).transpose(0, 2, 1, 3, 4).reshape(-1, p, p, columns)
-    return Look(
-        name, glance_of_columns(weights, example.coarse, grid), cells.astype(np.float32), labels,
+    return Sight(
+        name, CoarseLook(grid, np.ascontiguousarray(example.coarse, np.float32)), cells.astype(np.float32), labels,
         len(scene.wavelength_nm), observed.fine[: grid.height, : grid.width],
     )  # fmt: skip

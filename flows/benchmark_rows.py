@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.benchmark_frames import Look
+from flows.benchmark_frames import Look, Sight
 from models.boundary import boundary_counts
 from models.controls import RANDOM_DRAWS
-from models.cost import SCORE_PER_PIXEL, multiply_adds
+from models.cost import MultiplyAdds, multiply_adds
 from models.inference import segment
 from models.metrics import confusion, iou_per_class, mean_iou
 from models.placement_metrics import average_precision, gain_sums, oracle_gain, rank_correlation, top_seats
 from models.policies import score_seats
 from models.weights import Weights
-from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_full, coarse_sweeps
-from pipeline.errors import PoseError
 from pipeline.grid import UNLABELLED
-from pipeline.planning import price_of_seats
 from pipeline.savings import BYTES_PER_SAMPLE
-from pipeline.scan import CostModel
 from pipeline.selection import frame_seats
 
 ORACLE = "oracle"
@@ -72,11 +67,12 @@ def judge_frame(
     valid = grid.valid_seats()
     placed = placings(trial, look, weights)
     gain = placed[-1].scores
-    wanted = list(_wanted(trial, placed, look))
+    wanted = list(wanted_rows(trial, placed, look))
     rows = []
     for number, (policy, draw, share, seats) in enumerate(wanted):
         row = {"policy": policy, "draw": draw, "share": share, "seats": len(seats)}
-        row |= _drawn(look, weights, seats)
+        drawn = segment(weights, look.seen, look.fine[seats], seats).classes
+        row |= judge_map(look, drawn, seats, weights.config.classes)
         row |= _cost(look, weights, seats, policy)
         row["gain"], row["best_gain"] = gain_sums(gain, seats, valid)
         row["ap_top"] = _ap_top(placed, policy, draw, gain, seats, valid)
@@ -92,8 +88,8 @@ def judge_frame(
     }
 
 
-def _wanted(trial: Trial, placed: list[Placing], look: Look) -> Iterator[tuple[str, int, float, Seats]]:
-    """(policy, draw, share, seats) of each row."""
+def wanted_rows(trial: Trial, placed: list[Placing], look: Look) -> Iterator[tuple[str, int, float, Seats]]:
+    """Give (policy, draw, share, seats) of each row."""
     allowed = look.seen.grid.valid_share().ravel() > 0
     yield "none", 0, 0.0, np.empty(0, np.intp)
     yield "all", 0, 1.0, np.flatnonzero(allowed)
@@ -102,22 +98,20 @@ def _wanted(trial: Trial, placed: list[Placing], look: Look) -> Iterator[tuple[s
             yield one.policy, one.draw, share, frame_seats(one.scores, share, allowed).seats
 
 
-def _drawn(look: Look, weights: Weights, seats: Seats) -> dict[str, Any]:
+def judge_map(look: Sight, drawn: NDArray[np.uint8], seats: Seats, classes: int) -> dict[str, Any]:
     """Counts of the whole map, of the captured seats alone, and near borders; and the frame's own mean IoU."""
-    classes = weights.config.classes
-    drawn = segment(weights, look.seen, look.fine[seats], seats).classes
     inside = np.where(captured_px(look, seats), look.labels, np.uint8(UNLABELLED))
     whole = confusion(look.labels, drawn, classes)
     return {
         "counts": whole.tolist(),
         "inside": confusion(inside, drawn, classes).tolist(),
         "boundary": boundary_counts(look.labels, drawn, classes).tolist(),
-        "miou": _or_none(mean_iou(whole)),
-        "per_class_iou": [_or_none(iou) for iou in iou_per_class(whole)],
+        "miou": known_or_none(mean_iou(whole)),
+        "per_class_iou": [known_or_none(iou) for iou in iou_per_class(whole)],
     }
 
 
-def captured_px(look: Look, seats: Seats) -> NDArray[np.bool_]:
+def captured_px(look: Sight, seats: Seats) -> NDArray[np.bool_]:
     """Pixels of the scene that lie in captured seats, (y, x)."""
     grid = look.seen.grid
     chosen = np.zeros(grid.seat_shape, bool)
@@ -128,13 +122,24 @@ def captured_px(look: Look, seats: Seats) -> NDArray[np.bool_]:
 
 def _cost(look: Look, weights: Weights, seats: Seats, policy: str) -> dict[str, Any]:
     """Samples with those of the coarse pass, their bytes, and multiply-adds (`none` and `all`: the map alone)."""
-    grid = look.seen.grid
-    samples = float(grid.valid_share().ravel()[seats].sum() * grid.patch**2 + np.prod(grid.coarse_shape))
     known = {"none": None, "all": None, ORACLE: "random"}.get(policy, policy)  # the oracle scores by labels
-    adds = None
-    if known is None or known in SCORE_PER_PIXEL:
-        adds = multiply_adds(weights.config, grid, len(seats), look.bands, known).total
-    return {"samples": samples, "bytes": samples * look.bands * BYTES_PER_SAMPLE, "multiply_adds": adds}
+    adds = multiply_adds(weights.config, look.seen.grid, len(seats), look.bands, known)
+    return cost_of(look, float(np.prod(look.seen.grid.coarse_shape)) + fine_samples(look, seats), adds)
+
+
+def cost_of(look: Sight, samples: float, adds: MultiplyAdds) -> dict[str, Any]:
+    """Samples, their bytes before compression, and multiply-adds, also told apart by what they are for."""
+    return {
+        "samples": samples,
+        "bytes": samples * look.bands * BYTES_PER_SAMPLE,
+        "multiply_adds": adds.total,
+        "adds": asdict(adds),
+    }
+
+
+def fine_samples(look: Sight, seats: Seats) -> float:
+    """Pixels of the scene in the seats."""
+    return float(look.seen.grid.valid_share().ravel()[seats].sum() * look.seen.grid.patch**2)
 
 
 def _ap_top(
@@ -142,39 +147,20 @@ def _ap_top(
 ) -> float | None:
     """Average precision of the scores against as many of the oracle's best seats."""
     one = next((one for one in placed if (one.policy, one.draw) == (policy, draw)), None)
-    return None if one is None else _or_none(average_precision(one.scores[valid], top_seats(gain[valid], len(seats))))
+    return (
+        None if one is None else known_or_none(average_precision(one.scores[valid], top_seats(gain[valid], len(seats))))
+    )
 
 
 def _ranking(one: Placing, gain: NDArray[np.float64], valid: Seats) -> dict[str, Any]:
     return {
         "policy": one.policy,
         "draw": one.draw,
-        "ap_gain": _or_none(average_precision(one.scores[valid], gain[valid] > 0)),
-        "spearman": _or_none(rank_correlation(one.scores[valid], gain[valid])),
+        "ap_gain": known_or_none(average_precision(one.scores[valid], gain[valid] > 0)),
+        "spearman": known_or_none(rank_correlation(one.scores[valid], gain[valid])),
     }
 
 
-def capture_seconds(
-    trial: Trial, look: Look, weights: Weights, camera: LineCamera, cost: CostModel
-) -> dict[str, Any] | None:
-    """What the rig takes for the same seats [s], by the cost model: runs of lines and coarse pass, beside full.
-
-    None where the field is beyond the mirror's range. The full scan is taken where it is cheaper.
-    """
-    grid = look.seen.grid
-    try:
-        along, _, full_s = cheapest_full(grid, camera, cost)
-        coarse_s = cost.seconds(coarse_sweeps(grid, camera, along), camera)
-        found = []
-        for policy, draw, share, seats in _wanted(trial, placings(trial, look, weights), look):
-            if draw or policy in ("none", "all"):
-                continue
-            lines, seconds = price_of_seats(grid, camera, cost, along, seats).least if len(seats) else (0, 0.0)
-            found.append({"policy": policy, "share": share, "lines": lines, "seconds": coarse_s + seconds})
-    except PoseError:
-        return None
-    return {"frame": look.name, "none": coarse_s, "full": full_s, "rows": found}
-
-
-def _or_none(value: float) -> float | None:
+def known_or_none(value: float) -> float | None:
+    """Turn NaN into None, which JSON knows."""
     return None if np.isnan(value) else float(value)

@@ -12,7 +12,7 @@ from typing import Any
 
 from pipeline.errors import ArchiveError
 
-VERSION = 1  # of what a kept result says
+VERSION = 2  # of what a kept result says
 
 
 @contextmanager

@@ -2,188 +2,205 @@
 
 from __future__ import annotations
 
+import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
-from flows.benchmark_frames import Candidate, Look, look_at
-from flows.benchmark_rows import Trial, capture_seconds, judge_frame
-from flows.benchmark_store import KeptResults, writing
-from flows.benchmark_timing import time_frame
-from flows.receipt import to_json
+from flows.benchmark_capture import capture_seconds
+from flows.benchmark_controls import design_of, judge_control
+from flows.benchmark_equal_time import judge_equal_time
+from flows.benchmark_frames import Candidate, Look, Sight, look_at, sight_of
+from flows.benchmark_jobs import Job, Jobs, Show, scene_of
+from flows.benchmark_request import COST, EvaluateRequest
+from flows.benchmark_rig import BUDGETS, judge_rig
+from flows.benchmark_rows import Trial, judge_frame
+from flows.benchmark_store import KeptResults
+from flows.benchmark_timing import Rounds, time_frame
+from flows.figures import format_seconds
 from flows.training_data import TrainingData
-from models.bootstrap import DRAWS
-from models.policies import POLICIES
-from models.weights import Weights
+from models.weights import AnyWeights, Weights
 from pipeline.camera import LineCamera
-from pipeline.scan import CostModel
 from pipeline.simulator.scene import RasterScene
 
-SHARES = (0.05, 0.10, 0.15, 0.20, 0.35)
-JUDGED = tuple(name for name in POLICIES if name not in ("mask", "vgg-static"))  # these need a file of one's own
-USUAL = ("entropy", "sobel", "random")
-SHOWN_SHARE = 0.10  # of the seats, or the nearest one tried: what the pictures show
-COST = CostModel()
-Show = Callable[[str, float, str], None]
+Record = dict[str, Any]
+Report = Callable[[float], None]
+UNITS = {"frame": 1.0, "time": 3.0, "capture": 0.5, "control": 0.7, "rig": 1.5, "equal": 1.5}  # rough shares of time
+
+
+@dataclass
+class Judged:
+    """Records of every kind; those of weights and controls apart, in the order of the files."""
+
+    runs: list[list[Record]]
+    controls: list[list[Record]]
+    rig: list[list[Record]]
+    equal: list[list[Record]]
+    timed: list[Record] = field(default_factory=list)
+    captured: list[Record] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
-class EvaluateRequest:
-    """What to judge and how."""
+class Task:
+    """One result to make of a frame: of which kind, and by which of the weights or controls."""
 
-    dataset: str
-    weights: tuple[Path, ...]
-    out: Path | None = None
-    shares: tuple[float, ...] = SHARES
-    policies: tuple[str, ...] = USUAL
-    frames: tuple[str, ...] = ()  # all, without one
-    scenes: int | None = None  # of the built-in farm
-    seed: int = 0
-    draws: int = DRAWS
-    timed_frames: int = 2
-    timed_runs: int = 5
-    choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths
-
-
-@dataclass(frozen=True)
-class Job:
-    """A frame and the weights that it says something of."""
-
+    kind: str
     name: str
-    weights: tuple[int, ...]
-
-
-def scene_of(data: TrainingData, name: str) -> RasterScene:
-    """Make one scene of the data."""
-    return next(data.scenes((name,)))
+    index: int
+    beside: tuple[int, ...] = ()  # controls to time
 
 
 class Work:
     """The frames one after the other: what was kept is not made again."""
 
     def __init__(
-        self, request: EvaluateRequest, data: TrainingData, candidates: list[Candidate], camera: LineCamera
+        self,
+        request: EvaluateRequest,
+        data: TrainingData,
+        candidates: Sequence[Candidate],
+        controls: Sequence[Candidate] = (),
     ) -> None:
-        self.request, self.data, self.candidates, self.camera = request, data, candidates, camera
+        self.request, self.data, self.candidates, self.controls = request, data, candidates, controls
+        self.camera: LineCamera = candidates[0].camera
         self.trial = Trial(request.shares, request.policies, request.seed)
         self.kept = KeptResults(None if request.out is None else request.out / "frames")
-        self._weights: dict[int, Weights] = {}
-        self._last: tuple[str, int, Look] | None = None
+        self._weights: dict[str, AnyWeights] = {}
+        self._last: tuple[str, str, Look] | None = None
+        self._scene: RasterScene | None = None
+        self._last_name = ""
+        self._spent, self._made = 0.0, 0.0  # seconds, and units made in them
 
-    def judge(
-        self, jobs: list[Job], show: Show
-    ) -> tuple[list[list[dict[str, Any]]], list[list[dict[str, Any]]], list[dict[str, Any]]]:
-        """Records of each weights, times of each weights, and seconds of capture."""
-        runs = [list[dict[str, Any]]() for _ in self.candidates]
-        timed = [list[dict[str, Any]]() for _ in self.candidates]
-        captured: list[dict[str, Any]] = []
-        total, done = sum(len(job.weights) for job in jobs), 0
-        for job in jobs:
-            scene = scene_of(self.data, job.name)
+    def tasks(self, jobs: Jobs) -> list[Task]:
+        """Everything to make, frame by frame; a frame's results of one weights follow each other."""
+        found = []
+        for number, job in enumerate(jobs.frames):
             for index in job.weights:
-                words = job.name if len(self.candidates) == 1 else f"{job.name}, {self.candidates[index].path.name}"
+                found.append(Task("frame", job.name, index))
+                found += [Task("rig", job.name, index)] if self.request.rig else []
+                found += [Task("equal", job.name, index)] if self.request.equal_time else []
+                if number < self.request.timed_frames and index == job.weights[0]:
+                    found += [Task("time", job.name, index, self._first_of_each(job)), Task("capture", job.name, index)]
+            found += [Task("control", job.name, index) for index in job.controls]
+        return found
 
-                def report(part: float, words: str = words, done: int = done) -> None:
-                    show("judging frames", (done + 0.9 * part) / total, words)
+    def _first_of_each(self, job: Job) -> tuple[int, ...]:
+        """A control of each design."""
+        first: dict[str, int] = {}
+        for index in job.controls:
+            first.setdefault(design_of(self.controls[index]), index)
+        return tuple(first.values())
 
-                runs[index].append(self._judged(scene, job.name, index, report))
-                if len(timed[index]) < self.request.timed_frames:
-                    timed[index].append(self._timed(scene, job.name, index))
-                if not index and len(captured) < self.request.timed_frames:
-                    captured += [record for record in [self._captured(scene, job.name)] if record is not None]
-                done += 1
-        show("judging frames", 1.0, f"{len(jobs)} frames")
-        return runs, timed, captured
+    def judge(self, jobs: Jobs, show: Show) -> Judged:
+        """Make every record."""
+        own = self.candidates
+        judged = Judged(_empty(own), _empty(self.controls), _empty(own), _empty(own))
+        places = {"frame": judged.runs, "control": judged.controls, "rig": judged.rig, "equal": judged.equal}
+        tasks = self.tasks(jobs)
+        total, done = sum(UNITS[task.kind] for task in tasks), 0.0
+        for task in tasks:
+            share, before = UNITS[task.kind], done
 
-    def _judged(self, scene: RasterScene, name: str, index: int, report: Callable[[float], None]) -> dict[str, Any]:
-        def make() -> dict[str, Any]:
-            return judge_frame(self.trial, self.look(scene, name, index), self._loaded(index), report)
+            def report(part: float, task: Task = task, share: float = share, before: float = before) -> None:
+                reached = before + 0.95 * part * share
+                show("judging frames", reached / total, self._words(task, total - reached))
 
-        record: dict[str, Any] = self.kept.made("frame", self._follows_from(scene, name, index), make)
+            report(0.0)
+            record = self._record(task, report)
+            if record is not None:
+                kind = {"time": judged.timed, "capture": judged.captured}
+                (kind[task.kind] if task.kind in kind else places[task.kind][task.index]).append(record)
+            done += share
+        show("judging frames", 1.0, f"{len(jobs.frames)} frames")
+        return judged
+
+    def _words(self, task: Task, left: float) -> str:
+        """Frame, file where there are several, and about how long the rest will take."""
+        files = self.controls if task.kind == "control" else self.candidates
+        named = task.name if len(files) == 1 else f"{task.name}, {files[task.index].path.name}"
+        what = {"frame": "", "control": "control, "}.get(task.kind, f"{task.kind}, ")
+        rest = f", about {format_seconds(left * self._spent / self._made)} left" if self._made else ""
+        return f"{what}{named}{rest}"
+
+    def _record(self, task: Task, report: Report) -> Record | None:
+        if self._scene is None or self._last_name != task.name:
+            self._scene, self._last_name = scene_of(self.data, task.name), task.name
+        scene, makers = self._scene, {
+            "frame": self._frame, "time": self._time, "capture": self._capture, "control": self._control,
+            "rig": self._rig, "equal": self._equal,
+        }  # fmt: skip
+
+        def make() -> Record | None:
+            start = time.monotonic()
+            made = makers[task.kind](scene, task, report)
+            self._spent, self._made = self._spent + time.monotonic() - start, self._made + UNITS[task.kind]
+            return made
+
+        record: Record | None = self.kept.made(task.kind, self._follows_from(scene, task), make)
         return record
 
-    def _timed(self, scene: RasterScene, name: str, index: int) -> dict[str, Any]:
-        def make() -> dict[str, Any]:
-            return time_frame(self.trial, self.look(scene, name, index), self._loaded(index), self.request.timed_runs)
-
-        what = {**self._follows_from(scene, name, index), "runs": self.request.timed_runs}
-        record: dict[str, Any] = self.kept.made("time", what, make)
-        return record
-
-    def _captured(self, scene: RasterScene, name: str) -> dict[str, Any] | None:
-        def make() -> dict[str, Any] | None:
-            return capture_seconds(self.trial, self.look(scene, name, 0), self._loaded(0), self.camera, COST)
-
-        what = {**self._follows_from(scene, name, 0), "cost": asdict(COST)}
-        record: dict[str, Any] | None = self.kept.made("capture", what, make)
-        return record
-
-    def _follows_from(self, scene: RasterScene, name: str, index: int) -> dict[str, Any]:
+    def _follows_from(self, scene: RasterScene, task: Task) -> Record:
         """All that a result depends on; the farm's labels follow from its key and are not drawn for this."""
         labels = None if self.data.files is None or scene.labels is None else zlib.crc32(scene.labels.tobytes())
-        return {
-            "weights": self.candidates[index].key, "frame": name, "scene": scene.key, "labels": labels,
+        one = (self.controls if task.kind == "control" else self.candidates)[task.index]
+        own: Record = {
+            "weights": one.key, "frame": task.name, "scene": scene.key, "labels": labels,
             "camera": asdict(self.camera), **asdict(self.trial),
         }  # fmt: skip
+        if task.kind in ("capture", "rig", "equal"):
+            own["cost"] = asdict(COST)
+        if task.kind in ("rig", "equal"):
+            own["budgets"] = BUDGETS
+        if task.kind == "time":
+            own |= {"runs": self.request.timed_runs, "controls": [self.controls[index].key for index in task.beside]}
+        return own
+
+    def _frame(self, scene: RasterScene, task: Task, report: Report) -> Record:
+        return judge_frame(self.trial, self.look(scene, task.name, task.index), self.loaded(task.index), report)
+
+    def _rig(self, scene: RasterScene, task: Task, report: Report) -> Record:
+        look = self.look(scene, task.name, task.index)
+        return judge_rig(look, self.loaded(task.index), self.camera, COST, self.request.seed, report)
+
+    def _equal(self, scene: RasterScene, task: Task, report: Report) -> Record | None:
+        look = self.look(scene, task.name, task.index)
+        return judge_equal_time(self.trial, scene, look, self.loaded(task.index), self.camera, COST, report)
+
+    def _time(self, scene: RasterScene, task: Task, report: Report) -> Record:
+        beside = [self._control_sight(scene, task.name, index) for index in task.beside]
+        look, rounds = self.look(scene, task.name, task.index), Rounds(self.request.timed_runs)
+        return time_frame(self.trial, look, self.loaded(task.index), rounds, beside)
+
+    def _capture(self, scene: RasterScene, task: Task, report: Report) -> Record | None:
+        look = self.look(scene, task.name, task.index)
+        return capture_seconds(self.trial, look, self.loaded(task.index), self.camera, COST)
+
+    def _control(self, scene: RasterScene, task: Task, report: Report) -> Record:
+        return judge_control(self.trial, *self._control_sight(scene, task.name, task.index), report)
+
+    def _control_sight(self, scene: RasterScene, name: str, index: int) -> tuple[Sight, AnyWeights]:
+        weights = self._load(self.controls[index])
+        return sight_of(scene, name, weights, self.camera, self.request.seed), weights
 
     def look(self, scene: RasterScene, name: str, index: int) -> Look:
         """Look at a frame with some of the weights; the last look is kept."""
-        if self._last is None or self._last[:2] != (name, index):
+        key = self.candidates[index].key
+        if self._last is None or self._last[:2] != (name, key):
             self._last = None  # two looks at once are not needed
-            self._last = (name, index, look_at(scene, name, self._loaded(index), self.camera, self.request.seed))
+            self._last = (name, key, look_at(scene, name, self.loaded(index), self.camera, self.request.seed))
         return self._last[2]
 
-    def _loaded(self, index: int) -> Weights:
-        if index not in self._weights:
-            self._weights[index] = self.candidates[index].load()
-        return self._weights[index]
+    def loaded(self, index: int) -> Weights:
+        """Weights of a candidate, read once."""
+        weights = self._load(self.candidates[index])
+        assert isinstance(weights, Weights)  # open_candidates
+        return weights
 
-    def publish(
-        self, content: dict[str, Any], jobs: list[Job], runs: list[list[dict[str, Any]]], show: Show
-    ) -> list[str]:
-        """Write figures, plot and pictures into the folder; names of the files."""
-        out = self.request.out
-        if out is None:
-            return []
-        from flows.evaluation_pictures import draw_frame
-        from flows.evaluation_plot import draw_evaluation
-
-        shown = _shown(self.trial)
-        files = [out / "evaluation.json", out / "evaluation.png"]
-        with writing(out):
-            draw_evaluation(files[1], content)
-            for title, name in _ends(runs[0], *shown):
-                show("drawing", len(files) / 5, title)
-                path = out / f"{title}.png"
-                draw_frame(
-                    path, f"{title} frame", self.look(scene_of(self.data, name), name, 0), self._loaded(0), *shown
-                )
-                files.append(path)
-            content["files"] = [str(path) for path in files]
-            temporary = files[0].with_name("evaluation.json.part")
-            temporary.write_text(to_json(content), encoding="utf-8")
-            temporary.replace(files[0])
-        show("drawing", 1.0, "")
-        return [str(path) for path in files]
+    def _load(self, one: Candidate) -> AnyWeights:
+        if one.key not in self._weights:
+            self._weights[one.key] = one.load()
+        return self._weights[one.key]
 
 
-def _shown(trial: Trial) -> tuple[str, float]:
-    """Policy and share of the pictures: the first policy, and the share nearest 10 %."""
-    policy = trial.policies[0] if trial.policies and trial.shares else "none"
-    share = min(trial.shares, key=lambda share: abs(share - SHOWN_SHARE), default=0.0) if policy != "none" else 0.0
-    return policy, share
-
-
-def _ends(records: list[dict[str, Any]], policy: str, share: float) -> list[tuple[str, str]]:
-    """The frames with the lowest and the highest mIoU of their own; one alone is the worst."""
-    judged = {}
-    for record in records:
-        row = next(row for row in record["rows"] if (row["policy"], row["share"]) == (policy, share))
-        if row["miou"] is not None:
-            judged[record["frame"]] = row["miou"]
-    if not judged:
-        return []
-    worst, best = min(judged, key=lambda name: judged[name]), max(judged, key=lambda name: judged[name])
-    return [("worst", worst)] if worst == best else [("worst", worst), ("best", best)]
+def _empty(files: Sequence[Candidate]) -> list[list[Record]]:
+    return [[] for _ in files]

@@ -99,7 +99,13 @@ def train(
     patch: int | None = None,
     factor: int = 4,
     columns: int = 24,
+    preset: Literal["two-scale", "paper", "dense", "upsampled", "coarser"] = "two-scale",
     positions: Literal["2d", "paper"] = "2d",
+    init: Path | None = None,
+    dim: int = 128,
+    layers: int = 4,
+    heads: int = 4,
+    mlp_ratio: int = 3,
     crop: int | None = None,
     batch: int = 4,
     labels: str | None = None,
@@ -135,10 +141,25 @@ def train(
         How many times coarser the coarse pass is.
     columns
         Spectral columns that the bands are gathered into.
+    preset
+        Which network: `two-scale`, what surveys are made with, or a control to compare it with: the network of the
+        `paper`, its `dense` twin of one scale, the twin given the coarse image `upsampled`, or a uniform grid `coarser`
+        by 2.
     positions
         How tokens are told their places: `2d`, or the paper's one-dimensional numbers.
+    init
+        Weights to begin from: a vision transformer of timm or DeiT, a Segmenter checkpoint with its variant.yml beside
+        it, or weights that this command made. What is taken is said, and kept in the weights.
+    dim
+        Width of tokens; 192 and 384 are those of ViT-Tiny and ViT-Small.
+    layers
+        Of the transformer.
+    heads
+        Of its attention.
+    mlp_ratio
+        How many times wider the middle of its MLPs is.
     crop
-        Size of the crops [px].
+        Size of the crops [px]; by default 256 for the farm, 384 for files, whole scenes for the paper's network.
     batch
         Crops a step.
     labels
@@ -152,11 +173,11 @@ def train(
     mask_classes
         For one scene: the class number that each number of the mask means.
     """
-    from flows.train import FARM_CROP, FRAME_CROP, TrainRequest
+    from flows.train import TrainRequest, usual_crop
     from flows.train_command import run_train
     from models.training import TrainingSettings
 
-    size = crop if crop is not None else FARM_CROP if dataset == "farm" else FRAME_CROP
+    size = crop if crop is not None else usual_crop(dataset, preset)
     choices = {
         "labels": labels,
         "bands": parse_wholes(bands, "--bands"),
@@ -166,7 +187,9 @@ def train(
     }
     request = TrainRequest(
         dataset, out, split_list(hold_out), validation, scenes, patch, factor, columns, positions=positions,
-        choices=choices, settings=TrainingSettings(steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch),
+        preset=preset, tokens={"dim": dim, "layers": layers, "heads": heads, "mlp_ratio": mlp_ratio}, init=init,
+        choices=choices,
+        settings=TrainingSettings(steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch),
     )  # fmt: skip
     record = run_train(request, stderr)
     if as_json:

@@ -16,7 +16,11 @@ from pipeline.errors import PipelineError
 from storage.archive import StageRef
 from storage.staging import remove_tree, take_lock
 
-RETRIES = {"capture_coarse": 2, "capture_fine": 2}  # a device may answer the second time; the spool goes on
+RETRIES = {
+    "capture_coarse": 2,
+    "capture_fine": 2,
+    "capture_again": 2,
+}  # a device may answer the second time; the spool goes on
 RETRY_DELAY_S = 2.0
 QUIET = {
     "DO_NOT_TRACK": "1",
@@ -76,7 +80,7 @@ def _run_flow(runner: StageRunner) -> Products:
     def survey_flow(scene: str, seed: int, budget: float) -> None:
         """Sweep coarsely, look again where it changes the map, draw the map."""
         started.append(True)
-        left.append(survey(step))
+        left.append(survey(step, runner.run.settings.rounds))
 
     settings = runner.run.settings
     try:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.region_work import Drawing, Scoring, WeightsFile
+from flows.region_work import Comparing, Drawing, Scoring, WeightsFile
 from flows.run import SurveyRun, weights_path
 from models.policies import IMAGE_POLICIES
 from models.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field
@@ -41,7 +41,7 @@ class FieldWork:
     regions: Sequence[Region]
     crew: Crew
     memory: int  # of this process and those that it starts, together [bytes]
-    vgg: VggFile | None = None  # for the policy vgg-static
+    vgg: VggFile | None = None  # for the policies vgg-static and vgg-trained
 
     @staticmethod
     def of(run: SurveyRun) -> FieldWork:
@@ -60,10 +60,11 @@ class FieldWork:
         """
         if policy in IMAGE_POLICIES:
             return self._score_image(policy, mosaic.resolve(), report)
-        beside = max(saliency_bytes(region.coarse.shape) for region in self.regions) if self.vgg else 0
+        vgg = self.vgg
+        beside = max(saliency_bytes(one.coarse.shape, vgg.channels) for one in self.regions) if vgg else 0
         crew = self.crew_for(np.empty(0, np.int64), len(mosaic_wavelengths(mosaic)), beside=beside)
         path = mosaic.resolve()
-        work, paths = Scoring(self.weights, path, policy, self.vgg), [path, *([self.vgg.path] if self.vgg else [])]
+        work, paths = Scoring(self.weights, path, policy, vgg), [path, *([vgg.path] if vgg else [])]
         parts = run_blocks(work, self.regions, crew, report=report, paths=paths)
         scores = np.zeros(self.regions[0].field.seat_shape)
         for region, part in zip(self.regions, parts, strict=True):
@@ -85,6 +86,22 @@ class FieldWork:
         work = Scoring(self.weights, mosaic, policy)
         (scores,) = run_blocks(work, [whole_field(grid)], crew, report=report, paths=[mosaic])
         return np.asarray(scores, np.float64)
+
+    def compare(self, mosaic: Path, patches: Path, report: Callable[[float], None]) -> NDArray[np.float64]:
+        """Tell how much each captured seat changed the map, (seat,) [nat per px], NaN for the others.
+
+        Raises
+        ------
+        SettingsError : not even one region at a time fits the memory.
+        """
+        store = open_patches(patches)
+        crew = self.crew_for(store.seats, len(store.wavelength_nm))
+        paths = mosaic.resolve(), patches.resolve()
+        parts = run_blocks(Comparing(self.weights, *paths), self.regions, crew, report=report, paths=paths)
+        found = np.full(self.regions[0].field.seat_shape, np.nan)
+        for region, part in zip(self.regions, parts, strict=True):
+            found[region.kept_seats.rows, region.kept_seats.columns] = part
+        return found.ravel()
 
     def draw(self, mosaic: Path, patches: Path, out: Path, report: Callable[[float], None]) -> None:
         """Draw the class map into the store that was created at ``out``.

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+from flows.figures import format_percent
 
 LEAST_HECTARES = 0.1  # smaller areas are told in square metres
 
@@ -33,8 +35,32 @@ def _plan_words(plan: Mapping[str, Any]) -> list[str]:
         words.append(_sentence(plan["reason"]))
     if plan["out_of_reach"]:
         words.append(f"{plan['out_of_reach']} places worth a second look lie beyond the mirror's range.")
-    words.append(_sentence(plan["orientation"]["sentence"]))
+    if plan.get("spared_s"):
+        words.append(_spared_words(plan))
+    rounds = plan.get("rounds", [])
+    if rounds:
+        words.append(_round_words(rounds, plan["second_move_s"]))
+    words.append(("In the first round: " if rounds else "") + _sentence(plan["orientation"]["sentence"]))
     return words
+
+
+def _spared_words(plan: Mapping[str, Any]) -> str:
+    share = f" ({format_percent(plan['spared_share'])} of the full scan's)" if plan["spared_share"] else ""
+    return (
+        f"The threshold of {plan['threshold']:g} a second left {plan['spared_s']:.1f} s{share} unspent: no further run "
+        f"of lines pays."
+    )
+
+
+def _round_words(rounds: Sequence[Mapping[str, Any]], move_s: float) -> str:
+    parts = [
+        f"{one['seats']} seats in {one['sweeps']} runs of {one['lines']} lines for {one['seconds']:.1f} s"
+        for one in rounds
+    ]
+    return (
+        f"The first round showed {parts[0]}, the second {parts[1]}; to go back a second time took {move_s:.1f} s of "
+        f"them."
+    )
 
 
 def _sentence(text: str) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,14 +14,18 @@ from flows.pointing_stage import load_registration
 from flows.run import SurveyRun
 from flows.stages import load_orientation, load_plan
 from flows.survey import Products
+from pipeline.planning import FinePlan, joined_plan
 from storage.archive import StageRef
+from storage.attention import load_attention
 from storage.ground_maps import load_ground_map
 
 
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     """Gather ``plan`` and the parts of the receipt that not every survey has: ``pointing``, ``ground``, ``lines``."""
-    found: dict[str, Any] = {"plan": _plan(products.attention)}
-    passes = {"coarse": products.coarse_pointing, "fine": products.fine_pointing}
+    found: dict[str, Any] = {"plan": _plan(run, products)}
+    passes = {
+        "coarse": products.coarse_pointing, "fine": products.fine_pointing, "second fine": products.pointing_again,
+    }  # fmt: skip
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
     if "fine" in pointing:
         pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_shares(run, products.patches) < 1))
@@ -33,9 +39,16 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     return found
 
 
-def _plan(attention: StageRef) -> dict[str, Any]:
-    """How the fine pass was laid out, and what the other orientation would have shown."""
-    plan, turned = load_plan(attention), load_orientation(attention)
+def _plan(run: SurveyRun, products: Products) -> dict[str, Any]:
+    """How the fine pass was laid out, and what the other orientation would have shown.
+
+    Of two rounds the score is that of the first look, and the other orientation that of the first round.
+    """
+    attention = products.attention
+    plans, turned = [load_plan(attention) for attention in products.attentions], load_orientation(attention)
+    plan = joined_plan(plans)
+    if len(plans) > 1:
+        plan = replace(plan, worth=_worth_by_first_look(plan, attention))
     return {
         "kind": plan.kind,
         "reason": plan.reason,
@@ -46,7 +59,53 @@ def _plan(attention: StageRef) -> dict[str, Any]:
         "full_seconds": plan.full_seconds,
         "out_of_reach": plan.out_of_reach,
         "orientation": turned,
+        **_spared(run, plans),
+        **_rounds(run, plans),
     }
+
+
+def _worth_by_first_look(plan: FinePlan, attention: StageRef) -> float:
+    """What all seats that were shown were worth by the scores of the first look: no more than was wanted."""
+    score = load_attention(attention.path / "attention.zarr").score.ravel()[plan.seats]
+    return min(float(score[score > 0].sum()), plan.wanted_worth)
+
+
+def _spared(run: SurveyRun, plans: Sequence[FinePlan]) -> dict[str, Any]:
+    """What the threshold left: seconds, their share of the full scan's, and the score that was not worth more of them.
+
+    Nothing without a threshold. Seconds are those of the last round: an earlier one leaves its own to the next.
+    """
+    last = plans[-1]
+    if last.threshold is None:
+        return {}
+    return {
+        "threshold": last.threshold,
+        "spared_s": last.spared_s,
+        "spared_share": None if last.spared_s is None else last.spared_s / run.plan.full_s,
+        "spared_score": last.wanted_worth - last.worth,
+    }
+
+
+def _rounds(run: SurveyRun, plans: Sequence[FinePlan]) -> dict[str, Any]:
+    """What each of several rounds bought, and what going back a second time cost; nothing of a single one.
+
+    ``second_move_s``: both rounds as they were priced, less the same sweeps in one go.
+    """
+    if len(plans) == 1:
+        return {}
+    apart, together = sum(plan.seconds for plan in plans), [sweep for plan in plans for sweep in plan.sweeps]
+    rows = [
+        {
+            "seats": len(plan.seats),
+            "lines": plan.lines,
+            "sweeps": len(plan.sweeps),
+            "seconds": plan.seconds,
+            "score": plan.worth,
+            "score_share": plan.worth / plan.wanted_worth if plan.wanted_worth else None,
+        }
+        for plan in plans
+    ]
+    return {"rounds": rows, "second_move_s": apart - run.settings.cost.seconds(together, run.camera)}
 
 
 def _pointing(ref: StageRef) -> dict[str, Any]:

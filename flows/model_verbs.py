@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from flows.app import AsJson, OutFolder, app, parse_numbers, parse_wholes, split_list, stderr
+from flows.app import AsJson, OutFolder, Switch, app, parse_numbers, parse_wholes, split_list, stderr
 
 
 @app.command
@@ -23,6 +23,10 @@ def evaluate(
     seed: int = 0,
     draws: int = 2000,
     timed_frames: int = 2,
+    timed_runs: int = 10,
+    control: Annotated[tuple[Path, ...], Parameter(negative="")] = (),
+    rig: bool = True,
+    equal_time: Switch = False,
     labels: str | None = None,
     bands: str | None = None,
     wavelengths: str | None = None,
@@ -37,13 +41,14 @@ def evaluate(
     dataset
         `farm`, a folder of labelled scenes, or one scene file.
     weights
-        A file of weights. Several are seeds of one training: mean and spread.
+        A file of weights. Several are seeds of one training, or of frames left out in turn: each frame is judged by
+        those that never saw it.
     out
-        Folder for evaluation.json, the plot (evaluation.png) and pictures of the worst and the best frame.
+        Folder for evaluation.json, the plots (evaluation.png, rig.png) and pictures of the worst and the best frame.
     shares
         Shares of the seats to try, with commas; 0.05,0.1,0.15,0.2,0.35 by default. None and all are always there.
     policies
-        Placements to try, with commas; entropy,sobel,random by default. The oracle is always there.
+        Placements to try, with commas; gain,entropy,sobel,random by default. The oracle is always there.
     frames
         Names of the frames to judge on, with commas; all by default.
     scenes
@@ -54,6 +59,15 @@ def evaluate(
         Of the bootstrap.
     timed_frames
         How many frames to time, and to price the capture of; 0 leaves both out.
+    timed_runs
+        How often each is timed, after three rounds that are not counted; the median is given.
+    control
+        Weights of another design to compare with; repeat it for more. The better of all and a dense one is the
+        baseline.
+    rig
+        Also compare plans of lines at equal capture seconds: ours, evenly spaced blocks and random blocks.
+    equal_time
+        Also judge each row with the exposure that makes its capture take as long as the full scan.
     labels
         For one scene: its labels.
     bands
@@ -61,7 +75,7 @@ def evaluate(
     wavelengths
         For one scene: wavelengths of its bands [nm].
     """
-    from flows.benchmark_work import SHARES, USUAL, EvaluateRequest
+    from flows.benchmark_request import SHARES, USUAL, EvaluateRequest
     from flows.evaluate_command import run_evaluate
 
     choices = {
@@ -72,7 +86,8 @@ def evaluate(
     given = parse_numbers(shares, "--shares")
     request = EvaluateRequest(
         dataset, weights, out, SHARES if given is None else tuple(given), split_list(policies) or USUAL,
-        split_list(frames), scenes, seed, draws, timed_frames, choices=choices,
+        split_list(frames), scenes, seed, draws, timed_frames, timed_runs, control, rig, equal_time,
+        choices,
     )  # fmt: skip
     run_evaluate(request, stderr, as_json=as_json)
     return 0

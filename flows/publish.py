@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from flows.settings import anchor_paths
 from flows.stages import SEATS_AT_ONCE, captured, load_plan
 from flows.survey import Products, StageRunner
 from models.cost import MultiplyAdds, multiply_adds
-from pipeline.planning import FinePlan
+from pipeline.planning import FinePlan, joined_plan
 from pipeline.rectify.calibrate import of_bands, reflectance
 from pipeline.savings import Entry, capture_savings
 from pipeline.scan import Sweep
@@ -61,7 +61,7 @@ class Published:
 def publish_run(runner: StageRunner, products: Products, started: str) -> Published:
     """Write receipt.json, quicklook.png and report.html into a run folder and publish it as a whole."""
     run = runner.run
-    plan = load_plan(products.attention)
+    plan = joined_plan([load_plan(attention) for attention in products.attentions])
     looked_twice = float(seen_shares(run, products.patches).sum()) / len(run.grid.valid_seats())
     with run.archive.new_run(run.name) as draft:
         receipt = make_receipt(runner, products, plan, started, f"runs/{draft.id}")
@@ -116,13 +116,16 @@ def _addresses(products: Products, folder: str) -> dict[str, str]:
         "raw_coarse": products.raw_coarse.uri,
         "lookup": f"{products.lookup.uri}/lookup.zarr",
         "mosaic": f"{products.mosaic.uri}/mosaic.zarr",
-        "attention": f"{products.attention.uri}/attention.zarr",
+        "attention": f"{products.attentions[-1].uri}/attention.zarr",
         "plan": f"{products.attention.uri}/plan.json",
         "raw_fine": products.raw_fine.uri,
         "patches": f"{products.patches.uri}/patches.zarr",
         "class_map": f"{products.class_map.uri}/class_map.zarr",
     }
-    for name, ref in (("coarse_pointing", products.coarse_pointing), ("fine_pointing", products.fine_pointing)):
+    if products.attention_again is not None and products.raw_again is not None:
+        named |= {"raw_again": products.raw_again.uri, "plan_again": f"{products.attention_again.uri}/plan.json"}
+    pointing = {name: getattr(products, name) for name in ("coarse_pointing", "fine_pointing", "pointing_again")}
+    for name, ref in pointing.items():
         if ref is not None:
             named[name] = f"{ref.uri}/{RECORD}"
     if products.ground_map is not None:
@@ -137,9 +140,9 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
     bands = len(run.scene.wavelength_nm)
     done = [*run.plan.coarse, *plan.sweeps]
     entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
-    stored = [run.archive.stored_bytes(ref) for ref in (products.raw_coarse, products.raw_fine)]
+    stored = [run.archive.stored_bytes(ref) for ref in (products.raw_coarse, *products.raws_fine)]
     # Fine lines compress like the full scan's would; without any, the coarse ones have to stand for them.
-    like, kept = (plan.sweeps, stored[1]) if plan.sweeps else (run.plan.coarse, stored[0])
+    like, kept = (plan.sweeps, sum(stored[1:])) if plan.sweeps else (run.plan.coarse, stored[0])
     of_these = capture_savings(like, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
     full_stored = entries["bytes_raw"].full * kept / of_these["bytes_raw"].done
     config, valid = run.weights.config, len(run.grid.valid_seats())
@@ -149,12 +152,23 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
         "capture_s": Entry(run.plan.coarse_s + plan.seconds, run.plan.full_s, "predicted").as_dict(),
         "bytes_stored": Entry(sum(stored), round(full_stored), "predicted").as_dict(),
         "tokens": Entry(cells + len(plan.seats), cells + valid, "predicted").as_dict(),
-        "multiply_adds": _multiply_adds(run, len(plan.seats), valid, bands),
+        "multiply_adds": _multiply_adds(run, len(plan.seats), valid, bands, first=_looked_at_first(products)),
     }
 
 
-def _multiply_adds(run: SurveyRun, seats: int, valid: int, bands: int) -> dict[str, Any]:
-    done: MultiplyAdds = multiply_adds(run.weights.config, run.grid, seats, bands, run.settings.policy)
+def _looked_at_first(products: Products) -> int:
+    """Patches that were read for the second round's scores."""
+    return 0 if products.attention_again is None else len(load_plan(products.attention).seats)
+
+
+def _multiply_adds(run: SurveyRun, seats: int, valid: int, bands: int, *, first: int) -> dict[str, Any]:
+    """What the model did; a second round's scores take another reading of the coarse look and of ``first`` patches."""
+    channels = 3 if run.vgg is None else run.vgg.channels
+    done: MultiplyAdds = multiply_adds(
+        run.weights.config, run.grid, seats, bands, run.settings.policy, channels=channels
+    )
+    if first:
+        done = replace(done, score=done.score + multiply_adds(run.weights.config, run.grid, first, bands, None).total)
     full = multiply_adds(run.weights.config, run.grid, valid, bands, None)
     split = {"glance": done.glance, "score": done.score, "encode": done.encode, "decode": done.decode}
     return {**Entry(done.total, full.total, "predicted").as_dict(), **split}
@@ -179,7 +193,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     """Gather what the four panels show, three bands of it."""
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
-    attention = load_attention(products.attention.path / "attention.zarr")
+    attention = load_attention(products.attentions[-1].path / "attention.zarr")
     found: ClassMap = load_class_map(products.class_map.path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")
     accuracy = receipt.get("accuracy")

@@ -18,7 +18,7 @@ from flows.capture_plan import CapturePlan, check_memory, plan_capture
 from flows.settings import BUILT_IN_SCENES, Settings
 from flows.survey_scene import check_labels, check_mask, farm_refusal, judged_labels, open_scene
 from models.vgg_file import VggFile
-from models.weights import Description, Weights, describe_weights, load_weights
+from models.weights import Description, Weights, check_two_scale, describe_weights, load_weights
 from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.grid import SceneGrid
@@ -82,8 +82,8 @@ class SurveyRun:
 
     @cached_property
     def vgg(self) -> VggFile | None:
-        """VGG19 for the policy ``vgg-static``."""
-        return None if self.settings.vgg is None else VggFile.found(Path(self.settings.vgg))
+        """VGG19 for the policies ``vgg-static`` and ``vgg-trained``."""
+        return _vgg_file(self.settings)
 
     def angular_grid(self, factor: int = 1) -> AngularGrid:
         """Where pixels of ``factor`` fine px lie."""
@@ -113,6 +113,7 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
         raise SettingsError(f"--source {settings.source}: this version has the simulated source only; use --source sim")
     path = weights_path(settings)
     described, load = describe_weights(path), Once(lambda: load_weights(path))
+    check_two_scale(described.config, path)
     if not planning:
         load()  # refuses tensors that do not fit
     refused = farm_refusal(settings)
@@ -129,7 +130,7 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     if settings.mask is not None:
         check_mask(settings.mask, scene.shape)
     effects = _chosen_effects(settings.effects)
-    vgg_notes = _check_vgg(settings, planning=planning)
+    vgg_notes = _check_vgg(settings, None if planning else load)
     source = SimulatedSource(scene, settings.camera, settings.seed, effects, pointing=_pointing(settings))
     check_memory(settings, source, grid, plan)
     _check_pose(settings, scene.shape)
@@ -140,12 +141,19 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     )  # fmt: skip
 
 
-def _check_vgg(settings: Settings, *, planning: bool) -> tuple[str, ...]:
-    """Refuse a file that is no VGG19 (when planning: one that is not there), and say what was taken from it."""
+def _vgg_file(settings: Settings) -> VggFile | None:
     if settings.vgg is None:
+        return None
+    return VggFile.found(Path(settings.vgg), trained=settings.policy == "vgg-trained")
+
+
+def _check_vgg(settings: Settings, load: Once[Weights] | None) -> tuple[str, ...]:
+    """Refuse a VGG19 that does not go with the weights (without these: one that is not there); say what was taken."""
+    file = _vgg_file(settings)
+    if file is None or load is None:
         return ()
-    file = VggFile.found(Path(settings.vgg))
-    return () if planning else (f"VGG19 from {file.path.name}: {file.report()}",)
+    file.saliency(load())
+    return (f"VGG19 from {file.path.name}: {file.report()}",)
 
 
 def _pointing(settings: Settings) -> PointingErrors | None:

@@ -24,7 +24,7 @@ from flows.setting_values import (
     parse_wavelengths,
     parse_whole,
 )
-from models.vgg_sizes import VGG_FROM
+from models.vgg_sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.camera import LineCamera
 from pipeline.errors import PoseError, SettingsError
 from pipeline.ground import LIMITS, RigPose
@@ -32,14 +32,17 @@ from pipeline.scan import CostModel
 from storage.block_work import Crew
 
 POLICIES = (
-    "entropy", "margin", "sobel", "saliency", "spectral-residual", "random", "stratified", "centre", "uniform", "mask",
-    "vgg-static",
+    "gain", "entropy", "margin", "sobel", "saliency", "spectral-residual", "random", "stratified", "centre", "uniform",
+    "mask", "vgg-static", "vgg-trained", "self-attention",
 )  # fmt: skip
+IN_NAT = ("gain", "entropy")  # policies whose scores are gains, or the most that these can be
+UNMOVED = ("random", "stratified", "centre", "uniform", "mask")  # policies by place: nothing seen changes them
 ENGINES = ("prefect", "plain")
 KERNELS = ("catmull-rom", "bilinear", "nearest")
 BUILT_IN_SCENES = ("farm",)
 BUILT_IN_SOURCES = ("sim", "rig")
 OF_THE_MACHINE = ("scheduler", "workers")  # no byte depends on them; a cluster of that day need not be there today
+_VGG_FROM = {"vgg-static": VGG_FROM, "vgg-trained": TRAINED_VGG_FROM}  # policies that read a file of VGG19
 _PATHS = ("scene", "labels", "source", "out", "mask", "vgg", "weights")
 
 Parser = Callable[[object, str], object]
@@ -66,9 +69,10 @@ class Settings:
     budget: float = 0.5  # seconds of coarse and fine capture over those of the full scan, 0 < b <= 1
     policy: str = "entropy"
     mask: str | None = None
-    vgg: str | None = None  # VGG19's weights, for policy vgg-static
+    vgg: str | None = None  # VGG19's weights, for policies vgg-static and vgg-trained
     weights: str | None = None
-    rounds: int = 1
+    rounds: int = 1  # of detail: with 2 half of the seconds are spent first, the rest by what they showed
+    threshold: float | None = None  # least expected gain per second of fine capture [nat per px, summed over seats]
     seed: int = 0
     effects: str = "auto"  # auto, all, none, or names with commas
     controls: bool = True
@@ -193,10 +197,13 @@ def _check_together(settings: Settings, origin: Mapping[str, str]) -> None:
         wants = "policy 'mask' needs a mask file" if settings.mask is None else "a mask is used by policy 'mask' only"
         got = f"policy = {settings.policy!r}, mask = {settings.mask!r}"
         raise SettingsError(f"{wants}: got {got}; give both or neither")
-    if settings.policy == "vgg-static" and settings.vgg is None:
-        raise SettingsError(f"policy 'vgg-static' needs --vgg FILE, {VGG_FROM}")
-    if settings.policy != "vgg-static" and settings.vgg is not None:
-        raise SettingsError(f"a vgg file is for policy 'vgg-static', got policy = {settings.policy!r}; leave --vgg out")
+    vgg_from = _VGG_FROM.get(settings.policy)
+    if vgg_from is not None and settings.vgg is None:
+        raise SettingsError(f"policy {settings.policy!r} needs --vgg FILE, {vgg_from}")
+    if vgg_from is None and settings.vgg is not None:
+        wanted = " or ".join(map(repr, _VGG_FROM))
+        raise SettingsError(f"a vgg file is for policy {wanted}, got policy = {settings.policy!r}; leave --vgg out")
+    _check_spending(settings)
     bands, wavelengths = settings.bands, settings.wavelengths
     if bands is not None and wavelengths is not None and len(bands) != len(wavelengths):
         raise SettingsError(
@@ -212,6 +219,21 @@ def _check_together(settings: Settings, origin: Mapping[str, str]) -> None:
         )
     if settings.pose is None and settings.map != MapChoice():
         raise SettingsError("[map] says how to draw the ground, which needs to know where the rig stands: give [pose]")
+
+
+def _check_spending(settings: Settings) -> None:
+    """Thresholds and rounds that the policy gives no meaning to."""
+    policy = settings.policy
+    if settings.threshold is not None and policy not in IN_NAT:
+        raise SettingsError(
+            f"threshold is a gain [nat], and policy {policy!r} scores in a unit of its own: leave --threshold out, or "
+            f"take --policy {' or '.join(IN_NAT)} (entropy is the most that a look can gain)"
+        )
+    if settings.rounds > 1 and policy in UNMOVED:
+        raise SettingsError(
+            f"a second round goes where the first showed more than was expected, and policy {policy!r} expects "
+            f"nothing: take --rounds 1, or a policy that looks, such as entropy"
+        )
 
 
 def _read_toml(path: Path) -> dict[str, object]:
@@ -310,7 +332,8 @@ _SURVEY: dict[str, Parser] = {
     "mask": parse_text,
     "vgg": parse_text,
     "weights": parse_text,
-    "rounds": parse_whole(1, 1, why="this version looks twice at most: one coarse look, one round of detail"),
+    "rounds": parse_whole(1, 2, why="one coarse look, then one round of detail or two"),
+    "threshold": parse_number(Span(0, 1e9, "nat per second")),
     "seed": parse_whole(0, 2**63 - 1),
     "effects": parse_effects,
     "controls": parse_switch,

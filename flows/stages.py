@@ -37,8 +37,8 @@ from storage.spool import Spool
 from storage.stored_tables import read_table
 
 VERSIONS = {
-    "capture": 2, "register": 2, "locate": 2, "rectify": 3, "attend": 4, "patches": 3, "segment": 3, "ground": 2,
-    "evaluate": 5,
+    "capture": 2, "register": 2, "locate": 2, "rectify": 3, "attend": 5, "patches": 3, "segment": 4, "ground": 2,
+    "evaluate": 6,
 }  # fmt: skip
 SEATS_AT_ONCE = 64
 
@@ -99,25 +99,30 @@ def glance_at(run: SurveyRun, mosaic: StageRef) -> Glance:
 
 
 def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
-    """Score every seat by the coarse mosaic, and plan the sweeps that show the most score in the time left."""
+    """Score every seat by the coarse mosaic, and plan the sweeps that show the most score in the time left.
+
+    With two rounds half of that time is planned; see `flows.second_round`.
+    """
     settings = run.settings
+    budget_s = run.plan.fine_s / settings.rounds
 
     def build(path: Path) -> None:
         work = FieldWork.of(run)
         scores = _scores(run, work, mosaic)
         plan = plan_fine(
-            run.grid, run.camera, settings.cost, run.plan.along, scores,
-            budget_s=run.plan.fine_s, margin_px=run.plan.margin_px, full=run.plan.full,
+            run.grid, run.camera, settings.cost, run.plan.along, scores, budget_s=budget_s,
+            margin_px=run.plan.margin_px, full=run.plan.full, threshold=settings.threshold,
         )  # fmt: skip
         work.check_memory(plan.seats, len(run.scene.wavelength_nm))  # before the rig goes back, not after
         rank = np.full(scores.shape, -1, np.int32)
         rank[plan.seats[np.argsort(-scores[plan.seats], kind="stable")]] = np.arange(len(plan.seats))
         shape = run.grid.seat_shape
         write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), settings.policy))
-        write_json(path / "plan.json", asdict(plan) | {"seats": plan.seats.tolist()})
+        write_plan(path, plan)
         turned = compare_orientations(
-            run.grid, run.camera, settings.cost, run.plan.along, scores, budget_s=run.plan.fine_s, plan=plan,
+            run.grid, run.camera, settings.cost, run.plan.along, scores, budget_s=budget_s, plan=plan,
             rows=_crop_rows(mosaic), overlap_px=run.plan.overlap_px, margin_px=run.plan.margin_px,
+            threshold=settings.threshold,
         )  # fmt: skip
         write_json(path / "orientation.json", asdict(turned) | {"sentence": turned.sentence})
 
@@ -135,6 +140,8 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
         "cost": asdict(settings.cost),
         **(region_params(run.grid) if settings.policy in SEEING_POLICIES else {}),
         **({} if run.vgg is None else {"vgg": run.vgg.key}),
+        **({} if settings.threshold is None else {"threshold": settings.threshold}),
+        **({} if settings.rounds == 1 else {"rounds": settings.rounds}),
     }
     return produce("attend", build, params, [mosaic])
 
@@ -151,6 +158,13 @@ def _scores(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.flo
 def _crop_rows(mosaic: StageRef) -> CropRows:
     """Crop rows as the coarse mosaic shows them, all bands together."""
     return find_rows(mosaic_brightness(mosaic.path / "mosaic.zarr"))
+
+
+def write_plan(folder: Path, plan: FinePlan) -> None:
+    """Write the plan of an attention store; of a threshold only where there was one."""
+    content = asdict(plan) | {"seats": plan.seats.tolist()}
+    absent = [name for name in ("threshold", "spared_s") if content[name] is None]
+    write_json(folder / "plan.json", {name: value for name, value in content.items() if name not in absent})
 
 
 def load_plan(attention: StageRef) -> FinePlan:

@@ -16,6 +16,7 @@ from flows.ground_stage import ground
 from flows.pointing_stage import register_coarse, register_fine
 from flows.receipt import StageRecord, State
 from flows.run import SurveyRun
+from flows.second_round import attend_again
 from storage.archive import StageRef
 
 STAGES: dict[str, Callable[..., StageRef | None]] = {
@@ -27,10 +28,15 @@ STAGES: dict[str, Callable[..., StageRef | None]] = {
     "capture_fine": stages.capture_fine,
     "register_fine": register_fine,
     "cut_patches": placement.cut_patches,
+    "attend_again": attend_again,
+    "capture_again": stages.capture_fine,
+    "register_again": register_fine,
+    "cut_again": placement.cut_again,
     "draw_map": stages.draw_map,
     "ground": ground,
     "evaluate": evaluate,
 }
+OF_ROUND_TWO = ("attend_again", "capture_again", "register_again", "cut_again")
 TITLES = {
     "capture_coarse": "coarse sweep",
     "register_coarse": "seams of the coarse sweeps",
@@ -40,6 +46,10 @@ TITLES = {
     "capture_fine": "fine sweeps",
     "register_fine": "fine sweeps on the mosaic",
     "cut_patches": "fine patches",
+    "attend_again": "attention to what is left",
+    "capture_again": "fine sweeps, second round",
+    "register_again": "these sweeps on the mosaic",
+    "cut_again": "fine patches of both rounds",
     "draw_map": "class map",
     "ground": "map on the ground",
     "evaluate": "accuracy (not part of the survey)",
@@ -55,7 +65,10 @@ class Step(Protocol):
 
 @dataclass(frozen=True)
 class Products:
-    """The stores that a survey leaves; None where a stage had nothing to do."""
+    """The stores that a survey leaves; None where a stage had nothing to do.
+
+    ``patches`` are those of all rounds, ``attention``, ``raw_fine`` and ``fine_pointing`` of the first.
+    """
 
     raw_coarse: StageRef
     coarse_pointing: StageRef | None
@@ -68,10 +81,27 @@ class Products:
     class_map: StageRef
     ground_map: StageRef | None
     accuracy: StageRef | None
+    first_patches: StageRef | None = None  # these and those below: only with two rounds
+    attention_again: StageRef | None = None
+    raw_again: StageRef | None = None
+    pointing_again: StageRef | None = None
+
+    @property
+    def attentions(self) -> list[StageRef]:
+        """Scores and plan of each round."""
+        return [self.attention, *_there(self.attention_again)]
+
+    @property
+    def raws_fine(self) -> list[StageRef]:
+        """The fine sweeps of each round."""
+        return [self.raw_fine, *_there(self.raw_again)]
 
 
-def survey(step: Step) -> Products:
-    """Sweep the field coarsely, decide where detail changes the map, look there again, and draw the map."""
+def survey(step: Step, rounds: int = 1) -> Products:
+    """Sweep the field coarsely, decide where detail changes the map, look there again, and draw the map.
+
+    With two rounds the second goes where the first showed that more is to be found.
+    """
     raw = _needed(step("capture_coarse"))
     coarse_pointing = step("register_coarse", raw)
     lookup = _needed(step("locate", raw, *_there(coarse_pointing)))
@@ -80,12 +110,21 @@ def survey(step: Step) -> Products:
     fine = _needed(step("capture_fine", attention))
     fine_pointing = step("register_fine", fine, mosaic)
     patches = _needed(step("cut_patches", attention, fine, *_there(fine_pointing)))
+    second: dict[str, StageRef | None] = {}
+    if rounds > 1:
+        again = _needed(step("attend_again", mosaic, attention, patches))
+        raw_again = _needed(step("capture_again", again))
+        pointing_again = step("register_again", raw_again, mosaic)
+        second = {"first_patches": patches, "attention_again": again, "raw_again": raw_again,
+                  "pointing_again": pointing_again}  # fmt: skip
+        patches = _needed(step("cut_again", again, raw_again, patches, *_there(pointing_again)))
     class_map = _needed(step("draw_map", mosaic, patches))
     ground_map = step("ground", class_map, mosaic)
     accuracy = step("evaluate", mosaic, patches, class_map, *_there(coarse_pointing))
     return Products(
-        raw, coarse_pointing, lookup, mosaic, attention, fine, fine_pointing, patches, class_map, ground_map, accuracy
-    )
+        raw, coarse_pointing, lookup, mosaic, attention, fine, fine_pointing, patches, class_map, ground_map, accuracy,
+        **second,
+    )  # fmt: skip
 
 
 def _there(ref: StageRef | None) -> tuple[StageRef, ...]:

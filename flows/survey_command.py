@@ -56,11 +56,11 @@ def _survey_and_publish(run: SurveyRun, settings: Settings, console: Console, st
 
 def _run(runner: StageRunner, engine: str, console: Console) -> Products:
     if engine == "plain":
-        return survey(runner)
+        return survey(runner, runner.run.settings.rounds)
     from flows.engine import EngineUnavailable, survey_with_prefect
 
     try:
         return survey_with_prefect(runner)
     except EngineUnavailable as error:
         console.print(f"[yellow]{escape(str(error))}; going on with --engine plain[/]", highlight=False)
-        return survey(runner)
+        return survey(runner, runner.run.settings.rounds)

@@ -30,15 +30,18 @@ class SurveyFlags:
     """Seconds of coarse and fine capture over those of the full scan, above 0 and at most 1; 0.5 by default."""
     policy: str | None = None
     """Where to look twice: entropy (default), margin, sobel, saliency, spectral-residual, random, stratified, centre,
-    uniform, mask or vgg-static."""
+    uniform, mask, vgg-static, vgg-trained or self-attention."""
     mask: str | None = None
     """Image of where to look twice, for the policy mask."""
     vgg: str | None = None
-    """Weights of VGG19, for the policy vgg-static."""
+    """Weights of VGG19, for the policies vgg-static and vgg-trained."""
     weights: str | None = None
     """Model weights (.safetensors); those for `farm` are built in."""
     rounds: str | None = None
-    """How often to look again; 1."""
+    """Rounds of detail: 1 (default), or 2: half of the time first, the rest where that showed more than expected."""
+    threshold: str | None = None
+    """Least gain that a second of the fine pass is spent for [nat per px, summed over seats], as the receipt's
+    score_per_second; none by default. For the policies gain and entropy."""
     seed: str | None = None
     """Of the scene `farm` and of all noise; 0 by default."""
     effects: str | None = None

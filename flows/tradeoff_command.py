@@ -15,6 +15,7 @@ import flows.tradeoff_line_model
 import flows.tradeoff_overlap
 import flows.tradeoff_resample
 import flows.tradeoff_scan_step
+import flows.tradeoff_segment
 import flows.tradeoff_store
 import flows.tradeoff_tie_spacing  # noqa: F401 - each registers its entry
 from flows.tradeoff import find_tradeoffs, measure_tradeoff, registered

@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.train_figures import validate
+from flows.train_start import joined_split, open_start, refuse_seen
 from flows.training_data import TrainingData, open_training_data, pack_mask, trained_pixels
-from models.controls import CONTROL_SHARE, Controls, Counts, run_controls
-from models.examples import Example, Observation, measured_normalisation, normalised, observe
-from models.inference import glance_of_columns
-from models.metrics import mean_iou
-from models.segmenter import SegmenterConfig
+from models.examples import Observation, measured_normalisation, normalised, observe
+from models.sizes import PRESETS, Positions, Preset, SegmenterConfig
 from models.spectral import SpectralBasis
-from models.tokens import Positions
 from models.training import Progress, TrainingSettings, train
-from models.weights import Weights, save_weights, with_record
+from models.weights import AnyWeights, save_weights, with_record
 from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, SettingsError
 from pipeline.grid import SceneGrid
 from pipeline.simulator.scene import RasterScene
 
 FRAME_CROP, FARM_CROP = 384, 256  # px
+WHOLE_CROP = 1024  # px; the paper's network counts its places along the whole scene, a crop's would be others
 
 
 @dataclass(frozen=True)
@@ -40,8 +39,11 @@ class TrainRequest:
     patch: int | None = None
     factor: int = 4
     columns: int = 24
-    width: int = 32
+    width: int = 24
     positions: Positions = "2d"
+    preset: Preset = "two-scale"
+    tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads, mlp_ratio, where not the usual ones
+    init: Path | None = None  # weights to begin from
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
     settings: TrainingSettings = field(default_factory=TrainingSettings)
     camera: LineCamera = field(default_factory=LineCamera)
@@ -63,27 +65,35 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
         raise SettingsError(f"-o {request.out}: the folder {request.out.parent} does not exist; make it first")
     if request.out.is_dir():
         raise SettingsError(f"-o {request.out} is a folder, expected a file; name the weights in it")
+    start = open_start(request.init, request.tokens, request.preset)
     data = open_training_data(
         request.dataset, request.validation, request.scenes, request.camera,
         hold_out=request.hold_out, **request.choices,
     )  # fmt: skip
+    refuse_seen(start, data)
     seen, about = _observe_all(request, data, data.train, "looking at scenes", report)
     normalisation = measured_normalisation(seen)
     reached = np.ones(about.basis.columns, bool)
     examples = [normalised(observation, normalisation, reached) for observation in seen]
     config = _config(request, about)
+    begun = None
+    if start is not None:
+        config = replace(config, patch_kernel=start.patch_kernel)
+        begun = start.begin(config, about.basis, normalisation, about.names)
+    state = None if begun is None else begun.state
 
     def progress(now: Progress) -> None:
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
 
-    split = _split(about, data)  # before validation scenes are looked at: what was trained on
+    split = joined_split(_split(about, data), start)  # before validation scenes are looked at: what was trained on
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
     model, summary = train(
-        config, examples, normalisation.gain_shift, request.settings, progress, checkpoint=checkpoint
+        config, examples, normalisation.gain_shift, request.settings, progress, start=state, checkpoint=checkpoint
     )
-    weights = Weights(model, about.basis, normalisation, about.names, about.colours)
+    weights = AnyWeights(model, about.basis, normalisation, about.names, about.colours)
     kept, _ = _observe_all(request, data, data.validation, "looking at validation scenes", report, about)
-    rows = [_validate(weights, normalised(one, normalisation, reached), request, report) for one in kept]
+    frames = (normalised(one, normalisation, reached) for one in kept)
+    figures = validate(weights, frames, request.settings.seed, lambda row: report("validating", 0.0, row))
     record = {
         "command": request.command,
         "data": data.law,
@@ -91,7 +101,8 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
         "settings": asdict(request.settings),
         "camera": asdict(request.camera),
         "training": summary,
-        "validation": _summary(rows),
+        "validation": figures,
+        **({} if begun is None else {"begun_from": begun.record}),
     }
     save_weights(with_record(weights, **record), request.out)
     checkpoint.unlink(missing_ok=True)
@@ -160,6 +171,11 @@ def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
     return 32 if min(shape) >= 512 else 16 if min(shape) >= 256 else 8
 
 
+def usual_crop(dataset: str, preset: Preset) -> int:
+    """Size of the crops to train on [px]: whole scenes for the paper's network, as far as they are square."""
+    return WHOLE_CROP if preset == "paper" else FARM_CROP if dataset == "farm" else FRAME_CROP
+
+
 def _check_alike(scene: RasterScene, about: _About) -> None:
     if scene.class_names != about.names:
         raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {about.names}")
@@ -175,45 +191,8 @@ def _config(request: TrainRequest, about: _About) -> SegmenterConfig:
             patch=about.patch,
             factor=request.factor,
             width=request.width,
-            positions=request.positions,
+            **request.tokens,
+            **{"positions": request.positions, **PRESETS[request.preset]},
         )
     except ValueError as error:
-        raise SettingsError(f"{error}; choose another --patch or --factor") from error
-
-
-def _validate(weights: Weights, example: Example, request: TrainRequest, report: Report) -> Controls:
-    p, columns = weights.config.patch, weights.config.columns
-    grid = SceneGrid(*example.shape, p, weights.config.factor)
-    rows, across = grid.seat_shape
-    cells = example.fine.reshape(rows, p, across, p, columns).transpose(0, 2, 1, 3, 4).reshape(-1, p, p, columns)
-    labels = example.labels[: grid.height, : grid.width]
-    return run_controls(
-        weights, glance_of_columns(weights, example.coarse, grid), cells.astype(np.float32), labels,
-        share=CONTROL_SHARE, seed=request.settings.seed, report=lambda row: report("validating", 0.0, row),
-    )  # fmt: skip
-
-
-def _summary(rows: list[Controls]) -> dict[str, Any] | None:
-    """mIoU over all validation scenes together, at one share of the seats."""
-    if not rows:
-        return None
-    whole = Controls(
-        rows[0].share,
-        sum(row.seats for row in rows),
-        _added([row.none for row in rows]),
-        _added([row.every for row in rows]),
-        {name: _added([row.policies[name] for row in rows]) for name in rows[0].policies},
-        [_added([row.random[draw] for row in rows]) for draw in range(len(rows[0].random))],
-    )
-    return {
-        "scenes": len(rows),
-        "share_of_seats": whole.share,
-        "none": mean_iou(whole.none),
-        "all": mean_iou(whole.every),
-        **whole.as_dict(),
-    }
-
-
-def _added(parts: list[Counts]) -> Counts:
-    counts: Counts = np.sum(parts, axis=0)
-    return counts
+        raise SettingsError(f"{error}; choose another --patch or --factor, --dim or --heads") from error

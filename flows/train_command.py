@@ -13,6 +13,7 @@ from rich.table import Table
 
 from flows.progress import StageProgress
 from flows.train import TrainRequest, train_weights
+from flows.train_start import print_start
 from pipeline.errors import SettingsError
 
 
@@ -32,6 +33,8 @@ def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
 
         record = train_weights(request, report)
         progress.show(last, 1.0, ended=True)
+    if "begun_from" in record:
+        print_start(record["begun_from"], console)
     _print_figures(record, request.out, console)
     return record
 
@@ -41,6 +44,7 @@ def _check_counts(request: TrainRequest) -> None:
     counts = {
         "--steps": settings.steps, "--minutes": settings.minutes, "--batch": settings.batch, "--crop": settings.crop,
         "--scenes": request.scenes, "--patch": request.patch, "--factor": request.factor, "--columns": request.columns,
+        **{"--" + name.replace("_", "-"): size for name, size in request.tokens.items()},
     }  # fmt: skip
     for name, value in counts.items():
         if value is not None and not value > 0:
@@ -48,6 +52,10 @@ def _check_counts(request: TrainRequest) -> None:
     for name, number in {"--validation": request.validation, "--seed": settings.seed}.items():
         if number is not None and number < 0:
             raise SettingsError(f"{name} must be 0 or more, got {number}")
+    if request.positions == "paper" and request.preset not in ("two-scale", "paper"):
+        raise SettingsError(
+            f"--positions paper is not for --preset {request.preset}, which reads one scale; leave it out"
+        )
 
 
 def _command() -> str:
@@ -64,8 +72,8 @@ def _print_figures(record: dict[str, Any], out: Path, console: Console) -> None:
         return
     title = f"{figures['scenes']} validation scenes, K = {figures['share_of_seats']:.0%}"
     table = Table("placement", "mIoU", title=title)
-    table.add_row("none", f"{figures['none']:.1%}")
-    for policy in ("random", "sobel", "entropy"):
-        table.add_row(policy, f"{figures[policy]['miou']:.1%}")
-    table.add_row("all", f"{figures['all']:.1%}")
+    for name in ("none", "random", "sobel", "entropy", "all"):
+        if name in figures:  # a control has some of them
+            found = figures[name]
+            table.add_row(name, f"{found['miou'] if isinstance(found, dict) else found:.1%}")
     console.print(table)

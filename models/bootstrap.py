@@ -1,4 +1,4 @@
-"""How sure a difference of two rows is: frames drawn again and again, both rows judged on the same draw."""
+"""How sure a difference of two rows is: frames and seeds drawn again and again, both rows judged on the same draw."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pipeline.errors import ShapeError
 DRAWS = 2000
 LEVEL = 0.95
 Counts = NDArray[np.int64]
+Numbers = NDArray[np.integer]
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,15 @@ def mean_iou_of_sums(counts: NDArray[np.integer]) -> NDArray[np.float64]:
     return mean
 
 
-def paired_interval(first: Counts, second: Counts, *, draws: int = DRAWS, seed: int = 0) -> Interval:
-    """Bootstrap the difference of two rows over frames.
+def paired_interval(
+    first: Counts,
+    second: Counts,
+    *,
+    seeds: tuple[Numbers, Numbers] | None = None,
+    draws: int = DRAWS,
+    seed: int = 0,
+) -> Interval:
+    """Bootstrap the difference of two rows over frames, and over seeds of the training where there are several.
 
     Parameters
     ----------
@@ -49,22 +57,33 @@ def paired_interval(first: Counts, second: Counts, *, draws: int = DRAWS, seed: 
         (run, frame, class, class) confusion counts. A run is a seed of the training or of the placement; a row's
         figure is the mean over its runs of the mIoU of the drawn frames together. The rows may differ in runs, not in
         frames. A frame that a run did not judge is all zeros.
+    seeds
+        Of each row, which seed of the training every run is of, (run,) from 0. Seeds are drawn with replacement too;
+        rows of equally many share the draw. Without them all runs count alike.
     draws
         How many times as many frames as there are are drawn, with replacement.
 
     Raises
     ------
-    ShapeError : the rows differ in frames or classes.
+    ShapeError : the rows differ in frames or classes, or seeds are not given for every run.
     """
     if first.shape[1:] != second.shape[1:] or first.ndim != 4:
         raise ShapeError(f"expected two rows of the same frames and classes, got {first.shape} and {second.shape}")
+    of_runs = (np.zeros(len(first), np.intp), np.zeros(len(second), np.intp)) if seeds is None else seeds
+    if (len(of_runs[0]), len(of_runs[1])) != (len(first), len(second)):
+        raise ShapeError(f"expected a seed for each of {len(first)} and {len(second)} runs, got {len(of_runs[0])}")
     frames = first.shape[1]
     whole = np.ones((1, frames), np.int64)
     difference = float((_means(first, whole) - _means(second, whole))[0])
     if frames < 2:
         return Interval(difference, None, None)
-    drawn = np.random.default_rng([seed, 0xB007]).multinomial(frames, np.full(frames, 1 / frames), size=draws)
-    moved = _means(first, drawn) - _means(second, drawn)
+    drawn = _drawn(frames, draws, [seed, 0xB007])
+    often = {count: _drawn(count, draws, [seed, 0x5EED, count]) for count in {int(of.max()) + 1 for of in of_runs}}
+    one, other = (
+        _means(counts, drawn, often[int(of.max()) + 1][:, of])
+        for counts, of in zip((first, second), of_runs, strict=True)
+    )
+    moved = one - other
     moved = moved[~np.isnan(moved)]
     if not moved.size:
         return Interval(difference, None, None)
@@ -72,13 +91,21 @@ def paired_interval(first: Counts, second: Counts, *, draws: int = DRAWS, seed: 
     return Interval(difference, float(low), float(high))
 
 
-def _means(counts: Counts, times: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Mean over runs of the mIoU of frames taken ``times`` (draw, frame) each; NaN where no run has a frame."""
+def _drawn(count: int, draws: int, seed: list[int]) -> NDArray[np.int64]:
+    """How often each of ``count`` is drawn in as many goes, (draw, count)."""
+    return np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=draws)
+
+
+def _means(counts: Counts, times: Numbers, often: Numbers | None = None) -> NDArray[np.float64]:
+    """Mean over runs of the mIoU of frames taken ``times`` (draw, frame) each; NaN where no run has a frame.
+
+    ``often`` (draw, run) says how often each run counts; once, without it.
+    """
     sums = np.einsum("df,rfij->drij", times, counts)
     each = mean_iou_of_sums(sums)
-    known = ~np.isnan(each)
-    number = known.sum(axis=1)
+    share = (~np.isnan(each)) * (1 if often is None else often)
+    number = share.sum(axis=1)
     means: NDArray[np.float64] = np.divide(
-        np.where(known, each, 0.0).sum(axis=1), number, out=np.full(len(each), np.nan), where=number > 0
+        (np.nan_to_num(each) * share).sum(axis=1), number, out=np.full(len(each), np.nan), where=number > 0
     )
     return means

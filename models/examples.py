@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from pipeline.errors import SceneError
 from pipeline.grid import UNLABELLED, SceneGrid, pad_by_reflection
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
+NOISY = 0.25  # share of the crops that get the noise of a shorter exposure
 HALO = 8  # rows around a strip that the footprint reaches, a multiple of every factor up to 8
 
 
@@ -105,13 +107,16 @@ class Batch:
 
 
 class CropSampler:
-    """Draws random crops: place, flips, transposition and brightness all come from the given generator."""
+    """Draws random crops: place, flips, transposition, brightness and noise all come from the given generator."""
 
-    def __init__(self, examples: list[Example], config_patch: int, factor: int, crop: int) -> None:
+    def __init__(
+        self, examples: list[Example], config_patch: int, factor: int, crop: int, *, noise: float = 0.0
+    ) -> None:
+        """``noise`` is the most that is added, in spreads of the normalised columns."""
         cell = config_patch * factor
         smallest = min(min(example.labels.shape) for example in examples)
         self.size = max(cell, min(crop, smallest) // cell * cell)
-        self.examples, self.patch, self.factor = examples, config_patch, factor
+        self.examples, self.patch, self.factor, self.noise = examples, config_patch, factor, noise
         areas = np.array([np.count_nonzero(example.labels != UNLABELLED) for example in examples], np.float64)
         if not areas.any():
             raise SceneError(f"none of {len(examples)} scenes has a labelled pixel; training needs some")
@@ -138,6 +143,10 @@ class CropSampler:
         fine = turn(example.fine[y : y + size, x : x + size]).astype(np.float32) * gain
         shift = (gain - 1) * gain_shift
         channels_first = [np.ascontiguousarray((image + shift).transpose(2, 0, 1)) for image in (coarse, fine)]
+        if rng.random() < NOISY:  # a coarse pixel gathers s times the light of a fine one, in as many readings
+            noise = rng.uniform(0, self.noise)
+            for image, sigma in zip(channels_first, (noise / math.sqrt(s), noise), strict=True):
+                image += np.float32(sigma) * rng.standard_normal(image.shape, np.float32)
         return channels_first[0], channels_first[1], np.ascontiguousarray(turn(labels)).astype(np.int64)
 
     def _seats(self, fine: Tensor) -> Tensor:

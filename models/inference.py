@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.weights import Weights
+from models.holes import dead_pixels, fill_dead, image_of, patches_of, readable
+from models.self_attention import TokenReading, queries_kept, token_reading
+from models.sizes import PATCHES_AT_ONCE as PATCHES_AT_ONCE
+from models.sizes import SegmenterConfig
+from models.weights import AnyWeights, Weights
 from pipeline.errors import ShapeError
 from pipeline.grid import SceneGrid, pad_by_reflection
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-PATCHES_AT_ONCE = 64  # their features fit the caches; larger chunks go to memory and back at every layer
+    from models.segmenter import CoarseReading, Segmenter
+
+Precision = Literal["float32", "bfloat16"]
 
 
 @dataclass(frozen=True)
@@ -26,6 +34,23 @@ class CoarseLook:
     grid: SceneGrid
     columns: NDArray[np.float32]  # (y, x, column) normalised
     origin: tuple[int, int] = field(default=(0, 0), kw_only=True)  # row and column of the field's seat it begins at
+    living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) which are read; None: all
+
+
+@dataclass(frozen=True)
+class Read:
+    """A reading of a coarse look, by whom and of what: the fine patches go on from there."""
+
+    by: Segmenter
+    columns: NDArray[np.float32]
+    origin: tuple[int, int]
+    reading: CoarseReading
+    precision: Precision = "float32"
+
+    def fits(self, weights: Weights, look: CoarseLook, precision: Precision) -> bool:
+        """Whether these weights would read the same from this look."""
+        whose = self.by is weights.segmenter and self.columns is look.columns
+        return whose and (self.origin, self.precision) == (look.origin, precision)
 
 
 @dataclass(frozen=True)
@@ -33,6 +58,9 @@ class Glance(CoarseLook):
     """What the coarse pass alone says of a scene, on the padded coarse grid."""
 
     probability: NDArray[np.float32]  # (y, x, class)
+    gain: NDArray[np.float32] | None = field(default=None, kw_only=True)  # (seat_y, seat_x) expected [nat per px]
+    read: Read | None = field(default=None, kw_only=True, repr=False, compare=False)
+    tokens: TokenReading | None = field(default=None, kw_only=True, repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -61,7 +89,7 @@ def glance(
 
 
 def look_coarsely(
-    weights: Weights,
+    weights: AnyWeights,
     strips: Iterable[NDArray[np.floating]],
     wavelength_nm: NDArray[np.floating],
     grid: SceneGrid,
@@ -97,7 +125,20 @@ def look_coarsely(
         )
     y, x = grid.padded_shape
     padded = pad_by_reflection(columns, (y // grid.factor, x // grid.factor))
-    return CoarseLook(grid, np.ascontiguousarray(padded, np.float32), origin=origin)
+    mended, living = _without_holes(np.ascontiguousarray(padded, np.float32), weights.config)
+    return CoarseLook(grid, mended, origin=origin, living=living)
+
+
+def _without_holes(
+    columns: NDArray[np.float32], config: SegmenterConfig
+) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
+    """Coarse columns with dead pixels filled from their patch, and which tokens live (None: all)."""
+    dead = dead_pixels(columns)
+    if not dead.any():
+        return columns, None
+    patches, holes = patches_of(columns, config.patch), patches_of(dead, config.patch)
+    mended = image_of(fill_dead(patches, holes), columns.shape[1] // config.patch)
+    return np.ascontiguousarray(mended, np.float32), readable(holes, config.token_side).ravel()
 
 
 def glance_of_columns(weights: Weights, columns: NDArray[np.generic], grid: SceneGrid) -> Glance:
@@ -105,25 +146,64 @@ def glance_of_columns(weights: Weights, columns: NDArray[np.generic], grid: Scen
     return read_glance(weights, CoarseLook(grid, np.ascontiguousarray(columns, np.float32)))
 
 
-def read_glance(weights: Weights, look: CoarseLook) -> Glance:
+def read_glance(weights: Weights, look: CoarseLook, *, precision: Precision = "float32") -> Glance:
     """Read a coarse look alone."""
+    return glance_batch(weights, [look], precision=precision)[0]
+
+
+def glance_batch(weights: Weights, looks: Sequence[CoarseLook], *, precision: Precision = "float32") -> list[Glance]:
+    """Read coarse looks of any sizes, each alone, their patches packed; as ``read_glance`` one by one, but faster."""
     import torch
 
-    with torch.inference_mode():
-        logits = _read(weights, look, None, np.empty(0, np.int64))[1]
-        probability = logits[0].softmax(dim=0).permute(1, 2, 0).numpy()
-    return Glance(look.grid, look.columns, np.ascontiguousarray(probability), origin=look.origin)
+    from models.batches import packs
+
+    seen: list[Glance] = []
+    with torch.inference_mode(), _computing_in(precision):
+        for part in packs([_patches_in(look) for look in looks]):
+            with queries_kept() as queries:
+                readings = _read_coarse(weights, looks[part])
+            asked = torch.split(queries[-1], [reading.memory[-1][0].shape[2] for reading in readings], dim=2)
+            seen += [
+                _glance(weights, look, reading, [own], precision)
+                for look, reading, own in zip(looks[part], readings, asked, strict=True)
+            ]
+    return seen
 
 
-def segment(weights: Weights, seen: CoarseLook, patches: NDArray[np.floating], seats: NDArray[np.integer]) -> ClassMap:
+def _glance(
+    weights: Weights, look: CoarseLook, reading: CoarseReading, queries: list[Tensor], precision: Precision
+) -> Glance:
+    probability = np.ascontiguousarray(reading.logits[0].float().softmax(dim=0).permute(1, 2, 0).numpy())
+    gain = weights.segmenter.score(reading)[0].float().numpy()
+    tokens = token_reading(weights.segmenter, reading, queries, look.living)
+    read = Read(weights.segmenter, look.columns, look.origin, reading, precision)
+    return Glance(
+        look.grid,
+        look.columns,
+        probability,
+        origin=look.origin,
+        living=look.living,
+        gain=gain,
+        read=read,
+        tokens=tokens,
+    )
+
+
+def segment(
+    weights: Weights, seen: CoarseLook, patches: NDArray[np.floating], seats: NDArray[np.integer],
+    *, precision: Precision = "float32",
+) -> ClassMap:  # fmt: skip
     """Draw the class map from the coarse look and the fine patches.
 
     Parameters
     ----------
     patches
-        (seat, p, p, column) normalised columns of the fine pass; anything not finite counts as the median.
+        (seat, p, p, column) normalised columns of the fine pass. A dead pixel, not finite, counts as the mean of its
+        patch; a patch of which more than half is dead counts as not captured.
     seats
         (seat,) their numbers on the grid, each once.
+    precision
+        Of convolutions and matrix products; norms, softmax and the decision are float32.
 
     Returns
     -------
@@ -133,26 +213,76 @@ def segment(weights: Weights, seen: CoarseLook, patches: NDArray[np.floating], s
     ------
     ShapeError : a seat given twice or outside the grid, or patches of another shape.
     """
+    return segment_batch(weights, [seen], [patches], [seats], precision=precision)[0]
+
+
+def segment_batch(
+    weights: Weights, seen: Sequence[CoarseLook], patches: Sequence[NDArray[np.floating]],
+    seats: Sequence[NDArray[np.integer]], *, precision: Precision = "float32",
+) -> list[ClassMap]:  # fmt: skip
+    """Draw the maps of scenes of any sizes and numbers of seats together, as ``segment`` one by one, but faster.
+
+    Fine patches of all scenes are packed, nothing is padded. For the rest see ``segment``.
+    """
     import torch
 
-    grid, p = seen.grid, seen.grid.patch
-    numbers = np.asarray(seats, np.int64)
-    _check_seats(numbers, grid)
-    expected = (len(numbers), p, p, weights.config.columns)
-    if patches.shape != expected:
-        raise ShapeError(f"expected patches of shape {expected} (seat, y, x, column), got {patches.shape}")
-    with torch.inference_mode():
-        fine = torch.from_numpy(np.nan_to_num(np.asarray(patches, np.float32), nan=0.0, posinf=0.0, neginf=0.0))
-        fine_classes, coarse_logits = _read(weights, seen, fine, numbers)
-        drawn = _draw_coarse(coarse_logits, grid)
-    for (values, confidence), (y, x) in zip(fine_classes, grid.seat_origin(numbers), strict=True):
-        drawn.classes[y : y + p, x : x + p] = values
-        drawn.confidence[y : y + p, x : x + p] = confidence
-    scene = np.s_[: grid.height, : grid.width]
-    return ClassMap(drawn.classes[scene].copy(), drawn.confidence[scene].copy())
+    from models.batches import packs
+
+    scenes = [
+        (look, own, np.asarray(numbers, np.int64)) for look, own, numbers in zip(seen, patches, seats, strict=True)
+    ]
+    for look, own, numbers in scenes:
+        check_seats(numbers, look.grid)
+        expected = (len(numbers), look.grid.patch, look.grid.patch, weights.config.columns)
+        if own.shape != expected:
+            raise ShapeError(f"expected patches of shape {expected} (seat, y, x, column), got {own.shape}")
+    scenes = [(look, *_captured(own, numbers)) for look, own, numbers in scenes]
+    with torch.inference_mode(), _computing_in(precision):
+        counts = [_patches_in(look) + len(numbers) for look, _, numbers in scenes]
+        return [drawn for part in packs(counts) for drawn in _draw_pack(weights, scenes[part], precision)]
 
 
-def _check_seats(seats: NDArray[np.int64], grid: SceneGrid) -> None:
+def _draw_pack(
+    weights: Weights, pack: Sequence[tuple[CoarseLook, NDArray[np.floating], NDArray[np.int64]]], precision: Precision
+) -> Iterator[ClassMap]:
+    """Maps of scenes that are read together."""
+    import torch
+
+    from models.batches import FineScene, read_fine_packed
+
+    looks = [look for look, _, _ in pack]
+    readings = _kept_or_read(weights, looks, precision)
+    padded = [draw_coarse(reading.logits.float(), look.grid) for reading, look in zip(readings, looks, strict=True)]
+    places = ((drawn, place) for drawn, (look, _, seats) in zip(padded, pack, strict=True)
+              for place in look.grid.seat_origin(seats))  # fmt: skip
+    scenes = [
+        FineScene(reading, own, torch.from_numpy(seats), origin_of(look))
+        for reading, (look, own, seats) in zip(readings, pack, strict=True)
+    ]
+    p = weights.config.patch
+    for logits in read_fine_packed(weights.segmenter.eval(), scenes):
+        confidence, classes = (part.numpy() for part in logits.float().softmax(dim=1).max(dim=1))
+        for sure, values, (drawn, (y, x)) in zip(confidence, classes, places, strict=False):
+            drawn.classes[y : y + p, x : x + p] = values
+            drawn.confidence[y : y + p, x : x + p] = sure
+    for drawn, look in zip(padded, looks, strict=True):
+        scene = np.s_[: look.grid.height, : look.grid.width]
+        yield ClassMap(drawn.classes[scene].copy(), drawn.confidence[scene].copy())
+
+
+def _captured(
+    patches: NDArray[np.floating], seats: NDArray[np.int64]
+) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
+    """Patches that show something of their seats, dead pixels filled, and these seats."""
+    if np.isfinite(patches).all():
+        return patches, seats
+    dead = dead_pixels(patches)
+    shown = readable(dead)[:, 0]
+    return fill_dead(patches[shown], dead[shown]), seats[shown]
+
+
+def check_seats(seats: NDArray[np.int64], grid: SceneGrid) -> None:
+    """Refuse numbers that are none of the grid's seats, or given twice (ShapeError)."""
     count = grid.seat_shape[0] * grid.seat_shape[1]
     if outside := seats[(seats < 0) | (seats >= count)].tolist():
         raise ShapeError(f"seat {outside[0]} is none of the {count} seats of the scene, 0..{count - 1}")
@@ -161,7 +291,7 @@ def _check_seats(seats: NDArray[np.int64], grid: SceneGrid) -> None:
         raise ShapeError(f"seat {repeated[0]} is given more than once; give each seat one patch")
 
 
-def _check_grid(weights: Weights, grid: SceneGrid) -> None:
+def _check_grid(weights: AnyWeights, grid: SceneGrid) -> None:
     config = weights.config
     if (grid.patch, grid.factor) != (config.patch, config.factor):
         raise ShapeError(
@@ -170,32 +300,57 @@ def _check_grid(weights: Weights, grid: SceneGrid) -> None:
         )
 
 
-def _read(
-    weights: Weights, look: CoarseLook, fine: Tensor | None, seats: NDArray[np.int64]
-) -> tuple[list[tuple[NDArray[np.uint8], NDArray[np.float32]]], Tensor]:
-    """Classes and confidence of each fine patch, and the coarse logits, after one reading of both scales."""
+def _patches_in(look: CoarseLook) -> int:
+    """Coarse patches of a look."""
+    rows, columns = look.grid.seat_shape
+    return rows * columns // look.grid.factor**2
+
+
+@contextmanager
+def _computing_in(precision: Precision) -> Iterator[None]:
+    """Let convolutions and matrix products compute in a precision."""
     import torch
 
-    model = weights.segmenter.eval()
-    origin = torch.tensor([look.origin]) if any(look.origin) else None
-    view = model.view(torch.from_numpy(look.columns).permute(2, 0, 1)[None].contiguous(), origin)
-    numbers = torch.from_numpy(seats)[None]
-    chunks = [] if fine is None else list(torch.split(fine.permute(0, 3, 1, 2), PATCHES_AT_ONCE))
-    described = [model.stem(chunk.contiguous(), coarse=False) for chunk in chunks]
-    empty = torch.zeros(1, 0, model.config.dim)
-    tokens = torch.cat([token for _, token in described])[None] if described else empty
-    grid = model.encode(view, tokens, numbers, origin)
-    canvas = model.coarse_canvas(view, grid)
-    drawn: list[tuple[NDArray[np.uint8], NDArray[np.float32]]] = []
-    for number, (features, _) in zip(torch.split(numbers, PATCHES_AT_ONCE, dim=1), described, strict=False):
-        context = model.seat_context(grid, number)[0]
-        logits = model.decode_fine(features, context, model.canvas_windows(canvas, number))
-        confidence, classes = logits.softmax(dim=1).max(dim=1)
-        drawn.extend(zip(classes.to(torch.uint8).numpy(), confidence.numpy(), strict=True))
-    return drawn, model.coarse_logits(canvas)
+    if precision == "float32":
+        yield
+        return
+    with torch.autocast("cpu", dtype=torch.bfloat16), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Mismatch dtype between input and weight")  # slower, not less exact
+        yield
 
 
-def _draw_coarse(logits: Tensor, grid: SceneGrid) -> ClassMap:
+def _kept_or_read(weights: Weights, looks: Sequence[CoarseLook], precision: Precision) -> list[CoarseReading]:
+    """Readings of coarse looks. Nothing flows back from fine patches, so one that a glance kept is not made twice."""
+    kept = [_kept(weights, look, precision) for look in looks]
+    unread = [look for look, reading in zip(looks, kept, strict=True) if reading is None]
+    fresh = iter(_read_coarse(weights, unread))
+    return [next(fresh) if reading is None else reading for reading in kept]
+
+
+def _kept(weights: Weights, look: CoarseLook, precision: Precision) -> CoarseReading | None:
+    """The reading that a glance kept, if these weights would read the same."""
+    read = look.read if isinstance(look, Glance) else None
+    return read.reading if read is not None and read.fits(weights, look, precision) else None
+
+
+def _read_coarse(weights: Weights, looks: Sequence[CoarseLook]) -> list[CoarseReading]:
+    import torch
+
+    from models.batches import read_coarse_packed
+
+    images = [torch.from_numpy(look.columns).permute(2, 0, 1)[None] for look in looks]
+    living = [None if look.living is None else torch.from_numpy(look.living) for look in looks]
+    return read_coarse_packed(weights.segmenter.eval(), images, [origin_of(look) for look in looks], living)
+
+
+def origin_of(look: CoarseLook) -> Tensor | None:
+    """Seat of the field in which a look begins, (1, 2); None at the field's own corner."""
+    import torch
+
+    return torch.tensor([look.origin]) if any(look.origin) else None
+
+
+def draw_coarse(logits: Tensor, grid: SceneGrid) -> ClassMap:
     """Bring coarse logits up to the padded fine grid and decide, in strips of rows."""
     import torch
     import torch.nn.functional as F  # noqa: N812 - its usual name

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -10,21 +11,36 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.spectral import REACH, SpectralBasis
+from models.spectral import REACH, Normalisation, SpectralBasis
 
 RGB_NM = (650.0, 550.0, 450.0)
 
 
 def rgb_response(basis: SpectralBasis) -> NDArray[np.float32]:
-    """How much each spectral column says of red, green and blue (650, 550, 450 nm), (3, column), rows summing to 1.
+    """How much each spectral column says of red, green and blue (650, 550, 450 nm), (3, column), rows summing to 1."""
+    return wavelength_response(basis, RGB_NM)
 
-    A colour outside the basis takes its nearest end: data without blue show red there.
+
+def wavelength_response(basis: SpectralBasis, wavelength_nm: Sequence[float]) -> NDArray[np.float32]:
+    """How much each spectral column says of the light at some wavelengths, (wavelength, column), rows summing to 1.
+
+    A wavelength outside the basis takes its nearest end: data without blue show red there.
     """
     centres = np.linspace(basis.low_nm, basis.high_nm, basis.columns)
-    wanted = np.clip(RGB_NM, basis.low_nm, basis.high_nm)
+    wanted = np.clip(wavelength_nm, basis.low_nm, basis.high_nm)
     distance = np.abs(wanted[:, None] - centres[None, :]) / basis.spacing_nm
     bump = np.where(distance <= REACH, np.exp(-0.5 * (distance / 0.5) ** 2), 0.0)
     return np.asarray(bump / bump.sum(axis=1, keepdims=True), np.float32)
+
+
+def mixed_channels(normalisation: Normalisation, response: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Mix normalised columns to channels by a response (channel, column), (column, channel).
+
+    The median of the training data becomes 0 in every channel, one spread more of all columns 1.
+    """
+    exact = response.astype(np.float64)
+    undo = np.linalg.inv(normalisation.whitening.astype(np.float64)) * normalisation.spread
+    return np.asarray(undo @ exact.T / (exact @ normalisation.spread), np.float32)
 
 
 def map_rgb_kernel(kernel: Tensor, response: NDArray[np.floating]) -> Tensor:

@@ -70,9 +70,9 @@ def kappa(counts: NDArray[np.int64]) -> float:
 
 
 def gap_closed(reached: float, none: float, all_seats: float) -> float | None:
-    """Share of the way from no fine seat to every fine seat; None where that way is under one point."""
+    """Share of the way from no fine seat to every fine seat; None where that way is not one point up or more."""
     way = all_seats - none
-    return None if not abs(way) >= 0.01 else (reached - none) / way
+    return (reached - none) / way if way >= 0.01 else None  # NaN is None too
 
 
 def frequency_weighted_iou(counts: NDArray[np.int64]) -> float:

@@ -65,18 +65,16 @@ def _logits_of_seats(
     model, valid = weights.segmenter.eval(), seen.grid.valid_seats()
     chunks = [valid[first : first + PATCHES_AT_ONCE] for first in range(0, len(valid), PATCHES_AT_ONCE)]
     with torch.inference_mode():
-        view = model.view(torch.from_numpy(seen.columns).permute(2, 0, 1)[None].contiguous())
-        described = [model.stem(_patches(fine, chunk), coarse=False) for chunk in chunks]
+        reading = model.read_coarse(torch.from_numpy(seen.columns).permute(2, 0, 1)[None].contiguous())
+        described = [model.fine_stem(_patches(fine, chunk)) for chunk in chunks]
         tokens = torch.cat([token for _, token in described])[None]
         numbers = torch.from_numpy(valid.astype(np.int64))[None]
-        grid = model.encode(view, tokens, numbers)
-        canvas = model.coarse_canvas(view, grid)
+        read = torch.split(model.encode_fine(reading, tokens, numbers)[0], PATCHES_AT_ONCE)
         alone = torch.from_numpy(seen.probability).permute(2, 0, 1)[None].clamp_min(1e-30).log()
-        for chunk, (features, _) in zip(chunks, described, strict=True):
+        for chunk, token, (features, _) in zip(chunks, read, described, strict=True):
             number = torch.from_numpy(chunk.astype(np.int64))[None]
-            context = model.seat_context(grid, number)[0]
-            after = model.decode_fine(features, context, model.canvas_windows(canvas, number))
-            before = model.canvas_windows(alone, number)
+            after = model.decode_fine(features, token, model.canvas_windows(reading.canvas, number))
+            before = model.seat_windows(alone, number)
             yield chunk, before.numpy(), after.numpy()
 
 

@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 
 from models.inference import CoarseLook, Glance
 from models.saliency import fine_grained, spectral_residual
+from models.self_attention import attention_of_seats
 from models.spacing import centre_scores, random_scores, stratified_scores, uniform_scores
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.grid import SceneGrid
 
 Scores = NDArray[np.float64]
 POLICIES = (
-    "entropy", "margin", "sobel", "saliency", "spectral-residual", "random", "stratified", "centre", "uniform", "mask",
-    "vgg-static",
+    "gain", "entropy", "margin", "sobel", "saliency", "spectral-residual", "random", "stratified", "centre", "uniform",
+    "mask", "vgg-static", "vgg-trained", "self-attention",
 )  # fmt: skip
 
 
@@ -37,18 +38,25 @@ def score_seats(
     Parameters
     ----------
     policy
-        By the glance's classes: ``entropy``, or ``margin``, 1 less what the likeliest is ahead of the next. By the
-        coarse image: ``sobel`` edges (the paper's ED), ``saliency`` (fine-grained) or ``spectral-residual``. By place:
-        ``random`` and ``stratified``, by ``seed``, the ``centre`` first, or ``uniform``, a grid. Or ``mask``: a given
-        (y, x) image of the scene's size (the paper's fixed attention policy), in which NaN counts as 0.
-        Or ``vgg-static``, the paper's SA: the greatest saliency of the seat's coarse pixels to ``network``.
+        What the weights expect a look to gain: ``gain``. How much of the encoder's own attention the place receives:
+        ``self-attention``. By the glance's classes: ``entropy``, or ``margin``, 1 less what the likeliest is ahead of
+        the next. By the coarse image: ``sobel`` edges (the paper's ED), ``saliency`` (fine-grained) or
+        ``spectral-residual``. By place: ``random`` and ``stratified``, by ``seed``, the ``centre`` first, or
+        ``uniform``, a grid. Or ``mask``: a given (y, x) image of the scene's size (the paper's fixed attention
+        policy), in which NaN counts as 0.
+        Or the greatest saliency of the seat's coarse pixels to ``network``: ``vgg-static``, the paper's SA, by
+        photographs, or ``vgg-trained``, its TA, by a network that learned from data of one's own.
 
     Raises
     ------
     SettingsError : an unknown policy, ``mask`` without a mask, or saliency without OpenCV's contrib modules.
     ShapeError : a mask of another size than the scene's.
     """
-    if policy in _PLACE_SCORES:
+    if policy == "gain":
+        scores = _expected_gain(seen)
+    elif policy == "self-attention":
+        scores = _received_attention(seen)
+    elif policy in _PLACE_SCORES:
         scores = _PLACE_SCORES[policy](seen.grid, seed)
     elif policy == "mask":
         scores = _mask_scores(seen, mask)
@@ -57,7 +65,7 @@ def score_seats(
     elif policy in _IMAGE_SCORES:
         scores = _seat_means(_on_the_scene(_IMAGE_SCORES[policy], seen), seen)
     elif policy in NETWORK_POLICIES:
-        scores = _network_scores(seen, network)
+        scores = _network_scores(policy, seen, network)
     else:
         raise SettingsError(f"unknown policy {policy!r}; choose one of {', '.join(POLICIES)}")
     share = seen.grid.valid_share()
@@ -72,6 +80,18 @@ def pixel_entropy(probability: NDArray[np.floating]) -> NDArray[np.float64]:
     exact = probability.astype(np.float64)
     entropy: NDArray[np.float64] = -xlogy(exact, exact).sum(axis=-1)
     return entropy
+
+
+def _expected_gain(seen: Glance) -> Scores:
+    if seen.gain is None:
+        raise SettingsError("the policy 'gain' asks the weights, and nothing was read with them")
+    return seen.gain.astype(np.float64)
+
+
+def _received_attention(seen: Glance) -> Scores:
+    if seen.tokens is None:
+        raise SettingsError("the policy 'self-attention' asks the weights, and nothing was read with them")
+    return attention_of_seats(seen.tokens, seen.grid.seat_shape, seen.grid.factor)
 
 
 def _entropy(seen: Glance) -> NDArray[np.float64]:
@@ -116,9 +136,9 @@ _PLACE_SCORES: dict[str, Callable[[SceneGrid, int], Scores]] = {
     "uniform": uniform_scores,
 }
 NetworkScore = Callable[[CoarseLook], NDArray[np.float64]]  # (y, x) of the padded coarse grid
-NETWORK_POLICIES = ("vgg-static",)  # by the coarse image alone, through a network of the user's
+NETWORK_POLICIES = ("vgg-static", "vgg-trained")  # by the coarse image alone, through a network of the user's
 # by what lies around each pixel: a large field may be scored in parts
-SEEING_POLICIES = (*_PIXEL_SCORES, *NETWORK_POLICIES)
+SEEING_POLICIES = ("gain", "self-attention", *_PIXEL_SCORES, *NETWORK_POLICIES)
 IMAGE_POLICIES = tuple(_IMAGE_SCORES)  # by the coarse image of the whole field at once; the glance is not needed
 SEEDED_POLICIES = ("random", "stratified")
 
@@ -141,10 +161,10 @@ def _scene_share(size: tuple[int, int], factor: int, shape: tuple[int, ...]) -> 
     return share
 
 
-def _network_scores(seen: Glance, network: NetworkScore | None) -> Scores:
+def _network_scores(policy: str, seen: Glance, network: NetworkScore | None) -> Scores:
     """The greatest of the coarse pixels of each seat that lie on the scene, as the paper pools."""
     if network is None:
-        raise SettingsError("the policy 'vgg-static' needs --vgg FILE, the weights of VGG19")
+        raise SettingsError(f"the policy {policy!r} needs --vgg FILE, the weights of VGG19")
     grid, cells = seen.grid, seen.grid.patch // seen.grid.factor
     pixels = network(seen)
     there = _scene_share((grid.height, grid.width), grid.factor, pixels.shape) > 0

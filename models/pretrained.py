@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from models.kernel_fits import map_rgb_kernel, resize_patch_kernel, resize_positions
+from models.spectral import checked_wavelengths
 from models.state_files import read_state
-from models.vgg import VggFeatures, common_names
+from models.vgg import WAVELENGTHS, VggFeatures, common_names
 from models.vgg_sizes import VggSizes
-from pipeline.errors import WeightsError
+from pipeline.errors import WavelengthError, WeightsError
 
 PATCHES, POSITIONS = "patch_embed.proj.weight", "pos_embed"
 TOKENS = ("cls_token", "dist_token")
@@ -29,6 +30,10 @@ _UNUSED = {
     "head_dist": "a classifier of photographs",
     "classifier": "a classifier of photographs",
     "pre_logits": "a classifier of photographs",
+    "patch_embed": "a kernel of whole patches of colours",
+    "pos_embed": "positions on a grid of its own",
+    "cls_token": "a token of the whole image",
+    "dist_token": "a token of the whole image",
     "decoder": "a decoder for its own classes",
     "decode_head": "a decoder for its own classes",
 }
@@ -141,22 +146,40 @@ def _fit_patches(value: Tensor, shape: torch.Size, response: NDArray[np.floating
 
 def _nothing_fits(state: Mapping[str, Tensor], report: LoadReport) -> str:
     shown = ", ".join(f"{name} {tuple(value.shape)}" for name, value in list(state.items())[:4])
-    reasons = "; ".join(sorted(set(report.skipped.values()))[:3])
+    expected = set(_UNUSED.values())  # of such files: what else is wrong comes first
+    reasons = "; ".join(sorted(set(report.skipped.values()), key=lambda why: (why in expected, why))[:3])
     found = f"found {shown or 'nothing'} ({reasons})"
     return f"none of {len(state)} tensors fits the network: {found}; use weights made for it"
 
 
-def load_vgg(path: Path, sizes: VggSizes | None = None) -> tuple[VggFeatures, LoadReport]:
+def load_vgg(path: Path, sizes: VggSizes | None = None, *, trained: bool = False) -> tuple[VggFeatures, LoadReport]:
     """Read VGG19's convolutions: torchvision's file, the stack alone, or the normalised variant.
+
+    Parameters
+    ----------
+    trained
+        On data of one's own: then it may read any number of channels, and a tensor ``wavelength_nm`` in the file, one
+        number for each, says where they lie.
 
     Raises
     ------
-    WeightsError : as `read_state`, or a convolution is missing or of another size: another network, such as VGG16.
+    WeightsError : as `read_state`, or a convolution is missing or of another size: another network, such as VGG16;
+        or other channels than photographs have, or wavelengths that do not belong to them.
     """
-    network = VggFeatures(sizes)
+    sizes = sizes or VggSizes()
     state = read_state(path)
+    wavelengths = state.pop(WAVELENGTHS, None) if trained else None
+    state = common_names(state, sizes)
+    channels = _channels(state)
+    if channels != 3 and not trained:
+        raise WeightsError(
+            f"{path} reads {channels} channels, a VGG19 of photographs 3; one trained on such data is for the"
+            " policy vgg-trained"
+        )
+    named = None if wavelengths is None else _wavelengths(wavelengths, channels, path)
+    network = VggFeatures(replace(sizes, channels=channels), named)
     try:
-        report = load_into(network, common_names(state, network.sizes))
+        report = load_into(network, state)
     except WeightsError as error:
         raise WeightsError(f"{path} is no VGG19: {error}") from error
     if report.missing:
@@ -165,3 +188,16 @@ def load_vgg(path: Path, sizes: VggSizes | None = None) -> tuple[VggFeatures, Lo
             f" first {report.missing[0]} ({report}); give VGG19 without batch normalisation"
         )
     return network.requires_grad_(False).eval(), report
+
+
+def _channels(state: Mapping[str, Tensor]) -> int:
+    """What the first convolution reads; 3 where there is none, which loading refuses."""
+    first = state.get("features.0.weight")
+    return 3 if first is None or first.dim() != 4 else int(first.shape[1])
+
+
+def _wavelengths(tensor: Tensor, channels: int, path: Path) -> tuple[float, ...]:
+    try:
+        return tuple(checked_wavelengths(tensor.double().numpy(), channels).tolist())
+    except WavelengthError as error:
+        raise WeightsError(f"{path}, tensor {WAVELENGTHS!r}: {error}") from error

@@ -179,12 +179,17 @@ def region_bytes(config: SegmenterConfig, region: Region, seats: int, bands: int
     the stores, some rows or patches at a time.
     """
     p, s = config.patch, config.factor
-    features = 4 * sum(width * (p >> level) ** 2 for level, width in enumerate(level_widths(config.width, p)))
+    coarse, features = (_feature_bytes(width, p) for width in (config.coarse_width, config.width))
     rows, columns = region.grid.seat_shape
     cells = rows * columns // s**2
     patch = features + (SEAT_COPIES * 4 * config.columns + 16) * p**2
     strip = max(min(STRIP_ROWS, region.coarse.shape[0]) * region.coarse.shape[1], min(PATCHES_READ, seats) * p**2)
-    return CELL_COPIES * features * cells + patch * seats + STRIP_COPIES * 4 * bands * strip
+    return CELL_COPIES * coarse * cells + patch * seats + STRIP_COPIES * 4 * bands * strip
+
+
+def _feature_bytes(width: int, patch: int) -> int:
+    """What the features of one patch take at all levels [bytes]."""
+    return 4 * sum(channels * (patch >> level) ** 2 for level, channels in enumerate(level_widths(width, patch)))
 
 
 def most_bytes(config: SegmenterConfig, regions: Sequence[Region], seats: NDArray[np.integer], bands: int) -> int:

@@ -1,64 +1,68 @@
 """The two-scale segmenter: coarse patches everywhere, fine patches where captured, one class map.
 
 Shapes: B scenes of H x W fine px, padded to whole cells of p * s px; coarse image H/s x W/s; seats (H/p) x (W/p);
-coarse patches (H/ps) x (W/ps), each p x p coarse px. J spectral columns, d token width, K fine patches a scene.
+coarse patches (H/ps) x (W/ps), each p x p coarse px. J spectral columns, d token width, K fine patches a scene, m
+tokens a side of a patch.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
-from models.encoder import Encoder
+from models.encoder import Encoder, Memory
 from models.patches import PatchHead, PatchStem, Residual
+from models.scorer import SeatScorer
 from models.sizes import SegmenterConfig as SegmenterConfig
 from models.sizes import level_widths
-from models.tokens import TokenSet, code_1d, code_2d, paper_numbers
+from models.tokens import code_1d, code_2d, paper_numbers
 
 
 @dataclass(frozen=True)
-class CoarseView:
-    """What the coarse patches alone say: features of each level, and tokens with their places."""
+class CoarseReading:
+    """What the coarse pass alone says; fine patches read it and change nothing of it."""
 
-    features: list[Tensor]  # (B * coarse patches, c, y, x), finest first
-    tokens: TokenSet
-    rows: int  # of coarse patches
-    columns: int
+    canvas: Tensor  # (B, c, H/s, W/s) features of every coarse pixel
+    logits: Tensor  # (B, classes, H/s, W/s)
+    memory: list[Memory]  # of the coarse tokens, one entry a layer
+    columns: int  # of coarse patches
 
 
 class Segmenter(nn.Module):
-    """See the module. ``forward`` is for training; inference calls the steps (models.inference)."""
+    """See the module. ``read_coarse`` is the glance, ``read_fine`` the second look."""
 
     def __init__(self, config: SegmenterConfig) -> None:
         super().__init__()
         self.config = config
-        widths = level_widths(config.width, config.patch)
-        self.stem = PatchStem(config.columns, widths, config.dim)
-        self.scale_code = nn.Parameter(torch.zeros(2, config.dim))
-        self.encoder = Encoder(config.dim, config.layers, config.heads, config.mlp_ratio)
-        self.token_gate = nn.Linear(2 * config.dim, config.dim)
-        self.seat_mix = nn.Conv2d(config.dim, config.dim, 3, padding=1, groups=config.dim)
-        self.coarse_head = PatchHead(widths, config.dim)
-        self.fine_head = PatchHead(widths, config.dim)
-        self.coarse_mix = Residual(config.width)
+        side, dim = config.token_side, config.dim
+        fine, coarse = (level_widths(width, config.patch) for width in (config.width, config.coarse_width))
+        kernel = config.patch // side if config.patch_kernel else 0
+        self.coarse_stem = PatchStem(config.columns, coarse, dim, side, kernel)
+        self.fine_stem = PatchStem(config.columns, fine, dim, side, kernel)
+        self.scale_code = nn.Parameter(torch.zeros(2, dim))
+        self.encoder = Encoder(dim, config.layers, config.heads, config.mlp_ratio)
+        self.coarse_head = PatchHead(coarse, dim, side)
+        self.fine_head = PatchHead(fine, dim, side)
+        self.coarse_mix = Residual(config.coarse_width)
+        self.coarse_classes = nn.Conv2d(config.coarse_width, config.classes, 1)
+        self.under = nn.Conv2d(config.coarse_width, config.width, 1)
         self.pixel_gate = nn.Conv2d(2 * config.width, config.width, 1)
         self.fine_mix = Residual(config.width)
-        self.coarse_classes = nn.Conv2d(config.width, config.classes, 1)
         self.fine_classes = nn.Conv2d(config.width, config.classes, 1)
+        self.scorer = SeatScorer(config)
 
     def forward(
-        self, view: CoarseView, fine: Tensor, seats: Tensor, origin: Tensor | None = None
+        self, coarse: Tensor, fine: Tensor, seats: Tensor, origin: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Classify a batch of scenes whose coarse patches are described already.
+        """Classify a batch of scenes.
 
         Parameters
         ----------
-        view
-            ``self.view(coarse, origin)``.
+        coarse
+            (B, J, H/s, W/s) normalised columns.
         fine
             (B, K, J, p, p) normalised columns of the captured seats.
         seats
@@ -70,106 +74,118 @@ class Segmenter(nn.Module):
         -------
         Logits of the coarse image (B, classes, H/s, W/s) and of the fine patches (B, K, classes, p, p).
         """
-        b, k = seats.shape
-        p, dim = self.config.patch, self.config.dim
-        if k == 0:  # the glance; convolutions take an empty batch forward but not backward
-            canvas = self.coarse_canvas(view, self.encode(view, fine.new_zeros(b, 0, dim), seats, origin))
-            return self.coarse_logits(canvas), fine.new_zeros(b, 0, self.config.classes, p, p)
-        features, tokens = self.stem(fine.flatten(0, 1), coarse=False)
-        grid = self.encode(view, tokens.view(b, k, dim), seats, origin)
-        canvas = self.coarse_canvas(view, grid)
-        context = self.seat_context(grid, seats)
-        patches = self.decode_fine(features, context.flatten(0, 1), self.canvas_windows(canvas, seats))
-        return self.coarse_logits(canvas), patches.view(b, k, *patches.shape[1:])
+        reading = self.read_coarse(coarse, origin)
+        return reading.logits, self.read_fine(reading, fine, seats, origin)
 
-    def view(self, coarse: Tensor, origin: Tensor | None = None) -> CoarseView:
-        """Cut the coarse image into patches and describe each one."""
-        p, s = self.config.patch, self.config.factor
+    def read_coarse(self, coarse: Tensor, origin: Tensor | None = None) -> CoarseReading:
+        """Read the coarse image alone."""
+        rows, columns = (size // self.config.patch for size in coarse.shape[2:])
+        features, tokens = self.coarse_stem(self.coarse_patches(coarse))
+        read, memory = self.encoder(self.code_coarse(tokens, rows, columns, origin))
+        image = self.coarse_head(features, read.view(tokens.shape))
+        return self.reading_of(image, memory, rows, columns)
+
+    def coarse_patches(self, coarse: Tensor) -> Tensor:
+        """Cut coarse images into patches, (B, J, H/s, W/s) -> (B * patches, J, p, p), row by row."""
+        p = self.config.patch
         b, j, y, x = coarse.shape
-        rows, columns = y // p, x // p
-        patches = coarse.view(b, j, rows, p, columns, p).permute(0, 2, 4, 1, 3, 5).reshape(-1, j, p, p)
-        features, tokens = self.stem(patches, coarse=True)
-        cells = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).to(coarse.device).double()
-        yx = ((cells + 0.5) * s).expand(b, -1, -1)
-        placed = self._token_set(tokens.view(b, rows * columns, self.config.dim), yx, 0, columns, origin)
-        return CoarseView(features, placed, rows, columns)
+        return coarse.view(b, j, y // p, p, x // p, p).permute(0, 2, 4, 1, 3, 5).reshape(-1, j, p, p)
 
-    def _token_set(self, x: Tensor, yx: Tensor, fine: int, columns: int, origin: Tensor | None) -> TokenSet:
-        s = self.config.factor
-        level = torch.full(x.shape[:2], 0.0 if fine else math.log2(s), device=x.device)
-        placed = yx if origin is None else yx + origin[:, None, :].double()
-        if self.config.positions == "paper":
-            coarse = torch.full(x.shape[:2], 1.0 - fine, device=x.device)
-            code = code_1d(paper_numbers(yx, coarse, columns, s), self.config.dim)
-        else:
-            code = code_2d(placed, self.config.dim)
-        coded = x + code.to(x.dtype) + self.scale_code[fine]
-        return TokenSet(coded, placed, level, torch.ones(x.shape[:2], dtype=torch.bool, device=x.device))
+    def code_coarse(self, tokens: Tensor, rows: int, columns: int, origin: Tensor | None = None) -> Tensor:
+        """Tokens of ``rows`` x ``columns`` coarse patches a scene, (B * P, m^2, d), with codes, (B, P m^2, d)."""
+        cells = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).to(tokens.device)
+        patches = tokens.view(-1, rows * columns, *tokens.shape[1:])
+        return self._coded(patches, cells.expand(len(patches), -1, -1), columns, origin, fine=False)
 
-    def encode(self, view: CoarseView, fine: Tensor, seats: Tensor, origin: Tensor | None = None) -> Tensor:
-        """Read coarse and fine tokens together; give the seat grid (B, d, rows, columns).
+    def reading_of(self, features: Tensor, memory: list[Memory], rows: int, columns: int) -> CoarseReading:
+        """Put the features of coarse patches, (B * P, c, p, p), together to what is known of the images."""
+        p, width = self.config.patch, self.config.coarse_width
+        cells = features.view(-1, rows, columns, width, p, p).permute(0, 1, 4, 2, 5, 3)
+        image = cells.reshape(-1, rows * p, columns * p, width).permute(0, 3, 1, 2)  # channels last, as convolved
+        canvas = self.coarse_mix(image)
+        return CoarseReading(canvas, self.coarse_classes(F.gelu(canvas)), memory, columns)
 
-        The grid is the coarse tokens brought up bilinearly; each fine token enters at its seat through a gate.
+    def score(self, reading: CoarseReading) -> Tensor:
+        """Tell what a fine look at each seat would gain, (B, H/p, W/p) [nat per px]."""
+        gain: Tensor = self.scorer(reading.canvas, reading.logits)
+        return gain
+
+    def read_fine(self, reading: CoarseReading, fine: Tensor, seats: Tensor, origin: Tensor | None = None) -> Tensor:
+        """Logits of the fine patches, (B, K, classes, p, p), from their own pixels and what the glance saw."""
+        b, k = seats.shape
+        p = self.config.patch
+        if k == 0:  # convolutions take an empty batch forward but not backward
+            return fine.new_zeros(b, 0, self.config.classes, p, p)
+        features, tokens = self.fine_stem(fine.flatten(0, 1))
+        read = self.encode_fine(reading, tokens.view(b, k, *tokens.shape[1:]), seats, origin)
+        logits = self.decode_fine(features, read.flatten(0, 1), self.canvas_windows(reading.canvas, seats))
+        return logits.view(b, k, *logits.shape[1:])
+
+    def encode_fine(
+        self, reading: CoarseReading, tokens: Tensor, seats: Tensor, origin: Tensor | None = None
+    ) -> Tensor:
+        """Let the tokens of fine patches, (B, K, m^2, d), read the coarse ones and each other."""
+        coded = self.code_fine(tokens, seats, reading.columns, origin)
+        read: Tensor = self.encoder(coded, reading.memory)[0]
+        return read.view(tokens.shape)
+
+    def code_fine(self, tokens: Tensor, seats: Tensor, columns: int, origin: Tensor | None = None) -> Tensor:
+        """Tokens of fine patches, (B, K, m^2, d), with their codes, (B, K m^2, d)."""
+        across = columns * self.config.factor
+        places = torch.stack([seats // across, seats % across], dim=-1)
+        return self._coded(tokens, places, columns, origin, fine=True)
+
+    def _coded(self, tokens: Tensor, places: Tensor, columns: int, origin: Tensor | None, *, fine: bool) -> Tensor:
+        """Tokens with the codes of their scale and place, (B, P, m^2, d) -> (B, P m^2, d).
+
+        ``places`` (B, P, 2) are rows and columns of patches: of seats where ``fine``, else of coarse patches.
         """
-        s = self.config.factor
-        rows, columns = view.rows * s, view.columns * s
-        yx = torch.stack([seats // columns, seats % columns], dim=-1).double() + 0.5
-        tokens = view.tokens.joined(self._token_set(fine, yx, 1, view.columns, origin))
-        mixed = self.encoder(tokens.x, tokens.scale, tokens.valid)
-        b, count = seats.shape[0], view.rows * view.columns
-        low = mixed[:, :count].transpose(1, 2).reshape(b, self.config.dim, view.rows, view.columns)
-        grid = F.interpolate(low, scale_factor=s, mode="bilinear", align_corners=False)
-        flat = grid.flatten(2).transpose(1, 2)
-        index = seats[..., None].expand(-1, -1, flat.shape[-1])
-        here, token = flat.gather(1, index), mixed[:, count:]
-        gate = torch.sigmoid(self.token_gate(torch.cat([here, token], dim=-1)))
-        flat = flat.scatter(1, index, (here + gate * (token - here)).to(flat.dtype))
-        grid = flat.transpose(1, 2).reshape(b, self.config.dim, rows, columns)
-        mixed_seats: Tensor = grid + self.seat_mix(grid)
-        return mixed_seats
-
-    def seat_context(self, grid: Tensor, seats: Tensor) -> Tensor:
-        """Read the seat grid at the given seats, (B, K, d)."""
-        flat = grid.flatten(2).transpose(1, 2)
-        return flat.gather(1, seats[..., None].expand(-1, -1, flat.shape[-1]))
-
-    def coarse_canvas(self, view: CoarseView, grid: Tensor) -> Tensor:
-        """Features of every coarse pixel, mixed across patch borders, (B, c, H/s, W/s)."""
-        p, s = self.config.patch, self.config.factor
-        context = F.avg_pool2d(grid, s).flatten(2).transpose(1, 2).flatten(0, 1)
-        patches = self.coarse_head(view.features, context)
-        b, c = grid.shape[0], patches.shape[1]
-        image = patches.view(b, view.rows, view.columns, c, p, p).permute(0, 3, 1, 4, 2, 5)
-        canvas: Tensor = self.coarse_mix(image.reshape(b, c, view.rows * p, view.columns * p))
-        return canvas
-
-    def coarse_logits(self, canvas: Tensor) -> Tensor:
-        """Class logits of every coarse pixel."""
-        logits: Tensor = self.coarse_classes(F.gelu(canvas))
-        return logits
+        side, step = self.config.token_side, 1 if fine else self.config.factor
+        within = (torch.arange(side, device=places.device).double() + 0.5) / side
+        inside = torch.cartesian_prod(within, within).view(-1, 2)
+        yx = (places.double()[:, :, None] + inside) * step  # centres in seat units, (B, P, m^2, 2)
+        if self.config.positions == "paper":
+            scale = torch.full(yx.shape[:-1], 0.0 if fine else 1.0, device=yx.device)
+            code = code_1d(paper_numbers(yx, scale, columns, self.config.factor), self.config.dim)
+        else:
+            code = code_2d(yx if origin is None else yx + origin[:, None, None].double(), self.config.dim)
+        coded: Tensor = tokens + code + self.scale_code[int(fine)]
+        return coded.flatten(1, 2)
 
     def canvas_windows(self, canvas: Tensor, seats: Tensor) -> Tensor:
-        """The coarse features under each seat, brought up to fine pixels, (B * K, c, p, p).
+        """The coarse features under each seat at the width of the fine ones, (B * K, width, p, p)."""
+        return self.bring_up(self.under(self.around_seats(canvas, seats)))
 
-        Equal to the window of the whole canvas brought up bilinearly, without making that.
+    def seat_windows(self, image: Tensor, seats: Tensor) -> Tensor:
+        """The window of each seat of a coarse image, (B, c, H/s, W/s) -> (B * K, c, p, p).
+
+        Equal to the window of the whole image brought up bilinearly, without making that.
         """
+        return self.bring_up(self.around_seats(image, seats))
+
+    def around_seats(self, image: Tensor, seats: Tensor) -> Tensor:
+        """The coarse pixels under each seat and one more on every side, (B * K, c, p/s + 2, p/s + 2)."""
         p, s = self.config.patch, self.config.factor
         cells = p // s
-        padded = F.pad(canvas, (1, 1, 1, 1), mode="replicate")
-        columns = canvas.shape[-1] // cells
-        reach = torch.arange(cells + 2, device=canvas.device)
+        padded = F.pad(image, (1, 1, 1, 1), mode="replicate")
+        columns = image.shape[-1] // cells
+        reach = torch.arange(cells + 2, device=image.device)
         y = (seats // columns * cells)[..., None] + reach  # (B, K, cells + 2)
         x = (seats % columns * cells)[..., None] + reach
-        scene = torch.arange(seats.shape[0], device=canvas.device)[:, None, None, None]
+        scene = torch.arange(seats.shape[0], device=image.device)[:, None, None, None]
         windows = padded.permute(0, 2, 3, 1)[scene, y[..., :, None], x[..., None, :]]
-        windows = windows.flatten(0, 1).permute(0, 3, 1, 2)
+        return windows.flatten(0, 1).permute(0, 3, 1, 2)
+
+    def bring_up(self, windows: Tensor) -> Tensor:
+        """Bring windows of ``around_seats`` up to fine pixels, (P, c, p/s + 2, p/s + 2) -> (P, c, p, p)."""
+        p, s = self.config.patch, self.config.factor
         return F.interpolate(windows, scale_factor=s, mode="bilinear", align_corners=False)[..., s : s + p, s : s + p]
 
-    def decode_fine(self, features: list[Tensor], context: Tensor, under: Tensor) -> Tensor:
-        """Class logits of fine patches from their own pixels, their context and the coarse features under them."""
-        own = self.fine_head(features, context)
+    def decode_fine(self, features: list[Tensor], tokens: Tensor, under: Tensor) -> Tensor:
+        """Class logits of fine patches from their own pixels, their tokens and the coarse features under them."""
+        own = self.fine_head(features, tokens)
         gate = torch.sigmoid(self.pixel_gate(torch.cat([own, under], dim=1)))
-        logits: Tensor = self.fine_classes(F.gelu(self.fine_mix(under + gate * (own - under))))
+        logits: Tensor = self.fine_classes(F.gelu(self.fine_mix(torch.lerp(under, own, gate))))
         return logits
 
     def composite(self, coarse_logits: Tensor, fine_logits: Tensor, seats: Tensor) -> Tensor:

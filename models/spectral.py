@@ -60,6 +60,33 @@ class SpectralBasis:
         return (weight / np.where(reached, total, 1.0)).astype(np.float32), reached
 
 
+def project(values: NDArray[np.floating], matrix: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Bring (..., band) values onto columns, (..., column), by the weights of `SpectralBasis.matrix`.
+
+    Bands of a pixel that are not finite are left out and the rest of a column's bands weigh for them; a column of which
+    no band is left is NaN, and so is every column of a pixel with more than half of its bands dead.
+    """
+    exact = np.asarray(values, np.float32)
+    with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is mended afterwards
+        seen = np.asarray(exact @ matrix, np.float32)
+    broken = ~np.isfinite(exact).all(axis=-1)
+    if broken.any():
+        seen[broken] = _of_living_bands(exact[broken], matrix)
+    return seen
+
+
+def _of_living_bands(values: NDArray[np.float32], matrix: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(pixel, band) -> (pixel, column) by the finite bands alone."""
+    living = np.isfinite(values)
+    weight = living.astype(np.float32) @ matrix
+    whole = matrix.sum(axis=0) > 0
+    total = np.where(living, values, np.float32(0)) @ matrix
+    mean: NDArray[np.float32] = np.divide(total, weight, out=np.zeros_like(weight), where=weight > 0)
+    mean[(weight <= 0) & whole] = np.nan
+    mean[2 * living.sum(axis=1) < values.shape[1]] = np.nan
+    return mean
+
+
 def checked_wavelengths(wavelength_nm: NDArray[np.floating], bands: int) -> NDArray[np.float64]:
     """Return the wavelengths as float64 after checking number, finiteness and unit; raises WavelengthError."""
     wavelength = np.asarray(wavelength_nm, np.float64)
@@ -111,16 +138,28 @@ class Normalisation:
         return Normalisation(centre.astype(np.float32), spread.astype(np.float32), whitening.astype(np.float32))
 
     def apply(self, columns: NDArray[np.floating], reached: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """(..., column) -> the same shape; values that are not finite count as the median.
+        """(..., column) -> the same shape; columns that are unreached or not finite take what the others let expect.
 
-        Unreached columns take what the reached ones let expect. Left at the median they would stand out among
-        neighbours that they nearly repeat, and whitening would make that larger than everything else.
+        Left at the median they would stand out among neighbours that they nearly repeat, and whitening would make that
+        larger than everything else. A pixel without a known column counts as the median.
         """
         normal = (np.asarray(columns, np.float32) - self.centre) / self.spread
-        known = np.where(reached & np.isfinite(normal), normal, np.float32(0))
-        if reached.any() and not reached.all():
-            known[..., ~reached] = known[..., reached] @ self._expectation(reached)
-        return known @ self.whitening
+        there = reached & np.isfinite(normal)
+        known = np.where(there, normal, np.float32(0))
+        alike = (there == reached).all(axis=-1)
+        self._complete(known, alike, reached)
+        broken = there[~alike]
+        for pattern in np.unique(broken, axis=0):
+            self._complete(known, np.asarray(~alike & (there == pattern).all(axis=-1), np.bool_), pattern)
+        return np.asarray(known @ self.whitening, np.float32)
+
+    def _complete(self, known: NDArray[np.float32], pixels: NDArray[np.bool_], reached: NDArray[np.bool_]) -> None:
+        """Put what the reached columns let expect into the others of some pixels, in place."""
+        if reached.all() or not reached.any() or not pixels.any():
+            return
+        rows = known[pixels]
+        rows[:, ~reached] = rows[:, reached] @ self._expectation(reached)
+        known[pixels] = rows
 
     def _expectation(self, reached: NDArray[np.bool_]) -> NDArray[np.float32]:
         """(reached, unreached): the conditional mean of a normal law whose inverse covariance is whitening squared."""

@@ -12,7 +12,7 @@ from typing import Any
 from zipfile import BadZipFile
 
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -36,6 +36,24 @@ def read_state(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise WeightsError(f"no file of weights at {path}; give the path of a .safetensors or .pth file")
     return unwrap_state(_read(path), str(path))
+
+
+def read_notes(path: Path) -> dict[str, str]:
+    """Texts that lie beside the tensors of a file: safetensors' own, or entries of what torch saved, by their names.
+
+    Raises
+    ------
+    WeightsError : as `read_state`.
+    """
+    if path.suffix != ".safetensors":
+        content = _read(path)
+        whole = content if isinstance(content, Mapping) else {}
+        return {str(name): value for name, value in whole.items() if isinstance(value, str)}
+    try:
+        with safe_open(path, framework="np") as file:
+            return dict(file.metadata() or {})
+    except DAMAGED as error:
+        raise WeightsError(f"{path} is damaged or no file of weights ({_first_line(error)}); copy it again") from error
 
 
 def _read(path: Path) -> object:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -12,24 +11,6 @@ from models.sizes import Positions as Positions
 from pipeline.errors import ShapeError
 
 LONGEST_PERIOD = 128.0  # seats; the shortest is 2
-
-
-@dataclass(frozen=True)
-class TokenSet:
-    """Tokens of a batch: features, centres in seat units, log2 of the side in fine samples a sample, validity.
-
-    ``x`` (B, N, d), ``yx`` (B, N, 2) float64, ``scale`` (B, N), ``valid`` (B, N) bool. Any mix of scales, any N.
-    """
-
-    x: Tensor
-    yx: Tensor
-    scale: Tensor
-    valid: Tensor
-
-    def joined(self, other: TokenSet) -> TokenSet:
-        """Put another set's tokens behind these."""
-        pairs = [(getattr(self, name), getattr(other, name)) for name in ("x", "yx", "scale", "valid")]
-        return TokenSet(*(torch.cat(pair, dim=1) for pair in pairs))
 
 
 def code_2d(yx: Tensor, dim: int) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from models.vgg_sizes import VggSizes
 
+WAVELENGTHS = "wavelength_nm"  # a tensor beside the others that says where the channels of a trained network lie
 # of the photographs that VGG learned from: red, green and blue, values 0..1
 PHOTO_MEAN, PHOTO_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
@@ -30,11 +31,13 @@ class VggFeatures(nn.Module):
     grey of their own and draw a frame; and where the sum over outputs ends, gradients no longer cancel.
     """
 
-    def __init__(self, sizes: VggSizes | None = None) -> None:
+    def __init__(self, sizes: VggSizes | None = None, wavelength_nm: tuple[float, ...] | None = None) -> None:
         super().__init__()
-        self.sizes = sizes or VggSizes()
+        self.sizes, self.wavelength_nm = sizes or VggSizes(), wavelength_nm  # of the channels, where they were named
         layers: list[nn.Module] = []
-        for (before, width), depth in zip(pairwise((3, *self.sizes.widths)), self.sizes.depths, strict=True):
+        for (before, width), depth in zip(
+            pairwise((self.sizes.channels, *self.sizes.widths)), self.sizes.depths, strict=True
+        ):
             layers += [HalvingMaximum()] if layers else []
             for number in range(depth):
                 layers.append(nn.Conv2d(width if number else before, width, 3, padding=1, padding_mode="circular"))
@@ -42,7 +45,7 @@ class VggFeatures(nn.Module):
         self.features = nn.Sequential(*layers)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(image, 3, y, x) in standard deviations of photographs -> (image, channel, y, x) of the last level.
+        """(image, channel, y, x), photographs in their standard deviations -> (image, width, y, x) of the last level.
 
         y and x must divide by ``sizes.coarsest``.
         """
@@ -59,7 +62,7 @@ def common_names(state: dict[str, Tensor], sizes: VggSizes) -> dict[str, Tensor]
     complete = all(f"{number}.{part}" in state for number in numbers for part in ("weight", "bias"))
     if not numbers or not complete or any(state[f"{number}.weight"].dim() != 4 for number in numbers):
         return state
-    if len(numbers) != len(sizes.places) + 1 or state["0.weight"].shape[2:] != (1, 1):
+    if len(numbers) != len(sizes.places) + 1 or state["0.weight"].shape[1:] != (3, 1, 1):
         return {f"features.{name}": value for name, value in state.items()}
     named = _joined(state, numbers[0], numbers[1])
     for place, number in zip(sizes.places[1:], numbers[2:], strict=True):

@@ -8,7 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from models.vgg_sizes import VGG_FROM
+from models.vgg_sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import SettingsError, WeightsError
 
 if TYPE_CHECKING:
@@ -24,23 +24,33 @@ class VggFile:
 
     path: Path
     key: str
+    trained: bool = False  # on data of one's own: it may read other channels than photographs have
 
     @staticmethod
-    def found(path: Path) -> VggFile:
+    def found(path: Path, *, trained: bool = False) -> VggFile:
         """Take the file as it is now. Raises SettingsError where there is none, saying what could stand there."""
         if not path.is_file():
-            raise SettingsError(f"no file {path}; --vgg takes {VGG_FROM}")
-        return VggFile(path.resolve(), _hash(path))
+            raise SettingsError(f"no file {path}; --vgg takes {TRAINED_VGG_FROM if trained else VGG_FROM}")
+        return VggFile(path.resolve(), _hash(path), trained)
+
+    @property
+    def channels(self) -> int:
+        """How many it reads; photographs have three. Raises WeightsError as `report`."""
+        return _network_at(self)[0].sizes.channels if self.trained else 3
 
     def report(self) -> LoadReport:
         """What was taken from it. Raises WeightsError: another network, damaged, or changed since."""
         return _network_at(self)[1]
 
     def saliency(self, weights: Weights) -> VggSaliency:
-        """Give the policy for looks with the columns of ``weights``. Raises WeightsError as `report`."""
-        from models.vgg_saliency import VggSaliency, colours_of
+        """Give the policy for looks with the columns of ``weights``.
 
-        return VggSaliency(_network_at(self)[0], colours_of(weights))
+        Raises WeightsError as `report`, or its channels are none that these weights can give.
+        """
+        from models.vgg_saliency import VggSaliency, channels_of, colours_of
+
+        network = _network_at(self)[0]
+        return VggSaliency(network, channels_of(weights, network) if self.trained else colours_of(weights))
 
 
 def _hash(path: Path) -> str:
@@ -52,7 +62,7 @@ def _hash(path: Path) -> str:
 def _network_at(file: VggFile) -> tuple[VggFeatures, LoadReport]:
     from models.pretrained import load_vgg
 
-    loaded = load_vgg(file.path)
+    loaded = load_vgg(file.path, trained=file.trained)
     if _hash(file.path) != file.key:
         raise WeightsError(f"the VGG19 {file.path} has changed since the survey began; start it again")
     return loaded

@@ -2,7 +2,12 @@
 
 The gradient is that of the summed last activation, not of a class score: the files in use hold no classifier, its
 classes are none of a field's, and its layers hold the image to 224 px. A sum is also local: parts of a field can be
-read apart. It is taken to the three colours that enter VGG, absolute, the largest of the three.
+read apart. It is taken to the channels that enter VGG, absolute, the largest of them.
+
+A network that learned from data of one's own (the paper's trained attention) is read the same way. The paper says
+neither how it is trained, a choice of seats passing no gradient, nor how more than three bands enter it. Here the user
+trains it on what they like; its channels are what `channels_of` says, each brought to the median 0 and the spread 1 of
+the data that the segmenter was trained on.
 """
 
 from __future__ import annotations
@@ -14,10 +19,42 @@ import torch
 from numpy.typing import NDArray
 
 from models.inference import CoarseLook
-from models.kernel_fits import rgb_response
-from models.vgg import VggFeatures
+from models.kernel_fits import mixed_channels, rgb_response, wavelength_response
+from models.spectral import REACH
+from models.vgg import WAVELENGTHS, VggFeatures
 from models.vgg_sizes import Stretch, stretches
 from models.weights import Weights
+from pipeline.errors import WeightsError
+
+
+def channels_of(weights: Weights, network: VggFeatures) -> NDArray[np.float32]:
+    """Mix normalised columns to the channels that a trained VGG19 reads, (column, channel).
+
+    By the wavelengths that its file names; where it names none, three channels are red, green and blue, and as many as
+    the segmenter has columns are those columns in their order.
+
+    Raises
+    ------
+    WeightsError : another number of channels and no wavelengths, or one that the segmenter's columns do not reach.
+    """
+    basis, count = weights.basis, network.sizes.channels
+    if network.wavelength_nm is not None:
+        edge = REACH * basis.spacing_nm
+        for nm in network.wavelength_nm:
+            if not basis.low_nm - edge <= nm <= basis.high_nm + edge:
+                raise WeightsError(
+                    f"a channel of the trained VGG19 is at {nm:g} nm, the segmenter's weights are for"
+                    f" {basis.low_nm:.0f}-{basis.high_nm:.0f} nm; use weights of both for the same bands"
+                )
+        return mixed_channels(weights.normalisation, wavelength_response(basis, network.wavelength_nm))
+    if count == 3:
+        return colours_of(weights)
+    if count == basis.columns:
+        return mixed_channels(weights.normalisation, np.eye(count, dtype=np.float32))
+    raise WeightsError(
+        f"the trained VGG19 reads {count} channels without saying which, the segmenter's weights have {basis.columns}"
+        f" spectral columns; give 3 (red, green, blue) or {basis.columns}, or add a tensor {WAVELENGTHS!r} to its file"
+    )
 
 
 def colours_of(weights: Weights) -> NDArray[np.float32]:
@@ -26,9 +63,7 @@ def colours_of(weights: Weights) -> NDArray[np.float32]:
     The median of the training data becomes the mean of VGG's photographs, its spread theirs: one rule for a whole
     field and for every field of these weights, whatever the light of one.
     """
-    normal, response = weights.normalisation, rgb_response(weights.basis).astype(np.float64)
-    undo = np.linalg.inv(normal.whitening.astype(np.float64)) * normal.spread
-    return np.asarray(undo @ response.T / (response @ normal.spread), np.float32)
+    return mixed_channels(weights.normalisation, rgb_response(weights.basis))
 
 
 @dataclass(frozen=True)
@@ -36,7 +71,7 @@ class VggSaliency:
     """Saliency of each coarse pixel."""
 
     network: VggFeatures
-    colours: NDArray[np.float32]  # (column, 3)
+    colours: NDArray[np.float32]  # (column, channel)
 
     def __call__(self, seen: CoarseLook) -> NDArray[np.float64]:
         """(y, x) of the padded coarse grid: never of a finer one, which would need what is not captured yet."""
@@ -59,7 +94,7 @@ class VggSaliency:
 
 
 def input_gradient(network: VggFeatures, picture: torch.Tensor) -> torch.Tensor:
-    """Gradient of the summed last activation to the picture (image, 3, y, x), of its shape."""
+    """Gradient of the summed last activation to the picture (image, channel, y, x), of its shape."""
     with torch.inference_mode(mode=False), torch.enable_grad():
         entered = picture.clone().requires_grad_(True)
         (gradient,) = torch.autograd.grad(network(entered).sum(), entered)

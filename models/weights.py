@@ -5,25 +5,27 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from models.sizes import SegmenterConfig
-from models.spectral import Normalisation, SpectralBasis
+from models.spectral import Normalisation, SpectralBasis, project
 from pipeline.errors import WeightsError
 
 if TYPE_CHECKING:
     import torch
 
+    from models.designs import Network
     from models.segmenter import Segmenter
 
 NORMALISATION = ("centre", "spread", "whitening")
 FORMAT = "spectralzoom-weights/1"
+Learned = TypeVar("Learned", bound="AnyWeights")
 
 
 @dataclass(frozen=True)
@@ -37,10 +39,10 @@ class Description:
 
 
 @dataclass(frozen=True)
-class Weights:
-    """A segmenter with all it needs to be used: basis, normalisation, classes, and the record of its training."""
+class AnyWeights:
+    """A network of any design with all it needs: basis, normalisation, classes, and the record of its training."""
 
-    segmenter: Segmenter
+    network: Network
     basis: SpectralBasis
     normalisation: Normalisation
     class_names: tuple[str, ...]
@@ -49,27 +51,40 @@ class Weights:
 
     @property
     def config(self) -> SegmenterConfig:
-        """Sizes of the segmenter."""
-        return self.segmenter.config
+        """Sizes of the network, and which one it is."""
+        return self.network.config
 
     def columns(self, values: NDArray[np.floating], wavelength_nm: NDArray[np.floating]) -> NDArray[np.float32]:
         """Normalised spectral columns of pixels, (..., band) -> (..., column) float32.
 
-        Columns that no band reaches take what the others let expect; pixels with a value that is not finite count as
-        the training median.
+        Columns that no band reaches take what the others let expect, and so do those of which all bands are dead.
+        A pixel with more than half of its bands dead is NaN.
         """
         matrix, reached = self.basis.matrix(wavelength_nm)
-        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite stays so and is replaced afterwards
-            seen = np.asarray(values, np.float32) @ matrix
-        return self.normalisation.apply(seen, reached)
+        seen = project(values, matrix)
+        columns = self.normalisation.apply(seen, reached)
+        columns[~np.isfinite(seen[..., reached]).any(axis=-1)] = np.nan
+        return columns
 
 
-def save_weights(weights: Weights, path: Path) -> None:
+@dataclass(frozen=True)
+class Weights(AnyWeights):
+    """Those of a two-scale segmenter, which surveys are made with."""
+
+    network: Segmenter
+
+    @property
+    def segmenter(self) -> Segmenter:
+        """The network."""
+        return self.network
+
+
+def save_weights(weights: AnyWeights, path: Path) -> None:
     """Write the file by a temporary name and a rename, so that it is whole or absent."""
     import torch
     from safetensors.torch import save
 
-    tensors = {name: value.detach().cpu().contiguous() for name, value in weights.segmenter.state_dict().items()}
+    tensors = {name: value.detach().cpu().contiguous() for name, value in weights.network.state_dict().items()}
     for name in NORMALISATION:
         tensors[f"normalisation.{name}"] = torch.from_numpy(getattr(weights.normalisation, name).copy())
     tensors["class_colours"] = torch.from_numpy(weights.class_colours.copy())
@@ -95,13 +110,39 @@ def save_weights(weights: Weights, path: Path) -> None:
 
 
 def load_weights(path: Path) -> Weights:
-    """Read a file that ``save_weights`` wrote. No pickle is involved.
+    """Read a file that ``save_weights`` wrote of a two-scale segmenter. No pickle is involved.
 
     Raises
     ------
-    WeightsError : missing, damaged, of another format, or a tensor that does not fit its config (named).
+    WeightsError : missing, damaged, of another format, a control, or a tensor that does not fit its config (named).
     """
     described = describe_weights(path)
+    check_two_scale(described.config, path)
+    weights = _read(path, described)
+    return Weights(*(getattr(weights, part.name) for part in fields(AnyWeights)))
+
+
+def load_any_weights(path: Path) -> AnyWeights:
+    """Read a file that ``save_weights`` wrote: ``Weights`` of a two-scale segmenter, otherwise those of a control.
+
+    Raises
+    ------
+    WeightsError : as in ``load_weights``.
+    """
+    described = describe_weights(path)
+    return load_weights(path) if described.config.design == "two-scale" else _read(path, described)
+
+
+def check_two_scale(config: SegmenterConfig, path: Path) -> None:
+    """Refuse a control where a survey is to be made (WeightsError)."""
+    if config.design != "two-scale":
+        raise WeightsError(
+            f"{path} holds the control '{config.preset}', which is there to be compared with; a survey needs weights of"
+            " two scales: train some with: spectralzoom train DATASET -o WEIGHTS (without --preset)"
+        )
+
+
+def _read(path: Path, described: Description) -> AnyWeights:
     with _opened(path, "pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
     return _assemble(path, described, tensors)
@@ -139,26 +180,26 @@ def _opened(path: Path, framework: str) -> Iterator[Any]:
         raise WeightsError(f"{path} is not a readable safetensors file ({error}); train or copy it again") from error
 
 
-def _assemble(path: Path, described: Description, tensors: dict[str, torch.Tensor]) -> Weights:
-    from models.segmenter import Segmenter
+def _assemble(path: Path, described: Description, tensors: dict[str, torch.Tensor]) -> AnyWeights:
+    from models.designs import build_network
 
-    segmenter = Segmenter(described.config)
-    parameters = segmenter.state_dict()
-    expected = {name: tuple(value.shape) for name, value in parameters.items()} | _shapes_beside(segmenter.config)
+    network = build_network(described.config)
+    parameters = network.state_dict()
+    expected = {name: tuple(value.shape) for name, value in parameters.items()} | _shapes_beside(network.config)
     for name, shape in expected.items():
         came = tuple(tensors[name].shape) if name in tensors else "nothing"
         if came != shape:
             raise WeightsError(f"{path}: tensor {name} should be {shape}, the file has {came}; train it again")
-    segmenter.load_state_dict({name: tensors[name] for name in parameters})
+    network.load_state_dict({name: tensors[name] for name in parameters})
     normalisation = Normalisation(*(tensors[f"normalisation.{name}"].numpy() for name in NORMALISATION))
-    return Weights(
-        segmenter.eval(), described.basis, normalisation, described.class_names, tensors["class_colours"].numpy(),
+    return AnyWeights(
+        network.eval(), described.basis, normalisation, described.class_names, tensors["class_colours"].numpy(),
         described.record,
     )  # fmt: skip
 
 
 def _shapes_beside(config: SegmenterConfig) -> dict[str, tuple[int, ...]]:
-    """Shapes of the tensors that are not the segmenter's own."""
+    """Shapes of the tensors that are not the network's own."""
     one, all_pairs = (config.columns,), (config.columns, config.columns)
     return {
         "normalisation.centre": one,
@@ -168,6 +209,6 @@ def _shapes_beside(config: SegmenterConfig) -> dict[str, tuple[int, ...]]:
     }
 
 
-def with_record(weights: Weights, **entries: Any) -> Weights:
+def with_record(weights: Learned, **entries: Any) -> Learned:
     """Give the same weights with entries added to their record."""
     return replace(weights, record={**weights.record, **entries})

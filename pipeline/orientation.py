@@ -89,12 +89,13 @@ def compare_orientations(
     rows: CropRows | None = None,
     overlap_px: float = 0,
     margin_px: float = 0,
+    threshold: float | None = None,
 ) -> OrientationReport:
     """Plan the same scores with lines along the other axis, for the seconds that both passes have here.
 
     Parameters
     ----------
-    scores, budget_s
+    scores, budget_s, threshold
         As for :func:`pipeline.planning.plan_fine`.
     plan
         The plan with lines along ``along`` where it is made already.
@@ -110,7 +111,9 @@ def compare_orientations(
     ------
     PoseError : the field is beyond the mirror's range with lines along ``along``; the other axis is only reported.
     """
-    here = plan or plan_fine(grid, camera, cost, along, scores, budget_s=budget_s, margin_px=margin_px)
+    here = plan or plan_fine(
+        grid, camera, cost, along, scores, budget_s=budget_s, margin_px=margin_px, threshold=threshold
+    )  # fmt: skip
 
     def coarse_seconds(axis: Axis) -> float:
         sweeps = coarse_sweeps(grid, camera, axis, overlap_px=overlap_px)
@@ -121,11 +124,14 @@ def compare_orientations(
     other = _turned(along)
     try:
         other_coarse_s = coarse_seconds(other)
-        left = coarse_s + budget_s - other_coarse_s
+        spent = budget_s if here.spared_s is None else here.seconds  # what a threshold left is not there to be spent
+        left = coarse_s + spent - other_coarse_s
         if left < 0:
             reason = f"the coarse pass alone takes {other_coarse_s:.1f} s"
             return OrientationReport(taken, None, rows, reason)
-        turned = plan_fine(grid, camera, cost, other, scores, budget_s=left, margin_px=margin_px)
+        turned = plan_fine(
+            grid, camera, cost, other, scores, budget_s=left, margin_px=margin_px, threshold=threshold
+        )  # fmt: skip
     except PoseError as error:
         return OrientationReport(taken, None, rows, str(error))
     return OrientationReport(taken, _outcome(other, other_coarse_s, turned), rows)

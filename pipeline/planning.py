@@ -17,6 +17,7 @@ from pipeline.errors import BudgetError, PoseError, ShapeError
 from pipeline.grid import SceneGrid
 from pipeline.runs import Prices, Run
 from pipeline.scan import Axis, CostModel, Sweep
+from pipeline.selection import check_threshold
 from pipeline.spending import cheapest_cover, spend
 from pipeline.strips import covered_seats, look_from, strips_at_seats
 
@@ -42,6 +43,8 @@ class FinePlan:
     wanted_worth: float = 0.0  # score of all seats that a line within the mirror's range shows
     full_seconds: float | None = None  # of the full scan with lines along the same axis; None beyond the mirror's range
     out_of_reach: int = 0  # seats worth something that no line within the mirror's range shows
+    threshold: float | None = None  # least score per second that was bought; None where there was no such limit
+    spared_s: float | None = None  # of the budget, left because nothing more pays by the threshold
 
     @property
     def lines(self) -> int:
@@ -129,6 +132,7 @@ def plan_fine(
     budget_s: float,
     margin_px: float = 0.0,
     full: Sequence[Sweep] | None = None,
+    threshold: float | None = None,
 ) -> FinePlan:
     """Choose the line runs that show the most score for at most ``budget_s`` seconds.
 
@@ -147,36 +151,46 @@ def plan_fine(
         How far beside the plan the mirror may look: every run shows its seats even so. [px]
     full
         Sweeps of the full scan; None lays the fewest strips that cover the field.
+    threshold
+        Buy no run, and nothing of a run, that shows less score per second than this: a floor under the price of a
+        second, a line priced with its share of a reload and a run with its set-up. None, like 0, spends the budget.
+        With the same scores a lower threshold never has less ``worth``.
 
     Raises
     ------
-    BudgetError : the budget is negative or not finite.
+    BudgetError : the budget or the threshold is negative or not finite.
     ShapeError : the number of scores is not that of the seats.
     SettingsError : a patch is wider than a line.
     PoseError : no line within the mirror's range shows any of the seats that are worth something.
     """
     if not isfinite(budget_s) or budget_s < 0:
         raise BudgetError(f"the fine pass needs a finite number of seconds, 0 or more, got {budget_s}")
-    worth = _worth(grid, scores)
+    limit = 0.0 if threshold is None else check_threshold(threshold)
+    worth, unit = _worth(grid, scores, limit * budget_s)
+    floor = limit / unit
     field = _field(grid, camera, cost, along, worth, margin_px)
     missed = int(np.count_nonzero(worth)) - len(np.unique(field.views.seat))
     whole = _full(grid, camera, cost, along) if full is None else (list(full), cost.seconds(list(full), camera))
     full_s = None if whole is None else whole[1]
-    plan = spend(field, budget_s if full_s is None else min(budget_s, float(np.nextafter(full_s, 0.0))))
+    plan = spend(field, budget_s if full_s is None else min(budget_s, float(np.nextafter(full_s, 0.0))), floor)
     everything = plan.worth >= field.total * (1 - NEGLIGIBLE)
-    if whole is not None and full_s is not None and full_s <= budget_s and not everything:
+    rest_pays = full_s is not None and field.total - plan.worth >= floor * (full_s - plan.seconds(field.prices))
+    if whole is not None and full_s is not None and full_s <= budget_s and not everything and rest_pays:
         reason = (
             f"to show every place worth a second look takes no less time than to scan everything in detail, "
             f"{full_s:.1f} s; the full scan is taken, which shows all of the field"
         )
-        return FinePlan(whole[0], grid.valid_seats(), full_s, field.total, "full", reason, field.total, full_s, missed)
+        return FinePlan(
+            whole[0], grid.valid_seats(), full_s, field.total, "full", reason, field.total, full_s, missed, threshold
+        )  # fmt: skip
     sweeps = _sweeps(field, plan)
     check_reach(sweeps, camera)
     seconds = cost.seconds(sweeps, camera)
     seats = covered_seats(grid, camera, sweeps, margin_px=margin_px)
     return FinePlan(
-        sweeps, seats, seconds, plan.worth, "lines", _lines_reason(seconds, full_s), field.total, full_s, missed
-    )
+        sweeps, seats, seconds, plan.worth, "lines", _lines_reason(seconds, full_s), field.total, full_s, missed,
+        threshold, budget_s - seconds if floor and not everything else None,
+    )  # fmt: skip
 
 
 def _lines_reason(seconds: float, full_s: float | None) -> str:
@@ -225,8 +239,34 @@ def _cut(strip: Sweep, run: Run) -> Sweep:
     return replace(strip, name=name, start_px=strip.start_px + run.first, lines=run.stop - run.first)
 
 
-def _worth(grid: SceneGrid, scores: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Scores as worth: 0 for what is not worth buying, finite for +inf, (seat,)."""
+def joined_plan(plans: Sequence[FinePlan]) -> FinePlan:
+    """Give the plan of several rounds, one after the other, as one; each stays priced by itself.
+
+    ``worth`` and ``wanted_worth`` are those of the first: later ones are in scores that were made anew.
+
+    Raises
+    ------
+    ShapeError : there is none.
+    """
+    if not plans:
+        raise ShapeError("expected the plans of one round or more, got none")
+    if len(plans) == 1:
+        return plans[0]
+    return replace(
+        plans[0],
+        sweeps=[sweep for plan in plans for sweep in plan.sweeps],
+        seats=np.unique(np.concatenate([plan.seats for plan in plans])),
+        seconds=sum(plan.seconds for plan in plans),
+        spared_s=plans[-1].spared_s,
+    )
+
+
+def _worth(grid: SceneGrid, scores: NDArray[np.floating], most: float) -> tuple[NDArray[np.float64], float]:
+    """Scores as worth, (seat,), and the score that is a worth of 1.
+
+    0 for what is not worth buying; finite for +inf, above all others together and above ``most``, which is the score
+    that the whole budget has to show.
+    """
     rows, columns = grid.seat_shape
     given = np.asarray(scores, np.float64)
     if given.shape != (rows * columns,):
@@ -234,12 +274,12 @@ def _worth(grid: SceneGrid, scores: NDArray[np.floating]) -> NDArray[np.float64]
     worth = np.zeros_like(given)
     valid = grid.valid_seats()
     worth[valid] = np.where(given[valid] > 0, given[valid], 0.0)
-    endless = np.isposinf(worth)
+    endless, peak = np.isposinf(worth), 1.0
     if endless.any():
         worth[endless] = 0.0
-        peak = worth.max(initial=0.0) or 1.0
-        worth = np.where(endless, worth.sum() / peak + 1, worth / peak)
-    return worth
+        peak = float(worth.max(initial=0.0)) or 1.0
+        worth = np.where(endless, (worth.sum() + most) / peak + 1, worth / peak)
+    return worth, peak
 
 
 def price_of_seats(

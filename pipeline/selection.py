@@ -22,6 +22,7 @@ class Selection:
 
     seats: Seats
     spread: bool = False
+    spared: int = 0  # seats that might have been bought as well and do not pay by the threshold
 
 
 def seat_count(share: float, valid: int) -> int:
@@ -36,7 +37,26 @@ def seat_count(share: float, valid: int) -> int:
     return min(int(np.floor(share * valid + 0.5)), valid)
 
 
-def select_seats(score: Scores, count: int, valid: NDArray[np.bool_] | None = None, *, clip: bool = False) -> Selection:
+def check_threshold(threshold: float) -> float:
+    """Give the threshold back.
+
+    Raises
+    ------
+    BudgetError : it is not a finite number of 0 or more.
+    """
+    if not (np.isfinite(threshold) and threshold >= 0):
+        raise BudgetError(f"the threshold must be a finite score of 0 or more, got {threshold}")
+    return threshold
+
+
+def select_seats(
+    score: Scores,
+    count: int,
+    valid: NDArray[np.bool_] | None = None,
+    *,
+    clip: bool = False,
+    threshold: float | None = None,
+) -> Selection:
     """Choose the ``count`` valid seats with the highest scores.
 
     Equal scores go to the lowest number; +inf comes first, NaN and -inf last. The choice is nested: the first K of a
@@ -53,20 +73,33 @@ def select_seats(score: Scores, count: int, valid: NDArray[np.bool_] | None = No
         (seat,) seats that may be chosen; None allows all.
     clip
         Take all valid seats where ``count`` is larger, instead of refusing.
+    threshold
+        Buy no seat with a score below this, 0 or more, however many are left of ``count``: no seat then of a negative
+        score, nor of one that cannot be ranked. None buys whatever the score.
 
     Raises
     ------
-    BudgetError : ``count`` is not a whole number, below 0, or above the number of valid seats.
+    BudgetError : ``count`` is not a whole number, below 0, or above the number of valid seats; or the threshold is
+        negative or not finite.
     """
     allowed = _allowed(score, valid)
     wanted = _check_count(count, len(allowed), clip=clip)
-    order, spread = _ranked(np.asarray(score, np.float64)[allowed])
-    return Selection(allowed[order[:wanted]], spread and wanted > 0)
+    worth = np.asarray(score, np.float64)[allowed]
+    order, spread = _ranked(worth)
+    if threshold is None:
+        return Selection(allowed[order[:wanted]], spread and wanted > 0)
+    paying = order[worth[order] >= check_threshold(threshold)]
+    return Selection(allowed[paying[:wanted]], spared=max(wanted - len(paying), 0))
 
 
-def frame_seats(score: Scores, share: float, valid: NDArray[np.bool_] | None = None) -> Selection:
-    """Choose a share of the valid seats as if each could be captured by itself (``frame`` mode: compares policies)."""
-    return select_seats(score, seat_count(share, len(_allowed(score, valid))), valid)
+def frame_seats(
+    score: Scores, share: float, valid: NDArray[np.bool_] | None = None, *, threshold: float | None = None
+) -> Selection:
+    """Choose a share of the valid seats as if each could be captured by itself (``frame`` mode: compares policies).
+
+    With a ``threshold`` of so much score a seat, for policy ``gain`` [nat per px], fewer where fewer pay.
+    """
+    return select_seats(score, seat_count(share, len(_allowed(score, valid))), valid, threshold=threshold)
 
 
 def complete_seats(requested: Seats, score: Scores, valid: NDArray[np.bool_] | None = None) -> Seats:

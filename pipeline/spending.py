@@ -23,17 +23,20 @@ WIDE_STEP = 0.7
 LEAST_RATE = 1e-10  # of the total worth over the price of all lines, to stand for "whatever it costs"
 
 
-def spend(field: Field, budget_s: float) -> Cover:
+def spend(field: Field, budget_s: float, floor: float = 0.0) -> Cover:
     """Choose the runs with the most worth found whose true price is at most ``budget_s``.
 
     Between the two covers that the budget lies between, the price of a second is halved down; what then is left goes
     to one run more, or to one run made longer. ``worth`` counts what was bought for its worth, at least.
+
+    With a ``floor`` [worth/s] the price of a second never falls below it, and nothing is bought merely to use up the
+    time. A lower floor, or with the same one a bigger budget, never buys less.
     """
     low, low_rate = Cover(), np.inf
     best = low
     for high, rate in covers(field):
-        if high.seconds(field.prices) > budget_s:
-            return _better(best, _between(field, (low, high), (low_rate, rate), budget_s))
+        if high.seconds(field.prices) > budget_s or rate < floor:
+            return _better(best, _between(field, (low, high), (low_rate, rate), budget_s, floor))
         low, low_rate, best = high, rate, _better(best, high)
     return best
 
@@ -42,8 +45,10 @@ def _better(one: Cover, other: Cover) -> Cover:
     return other if other.worth > one.worth else one
 
 
-def _between(field: Field, covers: tuple[Cover, Cover], rates: tuple[float, float], budget_s: float) -> Cover:
-    """Narrow down the edge from a cover that the budget pays for to one that it does not.
+def _between(
+    field: Field, covers: tuple[Cover, Cover], rates: tuple[float, float], budget_s: float, floor: float
+) -> Cover:
+    """Narrow down the edge from a cover that budget and floor allow to one that they do not.
 
     No cover is taken that is worth more than a dearer one: with a bigger budget only the dearer one is looked at.
     """
@@ -55,15 +60,20 @@ def _between(field: Field, covers: tuple[Cover, Cover], rates: tuple[float, floa
         prices = [cover.seconds(field.prices) for cover in (low, middle, high)]
         if not (low.worth < middle.worth < high.worth and prices[0] < prices[1] < prices[2]):
             break
-        if prices[1] <= budget_s:
+        if prices[1] <= budget_s and rate >= floor:
             low, low_rate, best = middle, rate, _better(best, middle)
         else:
             high, high_rate = middle, rate
     for cover in (low, *_peeled(field, high)):
-        for found in (cover, _one_more(field, cover, budget_s)):
-            if found.seconds(field.prices) <= budget_s:
+        for found in (cover,) if floor else (cover, _one_more(field, cover, budget_s)):
+            if found.seconds(field.prices) <= budget_s and _pays(found, low, floor):
                 best = _better(best, replace(found, worth=min(found.worth, high.worth)))
     return best
+
+
+def _pays(found: Cover, low: Cover, floor: float) -> bool:
+    """Whether what a cover has beyond another is worth its seconds at the floor; without a floor everything is."""
+    return not floor or found.worth - low.worth >= floor * (found.even_s - low.even_s)
 
 
 def _peeled(field: Field, cover: Cover) -> Iterator[Cover]:

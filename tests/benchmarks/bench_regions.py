@@ -9,6 +9,7 @@ import hashlib
 import multiprocessing
 import shutil
 import tempfile
+import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +31,8 @@ from models.regions import HALO_CELLS, Region, most_bytes, plan_regions
 from pipeline.grid import SceneGrid
 from pipeline.selection import frame_seats
 from storage.block_work import Crew
-from storage.class_maps import ClassNames, create_class_map, load_class_map
+from storage.class_maps import ClassMap, ClassNames, create_class_map, load_class_map
+from storage.layout import SHARD_ROWS
 from storage.mosaics import MosaicWriter
 from storage.patches import PATCHES_A_SHARD, PatchWriter, open_patches
 from storage.tile_work import RESERVED_BYTES
@@ -41,6 +43,8 @@ SHARE = 0.35
 SIDES, SYNTHETIC_PX, SYNTHETIC_BANDS = (640, 1920, 3840), (640, 640), 8
 MEMORY = 4 * 2**30
 MOST_GROWTH = 1.25
+MOSAIC_PX, MOSAIC_BANDS, MOSAIC_SHARE = 10240, 4, 0.02
+BLOBS, BLOB_PX = 400, 24.0  # of the coarse mosaic, bright on a dark ground
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,8 @@ class Seams:
     halo: int
     all_px: float  # share of pixels of the same class
     near_px: float  # the same within one coarse patch of a seam
+    far_px: float  # share of pixels of the same class further than that from every seam
+    step: float  # mean step of confidence across a seam, over the same step in the map of one region
     miou: float  # by the labels
     seats: float  # share of the chosen seats that both choose
     extra: float  # pixels read over pixels kept
@@ -64,13 +70,15 @@ def rows() -> list[Row]:
             f"{np.mean([one[halo].all_px for one in table]):.3%}",
             ">= 99.9 %" if halo == HALO_CELLS else "",
             np.mean([one[halo].all_px for one in table]) >= 0.999 if halo == HALO_CELLS else None,
-            f"within a patch of a seam {np.mean([one[halo].near_px for one in table]):.3%}; mIoU "
+            f"within a patch of a seam {np.mean([one[halo].near_px for one in table]):.3%}, further away "
+            f"{np.mean([one[halo].far_px for one in table]):.3%}; step of confidence across a seam over the same "
+            f"without it {np.mean([one[halo].step for one in table]):.3f}; mIoU "
             f"{np.mean([one[halo].miou - one[-1].miou for one in table]):+.4f}; seats in common "
             f"{np.mean([one[halo].seats for one in table]):.1%}",
         )
         for halo in HALOS
     ]
-    return [*found, *_memory()]
+    return [*found, *_memory(), *_mosaic()]
 
 
 def measure_halos() -> list[dict[int, Seams]]:
@@ -92,11 +100,11 @@ def _survey(folder: Path, seed: int) -> dict[int, Seams]:
     return {halo: _compared(run, drawn, halo) for halo in drawn}
 
 
-Read = tuple[list[Region], NDArray[np.uint8], NDArray[np.float64]]
+Read = tuple[list[Region], ClassMap, NDArray[np.float64]]
 
 
 def _read(run: SurveyRun, mosaic: Path, patches: Path, halo: int) -> Read:
-    """Regions, class map and scores for one halo, -1 for the field as one region."""
+    """Regions, maps and scores for one halo, -1 for the field as one region."""
     whole = FieldWork.of(run)
     regions = whole.regions if halo < 0 else plan_regions(run.grid, SHARD, most_px=MOST_PX, halo=halo)
     work = FieldWork(whole.weights, regions, Crew(workers=1), MEMORY)
@@ -104,12 +112,12 @@ def _read(run: SurveyRun, mosaic: Path, patches: Path, halo: int) -> Read:
     legend = ClassNames(run.weights.class_names, run.weights.class_colours)
     create_class_map(out, (run.grid.height, run.grid.width), legend)
     work.draw(mosaic, patches, out, lambda done: None)
-    return list(regions), load_class_map(out).classes, work.score("entropy", mosaic, lambda done: None)
+    return list(regions), load_class_map(out), work.score("entropy", mosaic, lambda done: None)
 
 
 def _compared(run: SurveyRun, drawn: dict[int, Read], halo: int) -> Seams:
-    (regions, classes, scores), (_, whole, whole_scores) = drawn[halo], drawn[-1]
-    same = classes == whole
+    (regions, cut, scores), (_, whole, whole_scores) = drawn[halo], drawn[-1]
+    same = cut.classes == whole.classes
     near = _near_seams(regions, run.grid.patch * run.grid.factor)
     assert run.labels is not None
     chosen, before = (
@@ -119,7 +127,9 @@ def _compared(run: SurveyRun, drawn: dict[int, Read], halo: int) -> Seams:
         halo,
         float(same.mean()),
         float(same[near].mean()) if near.any() else 1.0,
-        mean_iou(confusion(run.labels, classes, run.weights.config.classes)),
+        float(same[~near].mean()),
+        _step(regions, cut.confidence) / _step(regions, whole.confidence) if near.any() else 1.0,
+        mean_iou(confusion(run.labels, cut.classes, run.weights.config.classes)),
         len(np.intersect1d(chosen, before)) / len(before),
         sum(float(np.prod(region.read.shape)) for region in regions) / same.size,
     )
@@ -134,6 +144,14 @@ def _near_seams(regions: list[Region], reach: int) -> NDArray[np.bool_]:
     for seam in {region.kept.left for region in regions} - {0}:
         near[:, max(seam - reach, 0) : seam + reach] = True
     return near
+
+
+def _step(regions: list[Region], confidence: NDArray[np.float32]) -> float:
+    """Mean difference of neighbouring pixels on either side of the borders of regions."""
+    exact = confidence.astype(np.float64)
+    steps = [np.abs(exact[seam] - exact[seam - 1]) for seam in {region.kept.top for region in regions} - {0}]
+    steps += [np.abs(exact[:, seam] - exact[:, seam - 1]) for seam in {region.kept.left for region in regions} - {0}]
+    return float(np.concatenate(steps).mean())
 
 
 def _memory() -> list[Row]:
@@ -166,6 +184,65 @@ def _memory() -> list[Row]:
     ]
 
 
+def _mosaic() -> list[Row]:
+    """A field of the paper's size with little in it: one budget over all its regions, each read with its halo."""
+    with (
+        tempfile.TemporaryDirectory() as name,
+        ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool,
+    ):
+        peak, regions, seats, hit, cpu_s = pool.submit(_read_mosaic, Path(name)).result()
+    return [
+        Row(
+            f"peak memory of scoring and drawing {MOSAIC_PX} x {MOSAIC_PX} px, {MOSAIC_BANDS} bands, sparse content",
+            f"{peak / 2**30:.2f} GiB",
+            f"<= {MEMORY / 2**30:g} GiB",
+            peak <= MEMORY,
+            f"{regions} regions with their halos, one worker; {seats} seats by one budget over all of them, {hit:.0%} "
+            f"of them on content; CPU {cpu_s:.0f} s",
+        )
+    ]
+
+
+def _read_mosaic(folder: Path) -> tuple[int, int, int, float, float]:
+    """Peak memory, regions, seats, the share of them that hold content, and processor time, writing included."""
+    use_one_thread()
+    file = _shipped()
+    weights = file.load()
+    config = weights.config
+    grid = SceneGrid(MOSAIC_PX, MOSAIC_PX, config.patch, config.factor)
+    content = _write_sparse(folder / "mosaic.zarr", grid)
+    work = FieldWork(file, plan_regions(grid, SHARD), Crew(workers=1), MEMORY)
+    began = time.process_time()
+    scores = work.score("entropy", folder / "mosaic.zarr", lambda done: None)
+    seats = np.sort(frame_seats(scores.ravel(), MOSAIC_SHARE, grid.valid_share().ravel() > 0).seats)
+    _write_patches(folder / "patches.zarr", grid, seats, np.linspace(420, 980, MOSAIC_BANDS))
+    legend = ClassNames(weights.class_names, weights.class_colours)
+    create_class_map(folder / "map.zarr", (MOSAIC_PX, MOSAIC_PX), legend)
+    work.draw(folder / "mosaic.zarr", folder / "patches.zarr", folder / "map.zarr", lambda done: None)
+    cells = config.patch // config.factor
+    held = content.reshape(grid.seat_shape[0], cells, grid.seat_shape[1], cells).any(axis=(1, 3)).ravel()
+    return peak_bytes(), len(work.regions), len(seats), float(held[seats].mean()), time.process_time() - began
+
+
+def _write_sparse(path: Path, grid: SceneGrid) -> NDArray[np.bool_]:
+    """Store a coarse mosaic of bright blobs on a dark ground, some rows at a time; which pixels are bright."""
+    rng, nm = np.random.default_rng(0), np.linspace(420, 980, MOSAIC_BANDS)
+    y, x = grid.coarse_shape
+    centres = rng.uniform(0, (y, x), (BLOBS, 2))
+    bright = np.zeros((y, x), np.bool_)
+    rows, columns = np.ogrid[:y, :x]
+    for down, across in centres:
+        near = tuple(slice(max(int(at - BLOB_PX), 0), int(at + BLOB_PX) + 1) for at in (down, across))
+        bright[near] |= (rows[near[0]] - down) ** 2 + (columns[:, near[1]] - across) ** 2 < BLOB_PX**2
+    writer = MosaicWriter(path, grid.coarse_shape, nm)
+    for top in range(0, y, SHARD_ROWS):
+        part = bright[top : top + SHARD_ROWS]
+        noise = rng.normal(0, 0.005, (*part.shape, len(nm)))
+        values = np.where(part[..., None], 0.4 + 0.1 * np.sin(nm / 100), 0.1) + noise
+        writer.write_rows(top, values.astype(np.float32), np.ones(part.shape))
+    return bright
+
+
 def _mib(size: float) -> str:
     return f"{size / 2**20:.0f} MiB"
 
@@ -184,7 +261,13 @@ def _write_field(folder: Path, side: int) -> None:
     writer.write_rows(0, rng.uniform(0.1, 0.5, (*grid.coarse_shape, len(nm))), np.ones(grid.coarse_shape))
     count = int(np.prod(grid.seat_shape))
     seats = np.sort(rng.choice(count, int(SHARE * count), replace=False))
-    patches = PatchWriter(folder / "patches.zarr", seats, grid.seat_origin(seats), grid.patch, nm)
+    _write_patches(folder / "patches.zarr", grid, seats, nm)
+
+
+def _write_patches(path: Path, grid: SceneGrid, seats: NDArray[np.integer], nm: NDArray[np.float64]) -> None:
+    """Store random patches of these seats."""
+    rng = np.random.default_rng(1)
+    patches = PatchWriter(path, seats, grid.seat_origin(seats), grid.patch, nm)
     for first in range(0, len(seats), PATCHES_A_SHARD):
         shape = (min(PATCHES_A_SHARD, len(seats) - first), grid.patch, grid.patch)
         patches.write(first, rng.uniform(0.1, 0.5, (*shape, len(nm))).astype(np.float32), np.ones(shape, np.bool_))
@@ -193,8 +276,7 @@ def _write_field(folder: Path, side: int) -> None:
 def _draw_field(folder: Path, side: int, cut: bool) -> tuple[int, int]:
     """Draw a stored field with the shipped weights, one worker; memory of this process, and what was projected."""
     use_one_thread()
-    path = Path(__file__).resolve().parents[2] / "models" / "shipped" / "farm.safetensors"
-    file = WeightsFile(path, hashlib.sha256(path.read_bytes()).hexdigest()[:20])
+    file = _shipped()
     grid = SceneGrid(side, side, 16, 4)
     regions = plan_regions(grid, SHARD, most_px=SYNTHETIC_PX) if cut else plan_regions(grid, SHARD)
     weights, out = file.load(), folder / "map.zarr"
@@ -204,6 +286,11 @@ def _draw_field(folder: Path, side: int, cut: bool) -> tuple[int, int]:
     work.draw(folder / "mosaic.zarr", folder / "patches.zarr", out, lambda done: None)
     seats = open_patches(folder / "patches.zarr").seats
     return peak_bytes(), RESERVED_BYTES + most_bytes(weights.config, regions, seats, SYNTHETIC_BANDS)
+
+
+def _shipped() -> WeightsFile:
+    path = Path(__file__).resolve().parents[2] / "models" / "shipped" / "farm.safetensors"
+    return WeightsFile(path, hashlib.sha256(path.read_bytes()).hexdigest()[:20])
 
 
 def main() -> None:

@@ -9,63 +9,40 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from rich.console import Console
 
 from flows import benchmark_work
-from flows.benchmark_frames import FARM_TEST_SEED, look_at, open_candidates
+from flows.benchmark_costs import Prices
+from flows.benchmark_frames import FARM_TEST_SEED, open_candidates
+from flows.benchmark_request import EvaluateRequest
 from flows.benchmark_rows import ORACLE, Trial, captured_px, judge_frame, placings
+from flows.benchmark_series import collect_row
 from flows.benchmark_store import KeptResults
-from flows.benchmark_summary import collect_row, summarise
-from flows.benchmark_timing import row_seconds
-from flows.benchmark_work import EvaluateRequest
+from flows.benchmark_summary import summarise
+from flows.benchmark_timing import Rounds, cpu_seconds, row_seconds
 from flows.cli import main
 from flows.evaluate_command import evaluate_weights, run_evaluate
 from flows.train import TrainRequest, train_weights
 from models.metrics import mean_iou
 from models.training import TrainingSettings
-from models.weights import Weights, load_weights, save_weights
-from pipeline.camera import LineCamera
+from models.weights import load_weights, save_weights
 from pipeline.errors import SceneError, SettingsError
+from pipeline.simulator.farm_fields import CLASSES
+from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_field, write_weights
 from tests.models.conftest import make_weights
-
-FRAMES = ("001", "002", "003")
-QUICK: dict[str, Any] = {"shares": (0.25, 0.5), "policies": ("entropy", "random"), "draws": 20, "timed_runs": 1}
-
-
-def _folder(root: Path, size: tuple[int, int] = (24, 40)) -> Path:
-    """Three frames of two classes."""
-    rng = np.random.default_rng(0)
-    for folder in ("images", "annotations"):
-        (root / folder).mkdir(parents=True)
-    (root / "scene.toml").write_text(
-        'labels = "annotations/{number}_annotation.png"\n[classes]\nsoil = [0, 0, 0]\ncrop = [0, 255, 0]\n'
-    )
-    for number in FRAMES:
-        grown = rng.integers(0, 2, size, dtype=np.uint8) * 255
-        colours = np.stack([0 * grown, grown, 0 * grown], axis=-1)
-        Image.fromarray(colours).save(root / "annotations" / f"{number}_annotation.png")
-        Image.fromarray(colours // 2 + 40).save(root / "images" / f"{number}_image.png")
-    return root
-
-
-def _weights(path: Path, seed: int = 0, **record: Any) -> Path:
-    made = make_weights(seed, classes=2, columns=3)
-    save_weights(replace(made, class_names=("soil", "crop"), record={"seed": seed, **record}), path)
-    return path
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of three small frames."""
-    return _folder(tmp_path_factory.mktemp("evaluate") / "field")
+    return write_field(tmp_path_factory.mktemp("evaluate") / "field")
 
 
 @pytest.fixture(scope="module")
 def drawn(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """An evaluation of two seeds, and its folder."""
     folder = tmp_path_factory.mktemp("out")
-    weights = tuple(_weights(folder / f"w{seed}.safetensors", seed) for seed in (0, 1))
+    weights = tuple(write_weights(folder / f"w{seed}.safetensors", seed) for seed in (0, 1))
     return folder, evaluate_weights(EvaluateRequest(str(data), weights, folder / "out", **QUICK))
 
 
@@ -91,23 +68,25 @@ def test_seeds_give_mean_and_spread(drawn: tuple[Path, dict[str, Any]]):
     """The figure is the mean of the weights', the spread that between them."""
     _, content = drawn
     row = _row(content, "entropy", 0.25)
-    assert row["miou"] == pytest.approx(np.mean(row["by_weights"]))
-    assert row["spread"] == pytest.approx(np.std(row["by_weights"], ddof=1))
-    assert len(row["by_weights"]) == 2
+    assert row["miou"] == pytest.approx(np.mean(row["by_seed"]))
+    assert row["spread"] == pytest.approx(np.std(row["by_seed"], ddof=1))
+    assert len(row["by_seed"]) == 2
 
 
 def test_costs_stand_beside_all(drawn: tuple[Path, dict[str, Any]]):
     """All five columns are there; none costs more than all but in capture, and more seats cost more."""
     _, content = drawn
     cost = {share: _row(content, "entropy", share)["cost"] for share in (0.25, 0.5)}
-    for column in ("samples", "bytes", "multiply_adds", "cpu_s", "capture_s"):
+    for column in ("samples", "bytes", "multiply_adds", "cpu_s", "frame_s", "rig_s"):
         assert cost[0.25][column]["done"] is not None
     for column in ("samples", "bytes", "multiply_adds"):
         assert cost[0.25][column]["done"] < cost[0.5][column]["done"]
     assert _row(content, "all", 1.0)["cost"]["samples"] == {
         "done": 24 * 40 + 12 * 20, "full": 24 * 40 + 12 * 20, "ratio": 1.0,
     }  # fmt: skip
-    assert _row(content, "all", 1.0)["cost"]["capture_s"]["ratio"] == 1
+    assert _row(content, "all", 1.0)["cost"]["rig_s"]["ratio"] == 1
+    adds = cost[0.25]["multiply_adds"]
+    assert sum(adds[part] for part in ("glance", "score", "encode", "decode")) == adds["done"]
 
 
 def test_the_oracle_has_all_the_gain(drawn: tuple[Path, dict[str, Any]]):
@@ -122,7 +101,7 @@ def test_the_oracle_has_all_the_gain(drawn: tuple[Path, dict[str, Any]]):
 
 def test_a_killed_run_goes_on(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Frames that were judged are not judged again, and the figures are those of a run that was not killed."""
-    weights = (_weights(tmp_path / "w.safetensors"),)
+    weights = (write_weights(tmp_path / "w.safetensors"),)
     whole = evaluate_weights(EvaluateRequest(str(data), weights, **QUICK))
     request = EvaluateRequest(str(data), weights, tmp_path / "out", **QUICK)
     judged: list[str] = []
@@ -144,6 +123,17 @@ def test_a_killed_run_goes_on(data: Path, tmp_path: Path, monkeypatch: pytest.Mo
 
 def _without_costs(content: dict[str, Any]) -> str:
     return json.dumps([{name: row[name] for name in row if name != "cost"} for row in content["rows"]])
+
+
+def test_progress_tells_the_time_left(data: Path, tmp_path: Path):
+    """From the second frame on, beside the frame's name; the share done never falls."""
+    said: list[tuple[float, str]] = []
+    weights = (write_weights(tmp_path / "w.safetensors"),)
+    request = EvaluateRequest(str(data), weights, **{**QUICK, "timed_frames": 0})
+    evaluate_weights(request, lambda what, done, words: said.append((done, words)) if "judging" in what else None)
+    assert said[0] == (0, "001")
+    assert all(words.startswith("003, about ") and words.endswith(" left") for _, words in said[-3:-1])
+    assert [done for done, _ in said] == sorted(done for done, _ in said)
 
 
 def test_a_damaged_result_is_made_again(tmp_path: Path):
@@ -172,39 +162,32 @@ def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
     assert content["weights"][0]["left_out"] == sorted(split["train"])
     assert content["frames"] == sorted({"003", *split["validation"]})
     assert content["rows"][0]["cost"]["cpu_s"]["done"] is None
+    assert content["left_out"] == sorted(split["train"])
     with pytest.raises(SceneError, match=r"was trained on all 1 frames .* frames trained on are refused"):
         evaluate_weights(EvaluateRequest(str(data), (out,), frames=tuple(split["train"])))
+    with pytest.raises(SceneError, match=rf"no weights are left for {next(iter(split['train']))} of --frames"):
+        evaluate_weights(EvaluateRequest(str(data), (out,), frames=FRAMES))
 
 
 def test_folds_are_judged_each_on_its_own_frames(data: Path, tmp_path: Path):
     """With frames left out in turn every frame is judged by the weights that did not see it."""
-    scenes = {name: _key(data, name) for name in FRAMES}
-    first = _weights(tmp_path / "a.safetensors", 0, split={"train": {"001": scenes["001"]}})
-    second = _weights(tmp_path / "b.safetensors", 1, split={"train": {n: scenes[n] for n in ("002", "003")}})
+    scenes = {name: scene_at(data, name).key for name in FRAMES}
+    first = write_weights(tmp_path / "a.safetensors", 0, split={"train": {"001": scenes["001"]}})
+    second = write_weights(tmp_path / "b.safetensors", 1, split={"train": {n: scenes[n] for n in ("002", "003")}})
     content = evaluate_weights(EvaluateRequest(str(data), (first, second), **{**QUICK, "timed_frames": 0}))
     assert [(one["frames"], one["left_out"]) for one in content["weights"]] == [(2, ["001"]), (1, ["002", "003"])]
     assert content["frames"] == list(FRAMES)
     assert sum(content["support"].values()) == 3 * 24 * 40
-
-
-def _key(data: Path, name: str) -> str:
-    from flows.benchmark_frames import open_frames
-
-    opened = open_frames(str(data), (name,), None, LineCamera(), {})
-    return next(opened.scenes(opened.train)).key
-
-
-def _looked(data: Path, path: Path) -> tuple[Any, Weights]:
-    from flows.benchmark_frames import open_frames
-
-    opened = open_frames(str(data), ("001",), None, LineCamera(), {})
-    weights = load_weights(_weights(path))
-    return look_at(next(opened.scenes(opened.train)), "001", weights, LineCamera(), 0), weights
+    assert content["seeds"] == [["a.safetensors", "b.safetensors"]]
+    assert content["rows"][0]["spread"] is None
+    one = {**QUICK, "timed_frames": 0, "frames": ("001",)}
+    alone = evaluate_weights(EvaluateRequest(str(data), (first, second), **one))
+    assert [weights["covers"] for weights in alone["weights"]] == [[], ["001"]]
 
 
 def test_inside_and_outside_make_the_whole(data: Path, tmp_path: Path):
     """Counts of captured seats are those of their pixels; all seats are the whole, none nothing."""
-    look, weights = _looked(data, tmp_path / "w.safetensors")
+    look, weights = looked_at(data, tmp_path / "w.safetensors")
     record = judge_frame(Trial((0.25,), ("random",)), look, weights)
     rows = {row["policy"]: row for row in record["rows"]}
     assert np.sum(rows["none"]["inside"]) == 0
@@ -216,7 +199,7 @@ def test_inside_and_outside_make_the_whole(data: Path, tmp_path: Path):
 
 def test_a_look_does_not_depend_on_its_company(data: Path, tmp_path: Path):
     """Noise and figures of a frame follow from seed and name, whatever other frames are judged."""
-    weights = (_weights(tmp_path / "w.safetensors"),)
+    weights = (write_weights(tmp_path / "w.safetensors"),)
     quick = {**QUICK, "timed_frames": 0}
     every = evaluate_weights(EvaluateRequest(str(data), weights, **quick))
     alone = evaluate_weights(EvaluateRequest(str(data), weights, frames=("002",), **quick))
@@ -229,9 +212,10 @@ def test_the_order_of_frames_does_not_matter():
     rng = np.random.default_rng(0)
     records = [_record(f"{number:03d}", rng) for number in range(4)]
     trial = {"shares": (0.5,), "policies": (), "seed": 0, "draws": 10}
-    there, back = (summarise([order], ("a", "b"), trial, [], []) for order in (records, records[::-1]))
+    there, back = (summarise([order], ("a", "b"), trial, Prices()) for order in (records, records[::-1]))
     assert json.dumps(there["rows"][0], sort_keys=True) == json.dumps(back["rows"][0], sort_keys=True)
     whole = collect_row([records], "none", 0.0)
+    assert whole is not None
     assert there["rows"][0]["miou"] == mean_iou(whole.counts.sum(axis=(0, 1)))
 
 
@@ -240,7 +224,8 @@ def _record(name: str, rng: np.random.Generator) -> dict[str, Any]:
         {
             "policy": policy, "draw": 0, "share": share, "counts": rng.integers(1, 9, (2, 2)).tolist(),
             "inside": [[0, 0], [0, 0]], "boundary": [[1, 2], [1, 3]], "samples": 1.0, "bytes": 2.0,
-            "multiply_adds": 3, "gain": 1.0, "best_gain": 2.0, "ap_top": None,
+            "multiply_adds": 3, "adds": {"glance": 1, "score": 0, "encode": 1, "decode": 1},
+            "gain": 1.0, "best_gain": 2.0, "ap_top": None,
         }
         for policy, share in (("none", 0.0), ("oracle", 0.5), ("all", 1.0))
     ]  # fmt: skip
@@ -248,21 +233,37 @@ def _record(name: str, rng: np.random.Generator) -> dict[str, Any]:
 
 
 def test_seconds_of_a_row():
-    """Glance, scores and map together; `all` and `none` are the map alone."""
-    timed = {"glance": 1.0, "score": {"entropy": 0.5}, "segment": {"0": 2.0, "0.1": 3.0, "1": 9.0}}
+    """Glance, scores and map together; `all`, `none` and a control are the map alone."""
+    timed = {
+        "glance": 1.0, "score": {"entropy": 0.5}, "segment": {"0": 2.0, "0.1": 3.0, "1": 9.0},
+        "control": {"dense 1": 7.0},
+    }  # fmt: skip
+    assert row_seconds(timed, "dense", 1.0) == 7
+    assert row_seconds(timed, "margin", 0.1) is row_seconds(timed, "coarser", 1.1) is None
     assert row_seconds(timed, "entropy", 0.1) == 4.5
     assert row_seconds(timed, ORACLE, 0.1) == 4
     assert (row_seconds(timed, "none", 0.0), row_seconds(timed, "all", 1.0)) == (2, 9)
 
 
+def test_everything_timed_goes_in_turn():
+    """Whatever slows the machine for a while meets all parts alike; rounds of warming up are not counted."""
+    went: list[str] = []
+    works = {("segment", name): lambda name=name: went.append(name) for name in ("a", "b")}  # type: ignore[misc]
+    taken = cpu_seconds(works, Rounds(counted=2, warm_up=1))
+    assert went == ["a", "b"] * 3
+    assert all(seconds >= 0 for seconds in taken.values())
+
+
 def test_the_farm_is_judged_on_seeds_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Small built-in fields, neither trained on nor shown."""
+    """Small built-in fields, neither trained on nor shown, noisy: with equal time beside equal exposure."""
     monkeypatch.setattr("flows.training_data.FARM_SHAPE", (32, 48))
-    shipped = Path(benchmark_work.__file__).parents[1] / "models" / "shipped" / "farm.safetensors"
-    quick = {**QUICK, "policies": ("entropy",), "shares": (0.25,), "timed_frames": 0}
-    content = evaluate_weights(EvaluateRequest("farm", (shipped,), scenes=2, **quick))
+    made, weights = make_weights(classes=len(CLASSES), columns=6), tmp_path / "w.safetensors"
+    save_weights(replace(made, class_names=CLASSES), weights)
+    quick = {**QUICK, "policies": ("entropy",), "shares": (0.25,), "timed_frames": 0, "equal_time": True}
+    content = evaluate_weights(EvaluateRequest("farm", (weights,), scenes=2, **quick))
     assert content["frames"] == [str(FARM_TEST_SEED), str(FARM_TEST_SEED + 1)]
-    assert 0 < _row(content, "none", 0.0)["miou"] <= 1
+    assert 0 <= _row(content, "none", 0.0)["miou"] <= 1
+    assert content["equal_time"][0]["frames"] == 2
 
 
 @pytest.mark.parametrize(
@@ -271,20 +272,21 @@ def test_the_farm_is_judged_on_seeds_of_its_own(tmp_path: Path, monkeypatch: pyt
         ({"shares": (10.0,)}, "--shares are shares of the seats from 0 to 1"),
         ({"policies": ("mask",)}, "'mask' is none that can be judged"),
         ({"draws": 0}, "--draws must be at least 1"),
+        ({"timed_runs": 0}, "--timed-runs must be at least 1"),
         ({"seed": -1}, "--seed must be at least 0"),
         ({"scenes": 2}, "--scenes is for the built-in farm"),
     ],
 )
 def test_what_cannot_be_is_refused(data: Path, tmp_path: Path, change: dict[str, Any], words: str):
     """The message names the flag."""
-    request = EvaluateRequest(str(data), (_weights(tmp_path / "w.safetensors"),), **QUICK)
+    request = EvaluateRequest(str(data), (write_weights(tmp_path / "w.safetensors"),), **QUICK)
     with pytest.raises(SettingsError, match=words):
         evaluate_weights(replace(request, **change))
 
 
 def test_several_weights_are_seeds_of_one_training(tmp_path: Path):
     """Other classes, or the same file twice, are refused."""
-    first, again = _weights(tmp_path / "a.safetensors"), _weights(tmp_path / "b.safetensors")
+    first, again = write_weights(tmp_path / "a.safetensors"), write_weights(tmp_path / "b.safetensors")
     with pytest.raises(SettingsError, match="the same weights are given twice"):
         open_candidates((first, again))
     save_weights(make_weights(1, classes=3, columns=3), again)
@@ -295,7 +297,7 @@ def test_several_weights_are_seeds_of_one_training(tmp_path: Path):
 def test_an_unknown_frame_is_refused(data: Path, tmp_path: Path):
     """The message names those that there are."""
     with pytest.raises(SceneError, match="has no frame 099; it has 001, 002, 003"):
-        evaluate_weights(EvaluateRequest(str(data), (_weights(tmp_path / "w.safetensors"),), frames=("099",)))
+        evaluate_weights(EvaluateRequest(str(data), (write_weights(tmp_path / "w.safetensors"),), frames=("099",)))
 
 
 def test_the_table_prints(drawn: tuple[Path, dict[str, Any]], data: Path, capsys: pytest.CaptureFixture[str]):
@@ -304,14 +306,14 @@ def test_the_table_prints(drawn: tuple[Path, dict[str, Any]], data: Path, capsys
     weights = tuple(folder / f"w{seed}.safetensors" for seed in (0, 1))
     run_evaluate(EvaluateRequest(str(data), weights, folder / "out", **QUICK), Console(stderr=True))
     shown = capsys.readouterr()
-    for words in ("oracle*", "multiply-adds", "capture s", "crop", "uses labels", "paired draws"):
+    for words in ("oracle*", "multiply-adds", "rig s", "crop", "uses labels", "paired bootstrap", "baseline: all"):
         assert words in shown.out
     assert "evaluation.json" in shown.err
 
 
 def test_the_verb_prints_one_object(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """`evaluate --json` gives the figures on stdout and leaves with 0; frames trained on leave with 1."""
-    weights = _weights(tmp_path / "w.safetensors")
+    weights = write_weights(tmp_path / "w.safetensors")
     words = ["evaluate", str(data), "--weights", str(weights), "--shares", "0.5", "--policies", "entropy", "--json"]
     with pytest.raises(SystemExit) as left:
         main([*words, "--frames", "001", "--timed-frames", "0", "--draws", "5"])

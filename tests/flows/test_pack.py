@@ -34,7 +34,7 @@ def _survey(root: Path) -> Published:
     """A small farm in as many bands as light with a spectrum needs."""
     flags = {
         "scene": "farm", "size": "256x192", "bands": ",".join(map(str, range(5, 265, 10))), "engine": "plain",
-        "controls": False, "budget": "0.9", "out": str(root),
+        "controls": False, "budget": "0.95", "out": str(root),
     }  # fmt: skip
     return run_survey(load_settings(None, flags), Console(quiet=True))
 

@@ -17,13 +17,13 @@ from flows.run import open_run
 from flows.settings import load_settings
 from flows.stages import attend
 from flows.survey_command import run_survey
-from models.policies import IMAGE_POLICIES, POLICIES, SEEDED_POLICIES
+from models.policies import IMAGE_POLICIES, NETWORK_POLICIES, POLICIES, SEEDED_POLICIES
 from models.regions import plan_regions
 from pipeline.errors import SettingsError
 from storage.archive import StageRef
 from storage.attention import load_attention
 
-FREE = [policy for policy in POLICIES if policy not in ("mask", "vgg-static")]
+FREE = [policy for policy in POLICIES if policy not in ("mask", *NETWORK_POLICIES)]
 
 
 @pytest.fixture(scope="module")

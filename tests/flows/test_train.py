@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from flows import train as flow
-from flows.train import TrainRequest, suggested_patch, train_weights
+from flows.run import open_run
+from flows.settings import load_settings
+from flows.train import TrainRequest, suggested_patch, train_weights, usual_crop
+from flows.train_command import run_train
+from models.sizes import PRESETS, Preset
 from models.training import TrainingSettings
-from models.weights import load_weights
-from pipeline.errors import SceneError, SettingsError
+from models.weights import load_any_weights, load_weights
+from pipeline.errors import SceneError, SettingsError, WeightsError
 
 SETTINGS = TrainingSettings(steps=1, batch=1, crop=16)
 
@@ -86,3 +92,55 @@ def test_scenes_of_other_bands_are_not_mixed(tmp_path: Path):
 def test_patches_follow_the_size_of_scenes(shape: tuple[int, int], built_in: bool, patch: int):
     """Small scenes get small patches, so that there are seats to choose from."""
     assert suggested_patch(shape, built_in=built_in) == patch
+
+
+ROWS = {
+    "two-scale": {"none", "random", "sobel", "entropy", "all"},
+    "paper": {"none", "random", "sobel", "all"},
+    "dense": {"all"},
+    "upsampled": {"none"},
+    "coarser": {"all"},
+}
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_trains_and_shows_the_rows_it_has(tmp_path: Path, preset: Preset):
+    """The file holds the network that was asked for; its figures are those that it can give."""
+    shown = io.StringIO()
+    request = _request(tmp_path, validation=1, preset=preset)
+    record = run_train(request, Console(file=shown, width=100))
+    assert load_any_weights(request.out).config.preset == preset
+    figures = record["validation"]
+    assert set(figures) - {"scenes", "share_of_seats"} == ROWS[preset]
+    for name in ROWS[preset]:
+        assert 0 <= (figures[name]["miou"] if isinstance(figures[name], dict) else figures[name]) <= 1
+        assert name in shown.getvalue()
+
+
+def test_without_validation_scenes_a_control_is_not_judged(tmp_path: Path):
+    """Nothing stands in the record where no scene was kept."""
+    assert train_weights(_request(tmp_path, validation=0, preset="dense"))["validation"] is None
+
+
+def test_positions_that_a_preset_cannot_have_are_refused(tmp_path: Path):
+    """The flag is named before any scene is read; so is a factor that a coarser grid cannot be made of."""
+    with pytest.raises(SettingsError, match="--positions paper is not for --preset coarser"):
+        run_train(_request(tmp_path / "a", preset="coarser", positions="paper"), Console(quiet=True))
+    with pytest.raises(SettingsError, match="needs an even factor, got 1; choose another --patch or --factor"):
+        train_weights(_request(tmp_path / "b", preset="coarser", factor=1))
+
+
+def test_the_papers_network_trains_on_whole_scenes():
+    """Its numbers of places depend on the width of what it reads; the others' do not."""
+    assert usual_crop("farm", "paper") == usual_crop("frames", "paper") == 1024
+    assert [usual_crop("farm", "dense"), usual_crop("frames", "two-scale")] == [256, 384]
+
+
+def test_a_survey_with_a_control_is_refused(tmp_path: Path):
+    """Before the scene is opened: weights of a control make no survey."""
+    request = _request(tmp_path, validation=0, preset="paper")
+    train_weights(request)
+    flags = {"scene": str(tmp_path / "data" / "images" / "001_image.png"), "weights": str(request.out)}
+    for planning in (False, True):
+        with pytest.raises(WeightsError, match=r"holds the control 'paper'.*a survey needs weights of two scales"):
+            open_run(load_settings(None, {**flags, "out": str(tmp_path / "a")}), planning=planning)

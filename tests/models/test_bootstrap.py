@@ -68,6 +68,27 @@ def test_a_run_is_judged_on_its_own_frames_alone():
     assert paired_interval(counts, none, draws=20).difference == pytest.approx(expected)
 
 
+def test_seeds_that_differ_widen_the_interval():
+    """Frames that are all alike leave no doubt; seeds that are not alike do, and both rows share their draw."""
+    good, bad = np.eye(3, dtype=np.int64) * 9, np.eye(3, dtype=np.int64) + 2
+    first = np.stack([np.stack([good] * 4), np.stack([bad] * 4)])
+    second = np.stack([np.stack([good] * 4)] * 2)
+    two = np.arange(2)
+    assert paired_interval(first, second, draws=50).low == pytest.approx(paired_interval(first, second).high)
+    wide = paired_interval(first, second, seeds=(two, two), draws=50)
+    assert wide.low == pytest.approx(mean_iou(4 * bad) - 1)
+    assert wide.high == pytest.approx(0)
+    same = paired_interval(first, first, seeds=(two, two), draws=50)
+    assert (same.low, same.high) == (0, 0)
+
+
+def test_every_run_has_a_seed():
+    """The message names how many there are."""
+    row = _frames(2, 3)
+    with pytest.raises(ShapeError, match="a seed for each of 2 and 2 runs"):
+        paired_interval(row, row, seeds=(np.arange(1), np.arange(2)))
+
+
 def test_one_frame_has_no_interval():
     """A difference, and no bounds that would feign certainty."""
     found = paired_interval(_frames(1, 1, 1), _frames(1, 1, 2))

@@ -25,34 +25,48 @@ def test_patches_that_cannot_be_halved_to_four_are_refused(patch: int):
 
 
 @torch.inference_mode()
-@pytest.mark.parametrize("patch", [4, 8, 32])
-def test_a_patch_comes_back_at_its_size(patch: int):
-    """Features of every level, finest first, one token, and the width per pixel again."""
+@pytest.mark.parametrize(("patch", "side"), [(4, 1), (8, 1), (32, 2), (64, 4)])
+def test_a_patch_comes_back_at_its_size(patch: int, side: int):
+    """Features of every level, finest first, a token for each part, and the width per pixel again."""
     widths = level_widths(8, patch)
-    features, token = PatchStem(5, widths, 12)(torch.zeros(3, 5, patch, patch), coarse=False)
+    features, tokens = PatchStem(5, widths, 12, side)(torch.zeros(3, 5, patch, patch))
     assert [tuple(level.shape) for level in features] == [
         (3, width, patch >> i, patch >> i) for i, width in enumerate(widths)
     ]
-    assert token.shape == (3, 12)
-    assert PatchHead(widths, 12)(features, token).shape == (3, 8, patch, patch)
+    assert tokens.shape == (3, side**2, 12)
+    assert PatchHead(widths, 12, side)(features, tokens).shape == (3, 8, patch, patch)
+
+
+@torch.inference_mode()
+def test_tokens_lie_row_by_row():
+    """What stands in one quarter of a patch of 32 px changes the tokens near it, and most its own."""
+    stem, patch = PatchStem(1, level_widths(8, 32), 12, 2), torch.zeros(1, 1, 32, 32)
+    still = stem(patch)[1][0]
+    patch[..., 2:14, 18:30] = 1.0  # above, right
+    moved = (stem(patch)[1][0] - still).abs().sum(dim=1)
+    assert moved.argmax() == 1
+
+
+@torch.inference_mode()
+def test_context_falls_where_its_token_stands():
+    """A token's context reaches the part of the patch that it stands for, and little else."""
+    widths = level_widths(8, 32)
+    head = PatchHead(widths, 12, 2)
+    features = [torch.zeros(1, width, 32 >> i, 32 >> i) for i, width in enumerate(widths)]
+    tokens = torch.zeros(1, 4, 12)
+    still = head(features, tokens)
+    tokens[0, 2] = 1.0  # below, left
+    moved = (head(features, tokens) - still).abs().sum(dim=1)[0]
+    assert moved[16:, :16].mean() > 4 * moved[:16, 16:].mean()
 
 
 @torch.inference_mode()
 def test_patches_do_not_see_each_other():
     """A patch reads the same alone and among others."""
-    stem, patches = PatchStem(3, [8, 16], 12), torch.randn(7, 3, 8, 8, generator=torch.Generator().manual_seed(0))
-    _, together = stem(patches, coarse=False)
-    alone = torch.cat([stem(patch[None], coarse=False)[1] for patch in patches])
+    stem, patches = PatchStem(3, [8, 16], 12, 1), torch.randn(7, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    _, together = stem(patches)
+    alone = torch.cat([stem(patch[None])[1] for patch in patches])
     assert (together - alone).abs().max() <= 1e-6
-
-
-@torch.inference_mode()
-def test_scales_share_the_stem_until_told_apart():
-    """Both scales read alike at first; the learned shift alone tells them apart."""
-    stem, patch = PatchStem(3, [8], 12), torch.ones(1, 3, 4, 4)
-    assert (stem(patch, coarse=True)[1] == stem(patch, coarse=False)[1]).all()
-    stem.scale_shift[1] += 1.0
-    assert (stem(patch, coarse=True)[1] != stem(patch, coarse=False)[1]).any()
 
 
 def test_an_empty_pixel_has_a_finite_norm_and_gradient():

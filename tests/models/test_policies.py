@@ -7,6 +7,7 @@ import pytest
 
 from models.inference import Glance
 from models.policies import NETWORK_POLICIES, POLICIES, pixel_entropy, score_seats
+from models.self_attention import TokenReading
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.grid import SceneGrid
 from pipeline.selection import select_seats
@@ -16,7 +17,10 @@ def _glance(height: int = 32, width: int = 48, patch: int = 8, factor: int = 2) 
     """A flat scene of which the glance is equally unsure everywhere."""
     grid = SceneGrid(height, width, patch, factor)
     y, x = (size // factor for size in grid.padded_shape)
-    return Glance(grid, np.full((y, x, 3), 0.7, np.float32), np.full((y, x, 4), 0.25, np.float32))
+    columns, probability = np.full((y, x, 3), 0.7, np.float32), np.full((y, x, 4), 0.25, np.float32)
+    alike = np.ones((2, y * x // patch**2, 4), np.float32)
+    gain, tokens = np.ones(grid.seat_shape, np.float32), TokenReading(alike, alike, side=1)
+    return Glance(grid, columns, probability, gain=gain, tokens=tokens)
 
 
 @pytest.mark.parametrize("classes", [2, 5, 12])
@@ -124,13 +128,13 @@ def test_saliency_looks_at_what_differs(policy: str):
     assert (score_seats(policy, seen) == scores).all()
 
 
-@pytest.mark.parametrize("policy", ["entropy", "margin", "mask"])
+@pytest.mark.parametrize("policy", ["entropy", "margin", "mask", "gain", "self-attention"])
 @pytest.mark.parametrize("factor", [1, 2, 4])
 def test_a_border_seat_is_worth_its_share(policy: str, factor: int):
     """On a scene alike everywhere a seat scores in proportion to its pixels on the scene."""
     seen = _glance(37, 53, factor=factor)
     scores = score_seats(policy, seen, mask=np.full((37, 53), np.log(4)))
-    level = 1 if policy == "margin" else np.log(4)
+    level = 1 if policy in ("margin", "gain", "self-attention") else np.log(4)
     assert scores == pytest.approx(level * seen.grid.valid_share().ravel(), abs=1e-6)
 
 
@@ -143,7 +147,7 @@ def test_what_lies_off_the_scene_does_not_count():
 
 def test_policies_and_masks_that_do_not_fit_are_refused():
     """The messages name the policies there are, the flag that is missing, and both sizes."""
-    with pytest.raises(SettingsError, match="unknown policy 'best'; choose one of entropy, margin, sobel"):
+    with pytest.raises(SettingsError, match="unknown policy 'best'; choose one of gain, entropy, margin, sobel"):
         score_seats("best", _glance())
     with pytest.raises(SettingsError, match="needs --mask"):
         score_seats("mask", _glance())

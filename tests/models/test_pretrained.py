@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -69,7 +71,7 @@ def test_distilled_transformers_lose_their_extra_token():
     """DeiT's distillation token has no place; its position is cut out of the codes, the others stay."""
     state, module = photographs(distilled=True), Transformer()
     report = load_into(module, state)
-    assert report.skipped["dist_token"] == "no place for dist_token"
+    assert report.skipped["dist_token"] == "a token of the whole image"
     assert report.resized == {"pos_embed": "(1, 18, 8) to (1, 17, 8)"}
     kept = [0, *range(2, 18)]
     torch.testing.assert_close(module.pos_embed.detach(), state["pos_embed"][:, kept])
@@ -155,3 +157,40 @@ def test_another_network_is_no_vgg19(tmp_path):
     with pytest.raises(WeightsError, match="none of 32 tensors fits"):
         load_vgg(tmp_path / "vit.pth", NARROW)
     assert read_state(tmp_path / "vit.pth").keys() == photographs().keys()
+
+
+def test_a_trained_vgg_may_read_other_channels(tmp_path):
+    """As many as its first convolution has, at the wavelengths that its file names; one of photographs has three."""
+    sizes = replace(NARROW, channels=5)
+    state = VggFeatures(sizes).state_dict()
+    torch.save(state, tmp_path / "five.pth")
+    network, report = load_vgg(tmp_path / "five.pth", NARROW, trained=True)
+    assert (network.sizes, network.wavelength_nm, len(report.matched)) == (sizes, None, 32)
+    with pytest.raises(WeightsError, match=r"five\.pth reads 5 channels.* 3; .* is for the policy vgg-trained"):
+        load_vgg(tmp_path / "five.pth", NARROW)
+    bare = {name.removeprefix("features."): value for name, value in state.items()}
+    torch.save(bare | {"wavelength_nm": torch.linspace(500, 900, 5)}, tmp_path / "named.pth")
+    network, report = load_vgg(tmp_path / "named.pth", NARROW, trained=True)
+    assert network.wavelength_nm == (500.0, 600.0, 700.0, 800.0, 900.0)
+    assert report.skipped == {}
+
+
+@pytest.mark.parametrize("named", [torch.ones(4), torch.tensor([0.5] * 5), torch.full((5,), np.nan), torch.tensor(3.0)])
+def test_wavelengths_that_do_not_belong_to_the_channels_are_refused(tmp_path, named: Tensor):
+    """Another number of them, micrometres, or none at all: the message names file and tensor."""
+    state = VggFeatures(replace(NARROW, channels=5)).state_dict()
+    torch.save(state | {"wavelength_nm": named}, tmp_path / "v.pth")
+    with pytest.raises(WeightsError, match=r"v\.pth, tensor 'wavelength_nm': .*wavelength"):
+        load_vgg(tmp_path / "v.pth", NARROW, trained=True)
+
+
+@pytest.mark.parametrize("channels", [1, 4])
+def test_a_mixing_convolution_of_other_channels_is_no_vgg19(tmp_path, channels: int):
+    """The normalised variant begins with three colours; anything else there is refused, whoever trained it."""
+    state = {"0.weight": torch.ones(3, channels, 1, 1), "0.bias": torch.ones(3)}
+    for number, place in enumerate(NARROW.places):
+        layer = VggFeatures(NARROW).features[place]
+        state |= {f"{3 * number + 2}.weight": layer.weight, f"{3 * number + 2}.bias": layer.bias}
+    torch.save(state, tmp_path / "v.pth")
+    with pytest.raises(WeightsError, match=r"v\.pth (is no VGG19|lacks \d+ of 32)"):
+        load_vgg(tmp_path / "v.pth", NARROW, trained=True)

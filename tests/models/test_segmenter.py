@@ -59,10 +59,10 @@ def test_windows_are_those_of_the_whole_canvas(tiny: Maker, patch: int, factor: 
     """The features under a seat equal the window of the whole canvas brought up bilinearly, borders included."""
     model = tiny(patch=patch, factor=factor).segmenter
     rows, columns = 2 * factor, 3 * factor
-    canvas = _drawn(2, 8, 2 * patch, 3 * patch)
-    whole = F.interpolate(canvas, scale_factor=factor, mode="bilinear", align_corners=False)
+    canvas = _drawn(2, model.config.coarse_width, 2 * patch, 3 * patch)
+    whole = F.interpolate(model.under(canvas), scale_factor=factor, mode="bilinear", align_corners=False)
     seats = torch.randperm(rows * columns, generator=torch.Generator().manual_seed(3)).expand(2, -1)
-    windows = model.canvas_windows(canvas, seats).view(2, -1, 8, patch, patch)
+    windows = model.canvas_windows(canvas, seats).view(2, -1, model.config.width, patch, patch)
     for place, seat in enumerate(seats[0].tolist()):
         y, x = seat // columns * patch, seat % columns * patch
         assert (windows[:, place] - whole[:, :, y : y + patch, x : x + patch]).abs().max() <= 1e-6
@@ -88,26 +88,25 @@ def test_tokens_are_counted_as_in_the_paper(tiny: Maker, positions: str, seats: 
     """A scene of 256 px with patches of 8 px and factor 2 has 256 coarse tokens, and one more a seat."""
     model = tiny(positions=positions, width=4, dim=8).segmenter
     read: list[int] = []
-    model.encoder.register_forward_hook(lambda module, args, out: read.append(out.shape[1]))
+    model.encoder.register_forward_hook(lambda module, args, out: read.append(out[0].shape[1]))
     coarse, fine = torch.zeros(1, 4, 128, 128), torch.zeros(1, seats, 4, 8, 8)
-    logits, patches = model(model.view(coarse), fine, torch.arange(seats)[None])
-    assert read == [tokens]
+    logits, patches = model(coarse, fine, torch.arange(seats)[None])
+    assert sum(read) == tokens
     assert logits.shape == (1, 3, 128, 128)
     assert patches.shape == (1, seats, 3, 8, 8)
 
 
 @torch.inference_mode()
-@pytest.mark.parametrize("positions", ["2d", "paper"])
-def test_every_place_has_a_token_of_its_own(tiny: Maker, positions: str):
+@pytest.mark.parametrize(("positions", "patch"), [("2d", 8), ("paper", 8), ("2d", 32)])
+def test_every_place_has_a_token_of_its_own(tiny: Maker, positions: str, patch: int):
     """Equal pixels become tokens that differ by place: between patches, between seats, between scales."""
-    model = tiny(positions=positions).segmenter
-    model.scale_code.zero_()
-    view = model.view(torch.zeros(1, 4, 16, 16))
-    places = torch.cartesian_prod(torch.arange(4), torch.arange(4)).double()[None] + 0.5
-    blank = torch.zeros(1, 16, 16)
-    fine = model._token_set(blank, places, 1, 2, None).x[0]
-    coarse = model._token_set(blank[:, :4], view.tokens.yx, 0, 2, None).x[0]
-    assert len(torch.cat([fine, coarse]).unique(dim=0)) == 20
+    model = tiny(positions=positions, patch=patch, factor=2).segmenter
+    count = model.config.token_side**2
+    cells = torch.cartesian_prod(torch.arange(2), torch.arange(2))[None]
+    places = torch.cartesian_prod(torch.arange(4), torch.arange(4))[None]
+    coarse = model._coded(torch.zeros(1, 4, count, 16), cells, 2, None, fine=False)
+    fine = model._coded(torch.zeros(1, 16, count, 16), places, 2, None, fine=True)
+    assert len(torch.cat([fine, coarse], dim=1)[0].unique(dim=0)) == 20 * count
 
 
 @torch.inference_mode()
@@ -117,29 +116,40 @@ def test_crops_move_in_the_plane_and_not_in_the_papers_row(tiny: Maker):
     seats, origin = torch.arange(8)[None], torch.tensor([[37, 11]])
     for positions, moves in (("2d", True), ("paper", False)):
         model = tiny(positions=positions).segmenter
-        still = model(model.view(coarse), fine, seats)[0]
-        moved = model(model.view(coarse, origin), fine, seats, origin)[0]
-        assert bool((still != moved).any()) == moves
+        still, moved = model(coarse, fine, seats), model(coarse, fine, seats, origin)
+        assert all(bool((a != b).any()) == moves for a, b in zip(still, moved, strict=True))
 
 
 @torch.inference_mode()
-def test_fine_patches_reach_the_map_elsewhere(tiny: Maker):
-    """A captured seat informs the coarse map beyond itself: both scales are read together."""
+def test_fine_patches_change_nothing_of_the_glance(tiny: Maker):
+    """What the coarse pass says stands, bit by bit, however many places are looked at again."""
     model = tiny().segmenter
     coarse, fine = _scene(model)
-    view = model.view(coarse)
-    alone, _ = model(view, fine[:, :0], torch.zeros(1, 0, dtype=torch.int64))
-    joint, _ = model(view, fine[:, :1], torch.zeros(1, 1, dtype=torch.int64))
-    assert (alone - joint)[..., 8:].abs().max() > 1e-4
+    alone, _ = model(coarse, fine[:, :0], torch.zeros(1, 0, dtype=torch.int64))
+    joint, _ = model(coarse, fine[:, :5], torch.arange(5)[None])
+    assert (alone == joint).all()
+
+
+@torch.inference_mode()
+def test_fine_patches_read_the_glance_and_each_other(tiny: Maker):
+    """A patch is read otherwise beside another patch, and above another coarse pass."""
+    model = tiny().segmenter
+    coarse, fine = _scene(model)
+    _, alone = model(coarse, fine[:, :1], torch.tensor([[0]]))
+    _, beside = model(coarse, fine[:, :2], torch.tensor([[0, 1]]))
+    _, above = model(coarse.flip(2), fine[:, :1], torch.tensor([[0]]))
+    assert (alone - beside[:, :1]).abs().max() > 1e-4
+    assert (alone - above).abs().max() > 1e-4
 
 
 def test_every_parameter_learns(tiny: Maker):
-    """The loss of a map with some seats has a gradient in every parameter."""
+    """The loss of a map with some seats, and of their scores, has a gradient in every parameter."""
     model = tiny(layers=2).segmenter
     coarse, fine = _scene(model)
     seats = torch.tensor([[3, 0, 9]])
-    logits, patches = model(model.view(coarse), fine[:, seats[0]], seats)
-    model.composite(logits, patches, seats).square().mean().backward()
+    logits, patches = model(coarse, fine[:, seats[0]], seats)
+    gain = model.score(model.read_coarse(coarse))
+    (model.composite(logits, patches, seats).square().mean() + gain.square().mean()).backward()
     idle = [name for name, value in model.named_parameters() if value.grad is None or not value.grad.any()]
     assert not idle
 
@@ -149,7 +159,7 @@ def test_a_factor_of_one_looks_twice_at_one_size(tiny: Maker):
     """With factor 1 coarse and fine patches have the same ground, and the map the size of the coarse image."""
     model = tiny(factor=1).segmenter
     coarse, fine = _scene(model)
-    logits, patches = model(model.view(coarse), fine, torch.arange(6)[None])
+    logits, patches = model(coarse, fine, torch.arange(6)[None])
     assert model.composite(logits, patches, torch.arange(6)[None]).shape == (1, 3, 16, 24)
 
 

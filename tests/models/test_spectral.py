@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.spectral import Normalisation, SpectralBasis, band_widths, checked_wavelengths
+from models.spectral import Normalisation, SpectralBasis, band_widths, checked_wavelengths, project
 from pipeline.errors import WavelengthError
 
 BASIS = SpectralBasis(400.0, 1000.0, 24)
@@ -137,13 +137,27 @@ def test_more_light_is_a_gain_and_a_shift():
     assert bright == pytest.approx(expected, abs=1e-3)
 
 
-def test_what_is_missing_counts_as_the_median():
-    """Values that are not finite enter as the training median."""
-    normalisation = Normalisation.measured(_sample())
-    pixel = np.where([True, True, False, False, True], 0.5, normalisation.centre)
-    broken = np.where([True, True, False, False, True], 0.5, np.nan)
-    expected = normalisation.apply(pixel, np.ones(5, bool))
-    assert (normalisation.apply(broken, np.ones(5, bool)) == expected).all()
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_missing_counts_as_what_the_others_let_expect(bad: float):
+    """A value that is not finite enters as a column that no band reaches; without any value it is the median's."""
+    normalisation, known = Normalisation.measured(_sample()), np.array([True, True, False, False, True])
+    broken = np.stack([np.full(5, 0.4), np.where(known, 0.5, bad), np.full(5, bad)])
+    found = normalisation.apply(broken, np.ones(5, bool))
+    assert found[0] == pytest.approx(normalisation.apply(broken[0], np.ones(5, bool)), abs=1e-5)
+    assert found[1] == pytest.approx(normalisation.apply(broken[1], known), abs=1e-5)
+    assert not found[2].any()
+
+
+def test_dead_bands_leave_their_weight_to_the_rest():
+    """A flat spectrum stays flat where bands are dead; a column without a band is NaN, and so is a pixel half dead."""
+    nm = np.linspace(400, 1000, 31)
+    matrix, _ = SpectralBasis(400.0, 1000.0, 8).matrix(nm)
+    values = np.full((4, 31), 0.3)
+    values[1, ::3], values[2, :8], values[3, :16] = np.nan, np.inf, np.nan
+    found = project(values, matrix)
+    assert found[:2] == pytest.approx(0.3, abs=1e-6)
+    assert np.isnan(found[2]).tolist() == [True] + [False] * 7
+    assert np.isnan(found[3]).all()
 
 
 def test_unreached_columns_are_what_the_others_let_expect():

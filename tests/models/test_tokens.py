@@ -6,9 +6,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
-from models.tokens import TokenSet, code_1d, code_2d, paper_numbers
+from models.tokens import code_1d, code_2d, paper_numbers
 from pipeline.errors import ShapeError
 
 PLACE = st.tuples(st.integers(0, 4000), st.integers(0, 4000))
@@ -84,18 +83,3 @@ def test_the_papers_code_has_no_columns(first: int, second: int, cosine: float):
     """Right neighbour and row wrap look alike, and a patch's last seat is nearer to the next patch."""
     a, b = code_1d(torch.tensor([first, second]), 768)
     assert torch.cosine_similarity(a, b, dim=0).item() == pytest.approx(cosine, abs=1e-3)
-
-
-def test_sets_are_joined_behind_each_other():
-    """Every field of the second set stands behind the first's."""
-
-    def tokens(count: int, value: float) -> TokenSet:
-        full = torch.full((2, count), value)
-        return TokenSet(full[..., None].expand(-1, -1, 4), full[..., None].expand(-1, -1, 2).double(), full, full > 0)
-
-    both = tokens(3, 0.0).joined(tokens(2, 1.0))
-    assert both.x.shape == (2, 5, 4)
-    expected: Tensor = torch.tensor([0.0, 0, 0, 1, 1])
-    assert (both.scale == expected).all()
-    assert (both.valid == (expected > 0)).all()
-    assert both.yx.dtype == torch.float64

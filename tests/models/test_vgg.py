@@ -95,15 +95,17 @@ def test_a_moved_picture_has_a_moved_gradient(shift: tuple[int, int]):
     torch.testing.assert_close(moved, input_gradient(network, picture).roll(shift, (2, 3)), rtol=1e-4, atol=1e-5)
 
 
-def test_multiply_adds_are_those_torch_counts():
+@pytest.mark.parametrize("channels", [1, 3, 24])
+def test_multiply_adds_are_those_torch_counts(channels: int):
     """The closed form counts forward and input gradient, blocks with their surroundings and closing included."""
+    sizes = VggSizes(channels=channels)
     with torch.device("meta"):
-        network = VggFeatures().requires_grad_(False)
-        picture = torch.zeros(1, 3, 64, 80, requires_grad=True)
+        network = VggFeatures(sizes).requires_grad_(False)
+        picture = torch.zeros(1, channels, 64, 80, requires_grad=True)
         with FlopCounterMode(display=False) as counter:
             network(picture).sum().backward()
-    assert counter.get_total_flops() / 2 == 2 * VggSizes().forward_multiply_adds * 64 * 80
-    assert saliency_multiply_adds((32, 48), 7) == counter.get_total_flops() / 2 + 3 * 7 * 32 * 48
+    assert counter.get_total_flops() / 2 == 2 * sizes.forward_multiply_adds * 64 * 80
+    assert saliency_multiply_adds((32, 48), 7, channels) == counter.get_total_flops() / 2 + channels * 7 * 32 * 48
 
 
 @pytest.mark.parametrize("size", [1, 31, BLOCK_PX, BLOCK_PX + 1, 3 * BLOCK_PX - 5])

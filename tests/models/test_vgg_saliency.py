@@ -15,7 +15,7 @@ from models.kernel_fits import rgb_response
 from models.policies import score_seats
 from models.vgg import VggFeatures
 from models.vgg_file import VggFile
-from models.vgg_saliency import VggSaliency, close_ring, colours_of
+from models.vgg_saliency import VggSaliency, channels_of, close_ring, colours_of
 from models.vgg_sizes import VggSizes
 from models.weights import Weights
 from pipeline.errors import SettingsError, WeightsError
@@ -141,6 +141,57 @@ def test_the_gradient_is_at_hand_inside_inference_mode(saliency: VggSaliency):
     assert (inside == saliency(seen)).all()
 
 
+def trained(channels: int, wavelength_nm: tuple[float, ...] | None = None) -> VggFeatures:
+    """A narrow network that reads some channels, as one that learned from data of one's own."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(4)
+        sizes = VggSizes(widths=(4, 6, 8, 10, 10), channels=channels)
+        return VggFeatures(sizes, wavelength_nm).eval().requires_grad_(False)
+
+
+@pytest.mark.parametrize("network", [trained(3), trained(4), trained(2, (500.0, 900.0)), trained(1, (650.0,))])
+def test_channels_of_a_trained_network_are_brought_to_one_scale(tiny: Callable[..., Weights], network: VggFeatures):
+    """Whatever they are, the training median becomes 0 and one spread more of every column 1."""
+    weights = tiny()
+    normal, count = weights.normalisation, network.sizes.channels
+    pixels = np.stack([normal.centre, normal.centre + normal.spread])
+    found = normal.apply(pixels, np.ones(4, np.bool_)) @ channels_of(weights, network)
+    assert found == pytest.approx(np.repeat([[0.0], [1.0]], count, axis=1), abs=1e-4)
+
+
+def test_which_channels_a_trained_network_reads(tiny: Callable[..., Weights]):
+    """Three are colours, as many as there are columns those in their order, named ones lie where they are named."""
+    weights = tiny()
+    normal = weights.normalisation
+    scene = np.random.default_rng(5).uniform(0, 1, (20, 4)).astype(np.float32)
+    columns = normal.apply(scene, np.ones(4, np.bool_))
+    assert (channels_of(weights, trained(3)) == colours_of(weights)).all()
+    own = columns @ channels_of(weights, trained(4))
+    assert own == pytest.approx((scene - normal.centre) / normal.spread, abs=1e-4)
+    named = channels_of(weights, trained(3, (450.0, 550.0, 650.0)))  # the other way round than red, green, blue
+    assert named == pytest.approx(colours_of(weights)[:, ::-1], abs=1e-6)
+
+
+def test_channels_that_the_weights_do_not_have_are_refused(tiny: Callable[..., Weights]):
+    """The message says what came, what would do, and how wavelengths are named."""
+    with pytest.raises(WeightsError, match=r"reads 5 channels without saying which.* have 4 .* tensor 'wavelength_nm'"):
+        channels_of(tiny(), trained(5))
+    with pytest.raises(WeightsError, match=r"a channel .* is at 1650 nm, the segmenter's weights are for 400-1000 nm"):
+        channels_of(tiny(), trained(2, (500.0, 1650.0)))
+
+
+def test_a_trained_network_finds_detail_in_its_channels(tiny: Callable[..., Weights]):
+    """The policy vgg-trained scores by all channels that enter, also what colours do not show."""
+    weights = tiny()
+    saliency = VggSaliency(trained(4), channels_of(weights, trained(4)))
+    columns = np.zeros((64, 96, 4), np.float32)
+    columns[16:32, 64:80] = noise(2, 16, 16, 4)
+    scores = score_seats("vgg-trained", look(columns), network=saliency).reshape(16, 24)
+    assert np.median(scores[4:8, 16:20]) > 2 * np.median(scores[:, :8])
+    with pytest.raises(SettingsError, match="'vgg-trained' needs --vgg FILE"):
+        score_seats("vgg-trained", look(columns))
+
+
 def test_a_network_that_is_missing_is_asked_for(tmp_path, tiny: Callable[..., Weights]):
     """The policy names its flag, a missing file what could stand there, a changed one that it changed."""
     seen: CoarseLook = look(noise(0, 8, 8, 4))
@@ -148,6 +199,8 @@ def test_a_network_that_is_missing_is_asked_for(tmp_path, tiny: Callable[..., We
         score_seats("vgg-static", seen)  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match=r"no file .*none\.pth; --vgg takes the weights of VGG19: torchvision"):
         VggFile.found(tmp_path / "none.pth")
+    with pytest.raises(SettingsError, match=r"no file .*none\.pth; --vgg takes VGG19 trained on data of your own"):
+        VggFile.found(tmp_path / "none.pth", trained=True)
     (tmp_path / "other.pth").write_bytes(b"no weights")
     with pytest.raises(WeightsError, match=r"other\.pth"):
         VggFile.found(tmp_path / "other.pth").saliency(tiny())

@@ -79,14 +79,14 @@ def test_parameters_in_another_memory_order_are_kept(tiny: Maker, tmp_path: Path
     assert all(torch.equal(loaded[name], value) for name, value in tiny().segmenter.state_dict().items())
 
 
-def test_unreached_columns_and_dead_pixels_are_the_median(tiny: Maker):
-    """Without correlation, bands of half the range leave the other half's columns at 0; a dead pixel is 0 in all."""
+def test_unreached_columns_are_the_median_and_dead_pixels_nothing(tiny: Maker):
+    """Without correlation, bands of half the range leave the other half's columns at 0; a dead pixel is NaN in all."""
     weights = tiny(columns=6)
     plain = replace(weights, normalisation=replace(weights.normalisation, whitening=np.eye(6, dtype=np.float32)))
-    columns = plain.columns(np.array([[0.3, 0.4, 0.5], [0.3, np.nan, 0.5]]), np.array([400.0, 450.0, 500.0]))
+    columns = plain.columns(np.array([[0.3, 0.4, 0.5], [0.3, np.nan, np.inf]]), np.array([400.0, 450.0, 500.0]))
     assert columns[0, :3].all()
     assert not columns[0, 3:].any()
-    assert not columns[1].any()
+    assert np.isnan(columns[1]).all()
 
 
 def test_records_grow_without_changing_the_rest(tiny: Maker):
@@ -135,7 +135,7 @@ def test_another_format_is_named(saved: Path):
         ({"classes": 1}, "description is damaged.*2 to 255 classes, got 1"),
         ({"depth": 3}, "description is damaged.*depth"),
         ({"dim": 32}, r"tensor scale_code should be \(2, 32\), the file has \(2, 16\)"),
-        ({"columns": 7}, r"tensor stem.enter.weight should be \(8, 7, 1, 1\)"),
+        ({"columns": 7}, r"tensor coarse_stem.enter.weight should be \(8, 7, 1, 1\)"),
     ],
 )
 def test_sizes_that_do_not_fit_are_named(saved: Path, changes: dict[str, int], words: str):

@@ -45,6 +45,14 @@ def test_both_have_the_same_seconds():
     assert report.other.coarse_s + report.other.fine_s <= whole
 
 
+def test_what_a_threshold_left_is_left_in_either_orientation():
+    """Where one run of lines pays, the other orientation is compared for the seconds spent, not for those allowed."""
+    scores = row_of_seats() + 0.001
+    report = compare_orientations(GRID, CAMERA, COST, "x", scores, budget_s=40.0, threshold=0.5)
+    assert 0 < report.taken.fine_s < 10
+    assert report.other.coarse_s + report.other.fine_s <= report.taken.coarse_s + report.taken.fine_s
+
+
 def test_coarse_strips_that_overlap_are_paid_for():
     """The coarse seconds of either orientation are those of strips that overlap by as much."""
     grid = SceneGrid(700, 1280, 32, 4)

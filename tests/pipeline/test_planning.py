@@ -13,7 +13,7 @@ from pipeline.camera import LineCamera
 from pipeline.coverage import cheapest_full, coarse_sweeps, full_sweeps
 from pipeline.errors import BudgetError, SettingsError, ShapeError
 from pipeline.grid import SceneGrid
-from pipeline.planning import SeatsPrice, check_budget, least_budget, plan_fine, price_of_seats
+from pipeline.planning import SeatsPrice, check_budget, joined_plan, least_budget, plan_fine, price_of_seats
 from pipeline.scan import CostModel
 from pipeline.strips import covered_seats
 
@@ -255,3 +255,116 @@ def test_a_margin_shows_the_seats_wherever_the_mirror_looks() -> None:
     for along, scan in ((6, 6), (-6, 6), (6, -6), (-6, -6)):
         beside = [replace(one, strip_px=one.strip_px + along, start_px=one.start_px + scan) for one in plan.sweeps]
         assert set(plan.seats) <= set(covered_seats(grid, camera, beside))
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.floats(0, 4), st.floats(0, 4), st.floats(1, 80), st.integers(0, 99), st.sampled_from(["x", "y"]))
+def test_a_higher_threshold_never_buys_more(one: float, other: float, budget_s: float, seed: int, along: str):
+    """Less worth, within the budget, and each plan shows the threshold's score a second, but for a part of a reload."""
+    scores = drawn(GRID, seed)
+    low, high = (
+        plan_fine(GRID, CAMERA, COST, along, scores, budget_s=budget_s, threshold=limit)
+        for limit in sorted((one, other))
+    )
+    assert high.worth <= low.worth
+    assert max(low.seconds, high.seconds) <= budget_s
+    for plan, limit in ((low, min(one, other)), (high, max(one, other))):
+        assert plan.worth >= limit * (plan.seconds - COST.reload_s) * (1 - 1e-9)
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.floats(0, 60), st.floats(0, 60), st.floats(0.05, 3), st.integers(0, 99))
+def test_a_bigger_budget_never_buys_less_above_a_threshold(one: float, other: float, threshold: float, seed: int):
+    """The law of budgets holds for every threshold."""
+    small, large = (
+        plan_fine(GRID, CAMERA, COST, "x", drawn(GRID, seed), budget_s=budget_s, threshold=threshold)
+        for budget_s in sorted((one, other))
+    )
+    assert large.worth >= small.worth * (1 - 1e-12)
+
+
+@pytest.mark.parametrize("budget_s", [0.0, 7.0, 25.0, 60.0])
+def test_a_threshold_of_0_is_none(budget_s: float):
+    """With scores of 0 and more the plan is the same to the last line."""
+    scores = drawn(GRID)
+    plain, zero = (
+        plan_fine(GRID, CAMERA, COST, "x", scores, budget_s=budget_s, threshold=limit) for limit in (None, 0.0)
+    )
+    assert (zero.sweeps, zero.seats.tolist(), zero.worth) == (plain.sweeps, plain.seats.tolist(), plain.worth)
+    assert (plain.threshold, zero.threshold, zero.spared_s) == (None, 0.0, None)
+
+
+def test_a_threshold_leaves_seconds_where_nothing_more_pays():
+    """Two strong places and a faint field: with a threshold between them only the strong ones are shown."""
+    rows, columns = GRID.seat_shape
+    scores = np.full((rows, columns), 0.01)
+    scores[2, 3:8] = scores[5, 20:24] = 2.0
+    plan = plan_fine(GRID, CAMERA, COST, "x", scores.ravel(), budget_s=40.0, threshold=0.5)
+    strong = np.flatnonzero(scores.ravel() > 1)
+    assert set(strong) <= set(plan.seats.tolist())
+    assert plan.spared_s == pytest.approx(40.0 - plan.seconds)
+    assert plan.spared_s > 20
+    assert plan.threshold == 0.5
+    all_of_it = plan_fine(GRID, CAMERA, COST, "x", scores.ravel(), budget_s=40.0)
+    assert all_of_it.seconds > plan.seconds + 5
+    assert all_of_it.spared_s is None
+    nothing = plan_fine(GRID, CAMERA, COST, "x", scores.ravel(), budget_s=40.0, threshold=1e3)
+    assert (nothing.sweeps, nothing.worth, nothing.spared_s) == ([], 0.0, 40.0)
+
+
+def test_the_full_scan_has_to_pay_as_well():
+    """It is taken where what it shows beside the runs is worth its seconds, and not where it is not."""
+    grid = SceneGrid(600, 1280, 400, 1)
+    kinds = [
+        plan_fine(grid, CAMERA, COST, "x", np.ones(8), budget_s=500.0, threshold=limit).kind
+        for limit in (0.0, 0.01, 5.0)
+    ]
+    assert kinds == ["full", "full", "lines"]
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 99), st.floats(5, 40))
+def test_negative_scores_ride_along_and_change_nothing(seed: int, budget_s: float):
+    """The plan is that of scores of 0 in their place: negative seats are shown by runs made for others alone."""
+    scores = drawn(GRID, seed)
+    gone = np.random.default_rng(seed).random(len(scores)) < 0.5
+    negative, nothing = np.where(gone, -scores, scores), np.where(gone, 0.0, scores)
+    one, other = (plan_fine(GRID, CAMERA, COST, "x", s, budget_s=budget_s, threshold=0.1) for s in (negative, nothing))
+    assert (one.sweeps, one.worth, one.seats.tolist()) == (other.sweeps, other.worth, other.seats.tolist())
+    for sweep in one.sweeps:
+        assert nothing[covered_seats(GRID, CAMERA, [sweep])].max() > 0
+
+
+def test_a_threshold_counts_scores_beside_an_infinite_one():
+    """Where a score is +inf the threshold still stands for the finite scores as they were given."""
+    rows, columns = GRID.seat_shape
+    scores = np.full((rows, columns), 0.001)
+    scores[1, 4], scores[5, 10:15] = np.inf, 8.0
+    plan = plan_fine(GRID, CAMERA, COST, "x", scores.ravel(), budget_s=40.0, threshold=1.0)
+    assert {columns + 4, *(5 * columns + np.arange(10, 15)).tolist()} <= set(plan.seats.tolist())
+    assert plan.spared_s is not None
+    few = plan_fine(GRID, CAMERA, COST, "x", scores.ravel(), budget_s=40.0, threshold=12.0)
+    assert columns + 4 in few.seats
+
+
+@pytest.mark.parametrize("threshold", [-1.0, np.nan, np.inf])
+def test_thresholds_that_cannot_be_are_refused(threshold: float):
+    """A threshold is a finite score of 0 or more."""
+    with pytest.raises(BudgetError, match="threshold must be a finite score of 0 or more, got"):
+        plan_fine(GRID, CAMERA, COST, "x", drawn(GRID), budget_s=9.0, threshold=threshold)
+
+
+def test_rounds_are_joined_as_they_were_priced():
+    """Sweeps one after the other, seconds added, every seat once, also one that both rounds show."""
+    scores = drawn(GRID)
+    first = plan_fine(GRID, CAMERA, COST, "x", scores, budget_s=12.0)
+    left = scores.copy()
+    left[first.seats] = 0.0
+    second = plan_fine(GRID, CAMERA, COST, "x", left, budget_s=12.0)
+    both = joined_plan([first, second])
+    assert both.sweeps == [*first.sweeps, *second.sweeps]
+    assert both.seconds == first.seconds + second.seconds
+    assert both.seats.tolist() == sorted({*first.seats.tolist(), *second.seats.tolist()})
+    assert joined_plan([first]) is first
+    with pytest.raises(ShapeError, match="one round or more, got none"):
+        joined_plan([])

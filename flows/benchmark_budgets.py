@@ -1,0 +1,76 @@
+"""Figures over budgets of seconds: our plans beside lines spent without a model, and rows of equal time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from flows.benchmark_equal_time import plan_name
+from flows.benchmark_rig import BUDGETS, PLANNED, RANDOM, UNIFORM
+from flows.benchmark_series import Record, Row, Runs, by_seed, collect_row, difference, frame_names, mean_of
+from models.metrics import mean_iou
+
+PLANS = (*PLANNED, UNIFORM, RANDOM)
+
+
+def summarise_rig(runs: Runs, trial: Record) -> dict[str, Any]:
+    """Give mIoU, seconds and lines of every plan at every budget, and our plans against the two without a model.
+
+    A budget at which a frame has no plan is judged on the other frames, in every row alike; their number is said.
+    """
+    names, seeds = frame_names(runs), by_seed(runs)
+    rows = {
+        (plan, budget): row
+        for plan in PLANS
+        for budget in BUDGETS
+        if (row := collect_row(seeds, plan, budget, names)) is not None
+    }
+    table = []
+    for (plan, budget), row in rows.items():
+        figures = _figures(row, "budget")
+        for other, name in ((UNIFORM, "against_uniform"), (RANDOM, "against_random")):
+            figures[name] = difference(row, rows[other, budget], trial) if plan in PLANNED else None
+        table.append(figures)
+    left_out = [
+        {"frame": record["frame"], **one} for records in runs for record in records for one in record["left_out"]
+    ]
+    return {"rows": table, "left_out": left_out}
+
+
+def summarise_equal_time(runs: Runs, judged: Runs, rig: Runs, trial: Record) -> list[dict[str, Any]]:
+    """Give the rows with the exposure of equal time, against `all` and against the same row at equal exposure.
+
+    ``rig`` holds the plans of lines at equal exposure; without them their differences are None.
+    """
+    names = frame_names(judged)
+    seeds, usual, plans = by_seed(runs), by_seed(judged), by_seed(rig)
+    whole = collect_row(usual, "all", 1.0, names)
+    wanted = [(policy, share, policy, usual) for policy in trial["policies"] for share in trial["shares"]]
+    wanted += [(plan_name(policy), budget, policy, plans) for policy in PLANNED for budget in BUDGETS]
+    found = []
+    for name, share, policy, beside in wanted:
+        row, same = collect_row(seeds, name, share, names), collect_row(beside, policy, share, names)
+        if row is None or whole is None:
+            continue
+        figures = _figures(row, "share") | {"exposure": mean_of([part["exposure"] for part in row.parts])}
+        figures["against_all"] = difference(row, whole, trial)
+        figures["against_equal_exposure"] = None if same is None else difference(row, same, trial)
+        figures["equal_exposure_miou"] = None if same is None else mean_of(same.over_runs(mean_iou))
+        found.append(figures)
+    return found
+
+
+def _figures(row: Row, name: str) -> dict[str, Any]:
+    each = row.over_runs(mean_iou)
+    return {
+        "policy": row.policy,
+        name: row.share,
+        "miou": mean_of(each),
+        "frames": int(row.judged.sum()),
+        **{part: _mean_part(row.parts, part) for part in ("seconds", "full_s", "lines", "full_lines", "seats")},
+    }
+
+
+def _mean_part(parts: Sequence[Record], name: str) -> float | None:
+    values = [part[name] for part in parts if name in part]
+    return mean_of(values) if values else None

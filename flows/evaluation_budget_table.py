@@ -1,0 +1,87 @@
+"""An evaluation over budgets as tables: plans of the rig at equal seconds, and rows with the exposure of equal time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from flows.figures import DASH, format_percent, format_points
+
+
+def budget_tables(content: dict[str, Any]) -> Iterator[Table]:
+    """Give a table of the rig's plans and one of equal time, as far as they were judged."""
+    if content["rig"]["rows"] or content["rig"]["left_out"]:
+        yield _rig(content)
+    if content["equal_time"]:
+        yield _equal_time(content)
+
+
+def format_difference(interval: dict[str, float | None] | None) -> str:
+    """Points of mIoU with the bounds of the interval, as far as there are any."""
+    if interval is None or interval["difference"] is None:
+        return ""
+    text = f"{100 * interval['difference']:+.1f}"
+    low, high = interval["low"], interval["high"]
+    return text if low is None or high is None else f"{text} [{100 * low:+.1f}, {100 * high:+.1f}]"
+
+
+def _table(title: str, caption: str, first: str, *columns: str) -> Table:
+    table = Table(
+        title=title, title_justify="left", title_style="", caption=caption or None, caption_justify="left",
+        header_style="dim", box=SIMPLE_HEAD, collapse_padding=True,
+    )  # fmt: skip
+    table.add_column(first, no_wrap=True)
+    for name in columns:
+        table.add_column(name, justify="right", no_wrap=True)
+    return table
+
+
+def _rig(content: dict[str, Any]) -> Table:
+    rig = content["rig"]
+    names = ("budget", "seconds", "of full", "lines", "of full", "seats", "mIoU", "to uniform", "to random")
+    table = _table("rig mode: mIoU at equal capture seconds", _left_out(rig["left_out"]), "plan", *names)
+    for row in sorted(rig["rows"], key=lambda row: row["budget"]):
+        table.add_row(
+            row["policy"], format_percent(row["budget"]), _whole(row["seconds"]),
+            _part(row["seconds"], row["full_s"]), _whole(row["lines"]), _part(row["lines"], row["full_lines"]),
+            _whole(row["seats"]), format_points(row["miou"]), format_difference(row["against_uniform"]),
+            format_difference(row["against_random"]),
+        )  # fmt: skip
+    return table
+
+
+def _left_out(missing: list[dict[str, Any]]) -> str:
+    """Which budgets were left out, on how many frames, and why on the first of them."""
+    budgets: dict[float | None, list[str]] = {}
+    for one in missing:
+        budgets.setdefault(one["budget"], []).append(one["why"])
+    return "\n".join(
+        f"left out on {len(why)} frame{'s' if len(why) > 1 else ''}, "
+        f"{'all budgets' if budget is None else format_percent(budget)}: {why[0]}"
+        for budget, why in budgets.items()
+    )
+
+
+def _equal_time(content: dict[str, Any]) -> Table:
+    names = ("K", "exposure", "seconds", "of full", "mIoU", "to all", "equal exposure", "to equal exposure")
+    table = _table(
+        "equal time: as many capture seconds as all takes", content["notes"]["equal_time"], "placement", *names
+    )
+    for row in content["equal_time"]:
+        table.add_row(
+            row["policy"], format_percent(row["share"]), f"x {row['exposure']:.2f}", _whole(row["seconds"]),
+            _part(row["seconds"], row["full_s"]), format_points(row["miou"]), format_difference(row["against_all"]),
+            format_points(row["equal_exposure_miou"]), format_difference(row["against_equal_exposure"]),
+        )  # fmt: skip
+    return table
+
+
+def _whole(value: float | None) -> str:
+    return DASH if value is None else f"{value:.0f}"
+
+
+def _part(done: float | None, full: float | None) -> str:
+    return DASH if done is None or not full else format_percent(done / full)

@@ -1,0 +1,121 @@
+"""What `spectralzoom train` says of new weights: agreement with the labels of scenes kept for validation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.control_maps import draw_with_control
+from models.controls import CONTROL_SHARE, RANDOM_DRAWS, Controls, Counts, run_controls
+from models.examples import Example
+from models.inference import Glance, glance_of_columns
+from models.metrics import confusion, mean_iou
+from models.policies import score_seats
+from models.segmenter import Segmenter
+from models.weights import AnyWeights, Weights
+from pipeline.grid import SceneGrid
+from pipeline.selection import frame_seats
+
+Show = Callable[[str], None]
+Patches = NDArray[np.float32]  # (seat, p, p, column) of every seat of the padded grid
+
+
+def validate(weights: AnyWeights, examples: Iterable[Example], seed: int, show: Show) -> dict[str, Any] | None:
+    """mIoU over all scenes together, at one share of the seats; None without a scene.
+
+    Of a control, those rows that it has: the paper's network is drawn with no seat, random ones, those with edges and
+    all; `upsampled` sees none and stands as `none`; `dense` and `coarser` see all of the scene and stand as `all`.
+    """
+    if not isinstance(weights.network, Segmenter):
+        return _validate_control(weights, examples, seed, show)
+    two_scale = Weights(
+        weights.network, weights.basis, weights.normalisation, weights.class_names, weights.class_colours
+    )
+    return _summary([_rows(two_scale, example, seed, show) for example in examples])
+
+
+def _rows(weights: Weights, example: Example, seed: int, show: Show) -> Controls:
+    grid, cells, labels = _parts(weights, example)
+    return run_controls(
+        weights, glance_of_columns(weights, example.coarse, grid), cells, labels,
+        share=CONTROL_SHARE, seed=seed, report=show,
+    )  # fmt: skip
+
+
+def _parts(weights: AnyWeights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
+    """The grid of a scene, every fine patch of it, and its labels without the padding."""
+    p, columns = weights.config.patch, weights.config.columns
+    grid = SceneGrid(*example.shape, p, weights.config.factor)
+    rows, across = grid.seat_shape
+    cells = example.fine.reshape(rows, p, across, p, columns).transpose(0, 2, 1, 3, 4).reshape(-1, p, p, columns)
+    return grid, cells.astype(np.float32), example.labels[: grid.height, : grid.width]
+
+
+def _summary(rows: list[Controls]) -> dict[str, Any] | None:
+    if not rows:
+        return None
+    whole = Controls(
+        rows[0].share,
+        sum(row.seats for row in rows),
+        _added([row.none for row in rows]),
+        _added([row.every for row in rows]),
+        {name: _added([row.policies[name] for row in rows]) for name in rows[0].policies},
+        [_added([row.random[draw] for row in rows]) for draw in range(len(rows[0].random))],
+    )
+    return {
+        "scenes": len(rows),
+        "share_of_seats": whole.share,
+        "none": mean_iou(whole.none),
+        "all": mean_iou(whole.every),
+        **whole.as_dict(),
+    }
+
+
+def _validate_control(weights: AnyWeights, examples: Iterable[Example], seed: int, show: Show) -> dict[str, Any] | None:
+    scenes = [_control_rows(weights, example, seed, show) for example in examples]
+    if not scenes:
+        return None
+    figures: dict[str, Any] = {"scenes": len(scenes), "share_of_seats": CONTROL_SHARE}
+    for name in scenes[0]:
+        miou = [mean_iou(_added(list(draws))) for draws in zip(*(scene[name] for scene in scenes), strict=True)]
+        if name in ("none", "all"):
+            figures[name] = miou[0]
+        else:
+            spread = float(np.std(miou, ddof=1)) if len(miou) > 1 else None
+            figures[name] = {"miou": float(np.mean(miou)), "spread": spread}
+    return figures
+
+
+def _control_rows(weights: AnyWeights, example: Example, seed: int, show: Show) -> dict[str, list[Counts]]:
+    """Confusion counts of each row that a control has, one for each random draw."""
+    grid, cells, labels = _parts(weights, example)
+    # these policies ask the coarse image and the place of a seat, not a glance's classes
+    look = Glance(grid, np.ascontiguousarray(example.coarse, np.float32), np.empty((0, 0, 0), np.float32))
+    valid = grid.valid_seats()
+
+    def counts(name: str, seats: NDArray[np.integer]) -> Counts:
+        show(name)
+        return confusion(labels, draw_with_control(weights, look, cells[seats], seats).classes, weights.config.classes)
+
+    def placed(policy: str, number: int = 0) -> NDArray[np.integer]:
+        worth = score_seats(policy, look, seed=seed + number)
+        return frame_seats(worth, CONTROL_SHARE, grid.valid_share().ravel() > 0).seats
+
+    if weights.config.preset == "upsampled":
+        return {"none": [counts("none", valid[:0])]}
+    if weights.config.design == "dense":
+        return {"all": [counts("all", valid)]}
+    return {
+        "none": [counts("none", valid[:0])],
+        "random": [counts("random", placed("random", 1000 * (draw + 1))) for draw in range(RANDOM_DRAWS)],
+        "sobel": [counts("sobel", placed("sobel"))],
+        "all": [counts("all", valid)],
+    }
+
+
+def _added(parts: list[Counts]) -> Counts:
+    counts: Counts = np.sum(parts, axis=0)
+    return counts

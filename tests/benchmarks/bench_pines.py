@@ -1,0 +1,292 @@
+"""Indian Pines, trained and judged on halves of the same fields: the segmenter beside LDA, SVM and random forest.
+
+Two inputs, the same for everyone: the spectra of the file as they are, and what the simulated camera makes of them (its
+blur and noise), which is what surveys and `spectralzoom train` see. The peers read every band, pixel by pixel and
+averaged over 5 x 5 px; their settings are chosen on the training pixels alone, one half of each field against the
+other, as the test halves lie. bench_pines.py --weights FILE judges weights of the command instead of training some.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE), str(HERE.parents[1])]
+
+import numpy as np  # noqa: E402 - after the number of threads is set
+from measure import Row, data_folder, not_run  # noqa: E402
+from numpy.typing import NDArray  # noqa: E402
+
+from models.metrics import average_accuracy, confusion, kappa, overall_accuracy  # noqa: E402
+from pipeline.grid import UNLABELLED  # noqa: E402
+
+if TYPE_CHECKING:
+    from models.inference import Glance
+    from models.training import TrainingSettings
+    from models.weights import Weights
+    from pipeline.simulator.scene import RasterScene
+
+SCENE, MASK = "Indian_pines_corrected.npy", "indianpines_disjoint_dset.mat"
+MASK_CLASSES = (2, 3, 5, 6, 8, 10, 11, 12, 14, 1, 4, 7, 9, 13, 15, 16)  # classes of the labels by the mask's numbers
+WINDOW = 5  # px a side, averaged for the second round of the peers
+SHARES = (0.0, 0.1, 0.2, 0.35, 1.0)  # of the seats, by entropy
+STEPS = 300
+
+Values = NDArray[np.float32]
+Labels = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Split:
+    """The scene with the labels to train on and those to be judged by, 255 elsewhere."""
+
+    values: Values  # (y, x, band)
+    train: Labels
+    test: Labels
+    classes: int
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one way of drawing the map reaches on the test pixels, and what it took."""
+
+    name: str
+    counts: NDArray[np.int64]
+    cpu_s: float
+    words: str
+    every: bool = False  # the segmenter with every seat
+
+    @property
+    def figures(self) -> tuple[float, float, float]:
+        """Overall accuracy, average accuracy, kappa."""
+        return overall_accuracy(self.counts), average_accuracy(self.counts), kappa(self.counts)
+
+
+def rows(weights: Sequence[Path] = ()) -> list[Row]:
+    """Every way, best peer on the same input as the goal of ours. Without ``weights`` ours is trained first."""
+    folder = data_folder("indian_pines")
+    if not (folder / SCENE).is_file():
+        return [not_run("Indian Pines, disjoint halves", folder)]
+    split = _open(folder)
+    with tempfile.TemporaryDirectory() as name:
+        found = [one for path in weights or (_trained(folder, Path(name)),) for one in _through_camera(folder, path)]
+    seen = replace(split, values=_seen_by_camera(folder))
+    table = _compared(found, _peers(seen, "camera"))
+    return table + _compared([] if weights else _of_the_file(folder, split), _peers(split, "file"))
+
+
+def _compared(ours: Sequence[Result], peers: Sequence[Result]) -> list[Row]:
+    """Rows of one input. The goal is the best peer in each of the three figures."""
+    if not peers:
+        return [*map(_row, ours), Row("peers", "not run: needs scikit-learn")]
+    bars = [max(peer.figures[number] for peer in peers) for number in range(3)]
+    goal = f"> {bars[0]:.1%} {bars[1]:.1%} {bars[2]:.3f}"
+    shown = [
+        _row(one, goal, all(a > b for a, b in zip(one.figures, bars, strict=True))) if one.every else _row(one)
+        for one in ours
+    ]
+    return [*shown, *map(_row, peers)]
+
+
+def _row(one: Result, goal: str = "", met: bool | None = None) -> Row:
+    overall, average, agreement = one.figures
+    figure = f"{overall:.1%} {average:.1%} {agreement:.3f}"
+    return Row(f"{one.name}: overall, average, kappa", figure, goal, met, f"{one.cpu_s:.1f} s CPU; {one.words}")
+
+
+def _choices(folder: Path) -> dict[str, Any]:
+    return {"train_mask": str(folder / MASK), "mask_classes": MASK_CLASSES}
+
+
+def _open(folder: Path) -> Split:
+    from storage.datasets import load_data_set
+
+    files = load_data_set(folder / SCENE, **_choices(folder))
+    (_, train), (_, test) = next(files.train()), next(files.test())
+    assert train.labels is not None
+    assert test.labels is not None
+    return Split(np.asarray(train.values, np.float32), train.labels, test.labels, len(train.class_names))
+
+
+def halves(labels: Labels) -> NDArray[np.int64]:
+    """Cut every connected field of one class in two across its longer side: 0 and 1, -1 where nothing is labelled."""
+    from scipy.ndimage import label
+
+    half = np.full(labels.shape, -1)
+    for number in np.unique(labels[labels != UNLABELLED]):
+        fields, count = label(labels == number)
+        for one in range(1, count + 1):
+            y, x = np.nonzero(fields == one)
+            along = y if np.ptp(y) >= np.ptp(x) else x
+            half[y, x] = along > np.median(along)
+    return half
+
+
+def _peers(split: Split, source: str) -> list[Result]:
+    """Each classifier on single spectra and on spectra averaged over a window."""
+    try:
+        import sklearn  # noqa: F401 - an extra of the benchmarks
+    except ImportError:
+        return []
+    from scipy.ndimage import uniform_filter
+
+    smooth = np.asarray(uniform_filter(split.values, (WINDOW, WINDOW, 1), mode="reflect"), np.float32)
+    looks = {"single spectra": split.values, f"{WINDOW} x {WINDOW} px": smooth}
+    return [
+        _peer(f"{source}: {name}, {look}", values, split, *made)
+        for look, values in looks.items()
+        for name, made in _classifiers().items()
+    ]
+
+
+def _classifiers() -> dict[str, tuple[Any, dict[str, list[Any]]]]:
+    """Classifiers with the settings to choose from."""
+    from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+    from sklearn.ensemble import RandomForestClassifier
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+    from sklearn.svm import SVC
+
+    forest: dict[str, list[Any]] = {"max_features": ["sqrt", 40]}
+    svm: dict[str, list[Any]] = {"svc__C": [10, 100, 1000], "svc__gamma": [3e-4, 1e-3, 3e-3, 1e-2]}
+    return {
+        "LDA": (LinearDiscriminantAnalysis(solver="lsqr"), {"shrinkage": [1e-6, 1e-5, 1e-4, 1e-3, 1e-2]}),
+        "SVM": (make_pipeline(StandardScaler(), SVC()), svm),
+        "random forest": (RandomForestClassifier(200, random_state=0), forest),
+    }
+
+
+def _peer(name: str, values: Values, split: Split, classifier: Any, grid: dict[str, list[Any]]) -> Result:
+    from sklearn.model_selection import GridSearchCV
+
+    began, taught = time.process_time(), split.train != UNLABELLED
+    half = halves(split.train)[taught]
+    folds = [(np.flatnonzero(half == one), np.flatnonzero(half != one)) for one in (0, 1)]
+    search = GridSearchCV(classifier, grid, cv=folds).fit(values[taught], split.train[taught])
+    judged = split.test != UNLABELLED
+    drawn = search.predict(values[judged]).astype(np.uint8)
+    chosen = ", ".join(f"{key.rpartition('__')[2]} {value}" for key, value in search.best_params_.items())
+    counts = confusion(split.test[judged], drawn, split.classes)
+    return Result(name, counts, time.process_time() - began, f"{chosen} chosen on the training halves")
+
+
+def _trained(folder: Path, out: Path) -> Path:
+    """Weights as the command makes them."""
+    from flows.train import TrainRequest, train_weights
+
+    path = out / "pines.safetensors"
+    train_weights(TrainRequest(str(folder / SCENE), path, choices=_choices(folder), settings=_settings()))
+    return path
+
+
+def _settings() -> TrainingSettings:
+    from models.training import TrainingSettings
+
+    return TrainingSettings(steps=STEPS, minutes=120)
+
+
+def _scene(folder: Path) -> RasterScene:
+    from flows.training_data import scene_of_file
+    from pipeline.camera import LineCamera
+    from storage.datasets import load_data_set
+
+    return scene_of_file(load_data_set(folder / SCENE).load(Path(SCENE).stem), LineCamera())
+
+
+def _seen_by_camera(folder: Path) -> Values:
+    """One fine exposure of the scene, (y, x, band), as training's fine look has it before its columns."""
+    from models.examples import electrons_of
+    from pipeline.camera import LineCamera, expose, footprint
+
+    scene, camera = _scene(folder), LineCamera()
+    electrons = electrons_of(scene, footprint(np.asarray(scene.planes, np.float32), camera), camera)
+    values = expose(electrons, camera, step=1, rng=np.random.default_rng(0))
+    return np.asarray(values * (scene.panel / scene.panel_electrons), np.float32)
+
+
+def _through_camera(folder: Path, path: Path) -> list[Result]:
+    """The segmenter that the command trained, with several shares of the seats."""
+    from flows.benchmark_frames import look_at
+    from models.weights import load_weights
+    from pipeline.camera import LineCamera
+
+    weights, scene = load_weights(path), _scene(folder)
+    if scene.key not in weights.record.get("split", {}).get("pixels", {}):
+        raise ValueError(f"{path} was not trained with --train-mask on {SCENE}: its test pixels may have taught it")
+    look = look_at(scene, scene.name, weights, LineCamera(), 0)
+    return _judged("camera", weights, look.seen, look.fine, look.labels)
+
+
+def _of_the_file(folder: Path, split: Split) -> list[Result]:
+    """The segmenter trained on the spectra of the file, coarse pixels being their means."""
+    from models.examples import Observation, measured_normalisation, normalised
+    from models.holes import patches_of
+    from models.inference import glance_of_columns
+    from models.segmenter import Segmenter, SegmenterConfig
+    from models.spectral import SpectralBasis
+    from models.training import train
+    from models.weights import Weights
+    from pipeline.grid import SceneGrid, pad_by_reflection
+
+    scene = _scene(folder)
+    (height, width), basis = split.train.shape, SpectralBasis.spanning(scene.wavelength_nm)
+    grid = SceneGrid(height, width, patch=8, factor=4)
+    columns = (split.values / np.float32(split.values.max())) @ basis.matrix(scene.wavelength_nm)[0]
+    fine = np.asarray(pad_by_reflection(columns, grid.padded_shape), np.float32)
+    labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
+    labels[:height, :width] = split.train
+    coarse = np.asarray(patches_of(fine, grid.factor).mean(axis=(1, 2)), np.float32)
+    coarse = coarse.reshape(fine.shape[0] // grid.factor, -1, basis.columns)
+    observed = Observation("pines", fine, coarse, labels, (height, width))
+    normalisation = measured_normalisation([observed])
+    example = normalised(observed, normalisation, np.ones(basis.columns, bool))
+    config = SegmenterConfig(split.classes, basis.columns, grid.patch, grid.factor)
+    network, record = train(config, [example], normalisation.gain_shift, _settings())
+    assert isinstance(network, Segmenter)
+    weights = Weights(network, basis, normalisation, scene.class_names, scene.class_colours, {"training": record})
+    patches = np.asarray(patches_of(example.fine, grid.patch), np.float32)
+    return _judged("file", weights, glance_of_columns(weights, example.coarse, grid), patches, split.test)
+
+
+def _judged(source: str, weights: Weights, seen: Glance, fine: Values, labels: Labels) -> list[Result]:
+    """The map with several shares of the seats, by entropy."""
+    from models.inference import glance_of_columns, segment
+    from models.policies import score_seats
+    from models.threads import one_thread
+    from pipeline.selection import frame_seats
+
+    training, valid, found = weights.record["training"], seen.grid.valid_share().ravel() > 0, []
+    words = f"a map; training {training.get('processor_seconds', 0)} s CPU, {training['steps']} steps"
+    with one_thread():
+        for share in SHARES:
+            began = time.process_time()
+            looked = glance_of_columns(weights, seen.columns, seen.grid)
+            seats = frame_seats(score_seats("entropy", looked), share, valid).seats
+            drawn = segment(weights, looked, fine[seats], seats).classes
+            spent, counts = time.process_time() - began, confusion(labels, drawn, weights.config.classes)
+            found.append(Result(f"{source}: segmenter, {100 * share:.0f} % of seats", counts, spent, words, share == 1))
+    return found
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Print the table for weights that were trained before."""
+    parser = argparse.ArgumentParser(description="Indian Pines beside LDA, SVM and random forest.")
+    parser.add_argument("--weights", type=Path, action="append", default=[], metavar="FILE", help="several are seeds")
+    for row in rows(parser.parse_args(arguments).weights):
+        met = {True: "met", False: "NOT met", None: ""}[row.met]
+        print("  ".join(text for text in (row.what, row.figure, row.goal, met, row.peers) if text))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

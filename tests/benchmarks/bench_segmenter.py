@@ -1,0 +1,286 @@
+"""The segmenter's throughput: many frames packed, 270 bands against 4, what a share of the seats costs, half precision.
+
+Weights are drawn, not trained: time does not depend on them. ``bench_regions.py`` has fields too large to read whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from measure import Clock, Row, ratio, time_in_turn
+from numpy.typing import NDArray
+
+from models.cost import multiply_adds
+from models.encoder import Encoder, Memory
+from models.inference import (
+    ClassMap,
+    CoarseLook,
+    Glance,
+    draw_coarse,
+    glance,
+    read_glance,
+    segment,
+    segment_batch,
+)
+from models.policies import score_seats
+from models.process import keep_freed_memory
+from models.segmenter import Segmenter, SegmenterConfig
+from models.spectral import Normalisation, SpectralBasis
+from models.threads import one_thread
+from models.weights import Weights
+from pipeline.grid import SceneGrid
+from pipeline.selection import frame_seats
+
+FRAMES, PADDED_AT_ONCE = 64, 8
+SIDES_PX, SHARES = (96, 480), (0.0, 0.05, 0.1, 0.2, 0.35)
+FRAME = SceneGrid(966, 1296, 32, 4)
+FRAME_SIZES = {"classes": 3, "columns": 2, "patch": 32, "factor": 4}
+COST_GOALS = {0.05: 0.07, 0.10: 0.10, 0.15: 0.17, 0.20: 0.17, 0.35: None}
+FIELD = SceneGrid(384, 640, 16, 4)
+FIELD_SIZES = {"classes": 8, "columns": 24, "patch": 16, "factor": 4}
+MANY, FEW, MOST_BANDS_RATIO = 270, 4, 1.5
+ROUNDS = 5
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame to read: its coarse look, and the patches of some of its seats."""
+
+    look: CoarseLook
+    patches: NDArray[np.float32]
+    seats: NDArray[np.int64]
+
+
+def rows() -> list[Row]:
+    """All figures, on one thread."""
+    keep_freed_memory()
+    with one_thread():
+        return [*_batches(), *_bands(), *_shares()]
+
+
+def drawn_weights(**sizes: int) -> Weights:
+    """Weights of these sizes that nothing was learned by."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = Segmenter(SegmenterConfig(**sizes)).eval()  # type: ignore[arg-type]
+    columns, classes = model.config.columns, model.config.classes
+    flat = Normalisation(np.zeros(columns, np.float32), np.ones(columns, np.float32), np.eye(columns, dtype=np.float32))
+    names, colours = tuple(map(str, range(classes))), np.zeros((classes, 3), np.uint8)
+    return Weights(model, SpectralBasis(400.0, 1000.0, columns), flat, names, colours)
+
+
+def drawn_frame(weights: Weights, grid: SceneGrid, share: float, rng: np.random.Generator) -> Frame:
+    """Noise, with so much of the seats in use."""
+    p, columns = grid.patch, weights.config.columns
+    y, x = (size // grid.factor for size in grid.padded_shape)
+    valid = grid.valid_seats()
+    seats = np.sort(rng.permutation(valid)[: round(share * len(valid))]).astype(np.int64)
+    patches = rng.standard_normal((len(seats), p, p, columns), dtype=np.float32)
+    return Frame(CoarseLook(grid, rng.standard_normal((y, x, columns), dtype=np.float32)), patches, seats)
+
+
+def _batches() -> list[Row]:
+    weights, rng = drawn_weights(**FRAME_SIZES), np.random.default_rng(0)
+    sides, shares = rng.integers(*SIDES_PX, (FRAMES, 2)), rng.choice(SHARES, FRAMES)
+    frames = [
+        drawn_frame(weights, SceneGrid(int(y), int(x), 32, 4), float(share), rng)
+        for (y, x), share in zip(sides, shares, strict=True)
+    ]
+    calls = {
+        "packed": partial(_packed, weights, frames),
+        "one by one": partial(_one_by_one, weights, frames),
+        "padded": partial(_padded, weights, frames),
+    }
+    clocks = time_in_turn(calls, ROUNDS)
+    apart = max(
+        float(np.abs(one.confidence - other.confidence).max())
+        for one, other in zip(calls["packed"](), calls["one by one"](), strict=True)
+    )
+    alike = all(
+        (one.classes == other.classes).all()
+        for one, other in zip(calls["packed"](), calls["one by one"](), strict=True)
+    )
+    alone, padded = (ratio(clocks, other, "packed") for other in ("one by one", "padded"))
+    sizes = f"sides of {SIDES_PX[0]} to {SIDES_PX[1]} px, 0 to {max(SHARES):.0%} of the seats"
+    return [
+        Row(
+            f"{FRAMES} mixed frames packed ({sizes}): CPU of one by one over packed",
+            f"{alone:.2f}",
+            ">= 1",
+            alone >= 1,
+            f"frames a second of CPU: {', '.join(f'{name} {_rate(clock):.1f}' for name, clock in clocks.items())}",
+        ),
+        Row(
+            f"the same: CPU of batches of {PADDED_AT_ONCE} padded to their largest over packed",
+            f"{padded:.2f}",
+            "> 1",
+            padded > 1,
+            "padded: the same network, masked attention",
+        ),
+        Row(
+            "packed against one by one: greatest difference of confidence",
+            f"{apart:.1e}",
+            "<= 1e-6, same classes",
+            apart <= 1e-6 and alike,
+        ),
+    ]
+
+
+def _rate(clock: Clock) -> float:
+    return FRAMES / clock.cpu_min_s
+
+
+def _packed(weights: Weights, frames: Sequence[Frame]) -> list[ClassMap]:
+    looks, patches, seats = zip(*((one.look, one.patches, one.seats) for one in frames), strict=True)
+    return segment_batch(weights, looks, patches, seats)
+
+
+def _one_by_one(weights: Weights, frames: Sequence[Frame]) -> list[ClassMap]:
+    return [segment(weights, one.look, one.patches, one.seats) for one in frames]
+
+
+def _padded(weights: Weights, frames: Sequence[Frame]) -> list[ClassMap]:
+    """The usual way: batches of equal shapes, what is missing filled with zeros and masked in attention."""
+    with torch.inference_mode():
+        starts = range(0, len(frames), PADDED_AT_ONCE)
+        return [drawn for first in starts for drawn in _padded_batch(weights, frames[first : first + PADDED_AT_ONCE])]
+
+
+def _padded_batch(weights: Weights, frames: Sequence[Frame]) -> list[ClassMap]:
+    model, config, p = weights.segmenter, weights.config, weights.config.patch
+    rows, columns = (max(one.look.columns.shape[axis] for one in frames) // p for axis in (0, 1))
+    most = max(len(one.seats) for one in frames)
+    coarse = torch.zeros(len(frames), config.columns, rows * p, columns * p)
+    there = torch.zeros(len(frames), rows, columns, dtype=torch.bool)
+    fine, seats = (
+        torch.zeros(len(frames), most, config.columns, p, p),
+        torch.zeros(len(frames), most, dtype=torch.int64),
+    )
+    used = torch.zeros(len(frames), most, dtype=torch.bool)
+    for number, one in enumerate(frames):
+        y, x = one.look.columns.shape[:2]
+        coarse[number, :, :y, :x] = torch.from_numpy(one.look.columns).permute(2, 0, 1)
+        there[number, : y // p, : x // p] = True
+        row, column = np.divmod(one.seats, one.look.grid.seat_shape[1])
+        fine[number, : len(row)] = torch.from_numpy(one.patches).permute(0, 3, 1, 2)
+        seats[number, : len(row)] = torch.from_numpy(row * columns * config.factor + column)
+        used[number, : len(row)] = True
+    side = config.token_side**2
+    known, asked = (mask.flatten(1).repeat_interleave(side, dim=1) for mask in (there, used))
+    features, tokens = model.coarse_stem(model.coarse_patches(coarse))
+    read, memory = _masked(model.encoder, model.code_coarse(tokens, rows, columns), known, None)
+    image = model.coarse_head(features, read.view(tokens.shape)) * there.flatten()[:, None, None, None]
+    reading = model.reading_of(image, memory, rows, columns)
+    logits = torch.zeros(len(frames), 0, config.classes, p, p)
+    if most:
+        features, tokens = model.fine_stem(fine.flatten(0, 1))
+        coded = model.code_fine(tokens.view(len(frames), most, *tokens.shape[1:]), seats, columns)
+        read, _ = _masked(model.encoder, coded, torch.cat([known, asked], dim=1), memory)
+        windows = model.canvas_windows(reading.canvas, seats)
+        logits = model.decode_fine(features, read.view(tokens.shape), windows).view(len(frames), most, -1, p, p)
+    return [_drawn(one, reading.logits[number], logits[number]) for number, one in enumerate(frames)]
+
+
+def _masked(
+    encoder: Encoder, x: torch.Tensor, kept: torch.Tensor, before: list[Memory] | None
+) -> tuple[torch.Tensor, list[Memory]]:
+    memory = []
+    for layer, block in enumerate(encoder.blocks):
+        x, own = block(x, None if before is None else before[layer], kept)
+        memory.append(own)
+    return encoder.norm(x), memory
+
+
+def _drawn(frame: Frame, coarse: torch.Tensor, fine: torch.Tensor) -> ClassMap:
+    """The map of one frame of a padded batch."""
+    grid, p = frame.look.grid, frame.look.grid.patch
+    y, x = frame.look.columns.shape[:2]
+    drawn = draw_coarse(coarse[None, :, :y, :x], grid)
+    confidence, classes = (part.numpy() for part in fine[: len(frame.seats)].softmax(dim=1).max(dim=1))
+    for (top, left), values, sure in zip(grid.seat_origin(frame.seats), classes, confidence, strict=True):
+        drawn.classes[top : top + p, left : left + p] = values
+        drawn.confidence[top : top + p, left : left + p] = sure
+    scene = np.s_[: grid.height, : grid.width]
+    return ClassMap(drawn.classes[scene].copy(), drawn.confidence[scene].copy())
+
+
+def _bands() -> list[Row]:
+    """The whole way from scene values to the map, with all bands and with a few of the same pixels."""
+    weights, rng = drawn_weights(**FIELD_SIZES), np.random.default_rng(0)
+    nm = np.linspace(400, 1000, MANY)
+    coarse = rng.uniform(0.1, 0.5, (*FIELD.coarse_shape, MANY)).astype(np.float32)
+    valid = FIELD.valid_seats()
+    seats = np.sort(rng.permutation(valid)[: round(0.35 * len(valid))])
+    fine = rng.uniform(0.1, 0.5, (len(seats), FIELD.patch, FIELD.patch, MANY)).astype(np.float32)
+    some = np.linspace(0, MANY - 1, FEW).astype(int)
+    few = np.ascontiguousarray(coarse[..., some]), np.ascontiguousarray(fine[..., some])
+
+    def draw(coarse: NDArray[np.float32], fine: NDArray[np.float32], nm: NDArray[np.float64]) -> ClassMap:
+        seen = glance(weights, coarse, nm, FIELD)
+        return segment(weights, seen, weights.columns(fine, nm), seats)
+
+    clocks = time_in_turn({"many": partial(draw, coarse, fine, nm), "few": partial(draw, *few, nm[some])}, ROUNDS)
+    found = ratio(clocks, "many", "few")
+    spent = {name: clock.cpu_min_s for name, clock in clocks.items()}
+    return [
+        Row(
+            f"{MANY} bands over {FEW} of the same pixels: CPU from values to map, 35 % of the seats of "
+            f"{FIELD.width} x {FIELD.height} px",
+            f"{found:.2f}",
+            f"<= {MOST_BANDS_RATIO}",
+            found <= MOST_BANDS_RATIO,
+            f"{MANY} bands {spent['many']:.2f} s, {FEW} bands {spent['few']:.2f} s",
+        )
+    ]
+
+
+def _shares() -> list[Row]:
+    """Glance, scores and map at each share of the seats over the map of every seat on its fastest path."""
+    weights, rng = drawn_weights(**FRAME_SIZES), np.random.default_rng(0)
+    every = drawn_frame(weights, FRAME, 1.0, rng)
+    calls = {"all": lambda: segment(weights, every.look, every.patches, every.seats)}
+    seats_of = {}
+    for share in COST_GOALS:
+        count = frame_seats(np.zeros(FRAME.valid_share().size), share, FRAME.valid_share().ravel() > 0).seats
+        seats_of[share] = len(count)
+        calls[f"{share:.0%}"] = partial(_adaptive, weights, every, len(count))
+    calls["35% in bfloat16"] = partial(_adaptive, weights, every, seats_of[0.35], "bfloat16")
+    calls["all in bfloat16"] = lambda: segment(weights, every.look, every.patches, every.seats, precision="bfloat16")
+    clocks = time_in_turn(calls, ROUNDS)
+    full = multiply_adds(weights.config, FRAME, len(every.seats), 2, None).total
+    found = []
+    for share, goal in COST_GOALS.items():
+        cost = ratio(clocks, f"{share:.0%}", "all")
+        macs = multiply_adds(weights.config, FRAME, seats_of[share], 2, "gain").total / full
+        found.append(
+            Row(
+                f"CPU at {share:.0%} of the seats over every seat, frame of {FRAME.width} x {FRAME.height} px",
+                f"{cost:.3f}",
+                "" if goal is None else f"<= {goal}",
+                None if goal is None else cost <= goal,
+                f"multiply-adds {macs:.3f}; {clocks[f'{share:.0%}'].cpu_min_s:.3f} s against "
+                f"{clocks['all'].cpu_min_s:.2f} s, glance and scorer included",
+            )
+        )
+    half = {name: ratio(clocks, f"{name} in bfloat16", name) for name in ("35%", "all")}
+    native = torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    return [
+        *found,
+        Row(
+            "bfloat16 over float32: CPU at 35 % of the seats",
+            f"{half['35%']:.2f}",
+            peers=f"at every seat {half['all']:.2f}; the processor {'has' if native else 'lacks'} bfloat16 arithmetic",
+        ),
+    ]
+
+
+def _adaptive(weights: Weights, every: Frame, count: int, precision: str = "float32") -> ClassMap:
+    """Glance, score by the learned gain, and draw with so many seats."""
+    seen: Glance = read_glance(weights, every.look, precision=precision)  # type: ignore[arg-type]
+    scores = score_seats("gain", seen).ravel()[every.seats]
+    best = np.sort(np.argsort(-scores, kind="stable")[:count])
+    return segment(weights, seen, every.patches[best], every.seats[best], precision=precision)  # type: ignore[arg-type]

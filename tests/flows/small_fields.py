@@ -1,0 +1,58 @@
+"""A folder of three small labelled frames, small weights to judge on them, and what every quick evaluation asks for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from flows.benchmark_frames import Look, look_at, open_frames
+from models.sizes import PRESETS, Preset
+from models.weights import AnyWeights, Weights, load_weights, save_weights
+from pipeline.camera import LineCamera
+from pipeline.simulator.scene import RasterScene
+from tests.models.conftest import make_any_weights
+
+FRAMES = ("001", "002", "003")
+NAMES = ("soil", "crop")
+QUICK: dict[str, Any] = {
+    "shares": (0.25, 0.5), "policies": ("entropy", "random"), "draws": 20, "timed_runs": 1, "rig": False,
+}  # fmt: skip
+
+
+def write_field(root: Path, size: tuple[int, int] = (24, 40)) -> Path:
+    """Three frames of two classes."""
+    rng = np.random.default_rng(0)
+    for folder in ("images", "annotations"):
+        (root / folder).mkdir(parents=True)
+    (root / "scene.toml").write_text(
+        'labels = "annotations/{number}_annotation.png"\n[classes]\nsoil = [0, 0, 0]\ncrop = [0, 255, 0]\n'
+    )
+    for number in FRAMES:
+        grown = rng.integers(0, 2, size, dtype=np.uint8) * 255
+        colours = np.stack([0 * grown, grown, 0 * grown], axis=-1)
+        Image.fromarray(colours).save(root / "annotations" / f"{number}_annotation.png")
+        Image.fromarray(colours // 2 + 40).save(root / "images" / f"{number}_image.png")
+    return root
+
+
+def write_weights(path: Path, seed: int = 0, preset: Preset = "two-scale", factor: int = 2, **record: Any) -> Path:
+    """Small random weights of any design for the field's two classes."""
+    made: AnyWeights = make_any_weights(seed, classes=2, columns=3, factor=factor, **PRESETS[preset])
+    save_weights(replace(made, class_names=NAMES, record={"seed": seed, **record}), path)
+    return path
+
+
+def scene_at(data: Path, name: str = "001") -> RasterScene:
+    """One frame of the field."""
+    opened = open_frames(str(data), (name,), None, LineCamera(), {})
+    return next(opened.scenes(opened.train))
+
+
+def looked_at(data: Path, path: Path, factor: int = 2, seed: int = 0) -> tuple[Look, Weights]:
+    """The first frame as small weights see it."""
+    weights = load_weights(write_weights(path, seed, factor=factor))
+    return look_at(scene_at(data), "001", weights, LineCamera(), 0), weights

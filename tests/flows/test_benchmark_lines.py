@@ -1,0 +1,64 @@
+"""Lines spent without a model: blocks that cover the field, evenly or at random, never above the seconds given."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flows.benchmark_lines import LineBlocks, line_blocks, most_shown
+from pipeline.camera import LineCamera
+from pipeline.grid import SceneGrid
+from pipeline.scan import Axis, CostModel
+
+CAMERA, COST = LineCamera(samples=64), CostModel()
+
+
+def _blocks(rows: int = 1, along: Axis = "x") -> LineBlocks:
+    return line_blocks(SceneGrid(128, 160, 8, 2), CAMERA, COST, along, rows)
+
+
+@pytest.mark.parametrize("along", ["x", "y"])
+@pytest.mark.parametrize("rows", [1, 4])
+def test_all_blocks_show_every_seat(along: Axis, rows: int):
+    """Every strip shows whole seats, and together all of them."""
+    blocks = _blocks(rows, along)
+    assert blocks.seats(blocks.blocks).tolist() == list(range(16 * 20))
+
+
+def test_a_block_shows_a_row_of_its_strip():
+    """One block alone shows as many seats as a line is wide, and its lines are priced with a set-up."""
+    blocks = _blocks()
+    one = [blocks.blocks[3]]
+    seats = blocks.seats(one)
+    assert len(seats) == 8
+    assert len(np.unique(seats // 20)) == 1
+    assert blocks.seconds(one) == pytest.approx(COST.seconds(blocks.sweeps(one), CAMERA))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4, 0.9])
+def test_no_choice_exceeds_its_seconds(share: float):
+    """Even and random choices cost at most what is given, and one more evenly spaced block would be too dear."""
+    blocks = _blocks()
+    budget = share * blocks.seconds(blocks.blocks)
+    even, drawn = blocks.evenly(budget), blocks.at_random(budget, np.random.default_rng(0))
+    assert 0 < blocks.seconds(even) <= budget
+    assert 0 < blocks.seconds(drawn) <= budget
+    assert len(set(even)) == len(even)
+
+
+def test_neighbouring_blocks_are_one_sweep():
+    """A second set-up is not paid where scanning on is cheaper."""
+    blocks = _blocks()
+    both, first = blocks.blocks[:2], blocks.blocks[:1]
+    assert len(blocks.sweeps(both)) == 1
+    assert blocks.seconds(both) < 2 * blocks.seconds(first)
+    assert len(blocks.sweeps([blocks.blocks[0], blocks.blocks[8]])) == 2
+
+
+def test_the_width_that_shows_most_is_taken():
+    """And without seconds nothing is shown."""
+    options = [_blocks(rows) for rows in (1, 4)]
+    budget = 0.5 * options[0].seconds(options[0].blocks)
+    lines = most_shown(options, lambda blocks: blocks.evenly(budget))
+    assert len(lines.seats) == max(len(blocks.seats(blocks.evenly(budget))) for blocks in options)
+    assert not len(most_shown(options, lambda blocks: blocks.evenly(0.0)).seats)

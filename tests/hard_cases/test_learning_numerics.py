@@ -1,0 +1,217 @@
+"""Numerical hard cases of what is learned and counted: rows 4, 13, 14, 16, 26, 28 and 29 of the design's table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import nn
+
+from models import training
+from models.encoder import Attention
+from models.examples import Example
+from models.inference import glance_of_columns
+from models.metrics import mean_iou
+from models.objective import map_loss, pixel_losses
+from models.patches import ChannelNorm
+from models.placement_metrics import captured_gain, gain_sums, oracle_gain
+from models.scorer import MOST_GAIN, scoring_loss
+from models.segmenter import Segmenter, SegmenterConfig
+from models.spectral import Normalisation, SpectralBasis
+from models.training import Trainer, TrainingSettings, train
+from models.weights import Weights
+from pipeline.grid import UNLABELLED, SceneGrid
+from pipeline.selection import frame_seats
+from storage.band_statistics import BandPart, tabulate
+
+SIZES: dict[str, Any] = {"classes": 2, "columns": 4, "patch": 8, "factor": 2, "width": 8, "coarse_width": 8, "dim": 16,
+                         "heads": 2, "layers": 1}  # fmt: skip
+SETTINGS = TrainingSettings(steps=4, batch=1, crop=16)
+NO_SHIFT = np.zeros(4, np.float32)
+
+
+def _example(labels: np.ndarray) -> Example:
+    rng = np.random.default_rng(0)
+    fine = rng.normal(0, 1, (*labels.shape, 4)).astype(np.float16)
+    coarse = fine.reshape(labels.shape[0] // 2, 2, labels.shape[1] // 2, 2, 4).mean(axis=(1, 3)).astype(np.float32)
+    return Example("e", fine, coarse, labels, labels.shape)
+
+
+def test_4_a_crop_without_a_label_is_no_step():
+    """Where no pixel of a batch is labelled no weight moves, not even by decay; the step is counted."""
+    labels = np.full((64, 64), UNLABELLED, np.uint8)
+    labels[0, 0] = 1
+    trainer = Trainer(SegmenterConfig(**SIZES), [_example(labels)], NO_SHIFT, SETTINGS)
+    for sampler in trainer.samplers.values():
+        sampler.examples = [_example(np.full((64, 64), UNLABELLED, np.uint8))]
+    before = [parameter.clone() for parameter in trainer.model.parameters()]
+    for _ in range(4):  # three in a row are no failure
+        trainer.step(0.5)
+    assert all(torch.equal(a, b) for a, b in zip(before, trainer.model.parameters(), strict=True))
+    assert trainer.summary()["steps"] == trainer.summary()["unlabelled_steps"] == 4
+    assert trainer.summary()["skipped_steps"] == 0
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e-6])
+def test_13_norms_of_nothing_are_nothing(size: float):
+    """There is no cosine decoder; the norms that there are give 0 for zero tokens, with bounded gradients."""
+    attention, norm = Attention(16, 2), ChannelNorm(8)
+    pixels, tokens = torch.full((1, 8, 2, 2), size).requires_grad_(), torch.full((1, 3, 8), size).requires_grad_()
+    for x, layer in ((pixels, norm), (tokens, attention.query_norm), (tokens, attention.key_norm)):
+        out = layer(x)
+        assert out.abs().max() <= 1
+        assert size > 0 or not out.any()
+        (gradient,) = torch.autograd.grad(out.sum(), x)
+        assert gradient.abs().max() <= 1001  # 1 / sqrt(1e-6), and rounding
+
+
+def test_13_an_encoder_of_zero_tokens_has_finite_gradients():
+    """Attention over tokens that are all 0 is finite forward and backward."""
+    attention, x = Attention(16, 2), torch.zeros(1, 5, 16, requires_grad=True)
+    attention(x, None, None)[0].square().sum().backward()
+    assert x.grad is not None
+    assert x.grad.isfinite().all()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in attention.parameters())
+
+
+@pytest.mark.parametrize("classes", [-1, 0, 1])
+def test_14_one_class_is_no_map(classes: int):
+    """A segmenter of fewer than two classes is refused with the number."""
+    with pytest.raises(ValueError, match=f"2 to 255 classes, got {classes}"):
+        SegmenterConfig(**SIZES | {"classes": classes})
+
+
+def test_14_two_classes_learn():
+    """There is no mask_norm, which is a sign for two classes: the logits have values of any size, and gradients."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = Segmenter(SegmenterConfig(**SIZES))
+        x = torch.randn(1, 4, 16, 16)
+    labels = (x[:, 0].repeat_interleave(2, 1).repeat_interleave(2, 2) > 0).long()
+    reading = model.read_coarse(x)
+    none = torch.zeros(1, 0, dtype=torch.int64)
+    logits = model.composite(reading.logits, reading.logits.new_zeros(1, 0, 2, 8, 8), none)
+    loss = map_loss(logits, pixel_losses(logits, labels), labels, torch.ones(2), soft_dice=True)
+    loss.backward()  # type: ignore[no-untyped-call]
+    assert model.coarse_classes.weight.grad is not None
+    assert all(row.abs().max() > 1e-4 for row in model.coarse_classes.weight.grad)
+    assert logits[0, :, 0].unique().numel() > 2
+
+
+@pytest.mark.parametrize("value", [4096.1, 1e-3, 1e7])
+def test_16_a_constant_has_no_variance_in_any_parts(value: float):
+    """The spread of a constant in float32, merged over parts, is 0 to rounding and never of a negative square."""
+    values = np.full((1000, 3), value, np.float32)
+    part = BandPart.of(values[:1])
+    for first in range(1, 1000, 333):
+        part = part.merged(BandPart.of(values[first : first + 333]))
+    assert (part.squares >= 0).all()
+    assert tabulate(part, np.arange(3.0)).std == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("parts", [2, 7, 100])
+def test_16_merged_parts_are_the_whole(parts: int):
+    """Means and spreads merged in any order of parts equal those of all at once to 1e-10, far from zero too."""
+    rng = np.random.default_rng(parts)
+    values = (4096.1 + rng.normal(0, 0.3, (3000, 2))).astype(np.float32)
+    pieces = [BandPart.of(piece) for piece in np.array_split(values, parts)]
+    merged = pieces.pop(0)
+    for number in rng.permutation(len(pieces)):
+        merged = merged.merged(pieces[number])
+    found, exact = tabulate(merged, np.arange(2.0)), values.astype(np.float64)
+    assert found.mean == pytest.approx(exact.mean(axis=0), rel=1e-10)
+    assert found.std == pytest.approx(exact.std(axis=0), rel=1e-10)
+
+
+def test_16_columns_far_from_zero_keep_their_scale():
+    """Normalisation takes medians, never a difference of squares: 4096.1 with a spread of 0.1 comes out as spread 1."""
+    sample = (4096.1 + np.random.default_rng(0).normal(0, 0.1, (5000, 3))).astype(np.float32)
+    normalisation = Normalisation.measured(sample)
+    assert (normalisation.spread > 0).all()
+    assert normalisation.apply(sample, np.ones(3, bool)).std(axis=0) == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16])
+def test_26_losses_of_half_precision_add_up_in_single(kind: torch.dtype):
+    """The mean over 1e5 pixels whose logits are in 16 bits is that of the same numbers in float64 to 1e-5."""
+    generator = torch.Generator().manual_seed(0)
+    logits = torch.randn(1, 3, 250, 400, generator=generator).to(kind)
+    labels = torch.randint(0, 3, (1, 250, 400), generator=generator)
+    weight = torch.tensor([1.0, 2.0, 0.5])
+    losses = pixel_losses(logits, labels)
+    assert losses.dtype == torch.float32
+    exact = nn.functional.cross_entropy(logits.double(), labels, weight.double())
+    assert float(map_loss(logits, losses, labels, weight, soft_dice=False)) == pytest.approx(float(exact), rel=1e-5)
+    rough = map_loss(logits, losses, labels, weight, soft_dice=True)
+    fine = map_loss(logits.double(), losses.double(), labels, weight.double(), soft_dice=True)
+    assert float(rough) == pytest.approx(float(fine), rel=1e-4)
+
+
+def test_26_counts_do_not_round():
+    """2^24 + 1 pixels of one class, where float32 stops counting, keep their last one in the accuracy."""
+    counts = np.array([[2**24 + 1, 0], [1, 2**31]], np.int64)
+    first = (2**24 + 1) / (2**24 + 2)
+    second = 2**31 / (2**31 + 1)
+    assert mean_iou(counts) == pytest.approx((first + second) / 2, rel=1e-12)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_28_gains_are_signed_and_clipped(sign: int):
+    """A gain of 100 nat, or a loss of as much, teaches the scorer no more than one of 5; its sign stays."""
+    score = torch.tensor([[0.1, -0.2, 0.0]])
+    wild, clipped = (torch.tensor([[0.05, -0.3, sign * most]]) for most in (100.0, MOST_GAIN))
+    assert torch.equal(scoring_loss(score, wild), scoring_loss(score, clipped))
+    towards = score.clone().requires_grad_()
+    scoring_loss(towards, wild).backward()
+    assert towards.grad is not None
+    assert towards.grad[0, 2] * sign < 0
+
+
+def test_28_patches_that_mislead_have_negative_gain():
+    """Where every patch makes the map worse than none, gains are negative, and their sums and ratio say so."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = Segmenter(SegmenterConfig(**SIZES)).eval()
+    with torch.no_grad():  # the glance says class 0 everywhere, every fine patch class 1
+        for layer, likes in ((model.coarse_classes, 0), (model.fine_classes, 1)):
+            layer.weight.zero_()
+            layer.bias.copy_(torch.tensor([4.0, -4.0] if likes == 0 else [-4.0, 4.0]))
+    one = np.ones(4, np.float32)
+    normalisation = Normalisation(0 * one, one, np.eye(4, dtype=np.float32))
+    weights = Weights(model, SpectralBasis(400.0, 1000.0, 4), normalisation, ("a", "b"), np.zeros((2, 3), np.uint8))
+    seen = glance_of_columns(weights, np.zeros((16, 16, 4), np.float32), SceneGrid(32, 32, 8, 2))
+    gain = oracle_gain(weights, seen, np.zeros((16, 8, 8, 4), np.float32), np.zeros((32, 32), np.uint8)).ravel()
+    assert gain == pytest.approx(-8 * np.ones(16) * (gain[0] / -8), rel=1e-4)
+    assert (gain < -1).all()
+    bought, best = gain_sums(gain, np.array([0, 1]), np.arange(16))
+    assert bought < 0
+    assert captured_gain(bought, best) is None
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.05])
+def test_28_negative_gains_are_never_bought_by_threshold(threshold: float):
+    """With a threshold no seat of a negative score is bought, whatever the budget, nor one that is no number."""
+    score = np.array([0.3, -0.1, np.nan, 0.06, -np.inf, 0.01, -1e-12])
+    choice = frame_seats(score, 1.0, threshold=threshold)
+    assert choice.seats.tolist() == ([0, 3, 5] if threshold == 0 else [0, 3])
+    assert choice.spared == 7 - len(choice.seats)
+    assert not len(frame_seats(-np.abs(np.nan_to_num(score)) - 1, 1.0, threshold=threshold).seats)
+
+
+def test_29_the_batch_of_a_failed_run_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Three bad steps in a row end a run; the last batch and the weights that it met are beside the checkpoint."""
+    labels = np.random.default_rng(0).integers(0, 2, (16, 16)).astype(np.uint8)
+    honest = training.batch_loss
+    monkeypatch.setattr(training, "batch_loss", lambda *a, **k: honest(*a, **k) * float("nan"))
+    with pytest.raises(RuntimeError, match="not finite in steps 1 to 3") as failed:
+        train(SegmenterConfig(**SIZES), [_example(labels)], NO_SHIFT, SETTINGS, checkpoint=tmp_path / "w.checkpoint")
+    saved = load_file(tmp_path / "w.checkpoint.batch")
+    assert "w.checkpoint.batch" in str(failed.value)
+    assert saved["labels"].shape == (1, 16, 16)
+    assert saved["fine"].shape == (1, 4, 4, 8, 8)
+    assert saved["coarse"].isfinite().all()
+    assert saved["model.coarse_classes.weight"].shape == (2, 8, 1, 1)

@@ -1,0 +1,147 @@
+"""Scenes of different sizes read together: the maps of one by one, whatever they are packed with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models import batches, inference
+from models.batches import encode_packed, packs
+from models.inference import CoarseLook, Glance, glance_batch, read_glance, segment, segment_batch
+from models.weights import Weights
+from pipeline.errors import ShapeError
+from pipeline.grid import SceneGrid
+
+Maker = Callable[..., Weights]
+Scenes = tuple[list[CoarseLook], list[np.ndarray], list[np.ndarray]]
+SIZES = [(37, 53), (1, 1), (48, 16), (16, 16), (60, 44), (17, 90)]
+COUNTS = [5, 1, 0, 4, 40, 9]
+
+
+def _scenes(weights: Weights, seed: int = 0) -> Scenes:
+    """Looks, patches and seats of scenes that have nothing in common."""
+    p, s, columns = weights.config.patch, weights.config.factor, weights.config.columns
+    rng = np.random.default_rng(seed)
+    looks, patches, seats = [], [], []
+    for number, (size, count) in enumerate(zip(SIZES, COUNTS, strict=True)):
+        grid = SceneGrid(*size, p, s)
+        y, x = (side // s for side in grid.padded_shape)
+        origin = (0, 0) if number % 2 else (4 * number, 12)
+        looks.append(CoarseLook(grid, rng.standard_normal((y, x, columns), dtype=np.float32), origin=origin))
+        seats.append(rng.permutation(int(np.prod(grid.seat_shape)))[:count])
+        patches.append(rng.standard_normal((len(seats[-1]), p, p, columns), dtype=np.float32))
+    return looks, patches, seats
+
+
+@pytest.mark.parametrize("sizes", [{}, {"patch": 32, "factor": 4, "layers": 2}, {"positions": "paper"}])
+@pytest.mark.parametrize("most", [1, 20, 1000])
+def test_packed_maps_are_those_of_one_by_one(tiny: Maker, sizes: dict, most: int, monkeypatch: pytest.MonkeyPatch):
+    """However scenes are packed, classes are the same and confidence differs by 1e-6 at most."""
+    monkeypatch.setattr(batches, "packs", lambda counts: packs(counts, most))
+    weights = tiny(**sizes)
+    looks, patches, seats = _scenes(weights)
+    together = segment_batch(weights, looks, patches, seats)
+    for drawn, *scene in zip(together, looks, patches, seats, strict=True):
+        alone = segment(weights, *scene)
+        assert (drawn.classes == alone.classes).all()
+        assert np.abs(drawn.confidence - alone.confidence).max() <= 1e-6
+
+
+def test_packed_glances_are_those_of_one_by_one(tiny: Maker):
+    """Probabilities, gains and what the tokens ask are those of each scene alone."""
+    weights = tiny(layers=2)
+    looks, _, _ = _scenes(weights)
+    for seen, look in zip(glance_batch(weights, looks), looks, strict=True):
+        alone = read_glance(weights, look)
+        assert np.abs(seen.probability - alone.probability).max() <= 1e-6
+        assert np.abs(seen.gain - alone.gain).max() <= 1e-5
+        assert np.abs(seen.tokens.queries - alone.tokens.queries).max() <= 1e-5
+        assert (seen.grid, seen.origin) == (look.grid, look.origin)
+
+
+def test_glances_and_bare_looks_mix(tiny: Maker):
+    """A scene already glanced at is not read again, and its map is that of its look."""
+    weights = tiny()
+    looks, patches, seats = _scenes(weights)
+    mixed = [read_glance(weights, look) if number % 2 else look for number, look in enumerate(looks)]
+    for one, other in zip(
+        segment_batch(weights, mixed, patches, seats), segment_batch(weights, looks, patches, seats), strict=True
+    ):
+        assert (one.classes == other.classes).all()
+        assert np.abs(one.confidence - other.confidence).max() <= 1e-6
+
+
+def test_a_kept_reading_counts_for_its_own_precision_place_and_weights_only(
+    tiny: Maker, monkeypatch: pytest.MonkeyPatch
+):
+    """The coarse image is read again where precision, place or weights are others than those of the glance."""
+    weights, other = tiny(0), tiny(1)
+    looks, patches, seats = _scenes(weights)
+    seen: Glance = read_glance(weights, looks[0])
+    again = []
+    read = inference._read_coarse
+    monkeypatch.setattr(inference, "_read_coarse", lambda *given: again.append(len(given[1])) or read(*given))
+    segment(weights, seen, patches[0], seats[0])
+    segment(weights, seen, patches[0], seats[0], precision="bfloat16")
+    segment(weights, replace(seen, origin=(4, 4)), patches[0], seats[0])
+    segment(other, seen, patches[0], seats[0])
+    assert again == [0, 1, 1, 1]
+
+
+def test_no_scenes_give_no_maps(tiny: Maker):
+    """Empty in, empty out."""
+    assert segment_batch(tiny(), [], [], []) == []
+    assert glance_batch(tiny(), []) == []
+
+
+def test_a_scene_that_cannot_be_is_refused_before_any_is_read(tiny: Maker, monkeypatch: pytest.MonkeyPatch):
+    """A bad seat in the last scene stops the batch."""
+    weights = tiny()
+    looks, patches, seats = _scenes(weights)
+    monkeypatch.setattr(inference, "_read_coarse", lambda *given: pytest.fail("read"))
+    with pytest.raises(ShapeError, match="seat 5000 is none"):
+        segment_batch(weights, looks, patches, [*seats[:-1], np.r_[seats[-1][1:], 5000]])
+
+
+def test_packed_tokens_are_encoded_as_each_scene_alone(tiny: Maker):
+    """With and without what was read before, tokens and memories are the encoder's own."""
+    encoder, rng = tiny(layers=3).segmenter.encoder, torch.Generator().manual_seed(0)
+    scenes = [torch.randn(count, 16, generator=rng) for count in (1, 7, 30)]
+    with torch.inference_mode():
+        first, memories = encode_packed(encoder, scenes)
+        second, _ = encode_packed(encoder, scenes, memories)
+        for tokens, own, memory, after in zip(scenes, first, memories, second, strict=True):
+            alone, kept = encoder(tokens[None])
+            assert (own - alone[0]).abs().max() <= 1e-5
+            assert (memory[-1][1] - kept[-1][1]).abs().max() <= 1e-5
+            assert (after - encoder(tokens[None], kept)[0][0]).abs().max() <= 1e-5
+
+
+@given(st.lists(st.integers(0, 40), max_size=20), st.integers(1, 50))
+def test_packs_hold_every_scene_once_in_order(counts: list[int], most: int):
+    """No pack is empty, and none of several scenes has more patches than allowed."""
+    found = packs(counts, most)
+    assert [number for part in found for number in range(len(counts))[part]] == list(range(len(counts)))
+    for part in found:
+        assert part.stop > part.start
+        assert part.stop - part.start == 1 or sum(counts[part]) <= most
+
+
+@pytest.mark.parametrize("sizes", [{}, {"patch": 32, "factor": 4}, {"patch": 16, "factor": 4, "layers": 2}])
+def test_half_precision_stays_near(tiny: Maker, sizes: dict):
+    """Confidence within 2e-2 and 99.5 % of the classes; what is given out is float32 either way."""
+    weights = tiny(**sizes)
+    looks, patches, seats = _scenes(weights)
+    exact = segment_batch(weights, looks, patches, seats)
+    rough = segment_batch(weights, looks, patches, seats, precision="bfloat16")
+    assert {one.confidence.dtype for one in rough} == {np.dtype(np.float32)}
+    assert max(np.abs(a.confidence - b.confidence).max() for a, b in zip(exact, rough, strict=True)) <= 2e-2
+    same = np.concatenate([(a.classes == b.classes).ravel() for a, b in zip(exact, rough, strict=True)])
+    assert same.mean() >= 0.995
+    assert read_glance(weights, looks[0], precision="bfloat16").probability.dtype == np.float32

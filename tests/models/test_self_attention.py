@@ -1,0 +1,180 @@
+"""Received attention: shares that add up, no favoured order or block size, what the encoder itself computes, seats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from models.encoder import LAST_QUERIES
+from models.inference import CoarseLook, Glance, glance_of_columns, read_glance
+from models.policies import score_seats
+from models.self_attention import TokenReading, attention_of_seats, queries_kept, received_attention, token_image
+from models.weights import Weights
+from pipeline.errors import SettingsError, ShapeError
+from pipeline.grid import SceneGrid
+
+Array = NDArray[np.float32]
+
+
+def noise(seed: int, *shape: int) -> Array:
+    """Seeded normal numbers."""
+    return np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
+
+
+def seen_by(weights: Weights, height: int = 48, width: int = 64, seed: int = 0) -> Glance:
+    """What small weights see of a noisy scene."""
+    grid = SceneGrid(height, width, weights.config.patch, weights.config.factor)
+    y, x = (size // grid.factor for size in grid.padded_shape)
+    return glance_of_columns(weights, noise(seed, y, x, weights.config.columns), grid)
+
+
+@pytest.mark.parametrize(("heads", "tokens", "width"), [(1, 1, 1), (2, 7, 4), (4, 60, 32)])
+def test_shares_add_up_to_one(heads: int, tokens: int, width: int):
+    """Softmax rows sum to 1, and so does their mean over heads and queries, however extreme the logits."""
+    for size in (1.0, 1e4):
+        share = received_attention(size * noise(1, heads, tokens, width), noise(2, heads, tokens, width))
+        assert share.shape == (tokens,)
+        assert share.sum() == pytest.approx(1.0, abs=1e-6)
+        assert (share >= 0).all()
+
+
+def test_tokens_in_another_order_receive_the_same():
+    """Permuting tokens permutes their shares."""
+    queries, keys, order = noise(3, 2, 30, 8), noise(4, 2, 30, 8), np.random.default_rng(5).permutation(30)
+    moved = received_attention(queries[:, order], keys[:, order])
+    assert moved == pytest.approx(received_attention(queries, keys)[order], abs=1e-7)
+
+
+@pytest.mark.parametrize("most", [1, 31, 100, 10**6])
+def test_blocks_change_nothing(most: int):
+    """However many weights are held at once, the shares are the same."""
+    queries, keys = noise(6, 2, 31, 8), noise(7, 2, 31, 8)
+    exact = np.einsum("hqc,hkc->hqk", queries.astype(float), keys.astype(float)) / np.sqrt(8)
+    weight = np.exp(exact) / np.exp(exact).sum(axis=-1, keepdims=True)
+    assert received_attention(queries, keys, most=most) == pytest.approx(weight.mean(axis=(0, 1)), abs=1e-6)
+
+
+def test_alike_tokens_receive_alike():
+    """Where no token differs each gets the same share; one that answers all questions gets nearly everything."""
+    alike = np.ones((2, 9, 4), np.float32)
+    assert received_attention(alike, alike) == pytest.approx(np.full(9, 1 / 9))
+    keys = alike.copy()
+    keys[:, 4] = 50.0
+    assert received_attention(alike, keys)[4] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("shapes", [((2, 3, 4), (2, 4, 4)), ((3, 4), (3, 4)), ((2, 0, 4), (2, 0, 4))])
+def test_queries_and_keys_that_do_not_belong_together_are_refused(shapes: tuple[tuple[int, ...], tuple[int, ...]]):
+    """The message shows both shapes."""
+    with pytest.raises(ShapeError, match="expected queries and keys"):
+        received_attention(*(np.ones(shape, np.float32) for shape in shapes))
+
+
+def test_it_is_what_the_last_layer_computes(tiny: Callable[..., Weights]):
+    """Queries and keys are those with which torch mixes values: values that name the tokens give the weights back."""
+    weights = tiny(layers=2)
+    read = seen_by(weights).tokens
+    assert read is not None
+    heads, tokens, width = read.keys.shape
+    assert (heads, width) == (weights.config.heads, weights.config.dim // weights.config.heads)
+    names = torch.eye(tokens).expand(1, heads, tokens, tokens)
+    mixed = torch.nn.functional.scaled_dot_product_attention(
+        torch.from_numpy(read.queries)[None], torch.from_numpy(read.keys)[None], names
+    )
+    assert received_attention(read.queries, read.keys) == pytest.approx(mixed.mean(dim=(0, 1, 2)).numpy(), abs=1e-6)
+
+
+def test_queries_are_kept_inside_alone(tiny: Callable[..., Weights]):
+    """Neither after a reading that failed nor in another thread is anything kept; those of the last layer are."""
+    weights = tiny(layers=2)
+    image = torch.from_numpy(noise(9, 1, 4, 16, 24))
+
+    def fail() -> None:
+        with queries_kept():
+            raise ShapeError("reading failed")
+
+    with pytest.raises(ShapeError, match="reading failed"):
+        fail()
+    assert LAST_QUERIES.get() is None
+    with queries_kept() as kept, ThreadPoolExecutor(1) as pool, torch.inference_mode():
+        pool.submit(weights.segmenter.read_coarse, image).result()
+        assert kept == []
+        reading = weights.segmenter.read_coarse(image)
+        assert [queries.shape for queries in kept] == [reading.memory[-1][0].shape]
+    assert LAST_QUERIES.get() is None
+
+
+def test_threads_that_read_at_once_keep_their_own(tiny: Callable[..., Weights]):
+    """Regions of a field are read by one network in several threads: each scores as it does alone."""
+    weights = tiny(layers=2)
+    alone = [score_seats("self-attention", seen_by(weights, seed=seed)) for seed in range(8)]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda seed: score_seats("self-attention", seen_by(weights, seed=seed)), range(8)))
+    assert np.array(together) == pytest.approx(np.array(alone), abs=1e-5)
+    assert np.ptp(alone, axis=0).max() > 1e-3
+
+
+def test_tokens_are_laid_out_patch_by_patch():
+    """Four tokens of a patch lie row by row inside it, patches row by row."""
+    image = token_image(np.arange(24.0), (2, 3), 2)
+    assert image.tolist() == [
+        [0, 1, 4, 5, 8, 9], [2, 3, 6, 7, 10, 11], [12, 13, 16, 17, 20, 21], [14, 15, 18, 19, 22, 23],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("side", "factor"), [(1, 1), (1, 2), (1, 4), (2, 1), (2, 2), (2, 4), (4, 2)])
+def test_seats_of_level_attention_are_level(side: int, factor: int):
+    """Tokens that receive alike give every seat 1, whatever a token and a seat are to each other."""
+    tokens = 2 * 3 * side**2
+    read = TokenReading(np.ones((2, tokens, 4), np.float32), np.ones((2, tokens, 4), np.float32), side)
+    assert attention_of_seats(read, (2 * factor, 3 * factor), factor) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("side", "factor"), [(1, 4), (2, 4), (2, 2), (2, 1)])
+def test_seats_over_the_token_that_is_read_come_first(side: int, factor: int):
+    """The greatest seat lies on the token that everything reads, and the seats share out what tokens receive."""
+    cells = (3, 4)
+    tokens = cells[0] * cells[1] * side**2
+    keys = np.ones((1, tokens, 4), np.float32)
+    keys[:, 5 * side**2] = 50.0  # the first token of the patch at row 1, column 1
+    found = attention_of_seats(TokenReading(np.ones_like(keys), keys, side), (3 * factor, 4 * factor), factor)
+    row, column = np.unravel_index(np.argmax(found), found.shape)
+    place = (np.array([row, column]) + 0.5) / factor * side  # in tokens
+    assert (np.floor(place) == side).all() or side > factor
+    assert found.mean() == pytest.approx(1.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("patch", [8, 32])
+def test_the_policy_scores_seats_by_their_share(tiny: Callable[..., Weights], patch: int):
+    """Seats off the scene score 0, those on it what they receive, border seats a share of it; 1 is the usual."""
+    weights = tiny(patch=patch)
+    seen = seen_by(weights, 5 * patch - 3, 7 * patch - 5)
+    scores = score_seats("self-attention", seen).reshape(seen.grid.seat_shape)
+    assert seen.tokens is not None
+    received = attention_of_seats(seen.tokens, seen.grid.seat_shape, seen.grid.factor)
+    assert scores == pytest.approx(received * seen.grid.valid_share())
+    assert received.mean() == pytest.approx(1.0, rel=1e-5)
+    assert np.ptp(received) > 1e-4
+
+
+def test_two_readings_score_alike(tiny: Callable[..., Weights]):
+    """Reading a look again changes no score, and places of a larger field tell in it."""
+    weights = tiny()
+    seen = seen_by(weights)
+    again = read_glance(weights, CoarseLook(seen.grid, seen.columns))
+    assert (score_seats("self-attention", again) == score_seats("self-attention", seen)).all()
+    moved = read_glance(weights, CoarseLook(seen.grid, seen.columns, origin=(5, 3)))
+    assert np.abs(score_seats("self-attention", moved) - score_seats("self-attention", seen)).max() > 1e-6
+
+
+def test_a_look_that_nobody_read_has_no_attention():
+    """The message says that the weights were not asked."""
+    grid = SceneGrid(16, 16, 8, 2)
+    seen = Glance(grid, np.zeros((8, 8, 2), np.float32), np.zeros((8, 8, 3), np.float32))
+    with pytest.raises(SettingsError, match="'self-attention' asks the weights, and nothing was read"):
+        score_seats("self-attention", seen)
