@@ -358,7 +358,7 @@ def draw_coarse(logits: Tensor, grid: SceneGrid) -> ClassMap:
     y, x = grid.padded_shape
     drawn = ClassMap(np.empty((y, x), np.uint8), np.empty((y, x), np.float32))
     cell = grid.patch
-    padded = F.pad(logits, (0, 0, 1, 1), mode="replicate")
+    padded = F.pad(logits, (0, 0, 1, 1), mode="replicate").contiguous(memory_format=torch.channels_last)
     for top in range(0, y // grid.factor, cell):
         strip = F.interpolate(
             padded[:, :, top : top + cell + 2], scale_factor=grid.factor, mode="bilinear", align_corners=False

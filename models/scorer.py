@@ -41,8 +41,9 @@ class SeatScorer(nn.Module):
         canvas, logits = canvas.detach(), logits.detach()
         probability = logits.float().softmax(dim=1).to(canvas.dtype)
         entropy = torch.special.entr(probability).sum(dim=1, keepdim=True)
-        mean = F.avg_pool2d(torch.cat([canvas, probability, entropy], dim=1), self.cells)
-        most = F.max_pool2d(torch.cat([canvas, entropy], dim=1), self.cells)
+        images = (canvas, probability, entropy)  # pooled one by one: each as it lies in memory
+        mean = torch.cat([F.avg_pool2d(image, self.cells) for image in images], dim=1)
+        most = torch.cat([F.max_pool2d(image, self.cells) for image in (canvas, entropy)], dim=1)
         x = self.enter(self.norm(torch.cat([mean, most], dim=1)))
         x = x + self.mix(self.around(F.gelu(x)))
         gain: Tensor = self.of_entropy * mean[:, -1] + self.leave(F.gelu(x))[:, 0]
