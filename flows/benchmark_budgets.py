@@ -31,19 +31,23 @@ def summarise_rig(runs: Runs, trial: Record) -> dict[str, Any]:
         for other, name in ((UNIFORM, "against_uniform"), (RANDOM, "against_random")):
             figures[name] = difference(row, rows[other, budget], trial) if plan in PLANNED else None
         table.append(figures)
-    left_out = [
-        {"frame": record["frame"], **one} for records in runs for record in records for one in record["left_out"]
-    ]
-    return {"rows": table, "left_out": left_out}
+    left_out = {  # a matter of the frame and the rig: of several weights the same
+        (record["frame"], one["budget"]): {"frame": record["frame"], **one}
+        for records in runs
+        for record in records
+        for one in record["left_out"]
+    }
+    return {"rows": table, "left_out": list(left_out.values())}
 
 
 def summarise_equal_time(runs: Runs, judged: Runs, rig: Runs, trial: Record) -> list[dict[str, Any]]:
     """Give the rows with the exposure of equal time, against `all` and against the same row at equal exposure.
 
-    ``rig`` holds the plans of lines at equal exposure; without them their differences are None.
+    ``rig`` holds the plans of lines at equal exposure; without them their differences are None. Of random placements
+    the first draw stands for all in ``runs``, and is what it is compared with.
     """
     names = frame_names(judged)
-    seeds, usual, plans = by_seed(runs), by_seed(judged), by_seed(rig)
+    seeds, usual, plans = by_seed(runs), [_first_draws(records) for records in by_seed(judged)], by_seed(rig)
     whole = collect_row(usual, "all", 1.0, names)
     wanted = [(policy, share, policy, usual) for policy in trial["policies"] for share in trial["shares"]]
     wanted += [(plan_name(policy), budget, policy, plans) for policy in PLANNED for budget in BUDGETS]
@@ -58,6 +62,11 @@ def summarise_equal_time(runs: Runs, judged: Runs, rig: Runs, trial: Record) -> 
         figures["equal_exposure_miou"] = None if same is None else mean_of(same.over_runs(mean_iou))
         found.append(figures)
     return found
+
+
+def _first_draws(records: Sequence[Record]) -> list[Record]:
+    """Records without further draws of random placements."""
+    return [{**record, "rows": [row for row in record["rows"] if row["draw"] == 0]} for record in records]
 
 
 def _figures(row: Row, name: str) -> dict[str, Any]:

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from flows.survey_scene import check_labels, judged_labels
 from flows.training_data import TrainingData, farm_data, open_training_data
 from models.examples import normalised, observe
+from models.holes import patches_of
 from models.inference import CoarseLook, Glance, glance_of_columns
 from models.weights import AnyWeights, Description, Weights, describe_weights, load_any_weights
 from pipeline.camera import LineCamera
-from pipeline.errors import SceneError, SettingsError, WeightsError
+from pipeline.errors import PipelineError, SceneError, SettingsError, WeightsError
 from pipeline.grid import SceneGrid
 from pipeline.simulator.scene import RasterScene
 
@@ -41,12 +42,41 @@ class Candidate:
     def camera(self) -> LineCamera:
         """The camera that training looked through."""
         known = self.described.record.get("camera")
-        return LineCamera(**known) if isinstance(known, dict) else LineCamera()
+        try:
+            return LineCamera(**known) if isinstance(known, dict) else LineCamera()
+        except (TypeError, PipelineError) as error:
+            raise WeightsError(f"{self.path}: its camera is damaged ({error}); copy or train the file again") from error
 
-    def trained_on(self, scene: RasterScene) -> bool:
-        """Whether labels of the scene taught these weights; not so where a mask kept some of its pixels out."""
-        split = self.described.record.get("split", {})
-        return scene.key in split.get("train", {}).values() and scene.key not in split.get("pixels", {})
+    def trained_on(self, scene: RasterScene, name: str, law: str, *, bands_chosen: bool = False) -> bool:
+        """Whether labels of the scene taught these weights; not so where a mask kept some of its pixels out.
+
+        Seen in other bands a scene has another identity: where bands or wavelengths were given, here or to the
+        training, a frame of the data set ``law`` is also told by its name.
+        """
+        train, record = self._split.get("train", {}), self.described.record
+        if scene.key in train.values():
+            return self.pixels_of(scene) is None
+        chosen = bands_chosen or any(flag in record.get("command", "") for flag in ("--bands", "--wavelengths"))
+        return chosen and record.get("data") == law and name in train
+
+    def pixels_of(self, scene: RasterScene) -> str | None:
+        """Those pixels of a scene that taught these weights, packed; None where a mask kept none of them out."""
+        pixels: str | None = self._split.get("pixels", {}).get(scene.key)
+        return pixels
+
+    @property
+    def held_out(self) -> tuple[str, ...]:
+        """Frames of its data set that were kept from training by name."""
+        return tuple(self._split.get("held_out", ()))
+
+    def validated_on(self, name: str, law: str) -> bool:
+        """Whether a frame of the data set ``law`` was kept for the figures that training ends with."""
+        return self.described.record.get("data") == law and name in self._split.get("validation", ())
+
+    @property
+    def _split(self) -> dict[str, Any]:
+        split: dict[str, Any] = self.described.record.get("split", {})
+        return split
 
 
 @dataclass(frozen=True)
@@ -171,10 +201,8 @@ def sight_of(scene: RasterScene, name: str, weights: AnyWeights, camera: LineCam
     example = normalised(observed, weights.normalisation, reached)
     labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))
     assert labels is not None  # check_frame
-    rows, across = grid.seat_shape
-    p, columns = config.patch, config.columns
-    cells = example.fine.reshape(rows, p, across, p, columns).transpose(0, 2, 1, 3, 4).reshape(-1, p, p, columns)
     return Sight(
-        name, CoarseLook(grid, np.ascontiguousarray(example.coarse, np.float32)), cells.astype(np.float32), labels,
+        name, CoarseLook(grid, np.ascontiguousarray(example.coarse, np.float32)),
+        patches_of(example.fine, config.patch).astype(np.float32), labels,
         len(scene.wavelength_nm), observed.fine[: grid.height, : grid.width],
     )  # fmt: skip

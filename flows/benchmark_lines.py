@@ -1,7 +1,8 @@
 """Two ways to spend seconds on lines that need no model: blocks evenly spaced over the field, or placed at random.
 
 A block is as wide as some rows of seats need, taps and the line's rotation included, so that all it shows is used. Wide
-blocks waste fewer lines and set-ups, narrow ones are spread better: the width that shows most for the seconds is taken.
+blocks waste fewer lines and set-ups, narrow ones are spread better and leave fewer of the seconds unspent: the width
+that shows most seats for the seconds is taken.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pipeline.grid import SceneGrid
 from pipeline.scan import Axis, CostModel, Sweep
 from pipeline.strips import Views, covered_seats, look_from, strips_at_seats
 
-WIDTHS = (1, 2)  # rows of seats in a block; wider ones leave too many of the seconds unspent
+WIDTHS = (1, 2, 3, 4, 6, 8, 16)  # rows of seats in a block
 
 
 @dataclass(frozen=True)

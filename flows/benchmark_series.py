@@ -17,7 +17,6 @@ from models.bootstrap import paired_interval
 
 Record = dict[str, Any]
 Runs = Sequence[Sequence[Record]]  # of each weights, or of each seed, the records of its frames
-Key = tuple[str, float]  # policy, plan or control; share or budget
 
 
 @dataclass(frozen=True)

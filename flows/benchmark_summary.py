@@ -25,9 +25,11 @@ from flows.benchmark_series import (
 )
 from models.boundary import boundary_iou, mean_boundary_iou
 from models.metrics import (
+    average_accuracy,
     frequency_weighted_iou,
     gap_closed,
     iou_per_class,
+    kappa,
     mean_iou,
     miou_over_frame_classes,
     miou_over_frames,
@@ -134,6 +136,8 @@ def _accuracy(row: Row, class_names: Sequence[str]) -> dict[str, Any]:
         "miou_c": mean_of([miou_over_frame_classes(run) for run in judged]),
         "frequency_weighted": mean_of(row.over_runs(frequency_weighted_iou)),
         "pixel_accuracy": mean_of(row.over_runs(overall_accuracy)),
+        "average_accuracy": mean_of(row.over_runs(average_accuracy)),
+        "kappa": mean_of(row.over_runs(kappa)),
         "per_class_iou": dict(zip(class_names, [mean_of(column) for column in classes.T], strict=True)),
         "boundary_iou": mean_of(row.over_runs(mean_boundary_iou, "boundary")),
         "per_class_boundary_iou": dict(

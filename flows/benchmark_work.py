@@ -13,6 +13,7 @@ from flows.benchmark_controls import design_of, judge_control
 from flows.benchmark_equal_time import judge_equal_time
 from flows.benchmark_frames import Candidate, Look, Sight, look_at, sight_of
 from flows.benchmark_jobs import Job, Jobs, Show, scene_of
+from flows.benchmark_lines import WIDTHS
 from flows.benchmark_request import COST, EvaluateRequest
 from flows.benchmark_rig import BUDGETS, judge_rig
 from flows.benchmark_rows import Trial, judge_frame
@@ -151,6 +152,8 @@ class Work:
             own["cost"] = asdict(COST)
         if task.kind in ("rig", "equal"):
             own["budgets"] = BUDGETS
+        if task.kind == "rig":
+            own["widths"] = WIDTHS
         if task.kind == "time":
             own |= {"runs": self.request.timed_runs, "controls": [self.controls[index].key for index in task.beside]}
         return own

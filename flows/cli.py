@@ -69,7 +69,7 @@ def tradeoff(
     Parameters
     ----------
     stage
-        rectify, plan or store; all without one.
+        rectify, plan, segment or store; all without one.
     out
         Folder for tradeoff.json and tradeoff.png.
     repeats

@@ -26,6 +26,7 @@ from flows.evaluation_table import print_evaluation
 from flows.progress import StageProgress
 from flows.receipt import to_json
 from models.bootstrap import LEVEL
+from models.process import keep_freed_memory
 
 
 def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = False) -> dict[str, Any]:
@@ -50,6 +51,7 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
     SceneError : no frame is left, one that was asked for by name has no weights left, or one has no labels.
     """
     request = checked_request(request)
+    keep_freed_memory()
     candidates = open_candidates(request.weights)
     controls = open_controls(request.controls, candidates)
     data = open_frames(request.dataset, request.frames, request.scenes, candidates[0].camera, request.choices)

@@ -134,9 +134,9 @@ def _controls(
 
 
 def _controls_mode(run: SurveyRun, seen: Glance, controls: Controls) -> dict[str, Any]:
-    """What the controls' seats are, and what those of entropy would cost the rig: seats are not lines, nor seconds."""
+    """What the controls' seats are, and what those of most gain would cost the rig: seats are not lines."""
     grid, share = run.grid, run.grid.valid_share().ravel()
-    seats = frame_seats(score_seats("entropy", seen), controls.share, share > 0).seats
+    seats = frame_seats(score_seats("gain", seen), controls.share, share > 0).seats
     fine = share[seats].sum() * grid.patch**2  # samples beside the scene do not count
     price = price_of_seats(grid, run.camera, run.settings.cost, run.plan.along, seats)
     coarse_lines, full_lines = count_lines(run.plan.coarse), count_lines(run.plan.full)

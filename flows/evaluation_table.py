@@ -30,7 +30,7 @@ def _head(content: dict[str, Any]) -> list[str]:
     """What was judged by whom: of several weights or controls, the frames that each covers."""
     frames, weights = content["frames"], content["weights"]
     seeds = f"{len(weights)} sets of weights" if len(weights) > 1 else weights[0]["file"]
-    left = f"; left out as trained on: {len(content['left_out'])}" if content["left_out"] else ""
+    left = f"; left out as seen in training: {len(content['left_out'])}" if content["left_out"] else ""
     lines = [f"{content['dataset']}: {len(frames)} frame{'s' if len(frames) != 1 else ''}, {seeds}{left}"]
     several = [*(weights if len(weights) > 1 else []), *content["controls"]]
     for one in several:
@@ -62,27 +62,34 @@ def _style(row: dict[str, Any]) -> str:
 
 
 def _accuracy(content: dict[str, Any]) -> Table:
-    names = ("K", "mIoU", "per frame", "boundary", "in / out", "to baseline", "to random", "gap")
+    """Of one frame alone, accuracies over its pixels take the place of the mean over frames."""
+    alone = len(content["frames"]) == 1
+    of_frames = ("overall", "average", "kappa") if alone else ("per frame",)
+    names = ("K", "mIoU", *of_frames, "boundary", "in / out", "to baseline", "to random", "gap")
     table = new_table("placement", *names)
     for row in content["rows"]:
-        table.add_row(*_accuracy_cells(row), style=_style(row))
+        table.add_row(*_accuracy_cells(row, alone=alone), style=_style(row))
     return table
 
 
-def _accuracy_cells(row: dict[str, Any]) -> list[str]:
+def _accuracy_cells(row: dict[str, Any], *, alone: bool) -> list[str]:
     spread = row["spread"] if row["spread"] is not None else row["draws_spread"]
     gap = row["gap_closed"] if row["policy"] not in ENDS and not row["control"] else None
     return [
         _name(row),
         format_percent(row["share"]),
         format_points(row["miou"]) + ("" if spread is None else f" ±{100 * spread:.1f}"),
-        format_points(row["miou_i"]),
+        *(_pixel_cells(row) if alone else [format_points(row["miou_i"])]),
         format_points(row["boundary_iou"]),
         f"{format_points(row['inside_miou'])} / {format_points(row['outside_miou'])}",
         format_difference(row["against_baseline"]),
         format_difference(row["against_random"]),
         format_percent(gap),
     ]
+
+
+def _pixel_cells(row: dict[str, Any]) -> list[str]:
+    return [format_points(row["pixel_accuracy"]), format_points(row["average_accuracy"]), _ratio(row["kappa"])]
 
 
 def _costs(content: dict[str, Any]) -> Table:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from flows.evaluation import load_accuracy
 from flows.findings import find_out
 from flows.ground_picture import draw_ground
 from flows.ground_stage import STORE
+from flows.model_work import work_done, work_of_map
 from flows.panels import choose_bands
 from flows.placement import seen_shares
 from flows.pointing_stage import RECORD
@@ -26,7 +28,6 @@ from flows.run import SurveyRun, now
 from flows.settings import anchor_paths
 from flows.stages import SEATS_AT_ONCE, captured, load_plan
 from flows.survey import Products, StageRunner
-from models.cost import MultiplyAdds, multiply_adds
 from pipeline.planning import FinePlan, joined_plan
 from pipeline.rectify.calibrate import of_bands, reflectance
 from pipeline.savings import Entry, capture_savings
@@ -146,32 +147,20 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
     of_these = capture_savings(like, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
     full_stored = entries["bytes_raw"].full * kept / of_these["bytes_raw"].done
     config, valid = run.weights.config, len(run.grid.valid_seats())
-    cells = int(np.prod(run.grid.padded_shape)) // (config.patch * config.factor) ** 2
+    cells, each = int(np.prod(run.grid.padded_shape)) // (config.patch * config.factor) ** 2, config.token_side**2
     return {
         **{name: entry.as_dict() for name, entry in entries.items()},
         "capture_s": Entry(run.plan.coarse_s + plan.seconds, run.plan.full_s, "predicted").as_dict(),
         "bytes_stored": Entry(sum(stored), round(full_stored), "predicted").as_dict(),
-        "tokens": Entry(cells + len(plan.seats), cells + valid, "predicted").as_dict(),
-        "multiply_adds": _multiply_adds(run, len(plan.seats), valid, bands, first=_looked_at_first(products)),
+        "tokens": Entry(each * (cells + len(plan.seats)), each * (cells + valid), "predicted").as_dict(),
+        "multiply_adds": _multiply_adds(run, [load_plan(attention) for attention in products.attentions]),
     }
 
 
-def _looked_at_first(products: Products) -> int:
-    """Patches that were read for the second round's scores."""
-    return 0 if products.attention_again is None else len(load_plan(products.attention).seats)
-
-
-def _multiply_adds(run: SurveyRun, seats: int, valid: int, bands: int, *, first: int) -> dict[str, Any]:
-    """What the model did; a second round's scores take another reading of the coarse look and of ``first`` patches."""
-    channels = 3 if run.vgg is None else run.vgg.channels
-    done: MultiplyAdds = multiply_adds(
-        run.weights.config, run.grid, seats, bands, run.settings.policy, channels=channels
-    )
-    if first:
-        done = replace(done, score=done.score + multiply_adds(run.weights.config, run.grid, first, bands, None).total)
-    full = multiply_adds(run.weights.config, run.grid, valid, bands, None)
-    split = {"glance": done.glance, "score": done.score, "encode": done.encode, "decode": done.decode}
-    return {**Entry(done.total, full.total, "predicted").as_dict(), **split}
+def _multiply_adds(run: SurveyRun, plans: Sequence[FinePlan]) -> dict[str, Any]:
+    """What the model did, beside the map of a full scan."""
+    done, full = work_done(run, plans), work_of_map(run, run.grid.valid_seats())
+    return {**Entry(done.total, full.total, "predicted").as_dict(), **asdict(done)}
 
 
 def _effects(run: SurveyRun) -> list[dict[str, Any]]:

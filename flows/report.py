@@ -153,7 +153,7 @@ def _control_words(accuracy: Mapping[str, Any]) -> str:
         return ""
     shares = [format_percent(mode[f"share_of_{what}"]) for what in ("samples", "lines", "seconds")]
     return (
-        f"<p class=note>Controls choose {mode['seats']:,} seats free of each other. Placed by entropy and with the "
+        f"<p class=note>Controls choose {mode['seats']:,} seats free of each other. Placed by gain and with the "
         f"coarse pass these are {shares[0]} of a full scan's samples; the camera would need {shares[1]} of its "
         f"lines and {shares[2]} of its seconds for them.</p>"
     )

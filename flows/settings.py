@@ -67,7 +67,7 @@ class Settings:
     source: str = "sim"
     out: str = "archive"
     budget: float = 0.5  # seconds of coarse and fine capture over those of the full scan, 0 < b <= 1
-    policy: str = "entropy"
+    policy: str = "gain"
     mask: str | None = None
     vgg: str | None = None  # VGG19's weights, for policies vgg-static and vgg-trained
     weights: str | None = None
@@ -232,7 +232,7 @@ def _check_spending(settings: Settings) -> None:
     if settings.rounds > 1 and policy in UNMOVED:
         raise SettingsError(
             f"a second round goes where the first showed more than was expected, and policy {policy!r} expects "
-            f"nothing: take --rounds 1, or a policy that looks, such as entropy"
+            f"nothing: take --rounds 1, or a policy that looks, such as gain"
         )
 
 

@@ -153,8 +153,8 @@ class PastCosts:
         below = self._below(record)
         captures = {bool(store.inputs): store for store in below if store.ref.stage == "capture"}
         passes = [store for store in below if store.ref.stage == "capture" and store.inputs]
-        if record.ref.stage == "capture":  # of a second round: the first is none of its work
-            passes = [store for store in passes if store.ref.key == record.ref.key]
+        if record.ref.stage in ("capture", "register"):  # of a second round: the first is none of its work
+            passes = [store for store in passes if store.ref.key in (record.ref.key, *record.inputs)]
         own = self._extent
         if record.ref.stage == "locate":  # is of a path, and of no field: its own grid is that of coarse pixels
             height, width = record.params["grid"]["shape"]

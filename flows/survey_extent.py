@@ -101,8 +101,7 @@ class Extent:
         for region in plan_regions(self.grid, SHARD):
             read = region.grid
             seats = round(min(self._fine_pixels / pixels, 1.0) * read.height * read.width / read.patch**2)
-            done = multiply_adds(self.config, read, seats, self.bands, None)
-            total += done.encode + done.decode
+            total += multiply_adds(self.config, read, seats, self.bands, None).total
         return float(total)
 
     @property

@@ -29,8 +29,8 @@ class SurveyFlags:
     budget: str | None = None
     """Seconds of coarse and fine capture over those of the full scan, above 0 and at most 1; 0.5 by default."""
     policy: str | None = None
-    """Where to look twice: entropy (default), margin, sobel, saliency, spectral-residual, random, stratified, centre,
-    uniform, mask, vgg-static, vgg-trained or self-attention."""
+    """Where to look twice: gain (default), entropy, margin, sobel, saliency, spectral-residual, random, stratified,
+    centre, uniform, mask, vgg-static, vgg-trained or self-attention."""
     mask: str | None = None
     """Image of where to look twice, for the policy mask."""
     vgg: str | None = None

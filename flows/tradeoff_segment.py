@@ -50,6 +50,9 @@ class Farm:
 
 
 def _prepare(seed: int) -> Farm:
+    from models.process import keep_freed_memory
+
+    keep_freed_memory()  # as surveys do
     farm = look_at_farm(seed, SHAPE)
     fine = _fine_values(farm)
     other = look_at_farm(seed, SHAPE, noise_seed=seed + 1)

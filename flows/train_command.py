@@ -72,7 +72,7 @@ def _print_figures(record: dict[str, Any], out: Path, console: Console) -> None:
         return
     title = f"{figures['scenes']} validation scenes, K = {figures['share_of_seats']:.0%}"
     table = Table("placement", "mIoU", title=title)
-    for name in ("none", "random", "sobel", "entropy", "all"):
+    for name in ("none", "random", "sobel", "entropy", "gain", "all"):
         if name in figures:  # a control has some of them
             found = figures[name]
             table.add_row(name, f"{found['miou'] if isinstance(found, dict) else found:.1%}")

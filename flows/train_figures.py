@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from models.control_maps import draw_with_control
 from models.controls import CONTROL_SHARE, RANDOM_DRAWS, Controls, Counts, run_controls
 from models.examples import Example
+from models.holes import patches_of
 from models.inference import Glance, glance_of_columns
 from models.metrics import confusion, mean_iou
 from models.policies import score_seats
@@ -47,11 +48,8 @@ def _rows(weights: Weights, example: Example, seed: int, show: Show) -> Controls
 
 def _parts(weights: AnyWeights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
     """The grid of a scene, every fine patch of it, and its labels without the padding."""
-    p, columns = weights.config.patch, weights.config.columns
-    grid = SceneGrid(*example.shape, p, weights.config.factor)
-    rows, across = grid.seat_shape
-    cells = example.fine.reshape(rows, p, across, p, columns).transpose(0, 2, 1, 3, 4).reshape(-1, p, p, columns)
-    return grid, cells.astype(np.float32), example.labels[: grid.height, : grid.width]
+    grid = SceneGrid(*example.shape, weights.config.patch, weights.config.factor)
+    return grid, patches_of(example.fine, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
 
 
 def _summary(rows: list[Controls]) -> dict[str, Any] | None:

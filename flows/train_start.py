@@ -42,7 +42,7 @@ def open_start(init: Path | None, tokens: Mapping[str, Any], preset: Preset) -> 
 def refuse_seen(start: StartFile | None, data: TrainingData) -> None:
     """Refuse to validate on scenes that the start was trained on. Raises SettingsError with the first of them."""
     earlier: Split = {} if start is None else start.earlier.get("split", {})
-    seen = set(earlier.get("train", {}).values()) - earlier.get("pixels", {}).keys()
+    seen = set(earlier.get("train", {}).values())  # with a mask too: validation counts every labelled pixel
     if start is None or not seen:
         return
     for name, scene in zip(data.validation, data.scenes(data.validation), strict=True):

@@ -33,12 +33,12 @@ def save_checkpoint(path: Path, identity: str, about: dict[str, Any], tensors: d
 
 
 def load_checkpoint(path: Path, identity: str) -> tuple[dict[str, Any], dict[str, Tensor]] | None:
-    """Read the checkpoint of the same training run; None where there is none, or one of another run or damaged."""
+    """Read the checkpoint of the same training run; None where none can be read, or it is of another run."""
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads((file.metadata() or {}).get("about", "{}"))
             if about.get("format") != FORMAT or about.get("identity") != identity:
                 return None
             return about, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-    except (FileNotFoundError, SafetensorError, json.JSONDecodeError):
+    except (OSError, SafetensorError, json.JSONDecodeError):
         return None

@@ -57,7 +57,7 @@ def run_controls(
     *,
     share: float,
     seed: int,
-    policies: tuple[str, ...] = ("entropy", "sobel"),
+    policies: tuple[str, ...] = ("gain", "entropy", "sobel"),
     report: Callable[[str], None] = lambda row: None,
 ) -> Controls:
     """Segment with no seat, every seat, and ``share`` of the seats placed by each policy and at random.

@@ -14,10 +14,10 @@ from pipeline.grid import SceneGrid
 class MultiplyAdds:
     """Multiply-adds of one survey's segmentation. Norms, activations, softmax and interpolation count as 0."""
 
-    glance: int  # the coarse pass read alone
+    glance: int  # the coarse pass read alone, its part of the map with it
     score: int  # the policy
-    encode: int  # coarse and fine patches to tokens, and the transformer over both
-    decode: int  # the map: coarse pixels and captured seats
+    encode: int  # fine patches to tokens, and the transformer over these (a control's: over all that it reads)
+    decode: int  # the map at captured seats (a control's: all of it)
 
     @property
     def total(self) -> int:
@@ -39,7 +39,7 @@ def multiply_adds(
 
     ``channels`` are those that VGG19 reads, for the policies through it.
 
-    The glance is the reading of the coarse pass: it is made once, and fine patches read what is kept of it.
+    The glance is the reading of the coarse pass, counted once: fine patches read what is kept of it.
     """
     p, s = config.patch, config.factor
     rows, columns = (size // (p * s) for size in grid.padded_shape)

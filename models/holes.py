@@ -19,10 +19,11 @@ def dead_pixels(columns: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 def fill_dead(patches: NDArray[np.floating], dead: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Patches (P, y, x, column) with the mean of each one's living pixels in the dead ones; 0 where none lives."""
-    known = np.where(dead[..., None], np.float32(0), np.asarray(patches, np.float32))
-    living = np.count_nonzero(~dead, axis=(1, 2))
-    mean = known.sum(axis=(1, 2), dtype=np.float64) / np.maximum(living, 1)[:, None]
-    return np.asarray(np.where(dead[..., None], mean[:, None, None], known), np.float32)
+    filled = np.array(patches, np.float32)
+    for patch, holes in zip(filled, dead, strict=True):  # one by one: together they would take several copies of all
+        if holes.any():
+            patch[holes] = 0 if holes.all() else patch[~holes].mean(axis=0, dtype=np.float64)
+    return filled
 
 
 def readable(dead: NDArray[np.bool_], side: int = 1) -> NDArray[np.bool_]:
@@ -37,10 +38,3 @@ def patches_of(image: NDArray[Kind], patch: int) -> NDArray[Kind]:
     y, x = image.shape[0] // patch, image.shape[1] // patch
     cells = image.reshape(y, patch, x, patch, *image.shape[2:]).swapaxes(1, 2)
     return cells.reshape(y * x, patch, patch, *image.shape[2:])
-
-
-def image_of(patches: NDArray[Kind], columns: int) -> NDArray[Kind]:
-    """Put the patches of `patches_of` together again, ``columns`` of them side by side."""
-    patch = patches.shape[1]
-    cells = patches.reshape(-1, columns, *patches.shape[1:]).swapaxes(1, 2)
-    return cells.reshape(cells.shape[0] * patch, columns * patch, *patches.shape[3:])

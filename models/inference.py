@@ -1,4 +1,4 @@
-"""Use of a trained segmenter on one scene: glance at the coarse pass, then read coarse and fine together."""
+"""Use of a trained segmenter on one scene: glance at the coarse pass, then go on from there with the fine patches."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from models.holes import dead_pixels, fill_dead, image_of, patches_of, readable
+from models.holes import dead_pixels, fill_dead, patches_of, readable
 from models.self_attention import TokenReading, queries_kept, token_reading
 from models.sizes import PATCHES_AT_ONCE as PATCHES_AT_ONCE
 from models.sizes import SegmenterConfig
@@ -125,20 +125,21 @@ def look_coarsely(
         )
     y, x = grid.padded_shape
     padded = pad_by_reflection(columns, (y // grid.factor, x // grid.factor))
-    mended, living = _without_holes(np.ascontiguousarray(padded, np.float32), weights.config)
-    return CoarseLook(grid, mended, origin=origin, living=living)
+    columns = np.ascontiguousarray(padded, np.float32)
+    living = _mend(columns, weights.config)
+    return CoarseLook(grid, columns, origin=origin, living=living)
 
 
-def _without_holes(
-    columns: NDArray[np.float32], config: SegmenterConfig
-) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
-    """Coarse columns with dead pixels filled from their patch, and which tokens live (None: all)."""
+def _mend(columns: NDArray[np.float32], config: SegmenterConfig) -> NDArray[np.bool_] | None:
+    """Fill dead pixels of coarse columns from their patch, in place, and tell which tokens live (None: all)."""
     dead = dead_pixels(columns)
     if not dead.any():
-        return columns, None
-    patches, holes = patches_of(columns, config.patch), patches_of(dead, config.patch)
-    mended = image_of(fill_dead(patches, holes), columns.shape[1] // config.patch)
-    return np.ascontiguousarray(mended, np.float32), readable(holes, config.token_side).ravel()
+        return None
+    p, holes = config.patch, patches_of(dead, config.patch)
+    for number in np.flatnonzero(holes.any(axis=(1, 2))):  # one by one: a copy of a field may not fit the memory
+        y, x = (p * int(at) for at in divmod(number, columns.shape[1] // p))
+        columns[y : y + p, x : x + p] = fill_dead(columns[None, y : y + p, x : x + p], holes[number][None])[0]
+    return readable(holes, config.token_side).ravel()
 
 
 def glance_of_columns(weights: Weights, columns: NDArray[np.generic], grid: SceneGrid) -> Glance:
@@ -236,7 +237,7 @@ def segment_batch(
         expected = (len(numbers), look.grid.patch, look.grid.patch, weights.config.columns)
         if own.shape != expected:
             raise ShapeError(f"expected patches of shape {expected} (seat, y, x, column), got {own.shape}")
-    scenes = [(look, *_captured(own, numbers)) for look, own, numbers in scenes]
+    scenes = [(look, *captured(own, numbers)) for look, own, numbers in scenes]
     with torch.inference_mode(), _computing_in(precision):
         counts = [_patches_in(look) + len(numbers) for look, _, numbers in scenes]
         return [drawn for part in packs(counts) for drawn in _draw_pack(weights, scenes[part], precision)]
@@ -251,7 +252,7 @@ def _draw_pack(
     from models.batches import FineScene, read_fine_packed
 
     looks = [look for look, _, _ in pack]
-    readings = _kept_or_read(weights, looks, precision)
+    readings = readings_of(weights, looks, precision=precision)
     padded = [draw_coarse(reading.logits.float(), look.grid) for reading, look in zip(readings, looks, strict=True)]
     places = ((drawn, place) for drawn, (look, _, seats) in zip(padded, pack, strict=True)
               for place in look.grid.seat_origin(seats))  # fmt: skip
@@ -270,10 +271,8 @@ def _draw_pack(
         yield ClassMap(drawn.classes[scene].copy(), drawn.confidence[scene].copy())
 
 
-def _captured(
-    patches: NDArray[np.floating], seats: NDArray[np.int64]
-) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
-    """Patches that show something of their seats, dead pixels filled, and these seats."""
+def captured(patches: NDArray[np.floating], seats: NDArray[np.int64]) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
+    """Keep the patches that show something of their seats, dead pixels filled, and these seats."""
     if np.isfinite(patches).all():
         return patches, seats
     dead = dead_pixels(patches)
@@ -319,7 +318,9 @@ def _computing_in(precision: Precision) -> Iterator[None]:
         yield
 
 
-def _kept_or_read(weights: Weights, looks: Sequence[CoarseLook], precision: Precision) -> list[CoarseReading]:
+def readings_of(
+    weights: Weights, looks: Sequence[CoarseLook], *, precision: Precision = "float32"
+) -> list[CoarseReading]:
     """Readings of coarse looks. Nothing flows back from fine patches, so one that a glance kept is not made twice."""
     kept = [_kept(weights, look, precision) for look in looks]
     unread = [look for look, reading in zip(looks, kept, strict=True) if reading is None]

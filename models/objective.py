@@ -1,8 +1,9 @@
 """What a training step asks for: seats drawn, the map with them and without, and what the scorer said of them.
 
 A crop is read twice: with no fine seat, and with a share of the seats drawn from ``SHARES``. What the loss falls by at
-a captured seat is what the scorer learns to tell. Three phases follow each other: seats are placed at random and by the
-entropy of the first reading; then also by the scorer; then in larger crops, of which fewer make a batch.
+a captured seat is what the scorer learns to tell; a seat without a label tells it nothing. Three phases follow each
+other: seats are placed at random and by the entropy of the first reading; then also by the scorer; then in larger
+crops, of which fewer make a batch.
 
 A control (``models.designs``) has one map and no scorer: it is asked for that map's loss alone, from the same crops.
 """
@@ -78,7 +79,8 @@ def batch_loss(
     drawn = model.composite(reading.logits, patches, seats), model.composite(reading.logits, nothing, empty)
     with_seats, without = (pixel_losses(logits, batch.labels) for logits in drawn)
     gain = F.avg_pool2d((without - with_seats).detach()[:, None], model.config.patch).flatten(1)
-    scoring = scoring_loss(score.gather(1, seats), gain.gather(1, seats))
+    known = F.max_pool2d((batch.labels != UNLABELLED).float()[:, None], model.config.patch).flatten(1) > 0
+    scoring = scoring_loss(score.gather(1, seats), gain.gather(1, seats), known.gather(1, seats))
     maps = [
         map_loss(logits, losses, batch.labels, weight, soft_dice=soft_dice)
         for logits, losses in zip(drawn, (with_seats, without), strict=True)

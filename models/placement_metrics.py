@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
-from models.inference import PATCHES_AT_ONCE, Glance
+from models.inference import Glance
+from models.second_look import both_looks
 from models.weights import Weights
 from pipeline.grid import UNLABELLED
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
 Values = NDArray[np.floating]
@@ -39,9 +34,10 @@ def oracle_gain(
     full[: grid.height, : grid.width] = labels
     rows, columns = grid.seat_shape
     truth = full.reshape(rows, p, columns, p).swapaxes(1, 2).reshape(-1, p, p)
-    gain = np.zeros(len(truth))
-    for seats, before, after in _logits_of_seats(weights, seen, fine):
-        gain[seats] = (_losses(before, truth[seats]) - _losses(after, truth[seats])).sum(axis=(1, 2)) / p**2
+    gain, valid = np.zeros(len(truth)), grid.valid_seats()
+    for seats, before, after in both_looks(weights, seen, fine[valid], valid):
+        lost = (_losses(logits.numpy(), truth[seats]) for logits in (before, after))
+        gain[seats] = (next(lost) - next(lost)).sum(axis=(1, 2)) / p**2
     return np.clip(gain, -MOST_GAIN, MOST_GAIN)
 
 
@@ -54,34 +50,6 @@ def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np
     exact = logits.astype(np.float64)
     loss = logsumexp(exact, axis=1) - np.take_along_axis(exact, index, axis=1)[:, 0]
     return np.where(labelled, loss, 0.0)
-
-
-def _logits_of_seats(
-    weights: Weights, seen: Glance, fine: NDArray[np.floating]
-) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]]:
-    """Numbers and class logits of some seats at a time: by the glance alone, and with every valid seat captured."""
-    import torch
-
-    model, valid = weights.segmenter.eval(), seen.grid.valid_seats()
-    chunks = [valid[first : first + PATCHES_AT_ONCE] for first in range(0, len(valid), PATCHES_AT_ONCE)]
-    with torch.inference_mode():
-        reading = model.read_coarse(torch.from_numpy(seen.columns).permute(2, 0, 1)[None].contiguous())
-        described = [model.fine_stem(_patches(fine, chunk)) for chunk in chunks]
-        tokens = torch.cat([token for _, token in described])[None]
-        numbers = torch.from_numpy(valid.astype(np.int64))[None]
-        read = torch.split(model.encode_fine(reading, tokens, numbers)[0], PATCHES_AT_ONCE)
-        alone = torch.from_numpy(seen.probability).permute(2, 0, 1)[None].clamp_min(1e-30).log()
-        for chunk, token, (features, _) in zip(chunks, read, described, strict=True):
-            number = torch.from_numpy(chunk.astype(np.int64))[None]
-            after = model.decode_fine(features, token, model.canvas_windows(reading.canvas, number))
-            before = model.seat_windows(alone, number)
-            yield chunk, before.numpy(), after.numpy()
-
-
-def _patches(fine: NDArray[np.floating], seats: NDArray[np.intp]) -> Tensor:
-    import torch
-
-    return torch.from_numpy(np.nan_to_num(np.asarray(fine[seats], np.float32), nan=0.0)).permute(0, 3, 1, 2)
 
 
 def gain_sums(gain: Values, chosen: NDArray[np.integer], valid: NDArray[np.integer]) -> tuple[float, float]:

@@ -50,15 +50,19 @@ class SeatScorer(nn.Module):
         return gain
 
 
-def scoring_loss(score: Tensor, gain: Tensor) -> Tensor:
+def scoring_loss(score: Tensor, gain: Tensor, known: Tensor | None = None) -> Tensor:
     """How far scores of seats are from what these gained, in size and in order, (B, K) and (B, K); gains are clipped.
 
-    Huber's loss and, with a fifth of its weight, the pairs of a scene that stand in the wrong order.
+    Huber's loss and, with a fifth of its weight, the pairs of a scene that stand in the wrong order. Seats that are not
+    ``known`` (B, K), which nothing is labelled in, have no say; 0, with a gradient of 0, where none is known.
     """
+    told = torch.ones_like(score, dtype=torch.bool) if known is None else known
+    if not told.any():
+        return score.sum() * 0.0
     gain = gain.clamp(-MOST_GAIN, MOST_GAIN)
-    size = F.smooth_l1_loss(score, gain, beta=HUBER_NAT)
+    size = F.smooth_l1_loss(score[told], gain[told], beta=HUBER_NAT)
     apart = gain[:, :, None] - gain[:, None, :]
-    pairs = apart > 0
+    pairs = (apart > 0) & told[:, :, None] & told[:, None, :]
     if not pairs.any():
         return size
     wrong = F.softplus((score[:, None, :] - score[:, :, None]) / RANK_NAT)

@@ -5,12 +5,13 @@ Where the fine patches said more than was expected, seats near them are likely t
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.inference import PATCHES_AT_ONCE, CoarseLook, origin_of
+from models.inference import CoarseLook, captured, check_seats, origin_of, readings_of
 from models.weights import Weights
 from pipeline.errors import ShapeError
 
@@ -134,58 +135,68 @@ def surprise(
     """Tell how much each fine patch changed the map, (seat,) [nat per px], by the share of it that lies on the scene.
 
     It is the divergence of what is said with the patch from what the glance said: of a model that knows how sure it is,
-    what the look gained in loss. At most ``MOST_GAIN``.
+    what the look gained in loss. At most ``MOST_GAIN``; NaN where a patch shows too little to be read.
 
     Parameters
     ----------
     patches
-        (seat, p, p, column) normalised columns of the fine pass; anything not finite counts as the median.
+        (seat, p, p, column) normalised columns of the fine pass, holes in them as in ``models.inference.segment``.
     seats
         (seat,) their numbers on the grid of ``seen``, each once.
-    """
-    import torch
 
+    Raises
+    ------
+    ShapeError : a seat given twice or outside the grid, or patches of another shape.
+    """
     from models.scorer import MOST_GAIN  # it is of torch, and a survey is planned without that
 
     grid, p, numbers = seen.grid, seen.grid.patch, np.asarray(seats, np.int64)
+    check_seats(numbers, grid)
     expected = (len(numbers), p, p, weights.config.columns)
     if patches.shape != expected:
         raise ShapeError(f"expected patches of shape {expected} (seat, y, x, column), got {patches.shape}")
-    if not len(numbers):
-        return np.zeros(0)
-    with torch.inference_mode():
-        apart = _divergence(weights, seen, np.nan_to_num(patches, nan=0.0, posinf=0.0, neginf=0.0), numbers)
-    pixel, corner = np.arange(p), grid.seat_origin(numbers)  # (seat, 2)
-    down = corner[:, 0, None] + pixel < grid.height
-    across = corner[:, 1, None] + pixel < grid.width
-    share = (down[:, :, None] & across[:, None, :]).astype(np.float64)
-    gained: NDArray[np.float64] = np.minimum((apart * share).sum(axis=(1, 2)) / p**2, MOST_GAIN)
-    return gained
+    gained, pixel = np.full(grid.seat_shape, np.nan).ravel(), np.arange(p)
+    for some, before, after in both_looks(weights, seen, patches, numbers):
+        corner = grid.seat_origin(some)  # (seat, 2)
+        down = corner[:, 0, None] + pixel < grid.height
+        across = corner[:, 1, None] + pixel < grid.width
+        apart = np.where(down[:, :, None] & across[:, None, :], _divergence(after, before), 0.0)
+        gained[some] = np.minimum(apart.sum(axis=(1, 2)) / p**2, MOST_GAIN)
+    return gained[numbers]
 
 
-def _divergence(
+def both_looks(
     weights: Weights, seen: CoarseLook, patches: NDArray[np.floating], seats: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """KL of the fine classes from the coarse ones brought up, pixel by pixel, (seat, p, p) [nat]."""
+) -> Iterator[tuple[NDArray[np.int64], Tensor, Tensor]]:
+    """Seats, some at a time, and class logits of their pixels by the glance alone and by the patches too.
+
+    Logits are (seat, class, p, p). A patch that shows too little to be read is left out, as in the map.
+    """
     import torch
 
-    model, origin = weights.segmenter.eval(), origin_of(seen)
-    reading = model.read_coarse(torch.from_numpy(seen.columns).permute(2, 0, 1)[None].contiguous(), origin)
-    numbers = torch.from_numpy(seats)[None]
-    fine = torch.from_numpy(np.asarray(patches, np.float32)).permute(0, 3, 1, 2)
-    described = [model.fine_stem(chunk.contiguous()) for chunk in torch.split(fine, PATCHES_AT_ONCE)]
-    tokens = torch.cat([token for _, token in described])[None]
-    tokens = model.encode_fine(reading, tokens, numbers, origin)[0]
-    parts = []
-    for number, token, (features, _) in zip(
-        torch.split(numbers, PATCHES_AT_ONCE, dim=1), torch.split(tokens, PATCHES_AT_ONCE), described, strict=True
-    ):
-        logits = model.decode_fine(features, token, model.canvas_windows(reading.canvas, number))
-        parts.append(_kl(logits, model.seat_windows(reading.logits, number)).numpy())
-    return np.concatenate(parts)
+    numbered: Iterator[tuple[NDArray[np.int64], Tensor, Tensor]]
+    numbered = torch.inference_mode()(_both_looks)(weights, seen, *captured(patches, seats))  # while it runs, not after
+    return numbered
 
 
-def _kl(of: Tensor, against: Tensor) -> Tensor:
-    """Divergence over the classes of logits (n, class, y, x), (n, y, x) float64, never below 0."""
+def _both_looks(
+    weights: Weights, seen: CoarseLook, patches: NDArray[np.floating], seats: NDArray[np.int64]
+) -> Iterator[tuple[NDArray[np.int64], Tensor, Tensor]]:
+    import torch
+
+    from models.batches import FineScene, read_fine_packed
+
+    if not len(seats):
+        return
+    model, (reading,), first = weights.segmenter.eval(), readings_of(weights, [seen]), 0
+    for after in read_fine_packed(model, [FineScene(reading, patches, torch.from_numpy(seats), origin_of(seen))]):
+        some = seats[first : first + len(after)]
+        yield some, model.seat_windows(reading.logits, torch.from_numpy(some)[None]), after
+        first += len(after)
+
+
+def _divergence(of: Tensor, against: Tensor) -> Floats:
+    """KL over the classes of logits (n, class, y, x), (n, y, x) [nat], never below 0."""
     sure, before = of.double().log_softmax(dim=1), against.double().log_softmax(dim=1)
-    return (sure.exp() * (sure - before)).sum(dim=1).clamp(min=0)
+    apart: Floats = (sure.exp() * (sure - before)).sum(dim=1).clamp(min=0).numpy()
+    return apart

@@ -22,7 +22,7 @@ from models.examples import Batch, CropSampler, Example
 from models.objective import PHASES, batch_loss, class_weights, phase_at
 from models.process import keep_freed_memory
 from models.sizes import SegmenterConfig
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, WeightsError
 from pipeline.grid import UNLABELLED
 
 KEEP_EVERY_S = 120.0  # between checkpoints
@@ -88,7 +88,9 @@ class Trainer:
             torch.manual_seed(settings.seed)
             self.model = build_network(config)
         if start is not None:
-            self.model.load_state_dict(start, strict=False)
+            strange = self.model.load_state_dict(start, strict=False).unexpected_keys
+            if strange:
+                raise WeightsError(f"{config.preset} has no place for {len(strange)} tensors, the first {strange[0]}")
         self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = copy.deepcopy(self.model).eval()
         groups = _parameter_groups(self.model, settings.weight_decay)
@@ -155,7 +157,7 @@ class Trainer:
         save_checkpoint(path, "batch", {"course": asdict(self.course)}, tensors)
 
     def go_on(self, path: Path, identity: str) -> bool:
-        """Go on from a checkpoint of the same run; False where there is none."""
+        """Go on from a checkpoint of the same run; False where there is none, or one of a network of other shapes."""
         found = load_checkpoint(path, identity)
         if found is None:
             return False
@@ -169,6 +171,9 @@ class Trainer:
                 state.setdefault(int(number), {})[moment] = tensor
             else:
                 parts[part][rest] = tensor
+        own = {name: tensor.shape for name, tensor in self.model.state_dict().items()}
+        if any({name: tensor.shape for name, tensor in part.items()} != own for part in parts.values()):
+            return False
         self.model.load_state_dict(parts["model"])
         self.averaged.load_state_dict(parts["averaged"])
         groups = self.optimiser.state_dict()["param_groups"]
@@ -219,6 +224,7 @@ def train(
     ------
     TrainingError : the loss or its gradient was not finite three steps in a row; the last batch is kept beside the
         checkpoint.
+    WeightsError : a tensor of ``start`` that the network has no place for.
     """
     keep_freed_memory()
     trainer = Trainer(config, examples, gain_shift, settings, start)

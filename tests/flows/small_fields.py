@@ -42,6 +42,9 @@ def write_field(root: Path, size: tuple[int, int] = (24, 40)) -> Path:
 def write_weights(path: Path, seed: int = 0, preset: Preset = "two-scale", factor: int = 2, **record: Any) -> Path:
     """Small random weights of any design for the field's two classes."""
     made: AnyWeights = make_any_weights(seed, classes=2, columns=3, factor=factor, **PRESETS[preset])
+    for name, tensor in made.network.state_dict().items():
+        if name.endswith("classes.weight"):
+            tensor *= 0.01  # else logits are in the hundreds, and gains all at their clip
     save_weights(replace(made, class_names=NAMES, record={"seed": seed, **record}), path)
     return path
 

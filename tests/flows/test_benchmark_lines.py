@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flows.benchmark_lines import LineBlocks, line_blocks, most_shown
+from flows.benchmark_lines import WIDTHS, LineBlocks, line_blocks, most_shown
 from pipeline.camera import LineCamera
 from pipeline.grid import SceneGrid
 from pipeline.scan import Axis, CostModel
@@ -62,3 +62,13 @@ def test_the_width_that_shows_most_is_taken():
     lines = most_shown(options, lambda blocks: blocks.evenly(budget))
     assert len(lines.seats) == max(len(blocks.seats(blocks.evenly(budget))) for blocks in options)
     assert not len(most_shown(options, lambda blocks: blocks.evenly(0.0)).seats)
+
+
+def test_wide_blocks_are_tried_where_they_show_more():
+    """Lines without a model are no weaker than they can be: on a frame of 1296 x 966 px wide blocks show most."""
+    grid, camera = SceneGrid(966, 1296, 32, 4), LineCamera()
+    narrow, wide = (
+        most_shown([line_blocks(grid, camera, COST, "y", rows) for rows in widths], lambda blocks: blocks.evenly(23.0))
+        for widths in ((1, 2), WIDTHS)
+    )
+    assert len(wide.seats) > 1.5 * len(narrow.seats)

@@ -23,10 +23,11 @@ from flows.benchmark_timing import Rounds, cpu_seconds, row_seconds
 from flows.cli import main
 from flows.evaluate_command import evaluate_weights, run_evaluate
 from flows.train import TrainRequest, train_weights
-from models.metrics import mean_iou
+from flows.training_data import pack_mask
+from models.metrics import average_accuracy, kappa, mean_iou, overall_accuracy
 from models.training import TrainingSettings
 from models.weights import load_weights, save_weights
-from pipeline.errors import SceneError, SettingsError
+from pipeline.errors import SceneError, SettingsError, WeightsError
 from pipeline.simulator.farm_fields import CLASSES
 from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_field, write_weights
 from tests.models.conftest import make_weights
@@ -183,6 +184,87 @@ def test_folds_are_judged_each_on_its_own_frames(data: Path, tmp_path: Path):
     one = {**QUICK, "timed_frames": 0, "frames": ("001",)}
     alone = evaluate_weights(EvaluateRequest(str(data), (first, second), **one))
     assert [weights["covers"] for weights in alone["weights"]] == [[], ["001"]]
+
+
+def test_folds_that_kept_frames_for_validation_are_one_seed(data: Path, tmp_path: Path):
+    """What one of them held out another validated on: each is judged on its own; alone, on both."""
+    keys = {name: scene_at(data, name).key for name in FRAMES}
+    paths = []
+    for number, (kept, validated, trained) in enumerate((("001", "002", "003"), ("002", "001", "003"))):
+        split = {"train": {trained: keys[trained]}, "held_out": [kept], "validation": [validated]}
+        paths.append(write_weights(tmp_path / f"{number}.safetensors", number, data="field", split=split))
+    content = evaluate_weights(EvaluateRequest(str(data), tuple(paths), **{**QUICK, "timed_frames": 0}))
+    assert [one["covers"] for one in content["weights"]] == [["001"], ["002"]]
+    assert content["seeds"] == [["0.safetensors", "1.safetensors"]]
+    alone = evaluate_weights(EvaluateRequest(str(data), (paths[0],), **{**QUICK, "timed_frames": 0}))
+    assert alone["frames"] == ["001", "002"]
+
+
+def test_files_that_leave_different_pixels_are_not_compared(data: Path, tmp_path: Path):
+    """With masks of their own two files would be judged on different pixels of one frame: refused."""
+    scene = scene_at(data)
+    halves = [np.zeros(scene.shape, bool) for _ in range(2)]
+    halves[0][:12], halves[1][12:] = True, True
+    paths = [
+        write_weights(
+            tmp_path / f"{number}.safetensors", number, "dense" if number == 1 else "two-scale",
+            split={"train": {"001": scene.key}, "pixels": {scene.key: pack_mask(half)}},
+        )
+        for number, half in enumerate((halves[0], halves[1], halves[0]))
+    ]  # fmt: skip
+    quick = {**QUICK, "timed_frames": 0, "frames": ("001",)}
+    with pytest.raises(SettingsError, match=r"were trained on different pixels of 001"):
+        evaluate_weights(EvaluateRequest(str(data), (paths[0],), controls=(paths[1],), **quick))
+    content = evaluate_weights(EvaluateRequest(str(data), (paths[0], paths[2]), **quick))
+    assert sum(content["support"].values()) == 12 * 40
+
+
+def test_frames_trained_on_are_known_in_other_bands(data: Path, tmp_path: Path):
+    """With bands chosen a frame's identity is another, here or in the training: its name tells."""
+    split = {"train": {"001": "of other bands"}}
+    quick = {**QUICK, "timed_frames": 0, "policies": (), "shares": ()}
+    plain = (write_weights(tmp_path / "w.safetensors", data="field", split=split),)
+    assert evaluate_weights(EvaluateRequest(str(data), plain, **quick))["left_out"] == []
+    chosen = EvaluateRequest(str(data), plain, choices={"bands": [0, 1]}, **quick)
+    assert evaluate_weights(chosen)["left_out"] == ["001"]
+    command = "spectralzoom train field -o w.safetensors --bands 0,1"
+    taught = (write_weights(tmp_path / "v.safetensors", data="field", split=split, command=command),)
+    assert evaluate_weights(EvaluateRequest(str(data), taught, **quick))["left_out"] == ["001"]
+
+
+def test_frames_without_a_label_are_refused(data: Path, tmp_path: Path):
+    """Where the mask of the training took every label there is nothing to judge by."""
+    scene = scene_at(data)
+    split = {"train": {"001": scene.key}, "pixels": {scene.key: pack_mask(np.ones(scene.shape, bool))}}
+    weights = (write_weights(tmp_path / "w.safetensors", split=split),)
+    with pytest.raises(SceneError, match="no labelled pixel is left on the 1 frames"):
+        evaluate_weights(EvaluateRequest(str(data), weights, frames=("001",), **QUICK))
+
+
+def test_a_damaged_camera_is_named(tmp_path: Path):
+    """A record that is none of a camera is a matter of the file."""
+    (one,) = open_candidates((write_weights(tmp_path / "w.safetensors", camera={"lens": 1}),))
+    with pytest.raises(WeightsError, match="its camera is damaged"):
+        _ = one.camera
+
+
+def test_one_frame_has_accuracies_over_its_pixels(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Overall and average accuracy and kappa stand in the table of one frame alone; freed memory is kept."""
+    kept: list[bool] = []
+    monkeypatch.setattr("flows.evaluate_command.keep_freed_memory", lambda: kept.append(True))
+    weights = (write_weights(tmp_path / "w.safetensors"),)
+    request = EvaluateRequest(str(data), weights, frames=("001",), **{**QUICK, "timed_frames": 0})
+    row = run_evaluate(request, Console(stderr=True))["rows"][0]
+    assert kept == [True]
+    look, loaded = looked_at(data, tmp_path / "w.safetensors")
+    record = judge_frame(Trial((), ()), look, loaded)
+    counts = np.array(record["rows"][0]["counts"])
+    assert row["pixel_accuracy"] == overall_accuracy(counts)
+    assert row["average_accuracy"] == average_accuracy(counts)
+    assert row["kappa"] == kappa(counts)
+    assert "overall  average  kappa" in capsys.readouterr().out
 
 
 def test_inside_and_outside_make_the_whole(data: Path, tmp_path: Path):

@@ -133,5 +133,5 @@ def test_a_control_is_judged_on_frames_it_never_saw(data: Path, tmp_path: Path):
     assert _row(content, "dense", 1.0)["against_all"]["frames"] == 2
     assert content["baseline"]["policy"] == "all"
     every = write_weights(tmp_path / "every.safetensors", 2, "dense", split={"train": keys})
-    with pytest.raises(SceneError, match=r"the control .*every.safetensors was trained on all 3 frames"):
+    with pytest.raises(SceneError, match=r"the control .*every.safetensors was trained on all 3 .* --hold-out NAMES$"):
         evaluate_weights(EvaluateRequest(str(data), weights, controls=(every,), **quick))

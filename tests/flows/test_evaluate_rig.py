@@ -80,7 +80,7 @@ def test_plans_are_compared_at_equal_seconds(record: dict[str, Any]):
 def test_the_table_says_what_is_left_out(record: dict[str, Any], capsys: pytest.CaptureFixture[str]):
     """Rows of plans, and the budgets without one; the plot has a line for each plan."""
     missing = {**record, "frame": "002", "rows": [], "left_out": [{"budget": 0.1, "why": "too little"}]}
-    rig = summarise_rig([[record, missing]], TRIAL)
+    rig = summarise_rig([[record, missing]] * 2, TRIAL)  # of two seeds the frame is one
     ends = [{"policy": name, "miou": 0.5} for name in ("none", "all")]
     content = {"dataset": "field", "frames": ["001"], "rig": rig, "equal_time": [], "rows": ends}
     for table in budget_tables(content):
@@ -106,12 +106,14 @@ def test_the_exposure_of_equal_time_takes_the_full_scans_seconds(looked: tuple[P
 def test_equal_time_stands_beside_equal_exposure(looked: tuple[Path, Look, Weights]):
     """Each row has its exposure, and its differences to `all` and to the same row at equal exposure."""
     data, look, weights = looked
-    trial = Trial((0.05,), ("entropy",))
+    trial = Trial((0.05,), ("entropy", "random"))
     longer = judge_equal_time(trial, scene_at(data), look, weights, CAMERA, COST)
     assert longer is not None
     usual = judge_frame(trial, look, weights)
     rig = {**longer, "rows": [{**one, "policy": "entropy"} for one in longer["rows"]]}
-    row, *plans = summarise_equal_time([[longer]], [[usual]], [[rig]], TRIAL)
+    row, chance, *plans = summarise_equal_time([[longer]], [[usual]], [[rig]], {**TRIAL, "policies": trial.policies})
+    first = next(one for one in usual["rows"] if (one["policy"], one["draw"]) == ("random", 0))
+    assert chance["equal_exposure_miou"] == pytest.approx(first["miou"])  # the draw that was exposed for longer
     assert row["exposure"] > 1
     assert row["seconds"] == pytest.approx(row["full_s"], rel=0.3)  # other seats than those the exposure was found for
     assert row["against_equal_exposure"]["difference"] == pytest.approx(row["miou"] - row["equal_exposure_miou"])

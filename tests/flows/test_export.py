@@ -145,7 +145,7 @@ def test_attention_keeps_its_seats(exports: list[Exported], number: int) -> None
         a, b, c, d, e, f = scene
         assert file.transform[:6] == pytest.approx((patch * a, b, c, d, patch * e, f))
         assert file.crs is None
-        assert file.tags()["policy"] == "entropy"
+        assert file.tags()["policy"] == "gain"
 
 
 @pytest.mark.parametrize("number", [0, 1])

@@ -16,7 +16,9 @@ from flows.forecast import StageForecast, forecast
 from flows.generations import asked_again
 from flows.publish import Published
 from flows.receipt import comparable
+from flows.run import open_run
 from flows.settings import load_settings
+from flows.stage_costs import PastCosts
 from flows.survey import OF_ROUND_TWO, STAGES
 from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
@@ -172,6 +174,10 @@ def test_a_mirror_off_the_plan_is_found_in_both_rounds(survey_png: Survey, tmp_p
     assert _states(receipt)["register_again"] == "ran"
     assert {"fine", "second fine"} <= set(receipt["pointing"])
     assert "pointing_again" in receipt["products"]
+    asked = asked_again(Catalogue.read(tmp_path).runs[0], tmp_path, None)
+    costs = PastCosts(Catalogue.read(tmp_path), open_run(asked))
+    costs.plan_fine("capture_again", receipt["plan"]["rounds"][1]["lines"])
+    assert "times 1," in costs.estimate("register_again")[2]
 
 
 def _asked_again(done: tuple[Published, Path], **changes: Any) -> dict[str, StageForecast]:

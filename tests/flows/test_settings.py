@@ -42,7 +42,7 @@ def test_nothing_given_is_the_default():
     """No file and no flag gives the defaults of the design."""
     found = load_settings()
     assert found == Settings()
-    assert (found.scene, found.budget, found.policy, found.memory) == ("farm", 0.5, "entropy", 4 * 2**30)
+    assert (found.scene, found.budget, found.policy, found.memory) == ("farm", 0.5, "gain", 4 * 2**30)
 
 
 def test_every_field_of_the_dataclasses_can_be_set():

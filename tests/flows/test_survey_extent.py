@@ -51,6 +51,11 @@ def test_operations_of_the_map_are_bounded_by_regions() -> None:
     assert 1 < many.work("operations of the map") / (16 * one.work("operations of the map")) < 1.4
 
 
+def test_a_map_without_fine_lines_reads_the_coarse_look() -> None:
+    """Each map does, for nothing is kept of the glance: without a patch it is all there is to do."""
+    assert replace(SMALL, fine_lines=0).work("operations of the map") == SMALL.work("operations of a glance") > 0
+
+
 @pytest.mark.parametrize(("seconds", "run_lines"), list(product((0.0, 0.5, 40.0, 1000.0), (20.0, 63.5, 700.0))))
 def test_seconds_buy_no_more_lines_than_they_pay_for(seconds: float, run_lines: float) -> None:
     """The lines bought cost no more than the cost model's price of such runs allows, and one more does."""

@@ -82,7 +82,7 @@ def test_receipt_has_every_field(farm: Done) -> None:
         (manifest,) = farm.archive.glob(f"stages/*/{stage['key']}/manifest.json")
         assert stage["manifest_sha256"] == hashlib.sha256(manifest.read_bytes()).hexdigest()
     assert all(stage["manifest_sha256"] is None for stage in receipt["stages"] if stage["state"] == "skipped")
-    assert set(receipt["accuracy"]["controls"]) == {"entropy", "sobel", "random"}
+    assert set(receipt["accuracy"]["controls"]) == {"gain", "entropy", "sobel", "random"}
     assert 0 <= receipt["accuracy"]["miou"] <= 1
     assert {row["name"] for row in receipt["effects"]} >= {"slit", "smear", "shot", "read", "quantisation"}
     assert 0 < farm.published.looked_twice < 1

@@ -31,10 +31,14 @@ def farm() -> Farm:
     flat = Normalisation(np.full(24, 0.3, np.float32), np.full(24, 0.1, np.float32), np.eye(24, dtype=np.float32))
     basis = SpectralBasis.spanning(scene.wavelength_nm)
     weights = Weights(model, basis, flat, scene.class_names, np.asarray(scene.class_colours))
+    kept: list[bool] = []
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("models.process.keep_freed_memory", lambda: kept.append(True))
         patch.setattr(tradeoff_farm, "load_weights", lambda path: weights)
         patch.setattr(tradeoff_segment, "SHAPE", SHAPE)
-        return SEATS.prepare(0)
+        prepared: Farm = SEATS.prepare(0)
+    assert kept == [True]  # as surveys do
+    return prepared
 
 
 def errors(farm: Farm, number: int) -> dict[object, float]:

@@ -95,7 +95,7 @@ def test_patches_follow_the_size_of_scenes(shape: tuple[int, int], built_in: boo
 
 
 ROWS = {
-    "two-scale": {"none", "random", "sobel", "entropy", "all"},
+    "two-scale": {"none", "random", "sobel", "entropy", "gain", "all"},
     "paper": {"none", "random", "sobel", "all"},
     "dense": {"all"},
     "upsampled": {"none"},

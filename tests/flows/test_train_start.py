@@ -95,6 +95,17 @@ def test_frames_that_the_start_has_seen_validate_nothing(folder: Path, earlier: 
         train_weights(_request(folder, tmp_path / "w.safetensors", validation=1, init=earlier))
 
 
+def test_frames_that_the_start_has_seen_in_part_validate_nothing_either(
+    folder: Path, earlier: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A mask kept some pixels from it, but validation counts all that are labelled."""
+    split = describe_weights(earlier).record["split"]
+    masks = {key: pack_mask(np.eye(16, dtype=bool)) for key in split["train"].values()}
+    monkeypatch.setattr(train_start.StartFile, "earlier", property(lambda file: {"split": {**split, "pixels": masks}}))
+    with pytest.raises(SettingsError, match="was trained on the scene 001, which is kept for validation"):
+        train_weights(_request(folder, tmp_path / "w.safetensors", validation=1, init=earlier))
+
+
 def test_tokens_of_another_width_are_refused_before_any_scene_is_opened(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

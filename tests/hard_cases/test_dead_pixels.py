@@ -6,14 +6,18 @@ holds for dead pixels, whose captured values are not numbers.
 
 from __future__ import annotations
 
+import tracemalloc
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from models.holes import fill_dead
 from models.inference import CoarseLook, Glance, glance, look_coarsely, segment
+from models.placement_metrics import oracle_gain
 from models.policies import score_seats
+from models.second_look import surprise
 from models.segmenter import Segmenter, SegmenterConfig
 from models.spectral import Normalisation, SpectralBasis
 from models.weights import Weights
@@ -109,6 +113,58 @@ def test_18_a_dead_fine_patch_is_as_if_not_captured(bad: float):
     without = segment(weights, seen, np.delete(patches, 1, axis=0), np.delete(seats, 1))
     assert np.abs(drawn.confidence - without.confidence).max() <= 1e-5
     assert (drawn.classes == without.classes).all()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_18_what_a_look_showed_is_told_of_the_map_that_is_drawn(bad: float):
+    """Holes in either scale: surprise and gain compare the map without patches with the one that has them."""
+    weights, grid, values = _weights(classes=2), SceneGrid(48, 64, 8, 2), _scene(24, 32)
+    values[:8, 8:16] = bad
+    seen = glance(weights, values, NM, grid)
+    seats = np.arange(48)
+    patches = _patches(48)
+    patches[7], patches[20, :3] = bad, bad
+    chances = [
+        np.where(drawn.classes == 1, drawn.confidence, 1 - drawn.confidence).astype(np.float64)
+        for drawn in (segment(weights, seen, _patches(0), seats[:0]), segment(weights, seen, patches, seats))
+    ]
+    before, after = (np.stack([1 - chance, chance]).reshape(2, 6, 8, 8, 8).swapaxes(2, 3) for chance in chances)
+    apart = (after * np.log(after / before)).sum(axis=0).mean(axis=(2, 3)).ravel()
+    found = surprise(weights, seen, patches, seats)
+    assert np.flatnonzero(np.isnan(found)).tolist() == [7]
+    assert np.delete(found, 7) == pytest.approx(np.delete(apart, 7), abs=1e-5)
+    gained = np.log(after[1] / before[1]).mean(axis=(2, 3)).ravel()
+    assert oracle_gain(weights, seen, patches, np.ones((48, 64), np.uint8)) == pytest.approx(gained, abs=1e-4)
+
+
+def test_18_filling_holes_takes_the_memory_of_the_patches_once():
+    """One copy is made, however many patches have a hole."""
+    patches = np.ones((200, 16, 16, 8), np.float32)
+    dead = np.zeros(patches.shape[:3], bool)
+    dead[:, 3, 4] = True
+    patches[dead] = np.nan
+    tracemalloc.start()
+    filled = fill_dead(patches, dead)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (filled == 1).all()
+    assert peak < 1.1 * patches.nbytes
+
+
+def test_18_holes_in_a_coarse_look_take_no_further_copy_of_it():
+    """A look with a dead pixel in every patch is made in the memory of one without, but for a mask."""
+    weights, peaks = _weights(), []
+    for bad in (0.3, np.nan):
+        values = _scene(256, 256)
+        values[3::8, 4::8] = bad
+        tracemalloc.start()
+        seen = look_coarsely(
+            weights, [values[row : row + 16] for row in range(0, 256, 16)], NM, SceneGrid(512, 512, 8, 2)
+        )
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        assert np.isfinite(seen.columns).all()
+    assert peaks[1] < peaks[0] + 0.5 * seen.columns.nbytes
 
 
 def test_18_what_is_dead_reaches_nobody():

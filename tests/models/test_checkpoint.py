@@ -85,3 +85,19 @@ def test_a_damaged_checkpoint_is_no_checkpoint(tmp_path: Path) -> None:
     assert load_checkpoint(file, "x") is None
     with pytest.raises(WeightsError, match="cannot keep the state of training"):
         save_checkpoint(tmp_path / "none" / "c", "x", {}, {"a": torch.ones(1)})
+
+
+def test_a_checkpoint_of_other_shapes_is_not_gone_on_from(tmp_path: Path) -> None:
+    """What an earlier version left of the same run, or what cannot be read, starts from the beginning."""
+    file, identity = tmp_path / "c", run_identity(CONFIG, [example()], SETTINGS)
+    with pytest.raises(KeyboardInterrupt):
+        train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(4), checkpoint=file, keep_every_s=0)
+    found = load_checkpoint(file, identity)
+    assert found is not None
+    about, tensors = found
+    del tensors["model.scale_code"]
+    save_checkpoint(file, identity, about, tensors)
+    steps: list[int] = []
+    train(CONFIG, [example()], SHIFT, SETTINGS, lambda now: steps.append(now.step), checkpoint=file)
+    assert steps[0] == 1
+    assert load_checkpoint(tmp_path, identity) is None

@@ -37,7 +37,7 @@ def test_every_row_counts_every_labelled_pixel(tiny: Maker):
     rows = [controls.none, controls.every, *controls.policies.values(), *controls.random]
     assert {int(row.sum()) for row in rows} == {27 * 45}
     assert controls.seats == round(0.35 * 4 * 6)
-    assert list(controls.policies) == ["entropy", "sobel"]
+    assert list(controls.policies) == ["gain", "entropy", "sobel"]
     assert len(controls.random) == RANDOM_DRAWS
 
 

@@ -98,6 +98,9 @@ def test_memory_is_that_of_a_region_not_of_the_field():
     assert need[0] < need[1] == need[2] < 1.2 * need[0]
     whole = whole_field(SceneGrid(640, 640, 16, 4))
     assert region_bytes(config, whole, 500, 270) > region_bytes(config, whole, 0, 270) + 500 * 24 * 4 * 16**2
+    deep = SegmenterConfig(classes=3, layers=2 * config.layers)  # keys and values of 100 coarse patches and 500 fine
+    more = region_bytes(deep, whole, 500, 270) - region_bytes(config, whole, 500, 270)
+    assert more == 600 * 2 * 4 * config.layers * config.dim
 
 
 @pytest.mark.parametrize(("most", "halo"), [((0, 640), 1), ((64, 640), -1)])

@@ -91,6 +91,21 @@ def test_equal_and_extreme_gains_have_a_finite_loss(gain: torch.Tensor):
     assert score.grad.isfinite().all()
 
 
+def test_seats_without_a_label_have_no_say():
+    """What is scored at seats of which nothing is known changes no loss and learns nothing; with none known it is 0."""
+    gain, known = (
+        torch.tensor([[0.3, 0.1, 0.0], [0.2, 0.0, 0.0]]),
+        torch.tensor([[True, True, False], [True, False, False]]),
+    )
+    score = torch.tensor([[0.1, 0.2, 3.0], [0.5, -3.0, 1.0]], requires_grad=True)
+    loss = scoring_loss(score, gain, known)
+    loss.backward()
+    assert score.grad is not None
+    assert torch.equal(score.grad != 0, known)
+    assert loss == scoring_loss(score.detach().where(known, 9.0), gain, known)
+    assert scoring_loss(score, gain, torch.zeros_like(known)) == 0
+
+
 def test_a_glance_tells_gains_and_the_policy_takes_them(tiny: Maker):
     """Scores of the policy are the glance's gains, by the share of each seat that lies on the scene."""
     weights = tiny()

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.inference import CoarseLook, look_coarsely
+from models import batches
+from models.inference import CoarseLook, look_coarsely, read_glance
 from models.scorer import MOST_GAIN
 from models.second_look import MOST_TIMES, rescore, surprise
 from models.weights import Weights
@@ -177,6 +178,17 @@ def test_a_surprise_is_the_divergence_from_the_glance(tiny: Callable[..., Weight
     assert found.max() <= MOST_GAIN
 
 
+def test_a_surprise_goes_on_from_what_the_glance_kept(
+    tiny: Callable[..., Weights], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a glance nothing is read again, and the figures are those of the coarse look."""
+    weights = tiny(0)
+    seen, patches, seats = _looked(weights, (32, 48))
+    found, kept = surprise(weights, seen, patches, seats), read_glance(weights, seen)
+    monkeypatch.setattr(batches, "read_coarse_packed", lambda segmenter, images, *rest: [1 / 0 for _ in images])
+    np.testing.assert_array_equal(surprise(weights, kept, patches, seats), found)
+
+
 def test_a_surprise_counts_the_scene_alone_and_any_order(tiny: Callable[..., Weights]) -> None:
     """A seat half beyond the scene counts by its half; patches in another order keep their surprise; none is empty."""
     weights = tiny(1)
@@ -187,3 +199,5 @@ def test_a_surprise_counts_the_scene_alone_and_any_order(tiny: Callable[..., Wei
     assert surprise(weights, seen, patches[:0], seats[:0]).shape == (0,)
     with pytest.raises(ShapeError, match="expected patches of shape"):
         surprise(weights, seen, patches[:1], seats)
+    with pytest.raises(ShapeError, match="given more than once"):
+        surprise(weights, seen, patches[:2], seats[[0, 0]])

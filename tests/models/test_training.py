@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from models import training
+from models import objective, training
 from models.examples import CropSampler, Example
 from models.objective import PHASES, SHARES, batch_loss, class_weights, draw_seats, map_loss, phase_at, pixel_losses
 from models.segmenter import Segmenter, SegmenterConfig
 from models.training import Progress, TrainingError, TrainingSettings, rate_at, train
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, WeightsError
 
 CONFIG = SegmenterConfig(classes=3, columns=2, patch=8, factor=2, width=8, dim=16, layers=1, heads=2)
 SETTINGS = TrainingSettings(steps=6, batch=2, crop=16, learning_rate=3e-3)
@@ -201,3 +201,29 @@ def test_unlabelled_pixels_have_no_say():
     assert map_loss(other, pixel_losses(other, labels), labels, torch.ones(3), soft_dice=True).item() == pytest.approx(
         loss.item(), abs=1e-6
     )
+
+
+def test_the_scorer_is_told_of_labelled_seats_alone(monkeypatch: pytest.MonkeyPatch):
+    """A seat with one labelled pixel is told of; one with none is not said to gain nothing."""
+    told: list[tuple[Tensor, ...]] = []
+
+    def scoring(*given: Tensor) -> Tensor:
+        told.append(given)
+        return given[0].sum() * 0
+
+    monkeypatch.setattr(objective, "scoring_loss", scoring)
+    monkeypatch.setattr(objective, "draw_seats", lambda *_: torch.arange(4)[None])
+    batch = CropSampler([_example()], 8, 2, 16).draw(1, np.random.default_rng(0), SHIFT)
+    batch.labels[:] = 255
+    batch.labels[0, 3, 12] = 1
+    with torch.no_grad():
+        batch_loss(Segmenter(CONFIG), batch, torch.ones(3), np.random.default_rng(0), phase_at(0.0), soft_dice=False)
+    score, gain, known = told[0]
+    assert score.shape == gain.shape == known.shape
+    assert known.tolist() == [[False, True, False, False]]
+
+
+def test_a_start_that_has_no_place_is_refused():
+    """A tensor of another network is not passed over in silence."""
+    with pytest.raises(WeightsError, match=r"two-scale has no place for 1 tensors, the first encoder\.extra"):
+        train(CONFIG, [_example()], SHIFT, SETTINGS, start={"encoder.extra": torch.zeros(1)})

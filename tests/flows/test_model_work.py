@@ -1,0 +1,59 @@
+"""What the receipt says that the model computed, against the readings that the stages of a survey make."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from flows.model_work import work_done, work_of_map
+from flows.run import SurveyRun
+from models.cost import multiply_adds
+from models.sizes import SegmenterConfig
+from pipeline.grid import SceneGrid
+from pipeline.planning import FinePlan
+
+CONFIG, BANDS = SegmenterConfig(classes=4), 8
+
+
+def _run(side: int, policy: str) -> SurveyRun:
+    """As much of a survey as is asked for its sizes."""
+    made: Any = SimpleNamespace(
+        grid=SceneGrid(side, side, 16, 4), described=SimpleNamespace(config=CONFIG), vgg=None,
+        scene=SimpleNamespace(wavelength_nm=np.linspace(400, 1000, BANDS)), settings=SimpleNamespace(policy=policy),
+    )  # fmt: skip
+    return cast("SurveyRun", made)
+
+
+def _plan(seats: list[int]) -> FinePlan:
+    return FinePlan([], np.array(seats, np.intp), 1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("policy", "looks"), [("gain", 2), ("sobel", 2), ("random", 1), ("saliency", 1), ("vgg-static", 1)]
+)
+def test_a_policy_that_asks_the_glance_reads_the_coarse_look_once_more(policy: str, looks: int) -> None:
+    """The map reads it anyway, from what is stored; scores of the glance read it before that."""
+    run = _run(256, policy)
+    done, closed = work_done(run, [_plan([3, 8])]), multiply_adds(CONFIG, run.grid, 2, BANDS, policy)
+    assert done.glance == looks * closed.glance
+    assert (done.score, done.encode, done.decode) == (closed.score, closed.encode, closed.decode)
+
+
+def test_a_second_rounds_scores_read_the_coarse_look_and_the_first_patches() -> None:
+    """They are counted with the scores; where the first round captured nothing there is nothing to read."""
+    run = _run(256, "gain")
+    one, two, none = (work_done(run, plans) for plans in ([_plan([3, 8])], [_plan([3]), _plan([8])],
+                                                          [_plan([]), _plan([3, 8])]))  # fmt: skip
+    assert two.score == one.score + multiply_adds(CONFIG, run.grid, 1, BANDS, None).total
+    assert (two.glance, two.encode, two.decode) == (one.glance, one.encode, one.decode)
+    assert none == one
+
+
+def test_a_large_field_is_counted_region_by_region() -> None:
+    """Sixteen times the field takes what sixteen such fields take, and its halos: attention ends with a region."""
+    small, large = (work_of_map(run, run.grid.valid_seats()) for run in (_run(2560, "gain"), _run(10240, "gain")))
+    assert 16 * small.decode < large.decode < 16 * 1.3 * small.decode
+    assert 16 * small.total < large.total < 16 * 1.3 * small.total
