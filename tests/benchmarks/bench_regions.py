@@ -69,7 +69,7 @@ def rows() -> list[Row]:
             f"class map in 2 x 2 regions against one, halo of {halo} coarse patches: same class",
             f"{np.mean([one[halo].all_px for one in table]):.3%}",
             ">= 99.9 %" if halo == HALO_CELLS else "",
-            np.mean([one[halo].all_px for one in table]) >= 0.999 if halo == HALO_CELLS else None,
+            bool(np.mean([one[halo].all_px for one in table]) >= 0.999) if halo == HALO_CELLS else None,
             f"within a patch of a seam {np.mean([one[halo].near_px for one in table]):.3%}, further away "
             f"{np.mean([one[halo].far_px for one in table]):.3%}; step of confidence across a seam over the same "
             f"without it {np.mean([one[halo].step for one in table]):.3f}; mIoU "
