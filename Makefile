@@ -4,7 +4,7 @@ PY ?= python3
 VENV ?= .venv
 ARCHIVE ?= archive
 SCENE ?= farm
-PYTEST_ARGS ?=
+PYTEST_ARGS ?= -n 2
 BENCH ?=
 BIN := $(VENV)/bin
 
