@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from flows.benchmark_frames import Look
-from flows.benchmark_lines import WIDTHS, line_blocks, most_shown
 from flows.benchmark_rows import Seats, known_or_none
 from models.controls import RANDOM_DRAWS
 from models.inference import segment
@@ -18,6 +17,7 @@ from models.weights import Weights
 from pipeline.camera import LineCamera
 from pipeline.coverage import cheapest_full, coarse_sweeps
 from pipeline.errors import BudgetError, PoseError
+from pipeline.line_blocks import WIDTHS, line_blocks, most_shown
 from pipeline.planning import check_budget, plan_fine
 from pipeline.savings import count_lines
 from pipeline.scan import CostModel

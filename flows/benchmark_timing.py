@@ -19,7 +19,7 @@ from flows.benchmark_rows import Trial
 from models.control_maps import draw_with_control
 from models.inference import CoarseLook, glance_of_columns, segment
 from models.policies import score_seats
-from models.threads import one_thread
+from models.process import one_thread
 from models.weights import AnyWeights, Weights
 from pipeline.selection import frame_seats
 

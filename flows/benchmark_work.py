@@ -13,7 +13,6 @@ from flows.benchmark_controls import design_of, judge_control
 from flows.benchmark_equal_time import judge_equal_time
 from flows.benchmark_frames import Candidate, Look, Sight, look_at, sight_of
 from flows.benchmark_jobs import Job, Jobs, Show, scene_of
-from flows.benchmark_lines import WIDTHS
 from flows.benchmark_request import COST, EvaluateRequest
 from flows.benchmark_rig import BUDGETS, judge_rig
 from flows.benchmark_rows import Trial, judge_frame
@@ -23,6 +22,7 @@ from flows.figures import format_seconds
 from flows.training_data import TrainingData
 from models.weights import AnyWeights, Weights
 from pipeline.camera import LineCamera
+from pipeline.line_blocks import WIDTHS
 from pipeline.simulator.scene import RasterScene
 
 Record = dict[str, Any]

@@ -37,7 +37,7 @@ from storage.spool import Spool
 from storage.stored_tables import read_table
 
 VERSIONS = {
-    "capture": 2, "register": 2, "locate": 2, "rectify": 3, "attend": 5, "patches": 3, "segment": 4, "ground": 2,
+    "capture": 2, "register": 2, "locate": 2, "rectify": 3, "attend": 6, "patches": 3, "segment": 4, "ground": 2,
     "evaluate": 6,
 }  # fmt: skip
 SEATS_AT_ONCE = 64

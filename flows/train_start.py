@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import base64
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
-from flows.training_data import TrainingData
+from flows.training_data import TrainingData, either_mask
 from models.sizes import Preset, SegmenterConfig
 from models.start_weights import StartFile
 from pipeline.errors import SettingsError, ShapeError
@@ -62,15 +59,9 @@ def joined_split(split: Split, start: StartFile | None) -> Split:
     before, parts_before = earlier["train"], earlier.get("pixels", {})
     whole = {key for key in before.values() if key not in parts_before}
     whole |= {key for key in own.values() if key not in parts}
-    masks = {key: _either(parts.get(key), parts_before.get(key)) for key in parts.keys() | parts_before.keys()}
+    masks = {key: either_mask(parts.get(key), parts_before.get(key)) for key in parts.keys() | parts_before.keys()}
     more = {f"{start.path.name}: {name}": key for name, key in before.items() if key not in own.values()}
     return split | {"train": own | more, "pixels": {key: mask for key, mask in masks.items() if key not in whole}}
-
-
-def _either(one: str | None, other: str | None) -> str:
-    """Pixels of either of two packed masks of one scene."""
-    bits = [np.frombuffer(zlib.decompress(base64.b64decode(mask)), np.uint8) for mask in (one, other) if mask]
-    return base64.b64encode(zlib.compress(np.bitwise_or.reduce(bits).tobytes(), 9)).decode("ascii")
 
 
 def print_start(begun: Mapping[str, Any], console: Console) -> None:

@@ -132,6 +132,12 @@ def unpack_mask(text: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
     return np.unpackbits(bits, count=shape[0] * shape[1]).reshape(shape).astype(bool)
 
 
+def either_mask(one: str | None, other: str | None) -> str:
+    """Pixels of either of two packed masks of one scene; None holds none."""
+    bits = [np.frombuffer(zlib.decompress(base64.b64decode(mask)), np.uint8) for mask in (one, other) if mask]
+    return base64.b64encode(zlib.compress(np.bitwise_or.reduce(bits).tobytes(), 9)).decode("ascii")
+
+
 def trained_pixels(scene: RasterScene) -> NDArray[np.bool_]:
     """Pixels whose label training sees."""
     if scene.labels is None:

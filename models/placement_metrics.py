@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from models.inference import Glance
 from models.second_look import both_looks
+from models.sizes import MOST_GAIN
 from models.weights import Weights
 from pipeline.grid import UNLABELLED
 
-MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
 Values = NDArray[np.floating]
 
 
@@ -36,8 +36,8 @@ def oracle_gain(
     truth = full.reshape(rows, p, columns, p).swapaxes(1, 2).reshape(-1, p, p)
     gain, valid = np.zeros(len(truth)), grid.valid_seats()
     for seats, before, after in both_looks(weights, seen, fine[valid], valid):
-        lost = (_losses(logits.numpy(), truth[seats]) for logits in (before, after))
-        gain[seats] = (next(lost) - next(lost)).sum(axis=(1, 2)) / p**2
+        lower = _losses(before.numpy(), truth[seats]) - _losses(after.numpy(), truth[seats])
+        gain[seats] = lower.sum(axis=(1, 2)) / p**2
     return np.clip(gain, -MOST_GAIN, MOST_GAIN)
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 
@@ -12,6 +14,17 @@ KEPT = ((-3, 2**30), (-1, 2**31 - 1), (-2, 2**26))  # mallopt: mmap threshold, t
 def use_one_thread() -> None:
     """Hold torch to one thread: on a shared machine two spend their time waiting for each other."""
     torch.set_num_threads(1)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Hold torch to one thread for a while, for a measurement; to as many as before afterwards."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def keep_freed_memory() -> None:

@@ -7,12 +7,11 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
 from models.patches import ChannelNorm
-from models.sizes import SCORER_WIDTH, SegmenterConfig, scorer_inputs
+from models.sizes import MOST_GAIN, SCORER_WIDTH, SegmenterConfig, scorer_inputs
 
 HUBER_NAT = 0.1  # errors above this count linearly
 RANK_WEIGHT = 0.2
 RANK_NAT = 0.05  # two seats that differ by less are hardly put in order
-MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
 
 
 class SeatScorer(nn.Module):

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.inference import CoarseLook, captured, check_seats, origin_of, readings_of
+from models.sizes import MOST_GAIN
 from models.weights import Weights
 from pipeline.errors import ShapeError
 
@@ -148,8 +149,6 @@ def surprise(
     ------
     ShapeError : a seat given twice or outside the grid, or patches of another shape.
     """
-    from models.scorer import MOST_GAIN  # it is of torch, and a survey is planned without that
-
     grid, p, numbers = seen.grid, seen.grid.patch, np.asarray(seats, np.int64)
     check_seats(numbers, grid)
     expected = (len(numbers), p, p, weights.config.columns)

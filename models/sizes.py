@@ -26,6 +26,7 @@ BOTTOM = 4  # pixels a side at the lowest level of a patch
 PATCHES_AT_ONCE = 64  # their features fit the caches; larger chunks go to memory and back at every layer
 TOKEN_PX = 16  # a token stands for at most so many pixels a side
 SCORER_WIDTH = 16  # channels of the network that scores seats
+MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
 
 
 def level_widths(width: int, patch: int) -> list[int]:

@@ -18,7 +18,7 @@ from pipeline.grid import SceneGrid
 from pipeline.runs import Prices, Run
 from pipeline.scan import Axis, CostModel, Sweep
 from pipeline.selection import check_threshold
-from pipeline.spending import cheapest_cover, spend
+from pipeline.spending import cheapest_cover, full_scan_pays, spend
 from pipeline.strips import covered_seats, look_from, strips_at_seats
 
 LEAST_DIGITS = 4  # of the least budget that a refusal names
@@ -174,14 +174,13 @@ def plan_fine(
     full_s = None if whole is None else whole[1]
     plan = spend(field, budget_s if full_s is None else min(budget_s, float(np.nextafter(full_s, 0.0))), floor)
     everything = plan.worth >= field.total * (1 - NEGLIGIBLE)
-    rest_pays = full_s is not None and field.total - plan.worth >= floor * (full_s - plan.seconds(field.prices))
-    if whole is not None and full_s is not None and full_s <= budget_s and not everything and rest_pays:
+    if whole is not None and whole[1] <= budget_s and not everything and full_scan_pays(field, whole[1], floor):
         reason = (
             f"to show every place worth a second look takes no less time than to scan everything in detail, "
-            f"{full_s:.1f} s; the full scan is taken, which shows all of the field"
+            f"{whole[1]:.1f} s; the full scan is taken, which shows all of the field"
         )
         return FinePlan(
-            whole[0], grid.valid_seats(), full_s, field.total, "full", reason, field.total, full_s, missed, threshold
+            whole[0], grid.valid_seats(), whole[1], field.total, "full", reason, field.total, full_s, missed, threshold
         )  # fmt: skip
     sweeps = _sweeps(field, plan)
     check_reach(sweeps, camera)

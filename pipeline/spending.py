@@ -41,6 +41,18 @@ def spend(field: Field, budget_s: float, floor: float = 0.0) -> Cover:
     return best
 
 
+def full_scan_pays(field: Field, full_s: float, floor: float) -> bool:
+    """Whether what each cover cheaper than a full scan leaves out is worth the rest of its seconds at the floor.
+
+    The covers asked do not depend on the floor: a full scan that pays at one floor does at every lower one.
+    """
+    return not floor or all(
+        field.total - cover.worth >= floor * (full_s - seconds)
+        for cover, seconds in ((cover, cover.seconds(field.prices)) for cover, _ in covers(field))
+        if seconds < full_s
+    )
+
+
 def _better(one: Cover, other: Cover) -> Cover:
     return other if other.worth > one.worth else one
 

@@ -262,7 +262,7 @@ def _judged(source: str, weights: Weights, seen: Glance, fine: Values, labels: L
     """The map with several shares of the seats, by entropy."""
     from models.inference import glance_of_columns, segment
     from models.policies import score_seats
-    from models.threads import one_thread
+    from models.process import one_thread
     from pipeline.selection import frame_seats
 
     training, valid, found = weights.record["training"], seen.grid.valid_share().ravel() > 0, []

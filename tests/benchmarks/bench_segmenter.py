@@ -27,10 +27,9 @@ from models.inference import (
     segment_batch,
 )
 from models.policies import score_seats
-from models.process import keep_freed_memory
+from models.process import keep_freed_memory, one_thread
 from models.segmenter import Segmenter, SegmenterConfig
 from models.spectral import Normalisation, SpectralBasis
-from models.threads import one_thread
 from models.weights import Weights
 from pipeline.grid import SceneGrid
 from pipeline.selection import frame_seats

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,15 +24,15 @@ QUICK: dict[str, Any] = {
 }  # fmt: skip
 
 
-def write_field(root: Path, size: tuple[int, int] = (24, 40)) -> Path:
-    """Three frames of two classes."""
+def write_field(root: Path, size: tuple[int, int] = (24, 40), names: Sequence[str] = FRAMES) -> Path:
+    """Frames of two classes."""
     rng = np.random.default_rng(0)
     for folder in ("images", "annotations"):
         (root / folder).mkdir(parents=True)
     (root / "scene.toml").write_text(
         'labels = "annotations/{number}_annotation.png"\n[classes]\nsoil = [0, 0, 0]\ncrop = [0, 255, 0]\n'
     )
-    for number in FRAMES:
+    for number in names:
         grown = rng.integers(0, 2, size, dtype=np.uint8) * 255
         colours = np.stack([0 * grown, grown, 0 * grown], axis=-1)
         Image.fromarray(colours).save(root / "annotations" / f"{number}_annotation.png")

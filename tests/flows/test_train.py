@@ -7,9 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from PIL import Image
 from rich.console import Console
 
 from flows import train as flow
@@ -21,24 +19,13 @@ from models.sizes import PRESETS, Preset
 from models.training import TrainingSettings
 from models.weights import load_any_weights, load_weights
 from pipeline.errors import SceneError, SettingsError, WeightsError
+from tests.flows.small_fields import write_field
 
 SETTINGS = TrainingSettings(steps=1, batch=1, crop=16)
 
 
 def _folder(root: Path) -> Path:
-    """Four frames of 16 x 16 px with two classes."""
-    rng = np.random.default_rng(0)
-    for folder in ("images", "annotations"):
-        (root / folder).mkdir(parents=True)
-    (root / "scene.toml").write_text(
-        'labels = "annotations/{number}_annotation.png"\n[classes]\nsoil = [0, 0, 0]\ncrop = [0, 255, 0]\n'
-    )
-    for number in ("001", "002", "003", "004"):
-        grown = rng.integers(0, 2, (16, 16), dtype=np.uint8) * 255
-        colours = np.stack([0 * grown, grown, 0 * grown], axis=-1)
-        Image.fromarray(colours).save(root / "annotations" / f"{number}_annotation.png")
-        Image.fromarray(colours // 2 + 40).save(root / "images" / f"{number}_image.png")
-    return root
+    return write_field(root, (16, 16), ("001", "002", "003", "004"))
 
 
 def _request(tmp_path: Path, **choices: Any) -> TrainRequest:

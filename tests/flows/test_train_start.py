@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from flows import train as flow
 from flows import train_start
@@ -22,6 +21,7 @@ from models.start_weights import StartFile
 from models.training import TrainingSettings
 from models.weights import describe_weights, load_weights
 from pipeline.errors import SettingsError
+from tests.flows.small_fields import write_field
 
 TOKENS = {"dim": 16, "layers": 1, "heads": 2, "mlp_ratio": 3}
 FLAGS = ("--steps", 1, "--batch", 1, "--crop", 16, "--patch", 8, "--factor", 2)
@@ -30,18 +30,7 @@ FLAGS = ("--steps", 1, "--batch", 1, "--crop", 16, "--patch", 8, "--factor", 2)
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four frames of 16 x 16 px with two classes."""
-    root, rng = tmp_path_factory.mktemp("frames"), np.random.default_rng(0)
-    for name in ("images", "annotations"):
-        (root / name).mkdir()
-    (root / "scene.toml").write_text(
-        'labels = "annotations/{number}_annotation.png"\n[classes]\nsoil = [0, 0, 0]\ncrop = [0, 255, 0]\n'
-    )
-    for number in ("001", "002", "003", "004"):
-        grown = rng.integers(0, 2, (16, 16), dtype=np.uint8) * 255
-        colours = np.stack([0 * grown, grown, 0 * grown], axis=-1)
-        Image.fromarray(colours).save(root / "annotations" / f"{number}_annotation.png")
-        Image.fromarray(colours // 2 + 40).save(root / "images" / f"{number}_image.png")
-    return root
+    return write_field(tmp_path_factory.mktemp("frames") / "field", (16, 16), ("001", "002", "003", "004"))
 
 
 def _request(folder: Path, out: Path, **choices: Any) -> TrainRequest:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flows.benchmark_lines import WIDTHS, LineBlocks, line_blocks, most_shown
 from pipeline.camera import LineCamera
 from pipeline.grid import SceneGrid
+from pipeline.line_blocks import WIDTHS, LineBlocks, line_blocks, most_shown
 from pipeline.scan import Axis, CostModel
 
 CAMERA, COST = LineCamera(samples=64), CostModel()
