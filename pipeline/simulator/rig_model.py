@@ -1,0 +1,139 @@
+"""What the simulated rig is like beyond its camera, and what lies between it and the scene: numbers with their source.
+
+Nothing here was measured on a unit. A field's metadata holds its unit and where its default comes from: ``measured``,
+``data sheet`` (from memory) or ``assumed``; settings and the manifest repeat them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
+from datetime import UTC, datetime
+from typing import Any, Literal
+
+from pipeline.camera import LineCamera
+from pipeline.errors import SettingsError
+
+Source = Literal["measured", "data sheet", "assumed"]
+Relief = Literal["flat", "step", "plane"]
+
+
+def stated(default: float, unit: str, source: Source, least: float = 0.0, most: float = math.inf) -> Any:
+    """A number of the rig: its default, its unit, where the default comes from, and the range that makes sense."""
+    return field(default=default, metadata={"unit": unit, "source": source, "least": least, "most": most})
+
+
+@dataclass(frozen=True)
+class Optics:
+    """Mirror as a stop, lens, slit spectrograph."""
+
+    aperture_mm: float = stated(15.0, "mm", "data sheet", 0.1)  # of the mirror, the aperture stop
+    focus_m: float = stated(math.inf, "m", "assumed", 0.01)  # distance that is sharp
+    aberration_px: float = stated(0.2, "px", "assumed")  # sd of the lens's own blur
+    keystone_px: float = stated(0.15, "px", "assumed")  # shift along the line from the first wavelength to the last
+    smile_nm: float = stated(0.3, "nm", "assumed")  # shift of the wavelengths from a line's centre to its ends
+    fwhm_nm: float = stated(6.0, "nm", "data sheet")  # width of a band
+    stray_share: float = stated(1e-3, "", "assumed", 0.0, 0.5)  # of all light of a line, spread over its detector
+    polarisation: float = stated(0.02, "", "assumed", 0.0, 0.5)  # change of reflectance from 45 to 70 deg incidence
+
+
+@dataclass(frozen=True)
+class MirrorMotion:
+    """How the mirror follows its commands: a second-order system fed from a vector memory."""
+
+    natural_hz: float = stated(20.0, "Hz", "data sheet", 0.1)  # full-scale bandwidth
+    damping: float = stated(0.7, "", "assumed", 0.01, 10.0)
+    settled_s: float = stated(0.2, "s", "assumed")  # at rest at the first position before a sweep starts
+    positions_per_line: float = stated(1.0, "", "assumed", 0.01)  # of the vector memory, for each px of the path
+    repeatability_urad: float = stated(0.0, "urad", "assumed")  # sd of the tilt, anew for every line; vendor: 40
+    hysteresis_px: float = stated(0.0, "px", "assumed")  # systematic, sign by direction; vendor's accuracy: 50 px
+    drift_px_per_min: float = stated(0.0, "px/min", "assumed")  # as the unit warms up
+
+
+@dataclass(frozen=True)
+class Detector:
+    """What the sensor adds to the camera's own read noise, gain and well."""
+
+    dark_e_per_s: float = stated(200.0, "e-/s", "assumed")  # at 25 deg C
+    temperature_deg_c: float = stated(25.0, "deg C", "assumed", -80.0, 80.0)
+    response_share: float = stated(0.01, "", "assumed", 0.0, 0.5)  # sd of a pixel's gain (PRNU)
+    stripe_share: float = stated(0.002, "", "assumed", 0.0, 0.5)  # sd of the gain that a sample's whole column shares
+    dead_share: float = stated(0.0, "", "assumed", 0.0, 0.5)
+    hot_share: float = stated(0.0, "", "assumed", 0.0, 0.5)
+    hot_e_per_s: float = stated(5e4, "e-/s", "assumed")
+    unit: int = 0  # which copy of the sensor: its fixed pattern follows from this number
+
+
+@dataclass(frozen=True)
+class Air:
+    """What lies between rig and scene. A scene without a distance is light at the aperture: no air, no parallax."""
+
+    distance_m: float | None = None
+    relief: Relief = "flat"
+    nearest_m: float | None = None  # None is distance_m
+    farthest_m: float | None = None
+    lever_m: float = stated(0.1, "m", "assumed")  # virtual pinhole behind the pivot
+    visibility_km: float = stated(23.0, "km", "assumed", 0.05)
+    turbulence_cn2: float = stated(1e-13, "m^(-2/3)", "assumed")
+    wind_amplitude_m: float = stated(0.0, "m", "assumed")  # of the canopy's sway
+    wind_hz: float = stated(1.0, "Hz", "assumed", 0.0, 50.0)
+
+
+@dataclass(frozen=True)
+class Sky:
+    """The light: sun, its course through the survey, clouds. None for the time: the sun stands still overhead."""
+
+    started: datetime | None = None  # with its time zone
+    latitude_deg: float = stated(52.0, "deg", "assumed", -90.0, 90.0)
+    longitude_deg: float = stated(10.0, "deg", "assumed", -180.0, 180.0)
+    cloud_share: float = stated(
+        0.0, "", "assumed", 0.0, 1.0
+    )  # light that a cloud's shadow takes away; 0 is a clear sky
+    cloud_px_per_s: float = stated(20.0, "px/s", "assumed")  # speed of the shadow's edge over the scene
+    cloud_size_px: float = stated(600.0, "px", "assumed", 1.0)
+    brdf_per_rad: float = stated(0.1, "1/rad", "assumed", 0.0, 5.0)  # change of reflectance with the view angle
+    hot_spot: float = stated(0.0, "", "assumed", 0.0, 2.0)  # brightening where the view looks along the sun's rays
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Camera and all that the effects of the simulator know about. The defaults are a rig at rest in calm, clear air."""
+
+    camera: LineCamera = field(default_factory=LineCamera)
+    optics: Optics = field(default_factory=Optics)
+    mirror: MirrorMotion = field(default_factory=MirrorMotion)
+    detector: Detector = field(default_factory=Detector)
+    air: Air = field(default_factory=Air)
+    sky: Sky = field(default_factory=Sky)
+
+    def __post_init__(self) -> None:
+        for place, value, least, most in self._numbers():
+            if not least <= value <= most:  # refuses NaN
+                raise SettingsError(f"{place} must be between {least:g} and {most:g}, got {value:g}")
+        for name in ("distance_m", "nearest_m", "farthest_m"):
+            metres = getattr(self.air, name)
+            if metres is not None and not metres > 0:
+                raise SettingsError(f"air.{name} must be above 0 m, got {metres:g}")
+        if self.sky.started is not None and self.sky.started.tzinfo is None:
+            raise SettingsError(f"sky.started needs a time zone, got {self.sky.started}; add +00:00 for UTC")
+
+    def _numbers(self) -> Iterator[tuple[str, float, float, float]]:
+        for part in ("optics", "mirror", "detector", "air", "sky"):
+            for item in fields(getattr(self, part)):
+                if "least" in item.metadata:
+                    value = float(getattr(getattr(self, part), item.name))
+                    yield f"{part}.{item.name}", value, item.metadata["least"], item.metadata["most"]
+
+    @property
+    def distances_m(self) -> tuple[float, float] | None:
+        """Nearest and farthest part of the scene [m]; None for a scene without a distance."""
+        air = self.air
+        if air.distance_m is None:
+            return None
+        return (air.nearest_m or air.distance_m, air.farthest_m or air.distance_m)
+
+    def moment(self, seconds: float) -> datetime | None:
+        """Time of day so many seconds after the survey's start; None where it has none."""
+        started = self.sky.started
+        return None if started is None else datetime.fromtimestamp(started.timestamp() + seconds, UTC)
