@@ -68,12 +68,13 @@ class Block:
     @cached_property
     def normals(self) -> Floats:
         """(line, 3) of the mirror at mid exposure, as planned; ``-n_z`` is the cosine of incidence of the chief ray."""
-        return position_to_normal(self.middle)
+        return np.asarray(position_to_normal(self.middle), np.float64)
 
     @property
     def scan_px(self) -> Floats:
         """(line,) scan coordinate at mid exposure [px]."""
-        return self.sweep.line_px()[self.numbers]
+        centres: Floats = self.sweep.line_px()[self.numbers]
+        return centres
 
     def stream(self, effect: str, number: int) -> np.random.Generator:
         """Give an effect's random stream at one line."""

@@ -1,4 +1,4 @@
-"""The summary of a scene and a rig from which effects are decided: how bright, how steep and how curved the image is."""
+"""The summary of a scene and a rig from which effects are decided: how bright, steep and curved the image is."""
 
 from __future__ import annotations
 

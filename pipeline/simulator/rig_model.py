@@ -87,9 +87,7 @@ class Sky:
     started: datetime | None = None  # with its time zone
     latitude_deg: float = stated(52.0, "deg", "assumed", -90.0, 90.0)
     longitude_deg: float = stated(10.0, "deg", "assumed", -180.0, 180.0)
-    cloud_share: float = stated(
-        0.0, "", "assumed", 0.0, 1.0
-    )  # light that a cloud's shadow takes away; 0 is a clear sky
+    cloud_share: float = stated(0.0, "", "assumed", 0.0, 1.0)  # light that a cloud takes; 0 is a clear sky
     cloud_px_per_s: float = stated(20.0, "px/s", "assumed")  # speed of the shadow's edge over the scene
     cloud_size_px: float = stated(600.0, "px", "assumed", 1.0)
     brdf_per_rad: float = stated(0.1, "1/rad", "assumed", 0.0, 5.0)  # change of reflectance with the view angle
@@ -98,7 +96,7 @@ class Sky:
 
 @dataclass(frozen=True)
 class Rig:
-    """Camera and all that the effects of the simulator know about. The defaults are a rig at rest in calm, clear air."""
+    """Camera and all that the effects know about. The defaults are a rig at rest in calm, clear air."""
 
     camera: LineCamera = field(default_factory=LineCamera)
     optics: Optics = field(default_factory=Optics)

@@ -1,8 +1,9 @@
 """What an effect is: a name, variants from exact to cheap, a bound on the error of each, a cost, and what it does.
 
-An effect does its work at one of six places of the chain, in this order: the mirror looks elsewhere (``Aim``), rays meet
-the scene elsewhere (``Displacement``), the footprint is blurred or shifted band by band (``Blur``), light is multiplied
-(``Gain``) or changed (``Change``), electrons are read out (``Readout``). All before the readout are linear in the light.
+An effect does its work at one of six places of the chain, in this order: the mirror looks elsewhere (``Aim``), rays
+meet the scene elsewhere (``Displacement``), the footprint is blurred or shifted band by band (``Blur``), light is
+multiplied (``Gain``) or changed (``Change``), electrons are read out (``readout.py``). All before that are linear in
+the light.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class Effect(Protocol):
         """Measured cost of each variant per px and band [ns]."""
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
-        """Bound the error of leaving the effect out, or of a variant against the exact one; 0 where the rig lacks it."""
+        """Bound the error of leaving it out, or of a variant against the exact one; 0 where the rig lacks it."""
 
 
 class Aim(Effect, Protocol):
