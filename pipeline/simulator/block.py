@@ -32,6 +32,8 @@ class Block:
     seed: int = 0
     samples: range | None = None  # None is all of the camera
     started_s: float = 0.0
+    fwhm_nm: Floats | None = None  # (band,) of the scene's own bands; None where not known
+    white_e: Floats | None = None  # (band,) electrons of the white panel in one exposure; None where not known
 
     @property
     def numbers(self) -> NDArray[np.int64]:
@@ -53,7 +55,7 @@ class Block:
     def time_s(self) -> Floats:
         """(line,) of mid exposure, since the survey's start [s]."""
         camera = self.rig.camera
-        return self.started_s + (self.numbers * camera.frame_ms + camera.exposure_ms / 2) * 1e-3
+        return self.started_s + (self.numbers.astype(np.float64) * camera.frame_ms + camera.exposure_ms / 2) * 1e-3
 
     @cached_property
     def positions(self) -> Floats:
@@ -68,7 +70,9 @@ class Block:
     @cached_property
     def normals(self) -> Floats:
         """(line, 3) of the mirror at mid exposure, as planned; ``-n_z`` is the cosine of incidence of the chief ray."""
-        return np.asarray(position_to_normal(self.middle), np.float64)
+        # Of the whole sweep: the product with the axes rounds otherwise for a single line than for several.
+        whole: Floats = position_to_normal(line_positions(self.sweep, self.rig.camera))
+        return whole[self.numbers]
 
     @property
     def scan_px(self) -> Floats:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -27,17 +28,19 @@ class Probe:
     wavelength_nm: Floats  # (band,)
     fwhm_nm: Floats | None  # (band,) of the scene's own bands; None where not known
     level: Floats  # (band,) greatest signal
-    spread: Floats  # (band,) greatest difference of a signal from the mean of its line
+    spread: Floats  # (band,) greatest difference of a signal from the mean of its line, all bands
     span: Floats  # (band,) greatest difference of two signals
     slope: Floats  # (2, band) greatest first derivative [1/px]
     curvature: Floats  # (2, band) greatest second derivative [1/px^2]
-    spectral_slope: Floats  # (band,) greatest first derivative over wavelength [1/nm]
-    spectral_curvature: Floats  # (band,) greatest second derivative over wavelength [1/nm^2]
+    spectral_slope: Floats  # (band,) greatest divided difference to a neighbouring band [1/nm]
+    spectral_curvature: Floats  # (band,) greatest second one, twice, 0 at either end [1/nm^2]
     brightest_e: float  # expected electrons of the brightest sample
     darkest_e: float
     unit_least_dn: float  # the smallest unit met, in DN: turns electrons into the unit, on the safe side
     lines: int  # of all sweeps
     seconds: float  # from the first line to the last
+    white_e: Floats | None = None  # (band,) electrons of the white panel in one exposure; None where not known
+    slit_errors: Mapping[str, float] = field(default_factory=dict)  # measured change by variant of the slit, or off
 
     def moved(self, along_px: float, scan_px: float) -> float:
         """Bound what a shift of the image by at most so much changes: slope times way, never more than the span."""

@@ -32,9 +32,11 @@ class Optics:
     focus_m: float = stated(math.inf, "m", "assumed", 0.01)  # distance that is sharp
     aberration_px: float = stated(0.2, "px", "assumed")  # sd of the lens's own blur
     keystone_px: float = stated(0.15, "px", "assumed")  # shift along the line from the first wavelength to the last
-    smile_nm: float = stated(0.3, "nm", "assumed")  # shift of the wavelengths from a line's centre to its ends
-    fwhm_nm: float = stated(6.0, "nm", "data sheet")  # width of a band
+    smile_nm: float = stated(0.3, "nm", "assumed", -100.0, 100.0)  # how much longer wavelengths are at a line's ends
+    fwhm_nm: float = stated(6.0, "nm", "data sheet", 0.0, 1e3)  # width of a band
     stray_share: float = stated(1e-3, "", "assumed", 0.0, 0.5)  # of all light of a line, spread over its detector
+    stray_even: float = stated(0.5, "", "assumed", 0.0, 1.0)  # of the stray light, falls evenly; the rest is a halo
+    stray_halo_px: float = stated(64.0, "px", "assumed", 2.0, 1e6)  # sd of the halo, over samples and bands alike
     polarisation: float = stated(0.02, "", "assumed", 0.0, 0.5)  # change of reflectance from 45 to 70 deg incidence
 
 
@@ -42,13 +44,13 @@ class Optics:
 class MirrorMotion:
     """How the mirror follows its commands: a second-order system fed from a vector memory."""
 
-    natural_hz: float = stated(20.0, "Hz", "data sheet", 0.1)  # full-scale bandwidth
+    natural_hz: float = stated(20.0, "Hz", "data sheet", 0.1, 1e5)  # full-scale bandwidth
     damping: float = stated(0.7, "", "assumed", 0.01, 10.0)
-    settled_s: float = stated(0.2, "s", "assumed")  # at rest at the first position before a sweep starts
-    positions_per_line: float = stated(1.0, "", "assumed", 0.01)  # of the vector memory, for each px of the path
-    repeatability_urad: float = stated(0.0, "urad", "assumed")  # sd of the tilt, anew for every line; vendor: 40
-    hysteresis_px: float = stated(0.0, "px", "assumed")  # systematic, sign by direction; vendor's accuracy: 50 px
-    drift_px_per_min: float = stated(0.0, "px/min", "assumed")  # as the unit warms up
+    settled_s: float = stated(0.2, "s", "assumed", 0.0, 1e4)  # to come to rest one position ahead of a sweep's first
+    positions_per_line: float = stated(1.0, "", "assumed", 0.01, 1e4)  # of the vector memory, for each px of the path
+    repeatability_urad: float = stated(0.0, "urad", "assumed", 0.0, 1e5)  # sd of the tilt, line by line; vendor: 40
+    hysteresis_px: float = stated(0.0, "px", "assumed", 0.0, 1e4)  # systematic, sign by direction; vendor: 50
+    drift_px_per_min: float = stated(0.0, "px/min", "assumed", 0.0, 1e4)  # as the unit warms up
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,9 @@ class Detector:
     stripe_share: float = stated(0.002, "", "assumed", 0.0, 0.5)  # sd of the gain that a sample's whole column shares
     dead_share: float = stated(0.0, "", "assumed", 0.0, 0.5)
     hot_share: float = stated(0.0, "", "assumed", 0.0, 0.5)
-    hot_e_per_s: float = stated(5e4, "e-/s", "assumed")
+    hot_e_per_s: float = stated(5e4, "e-/s", "assumed")  # more than a sound element's dark current, at 25 deg C
+    well_e: float = stated(math.inf, "e-", "assumed", 1.0)  # that an element holds; inf: the converter clips first
+    noiseless: bool = False  # an ideal sensor, for references: no shot noise, read noise or dark current
     unit: int = 0  # which copy of the sensor: its fixed pattern follows from this number
 
 
@@ -73,10 +77,12 @@ class Air:
     relief: Relief = "flat"
     nearest_m: float | None = None  # None is distance_m
     farthest_m: float | None = None
-    lever_m: float = stated(0.1, "m", "assumed")  # virtual pinhole behind the pivot
+    lever_m: float = stated(0.1, "m", "assumed", 0.0, 10.0)  # virtual pinhole behind the pivot
     visibility_km: float = stated(23.0, "km", "assumed", 0.05)
+    airlight_share: float = stated(0.3, "", "assumed", 0.0, 5.0)  # light of endless air over the white panel's
+    vapour_g_per_m3: float = stated(10.0, "g/m^3", "assumed", 0.0, 100.0)  # of water, absolute humidity
     turbulence_cn2: float = stated(1e-13, "m^(-2/3)", "assumed")
-    wind_amplitude_m: float = stated(0.0, "m", "assumed")  # of the canopy's sway
+    wind_amplitude_m: float = stated(0.0, "m", "assumed", 0.0, 100.0)  # of the canopy's sway
     wind_hz: float = stated(1.0, "Hz", "assumed", 0.0, 50.0)
 
 
@@ -88,8 +94,8 @@ class Sky:
     latitude_deg: float = stated(52.0, "deg", "assumed", -90.0, 90.0)
     longitude_deg: float = stated(10.0, "deg", "assumed", -180.0, 180.0)
     cloud_share: float = stated(0.0, "", "assumed", 0.0, 1.0)  # light that a cloud takes; 0 is a clear sky
-    cloud_px_per_s: float = stated(20.0, "px/s", "assumed")  # speed of the shadow's edge over the scene
-    cloud_size_px: float = stated(600.0, "px", "assumed", 1.0)
+    cloud_px_per_s: float = stated(20.0, "px/s", "assumed", 0.0, 1e6)  # speed of the shadow's edge over the scene
+    cloud_size_px: float = stated(600.0, "px", "assumed", 1.0, 1e9)
     brdf_per_rad: float = stated(0.1, "1/rad", "assumed", 0.0, 5.0)  # change of reflectance with the view angle
     hot_spot: float = stated(0.0, "", "assumed", 0.0, 2.0)  # brightening where the view looks along the sun's rays
 

@@ -79,8 +79,8 @@ class Moments:
 class Blur(Effect, Protocol):
     """The footprint is blurred by a kernel that is not negative and sums to 1; kernels of all blurs are folded."""
 
-    def moments(self, rig: Rig, wavelength_nm: Floats, variant: str) -> Moments:
-        """Give shift and variance in each band."""
+    def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
+        """Give shift and variance in each band; ``normal`` (3,) is the mirror's in the camera frame, None at rest."""
 
 
 class Gain(Effect, Protocol):

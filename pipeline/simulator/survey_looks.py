@@ -1,0 +1,115 @@
+"""Samples at any place of any sweep, and the light that they see through the footprint of slit and pixel alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.camera import LineCamera
+from pipeline.mirror import direction_to_normal, scene_to_direction
+from pipeline.scan import Sweep, scene_to_sweep
+from pipeline.simulator.footprint import Footprint
+from pipeline.simulator.rays import exact_tangents
+from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene, to_bands
+
+Floats = NDArray[np.float64]
+Light = NDArray[np.float32]
+
+LINE_SAMPLES = 64  # at most, of a line, evenly from end to end
+_PATCH = np.stack(np.meshgrid(np.arange(-2.0, 3.0), np.arange(-1.0, 2.0)), axis=-1).reshape(-1, 2)  # along, scan [px]
+PATCH_VIEWS = len(_PATCH)
+
+
+@dataclass(frozen=True)
+class Views:
+    """Samples at any place of any sweep, (view,) each: the line's centre and the camera's slope."""
+
+    strip_px: Floats
+    scan_px: Floats
+    slope: Floats
+    along_y: NDArray[np.bool_]
+
+    def chosen(self, which: NDArray[np.intp]) -> Views:
+        """Some of the views."""
+        return Views(*(getattr(self, one.name)[which] for one in fields(self)))
+
+
+def joined(parts: list[Views]) -> Views:
+    """Put views one after the other."""
+    return Views(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(Views)))
+
+
+def light_seen(
+    scene: Scene,
+    camera: LineCamera,
+    views: Views,
+    footprint: Footprint,
+    turned: tuple[float, float] = (0.0, 0.0),
+    moved: tuple[float, float] = (0.0, 0.0),
+) -> Light:
+    """Light (view, band) through a footprint of one kernel, rays turned and points moved (along, scan) [px]."""
+    ifov = camera.ifov_rad
+    tangents = np.stack([views.strip_px, views.scan_px], axis=-1) * ifov
+    normal = direction_to_normal(scene_to_direction(tangents))
+    gathered = np.zeros((), np.float32)
+    for across, along, weight in zip(footprint.across, footprint.along, footprint.weight[:, 0], strict=True):
+        xi, eta = exact_tangents(normal, (across + turned[1]) * ifov, views.slope + (along + turned[0]) * ifov)
+        line, scan = xi / ifov + moved[0], eta / ifov + moved[1]
+        y, x = np.where(views.along_y, line, scan), np.where(views.along_y, scan, line)
+        seen = scene.sample(y + (scene.shape[0] - 1) / 2, x + (scene.shape[1] - 1) / 2) * np.float32(weight)
+        gathered = gathered + seen
+    return to_bands(gathered, scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS))
+
+
+def line_samples(camera: LineCamera) -> int:
+    """Give how many samples of a line stand for all of it."""
+    return min(camera.samples, LINE_SAMPLES)
+
+
+def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> Views:
+    """Lines spread over all sweeps, the most oblique among them, of samples evenly from end to end."""
+    numbers = [(sweep, number) for sweep in sweeps for number in {0, sweep.lines // 2, sweep.lines - 1}]
+    numbers.sort(key=lambda one: -float(np.hypot(one[0].strip_px, one[0].line_px()[one[1]])))
+    most = max(room // line_samples(camera), 1)
+    kept = numbers[: most // 2 or 1]
+    rest = [(sweep, round(share * (sweep.lines - 1))) for sweep in sweeps for share in (0.25, 0.75)]
+    rest += numbers[len(kept) :]
+    kept += [rest[round(at)] for at in np.linspace(0, len(rest) - 1, most - len(kept))] if most > len(kept) else []
+    samples = np.linspace(0, camera.samples - 1, line_samples(camera)).round().astype(np.intp)
+    slopes = camera.pixel_slopes()[samples]
+    count = len(samples)
+    return Views(
+        np.repeat([sweep.strip_px for sweep, _ in kept], count).astype(np.float64),
+        np.repeat([sweep.line_px()[number] for sweep, number in kept], count),
+        np.tile(slopes, len(kept)),
+        np.repeat([sweep.along == "y" for sweep, _ in kept], count),
+    )
+
+
+def views_of_places(places: Floats, scene: Scene, camera: LineCamera, sweeps: tuple[Sweep, ...]) -> Views:
+    """Patches around places, each as the finest sweep of each orientation sees it that reaches it."""
+    centred = places - (np.array(scene.shape) - 1) / 2
+    found = []
+    for along_y in (False, True):
+        left = np.arange(len(places))
+        for sweep in sorted((one for one in sweeps if (one.along == "y") == along_y), key=lambda one: one.step):
+            along, scan = (centred[left] if along_y else centred[left, ::-1]).T
+            held = replace(sweep, step=1, lines=sweep.lines * sweep.step, binning=1)
+            line, sample = scene_to_sweep(held, camera, along, scan).T
+            with np.errstate(invalid="ignore"):
+                inside = (line > -2) & (line < held.lines + 1) & (sample > -3) & (sample < camera.samples + 2)
+            found.append(_patches(held, camera, line[inside], sample[inside]))
+            left = left[~inside]
+    return joined(found)
+
+
+def _patches(sweep: Sweep, camera: LineCamera, line: Floats, sample: Floats) -> Views:
+    """Views around continuous lines and samples of a sweep, moved to what it has."""
+    samples = np.rint(sample[:, None] + _PATCH[:, 0]).clip(0, camera.samples - 1).astype(np.intp).ravel()
+    lines = (line[:, None] + _PATCH[:, 1]).clip(0, sweep.lines - 1).ravel()
+    count = len(samples)
+    slopes = camera.pixel_slopes()[samples]
+    turned = np.full(count, sweep.along == "y")
+    return Views(np.full(count, sweep.strip_px), sweep.start_px + lines, slopes, turned)

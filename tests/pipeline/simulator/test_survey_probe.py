@@ -1,0 +1,155 @@
+"""The probe of a scene: what it finds is there, nothing in the image exceeds it, and odd scenes are told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.camera import LineCamera
+from pipeline.errors import SceneError, SettingsError
+from pipeline.once import Once
+from pipeline.scan import Sweep
+from pipeline.simulator.block import Block
+from pipeline.simulator.effects.rotation import ROTATION
+from pipeline.simulator.effects.slit import SLIT
+from pipeline.simulator.probe import Probe
+from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Detector, Rig
+from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+
+RIG = Rig(camera=LineCamera(samples=96))
+SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-30.0, lines=61)
+
+
+def scene_of(values: np.ndarray) -> RasterScene:
+    """A scene of given values (y, x, band)."""
+    return raster_from_values(values, RIG.camera, name="t", wavelength_nm=np.linspace(400, 900, values.shape[2]))
+
+
+def mixed(seed: int, shape: tuple[int, int] = (80, 110), bands: int = 6) -> RasterScene:
+    """Grain, waves, an edge and a point of 3 components, in strengths of their own."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
+    grain = rng.uniform(0, 1, (*shape, 3)) * rng.uniform(0, 0.6)
+    wave = np.sin(2 * np.pi * (y * rng.normal() + x * rng.normal()) / rng.uniform(4, 30))[..., None] * rng.normal(
+        size=3
+    )
+    edge = ((y - 40) * rng.normal() + (x - 55) * rng.normal() > 0)[..., None] * rng.uniform(0, 1, 3)
+    planes = np.clip(0.4 + grain + 0.2 * wave + edge, 0, None).astype(np.float32)
+    planes[rng.integers(20, 60), rng.integers(20, 90)] += rng.uniform(0, 2)
+    electrons = rng.uniform(50, 6e3, (3, bands)).astype(np.float32)
+    return RasterScene(
+        "mixed", f"{seed}", Raster.of(planes), Once.of(Light(electrons, electrons[0])), np.ones(bands, np.float32),
+        np.linspace(400, 1000, bands),
+    )  # fmt: skip
+
+
+def seen(scene: RasterScene, sweep: Sweep, variant: str = "4x2") -> np.ndarray:
+    """All lines of a sweep through the footprint."""
+    block = Block(RIG, sweep, range(sweep.lines), scene.wavelength_nm, scene.shape)
+    return expected_light(scene, block, {ROTATION: "rays", SLIT: variant})
+
+
+def test_flat_scene_has_no_slope() -> None:
+    """A flat scene has level but neither slope, curvature, span nor spread along one band."""
+    probe = probe_scene(scene_of(np.full((50, 60, 1), 3.0)), RIG, [SWEEP])
+    assert probe.slope.max() == probe.curvature.max() == probe.span.max() == 0
+    assert probe.spread.max() < 1e-3
+    assert probe.level[0] == pytest.approx(probe.brightest_e / noise_electrons(np.float32([probe.brightest_e]), RIG)[0])
+    assert probe.spectral_slope.shape == (1,)
+    assert set(probe.slit_errors.values()) == {0.0}
+
+
+@pytest.mark.parametrize("along", ["x", "y"])
+def test_wave_has_its_slope_and_curvature(along: str) -> None:
+    """A long wave across the lines has slope and curvature of its amplitude and frequency, and none along them."""
+    y, x = np.mgrid[:120, :120]
+    phase = 2 * np.pi * (y if along == "x" else x) / 24
+    scene = scene_of((1 + 0.5 * np.sin(phase))[..., None])
+    probe = probe_scene(scene, RIG, [replace(SWEEP, along=along)], "dn")
+    passed = np.sinc(RIG.camera.slit_px / 24)
+    high = 0.5 * scene.electrons[0] * passed / RIG.camera.electrons_per_dn
+    assert probe.slope[1, 0] == pytest.approx(high * 2 * np.pi / 24, rel=0.03)
+    assert probe.curvature[1, 0] == pytest.approx(high * (2 * np.pi / 24) ** 2, rel=0.08)
+    assert probe.slope[0, 0] < 0.02 * probe.slope[1, 0]
+    assert probe.span[0] == pytest.approx(2 * high, rel=0.01)
+    assert probe.unit_least_dn == 1.0
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_nothing_in_the_image_exceeds_the_probe(seed: int) -> None:
+    """Levels, spans, differences of neighbours and of variants of the slit stay below 1.05 of the probe's."""
+    scene = mixed(seed)
+    sweep = replace(SWEEP, strip_px=40.0 * (seed % 3), start_px=-30.0 + seed)
+    probe = probe_scene(scene, RIG, [sweep])
+    light = seen(scene, sweep)
+    noise = noise_electrons(light, RIG)
+    level = (light / noise).max(axis=(0, 1))
+    assert (level <= 1.03 * probe.level).all()
+    assert (level >= 0.9 * probe.level).all()
+    assert light.max() <= 1.03 * probe.brightest_e
+    assert light.min() >= 0.97 * probe.darkest_e
+    assert (light.max(axis=(0, 1)) - light.min(axis=(0, 1)) <= 1.05 * probe.span * noise.max(axis=(0, 1))).all()
+    for axis, step in ((1, np.diff(light, axis=0)), (0, np.diff(light, axis=1))):
+        least = np.minimum(noise[1:], noise[:-1]) if axis else np.minimum(noise[:, 1:], noise[:, :-1])
+        assert (np.abs(step) / least).max() <= 1.05 * probe.slope[axis].max()
+    for variant in ("4x2", "3x1"):
+        change = np.abs(seen(scene, sweep, variant) - seen(scene, sweep, "8x4")) / noise
+        assert change.max() <= SLIT.bound(probe, RIG, variant).value + 0.3 * SLIT.bound(probe, RIG, "8x4").value
+
+
+def test_probe_finds_a_single_bright_pixel_in_a_large_scene() -> None:
+    """One bright pixel among 360 000 is found by its level and its slope."""
+    values = np.full((600, 600, 2), 1.0)
+    values[431, 222] = 5.0
+    scene = scene_of(values)
+    sweeps = [replace(SWEEP, name=f"{n}", strip_px=n, start_px=-300, lines=600) for n in (-252.0, -160.0, -64.0, 90.0)]
+    probe = probe_scene(scene, RIG, sweeps)
+    assert probe.brightest_e > 1.5 * scene.electrons[0]
+    assert probe.slope.min() > 10
+
+
+def test_coarse_sweeps_are_looked_at_where_they_hold() -> None:
+    """A coarse sweep's probe is that of a fine one over the same path."""
+    scene = mixed(3)
+    fine = probe_scene(scene, RIG, [SWEEP])
+    coarse = probe_scene(scene, RIG, [replace(SWEEP, kind="coarse", lines=15, step=4, binning=4)])
+    np.testing.assert_allclose(coarse.slope, fine.slope, rtol=0.2)
+    assert (coarse.lines, coarse.sweeps[0].step) == (15, 4)
+
+
+def test_unit_of_a_noiseless_rig_is_the_quantisation() -> None:
+    """Without noise one sigma is that of rounding to DN."""
+    noiseless = replace(RIG, detector=Detector(noiseless=True))
+    np.testing.assert_allclose(noise_electrons(np.float32([0.0, 9e3]), noiseless), 5 / np.sqrt(12), rtol=1e-6)
+    np.testing.assert_allclose(noise_electrons(np.float32([-5.0]), RIG), np.sqrt(400 + 25 / 12), rtol=1e-6)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_number_that_is_not_finite_is_refused_with_its_place(bad: float) -> None:
+    """A scene with NaN or infinity is refused, and the message says where."""
+    planes = np.ones((70, 40, 3), np.float32)
+    planes[41, 17, 2] = bad
+    light = np.ones((3, 4), np.float32)
+    scene = RasterScene(
+        "holey", "k", Raster.of(planes), Once.of(Light(light, light[0])), np.ones(4, np.float32), np.arange(4) + 400.0
+    )
+    with pytest.raises(SceneError, match="holey is not finite at row 41, column 17, component 2"):
+        probe_scene(scene, RIG, [SWEEP])
+
+
+def test_no_lines_are_refused() -> None:
+    """Without a line there is nothing to look at."""
+    with pytest.raises(SettingsError, match="expected lines to take, got none"):
+        probe_scene(mixed(0), RIG, [replace(SWEEP, lines=0)])
+
+
+def test_sweep_beside_the_scene_is_flat() -> None:
+    """Lines that miss the scene see its repeated edge; the probe is finite."""
+    probe: Probe = probe_scene(mixed(1), RIG, [replace(SWEEP, strip_px=900.0, start_px=800.0)])
+    assert np.isfinite(probe.slope).all()
+    assert np.isfinite(probe.level).all()
