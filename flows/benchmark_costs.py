@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flows.benchmark_controls import BUYS_SEATS, POLICY
+from flows.benchmark_pooled import is_pooled, own_policy
 from flows.benchmark_series import Record, Row, mean_or_none
 from flows.benchmark_timing import row_seconds
 
@@ -31,7 +32,7 @@ def row_cost(row: Row, base: Row, prices: Prices) -> dict[str, Any]:
         return _entry(*(mean_or_none([one[part] for one in some.parts]) for some in (row, base)))
 
     def seconds(some: Row) -> float | None:
-        return mean_or_none([row_seconds(one, some.policy, some.share) for one in prices.timed])
+        return mean_or_none([row_seconds(one, own_policy(some.policy), some.share) for one in prices.timed])
 
     full_s = mean_or_none([one["full"] for one in prices.captured])
     adds = {part: mean_or_none([one["adds"][part] for one in row.parts]) for part in ADDS}
@@ -55,7 +56,9 @@ def _captured(row: Row, captured: Sequence[Record], what: str) -> float | None:
     if row.policy in ("none", "all", "dense", "upsampled"):
         key = "full" if row.policy in ("all", "dense") else "none"
         return None if what == "lines" else mean_or_none([one[key] for one in captured])
-    bought_by = POLICY if row.policy == BUYS_SEATS else row.policy
+    if is_pooled(row.policy) and what != "frame_s":  # its lines on these few frames say little of all of them
+        return None
+    bought_by = POLICY if row.policy == BUYS_SEATS else own_policy(row.policy)
     found = [
         part for one in captured for part in one["rows"] if (part["policy"], part["share"]) == (bought_by, row.share)
     ]

@@ -35,6 +35,7 @@ class EvaluateRequest:
     controls: tuple[Path, ...] = ()
     rig: bool = True
     equal_time: bool = False
+    pooled: bool = True
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths
 
 

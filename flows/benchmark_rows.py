@@ -34,11 +34,6 @@ class Trial:
     policies: tuple[str, ...]  # without the oracle, which is always there
     seed: int = 0
 
-    @property
-    def every_policy(self) -> tuple[str, ...]:
-        """Policies and the oracle."""
-        return (*self.policies, ORACLE)
-
 
 @dataclass(frozen=True)
 class Placing:
@@ -73,7 +68,7 @@ def judge_frame(
         row = {"policy": policy, "draw": draw, "share": share, "seats": len(seats)}
         drawn = segment(weights, look.seen, look.fine[seats], seats).classes
         row |= judge_map(look, drawn, seats, weights.config.classes)
-        row |= _cost(look, weights, seats, policy)
+        row |= cost_of_seats(look, weights, seats, policy)
         row["gain"], row["best_gain"] = gain_sums(gain, seats, valid)
         row["ap_top"] = _ap_top(placed, policy, draw, gain, seats, valid)
         rows.append(row)
@@ -120,7 +115,7 @@ def captured_px(look: Sight, seats: Seats) -> NDArray[np.bool_]:
     return full[: grid.height, : grid.width]
 
 
-def _cost(look: Look, weights: Weights, seats: Seats, policy: str) -> dict[str, Any]:
+def cost_of_seats(look: Look, weights: Weights, seats: Seats, policy: str) -> dict[str, Any]:
     """Samples with those of the coarse pass, their bytes, and multiply-adds (`none` and `all`: the map alone)."""
     known = {"none": None, "all": None, ORACLE: "random"}.get(policy, policy)  # the oracle scores by labels
     adds = multiply_adds(weights.config, look.seen.grid, len(seats), look.bands, known)

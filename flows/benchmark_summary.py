@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flows.benchmark_controls import DENSE
 from flows.benchmark_costs import Prices, row_cost
 from flows.benchmark_curve import summarise_curves
+from flows.benchmark_pooled import is_pooled, own_policy, pooled_name, pooled_policies
 from flows.benchmark_rows import ORACLE
 from flows.benchmark_series import (
     Record,
@@ -76,7 +77,8 @@ def summarise(
         figures["against_baseline"] = None if row is base else difference(row, base, trial)
         rival = rows.get(("random", share)) if policy != "random" else None
         figures["against_random"] = None if rival is None else difference(row, rival, trial)
-        figures |= _placement(row, runs, judged=not control and policy not in ENDS)
+        figures |= _pooled(row, rows, trial)
+        figures |= _placement(row, runs, judged=not (control or policy in ENDS or is_pooled(policy)))
         figures["cost"] = row_cost(row, base, prices)
         table.append(figures)
     return {
@@ -88,9 +90,10 @@ def summarise(
 
 
 def _rows(runs: Runs, trial: Record, controls: Runs, designs: Sequence[str]) -> dict[Key, Row]:
-    """Every row: none, policies and the oracle at every share, controls, all."""
+    """Every row: none, policies, pooled ones and the oracle at every share, controls, all."""
     names, seeds = frame_names(runs), by_seed(runs)
-    every = [(policy, share) for policy in (*trial["policies"], ORACLE) for share in trial["shares"]]
+    pooled = (pooled_name(policy) for policy in pooled_policies(trial["policies"]))
+    every = [(policy, share) for policy in (*trial["policies"], *pooled, ORACLE) for share in trial["shares"]]
     found = {key: collect_row(seeds, *key, names) for key in [("none", 0.0), *every]}
     for design in dict.fromkeys(designs):
         own = by_seed([records for records, name in zip(controls, designs, strict=True) if name == design])
@@ -152,6 +155,17 @@ def _draws_spread(row: Row, each: NDArray[np.float64]) -> float | None:
     """Spread of a placement's draws, the mean over the seeds of the training."""
     groups = [each[row.of_seed == number] for number in np.unique(row.of_seed)]
     return mean_of([group.std(ddof=1) for group in groups]) if len(groups[0]) > 1 else None
+
+
+def _pooled(row: Row, rows: dict[Key, Row], trial: Record) -> Record:
+    """Seats that frames bought and, where one threshold bought them, that of each seed and what it is worth."""
+    seats = [part["seats"] for part in row.parts]
+    figures: Record = {"seats_per_frame": {"least": min(seats), "mean": float(np.mean(seats)), "most": max(seats)}}
+    if not is_pooled(row.policy):
+        return figures | {"thresholds": None, "against_share_per_frame": None}
+    thresholds = list(dict.fromkeys(part["threshold"] for part in row.parts))
+    same = difference(row, rows[own_policy(row.policy), row.share], trial)
+    return figures | {"thresholds": thresholds, "against_share_per_frame": same}
 
 
 def _placement(row: Row, runs: Runs, *, judged: bool) -> Record:

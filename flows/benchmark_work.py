@@ -13,6 +13,7 @@ from flows.benchmark_controls import design_of, judge_control
 from flows.benchmark_equal_time import judge_equal_time
 from flows.benchmark_frames import Candidate, Look, Sight, look_at, sight_of
 from flows.benchmark_jobs import Job, Jobs, Show, scene_of
+from flows.benchmark_pooled import Bought, buy_by_seed, joined_rows, judge_pooled, pooled_policies, score_frame
 from flows.benchmark_request import COST, EvaluateRequest
 from flows.benchmark_rig import BUDGETS, judge_rig
 from flows.benchmark_rows import Trial, judge_frame
@@ -27,7 +28,9 @@ from pipeline.simulator.scene import RasterScene
 
 Record = dict[str, Any]
 Report = Callable[[float], None]
-UNITS = {"frame": 1.0, "time": 3.0, "capture": 0.5, "control": 0.7, "rig": 1.5, "equal": 1.5}  # rough shares of time
+UNITS = {  # rough shares of time
+    "frame": 1.0, "time": 3.0, "capture": 0.5, "control": 0.7, "rig": 1.5, "equal": 1.5, "scores": 0.05, "pooled": 0.4,
+}  # fmt: skip
 
 
 @dataclass
@@ -38,6 +41,8 @@ class Judged:
     controls: list[list[Record]]
     rig: list[list[Record]]
     equal: list[list[Record]]
+    scores: list[list[Record]]
+    pooled: list[list[Record]]
     timed: list[Record] = field(default_factory=list)
     captured: list[Record] = field(default_factory=list)
 
@@ -70,20 +75,30 @@ class Work:
         self._last: tuple[str, str, Look] | None = None
         self._scene: RasterScene | None = None
         self._last_name = ""
+        self._bought: Bought = {}
+        self._total, self._done = 0.0, 0.0  # units
         self._spent, self._made = 0.0, 0.0  # seconds, and units made in them
 
     def tasks(self, jobs: Jobs) -> list[Task]:
-        """Everything to make, frame by frame; a frame's results of one weights follow each other."""
-        found = []
+        """Everything to make of single frames; a frame's results of one weights follow each other."""
+        found, pooled = [], bool(self.pooled_tasks(jobs))
         for number, job in enumerate(jobs.frames):
             for index in job.weights:
                 found.append(Task("frame", job.name, index))
+                found += [Task("scores", job.name, index)] if pooled else []
                 found += [Task("rig", job.name, index)] if self.request.rig else []
                 found += [Task("equal", job.name, index)] if self.request.equal_time else []
                 if number < self.request.timed_frames and index == job.weights[0]:
                     found += [Task("time", job.name, index, self._first_of_each(job)), Task("capture", job.name, index)]
             found += [Task("control", job.name, index) for index in job.controls]
         return found
+
+    def pooled_tasks(self, jobs: Jobs) -> list[Task]:
+        """What is made of frames once all are scored; of one frame alone nothing."""
+        pooled = self.request.pooled and self.request.shares and pooled_policies(self.request.policies)
+        if not pooled or len(jobs.frames) < 2:
+            return []
+        return [Task("pooled", job.name, index) for job in jobs.frames for index in job.weights]
 
     def _first_of_each(self, job: Job) -> tuple[int, ...]:
         """A control of each design."""
@@ -95,25 +110,34 @@ class Work:
     def judge(self, jobs: Jobs, show: Show) -> Judged:
         """Make every record."""
         own = self.candidates
-        judged = Judged(_empty(own), _empty(self.controls), _empty(own), _empty(own))
-        places = {"frame": judged.runs, "control": judged.controls, "rig": judged.rig, "equal": judged.equal}
-        tasks = self.tasks(jobs)
-        total, done = sum(UNITS[task.kind] for task in tasks), 0.0
-        for task in tasks:
-            share, before = UNITS[task.kind], done
+        runs, rig, equal, scores, pooled = (_empty(own) for _ in range(5))
+        judged = Judged(runs, _empty(self.controls), rig, equal, scores, pooled)
+        first, second = self.tasks(jobs), self.pooled_tasks(jobs)
+        self._total, self._done = sum(UNITS[task.kind] for task in (*first, *second)), 0.0
+        self._make(first, judged, show)
+        self._bought = buy_by_seed(scores, self.request.shares)
+        self._make(second, judged, show)
+        judged.runs = joined_rows(runs, pooled)
+        show("judging frames", 1.0, f"{len(jobs.frames)} frames")
+        return judged
 
-            def report(part: float, task: Task = task, share: float = share, before: float = before) -> None:
-                reached = before + 0.95 * part * share
-                show("judging frames", reached / total, self._words(task, total - reached))
+    def _make(self, tasks: Sequence[Task], judged: Judged, show: Show) -> None:
+        places = {
+            "frame": judged.runs, "control": judged.controls, "rig": judged.rig, "equal": judged.equal,
+            "scores": judged.scores, "pooled": judged.pooled,
+        }  # fmt: skip
+        for task in tasks:
+
+            def report(part: float, task: Task = task) -> None:
+                reached = self._done + 0.95 * part * UNITS[task.kind]
+                show("judging frames", reached / self._total, self._words(task, self._total - reached))
 
             report(0.0)
             record = self._record(task, report)
             if record is not None:
                 kind = {"time": judged.timed, "capture": judged.captured}
                 (kind[task.kind] if task.kind in kind else places[task.kind][task.index]).append(record)
-            done += share
-        show("judging frames", 1.0, f"{len(jobs.frames)} frames")
-        return judged
+            self._done += UNITS[task.kind]
 
     def _words(self, task: Task, left: float) -> str:
         """Frame, file where there are several, and about how long the rest will take."""
@@ -128,7 +152,7 @@ class Work:
             self._scene, self._last_name = scene_of(self.data, task.name), task.name
         scene, makers = self._scene, {
             "frame": self._frame, "time": self._time, "capture": self._capture, "control": self._control,
-            "rig": self._rig, "equal": self._equal,
+            "rig": self._rig, "equal": self._equal, "scores": self._scores, "pooled": self._pooled,
         }  # fmt: skip
 
         def make() -> Record | None:
@@ -154,12 +178,21 @@ class Work:
             own["budgets"] = BUDGETS
         if task.kind == "rig":
             own["widths"] = WIDTHS
+        if task.kind == "pooled":
+            own["bought"] = self._bought[task.index, task.name]
         if task.kind == "time":
             own |= {"runs": self.request.timed_runs, "controls": [self.controls[index].key for index in task.beside]}
         return own
 
     def _frame(self, scene: RasterScene, task: Task, report: Report) -> Record:
         return judge_frame(self.trial, self.look(scene, task.name, task.index), self.loaded(task.index), report)
+
+    def _scores(self, scene: RasterScene, task: Task, report: Report) -> Record:
+        return score_frame(self.trial.policies, self.look(scene, task.name, task.index))
+
+    def _pooled(self, scene: RasterScene, task: Task, report: Report) -> Record:
+        bought = self._bought[task.index, task.name]
+        return judge_pooled(bought, self.look(scene, task.name, task.index), self.loaded(task.index), report)
 
     def _rig(self, scene: RasterScene, task: Task, report: Report) -> Record:
         look = self.look(scene, task.name, task.index)

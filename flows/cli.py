@@ -117,6 +117,9 @@ def train(
 ) -> int:
     """Train weights on DATASET: `farm`, a folder of labelled scenes, or one scene file.
 
+    The state of the run is kept beside the weights, in OUT.checkpoint: the same command goes on where it was stopped.
+    `spectralzoom evaluate` then says how good the weights are on scenes that they were not trained on.
+
     Parameters
     ----------
     dataset
@@ -126,52 +129,55 @@ def train(
     hold_out
         Names of scenes never to be trained on, with commas: 059,060. The split is kept in the weights.
     validation
-        How many scenes to keep for the figures at the end; by default one in eight, 4 at most.
+        How many scenes to keep from training, for the figures at its end; by default 3 of the farm, one in eight of a
+        folder, 4 at most.
     seed
-        Of the first weights, crops and noise.
+        Of all that is drawn by chance: first weights, crops, noise.
     steps
-        Training ends after so many, or after the minutes; the learning rate follows.
+        Training ends after so many steps or after --minutes, whichever comes first; the learning rate falls with it.
     minutes
-        Of training alone: looking at the scenes and validating come on top.
+        The longest that the steps may take; looking at the scenes before and validating after come on top.
     scenes
         How many scenes of the built-in farm; 24 by default.
     patch
         Size of a patch [px]; by default 16 for the farm, 8 to 32 for files, by their size.
     factor
-        How many times coarser the coarse pass is.
+        How many times coarser the coarse pass is than the fine one.
     columns
-        Spectral columns that the bands are gathered into.
+        How many numbers a pixel's spectrum is brought to, whatever bands a camera has.
     preset
-        Which network: `two-scale`, what surveys are made with, or a control to compare it with: the network of the
-        `paper`, its `dense` twin of one scale, the twin given the coarse image `upsampled`, or a uniform grid `coarser`
-        by 2.
+        Which network: `two-scale`, what surveys are made with, or a control to set beside it, with evaluate --control:
+        `paper`, the network of the paper; `dense`, one of ours that reads all of the scene finely, without a coarse
+        pass; `upsampled`, the same given the coarse pass alone; `coarser`, the same given a grid coarser by 2.
     positions
-        How tokens are told their places: `2d`, or the paper's one-dimensional numbers.
+        How patches are told their places: `2d`, by row and column, or `paper`, by one running number.
     init
         Weights to begin from: a vision transformer of timm or DeiT, a Segmenter checkpoint with its variant.yml beside
         it, or weights that this command made. What is taken is said, and kept in the weights.
     dim
-        Width of tokens; 192 and 384 are those of ViT-Tiny and ViT-Small.
+        Width of the transformer, the numbers that a patch becomes; 192 and 384 are those of ViT-Tiny and ViT-Small.
     layers
-        Of the transformer.
+        Layers of the transformer.
     heads
-        Of its attention.
+        Heads of its attention; --dim must be divisible by them.
     mlp_ratio
         How many times wider the middle of its MLPs is.
     crop
         Size of the crops [px]; by default 256 for the farm, 384 for files, whole scenes for the paper's network.
     batch
-        Crops a step.
+        Crops a step; half as many in the last 30 % of the run, where crops have twice the area if scenes are large
+        enough.
     labels
-        For one scene: its labels.
+        For one scene: the file of its labels.
     bands
-        For one scene: bands to use, from 0.
+        For one scene: numbers of the bands to use, from 0, with commas.
     wavelengths
-        For one scene: wavelengths of its bands [nm].
+        For one scene: wavelengths of its bands [nm], with commas.
     train_mask
-        For one scene: an image of where to train; 0 is nowhere.
+        For one scene: an image of its size that says where to train; 0 is nowhere.
     mask_classes
-        For one scene: the class number that each number of the mask means.
+        For one scene whose mask numbers classes in another way: the label file's class of its number 1, 2, ..., with
+        commas.
     """
     from flows.train import TrainRequest, usual_crop
     from flows.train_command import run_train

@@ -112,6 +112,9 @@ NOTES = {
     "the map alone, their fastest path; median of the rounds, all rows in turn",
     "capture_s": "by the cost model, coarse pass included; frame: as if each seat took its share of the full scan; "
     "rig: the same seats by runs of lines, or the full scan where cheaper; all is the full scan alone",
+    "pooled": "one threshold for the scores of all frames of a seed: the best seats of all of them together, as many as"
+    " the share of them; intervals over frames hold the threshold. CPU and frame seconds are those of the share on "
+    "every frame, on which a frame has as many seats in the mean",
     "intervals": "paired bootstrap over frames, and over seeds of the training where there are several",
     "baseline": "the better of all and the dense control",
     "curves": f"over multiply-adds; reference of the hypervolume: {REFERENCE}",

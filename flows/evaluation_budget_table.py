@@ -1,4 +1,4 @@
-"""An evaluation over budgets as tables: plans of the rig at equal seconds, and rows with the exposure of equal time."""
+"""An evaluation over budgets as tables: one threshold for all frames, plans of the rig, the exposure of equal time."""
 
 from __future__ import annotations
 
@@ -12,20 +12,22 @@ from flows.figures import DASH, format_percent, format_points
 
 
 def budget_tables(content: dict[str, Any]) -> Iterator[Table]:
-    """Give a table of the rig's plans and one of equal time, as far as they were judged."""
+    """Give tables of one threshold for all frames, of the rig's plans and of equal time, as far as they were judged."""
+    if any(row["thresholds"] for row in content["rows"]):
+        yield _pooled(content)
     if content["rig"]["rows"] or content["rig"]["left_out"]:
         yield _rig(content)
     if content["equal_time"]:
         yield _equal_time(content)
 
 
-def format_difference(interval: dict[str, float | None] | None) -> str:
+def format_difference(interval: dict[str, float | None] | None, digits: int = 1) -> str:
     """Points of mIoU with the bounds of the interval, as far as there are any."""
     if interval is None or interval["difference"] is None:
         return ""
-    text = f"{100 * interval['difference']:+.1f}"
+    text = f"{100 * interval['difference']:+.{digits}f}"
     low, high = interval["low"], interval["high"]
-    return text if low is None or high is None else f"{text} [{100 * low:+.1f}, {100 * high:+.1f}]"
+    return text if low is None or high is None else f"{text} [{100 * low:+.{digits}f}, {100 * high:+.{digits}f}]"
 
 
 def _table(title: str, caption: str, first: str, *columns: str) -> Table:
@@ -36,6 +38,23 @@ def _table(title: str, caption: str, first: str, *columns: str) -> Table:
     table.add_column(first, no_wrap=True)
     for name in columns:
         table.add_column(name, justify="right", no_wrap=True)
+    return table
+
+
+def _pooled(content: dict[str, Any]) -> Table:
+    names = ("K", "least", "most", "threshold", "mIoU", "to K on every frame")
+    table = _table(
+        "pooled: one threshold for the scores of all frames, and the seats that a frame then has",
+        content["notes"]["pooled"], "placement", *names,
+    )  # fmt: skip
+    for row in content["rows"]:
+        if row["thresholds"]:
+            seats = row["seats_per_frame"]
+            table.add_row(
+                row["policy"], format_percent(row["share"]), str(seats["least"]), str(seats["most"]),
+                ", ".join(DASH if one is None else f"{one:.3g}" for one in row["thresholds"]),
+                format_points(row["miou"]), format_difference(row["against_share_per_frame"], 2),
+            )  # fmt: skip
     return table
 
 

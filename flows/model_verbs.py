@@ -27,6 +27,7 @@ def evaluate(
     control: Annotated[tuple[Path, ...], Parameter(negative="")] = (),
     rig: bool = True,
     equal_time: Switch = False,
+    pooled: bool = True,
     labels: str | None = None,
     bands: str | None = None,
     wavelengths: str | None = None,
@@ -34,7 +35,7 @@ def evaluate(
 ) -> int:
     """Judge WEIGHTS on the frames of DATASET that they were not trained on: accuracy, intervals, placement, costs.
 
-    With a folder, frames that were judged are kept in it: the same command goes on where it was stopped.
+    With --out, frames that were judged are kept there: the same command goes on where it was stopped.
 
     Parameters
     ----------
@@ -46,9 +47,11 @@ def evaluate(
     out
         Folder for evaluation.json, the plots (evaluation.png, rig.png) and pictures of the worst and the best frame.
     shares
-        Shares of the seats to try, with commas; 0.05,0.1,0.15,0.2,0.35 by default. None and all are always there.
+        Shares of the seats (patches to look at finely) to try, with commas; 0.05,0.1,0.15,0.2,0.35 by default. No seat
+        (none) and every seat (all) are always tried.
     policies
-        Placements to try, with commas; gain,entropy,sobel,random by default. The oracle is always there.
+        Ways to choose the seats, with commas; gain,entropy,sobel,random by default. The oracle, which chooses by the
+        labels, is always there.
     frames
         Names of the frames to judge on, with commas; all by default.
     scenes
@@ -56,24 +59,27 @@ def evaluate(
     seed
         Of noise, random placements and the bootstrap.
     draws
-        Of the bootstrap.
+        How often frames are drawn anew for the intervals (bootstrap).
     timed_frames
         How many frames to time, and to price the capture of; 0 leaves both out.
     timed_runs
         How often each is timed, after three rounds that are not counted; the median is given.
     control
-        Weights of another design to compare with; repeat it for more. The better of all and a dense one is the
-        baseline.
+        Weights of another design to compare with, made by train --preset; repeat it for more. The better of all and a
+        dense one is the baseline.
     rig
         Also compare plans of lines at equal capture seconds: ours, evenly spaced blocks and random blocks.
     equal_time
         Also judge each row with the exposure that makes its capture take as long as the full scan.
+    pooled
+        Of several frames, also judge gain and entropy with one threshold for the scores of all frames, which buys the
+        share of the seats of all of them together: bare frames then get fewer, rich ones more.
     labels
-        For one scene: its labels.
+        For one scene: the file of its labels.
     bands
-        For one scene: bands to use, from 0.
+        For one scene: numbers of the bands to use, from 0, with commas.
     wavelengths
-        For one scene: wavelengths of its bands [nm].
+        For one scene: wavelengths of its bands [nm], with commas.
     """
     from flows.benchmark_request import SHARES, USUAL, EvaluateRequest
     from flows.evaluate_command import run_evaluate
@@ -87,7 +93,7 @@ def evaluate(
     request = EvaluateRequest(
         dataset, weights, out, SHARES if given is None else tuple(given), split_list(policies) or USUAL,
         split_list(frames), scenes, seed, draws, timed_frames, timed_runs, control, rig, equal_time,
-        choices,
+        pooled, choices,
     )  # fmt: skip
     run_evaluate(request, stderr, as_json=as_json)
     return 0

@@ -59,12 +59,10 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
     Raises
     ------
     SceneError : no labels, one class only, or scenes whose bands or classes differ.
-    SettingsError : a folder to write to that does not exist, or sizes that do not fit.
+    SettingsError : a folder to write to that does not exist, a folder in the place of a file, or sizes that do not fit.
     """
-    if not request.out.parent.is_dir():
-        raise SettingsError(f"-o {request.out}: the folder {request.out.parent} does not exist; make it first")
-    if request.out.is_dir():
-        raise SettingsError(f"-o {request.out} is a folder, expected a file; name the weights in it")
+    checkpoint = request.out.with_name(request.out.name + ".checkpoint")
+    _check_places(request.out, checkpoint)
     start = open_start(request.init, request.tokens, request.preset)
     data = open_training_data(
         request.dataset, request.validation, request.scenes, request.camera,
@@ -86,7 +84,6 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
 
     split = joined_split(_split(about, data), start)  # before validation scenes are looked at: what was trained on
-    checkpoint = request.out.with_name(request.out.name + ".checkpoint")
     model, summary = train(
         config, examples, normalisation.gain_shift, request.settings, progress, start=state, checkpoint=checkpoint
     )
@@ -107,6 +104,20 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
     save_weights(with_record(weights, **record), request.out)
     checkpoint.unlink(missing_ok=True)
     return record
+
+
+def _check_places(out: Path, checkpoint: Path) -> None:
+    """Refuse places that the weights, or the state of the run beside them, cannot be written to."""
+    if not out.parent.is_dir():
+        raise SettingsError(f"-o {out}: the folder {out.parent} does not exist; make it first")
+    if out.is_dir():
+        raise SettingsError(f"-o {out} is a folder, expected a file; name the weights in it")
+    for path in (checkpoint, *(path.with_name(path.name + ".part") for path in (out, checkpoint))):
+        if path.is_dir():
+            raise SettingsError(
+                f"-o {out}: {path} is a folder, and training keeps a file of that name; move it away, or name other "
+                "weights"
+            )
 
 
 @dataclass

@@ -35,7 +35,7 @@ def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
         progress.show(last, 1.0, ended=True)
     if "begun_from" in record:
         print_start(record["begun_from"], console)
-    _print_figures(record, request.out, console)
+    _print_figures(record, request, console)
     return record
 
 
@@ -64,14 +64,22 @@ def _command() -> str:
     return shlex.join(["spectralzoom", *words])
 
 
-def _print_figures(record: dict[str, Any], out: Path, console: Console) -> None:
+def _print_figures(record: dict[str, Any], request: TrainRequest, console: Console) -> None:
+    out = request.out
     console.print(f"weights: {out} ({out.stat().st_size / 1e6:.1f} MB), {record['training']['steps']} steps")
     figures = record["validation"]
     if figures is None:
-        console.print("no scene was kept for validation; survey one that was held out to judge the weights")
+        given = "--weights" if request.preset == "two-scale" else "--weights OTHERS --control"
+        console.print(
+            "no scene was kept for validation; to judge the weights on scenes that they were not trained on: "
+            f"spectralzoom evaluate {request.dataset} {given} {out}",
+            soft_wrap=True,
+            highlight=False,
+        )
         return
-    title = f"{figures['scenes']} validation scenes, K = {figures['share_of_seats']:.0%}"
-    table = Table("placement", "mIoU", title=title)
+    title = f"{figures['scenes']} scene{'s' if figures['scenes'] > 1 else ''} kept for validation"
+    caption = f"none: the coarse pass alone; all: fine everywhere; else fine at {figures['share_of_seats']:.0%}"
+    table = Table("placement", "mIoU", title=title, caption=caption)
     for name in ("none", "random", "sobel", "entropy", "gain", "all"):
         if name in figures:  # a control has some of them
             found = figures[name]

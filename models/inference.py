@@ -46,11 +46,12 @@ class Read:
     origin: tuple[int, int]
     reading: CoarseReading
     precision: Precision = "float32"
+    living: NDArray[np.bool_] | None = None
 
     def fits(self, weights: Weights, look: CoarseLook, precision: Precision) -> bool:
         """Whether these weights would read the same from this look."""
         whose = self.by is weights.segmenter and self.columns is look.columns
-        return whose and (self.origin, self.precision) == (look.origin, precision)
+        return whose and self.living is look.living and (self.origin, self.precision) == (look.origin, precision)
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,7 @@ def _glance(
     probability = np.ascontiguousarray(reading.logits[0].float().softmax(dim=0).permute(1, 2, 0).numpy())
     gain = weights.segmenter.score(reading)[0].float().numpy()
     tokens = token_reading(weights.segmenter, reading, queries, look.living)
-    read = Read(weights.segmenter, look.columns, look.origin, reading, precision)
+    read = Read(weights.segmenter, look.columns, look.origin, reading, precision, look.living)
     return Glance(
         look.grid,
         look.columns,

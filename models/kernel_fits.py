@@ -1,8 +1,7 @@
-"""Fitting tensors trained on photographs to other bands, another patch size, another number of positions."""
+"""Fitting kernels trained on photographs to other bands and another patch size."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -62,23 +61,3 @@ def resize_patch_kernel(kernel: Tensor, size: tuple[int, int]) -> Tensor:
     fitted = kernel.double().reshape(-1, rows * columns) @ torch.linalg.pinv(enlarge).T
     resized: Tensor = fitted.reshape(*kernel.shape[:2], *size).to(kernel.dtype)
     return resized
-
-
-def resize_positions(positions: Tensor, tokens: int, extra: tuple[int, int]) -> Tensor | None:
-    """Position codes (1, extra + G^2, d) -> (1, tokens, d) by bicubic interpolation; None where a grid is not square.
-
-    Parameters
-    ----------
-    extra
-        Codes before the grid's own (class token, distillation token): in the file, and wanted. Wanted ones beyond
-        those of the file are zero.
-    """
-    came, wanted = extra
-    old, new = math.isqrt(max(positions.shape[1] - came, 0)), math.isqrt(max(tokens - wanted, 0))
-    if old < 1 or new < 1 or old**2 + came != positions.shape[1] or new**2 + wanted != tokens:
-        return None
-    grid = positions[:, came:].reshape(1, old, old, -1).permute(0, 3, 1, 2)
-    fitted = F.interpolate(grid, size=(new, new), mode="bicubic", align_corners=False)
-    lead = torch.zeros(1, wanted, positions.shape[2], dtype=positions.dtype)
-    lead[:, : min(came, wanted)] = positions[:, : min(came, wanted)]
-    return torch.cat([lead, fitted.permute(0, 2, 3, 1).reshape(1, new * new, -1)], dim=1)

@@ -3,7 +3,7 @@
 A crop is read twice: with no fine seat, and with a share of the seats drawn from ``SHARES``. What the loss falls by at
 a captured seat is what the scorer learns to tell; a seat without a label tells it nothing. Three phases follow each
 other: seats are placed at random and by the entropy of the first reading; then also by the scorer; then in larger
-crops, of which fewer make a batch.
+crops, of which fewer make a batch, as far as the scenes have larger ones.
 
 A control (``models.designs``) has one map and no scorer: it is asked for that map's loss alone, from the same crops.
 """

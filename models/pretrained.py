@@ -11,20 +11,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from models.kernel_fits import map_rgb_kernel, resize_patch_kernel, resize_positions
 from models.spectral import checked_wavelengths
 from models.state_files import read_state
 from models.vgg import WAVELENGTHS, VggFeatures, common_names
 from models.vgg_sizes import VggSizes
 from pipeline.errors import WavelengthError, WeightsError
 
-PATCHES, POSITIONS = "patch_embed.proj.weight", "pos_embed"
-TOKENS = ("cls_token", "dist_token")
+PATCHES = "patch_embed.proj.weight"
 _UNUSED = {
     "head": "a classifier of photographs",
     "head_dist": "a classifier of photographs",
@@ -60,7 +56,6 @@ def load_into(
     state: Mapping[str, Tensor],
     *,
     names: Mapping[str, str] | None = None,
-    response: NDArray[np.floating] | None = None,
 ) -> LoadReport:
     """Put every tensor that has a place into ``module``, in place; nothing is changed where none has.
 
@@ -71,15 +66,12 @@ def load_into(
     names
         Beginnings of names, of the file to the module's own, ``*`` standing for one number:
         ``{"blocks.*.attn.qkv": "layers.*.qkv"}``. The first that fits counts; other names stay as they are.
-    response
-        (3, band): mixes the bands to colours, for a module that reads bands instead of colours.
 
     Raises
     ------
     WeightsError : nothing fits; names what was found.
     """
     places, report = module.state_dict(), LoadReport()
-    extra = tuple(sum(token in holder for token in TOKENS) for holder in ({_plain(n) for n in state}, set(places)))
     found: dict[str, Tensor] = {}
     for name, value in state.items():
         target = _renamed(_plain(name), names or {})
@@ -87,15 +79,12 @@ def load_into(
             head = _plain(name).split(".")[0]
             report.skipped[name] = _UNUSED.get(head, f"no place for {head}")
             continue
-        fitted, how = _fit(_plain(name), value, places[target].shape, response, (extra[0], extra[1]))
-        if fitted is None:
-            report.skipped[name] = how
+        why = _refusal(value, places[target].shape)
+        if why:
+            report.skipped[name] = why
             continue
-        found[target] = fitted
-        if how:
-            report.resized[name] = how
-        else:
-            report.matched.append(name)
+        found[target] = value
+        report.matched.append(name)
     report.missing = [name for name in places if name not in found]
     if not found:
         raise WeightsError(_nothing_fits(state, report))
@@ -117,31 +106,11 @@ def _renamed(name: str, names: Mapping[str, str]) -> str:
     return name
 
 
-def _fit(
-    name: str,
-    value: Tensor,
-    shape: torch.Size,
-    response: NDArray[np.floating] | None,
-    extra: tuple[int, int],
-) -> tuple[Tensor | None, str]:
-    """The tensor in its new shape with how it was resized (nothing if it was not), or None with the reason."""
+def _refusal(value: Tensor, shape: torch.Size) -> str:
+    """Why a tensor is not taken; nothing where it is."""
     if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
-        return None, "values that are not finite numbers"
-    fitted: Tensor | None = value
-    if name == PATCHES and value.dim() == len(shape) == 4:
-        fitted = _fit_patches(value, shape, response)
-    elif name == POSITIONS and value.dim() == len(shape) == 3 and (value.shape != shape or extra[0] != extra[1]):
-        fitted = resize_positions(value, shape[1], extra)
-    if fitted is None or fitted.shape != shape:
-        return None, f"{tuple(value.shape)} does not fit {tuple(shape)}"
-    return fitted, "" if fitted is value else f"{tuple(value.shape)} to {tuple(shape)}"
-
-
-def _fit_patches(value: Tensor, shape: torch.Size, response: NDArray[np.floating] | None) -> Tensor:
-    fitted = value
-    if shape[1] != 3 and value.shape[1] == 3 and response is not None and response.shape == (3, shape[1]):
-        fitted = map_rgb_kernel(value, response)
-    return fitted if value.shape[2:] == shape[2:] else resize_patch_kernel(fitted, (shape[2], shape[3]))
+        return "values that are not finite numbers"
+    return "" if value.shape == shape else f"{tuple(value.shape)} does not fit {tuple(shape)}"
 
 
 def _nothing_fits(state: Mapping[str, Tensor], report: LoadReport) -> str:

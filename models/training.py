@@ -121,8 +121,10 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = self.settings.learning_rate * rate_at(done)
         phase = phase_at(done)
-        count = max(1, self.settings.batch // phase.larger)
-        self.batch = batch = self.samplers[phase.larger].draw(count, self.rng, self.gain_shift)
+        sampler = self.samplers[phase.larger]
+        fewer = phase.larger if sampler.size > self.samplers[1].size else 1  # small scenes have no larger crops
+        count = max(1, self.settings.batch // fewer)
+        self.batch = batch = sampler.draw(count, self.rng, self.gain_shift)
         if not (batch.labels != UNLABELLED).any():  # nothing to learn; decay and momentum would move the weights
             course.step, course.unlabelled = course.step + 1, course.unlabelled + 1
             return

@@ -22,7 +22,6 @@ class Selection:
 
     seats: Seats
     spread: bool = False
-    spared: int = 0  # seats that might have been bought as well and do not pay by the threshold
 
 
 def seat_count(share: float, valid: int) -> int:
@@ -55,7 +54,6 @@ def select_seats(
     valid: NDArray[np.bool_] | None = None,
     *,
     clip: bool = False,
-    threshold: float | None = None,
 ) -> Selection:
     """Choose the ``count`` valid seats with the highest scores.
 
@@ -73,53 +71,20 @@ def select_seats(
         (seat,) seats that may be chosen; None allows all.
     clip
         Take all valid seats where ``count`` is larger, instead of refusing.
-    threshold
-        Buy no seat with a score below this, 0 or more, however many are left of ``count``: no seat then of a negative
-        score, nor of one that cannot be ranked. None buys whatever the score.
 
     Raises
     ------
-    BudgetError : ``count`` is not a whole number, below 0, or above the number of valid seats; or the threshold is
-        negative or not finite.
+    BudgetError : ``count`` is not a whole number, below 0, or above the number of valid seats.
     """
     allowed = _allowed(score, valid)
     wanted = _check_count(count, len(allowed), clip=clip)
-    worth = np.asarray(score, np.float64)[allowed]
-    order, spread = _ranked(worth)
-    if threshold is None:
-        return Selection(allowed[order[:wanted]], spread and wanted > 0)
-    paying = order[worth[order] >= check_threshold(threshold)]
-    return Selection(allowed[paying[:wanted]], spared=max(wanted - len(paying), 0))
+    order, spread = _ranked(np.asarray(score, np.float64)[allowed])
+    return Selection(allowed[order[:wanted]], spread and wanted > 0)
 
 
-def frame_seats(
-    score: Scores, share: float, valid: NDArray[np.bool_] | None = None, *, threshold: float | None = None
-) -> Selection:
-    """Choose a share of the valid seats as if each could be captured by itself (``frame`` mode: compares policies).
-
-    With a ``threshold`` of so much score a seat, for policy ``gain`` [nat per px], fewer where fewer pay.
-    """
-    return select_seats(score, seat_count(share, len(_allowed(score, valid))), valid, threshold=threshold)
-
-
-def complete_seats(requested: Seats, score: Scores, valid: NDArray[np.bool_] | None = None) -> Seats:
-    """Keep the first of repeated requests and refill with the next best seats, so that the count is conserved.
-
-    Raises
-    ------
-    BudgetError : more seats are requested than there are valid ones.
-    ShapeError : a requested seat does not exist or is not valid.
-    """
-    asked = np.asarray(requested, np.intp)
-    allowed = _allowed(score, valid)
-    strange = asked[~np.isin(asked, allowed)]
-    if len(strange):
-        raise ShapeError(f"seat {strange[0]} is not among the {len(allowed)} valid seats; request valid seats only")
-    _check_count(len(asked), len(allowed), clip=False)
-    unique = asked[np.sort(np.unique(asked, return_index=True)[1])]
-    ranked = allowed[_ranked(np.asarray(score, np.float64)[allowed])[0]]
-    spare = ranked[~np.isin(ranked, unique)]
-    return np.concatenate([unique, spare[: len(asked) - len(unique)]])
+def frame_seats(score: Scores, share: float, valid: NDArray[np.bool_] | None = None) -> Selection:
+    """Choose a share of the valid seats as if each could be captured by itself (``frame`` mode: compares policies)."""
+    return select_seats(score, seat_count(share, len(_allowed(score, valid))), valid)
 
 
 def _allowed(score: Scores, valid: NDArray[np.bool_] | None) -> Seats:

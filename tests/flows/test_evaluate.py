@@ -52,15 +52,16 @@ def _row(content: dict[str, Any], policy: str, share: float) -> dict[str, Any]:
 
 
 def test_every_row_is_there(drawn: tuple[Path, dict[str, Any]]):
-    """None, every policy at every share, the oracle, all: each with figures, and the files of the folder."""
+    """None, every policy at every share, pooled ones, the oracle, all: with figures, and the files of the folder."""
     folder, content = drawn
     keys = [(row["policy"], row["share"]) for row in content["rows"]]
-    policies = [(policy, share) for policy in ("entropy", "random", ORACLE) for share in (0.25, 0.5)]
+    names = ("entropy", "random", "entropy, pooled", ORACLE)
+    policies = [(policy, share) for policy in names for share in (0.25, 0.5)]
     assert keys == [("none", 0.0), *policies, ("all", 1.0)]
     assert content["frames"] == list(FRAMES)
     assert [one["frames"] for one in content["weights"]] == [3, 3]
-    names = {path.name for path in (folder / "out").iterdir()}
-    assert names >= {"evaluation.json", "evaluation.png", "worst.png", "frames"}
+    files = {path.name for path in (folder / "out").iterdir()}
+    assert files >= {"evaluation.json", "evaluation.png", "worst.png", "frames"}
     kept = json.loads((folder / "out" / "evaluation.json").read_text())
     assert kept["rows"][1]["miou"] == content["rows"][1]["miou"]
 
@@ -130,7 +131,7 @@ def test_progress_tells_the_time_left(data: Path, tmp_path: Path):
     """From the second frame on, beside the frame's name; the share done never falls."""
     said: list[tuple[float, str]] = []
     weights = (write_weights(tmp_path / "w.safetensors"),)
-    request = EvaluateRequest(str(data), weights, **{**QUICK, "timed_frames": 0})
+    request = EvaluateRequest(str(data), weights, pooled=False, **{**QUICK, "timed_frames": 0})
     evaluate_weights(request, lambda what, done, words: said.append((done, words)) if "judging" in what else None)
     assert said[0] == (0, "001")
     assert all(words.startswith("003, about ") and words.endswith(" left") for _, words in said[-3:-1])
@@ -282,7 +283,7 @@ def test_inside_and_outside_make_the_whole(data: Path, tmp_path: Path):
 def test_a_look_does_not_depend_on_its_company(data: Path, tmp_path: Path):
     """Noise and figures of a frame follow from seed and name, whatever other frames are judged."""
     weights = (write_weights(tmp_path / "w.safetensors"),)
-    quick = {**QUICK, "timed_frames": 0}
+    quick = {**QUICK, "timed_frames": 0, "pooled": False}
     every = evaluate_weights(EvaluateRequest(str(data), weights, **quick))
     alone = evaluate_weights(EvaluateRequest(str(data), weights, frames=("002",), **quick))
     assert alone["per_frame"] == [one for one in every["per_frame"] if one["frame"] == "002"]
@@ -304,7 +305,7 @@ def test_the_order_of_frames_does_not_matter():
 def _record(name: str, rng: np.random.Generator) -> dict[str, Any]:
     rows = [
         {
-            "policy": policy, "draw": 0, "share": share, "counts": rng.integers(1, 9, (2, 2)).tolist(),
+            "policy": policy, "draw": 0, "share": share, "seats": 2, "counts": rng.integers(1, 9, (2, 2)).tolist(),
             "inside": [[0, 0], [0, 0]], "boundary": [[1, 2], [1, 3]], "samples": 1.0, "bytes": 2.0,
             "multiply_adds": 3, "adds": {"glance": 1, "score": 0, "encode": 1, "decode": 1},
             "gain": 1.0, "best_gain": 2.0, "ap_top": None,

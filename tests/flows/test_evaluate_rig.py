@@ -81,7 +81,7 @@ def test_the_table_says_what_is_left_out(record: dict[str, Any], capsys: pytest.
     """Rows of plans, and the budgets without one; the plot has a line for each plan."""
     missing = {**record, "frame": "002", "rows": [], "left_out": [{"budget": 0.1, "why": "too little"}]}
     rig = summarise_rig([[record, missing]] * 2, TRIAL)  # of two seeds the frame is one
-    ends = [{"policy": name, "miou": 0.5} for name in ("none", "all")]
+    ends = [{"policy": name, "miou": 0.5, "thresholds": None} for name in ("none", "all")]
     content = {"dataset": "field", "frames": ["001"], "rig": rig, "equal_time": [], "rows": ends}
     for table in budget_tables(content):
         Console(width=200).print(table)

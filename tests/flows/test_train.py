@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 
 from flows import train as flow
+from flows.cli import main
 from flows.run import open_run
 from flows.settings import load_settings
 from flows.train import TrainRequest, suggested_patch, train_weights, usual_crop
@@ -61,6 +62,19 @@ def test_a_folder_to_write_to_must_be_there(tmp_path: Path):
         train_weights(TrainRequest("farm", tmp_path / "none" / "w.safetensors"))
 
 
+@pytest.mark.parametrize("ending", ["", ".part", ".checkpoint", ".checkpoint.part"])
+def test_a_folder_in_the_place_of_a_file_is_named(tmp_path: Path, ending: str, capsys: pytest.CaptureFixture[str]):
+    """Where weights or the state of the run go: one message before any scene is read, and the exit code of usage."""
+    out = tmp_path / "w.safetensors"
+    (tmp_path / f"w.safetensors{ending}").mkdir()
+    with pytest.raises(SystemExit) as left:
+        main(["train", "nowhere", "-o", str(out)])
+    shown = " ".join(capsys.readouterr().err.split())
+    assert left.value.code == SettingsError.exit_code
+    assert "defect" not in shown
+    assert f"w.safetensors{ending} is a folder" in shown
+
+
 def test_scenes_of_other_bands_are_not_mixed(tmp_path: Path):
     """One camera's scenes make one set of weights: the scene that differs is named."""
     request = _request(tmp_path)
@@ -105,8 +119,12 @@ def test_every_preset_trains_and_shows_the_rows_it_has(tmp_path: Path, preset: P
 
 
 def test_without_validation_scenes_a_control_is_not_judged(tmp_path: Path):
-    """Nothing stands in the record where no scene was kept."""
-    assert train_weights(_request(tmp_path, validation=0, preset="dense"))["validation"] is None
+    """Nothing stands in the record where no scene was kept, and the last line says how to judge the weights."""
+    shown = io.StringIO()
+    request = _request(tmp_path, validation=0, preset="dense")
+    assert run_train(request, Console(file=shown, width=100))["validation"] is None
+    told = f"spectralzoom evaluate {request.dataset} --weights OTHERS --control {request.out}"
+    assert told in shown.getvalue()
 
 
 def test_positions_that_a_preset_cannot_have_are_refused(tmp_path: Path):

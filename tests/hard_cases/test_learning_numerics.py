@@ -24,8 +24,10 @@ from models.segmenter import Segmenter, SegmenterConfig
 from models.spectral import Normalisation, SpectralBasis
 from models.training import Trainer, TrainingSettings, train
 from models.weights import Weights
+from pipeline.camera import LineCamera
 from pipeline.grid import UNLABELLED, SceneGrid
-from pipeline.selection import frame_seats
+from pipeline.planning import plan_fine
+from pipeline.scan import CostModel
 from storage.band_statistics import BandPart, tabulate
 
 SIZES: dict[str, Any] = {"classes": 2, "columns": 4, "patch": 8, "factor": 2, "width": 8, "coarse_width": 8, "dim": 16,
@@ -194,12 +196,15 @@ def test_28_patches_that_mislead_have_negative_gain():
 
 @pytest.mark.parametrize("threshold", [0.0, 0.05])
 def test_28_negative_gains_are_never_bought_by_threshold(threshold: float):
-    """With a threshold no seat of a negative score is bought, whatever the budget, nor one that is no number."""
-    score = np.array([0.3, -0.1, np.nan, 0.06, -np.inf, 0.01, -1e-12])
-    choice = frame_seats(score, 1.0, threshold=threshold)
-    assert choice.seats.tolist() == ([0, 3, 5] if threshold == 0 else [0, 3])
-    assert choice.spared == 7 - len(choice.seats)
-    assert not len(frame_seats(-np.abs(np.nan_to_num(score)) - 1, 1.0, threshold=threshold).seats)
+    """With a threshold no run is bought for a negative score, nor for one that is no number; all is left unspent."""
+    grid, score = SceneGrid(256, 256, 16, 4), np.full(256, -0.3)
+    score[[3, 70, 200]] = -5.0, np.nan, -np.inf
+    plan = plan_fine(grid, LineCamera(), CostModel(), "x", score, budget_s=10.0, threshold=threshold)
+    assert (plan.seats.tolist(), plan.sweeps, plan.worth) == ([], [], 0.0)
+    score[100] = 5.0
+    plan = plan_fine(grid, LineCamera(), CostModel(), "x", score, budget_s=10.0, threshold=threshold)
+    assert 100 in plan.seats
+    assert plan.worth == pytest.approx(5.0)
 
 
 def test_29_the_batch_of_a_failed_run_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

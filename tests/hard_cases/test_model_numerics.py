@@ -19,7 +19,7 @@ from torch import Tensor
 from models import training
 from models.encoder import Encoder
 from models.examples import Example
-from models.inference import Glance, glance, glance_of_columns, segment
+from models.inference import Glance, check_seats, glance, glance_of_columns, segment
 from models.metrics import average_accuracy, confusion, iou_per_class, kappa, mean_iou, overall_accuracy
 from models.objective import class_weights, draw_seats, map_loss, phase_at, pixel_losses
 from models.policies import pixel_entropy, score_seats
@@ -29,7 +29,7 @@ from models.tokens import code_1d, code_2d
 from models.training import TrainingSettings, train
 from models.weights import Weights, load_weights, save_weights
 from pipeline.grid import SceneGrid
-from pipeline.selection import complete_seats, frame_seats, select_seats
+from pipeline.selection import frame_seats, select_seats
 
 SIZES: dict[str, Any] = {"classes": 3, "columns": 4, "patch": 8, "factor": 2, "width": 8, "coarse_width": 8, "dim": 16,
                          "heads": 2}  # fmt: skip
@@ -230,9 +230,10 @@ def test_9_scores_that_are_all_dead_are_spread_and_flagged():
     assert not select_seats(np.arange(100.0), 10).spread
 
 
-def test_10_seats_asked_for_twice_are_replaced():
-    """A plan keeps the first of repeated requests and refills with the next best."""
-    assert complete_seats(np.array([4, 4, 1]), np.array([0.0, 1, 2, 9, 4])).tolist() == [4, 1, 3]
+def test_10_a_seat_given_twice_is_refused():
+    """A choice names each seat once; where a caller does not, nothing is added up or overwritten: it is told which."""
+    with pytest.raises(ValueError, match="seat 4 is given more than once"):
+        check_seats(np.array([4, 1, 4]), SceneGrid(37, 53, 8, 2))
 
 
 @torch.inference_mode()

@@ -80,7 +80,7 @@ def test_glances_and_bare_looks_mix(tiny: Maker):
 def test_a_kept_reading_counts_for_its_own_precision_place_and_weights_only(
     tiny: Maker, monkeypatch: pytest.MonkeyPatch
 ):
-    """The coarse image is read again where precision, place or weights are others than those of the glance."""
+    """The coarse image is read again where precision, place, living tokens or weights are not those of the glance."""
     weights, other = tiny(0), tiny(1)
     looks, patches, seats = _scenes(weights)
     seen: Glance = read_glance(weights, looks[0])
@@ -90,8 +90,10 @@ def test_a_kept_reading_counts_for_its_own_precision_place_and_weights_only(
     segment(weights, seen, patches[0], seats[0])
     segment(weights, seen, patches[0], seats[0], precision="bfloat16")
     segment(weights, replace(seen, origin=(4, 4)), patches[0], seats[0])
+    living = np.arange(inference._patches_in(seen) * weights.config.token_side**2) > 0
+    segment(weights, replace(seen, living=living), patches[0], seats[0])
     segment(other, seen, patches[0], seats[0])
-    assert again == [0, 1, 1, 1]
+    assert again == [0, 1, 1, 1, 1]
 
 
 def test_no_scenes_give_no_maps(tiny: Maker):

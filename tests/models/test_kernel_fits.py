@@ -1,4 +1,4 @@
-"""Kernels and positions fitted to other bands, patch sizes and grids."""
+"""Kernels fitted to other bands and patch sizes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 
-from models.kernel_fits import map_rgb_kernel, resize_patch_kernel, resize_positions, rgb_response
+from models.kernel_fits import map_rgb_kernel, resize_patch_kernel, rgb_response
 from models.spectral import SpectralBasis
 
 
@@ -49,23 +49,3 @@ def test_a_larger_patch_kernel_answers_enlarged_patches_alike():
     answer = F.conv2d(larger, resize_patch_kernel(kernel, (16, 16)))
     torch.testing.assert_close(answer, F.conv2d(patch, kernel), rtol=1e-3, atol=1e-3)
     assert resize_patch_kernel(kernel, (4, 4)).shape == (6, 3, 4, 4)
-
-
-def test_positions_are_resized_on_their_grid():
-    """A ramp stays one inside, to bicubic accuracy; class codes stay, distillation codes go, missing ones are zero."""
-    ramp = torch.arange(6.0).repeat_interleave(6).reshape(1, 36, 1)
-    codes = torch.cat([torch.full((1, 1, 1), 70.0), torch.full((1, 1, 1), 80.0), ramp], dim=1)
-    fitted = resize_positions(codes, 1 + 144, (2, 1))
-    assert fitted is not None
-    assert float(fitted[0, 0, 0]) == 70.0
-    rows = fitted[0, 1:].reshape(12, 12)
-    assert rows[4:8].mean(dim=1).tolist() == pytest.approx([1.75, 2.25, 2.75, 3.25], abs=0.06)
-    bare = resize_positions(codes[:, 2:], 1 + 36, (0, 1))
-    assert bare is not None
-    assert bare[0, :, 0].tolist() == pytest.approx([0.0, *ramp[0, :, 0].tolist()])
-
-
-@pytest.mark.parametrize(("came", "tokens", "extra"), [(12, 17, (0, 1)), (17, 12, (1, 0)), (0, 4, (0, 0))])
-def test_positions_of_no_square_grid_are_left(came: int, tokens: int, extra: tuple[int, int]):
-    """What is not square cannot be laid out again."""
-    assert resize_positions(torch.zeros(1, came, 3), tokens, extra) is None

@@ -1,4 +1,4 @@
-"""Other people's weights into our modules: what matched, what was resized, what was skipped and why."""
+"""Other people's weights into our modules: what matched, what was skipped and why."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from models.kernel_fits import rgb_response
 from models.pretrained import load_into, load_vgg
-from models.spectral import SpectralBasis
 from models.state_files import read_state
 from models.vgg import VggFeatures
 from models.vgg_sizes import VggSizes
@@ -68,13 +66,13 @@ def test_a_transformer_of_the_same_sizes_is_taken_whole():
 
 
 def test_distilled_transformers_lose_their_extra_token():
-    """DeiT's distillation token has no place; its position is cut out of the codes, the others stay."""
+    """DeiT's distillation token has no place; a code of its own for each place fits no other number of them."""
     state, module = photographs(distilled=True), Transformer()
     report = load_into(module, state)
     assert report.skipped["dist_token"] == "a token of the whole image"
-    assert report.resized == {"pos_embed": "(1, 18, 8) to (1, 17, 8)"}
-    kept = [0, *range(2, 18)]
-    torch.testing.assert_close(module.pos_embed.detach(), state["pos_embed"][:, kept])
+    assert report.skipped["pos_embed"] == "(1, 18, 8) does not fit (1, 17, 8)"
+    assert report.missing == ["pos_embed"]
+    assert torch.equal(module.cls_token, state["cls_token"])
 
 
 def test_a_segmenter_checkpoint_gives_its_encoder():
@@ -84,21 +82,6 @@ def test_a_segmenter_checkpoint_gives_its_encoder():
     report = load_into(Transformer(), state)
     assert len(report.matched) == len(state) - 4
     assert report.skipped["decoder.proj_patch"] == "a decoder for its own classes"
-
-
-def test_bands_patch_size_and_grid_are_fitted():
-    """Colours are mapped to bands, the patch and the grid resized; the report says from what to what."""
-    state = photographs()
-    module = Transformer(bands=6, patch=8, grid=5)
-    response = rgb_response(SpectralBasis(400.0, 1000.0, 6))
-    report = load_into(module, state, response=response)
-    assert report.resized == {
-        "pos_embed": "(1, 17, 8) to (1, 26, 8)",
-        "patch_embed.proj.weight": "(8, 3, 4, 4) to (8, 6, 8, 8)",
-    }
-    refused = load_into(Transformer(bands=6), state)
-    assert refused.skipped["patch_embed.proj.weight"] == "(8, 3, 4, 4) does not fit (8, 6, 4, 4)"
-    assert refused.missing == ["patch_embed.proj.weight"]
 
 
 def test_deeper_or_wider_files_give_what_fits():

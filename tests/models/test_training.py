@@ -57,6 +57,18 @@ def test_equal_seeds_give_equal_weights_and_leave_global_streams_alone():
     assert not first.training
 
 
+@pytest.mark.parametrize(("crop", "last"), [(48, (2, 64)), (64, (4, 64)), (16, (4, 16))])
+def test_batches_are_halved_where_crops_grow(crop: int, last: tuple[int, int]):
+    """The last phase has larger crops and fewer of them; where scenes have no larger ones, as many as before."""
+    trainer = training.Trainer(CONFIG, [_example(size=64)], SHIFT, replace(SETTINGS, batch=4, crop=crop))
+    sizes = []
+    for done in (0.1, 0.9):
+        trainer.step(done)
+        assert trainer.batch is not None
+        sizes.append((len(trainer.batch.labels), trainer.batch.labels.shape[-1]))
+    assert sizes == [(4, crop), last]
+
+
 def test_progress_runs_to_the_end():
     """Every step reports itself and how far the run is, by steps here."""
     seen: list[Progress] = []

@@ -1,4 +1,4 @@
-"""Selection: counts, ties, numbers that are not, nesting, repeats and border seats."""
+"""Selection: counts, ties, numbers that are not, nesting and border seats."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import BudgetError, ShapeError
-from pipeline.selection import complete_seats, frame_seats, seat_count, select_seats
+from pipeline.errors import BudgetError
+from pipeline.selection import frame_seats, seat_count, select_seats
 
 scores = st.lists(st.sampled_from([0.0, 1.0, 2.0, -1.0, np.nan, np.inf, -np.inf]), min_size=1, max_size=30)
 
@@ -100,63 +100,3 @@ def test_frame_mode_counts_valid_seats_only():
     """35 % of 20 valid seats are 7, whatever the padded grid holds."""
     valid = np.arange(64) < 20
     assert len(frame_seats(np.arange(64.0), 0.35, valid).seats) == 7
-
-
-@given(st.lists(st.integers(0, 9), min_size=1, max_size=10))
-def test_repeated_requests_are_refilled(requested: list[int]):
-    """Each request counts once, in order, and the best other seats fill up the count."""
-    score = np.arange(10.0)
-    seats = complete_seats(np.array(requested), score).tolist()
-    first = list(dict.fromkeys(requested))
-    assert seats[: len(first)] == first
-    assert seats[len(first) :] == [s for s in range(9, -1, -1) if s not in first][: len(requested) - len(first)]
-
-
-def test_requests_for_seats_off_the_scene_are_refused():
-    """A requested seat must exist, be valid, and there must be enough of them."""
-    with pytest.raises(ShapeError, match="seat 3 is not among the 2 valid"):
-        complete_seats(np.array([0, 3]), np.zeros(4), np.array([True, True, False, False]))
-    with pytest.raises(BudgetError, match="from 0 to 2, got 3"):
-        complete_seats(np.array([0, 0, 1]), np.zeros(2))
-
-
-thresholds = st.floats(0, 3)
-
-
-@given(scores, st.data(), thresholds, thresholds)
-def test_a_higher_threshold_buys_the_beginning_of_what_a_lower_one_does(
-    values: list[float], data: st.DataObject, one: float, other: float
-):
-    """Nested in the threshold, as in the count; what is bought pays, and what is spared is the rest of the count."""
-    count = data.draw(st.integers(0, len(values)))
-    low, high = (select_seats(np.array(values), count, threshold=limit) for limit in sorted((one, other)))
-    assert high.seats.tolist() == low.seats[: len(high.seats)].tolist()
-    assert all(values[seat] >= min(one, other) for seat in low.seats)
-    assert len(low.seats) + low.spared == count
-    assert low.seats.tolist() == select_seats(np.array(values), count).seats[: len(low.seats)].tolist()
-
-
-@given(st.lists(st.floats(0, 9), min_size=1, max_size=30), st.data())
-def test_a_threshold_of_0_buys_every_score_that_is_not_negative(values: list[float], data: st.DataObject):
-    """With scores of 0 and more it is as if there were none."""
-    count = data.draw(st.integers(0, len(values)))
-    assert select_seats(np.array(values), count, threshold=0).seats.tolist() == (
-        select_seats(np.array(values), count).seats.tolist()
-    )
-
-
-def test_what_does_not_pay_is_left_whatever_the_share():
-    """Negative gains, which a share alone would buy, and scores that are none, which it would spread, stay out."""
-    gain = np.array([0.3, -0.2, 0.1, np.nan, -5.0, 0.0])
-    assert frame_seats(gain, 1.0).seats.tolist() == [0, 2, 5, 1, 4, 3]
-    chosen = frame_seats(gain, 1.0, threshold=0.05)
-    assert (chosen.seats.tolist(), chosen.spared) == ([0, 2], 4)
-    nothing = frame_seats(np.full(4, np.nan), 0.5, threshold=0.0)
-    assert (nothing.seats.tolist(), nothing.spread, nothing.spared) == ([], False, 2)
-
-
-@pytest.mark.parametrize("threshold", [-0.1, np.nan, np.inf])
-def test_thresholds_that_cannot_be_are_refused(threshold: float):
-    """A threshold is a finite score of 0 or more."""
-    with pytest.raises(BudgetError, match="threshold must be a finite score of 0 or more, got"):
-        select_seats(np.ones(3), 1, threshold=threshold)
