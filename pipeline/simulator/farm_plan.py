@@ -153,7 +153,7 @@ def _plan_field(rng: np.random.Generator, parcel: Parcel, use: str) -> FieldPlan
         headland_px=float(rng.uniform(18, 34)),
         tramlines=trams if rng.uniform() < tram_chance else None,
         late_days=float(rng.uniform(-6, 6)),
-        gap_rate=float(rng.uniform(0.01, 0.09)),
+        gap_rate=float(rng.uniform(0.005, 0.06)),
         lodging=float(max(0.0, rng.uniform(-0.3, 1)) * crop.lodging) if crop else 0.0,
         weeds=float(np.exp(rng.uniform(*np.log(_WEEDS_ELSEWHERE[use] if crop is None else crop.weeds)))),
         wetter=float(rng.normal(0, 0.025)),

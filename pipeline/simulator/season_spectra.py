@@ -29,6 +29,7 @@ from pipeline.simulator.spectra import (
 )
 
 MOISTURE_EXPONENT = 5.0  # law of this project; 80 % of the darkening is done at 0.32 by volume
+RIPE_CONTRAST = 0.4  # of the twins' contrast, in ripe wheat (law of this project)
 
 STAGES: dict[str, Canopy] = {
     "maize_young": Canopy(1.40, 36, 8, 0.5, 0.00, 0.014, 0.0040, 1.3, 45),
@@ -76,7 +77,8 @@ def season_library(bands: int, materials: tuple[str, ...] = SEASON_MATERIALS) ->
 def _season_spectra() -> dict[str, Spectrum]:
     shared = known_spectra()
     known = {name: shared[name] for name in KEPT} | {name: canopy_spectrum(stage) for name, stage in STAGES.items()}
-    known |= {name: known[other] * twin_factor() for name, other in _TWINS.items()}
+    for name, other in _TWINS.items():  # varieties differ by their leaves' green, of which ripe wheat has little left
+        known[name] = known[other] * (1 + (RIPE_CONTRAST if name.endswith("ripe") else 1.0) * (twin_factor() - 1))
     return known | {"straw_grey": _weathered(known["straw"]), "twigs": _twigs()}
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from pipeline.crop_rows import find_rows
 from pipeline.simulator.farm_fields import Ground
-from pipeline.simulator.farm_layout import parcel_pixels, stripes
+from pipeline.simulator.farm_layout import Parcel, parcel_pixels, stripes
 from pipeline.simulator.farm_on_day import farm_on_day
 from pipeline.simulator.farm_plan import FarmPlan, FieldPlan, farm_plan
 from pipeline.simulator.farm_sun import Sun
@@ -116,10 +118,9 @@ def test_rows_turn_on_the_headland() -> None:
 def test_rows_shade_what_lies_away_from_the_sun(azimuth: float) -> None:
     """Rows that run north throw no shadow at noon; else it lies opposite the sun, as wide as cot(elevation) says."""
     x = np.arange(-30.0, 30.0, 0.25)
-    field = FieldPlan(a_field("maize")[1].parcel, "maize", 90.0, 20.0, 0.0, 0.0, None, 0.0, 0.0, 0.0, 0.0, 0.0)
-    centres = np.column_stack([np.zeros_like(x), x])
-    bare = FieldPlan(**{**vars(field), "parcel": type(field.parcel)(field.parcel.corners, ())})
-    rows = rows_of(np.random.default_rng(0), bare, centres)
+    open_land = Parcel(np.array([[-50.0, -50.0], [-50.0, 50.0], [50.0, 50.0], [50.0, -50.0]]))
+    northward = replace(a_field("maize")[1], parcel=open_land, row_angle_deg=90.0, row_phase_px=0.0)
+    rows = rows_of(np.random.default_rng(0), northward, np.column_stack([np.zeros_like(x), x]))
     shade = row_shadow(Sun(azimuth, 45.0), 6.0, rows, 20.0, np.full(x.size, 4.0))
     near = np.abs(x) < 10
     width = float(shade[near].sum() * 0.25)
