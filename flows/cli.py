@@ -12,7 +12,8 @@ from typing import Literal
 from cyclopts import CycloptsError
 
 import flows.archive_verbs
-import flows.model_verbs  # noqa: F401 - each registers its verbs
+import flows.model_verbs
+import flows.simulate_verb  # noqa: F401 - each registers its verbs
 from flows.app import GOES_ON, AsJson, OutFile, app, parse_numbers, parse_wholes, print_json, say, split_list, stderr
 from flows.survey_flags import SurveyFlags
 from pipeline.errors import PipelineError, SettingsError

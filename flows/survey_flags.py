@@ -45,7 +45,11 @@ class SurveyFlags:
     seed: str | None = None
     """Of the scene `farm` and of all noise; 0 by default."""
     effects: str | None = None
-    """Of the simulated camera: auto (default), all, none, or names with commas: slit,smear,throughput,shot,read"""
+    """Of the simulated rig: auto (default: those that change a number by more than --tol), all, none, or names with
+    commas: rotation,slit,smear,vignetting,shot,read-noise"""
+    tol: str | None = None
+    """What leaving effects out may change any number by: in sigmas of its noise, 0.1 by default, or in DN, 0.5dn. With
+    0 everything is computed exactly, with inf all is left out that can be."""
     controls: bool | None = None
     """Also judge other placements of the same number of seats (needs labels)."""
     engine: str | None = None

@@ -20,7 +20,7 @@ from typing import Literal, NamedTuple
 
 from pipeline.errors import SettingsError
 from pipeline.simulator.effects.effect import OFF, Effect
-from pipeline.simulator.options import ALWAYS_ON, Menu, Option, list_options
+from pipeline.simulator.options import ALWAYS_ON, Menu, Option, cost_of, list_options
 from pipeline.simulator.probe import Probe, Unit
 from pipeline.simulator.rig_model import Rig
 
@@ -82,18 +82,29 @@ class Decision:
     @property
     def cost_ns(self) -> float:
         """Per px and band, of the effects that are on [ns]."""
-        return math.fsum(one.option.cost_ns for one in self.taken)
+        return cost_of((one.menu for one in self.taken), {one.name: one.option for one in self.taken})
+
+    def cost_of(self, one: Taken) -> float:
+        """Per px and band, of one effect beside the others as they are taken [ns]."""
+        return one.menu.cost_beside(one.option, {other.name: other.option for other in self.taken})
 
     @property
     def exact_cost_ns(self) -> float:
         """Per px and band, of everything that the rig has, exact [ns]."""
-        return math.fsum(one.menu.exact.cost_ns for one in self.taken if one.menu.present)
+        menus = [one.menu for one in self.taken if one.menu.present]
+        return cost_of(menus, {menu.name: menu.exact for menu in menus})
 
     @property
     def cheap_cost_ns(self) -> float:
         """Per px and band, of everything that the rig has, each as cheap as a tenth of the tolerance lets it be."""
+        menus = [one.menu for one in self.taken if one.menu.present]
+        return cost_of(menus, {menu.name: menu.cheapest_within(CHEAP_SHARE * self.tolerance) for menu in menus})
+
+    @property
+    def cheap(self) -> dict[Effect, str]:
+        """Everything that the rig has, each in its cheapest variant that errs by no more than a tenth."""
         within = CHEAP_SHARE * self.tolerance
-        return math.fsum(one.menu.cheapest_within(within).cost_ns for one in self.taken if one.menu.present)
+        return {one.menu.effect: one.menu.cheapest_within(within).variant for one in self.taken if one.menu.present}
 
 
 def decide(probe: Probe, rig: Rig, effects: Sequence[Effect], tolerance: float, asked: str = "auto") -> Decision:
@@ -167,17 +178,17 @@ def _settled(menus: Sequence[Menu], tolerance: float, named: frozenset[str] | No
 def _cheapened(menus: Sequence[Menu], tolerance: float, *, forced: bool) -> dict[str, Option]:
     """Give the cheapest of what the greedy rule makes of everything exact, and of each one step from there."""
     exact = {menu.name: menu.exact for menu in menus}
-    first = (step for menu in menus for step in _steps(menu, menu.exact, forced=forced))
+    first = (step for menu in menus for step in _steps(menu, exact, menus, forced=forced))
     starts = [exact, *(exact | {step.name: step.option} for step in sorted(first) if step.option.error <= tolerance)]
     ends = (_greedy(menus, tolerance, start, forced=forced) for start in starts)
-    return min(ends, key=lambda end: math.fsum(option.cost_ns for option in end.values()))  # the first among equals
+    return min(ends, key=lambda end: cost_of(menus, end))  # the first among equals
 
 
 def _greedy(menus: Sequence[Menu], tolerance: float, start: Mapping[str, Option], *, forced: bool) -> dict[str, Option]:
     """Take cheaper options, the greatest saving per added error first, while the sum of errors fits."""
     current = dict(start)
     while True:
-        steps = sorted(step for menu in menus for step in _steps(menu, current[menu.name], forced=forced))
+        steps = sorted(step for menu in menus for step in _steps(menu, current, menus, forced=forced))
         fitting = (step for step in steps if _error((current | {step.name: step.option}).values()) <= tolerance)
         if (step := next(fitting, None)) is None:
             return current
@@ -194,13 +205,16 @@ class _Step(NamedTuple):
     option: Option
 
 
-def _steps(menu: Menu, now: Option, *, forced: bool) -> Iterator[_Step]:
-    """Give every option that is cheaper than what is taken now."""
-    stays = forced or menu.name in ALWAYS_ON
+def _steps(menu: Menu, taken: Mapping[str, Option], menus: Sequence[Menu], *, forced: bool) -> Iterator[_Step]:
+    """Give every option that makes all together cheaper than what is taken now."""
+    now, stays = taken[menu.name], forced or menu.name in ALWAYS_ON
+    sharing = [one for one in menus if one is menu or (one.merged is not None and one.merged.other == menu.name)]
     for option in menu.variants if stays else (*menu.variants, menu.off):
-        if option.cost_ns < now.cost_ns:
+        then = {**taken, menu.name: option} if len(sharing) > 1 or menu.merged else {menu.name: option}
+        saved = cost_of(sharing, taken) - cost_of(sharing, then)
+        if saved > 0:
             added = max(0.0, option.error - now.error)
-            yield _Step(added / (now.cost_ns - option.cost_ns), added, menu.name, option.variant, option)
+            yield _Step(added / saved, added, menu.name, option.variant, option)
 
 
 def _error(options: Iterable[Option]) -> float:

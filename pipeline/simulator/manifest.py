@@ -63,7 +63,7 @@ def _row(one: Taken, decision: Decision, measured: float | None) -> dict[str, An
         "variant": one.option.variant if one.is_on else None,
         "bound": _finite(one.option.error),
         "measured": measured,
-        "cost_s": _seconds(one.option.cost_ns, decision),
+        "cost_s": _seconds(decision.cost_of(one), decision),
         "why": explain(one, decision),
         "unit": decision.unit,
     }

@@ -11,7 +11,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincc, ndtr
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -170,6 +169,8 @@ def _series_quantile(mean: Floats, z: Floats) -> Floats:
     .. [1] Giles, "Algorithm 955: approximation of the inverse Poisson cumulative distribution function", ACM Trans.
            Math. Softw. 42, 2016. doi:10.1145/2699466
     """
+    from scipy.special import gammaincc, ndtr
+
     root, square = np.sqrt(mean), z * z
     x = mean + root * z
     x += 1 / 3 + square / 6
@@ -186,6 +187,8 @@ def _series_quantile(mean: Floats, z: Floats) -> Floats:
 
 def _summed_quantile(mean: Floats, z: Floats) -> Floats:
     """Poisson quantile at Phi(z) for small means: how many of the sums of probabilities lie below."""
+    from scipy.special import ndtr
+
     counts = np.zeros_like(mean)
     asked = ndtr(z)
     chance = np.exp(-mean)

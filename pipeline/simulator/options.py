@@ -9,7 +9,8 @@ changes it by ``t`` counts ``2 t`` deviations. Total variation is a metric and n
 all bounds is then twice a bound on how much more often than not one sample could tell the image from the exact one.
 
 Composition. Kernels that are not negative and sum to 1 have gain 1 at most, readout none. Gains of light (vignetting,
-drift, ...) multiply the errors of all other linear effects; each is at most 1 + its own bound on light of level 1.
+drift, ...) multiply the errors of all other effects in the light, each by its own greatest factor, and change the unit:
+see `gain_range`. Gains and changes are asked for their bounds with the light that earlier gains leave and add.
 Catmull-Rom's 1.5625 would multiply errors made in the scene's pixels: no effect is so early.
 """
 
@@ -22,7 +23,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.errors import SettingsError
-from pipeline.simulator.effects.effect import OFF, Bound, Effect
+from pipeline.simulator.effects.effect import OFF, Bound, Effect, Merged
+from pipeline.simulator.gain_range import GainRange, Growth, light_after
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -50,6 +52,7 @@ class Menu:
     variants: tuple[Option, ...]
     off: Option
     present: bool
+    merged: Merged | None = None
 
     @property
     def name(self) -> str:
@@ -60,6 +63,13 @@ class Menu:
     def exact(self) -> Option:
         """The exact variant."""
         return self.variants[0]
+
+    def cost_beside(self, option: Option, others: Mapping[str, Option]) -> float:
+        """Give what an option costs beside those taken for other effects, by name [ns]: draws may be shared."""
+        one = self.merged
+        if one is None or option.variant == OFF or one.other not in others or others[one.other].variant != one.variant:
+            return option.cost_ns
+        return max(one.cost_ns, LEAST_COST_NS)
 
     def cheapest_within(self, error: float) -> Option:
         """Give the cheapest variant, never off, whose own error is no more than this."""
@@ -74,9 +84,17 @@ def list_options(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> tuple[Men
     SettingsError : two effects have one name, or a bound is negative or not a number; names it.
     """
     _check_names(effects)
-    present = {effect.name: _is_present(effect, probe, rig) for effect in effects}
-    growth = {effect.name: _greatest_gain(effect, probe, rig) if present[effect.name] else 1.0 for effect in effects}
-    return tuple(_menu(effect, probe, rig, present[effect.name], _gain_of_others(effect, growth)) for effect in effects)
+    present = [_is_present(effect, probe, rig) for effect in effects]
+    ranges = [_gain_range(one, probe, rig) if there else None for one, there in zip(effects, present, strict=True)]
+    growth = Growth(probe, rig)
+    menus = []
+    for place, effect in enumerate(effects):
+        arriving = probe
+        if (hasattr(effect, "change") or hasattr(effect, "gain")) and any(ranges[:place]):
+            arriving = light_after(probe, [one for one in ranges[:place] if one is not None], rig)
+        gain = _gain_beside(effect, ranges, place, growth)
+        menus.append(_menu(effect, arriving, rig, present[place], gain))
+    return tuple(menus)
 
 
 def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) -> Menu:
@@ -86,7 +104,8 @@ def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) ->
         return Option(variant, error, _cost_ns(effect, variant), bound.why)
 
     exact = Option(effect.variants[0], 0.0, _cost_ns(effect, effect.variants[0]), "exact")
-    return Menu(effect, (exact, *map(option, effect.variants[1:])), option(OFF), present)
+    merged: Merged | None = effect.merged(rig) if hasattr(effect, "merged") else None
+    return Menu(effect, (exact, *map(option, effect.variants[1:])), option(OFF), present, merged)
 
 
 def _cost_ns(effect: Effect, variant: str) -> float:
@@ -123,22 +142,36 @@ def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
     return effect.name in ALWAYS_ON or shown > 0
 
 
-def _greatest_gain(effect: Effect, probe: Probe, rig: Rig) -> float:
-    """By how much an effect can multiply light, at most: 1 and its bound on light of level 1 without detail."""
+def _gain_range(effect: Effect, probe: Probe, rig: Rig) -> GainRange | None:
+    """By what an effect multiplies light; where a gain does not say, 1 more or less its bound on level 1."""
+    if hasattr(effect, "gain_range"):
+        stated: GainRange = effect.gain_range(probe, rig)
+        return stated
     if not hasattr(effect, "gain"):
-        return 1.0
-    nothing, ones = np.zeros(len(probe.wavelength_nm)), np.ones(len(probe.wavelength_nm))
+        return None
+    bands = len(probe.wavelength_nm)
+    nothing, ones = np.zeros(bands), np.ones(bands)
     even = replace(
         probe, level=ones, spread=ones, span=ones, spectral_slope=nothing, spectral_curvature=nothing,
-        slope=np.zeros((2, len(ones))), curvature=np.zeros((2, len(ones))), unit_least_dn=1.0,
+        slope=np.zeros((2, bands)), curvature=np.zeros((2, bands)), unit_least_dn=1.0,
     )  # fmt: skip
-    return 1.0 + effect.bound(even, rig, OFF).value
+    off = effect.bound(even, rig, OFF).value
+    return GainRange.between(max(1 - off, 0.0), 1 + off, bands, uneven=2 * off)
 
 
-def _gain_of_others(effect: Effect, growth: Mapping[str, float]) -> float:
+def _gain_beside(effect: Effect, ranges: Sequence[GainRange | None], place: int, growth: Growth) -> float:
+    """By what all others multiply the error of an effect."""
     if not any(hasattr(effect, action) for action in LINEAR_ACTIONS):
         return 1.0
-    return math.prod(sorted(gain for name, gain in growth.items() if name != effect.name))  # sorted: order of no matter
+    beside = [one for other, one in enumerate(ranges) if one is not None and other != place]
+    greatest = [np.maximum(one.greatest, 1.0) for one in beside]
+    others = float(np.prod(greatest, axis=0).max(initial=1.0)) if greatest else 1.0
+    return growth.of_gain(ranges[place], others)
+
+
+def cost_of(menus: Iterable[Menu], options: Mapping[str, Option]) -> float:
+    """Give what options, one for each menu by its name, cost together per px and band [ns]."""
+    return math.fsum(menu.cost_beside(options[menu.name], options) for menu in menus)
 
 
 def _by_cost(option: Option) -> tuple[float, float, str]:

@@ -20,7 +20,7 @@ from pipeline.simulator.effects.dark_current import DARK_CURRENT, dark_electrons
 from pipeline.simulator.effects.defects import DEFECTS, dead_elements, hot_electrons
 from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.read_noise import READ_NOISE
-from pipeline.simulator.effects.saturation import SATURATION
+from pipeline.simulator.effects.saturation import SATURATION, well_reached
 from pipeline.simulator.effects.shot import EXACT, SHOT
 from pipeline.simulator.noise import (
     LEAST_MERGED_READ_E,
@@ -130,9 +130,8 @@ class Readout:
     @cached_property
     def well_e(self) -> float | None:
         """Electrons that an element holds; None where the converter ends before any could overflow, or it is off."""
-        well, camera = self.block.rig.detector.well_e, self.block.rig.camera
-        reaches = well < (camera.full_scale_dn + 1 - camera.dark_dn) * camera.electrons_per_dn + 8 * self.read_noise_e
-        return well if reaches and self._variant(SATURATION.name) != OFF else None
+        on = self._variant(SATURATION.name) != OFF and well_reached(self.block.rig, self.read_noise_e)
+        return self.block.rig.detector.well_e if on else None
 
     def _cheap(self, expected: Light, deviate: Light, number: int) -> Light:
         """Cheap draws where they may stand for exact ones, exact ones below."""

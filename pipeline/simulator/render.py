@@ -1,10 +1,10 @@
-"""The light that a block of lines gathers: rays through mirror and slit to the scene, with the effects chosen."""
+"""The light that a block of lines gathers, through mirror and slit, with the effects chosen."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from itertools import islice
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,21 +12,22 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
 from pipeline.mirror import direction_to_scene, position_to_direction, position_to_normal
-from pipeline.scan import shifted_position
+from pipeline.scan import Sweep, line_positions, shifted_position
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Effect
 from pipeline.simulator.effects.pupil import middle_normal
-from pipeline.simulator.effects.slit import box_rays
-from pipeline.simulator.effects.smear import smeared_positions
+from pipeline.simulator.effects.slit import box_of, box_parts
+from pipeline.simulator.effects.smear import folded_positions, smeared_positions
 from pipeline.simulator.footprint import Footprint, fold
-from pipeline.simulator.rays import exact_tangents, straight_tangents
+from pipeline.simulator.rays import Views, exact_views, straight_views
+from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene
+from pipeline.simulator.scene_light import Looker
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
-_Ray = tuple[Floats, Floats, int, float]  # rows, columns, number and weight of the held position
 
-RAYS_AT_ONCE = 16  # held in memory until they are summed
+LOOKS = 17  # lines of a sweep and samples of a line that tell how far a footprint's shape varies
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,8 @@ def expected_light(scene: Scene, block: Block, chosen: Mapping[Any, str] | Choic
     SettingsError : an effect has no such variant.
     """
     choice = Choice.of(chosen)
+    if block.samples is not None and any(getattr(effect, "whole_line", False) for effect, _ in choice.effects):
+        return expected_light(scene, replace(block, samples=None), choice)[:, block.columns]
     light = _seen(scene, block, choice)
     for effect, variant in choice.effects:
         if hasattr(effect, "gain"):
@@ -91,75 +94,71 @@ def expected_light(scene: Scene, block: Block, chosen: Mapping[Any, str] | Choic
 
 
 def folded_footprint(block: Block, choice: Choice) -> Footprint:
-    """Fold slit, pixel and the blurs that are on into the rays that each sample of a sweep takes."""
-    rig, bands, normal = block.rig, len(block.wavelength_nm), middle_normal(block.sweep, block.rig)
-    shift, variance = np.zeros((2, bands)), np.zeros((2, bands))
-    for blur, variant in choice.doing("moments"):
-        moments = blur.moments(rig, block.wavelength_nm, variant, normal)
-        shift, variance = shift + moments.shift, variance + moments.variance
-    slit = choice.variant("slit")
-    boxes = (0.0, 0.0) if slit == OFF else (rig.camera.slit_px, 1.0)
-    return fold(boxes, box_rays(slit, rig.camera.slit_px), shift, variance)
+    """Fold slit, pixel, the blurs that are on and perhaps held positions: the same for all of a sweep, made once."""
+    return _looker_of(block, choice).footprint
 
 
-def held_positions(block: Block, choice: Choice) -> tuple[Floats, Floats]:
-    """Give what the mirror holds in each exposure, aims included, (line, step, 2), and (step,) weights of sum 1."""
-    position, weight = smeared_positions(block, choice.variant("smear"))
+def held_positions(block: Block, choice: Choice) -> Floats:
+    """Give what the mirror holds in each exposure, aims included, (line, step, 2); each for as long as the others."""
+    position = smeared_positions(block, choice.variant("smear"))
     for aim, variant in choice.doing("aim"):
         shift = aim.aim(block, variant)
         if shift.shape[1] not in (1, position.shape[1]) and block.sweep.step > 1:  # the mirror's course is not followed
             shift = shift.mean(axis=1, keepdims=True)
         position = shifted_position(position, shift, block.rig.camera)
-    steps = position.shape[1]
-    return position, weight if len(weight) == steps else np.full(steps, 1 / steps)
+    return position
 
 
 def _seen(scene: Scene, block: Block, choice: Choice) -> Light:
     """Light of the block through the folded footprint, (line, sample, band)."""
-    footprint = folded_footprint(block, choice)
-    spectra = scene.electrons * np.float32(block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-    size = (len(block.lines), len(block.columns))
-    points = _points(block, choice, footprint, scene.shape)
-    if spectra.ndim == 1:  # every band has a plane of its own, and so weights of its own
-        light = np.zeros((size[0] * size[1], len(spectra)), np.float32)
-        for y, x, ray, weight in points:
-            light += scene.sample(y, x) * (footprint.weight[ray] * weight).astype(np.float32)
-        light *= spectra
-        return light.reshape(*size, len(spectra))
-    rays, bands = footprint.kernels()
-    parts = _parted(scene, points, rays.astype(np.float32), size[0] * size[1], len(spectra))
-    mixing = bands.astype(np.float32)[:, None] * spectra  # (kernel, component, band)
-    mixed: Light = parts @ mixing.reshape(-1, mixing.shape[2])
-    return mixed.reshape(*size, mixing.shape[2])
+    steps = [views.flat() for views in _views(block, choice, scene.shape)]
+    exposures = block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
+    light = _looker_of(block, choice).look(scene, steps, along_y=block.sweep.along == "y", exposures=exposures)
+    return light.reshape(len(block.lines), len(block.columns), light.shape[1])
 
 
-def _parted(scene: Scene, points: Iterable[_Ray], rays: Light, count: int, components: int) -> Light:
-    """Sum the components along all rays under each kernel, (point, kernel * component)."""
-    parts = np.zeros((rays.shape[1], count * components), np.float32)
-    met = iter(points)
-    while some := list(islice(met, RAYS_AT_ONCE)):
-        weight = np.stack([rays[ray] * np.float32(held) for _, _, ray, held in some], axis=1)
-        parts += weight @ np.stack([scene.sample(y, x).reshape(-1) for y, x, _, _ in some])
-    return parts.reshape(-1, count, components).transpose(1, 0, 2).reshape(count, -1)
-
-
-def _points(block: Block, choice: Choice, footprint: Footprint, shape: tuple[int, int]) -> Iterator[_Ray]:
-    """Rows and columns of the scene that every ray of every held position meets, its number and its position's weight.
-
-    Each is (line * sample,).
-    """
-    position, weights = held_positions(block, choice)
+def _views(block: Block, choice: Choice, shape: tuple[int, int]) -> Iterator[Views]:
+    """Where the samples look at each held position, (line, sample) each. [px of the scene]"""
+    position, ifov = held_positions(block, choice), block.rig.camera.ifov_rad
+    size = shape if block.sweep.along == "y" else shape[::-1]
     displacements = list(choice.doing("displaced"))
-    exact = choice.variant("rotation") != OFF
-    pose = position_to_normal(position) if exact else direction_to_scene(position_to_direction(position))
-    ifov = block.rig.camera.ifov_rad
-    meet = exact_tangents if exact else straight_tangents
-    for step, weight in enumerate(weights):
-        for ray, (turn, run) in enumerate(zip(footprint.across, footprint.along, strict=True)):
-            along, scan = meet(pose[:, step, None], turn * ifov, block.slopes + run * ifov)
-            along, scan = along / ifov, scan / ifov
-            for displacement, variant in displacements:
-                beside = displacement.displaced(block, along, scan, variant)
-                along, scan = along + beside[0], scan + beside[1]
-            y, x = (scan, along) if block.sweep.along == "x" else (along, scan)
-            yield (y + (shape[0] - 1) / 2).ravel(), (x + (shape[1] - 1) / 2).ravel(), ray, float(weight)
+    for step in range(position.shape[1]):
+        views = _tangents(position[:, step, None], block.slopes, exact=choice.variant("rotation") != OFF)
+        along, scan = views.along / ifov, views.scan / ifov
+        for displacement, variant in displacements:
+            beside = displacement.displaced(block, along, scan, variant)
+            along, scan = along + beside[0], scan + beside[1]
+        yield replace(views, along=along + (size[0] - 1) / 2, scan=scan + (size[1] - 1) / 2)
+
+
+def _tangents(position: Floats, slopes: Floats, *, exact: bool) -> Views:
+    if exact:
+        return exact_views(position_to_normal(position), 0.0, slopes)
+    return straight_views(direction_to_scene(position_to_direction(position)), 0.0, slopes)
+
+
+def _looker_of(block: Block, choice: Choice) -> Looker:
+    moments, names = tuple(choice.doing("moments")), tuple(map(choice.variant, ("slit", "smear", "rotation")))
+    return _looker(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names)
+
+
+@lru_cache(maxsize=8)
+def _looker(
+    rig: Rig, sweep: Sweep, wavelengths: bytes, blurs: tuple[tuple[Any, str], ...], names: tuple[str, ...]
+) -> Looker:
+    wavelength, normal = np.frombuffer(wavelengths), middle_normal(sweep, rig)
+    shift, variance = np.zeros((2, len(wavelength))), np.zeros((2, len(wavelength)))
+    for blur, variant in blurs:
+        moments = blur.moments(rig, wavelength, variant, normal)
+        shift, variance = shift + moments.shift, variance + moments.variance
+    slit, smear, rotation = names
+    footprint = fold(box_of(slit, rig), box_parts(slit), folded_positions(sweep, smear), shift, variance)
+    return Looker(footprint, _extremes(rig, sweep, exact=rotation != OFF))
+
+
+def _extremes(rig: Rig, sweep: Sweep, *, exact: bool) -> Views:
+    """Views all over a sweep: the shape of a footprint varies smoothly between them."""
+    whole = line_positions(replace(sweep, lines=max(sweep.lines, 1)), rig.camera)
+    lines = np.linspace(0, len(whole) - 1, LOOKS).round().astype(np.intp)
+    slopes = np.linspace(-0.5, 0.5, LOOKS) * rig.camera.samples * rig.camera.ifov_rad
+    return _tangents(whole[lines][:, None], slopes, exact=exact).flat()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -11,11 +12,13 @@ from pipeline.camera import LineCamera
 from pipeline.mirror import direction_to_normal, scene_to_direction
 from pipeline.scan import Sweep, scene_to_sweep
 from pipeline.simulator.footprint import Footprint
-from pipeline.simulator.rays import exact_tangents
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene, to_bands
+from pipeline.simulator.rays import Views, exact_views
+from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene
+from pipeline.simulator.scene_light import Looker
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
+Way = tuple[float, float]
 
 LINE_SAMPLES = 64  # at most, of a line, evenly from end to end
 _PATCH = np.stack(np.meshgrid(np.arange(-2.0, 3.0), np.arange(-1.0, 2.0)), axis=-1).reshape(-1, 2)  # along, scan [px]
@@ -23,7 +26,7 @@ PATCH_VIEWS = len(_PATCH)
 
 
 @dataclass(frozen=True)
-class Views:
+class SampleViews:
     """Samples at any place of any sweep, (view,) each: the line's centre and the camera's slope."""
 
     strip_px: Floats
@@ -31,36 +34,47 @@ class Views:
     slope: Floats
     along_y: NDArray[np.bool_]
 
-    def chosen(self, which: NDArray[np.intp]) -> Views:
+    def chosen(self, which: NDArray[np.intp]) -> SampleViews:
         """Some of the views."""
-        return Views(*(getattr(self, one.name)[which] for one in fields(self)))
+        return SampleViews(*(getattr(self, one.name)[which] for one in fields(self)))
 
 
-def joined(parts: list[Views]) -> Views:
+def joined(parts: list[SampleViews]) -> SampleViews:
     """Put views one after the other."""
-    return Views(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(Views)))
+    return SampleViews(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(SampleViews)))
 
 
 def light_seen(
     scene: Scene,
     camera: LineCamera,
-    views: Views,
+    views: SampleViews,
     footprint: Footprint,
-    turned: tuple[float, float] = (0.0, 0.0),
-    moved: tuple[float, float] = (0.0, 0.0),
+    shifts: Sequence[tuple[Way, Way]] = (((0.0, 0.0), (0.0, 0.0)),),
 ) -> Light:
-    """Light (view, band) through a footprint of one kernel, rays turned and points moved (along, scan) [px]."""
+    """Light (shift, view, band) through a footprint, with rays turned and points moved (along, scan) by shifts [px]."""
+    exposures, ifov = camera.exposure_ms / DEFAULT_EXPOSURE_MS, camera.ifov_rad
+    light = np.empty((len(shifts), len(views.slope), len(scene.wavelength_nm)), np.float32)
+    for along_y in (False, True):
+        which = np.flatnonzero(views.along_y == along_y)
+        if not which.size:
+            continue
+        some = views.chosen(which)
+        looker = Looker(footprint, rays_of(some, camera))
+        size = scene.shape if along_y else scene.shape[::-1]
+        for number, (turned, moved) in enumerate(shifts):
+            seen = rays_of(some, camera, turned)
+            along, scan = seen.along / ifov + moved[0], seen.scan / ifov + moved[1]
+            placed = replace(seen, along=along + (size[0] - 1) / 2, scan=scan + (size[1] - 1) / 2)
+            light[number, which] = looker.look(scene, [placed], along_y=along_y, exposures=exposures)
+    return light
+
+
+def rays_of(views: SampleViews, camera: LineCamera, turned: Way = (0.0, 0.0)) -> Views:
+    """Give the middle rays of samples, moved by (along, across) px of the camera, in tangents."""
     ifov = camera.ifov_rad
     tangents = np.stack([views.strip_px, views.scan_px], axis=-1) * ifov
     normal = direction_to_normal(scene_to_direction(tangents))
-    gathered = np.zeros((), np.float32)
-    for across, along, weight in zip(footprint.across, footprint.along, footprint.weight[:, 0], strict=True):
-        xi, eta = exact_tangents(normal, (across + turned[1]) * ifov, views.slope + (along + turned[0]) * ifov)
-        line, scan = xi / ifov + moved[0], eta / ifov + moved[1]
-        y, x = np.where(views.along_y, line, scan), np.where(views.along_y, scan, line)
-        seen = scene.sample(y + (scene.shape[0] - 1) / 2, x + (scene.shape[1] - 1) / 2) * np.float32(weight)
-        gathered = gathered + seen
-    return to_bands(gathered, scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS))
+    return exact_views(normal, turned[1] * ifov, views.slope + turned[0] * ifov)
 
 
 def line_samples(camera: LineCamera) -> int:
@@ -68,7 +82,7 @@ def line_samples(camera: LineCamera) -> int:
     return min(camera.samples, LINE_SAMPLES)
 
 
-def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> Views:
+def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> SampleViews:
     """Lines spread over all sweeps, the most oblique among them, of samples evenly from end to end."""
     numbers = [(sweep, number) for sweep in sweeps for number in {0, sweep.lines // 2, sweep.lines - 1}]
     numbers.sort(key=lambda one: -float(np.hypot(one[0].strip_px, one[0].line_px()[one[1]])))
@@ -80,7 +94,7 @@ def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> 
     samples = np.linspace(0, camera.samples - 1, line_samples(camera)).round().astype(np.intp)
     slopes = camera.pixel_slopes()[samples]
     count = len(samples)
-    return Views(
+    return SampleViews(
         np.repeat([sweep.strip_px for sweep, _ in kept], count).astype(np.float64),
         np.repeat([sweep.line_px()[number] for sweep, number in kept], count),
         np.tile(slopes, len(kept)),
@@ -88,7 +102,7 @@ def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> 
     )
 
 
-def views_of_places(places: Floats, scene: Scene, camera: LineCamera, sweeps: tuple[Sweep, ...]) -> Views:
+def views_of_places(places: Floats, scene: Scene, camera: LineCamera, sweeps: tuple[Sweep, ...]) -> SampleViews:
     """Patches around places, each as the finest sweep of each orientation sees it that reaches it."""
     centred = places - (np.array(scene.shape) - 1) / 2
     found = []
@@ -105,11 +119,11 @@ def views_of_places(places: Floats, scene: Scene, camera: LineCamera, sweeps: tu
     return joined(found)
 
 
-def _patches(sweep: Sweep, camera: LineCamera, line: Floats, sample: Floats) -> Views:
+def _patches(sweep: Sweep, camera: LineCamera, line: Floats, sample: Floats) -> SampleViews:
     """Views around continuous lines and samples of a sweep, moved to what it has."""
     samples = np.rint(sample[:, None] + _PATCH[:, 0]).clip(0, camera.samples - 1).astype(np.intp).ravel()
     lines = (line[:, None] + _PATCH[:, 1]).clip(0, sweep.lines - 1).ravel()
     count = len(samples)
     slopes = camera.pixel_slopes()[samples]
     turned = np.full(count, sweep.along == "y")
-    return Views(np.full(count, sweep.strip_px), sweep.start_px + lines, slopes, turned)
+    return SampleViews(np.full(count, sweep.strip_px), sweep.start_px + lines, slopes, turned)

@@ -10,18 +10,24 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
 from pipeline.scan import CostModel, Sweep
-from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.effects.slit import SLIT, slit_footprint
+from pipeline.simulator.effects.aberration import ABERRATION
+from pipeline.simulator.effects.defocus import DEFOCUS
+from pipeline.simulator.effects.diffraction import DIFFRACTION
+from pipeline.simulator.effects.effect import OFF, Moments
+from pipeline.simulator.effects.keystone import KEYSTONE
+from pipeline.simulator.effects.slit import SLIT, box_of, box_parts
+from pipeline.simulator.footprint import Footprint, fold
 from pipeline.simulator.probe import Probe, Unit
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene
 from pipeline.simulator.scouting import telling_places
 from pipeline.simulator.survey_looks import (
     PATCH_VIEWS,
-    Views,
+    SampleViews,
     joined,
     light_seen,
     line_samples,
+    rays_of,
     views_of_lines,
     views_of_places,
 )
@@ -31,8 +37,8 @@ Light = NDArray[np.float32]
 
 MOST_VALUES = 1_000_000  # samples times bands; each is seen a few times over, a fraction of a px apart
 MOST_SAMPLES = 12_000
-FINEST_SAMPLES = 500  # at which variants of the slit are held against the finest
-_LOOK = "4x2"  # variant of the slit that is looked through
+FINEST_SAMPLES = 2000  # at which variants of the slit are held against the finest
+_LOOK = "2x1"  # variant of the slit that is looked through
 _ROUNDING = 2e-6  # of the level: less is rounding of float32
 _NEAR, _FAR = 0.25, 0.5  # px by which the footprint is shifted
 
@@ -66,30 +72,45 @@ def probe_scene(scene: Scene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "s
     most = (room - room // 3) // (PATCH_VIEWS * len({sweep.along for sweep in taken}))
     places = telling_places(scene, camera, taken, max(most, 1))
     views = joined([lines, views_of_places(places, scene, camera, taken)])
-    footprint = slit_footprint(_LOOK, camera.slit_px)
-    seen = np.stack([light_seen(scene, camera, views, footprint, *shift) for shift in _shifts()])
+    seen = light_seen(scene, camera, views, _footprint(_LOOK, rig, bands), _shifts())
     means = seen[0, : len(lines.slope)].reshape(-1, line_samples(camera) * bands).mean(axis=1)
     errors = _slit_errors(scene, rig, views, seen[0], unit)
     return replace(_summed_up(scene, rig, taken, unit, seen, means), slit_errors=errors)
 
 
-def _slit_errors(scene: Scene, rig: Rig, views: Views, level: Light, unit: Unit) -> dict[str, float]:
-    """Greatest change by every variant of the slit, over the unit: off, or against the finest.
+def _slit_errors(scene: Scene, rig: Rig, views: SampleViews, level: Light, unit: Unit) -> dict[str, float]:
+    """Greatest change by every variant of the slit, over the unit: off, or against the finest; with blurs and without.
 
-    The finest is looked through where a ray's light differs most from the footprint's.
+    Off is measured everywhere, all others where the middle ray's light differs most from the footprint's, in half of
+    the places weighed by how far the footprint lies turned.
     """
-    camera, scale = rig.camera, _unit(level, rig, unit)
-    ray = light_seen(scene, camera, views, slit_footprint(OFF, camera.slit_px))
-    off = (_above(np.abs(ray - level), level) / scale).max(axis=1)
-    rough = np.argsort(-off)[:FINEST_SAMPLES]
-    exact, *others = (slit_footprint(variant, camera.slit_px) for variant in SLIT.variants)
-    finest = light_seen(scene, camera, views.chosen(rough), exact)
-    scale = _unit(finest, rig, unit)
-    errors = {OFF: float(off.max(initial=0.0))}
-    for variant, footprint in zip(SLIT.variants[1:], others, strict=True):
-        change = np.abs(light_seen(scene, camera, views.chosen(rough), footprint) - finest)
-        errors[variant] = float((_above(change, finest) / scale).max(initial=0.0))
+    camera, bands, nm = rig.camera, level.shape[1], scene.wavelength_nm
+    ray = light_seen(scene, camera, views, _footprint(OFF, rig, bands))[0]
+    off = (_above(np.abs(ray - level), level) / _unit(level, rig, unit)).max(axis=1)
+    turned = rays_of(views, camera)
+    ranks = [np.argsort(-worth)[: FINEST_SAMPLES // 2] for worth in (off, off * np.abs(turned.along_turn))]
+    rough = views.chosen(np.unique(np.concatenate(ranks)))
+    errors = {OFF: float(off.max(initial=0.0)), **dict.fromkeys(SLIT.variants[1:], 0.0)}
+    for moments in (None, _blurs(rig, nm)):
+        finest = light_seen(scene, camera, rough, _footprint(SLIT.variants[0], rig, bands, moments))[0]
+        for variant in errors:
+            other = light_seen(scene, camera, rough, _footprint(variant, rig, bands, moments))[0]
+            change = _above(np.abs(other - finest), finest) / _unit(finest, rig, unit)
+            errors[variant] = max(errors[variant], float(change.max(initial=0.0)))
     return errors
+
+
+def _footprint(variant: str, rig: Rig, bands: int, moments: Moments | None = None) -> Footprint:
+    shift, variance = (np.zeros((2, bands)),) * 2 if moments is None else (moments.shift, moments.variance)
+    return fold(box_of(variant, rig), box_parts(variant), 1, shift, variance)
+
+
+def _blurs(rig: Rig, wavelength_nm: Floats) -> Moments:
+    """All that the rig's optics blur and shift, with the mirror at rest."""
+    blurs = (DIFFRACTION, DEFOCUS, ABERRATION, KEYSTONE)
+    found = [blur.moments(rig, wavelength_nm, blur.variants[0]) for blur in blurs]
+    none = np.zeros((2, len(wavelength_nm)))
+    return Moments(sum((one.shift for one in found), none), sum((one.variance for one in found), none))
 
 
 def _unit(light: Light, rig: Rig, unit: Unit) -> Light:

@@ -65,7 +65,7 @@ def test_ls_shows_runs_and_stores(surveyed: Path, capsys: pytest.CaptureFixture[
     out = capsys.readouterr().out
     assert first["id"] in out
     assert content["stages"]["rectify"][0]["key"] in out
-    assert "2 runs, 13 stores" in out
+    assert "2 runs, 14 stores" in out
 
 
 def test_of_many_stores_the_newest_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,6 +20,7 @@ from pipeline.grid import SceneGrid
 from pipeline.rectify.region import mosaic_rows
 from pipeline.simulator.farm import FARM_LAW, farm_scene
 from pipeline.simulator.farm_fields import CLASSES
+from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 PATH = Path(str(resources.files("models") / "shipped" / SHIPPED))
@@ -37,7 +38,7 @@ def controls(weights: Weights) -> Controls:
     """Placements judged on a farm that training has not seen, through the exact rays of the simulated rig."""
     camera, scene = LineCamera(), farm_scene(41, shape=SHAPE)
     grid = SceneGrid(*SHAPE, weights.config.patch, weights.config.factor)
-    source = SimulatedSource(scene, camera, 41)
+    source = SimulatedSource(scene, Rig(camera), 41)
     coarse = [SimulatedSweep(source, sweep) for sweep in coarse_sweeps(grid, camera, "x")]
     mosaic = np.concatenate([rows for _, rows, _ in mosaic_rows(coarse, camera, grid, rows=64)])
     columns = columns_of_all_seats(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Bound, Light
 from pipeline.simulator.effects.sight import reach_m, sample_distances, spoken_reach
+from pipeline.simulator.gain_range import GainRange
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -34,6 +35,7 @@ OXYGEN = np.array([
     (667.6, 0.0), (690.0, 0.15), (710.0, 0.0), (757.5, 0.0), (762.5, 4.0), (767.5, 0.35), (780.0, 0.0),
 ])  # fmt: skip
 AIR_MASS_M = 8434.0  # air at the ground that holds as much as the whole atmosphere above it: standard, 15 deg C
+_LOOKS = 9  # distances at which the spectrum's course is taken for the bounds of others: it is smooth
 _KNOTS = 65  # distances, evenly in the logarithm, between which the transmission is taken as straight in it
 _QUADRATURE = np.linspace(-2.0, 2.0, 33)  # over a band, in standard deviations of its Gaussian
 
@@ -63,6 +65,14 @@ class Absorption:
         where = f" at {probe.wavelength_nm[int(share.argmax())]:.0f} nm" if share.size else ""
         why = f"oxygen and water vapour {verb} at most {share.max(initial=0.0):.2%}{where} over {spoken_reach(reach)}"
         return Bound(probe.scaled(share), why)
+
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        """Give the transmission between the nearest and the farthest distance."""
+        reach, nm = reach_m(rig), np.asarray(probe.wavelength_nm, np.float64)
+        if reach is None:
+            return GainRange.between(1.0, 1.0, len(nm))
+        passed = transmission(np.geomspace(*reach, _LOOKS), rig, nm)
+        return GainRange.of(passed, nm, uneven=float(passed.max(initial=0.0) - passed.min(initial=1.0)))
 
     def gain(self, block: Block, variant: str) -> Light:
         """Give (line, sample, band), or (1, 1, band) where all is at one distance."""

@@ -12,6 +12,7 @@ from pipeline.camera import LineCamera
 from pipeline.scan import Sweep, points_of_scan
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Bound, Light
+from pipeline.simulator.gain_range import GainRange
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -46,6 +47,16 @@ class Brdf:
         peak = f" and a hot spot of {hot:.2g}" if hot else ""
         why = f"reflectance changes by at most {share:.2%}: {slope:.2g}/rad up to {np.rad2deg(angle):.2f} deg{peak}"
         return Bound(probe.scaled(share), why)
+
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        """Give the slope's ends, the hot spot on the upper one."""
+        slope, bands = rig.sky.brdf_per_rad, len(probe.wavelength_nm)
+        if not slope and not rig.sky.hot_spot:
+            return GainRange.between(1.0, 1.0, bands)
+        angle, phase = _extremes(probe.sweeps, rig.camera)
+        least = max(1 - slope * angle, 0.0)
+        greatest = 1 + slope * angle + rig.sky.hot_spot * float(np.exp(-phase / HOT_SPOT_RAD))
+        return GainRange.between(least, greatest, bands, uneven=greatest - least)
 
     def gain(self, block: Block, variant: str) -> Light:
         """Give (line, sample, 1)."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.scan import points_of_scan
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Bound, Light
+from pipeline.simulator.gain_range import GainRange
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.streams import sweep_stream
@@ -41,6 +42,11 @@ class Cloud:
             return Bound(0.0, "every sample at its own place")
         why = f"a shadow takes {sky.cloud_share:.0%} of the light and moves {sky.cloud_px_per_s:g} px/s over the scene"
         return Bound(probe.scaled(sky.cloud_share), why)
+
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        """Give 1 less a cloud's share, to 1."""
+        share = rig.sky.cloud_share
+        return GainRange.between(1 - share, 1.0, len(probe.wavelength_nm), uneven=share)
 
     def gain(self, block: Block, variant: str) -> Light:
         """Give (line, sample, 1)."""

@@ -19,10 +19,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Defocus:
-    """Blur by the distance from the plane of focus.
-
-    The kernel is that of ``air.distance_m``; the bound of leaving it out covers the whole depth of the scene.
-    """
+    """Blur by the distance from the plane of focus: that of ``air.distance_m`` for all of the scene."""
 
     name = "defocus"
     variants = ("disc",)
@@ -33,13 +30,12 @@ class Defocus:
         return even(_variance(rig, rig.air.distance_m, normal), len(wavelength_nm))
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
-        """Bound the error of no blur over all distances of the scene and all positions of the sweeps."""
+        """Bound the error of no blur over all positions of the sweeps."""
         if variant != OFF:
             return Bound(0.0, "exact")
         if rig.distances_m is None:
             return Bound(0.0, "the scene has no distance")
-        distances, normals = (rig.air.distance_m, *rig.distances_m), normals_met(probe, rig)
-        worst = np.max([_variance(rig, distance, normal) for distance in distances for normal in normals], axis=0)
+        worst = np.max([_variance(rig, rig.air.distance_m, normal) for normal in normals_met(probe, rig)], axis=0)
         cause = f"defocus at {rig.air.distance_m:g} m, focused at {rig.optics.focus_m:g} m"
         return blurred_bound(probe, even(worst, len(probe.wavelength_nm)).variance, cause)
 

@@ -16,7 +16,6 @@ from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import j0, j1
 
 from pipeline.simulator.effects.blurring import blurred_bound
 from pipeline.simulator.effects.effect import OFF, Bound, Moments
@@ -65,6 +64,8 @@ def diffraction_fwhm(rig: Rig, wavelength_nm: Floats, normal: Floats | None = No
 
 def airy_energy(v: float) -> float:
     """Give the share of the light of an Airy pattern within v = pi D theta / lambda (Rayleigh): 1 - J0^2 - J1^2."""
+    from scipy.special import j0, j1
+
     return float(1 - j0(v) ** 2 - j1(v) ** 2)
 
 
@@ -73,6 +74,8 @@ def airy_variance(v: float) -> float:
 
     The integral of t J1(t)^2, which is v^2 (J0^2 + J1^2) / 2 - v J0 J1, over the energy; towards 0 it is v^2 / 4.
     """
+    from scipy.special import j0, j1
+
     if v < 1e-2:
         return v * v / 4
     inside = v * v / 2 * (j0(v) ** 2 + j1(v) ** 2) - v * j0(v) * j1(v)

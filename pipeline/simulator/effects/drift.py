@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline.simulator.block import Block
 from pipeline.simulator.daylight import knots_within, relative_daylight, sun_elevation_deg
 from pipeline.simulator.effects.effect import OFF, Bound, Light
+from pipeline.simulator.gain_range import GainRange
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig, Sky
 
@@ -54,6 +55,10 @@ class Drift:
         verb = "changes" if variant == OFF else "at this variant is wrong"
         return Bound(probe.scaled(worst), f"light {verb} by at most {100 * worst.max(initial=0.0):.3g} % {course}")
 
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        """Give the daylight of the survey."""
+        return daylight_range(probe, rig)
+
     def gain(self, block: Block, variant: str) -> Light:
         """Give (line, 1, band), or (line, 1, 1) of the variants that take all bands as one."""
         sky = block.rig.sky
@@ -63,6 +68,16 @@ class Drift:
 
 
 DRIFT = Drift()
+
+
+def daylight_range(probe: Probe, rig: Rig) -> GainRange:
+    """Give the daylight of the survey over that at its start; 1 without a time of day."""
+    nm = np.asarray(probe.wavelength_nm, np.float64)
+    if rig.sky.started is None:
+        return GainRange.between(1.0, 1.0, len(nm))
+    times = knots_within(rig.sky, probe.seconds + rig.camera.frame_ms * 1e-3)
+    light = relative_daylight(rig.sky, nm, times)
+    return GainRange.of(light, nm, uneven=float(np.ptp(light, axis=1).max(initial=0.0)))
 
 
 def greatest_daylight(probe: Probe, rig: Rig) -> float:

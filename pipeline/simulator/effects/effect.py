@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,14 @@ class Bound:
 
     value: float
     why: str
+
+
+class Merged(NamedTuple):
+    """What an effect costs beside a variant of another, with which it shares a draw. [ns]"""
+
+    other: str
+    variant: str
+    cost_ns: float
 
 
 class Effect(Protocol):

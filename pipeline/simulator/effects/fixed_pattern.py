@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.gain_range import GainRange
 from pipeline.simulator.noise import normal_deviates
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
@@ -35,6 +36,12 @@ class Prnu:
         off = np.abs(response_gain(rig, len(probe.wavelength_nm)) - 1).max(axis=0)
         return Bound(probe.scaled(off), f"gains differ by {share:.2%} (sd), {off.max():.2%} at most")
 
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        """Give the sensor's least and greatest gain."""
+        gains, bands = response_gain(rig, len(probe.wavelength_nm)), len(probe.wavelength_nm)
+        least, greatest = float(gains.min(initial=1.0)), float(gains.max(initial=1.0))
+        return GainRange.between(least, greatest, bands, uneven=greatest - least)
+
     def gain(self, block: Block, variant: str) -> Light:
         """Give the gain of each element, (1, sample, band)."""
         return response_gain(block.rig, len(block.wavelength_nm))[None, block.columns]
@@ -55,6 +62,12 @@ class Striping:
             return Bound(0.0, "exact" if variant != OFF else "all columns respond alike")
         off = float(np.abs(stripe_gain(rig) - 1).max())
         return Bound(probe.scaled(off), f"gains of columns differ by {share:.2%} (sd), {off:.2%} at most")
+
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        """Give the sensor's least and greatest gain."""
+        gains, bands = stripe_gain(rig), len(probe.wavelength_nm)
+        least, greatest = float(gains.min(initial=1.0)), float(gains.max(initial=1.0))
+        return GainRange.between(least, greatest, bands, uneven=greatest - least)
 
     def gain(self, block: Block, variant: str) -> Light:
         """Give the gain of each column, (1, sample, 1)."""

@@ -30,7 +30,7 @@ class Hysteresis:
 
     name = "hysteresis"
     variants = ("exact",)
-    cost_ns = MappingProxyType({"exact": 0.2})
+    cost_ns = MappingProxyType({"exact": 0.07})
 
     def aim(self, block: Block, variant: str) -> Floats:
         """Give the shift, (line, 1, 2) along the line and the scan. [px]"""
@@ -52,7 +52,7 @@ class ThermalDrift:
 
     name = "thermal-drift"
     variants = ("exact",)
-    cost_ns = MappingProxyType({"exact": 0.01})
+    cost_ns = MappingProxyType({"exact": 0.06})
 
     def aim(self, block: Block, variant: str) -> Floats:
         """Give the shift since the survey's start, (line, 1, 2) along the line and the scan. [px]"""

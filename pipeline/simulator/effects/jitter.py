@@ -31,7 +31,7 @@ class Jitter:
 
     name = "jitter"
     variants = ("exact",)
-    cost_ns = MappingProxyType({"exact": 0.3})
+    cost_ns = MappingProxyType({"exact": 0.15})
 
     def aim(self, block: Block, variant: str) -> Floats:
         """Give the shift, (line, 1, 2) along the line and the scan. [px]"""

@@ -10,7 +10,7 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -18,15 +18,17 @@ from numpy.typing import NDArray
 
 from pipeline.simulator.block import Block
 from pipeline.simulator.daylight import relative_daylight
-from pipeline.simulator.effects.drift import greatest_daylight
+from pipeline.simulator.effects.drift import daylight_range, greatest_daylight
 from pipeline.simulator.effects.effect import OFF, Bound, Light
 from pipeline.simulator.effects.sight import reach_m, sample_distances, spoken_reach
+from pipeline.simulator.gain_range import GainRange
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Air, Rig
 
 Floats = NDArray[np.float64]
 RANGE, UNIFORM = "range", "uniform"
 KOSCHMIEDER = 3.912  # -ln 0.02 [1]
+_LOOKS = 9  # distances at which the spectrum's course is taken for the bounds of others: it is smooth
 VISIBLE_NM = 550.0  # of the visibility
 ANGSTROM = 1.14  # exponent of a rural aerosol [2]
 RAYLEIGH_PER_KM = 0.043  # of air at sea level at 400 nm; as wavelength^-4
@@ -64,6 +66,26 @@ class PathRadiance:
         verb = "takes" if variant == OFF else "at one distance for all is wrong by"
         most = f"at most {lost.max(initial=0.0):.2%} of the light"
         return Bound(worst, f"air {verb} {most} and adds its own, over {spoken_reach(reach)}")
+
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        """Give the transmission between the nearest and the farthest distance, and the air's own light."""
+        reach, nm = reach_m(rig), np.asarray(probe.wavelength_nm, np.float64)
+        if reach is None:
+            return GainRange.between(1.0, 1.0, len(nm))
+        passed = np.exp(-np.geomspace(*reach, _LOOKS)[:, None] * extinction_per_m(rig.air, nm))
+        uneven = float(passed.max(initial=0.0) - passed.min(initial=1.0))
+        if probe.white_e is None:
+            return GainRange.of(passed, nm, uneven=uneven)
+        sun = daylight_range(probe, rig)
+        still = rig.air.airlight_share * probe.white_e * (1 - passed)
+        alone = GainRange.of(passed, nm, uneven=uneven, added_e=still)
+        most = sun.greatest.max(initial=1.0)
+        return replace(
+            alone,
+            added_e=alone.added_e * most,
+            added_steepest=alone.added_steepest * most + alone.added_e * sun.steepest,
+            added_bend=alone.added_bend * most + 2 * alone.added_steepest * sun.steepest + alone.added_e * sun.bend,
+        )
 
     def change(self, light: Light, block: Block, variant: str) -> Light:
         """Change the light in place."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.effects.vignetting import ahead, sweep_ends
+from pipeline.simulator.gain_range import GainRange
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -46,6 +47,12 @@ class Polarisation:
         least_deg, most_deg = np.degrees(incidence.min()), np.degrees(incidence.max())
         why = f"{100 * most:.2g} % of the light, at incidences of {least_deg:.1f} to {most_deg:.1f} deg"
         return Bound(probe.scaled(most), why)
+
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        """Give the factors of all sweeps, each the same along a line."""
+        factors = _factor(_incidence(sweep_ends(probe, rig.camera)), rig.optics.polarisation)
+        least, greatest = float(factors.min(initial=1.0)), float(factors.max(initial=1.0))
+        return GainRange.between(least, greatest, len(probe.wavelength_nm))
 
     def gain(self, block: Block, variant: str) -> Light:
         """Give the factor of each line, (line, 1, 1)."""

@@ -46,6 +46,7 @@ class Response:
     name = "response"
     variants = (EXACT,)
     cost_ns = MappingProxyType({EXACT: 2.2})
+    whole_line = True  # a product's rounding depends on how many samples it has: a line is made whole, then cut
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
         """Bound it by I'' v / 2, or by I' sqrt(v) where that is less; 0 where the scene's bands are as wide.

@@ -46,3 +46,10 @@ class Saturation:
 
 
 SATURATION = Saturation()
+
+
+def well_reached(rig: Rig, read_noise_e: float) -> bool:
+    """Whether a well overflows before the converter ends, 8 deviations of the read noise counted in."""
+    camera = rig.camera
+    end_e = (camera.full_scale_dn + 1 - camera.dark_dn) * camera.electrons_per_dn
+    return rig.detector.well_e < end_e + 8 * read_noise_e

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scan import shifted_position
+from pipeline.scan import Sweep
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Bound
-from pipeline.simulator.footprint import quadrature
+from pipeline.simulator.effects.lag import transient
+from pipeline.simulator.effects.line_ends import at_line_ends, end_gains
+from pipeline.simulator.effects.staircase import beside_plan
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -23,7 +24,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Smear:
-    """The positions held within an exposure. Off, the mirror stands at mid exposure."""
+    """The positions held within an exposure. Off, the mirror stands at mid exposure.
+
+    ``folded`` takes them into the footprint, as if all lines of an exposure lay as its middle one does.
+    """
 
     name = "smear"
     variants = (POSITIONS, FOLDED)
@@ -36,9 +40,13 @@ class Smear:
         if variant == POSITIONS or variance == 0:
             return Bound(0.0, "the mirror stands still while a line is exposed" if variance == 0 else "exact")
         if variant == FOLDED:
-            way, area = np.max([_apart(sweep.step, rig.camera.slit_px) for sweep in probe.sweeps], axis=0)
-            change = np.minimum(np.minimum(probe.slope[1] * way, probe.curvature[1] * area), probe.span)
-            return Bound(float(change.max(initial=0.0)), f"light lies {way:.2g} px beside its place, mean 0")
+            along, scan = _beside(probe.sweeps, rig)
+            way, area = np.abs(np.arange(most) - (most - 1) / 2).mean(), 2 * variance
+            by_scan = np.minimum(probe.slope[1] * way, probe.curvature[1] * area) * scan
+            course = at_line_ends(probe.sweeps, rig.camera, 0.0, _uneven_course(probe.sweeps, rig))
+            by_course = probe.slope[0] * course[0] + probe.slope[1] * course[1]
+            change = np.minimum(probe.slope[0] * way * along + by_scan + by_course, probe.span)
+            return Bound(float(change.max(initial=0.0)), f"lines of an exposure lie as one, {most} px")
         both = np.zeros(probe.slope.shape)
         both[1] = variance
         return Bound(probe.blurred(both), f"the mirror moves {most} px in an exposure")
@@ -47,40 +55,38 @@ class Smear:
 SMEAR = Smear()
 
 
+def _uneven_course(sweeps: tuple[Sweep, ...], rig: Rig) -> float:
+    """Greatest mean way of held positions from where the mirror's mean in the exposure would have them. [px]"""
+    worst = 0.0
+    for sweep in {(one.lines, one.step): one for one in sweeps if one.lines and one.step > 1}.values():
+        numbers = np.arange(sweep.lines)
+        ways = transient(rig, sweep, numbers) + beside_plan(rig.mirror.positions_per_line, sweep.step, numbers)
+        worst = max(worst, float(np.abs(ways - ways.mean(axis=1, keepdims=True)).mean(axis=1).max()))
+    return worst
+
+
 def held_variance(positions: int) -> float:
     """Variance of positions 1 px apart [px^2]."""
     return (positions**2 - 1) / 12
 
 
-def smeared_positions(block: Block, variant: str) -> tuple[Floats, Floats]:
-    """Give the mirror positions (line, step, 2) that stand for an exposure, and (step,) weights of sum 1."""
-    count = block.sweep.step
-    if variant == OFF or count == 1:
-        return block.middle[:, None], np.ones(1)
-    if variant == POSITIONS:
-        return block.positions, np.full(count, 1 / count)
-    offset, weight = fewer_positions(count, block.rig.camera.slit_px)
-    shift = np.stack([np.zeros_like(offset), offset], axis=-1)
-    return shifted_position(block.middle[:, None], shift, block.rig.camera), weight
+def smeared_positions(block: Block, variant: str) -> Floats:
+    """Give the mirror positions (line, step, 2) at which a footprint stands in an exposure."""
+    if variant == POSITIONS and block.sweep.step > 1:
+        return block.positions
+    return block.middle[:, None]
 
 
-def fewer_positions(count: int, slit_px: float) -> tuple[Floats, Floats]:
-    """Give offsets from mid exposure [px] and weights of Gauss's quadrature for ``count`` positions 1 px apart.
-
-    They lie a slit's width apart at the ends and less within, so that no part of the scene falls between.
-    """
-    place: Floats = np.arange(count, dtype=np.float64) - (count - 1) / 2
-    return quadrature(place, np.full(count, 1 / count), min(count, math.ceil(count / max(slit_px, 1.0)) + 1))
+def folded_positions(sweep: Sweep, variant: str) -> int:
+    """Give how many held positions the footprint itself holds, 1 px apart along the scan."""
+    return sweep.step if variant == FOLDED else 1
 
 
-def _apart(count: int, slit_px: float) -> tuple[float, float]:
-    """Give what slope [px] and curvature [px^2] are multiplied by to bound the error of fewer positions.
-
-    The integrals of the size of the first and second antiderivative of the difference of both kernels (Peano).
-    """
-    offset, weight = fewer_positions(count, slit_px)
-    exact = np.arange(count, dtype=np.float64) - (count - 1) / 2
-    grid = np.linspace(-count / 2, count / 2, 200 * count + 1)
-    less = (grid[:, None] >= offset) @ weight - (grid[:, None] >= exact).mean(axis=1)
-    step = float(grid[1] - grid[0])
-    return float(np.abs(less).sum() * step), float(np.abs(np.cumsum(less)).sum() * step**2)
+def _beside(sweeps: tuple[Sweep, ...], rig: Rig) -> tuple[float, float]:
+    """Greatest way beside its place, along the line and the scan, of any point per px that the line's centre moves."""
+    found = np.zeros(2)
+    for sweep in sweeps:
+        if sweep.lines and sweep.step > 1:
+            moved = end_gains(sweep, rig.camera)[..., 1] - [0.0, 1.0]
+            found = np.maximum(found, np.abs(moved).max(axis=(0, 1)))
+    return float(found[0]), float(found[1])

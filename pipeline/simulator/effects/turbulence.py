@@ -27,7 +27,7 @@ class Turbulence:
 
     name = "turbulence"
     variants = ("jitter",)
-    cost_ns = MappingProxyType({"jitter": 0.15})
+    cost_ns = MappingProxyType({"jitter": 0.13})
 
     def aim(self, block: Block, variant: str) -> Floats:
         """Give how far each line looks beside its plan, (line, 1, 2) along the line and the scan. [px]"""

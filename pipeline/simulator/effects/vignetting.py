@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.gain_range import GainRange
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -48,6 +49,12 @@ class Vignetting:
         shares = np.sqrt(1 - ends)  # |n_z|^2 = (1 - o_z) / 2
         why = f"the mirror passes {shares.min():.3f} to {shares.max():.3f} of its light at rest"
         return Bound(probe.scaled(float(np.abs(shares - 1).max())), why)
+
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        """Give the factors of all sweeps, each the same along a line."""
+        shares = np.sqrt(1 - sweep_ends(probe, rig.camera))
+        least, greatest = float(shares.min(initial=1.0)), float(shares.max(initial=1.0))
+        return GainRange.between(least, greatest, len(probe.wavelength_nm))
 
     def gain(self, block: Block, variant: str) -> Light:
         """Give the factor of each line, (line, 1, 1)."""

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError
 from pipeline.simulator.choice import Decision, decide, named_effects
-from pipeline.simulator.options import SAFETY, list_options
+from pipeline.simulator.effects.cloud import CLOUD
+from pipeline.simulator.effects.read_noise import READ_NOISE
+from pipeline.simulator.effects.shot import SHOT
+from pipeline.simulator.options import LEAST_COST_NS, SAFETY, list_options
+from pipeline.simulator.rig_model import Rig, Sky
 from tests.pipeline.simulator.made_up_effects import RIG, Brightening, MadeUp, Shift, even_probe
 
 PROBE = even_probe()
@@ -170,10 +176,26 @@ def test_a_variant_is_taken_where_leaving_out_is_too_much():
 
 
 def test_gains_multiply_the_errors_of_others_but_not_their_own():
-    """Light that is brightened by a quarter carries a shift's error a quarter higher."""
+    """Light that is brightened by a quarter carries a shift's error a quarter higher; a unit of DN follows no light."""
     effects = [MadeUp("read", 0.1), Brightening("vignetting", 0.25, share=0.25), Brightening("cloud", 0.5, share=-0.5)]
-    errors = [menu.off.error for menu in list_options(PROBE, RIG, effects)]
+    errors = [menu.off.error for menu in list_options(replace(PROBE, unit="dn"), RIG, effects)]
     assert errors == pytest.approx([0.1 * SAFETY, 0.25 * 1.5 * SAFETY, 0.5 * 1.25 * SAFETY])
+
+
+def test_a_gain_that_only_darkens_does_not_multiply_errors():
+    """A shadow states its own range; what it takes, left out, counts by the smaller noise of the shadow."""
+    rig = Rig(sky=Sky(cloud_share=0.5))
+    slope = even_probe(slope=np.ones((2, 1)), brightest_e=1e4, darkest_e=1e4)
+    shift, cloud = (menu.off.error for menu in list_options(slope, rig, [Shift("shift", 0.1), CLOUD]))
+    assert shift == pytest.approx(0.1 * SAFETY)
+    assert cloud == pytest.approx(0.5 * SAFETY * math.sqrt((1e4 + 402.083) / (5e3 + 402.083)), rel=1e-6)
+
+
+def test_a_draw_that_two_share_is_paid_once():
+    """Read noise costs nothing in the cheap draw of the shot noise, and its own price beside the exact one."""
+    decision = decide(PROBE, RIG, [SHOT, READ_NOISE], 1e-3)
+    assert decision.cost_ns == pytest.approx(SHOT.cost_ns["gaussian"] + LEAST_COST_NS)
+    assert decision.exact_cost_ns == pytest.approx(SHOT.cost_ns["exact"] + READ_NOISE.cost_ns["exact"])
 
 
 def test_free_effects_go_last():

@@ -1,4 +1,4 @@
-"""Footprints: moments of what is folded, positive weights of sum 1, and kernels parted without loss."""
+"""Footprints: few kernels stand for those of all bands, their moments among the bands', one where none differ."""
 
 from __future__ import annotations
 
@@ -7,87 +7,75 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.simulator.footprint import AxisKernel, Footprint, fold, quadrature
+from pipeline.simulator.footprint import NEGLIGIBLE, Footprint, fold
+from pipeline.simulator.tap_tables import box_weight
+
+PLAIN = ((2.7, 1.0), (1, 1), 1)
 
 
-def moment(footprint: Footprint, axis: int, order: int) -> np.ndarray:
-    """Moment (band,) of the rays, axis 0 along and 1 across."""
-    place = (footprint.along, footprint.across)[axis]
-    return (place[:, None] ** order * footprint.weight).sum(axis=0)
+def folded(shift: np.ndarray, variance: np.ndarray) -> Footprint:
+    """The usual slit with blurs."""
+    return fold(*PLAIN, shift, variance)
 
 
-@settings(max_examples=40, deadline=None)
+def transfer(width: float, shift: np.ndarray, variance: np.ndarray, wave: float) -> np.ndarray:
+    """What a box and Gaussians leave of a wave, with its phase; wave in turns per px."""
+    return np.sinc(width * wave) * np.exp(-2 * np.pi**2 * variance * wave**2 - 2j * np.pi * shift * wave)
+
+
+def test_bands_alike_have_one_kernel() -> None:
+    """Equal moments need one kernel, and it has exactly those."""
+    found = folded(np.full((2, 9), 0.1), np.full((2, 9), 0.3))
+    assert found.kernels == 1
+    np.testing.assert_allclose(np.concatenate([found.shift, found.variance])[:, 0], [0.1, 0.1, 0.3, 0.3])
+    np.testing.assert_array_equal(found.mixing, 1.0)
+
+
+@pytest.mark.parametrize("bands", [2, 3])
+def test_few_bands_are_their_own_kernels(bands: int) -> None:
+    """As many kernels as bands at most; each band is then one of them, and exact."""
+    way = np.linspace(-1, 1, bands)
+    found = folded(np.stack([way, 0 * way]), np.stack([way + 2, way + 2]))
+    assert found.kernels == bands
+    np.testing.assert_allclose(found.shift @ found.mixing, [way, 0 * way], atol=1e-12)
+
+
+@settings(max_examples=15, deadline=None)
 @given(
-    box=st.floats(0, 6),
-    blur=st.floats(0, 1.5),
-    spread=st.floats(0, 1),
-    shift=st.floats(-2, 2),
-    nodes=st.tuples(st.integers(1, 9), st.integers(1, 6)),
+    blur=st.floats(0.1, 1),
+    spread=st.floats(0, 0.9),
+    keystone=st.floats(0, 0.5),
+    wave=st.tuples(st.floats(0, 0.5), st.floats(0, 0.5)),
 )
-def test_moments_of_box_and_blurs_add(
-    box: float, blur: float, spread: float, shift: float, nodes: tuple[int, int]
+def test_every_band_passes_waves_as_its_own_kernel(
+    blur: float, spread: float, keystone: float, wave: tuple[float, float]
 ) -> None:
-    """Every band has the shift of its blurs, and the variance of box and blurs together."""
-    bands = np.linspace(1 - spread, 1, 4)
-    variance = blur**2 * np.stack([bands, 2 * bands])
-    way = shift * np.stack([bands, -bands])
-    found = fold((box, 1.0), nodes, way, variance)
-    np.testing.assert_allclose(found.weight.sum(axis=0), 1, atol=1e-9)
-    for axis, width in ((0, 1.0), (1, box)):
-        np.testing.assert_allclose(moment(found, axis, 1), way[axis], atol=1e-8)
-        if len(set((found.along, found.across)[axis].round(9))) > 2:
-            total = width**2 / 12 + variance[axis] + way[axis] ** 2
-            np.testing.assert_allclose(moment(found, axis, 2), total, rtol=1e-7, atol=1e-7)
+    """Of 60 bands each passes any wave as its box, Gaussian and shift do, but for what is negligible."""
+    grown = np.linspace(1 - spread, 1, 60)
+    variance = blur**2 * np.stack([grown**2, 2 * grown**2])
+    shift = np.stack([keystone * (grown - grown.mean()), np.zeros(60)])
+    found = folded(shift, variance)
+    wanted = transfer(1.0, shift[0], variance[0], wave[0]) * transfer(2.7, shift[1], variance[1], wave[1])
+    kernels = transfer(1.0, found.shift[0], found.variance[0], wave[0]) * transfer(
+        2.7, found.shift[1], found.variance[1], wave[1]
+    )
+    assert found.kernels <= 12
+    np.testing.assert_allclose(found.mixing.sum(axis=0), 1, atol=1e-12)
+    assert np.abs(kernels @ found.mixing - wanted).max() <= 2 * NEGLIGIBLE
 
 
-def test_boxes_alone_give_legendre_nodes() -> None:
-    """Without a blur the rays are those of Gauss and Legendre, the same in all bands."""
-    found = fold((2.7, 1.0), (4, 2), np.zeros((2, 3)), np.zeros((2, 3)))
-    node, weight = np.polynomial.legendre.leggauss(4)
-    np.testing.assert_allclose(found.across[::2], node * 1.35, atol=1e-14)
-    np.testing.assert_allclose(found.along[:2], np.array([-0.5, 0.5]) / np.sqrt(3), atol=1e-14)
-    np.testing.assert_allclose(found.weight, np.repeat(np.repeat(weight / 4, 2)[:, None], 3, axis=1), atol=1e-14)
+def test_kernels_misplace_little_of_the_light() -> None:
+    """The usual diffraction and keystone take at most four kernels, whose weights do not run away."""
+    nm = np.linspace(0.4, 1.0, 270)
+    variance = np.stack([0.06 + 0.14 * nm**2, 0.06 + 0.28 * nm**2])
+    shift = np.stack([np.linspace(-0.075, 0.075, 270), np.zeros(270)])
+    found = folded(shift, variance)
+    assert 1 < found.kernels <= 4
+    assert np.abs(found.mixing).sum(axis=0).max() < 2.5
 
 
-def test_a_blur_alone_gives_hermite_nodes() -> None:
-    """Without a box three rays are those of Gauss and Hermite: 0 and sqrt(3) sd, weights 2/3 and 1/6."""
-    node, weight = AxisKernel(0.0, np.zeros(2), np.full(2, 4.0)).nodes(3)
-    np.testing.assert_allclose(node, 2 * np.sqrt(3) * np.array([-1, 0, 1]), atol=1e-12)
-    np.testing.assert_allclose(weight[:, 1], [1 / 6, 2 / 3, 1 / 6], atol=1e-12)
-
-
-@pytest.mark.parametrize("count", [1, 2, 5])
-def test_few_points_are_their_own_quadrature(count: int) -> None:
-    """As many nodes as points, or more, give the points back."""
-    place = np.arange(count) * 1.5 - 2
-    node, weight = quadrature(place, np.full(count, 1 / count), 8)
-    np.testing.assert_allclose(node, place, atol=1e-9)
-    np.testing.assert_allclose(weight, 1 / count, atol=1e-9)
-
-
-def test_a_slit_of_no_width_is_one_ray() -> None:
-    """A zero-width slit without blur takes one ray across."""
-    found = fold((0.0, 1.0), (4, 2), np.zeros((2, 1)), np.zeros((2, 1)))
-    np.testing.assert_array_equal(found.across, 0.0)
-    assert len(found.across) == 2
-
-
-def test_one_kernel_is_exact_to_the_double_degree() -> None:
-    """Five rays integrate the ninth degree over box and Gaussian: their eighth moment."""
-    variance = np.full(3, 0.3)
-    node, weight = AxisKernel(2.0, np.zeros(3), variance).nodes(5)
-    gauss, share = np.polynomial.hermite_e.hermegauss(20)
-    box = np.linspace(-1, 1, 20001)
-    wanted = np.mean((box[:, None] + gauss * np.sqrt(0.3)) ** 8 @ (share / share.sum()))
-    assert (node**8 @ weight)[1] == pytest.approx(wanted, rel=2e-4)
-
-
-def test_kernels_hold_all_bands_with_few_parts() -> None:
-    """Seventy bands with a blur of their own part into a few kernels that give the weights back."""
-    variance = np.linspace(0.02, 0.2, 70)[None] * np.array([[1.0], [2.0]])
-    shift = np.stack([np.linspace(-0.1, 0.1, 70), np.zeros(70)])
-    found = fold((2.7, 1.0), (5, 3), shift, variance)
-    rays, bands = found.kernels()
-    assert rays.shape[1] < 10
-    np.testing.assert_allclose(rays @ bands, found.weight, atol=3e-5)
-    assert fold((2.7, 1.0), (5, 3), np.zeros((2, 70)), np.zeros((2, 70))).kernels()[1].shape == (1, 70)
+def test_no_box_and_no_blur_is_catmull_rom() -> None:
+    """A zero-width slit without blur is a point interpolated."""
+    found = fold((0.0, 0.0), (1, 1), 1, np.zeros((2, 5)), np.zeros((2, 5)))
+    assert (found.kernels, found.variance.max()) == (1, 0)
+    np.testing.assert_allclose(box_weight(np.array([0.0, 0.5, 1.0, 1.5, 2.0]), 0.0), [1, 0.5625, 0, -0.0625, 0])

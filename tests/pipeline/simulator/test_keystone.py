@@ -54,7 +54,7 @@ def test_long_wavelengths_see_further_along_the_line():
         "ramp", "ramp", Raster.of(planes), Once.of(Light(electrons, electrons[0])), np.ones(3, np.float32), NM
     )
     block = Block(rig_of(0.5), SWEEP, range(10, 13), NM, scene.shape, samples=range(300, 340))
-    plain = {SLIT: "4x2"}
+    plain = {SLIT: "3x1"}
     beside = expected_light(scene, block, {KEYSTONE: "linear", **plain}) - expected_light(scene, block, plain)
     assert beside[..., 0] == pytest.approx(-25, abs=0.05)
     assert beside[..., 1] == pytest.approx(0, abs=0.05)

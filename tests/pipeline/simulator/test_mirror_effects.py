@@ -34,7 +34,7 @@ AIR = Air(distance_m=30.0, relief="step", nearest_m=3.0, wind_amplitude_m=0.005,
 RIG = Rig(camera=CAMERA, mirror=MOTION, air=AIR)
 STRIP = Sweep("strip", "fine", "x", 3.0, -25.0, 40)
 ACROSS = replace(STRIP, along="y")
-PLAIN: dict[Any, str] = {ROTATION: "rays", SLIT: "4x2"}
+PLAIN: dict[Any, str] = {ROTATION: "rays", SLIT: "3x1"}
 SLOPE = (8.0, 13.0)  # along x and along y [e-/px]
 MOVERS = [STAIRCASE, LAG, JITTER, HYSTERESIS, THERMAL_DRIFT, PARALLAX, WIND]
 

@@ -44,7 +44,7 @@ def waves(period: float) -> RasterScene:
 def light_of(scene: RasterScene, lines: range, chosen: dict[Any, str], samples: range | None = None) -> NDArray[Any]:
     """Electrons of some lines through the footprint and what is chosen."""
     block = Block(RIG, SWEEP, lines, NM, scene.shape, samples=samples)
-    return expected_light(scene, block, {SLIT: "4x2", **chosen})
+    return expected_light(scene, block, {SLIT: "3x1", **chosen})
 
 
 @pytest.mark.parametrize("blur", [DIFFRACTION, DEFOCUS, ABERRATION], ids=lambda blur: blur.name)

@@ -59,7 +59,7 @@ def test_broken_bound_is_named_with_its_place():
     decision = decided(Brightening("drift", 0.01, share=0.1))
     said = (
         r"drift: .* changes light by 0\.12 sigma of the noise at sweep fine-0, line 40, sample 0, band 0 of the "
-        r"brightest chip, above its bound of 0\.0144.*--tol 0 or"
+        r"brightest chip, above its bound of 0\.0145.*--tol 0 or"
     )
     with pytest.raises(BoundError, match=said):
         verify(decision, render, CHIPS, units)
