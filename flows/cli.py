@@ -70,7 +70,7 @@ def tradeoff(
     Parameters
     ----------
     stage
-        rectify, plan, segment or store; all without one.
+        rectify, plan, simulate, segment or store; all without one.
     out
         Folder for tradeoff.json and tradeoff.png.
     repeats

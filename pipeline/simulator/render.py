@@ -152,12 +152,13 @@ def _looker(
         moments = blur.moments(rig, wavelength, variant, normal)
         shift, variance = shift + moments.shift, variance + moments.variance
     slit, smear, rotation = names
-    footprint = fold(box_of(slit, rig), box_parts(slit), folded_positions(sweep, smear), shift, variance)
-    return Looker(footprint, _extremes(rig, sweep, exact=rotation != OFF))
+    views = views_all_over(rig, sweep, exact=rotation != OFF)
+    parts = box_parts(slit, rig, views)
+    return Looker(fold(box_of(slit, rig), parts, folded_positions(sweep, smear), shift, variance), views)
 
 
-def _extremes(rig: Rig, sweep: Sweep, *, exact: bool) -> Views:
-    """Views all over a sweep: the shape of a footprint varies smoothly between them."""
+def views_all_over(rig: Rig, sweep: Sweep, *, exact: bool) -> Views:
+    """Give views all over a sweep: the shape of a footprint varies smoothly between them."""
     whole = line_positions(replace(sweep, lines=max(sweep.lines, 1)), rig.camera)
     lines = np.linspace(0, len(whole) - 1, LOOKS).round().astype(np.intp)
     slopes = np.linspace(-0.5, 0.5, LOOKS) * rig.camera.samples * rig.camera.ifov_rad

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from pipeline.rectify.kernels import tensor_rows
@@ -40,6 +39,8 @@ class Looker:
 
         A sample's light does not depend on the others: products of matrices are always of the same shape.
         """
+        import torch
+
         spectra = scene.electrons * np.float32(exposures)
         pixels = _pixels(scene, along_y)
         mixing = self._mixing(spectra, len(steps) * (math.prod(self.footprint.parts) if pixels else 1))

@@ -33,6 +33,7 @@ class SampleViews:
     scan_px: Floats
     slope: Floats
     along_y: NDArray[np.bool_]
+    sweep: NDArray[np.intp]  # number of the sweep
 
     def chosen(self, which: NDArray[np.intp]) -> SampleViews:
         """Some of the views."""
@@ -84,6 +85,7 @@ def line_samples(camera: LineCamera) -> int:
 
 def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> SampleViews:
     """Lines spread over all sweeps, the most oblique among them, of samples evenly from end to end."""
+    order = {id(sweep): place for place, sweep in enumerate(sweeps)}
     numbers = [(sweep, number) for sweep in sweeps for number in {0, sweep.lines // 2, sweep.lines - 1}]
     numbers.sort(key=lambda one: -float(np.hypot(one[0].strip_px, one[0].line_px()[one[1]])))
     most = max(room // line_samples(camera), 1)
@@ -99,31 +101,55 @@ def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> 
         np.repeat([sweep.line_px()[number] for sweep, number in kept], count),
         np.tile(slopes, len(kept)),
         np.repeat([sweep.along == "y" for sweep, _ in kept], count),
+        np.repeat([order[id(sweep)] for sweep, _ in kept], count),
     )
 
 
 def views_of_places(places: Floats, scene: Scene, camera: LineCamera, sweeps: tuple[Sweep, ...]) -> SampleViews:
-    """Patches around places, each as the finest sweep of each orientation sees it that reaches it."""
+    """Patches around places, each as the finest and the most oblique sweep of each orientation see it."""
     centred = places - (np.array(scene.shape) - 1) / 2
     found = []
     for along_y in (False, True):
-        left = np.arange(len(places))
-        for sweep in sorted((one for one in sweeps if (one.along == "y") == along_y), key=lambda one: one.step):
-            along, scan = (centred[left] if along_y else centred[left, ::-1]).T
-            held = replace(sweep, step=1, lines=sweep.lines * sweep.step, binning=1)
-            line, sample = scene_to_sweep(held, camera, along, scan).T
-            with np.errstate(invalid="ignore"):
-                inside = (line > -2) & (line < held.lines + 1) & (sample > -3) & (sample < camera.samples + 2)
-            found.append(_patches(held, camera, line[inside], sample[inside]))
-            left = left[~inside]
+        numbers = [number for number, sweep in enumerate(sweeps) if (sweep.along == "y") == along_y]
+        finest = sorted(numbers, key=lambda number: sweeps[number].step)
+        oblique = sorted(numbers, key=lambda number: -abs(sweeps[number].strip_px))
+        along, scan = (centred if along_y else centred[:, ::-1]).T
+        seen = [_first_seeing(order, sweeps, camera, along, scan) for order in (finest, oblique)]
+        for number in numbers:
+            held = _held(sweeps[number])
+            which = np.flatnonzero((seen[0] == number) | (seen[1] == number))
+            line, sample = scene_to_sweep(held, camera, along[which], scan[which]).T
+            found.append(_patches(held, number, camera, line, sample))
     return joined(found)
 
 
-def _patches(sweep: Sweep, camera: LineCamera, line: Floats, sample: Floats) -> SampleViews:
+def _first_seeing(
+    order: list[int], sweeps: tuple[Sweep, ...], camera: LineCamera, along: Floats, scan: Floats
+) -> NDArray[np.intp]:
+    """Number of the first sweep that reaches each place, -1 where none does."""
+    found = np.full(len(along), -1)
+    for number in order:
+        left = np.flatnonzero(found < 0)
+        held = _held(sweeps[number])
+        line, sample = scene_to_sweep(held, camera, along[left], scan[left]).T
+        with np.errstate(invalid="ignore"):
+            inside = (line > -2) & (line < held.lines + 1) & (sample > -3) & (sample < camera.samples + 2)
+        found[left[inside]] = number
+    return found
+
+
+def _held(sweep: Sweep) -> Sweep:
+    """Every position that a sweep holds as a line of its own."""
+    return replace(sweep, step=1, lines=sweep.lines * sweep.step, binning=1)
+
+
+def _patches(sweep: Sweep, number: int, camera: LineCamera, line: Floats, sample: Floats) -> SampleViews:
     """Views around continuous lines and samples of a sweep, moved to what it has."""
     samples = np.rint(sample[:, None] + _PATCH[:, 0]).clip(0, camera.samples - 1).astype(np.intp).ravel()
     lines = (line[:, None] + _PATCH[:, 1]).clip(0, sweep.lines - 1).ravel()
     count = len(samples)
     slopes = camera.pixel_slopes()[samples]
     turned = np.full(count, sweep.along == "y")
-    return SampleViews(np.full(count, sweep.strip_px), sweep.start_px + lines, slopes, turned)
+    return SampleViews(
+        np.full(count, sweep.strip_px), sweep.start_px + lines, slopes, turned, np.full(count, number, np.intp)
+    )

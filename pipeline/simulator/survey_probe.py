@@ -10,16 +10,20 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
 from pipeline.scan import CostModel, Sweep
+from pipeline.simulator.band_differences import second_difference, steepest_difference
 from pipeline.simulator.effects.aberration import ABERRATION
 from pipeline.simulator.effects.defocus import DEFOCUS
 from pipeline.simulator.effects.diffraction import DIFFRACTION
 from pipeline.simulator.effects.effect import OFF, Moments
 from pipeline.simulator.effects.keystone import KEYSTONE
 from pipeline.simulator.effects.slit import SLIT, box_of, box_parts
+from pipeline.simulator.effects.turned import UPRIGHT
 from pipeline.simulator.footprint import Footprint, fold
+from pipeline.simulator.parting import LADDER
 from pipeline.simulator.probe import Probe, Unit
+from pipeline.simulator.render import views_all_over
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene
+from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene, Scene
 from pipeline.simulator.scouting import telling_places
 from pipeline.simulator.survey_looks import (
     PATCH_VIEWS,
@@ -27,7 +31,6 @@ from pipeline.simulator.survey_looks import (
     joined,
     light_seen,
     line_samples,
-    rays_of,
     views_of_lines,
     views_of_places,
 )
@@ -37,10 +40,12 @@ Light = NDArray[np.float32]
 
 MOST_VALUES = 1_000_000  # samples times bands; each is seen a few times over, a fraction of a px apart
 MOST_SAMPLES = 12_000
-FINEST_SAMPLES = 2000  # at which variants of the slit are held against the finest
-_LOOK = "2x1"  # variant of the slit that is looked through
+FINEST_SAMPLES = 1000  # at which variants of the slit are held against the finest
+_LEAST_OF_SWEEP = 50
+_LOOK, _CLOSE = (2, 1), (3, 1)  # boxes that are looked through, and that tell where variants differ
 _ROUNDING = 2e-6  # of the level: less is rounding of float32
 _NEAR, _FAR = 0.25, 0.5  # px by which the footprint is shifted
+_PHASES = tuple(((along, scan), (0.0, 0.0)) for along in (0.0, 0.5) for scan in (0.0, 0.5))  # at which boxes differ
 
 
 def noise_electrons(signal: Light, rig: Rig) -> Light:
@@ -72,37 +77,63 @@ def probe_scene(scene: Scene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "s
     most = (room - room // 3) // (PATCH_VIEWS * len({sweep.along for sweep in taken}))
     places = telling_places(scene, camera, taken, max(most, 1))
     views = joined([lines, views_of_places(places, scene, camera, taken)])
-    seen = light_seen(scene, camera, views, _footprint(_LOOK, rig, bands), _shifts())
+    seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _LOOK, None, scene), _shifts())
     means = seen[0, : len(lines.slope)].reshape(-1, line_samples(camera) * bands).mean(axis=1)
-    errors = _slit_errors(scene, rig, views, seen[0], unit)
+    errors = _slit_errors(scene, rig, views, taken, unit)
     return replace(_summed_up(scene, rig, taken, unit, seen, means), slit_errors=errors)
 
 
-def _slit_errors(scene: Scene, rig: Rig, views: SampleViews, level: Light, unit: Unit) -> dict[str, float]:
+def _slit_errors(scene: Scene, rig: Rig, views: SampleViews, sweeps: tuple[Sweep, ...], unit: Unit) -> dict[str, float]:
     """Greatest change by every variant of the slit, over the unit: off, or against the finest; with blurs and without.
 
-    Off is measured everywhere, all others where the middle ray's light differs most from the footprint's, in half of
-    the places weighed by how far the footprint lies turned.
+    Each sweep is seen through the boxes that a variant takes for it. Scenes without pixels know no boxes.
     """
-    camera, bands, nm = rig.camera, level.shape[1], scene.wavelength_nm
-    ray = light_seen(scene, camera, views, _footprint(OFF, rig, bands))[0]
-    off = (_above(np.abs(ray - level), level) / _unit(level, rig, unit)).max(axis=1)
-    turned = rays_of(views, camera)
-    ranks = [np.argsort(-worth)[: FINEST_SAMPLES // 2] for worth in (off, off * np.abs(turned.along_turn))]
-    rough = views.chosen(np.unique(np.concatenate(ranks)))
-    errors = {OFF: float(off.max(initial=0.0)), **dict.fromkeys(SLIT.variants[1:], 0.0)}
-    for moments in (None, _blurs(rig, nm)):
-        finest = light_seen(scene, camera, rough, _footprint(SLIT.variants[0], rig, bands, moments))[0]
-        for variant in errors:
-            other = light_seen(scene, camera, rough, _footprint(variant, rig, bands, moments))[0]
-            change = _above(np.abs(other - finest), finest) / _unit(finest, rig, unit)
-            errors[variant] = max(errors[variant], float(change.max(initial=0.0)))
+    ladder = LADDER if isinstance(scene, RasterScene) else LADDER[-1:]
+    views = views.chosen(_roughest(scene, rig, views, unit))
+    whole = [views_all_over(rig, sweep, exact=True) for sweep in sweeps]
+    errors = dict.fromkeys((*SLIT.variants[1:], OFF), 0.0)
+    for moments in (None, _blurs(rig, scene.wavelength_nm)):
+        boxes = {parts: _footprint(SLIT.variants[0], rig, parts, moments, scene) for parts in ladder}
+        finest = light_seen(scene, rig.camera, views, boxes[LADDER[-1]], _PHASES)
+        scale = _unit(finest, rig, unit)
+        found = {parts: _changes(scene, rig, views, boxes[parts], finest, scale) for parts in ladder[:-1]}
+        found[LADDER[-1]] = np.zeros(len(views.slope))
+        for variant in SLIT.variants[1:]:
+            taken = [box_parts(variant, rig, one) for one in whole]
+            seen = [found.get(parts, found[LADDER[-1]])[views.sweep == number] for number, parts in enumerate(taken)]
+            errors[variant] = max(errors[variant], *(float(one.max(initial=0.0)) for one in seen))
+        off = _changes(scene, rig, views, _footprint(OFF, rig, (1, 1), moments, scene), finest, scale)
+        errors[OFF] = max(errors[OFF], float(off.max(initial=0.0)))
     return errors
 
 
-def _footprint(variant: str, rig: Rig, bands: int, moments: Moments | None = None) -> Footprint:
-    shift, variance = (np.zeros((2, bands)),) * 2 if moments is None else (moments.shift, moments.variance)
-    return fold(box_of(variant, rig), box_parts(variant), 1, shift, variance)
+def _roughest(scene: Scene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray[np.intp]:
+    """Views where a middle ray, and a box that does not lie turned, differ most: of all, and of every sweep's own."""
+    boxes = _footprint(SLIT.variants[0], rig, _CLOSE, None, scene)
+    close = light_seen(scene, rig.camera, views, boxes, _PHASES)
+    scale, found = _unit(close, rig, unit), []
+    for variant in (OFF, UPRIGHT):
+        other = _footprint(variant, rig, (1, 1), None, scene)
+        order = np.argsort(-_changes(scene, rig, views, other, close, scale), kind="stable")
+        found.append(order[: FINEST_SAMPLES // 2])
+        numbers = np.unique(views.sweep)
+        each = max(FINEST_SAMPLES // 2 // len(numbers), _LEAST_OF_SWEEP)
+        found += [order[views.sweep[order] == number][:each] for number in numbers]
+    return np.unique(np.concatenate(found))
+
+
+def _changes(scene: Scene, rig: Rig, views: SampleViews, footprint: Footprint, finest: Light, scale: Light) -> Floats:
+    """Greatest change of each view by another footprint, over the unit, (view,)."""
+    other = light_seen(scene, rig.camera, views, footprint, _PHASES)
+    greatest: Floats = (_above(np.abs(other - finest), finest) / scale).max(axis=(0, 2)).astype(np.float64)
+    return greatest
+
+
+def _footprint(variant: str, rig: Rig, parts: tuple[int, int], moments: Moments | None, scene: Scene) -> Footprint:
+    shift, variance = (
+        (np.zeros((2, len(scene.wavelength_nm))),) * 2 if moments is None else (moments.shift, moments.variance)
+    )
+    return fold(box_of(variant, rig), parts, 1, shift, variance)
 
 
 def _blurs(rig: Rig, wavelength_nm: Floats) -> Moments:
@@ -167,18 +198,11 @@ def _derivatives(seen: Light, scale: Light) -> tuple[Floats, Floats]:
 
 def _spectral_derivatives(level: Light, wavelength_nm: Floats, scale: Light) -> tuple[Floats, Floats]:
     """Greatest divided differences over wavelength at each band, (band,) each over the unit; 0 where there is none."""
-    bands = len(wavelength_nm)
-    slope, curvature = np.zeros(bands), np.zeros(bands)
-    if bands < 2:
-        return slope, curvature
-    step = np.diff(wavelength_nm)
-    rise = np.diff(level, axis=1)
-    for side in (slice(None, -1), slice(1, None)):
-        slope[side] = np.maximum(slope[side], _greatest(np.abs(rise) / scale[:, side]) / np.abs(step))
-    if bands > 2:
-        bend = np.abs(np.diff(rise / step.astype(np.float32), axis=1)) / scale[:, 1:-1]
-        curvature[1:-1] = _greatest(bend) / np.abs((step[1:] + step[:-1]) / 2)
-    return slope, curvature
+    nm = np.asarray(wavelength_nm, np.float64)
+    if len(nm) < 2:
+        return np.zeros(len(nm)), np.zeros(len(nm))
+    bend = np.abs(second_difference(level, nm)) / scale
+    return _greatest(steepest_difference(level, nm) / scale), _greatest(bend)
 
 
 def _above(difference: Light, high: Light) -> Light:

@@ -9,14 +9,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from pipeline.simulator.footprint import Footprint
 from pipeline.simulator.rays import Views
 from pipeline.simulator.tap_tables import TapTable
+
+if TYPE_CHECKING:  # a second to import: the functions that use it do so, and a plan of a survey never needs it
+    import torch
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -89,7 +92,7 @@ class Gatherer:
         """``views`` are some that hold the extremes of all that will be gathered."""
         self.footprint = footprint
         shape = shape_of(footprint, views)
-        self.places = _places(footprint)
+        self.places = part_places(footprint)
         beside = Beside.of(views, shape, 0.0, 0.0)
         reach = [float(np.abs(off).max(initial=0.0)) + 0.02 for off in beside.parts(footprint.shift, self.places)]
         width, (across, along) = footprint.box, footprint.parts
@@ -107,6 +110,8 @@ class Gatherer:
 
         ``views`` are in px of the scene. A sample's numbers do not depend on the others.
         """
+        import torch
+
         along, scan = np.rint(views.along), np.rint(views.scan)
         index = self._window(pixels, along, scan)
         shape = shape_of(self.footprint, views)
@@ -123,6 +128,8 @@ class Gatherer:
 
     def _window(self, pixels: Pixels, along: Floats, scan: Floats) -> torch.Tensor:
         """Rows of the pixels' table, (n, tap); outside of the scene its edge is repeated."""
+        import torch
+
         kind = np.int32 if pixels.shape[0] * pixels.shape[1] < 2**31 else np.int64
         step, size = pixels.step, pixels.size
         first = along - self.along.left, scan - self.scan.left
@@ -171,8 +178,8 @@ def _scale(variance: Floats, nominal: Floats) -> Floats:
     return np.sqrt(np.maximum(found, 1e-4, out=found), out=found)
 
 
-def _places(footprint: Footprint) -> Light:
-    """Middles of the parts, (2, part) across and along, in px of the camera."""
+def part_places(footprint: Footprint) -> Light:
+    """Give the middles of the parts, (2, part) across and along, in px of the camera."""
     across, along = footprint.parts
     turn = ((np.arange(across) + 0.5) / across - 0.5) * footprint.box[0]
     run = ((np.arange(along) + 0.5) / along - 0.5) * footprint.box[1]

@@ -20,6 +20,8 @@ PER_PX = 128  # rows of a table; between them weights are linear, right to 8e-6 
 SCALE_STEP = 1 / 2048  # from one tabulated scale to the next; the nearest is taken
 _WORKED_OUT = 8  # every so many of them are worked out, those between are linear: right to 2e-6
 TAIL = 3e-5  # share of a kernel's weight, by size, that may lie beyond its taps; what is left is scaled to sum 1
+TAIL_WEIGHT = 2e-5  # of any one tap beyond them: weights jump by so much where a tap comes in
+TABULATED = 1e-4  # share of the light, by size, that a table of either axis misplaces at most, scales apart
 _SDS = 6.5  # of a Gaussian: nothing beyond
 
 
@@ -126,11 +128,13 @@ def _rows(place: Floats, taps: int, reach: float, kernels: tuple[Floats, Floats]
 
 
 def _reach(distance: Floats, weight: Floats) -> float:
-    """Distance beyond which a kernel holds no more than `TAIL`."""
+    """Distance beyond which a kernel holds no more than `TAIL`, and nowhere more than `TAIL_WEIGHT`."""
     half = len(distance) // 2
     size = np.abs(weight).max(axis=0)
-    beyond = (size[half:] + size[half::-1])[::-1].cumsum()[::-1] * (distance[1] - distance[0])
-    return float(distance[half:][beyond > TAIL][-1]) if (beyond > TAIL).any() else 0.0
+    both = size[half:] + size[half::-1]
+    beyond = both[::-1].cumsum()[::-1] * (distance[1] - distance[0])
+    counts = (beyond > TAIL) | (both > 2 * TAIL_WEIGHT)
+    return float(distance[half:][counts][-1]) if counts.any() else 0.0
 
 
 def _catmull_rom(t: Floats) -> Floats:

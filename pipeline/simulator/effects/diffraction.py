@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from types import MappingProxyType
 
 import numpy as np
@@ -39,7 +40,7 @@ class Diffraction:
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
         """Give the blur of each band; ``normal`` (3,) is the mirror's in the camera frame, None at rest."""
-        variance = _SPREAD * _size(rig, wavelength_nm, variant) * spread_of_waves(normal)[:, None]
+        variance = _spread() * _size(rig, wavelength_nm, variant) * spread_of_waves(normal)[:, None]
         return Moments(np.zeros_like(variance), variance)
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
@@ -51,7 +52,7 @@ class Diffraction:
         if variant != OFF:
             missing = np.abs(missing - _size(rig, probe.wavelength_nm, variant))
         cause = "diffraction" if variant == OFF else "diffraction of other bands in place of their own"
-        return blurred_bound(probe, _SPREAD * missing * widest[:, None], cause)
+        return blurred_bound(probe, _spread() * missing * widest[:, None], cause)
 
 
 DIFFRACTION = Diffraction()
@@ -82,7 +83,10 @@ def airy_variance(v: float) -> float:
     return float(inside) / airy_energy(v)
 
 
-_SPREAD = airy_variance(THIRD_RING) / math.pi**2  # per axis [(lambda / D)^2]
+@cache  # not at import: SciPy takes its time
+def _spread() -> float:
+    """Variance per axis of what is folded [(lambda / D)^2]."""
+    return airy_variance(THIRD_RING) / math.pi**2
 
 
 def _size(rig: Rig, wavelength_nm: Floats, variant: str) -> Floats:

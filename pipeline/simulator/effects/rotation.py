@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.scan import Sweep, points_of_scan
 from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.effects.turned import MARGIN, UPRIGHT, beside_plan_px
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -30,25 +31,33 @@ class Rotation:
         """Bound by slope times the greatest way between where rays meet the scene and where straight lines would."""
         if variant != OFF:
             return Bound(0.0, "rays are exact")
-        along, scan = _farthest(probe.sweeps, rig.camera)
+        along, scan = _farthest(probe.sweeps, rig.camera, beside_plan_px(probe, rig))
         why = f"lines are turned and stretched by at most {along:.3g} px along and {scan:.3g} px along the scan"
-        return Bound(probe.moved(along, scan), why)
+        # The footprint does not lie turned either: the same as one box that does not.
+        shape = MARGIN * probe.slit_errors.get(UPRIGHT, 0.0)
+        return Bound(probe.moved(along, scan) + shape, why)
 
 
 ROTATION = Rotation()
 
 
-def _farthest(sweeps: tuple[Sweep, ...], camera: LineCamera) -> tuple[float, float]:
-    """Greatest difference along the line and the scan over all sweeps, slit's edges included. [px]"""
-    ways = [_course(sweep, camera) for sweep in sweeps if sweep.lines]
+def _farthest(sweeps: tuple[Sweep, ...], camera: LineCamera, beside: tuple[float, float]) -> tuple[float, float]:
+    """Greatest difference along the line and the scan over all sweeps, wherever the mirror may look. [px]"""
+    ways = [
+        _course(sweep, camera, (along, scan))
+        for sweep in sweeps
+        if sweep.lines
+        for along in {-beside[0], 0.0, beside[0]}
+        for scan in {-beside[1], 0.0, beside[1]}
+    ]
     return (max(way[0] for way in ways), max(way[1] for way in ways)) if ways else (0.0, 0.0)
 
 
-def _course(sweep: Sweep, camera: LineCamera) -> tuple[float, float]:
+def _course(sweep: Sweep, camera: LineCamera, beside: tuple[float, float]) -> tuple[float, float]:
     slopes = camera.pixel_slopes()
     slopes = slopes[np.unique(np.linspace(0, len(slopes) - 1, _LOOKS).round().astype(int))]
     numbers = np.unique(np.linspace(0, sweep.lines - 1, _LOOKS).round().astype(int))
-    scan = sweep.line_px()[numbers][:, None]
-    along_px, scan_px = points_of_scan(sweep.strip_px, camera, scan, slopes)
-    straight = sweep.strip_px + slopes / camera.ifov_rad
+    strip, scan = sweep.strip_px + beside[0], sweep.line_px()[numbers][:, None] + beside[1]
+    along_px, scan_px = points_of_scan(strip, camera, scan, slopes)
+    straight = strip + slopes / camera.ifov_rad
     return float(np.abs(along_px - straight).max()), float(np.abs(scan_px - scan).max())

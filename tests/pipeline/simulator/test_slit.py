@@ -10,8 +10,10 @@ import pytest
 from pipeline.camera import LineCamera, footprint_kernel
 from pipeline.scan import Sweep
 from pipeline.simulator.block import Block
-from pipeline.simulator.effects.slit import MARGIN, SLIT, box_of, box_parts
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.effects.slit import SLIT, box_of, box_parts
+from pipeline.simulator.effects.turned import MARGIN
+from pipeline.simulator.parting import fewest_parts, misplaced
+from pipeline.simulator.render import expected_light, views_all_over
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import raster_from_values
 from pipeline.simulator.survey_probe import probe_scene
@@ -20,11 +22,47 @@ RIG = Rig(camera=LineCamera(samples=64))
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-14.5, lines=30)
 
 
-def test_boxes_of_every_variant() -> None:
+def boxes(variant: str, strip: float, rig: Rig = RIG) -> tuple[int, int]:
+    """Those that a variant takes for a sweep of a survey of 2560 px."""
+    sweep = replace(SWEEP, strip_px=strip, start_px=-1280.0, lines=2560)
+    return box_parts(variant, rig, views_all_over(rig, sweep, exact=True))
+
+
+def test_counted_variants_have_their_boxes_anywhere() -> None:
     """The exact variant has 27 boxes, off is one without any width."""
-    assert [box_parts(variant) for variant in SLIT.variants] == [(9, 3), (4, 2), (3, 1), (2, 1), (1, 1)]
-    assert (box_parts("off"), box_of("off", RIG)) == ((1, 1), (0.0, 0.0))
+    for strip in (0.0, 960.0):
+        assert [boxes(variant, strip) for variant in ("9x3", "3x1", "1x1", "off")] == [(9, 3), (3, 1), (1, 1), (1, 1)]
+    assert box_of("off", RIG) == (0.0, 0.0)
     assert set(SLIT.cost_ns) == set(SLIT.variants)
+
+
+def test_stated_variants_take_more_boxes_the_more_lines_are_turned() -> None:
+    """One in the middle, few at the outer strips, and never fewer for the smaller error."""
+    strips = (0.0, 60.0, 160.0, 320.0, 640.0, 960.0)
+    found = {variant: [np.prod(boxes(variant, strip)) for strip in strips] for variant in ("1-percent", "3-percent")}
+    for counts in found.values():
+        assert counts[0] == 1
+        assert counts[-1] > 1
+        assert counts == sorted(counts)
+    assert (np.array(found["1-percent"]) >= found["3-percent"]).all()
+
+
+def test_straight_lines_need_one_box() -> None:
+    """Where rotation is off nothing is turned."""
+    sweep = replace(SWEEP, strip_px=960.0)
+    assert box_parts("1-percent", RIG, views_all_over(RIG, sweep, exact=False)) == (1, 1)
+
+
+@pytest.mark.parametrize("width", [1.0, 2.7, 4.0])
+@pytest.mark.parametrize("strip", [60.0, 320.0, 960.0])
+def test_stated_share_is_kept(width: float, strip: float) -> None:
+    """What the boxes misplace, worked out in closed form, is no more than the variant says."""
+    views = views_all_over(RIG, replace(SWEEP, strip_px=strip, start_px=-1280.0, lines=2560), exact=True)
+    for share in (0.003, 0.01, 0.03):
+        parts = fewest_parts(share, (width, 1.0), views)
+        shapes = zip(views.along_run, views.scan_run, views.along_turn, views.scan_turn, strict=True)
+        worst = max(misplaced(parts, (width, 1.0), shape) for shape in list(shapes)[::16])
+        assert worst <= 1.1 * share
 
 
 @pytest.mark.parametrize("variant", SLIT.variants)

@@ -68,23 +68,28 @@ class Moved:
         return np.full_like(along_px, self.along), np.full_like(scan_px, self.scan)
 
 
-@pytest.mark.parametrize("blurs", [{}, BLURS], ids=["sharp", "blurred"])
 @pytest.mark.parametrize(
-    ("sweep", "line", "variant", "most"),
+    ("sweep", "line", "variant", "sharp", "blurred"),
     [
-        (MIDDLE, 1280, "1x1", 2e-3),
-        (MIDDLE, 1280, "9x3", 2e-3),
-        (CORNER, 2, "9x3", 1e-2),
-        (CORNER, 2, "3x1", 2e-2),
-        (CORNER, 2, "2x1", 6e-2),
-        (CORNER, 2, "1x1", 4e-1),
+        (MIDDLE, 1280, "1x1", 1e-3, 1e-3),
+        (MIDDLE, 1280, "9x3", 1e-3, 1e-3),
+        (CORNER, 2, "9x3", 1e-3, 1e-2),
+        (CORNER, 2, "3x1", 3e-3, 1e-2),
+        (CORNER, 2, "1-percent", 3e-2, 3e-2),
+        (CORNER, 2, "3-percent", 9e-2, 9e-2),
     ],
 )
 def test_closed_form_is_what_thousands_of_rays_give(
-    sweep: Sweep, line: int, variant: str, most: float, blurs: dict[Any, str]
+    sweep: Sweep, line: int, variant: str, sharp: float, blurred: float
 ) -> None:
-    """In the middle of a survey and at its corner, where lines are turned by 9 deg, with blurs and without."""
-    assert error(sweep, line, variant, blurs) < most
+    """In the middle of a survey and at its corner, where lines are turned by 9 deg, with blurs and without.
+
+    Tables misplace 1e-4 of the light, and grain ranges over 6 of its deviations: .0003 for either axis. A variant of a
+    stated share changes half of that times the range. With blurs, boxes at the corner are moved for the Gaussian's
+    covariance as well as their own, which leaves its fourth moments wrong: .008 of the deviation.
+    """
+    assert error(sweep, line, variant, {}) < sharp
+    assert error(sweep, line, variant, BLURS) < blurred
 
 
 def test_rays_converge_to_the_closed_form() -> None:
@@ -140,7 +145,7 @@ def test_light_is_the_same_to_the_bit_in_any_block(size: int) -> None:
     light = np.ascontiguousarray(rng.uniform(10, 900, (31, 31)), np.float32)
     scene = replace(scene, light=Once.of(Light(light, light[0])))
     sweep = Sweep("s", "fine", "x", strip_px=300.0, start_px=-300.0, lines=14)
-    chosen: dict[Any, str] = {ROTATION: "rays", SLIT: "2x1", **BLURS}
+    chosen: dict[Any, str] = {ROTATION: "rays", SLIT: "3x1", **BLURS}
 
     def made(lines: range, samples: range | None = None) -> np.ndarray:
         return expected_light(scene, Block(RIG, sweep, lines, nm, scene.shape, samples=samples), chosen)
