@@ -214,7 +214,7 @@ def _read_mosaic(folder: Path) -> tuple[int, int, int, float, float]:
     content = _write_sparse(folder / "mosaic.zarr", grid)
     work = FieldWork(file, plan_regions(grid, SHARD), Crew(workers=1), MEMORY)
     began = time.process_time()
-    scores = work.score("entropy", folder / "mosaic.zarr", lambda done: None)
+    scores = work.score("sobel", folder / "mosaic.zarr", lambda done: None)
     seats = np.sort(frame_seats(scores.ravel(), MOSAIC_SHARE, grid.valid_share().ravel() > 0).seats)
     _write_patches(folder / "patches.zarr", grid, seats, spectral_library(MOSAIC_BANDS).wavelength_nm)
     legend = ClassNames(weights.class_names, weights.class_colours)
