@@ -81,6 +81,8 @@ def _plans(look: Look, camera: LineCamera, cost: CostModel, seed: int) -> list[t
         return spend
 
     def without_a_model(draw: int | None) -> Spend:
+        """Blocks of lines evenly spread, or placed by a draw."""
+
         def spend(seconds: float) -> tuple[Seats, float, int]:
             if draw is None:
                 lines = most_shown(options, lambda blocks: blocks.evenly(seconds))

@@ -48,6 +48,9 @@ def evaluation_figure(content: dict[str, Any]) -> Figure:
 
 def _draw_panel(axes: Axes, content: dict[str, Any], what: str, unit: float) -> None:
     rows = [row for row in content["rows"] if row["miou"] is not None]
+    low, high = _reach(rows)
+    far = [row for row in rows if 100 * row["miou"] < low]
+    rows = [row for row in rows if 100 * row["miou"] >= low]
     single = {row["policy"]: row for row in rows if row["share"] in (0.0, 1.0)}
     base = single[content["baseline"]["policy"]]
     lines = {"none": ("none", (0, (2, 2))), base["policy"]: (f"baseline: {base['policy']}", "-")}
@@ -64,6 +67,8 @@ def _draw_panel(axes: Axes, content: dict[str, Any], what: str, unit: float) -> 
             _draw_line(axes, known, what, unit, _COLOURS[number % len(_COLOURS)], base["miou"])
     _name_shares(axes, [row for row in rows if row["policy"] not in single], what, unit)
     axes.set_xscale("log")
+    axes.set_ylim(low, high)
+    _point_down(axes, far, what, unit)
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
@@ -71,6 +76,32 @@ def _draw_panel(axes: Axes, content: dict[str, Any], what: str, unit: float) -> 
     axes.grid(visible=True, which="major", color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def _reach(rows: list[dict[str, Any]]) -> tuple[float, float]:
+    """Ends of the axis [%]: all rows of the weights, with controls that are no further below than these span."""
+    own = [100 * row["miou"] for row in rows if not row["control"]]
+    span = max(max(own) - min(own), 1.0)
+    shown = [100 * row["miou"] for row in rows if 100 * row["miou"] >= min(own) - span]
+    return min(shown) - 0.25 * span, max(shown) + 0.15 * span
+
+
+def _point_down(axes: Axes, far: list[dict[str, Any]], what: str, unit: float) -> None:
+    """Arrows at the lower edge for controls below it, the best row of each, with name and mIoU [%]."""
+    best = {row["policy"]: row for row in sorted(far, key=lambda row: float(row["miou"]))}
+    known = [row for row in best.values() if row["cost"][what]["done"] is not None]
+    edge = axes.get_xaxis_transform()
+    for row in known:
+        axes.plot(row["cost"][what]["done"] / unit, 0.025, "v", color=MUTED, transform=edge, zorder=2)
+    left, right = axes.get_xlim()
+    for number, row in enumerate(known):
+        x = row["cost"][what]["done"] / unit
+        side, away = ("left", 7) if x**2 < left * right else ("right", -7)  # towards the middle of the axis
+        axes.annotate(
+            f"{row['policy']} {100 * row['miou']:.1f}", (x, 0.025), (away, 13 * number - 3), xycoords=edge,
+            textcoords="offset points", color=INK, size=9, ha=side,
+            arrowprops={"arrowstyle": "-", "color": MUTED, "linewidth": 0.6, "shrinkB": 4},
+        )  # fmt: skip
 
 
 def _mark(axes: Axes, row: dict[str, Any], what: str, unit: float, named: bool) -> None:

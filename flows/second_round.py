@@ -34,6 +34,7 @@ def attend_again(
     """
 
     def build(path: Path) -> None:
+        """Both rounds as one plan, and the scores that the second was planned by."""
         work = FieldWork.of(run)
         before, first = load_attention(attention.path / "attention.zarr"), load_plan(attention)
         seats, share = open_patches(patches.path / "patches.zarr").seats, seen_shares(run, patches)

@@ -30,6 +30,7 @@ from models.process import use_one_thread
 from models.regions import HALO_CELLS, Region, most_bytes, plan_regions
 from pipeline.grid import SceneGrid
 from pipeline.selection import frame_seats
+from pipeline.simulator.spectra import MATERIALS, spectral_library
 from storage.block_work import Crew
 from storage.class_maps import ClassMap, ClassNames, create_class_map, load_class_map
 from storage.layout import SHARD_ROWS
@@ -44,7 +45,7 @@ SIDES, SYNTHETIC_PX, SYNTHETIC_BANDS = (640, 1920, 3840), (640, 640), 8
 MEMORY = 4 * 2**30
 MOST_GROWTH = 1.25
 MOSAIC_PX, MOSAIC_BANDS, MOSAIC_SHARE = 10240, 4, 0.02
-BLOBS, BLOB_PX = 400, 24.0  # of the coarse mosaic, bright on a dark ground
+BLOBS, BLOB_PX = 400, 24.0  # of the coarse mosaic, maize on bare soil
 
 
 @dataclass(frozen=True)
@@ -213,9 +214,9 @@ def _read_mosaic(folder: Path) -> tuple[int, int, int, float, float]:
     content = _write_sparse(folder / "mosaic.zarr", grid)
     work = FieldWork(file, plan_regions(grid, SHARD), Crew(workers=1), MEMORY)
     began = time.process_time()
-    scores = work.score("entropy", folder / "mosaic.zarr", lambda done: None)
+    scores = work.score("sobel", folder / "mosaic.zarr", lambda done: None)
     seats = np.sort(frame_seats(scores.ravel(), MOSAIC_SHARE, grid.valid_share().ravel() > 0).seats)
-    _write_patches(folder / "patches.zarr", grid, seats, np.linspace(420, 980, MOSAIC_BANDS))
+    _write_patches(folder / "patches.zarr", grid, seats, spectral_library(MOSAIC_BANDS).wavelength_nm)
     legend = ClassNames(weights.class_names, weights.class_colours)
     create_class_map(folder / "map.zarr", (MOSAIC_PX, MOSAIC_PX), legend)
     work.draw(folder / "mosaic.zarr", folder / "patches.zarr", folder / "map.zarr", lambda done: None)
@@ -225,22 +226,24 @@ def _read_mosaic(folder: Path) -> tuple[int, int, int, float, float]:
 
 
 def _write_sparse(path: Path, grid: SceneGrid) -> NDArray[np.bool_]:
-    """Store a coarse mosaic of bright blobs on a dark ground, some rows at a time; which pixels are bright."""
-    rng, nm = np.random.default_rng(0), np.linspace(420, 980, MOSAIC_BANDS)
+    """Store a coarse mosaic of clumps of maize on bare soil, some rows at a time; which pixels are maize."""
+    rng, library = np.random.default_rng(0), spectral_library(MOSAIC_BANDS)
+    nm = library.wavelength_nm
+    soil, maize = (library.reflectance[MATERIALS.index(name)] for name in ("soil_dry", "maize_dense"))
     y, x = grid.coarse_shape
     centres = rng.uniform(0, (y, x), (BLOBS, 2))
-    bright = np.zeros((y, x), np.bool_)
+    grown = np.zeros((y, x), np.bool_)
     rows, columns = np.ogrid[:y, :x]
     for down, across in centres:
         near = tuple(slice(max(int(at - BLOB_PX), 0), int(at + BLOB_PX) + 1) for at in (down, across))
-        bright[near] |= (rows[near[0]] - down) ** 2 + (columns[:, near[1]] - across) ** 2 < BLOB_PX**2
+        grown[near] |= (rows[near[0]] - down) ** 2 + (columns[:, near[1]] - across) ** 2 < BLOB_PX**2
     writer = MosaicWriter(path, grid.coarse_shape, nm)
     for top in range(0, y, SHARD_ROWS):
-        part = bright[top : top + SHARD_ROWS]
+        part = grown[top : top + SHARD_ROWS]
         noise = rng.normal(0, 0.005, (*part.shape, len(nm)))
-        values = np.where(part[..., None], 0.4 + 0.1 * np.sin(nm / 100), 0.1) + noise
+        values = np.where(part[..., None], maize, soil) + noise
         writer.write_rows(top, values.astype(np.float32), np.ones(part.shape))
-    return bright
+    return grown
 
 
 def _mib(size: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from flows.benchmark_request import EvaluateRequest
 from flows.benchmark_series import Row
 from flows.benchmark_summary import choose_baseline
 from flows.evaluate_command import evaluate_weights, run_evaluate
+from flows.evaluation_plot import evaluation_figure
 from models.weights import save_weights
 from pipeline.errors import SceneError, SettingsError
 from tests.flows.small_fields import FRAMES, QUICK, scene_at, write_field, write_weights
@@ -135,3 +137,16 @@ def test_a_control_is_judged_on_frames_it_never_saw(data: Path, tmp_path: Path):
     every = write_weights(tmp_path / "every.safetensors", 2, "dense", split={"train": keys})
     with pytest.raises(SceneError, match=r"the control .*every.safetensors was trained on all 3 .* --hold-out NAMES$"):
         evaluate_weights(EvaluateRequest(str(data), weights, controls=(every,), **quick))
+
+
+def test_a_control_far_below_does_not_squeeze_the_plot(judged: tuple[EvaluateRequest, dict[str, Any]]) -> None:
+    """It is an arrow at the lower edge with its figure; the axis is that of the weights."""
+    content = deepcopy(judged[1])
+    own = [row for row in content["rows"] if not row["control"]]
+    for number, row in enumerate(own):
+        row["miou"] = 0.7 + 0.001 * number
+    for row in content["rows"]:
+        row["miou"] = 0.1 if row["control"] else row["miou"]
+    axes = evaluation_figure(content).axes[-1]
+    assert axes.get_ylim()[0] > 69
+    assert "coarser 10.0" in [text.get_text() for text in axes.texts]

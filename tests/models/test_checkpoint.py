@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,6 +38,15 @@ def killed_after(step: int):
     return report
 
 
+def left_behind(file: Path, identity: str) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    """What a run that was killed after four steps left in its checkpoint."""
+    with pytest.raises(KeyboardInterrupt):
+        train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(4), checkpoint=file, keep_every_s=0)
+    found = load_checkpoint(file, identity)
+    assert found is not None
+    return found
+
+
 def test_a_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
     """Killed after step 4 and started again, training takes the steps that are left and ends where it would have."""
     file, steps = tmp_path / "c", []
@@ -66,11 +76,7 @@ def test_another_run_starts_from_the_beginning(tmp_path: Path) -> None:
 def test_time_spent_counts_after_a_restart(tmp_path: Path) -> None:
     """The minutes of a run are those of all its processes together."""
     file, identity = tmp_path / "c", run_identity(CONFIG, [example()], SETTINGS)
-    with pytest.raises(KeyboardInterrupt):
-        train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(4), checkpoint=file, keep_every_s=0)
-    found = load_checkpoint(file, identity)
-    assert found is not None
-    about, tensors = found
+    about, tensors = left_behind(file, identity)
     about["course"]["seconds"] = 60 * SETTINGS.minutes
     save_checkpoint(file, identity, about, tensors)
     _, summary = train(CONFIG, [example()], SHIFT, SETTINGS, checkpoint=file)
@@ -90,11 +96,7 @@ def test_a_damaged_checkpoint_is_no_checkpoint(tmp_path: Path) -> None:
 def test_a_checkpoint_of_other_shapes_is_not_gone_on_from(tmp_path: Path) -> None:
     """What an earlier version left of the same run, or what cannot be read, starts from the beginning."""
     file, identity = tmp_path / "c", run_identity(CONFIG, [example()], SETTINGS)
-    with pytest.raises(KeyboardInterrupt):
-        train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(4), checkpoint=file, keep_every_s=0)
-    found = load_checkpoint(file, identity)
-    assert found is not None
-    about, tensors = found
+    about, tensors = left_behind(file, identity)
     del tensors["model.scale_code"]
     save_checkpoint(file, identity, about, tensors)
     steps: list[int] = []
