@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pipeline.simulator.scene import RasterScene
 
 FARM_LAW, SEASON_LAW = "farm@1", "farm@2"
-BUILT_IN_SCENE = FARM_LAW  # what ``farm`` stands for, and what the weights that come with the house were trained on
+BUILT_IN_SCENE = SEASON_LAW  # what ``farm`` stands for, and what the weights that come with the house were trained on
 FARM_NAMES = ("farm", FARM_LAW, SEASON_LAW)
 FARM_SHAPE = (1024, 1280)  # (y, x) unless another is asked for [px]
 USUAL_DAY, USUAL_HOUR = 172, 11.0  # of ``farm@2``: the 21st of June, an hour before noon

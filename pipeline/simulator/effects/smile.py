@@ -33,7 +33,7 @@ class Smile:
     name = "smile"
     variants = (CUBIC, LINEAR)
     within_spectra = True  # a factor of a whole spectrum passes through
-    cost_ns = MappingProxyType({CUBIC: 2.8, LINEAR: 1.6})
+    cost_ns = MappingProxyType({CUBIC: 0.9, LINEAR: 0.5})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
         """Bound it by I' s, and a cubic beside its chord by I'' s (h - s) / 2 in a gap h between bands."""
