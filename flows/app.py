@@ -41,6 +41,7 @@ GOES_ON = (
     "evaluate",
     "export",
     "reprocess",
+    "simulate",
 )  # verbs that keep what they have done when they are interrupted
 
 

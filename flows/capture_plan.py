@@ -47,14 +47,27 @@ def plan_capture(settings: Settings, grid: SceneGrid) -> CapturePlan:
     BudgetError : the budget does not pay for the coarse pass.
     PoseError : the field is beyond the mirror's range.
     """
+    camera, cost = settings.camera, settings.cost
+    along, coarse, full = lay_out_sweeps(settings, grid)
+    full_s, coarse_s = cost.seconds(full, camera), cost.seconds(coarse, camera)
+    fine_s = check_budget(settings.budget, coarse_s, full_s)
+    overlap = _overlap(settings, grid.factor)
+    return CapturePlan(along, coarse, full, coarse_s, full_s, fine_s, overlap, 2 * settings.pointing_px)
+
+
+def lay_out_sweeps(settings: Settings, grid: SceneGrid) -> tuple[Axis, list[Sweep], list[Sweep]]:
+    """Give the axis that lines lie along, the coarse sweeps, and those of the full scan.
+
+    Raises
+    ------
+    SettingsError : the mirror may be so far off that overlaps take whole lines.
+    PoseError : the field is beyond the mirror's range.
+    """
     camera, cost, apart = settings.camera, settings.cost, 2 * settings.pointing_px
     coarse_overlap = _overlap(settings, grid.factor)
     along, full, _ = cheapest_full(grid, camera, cost, overlap_px=_overlap(settings, 1))
     coarse = with_margin(coarse_sweeps(grid, camera, along, overlap_px=coarse_overlap), camera, apart)
-    full = with_margin(full, camera, apart)
-    full_s, coarse_s = cost.seconds(full, camera), cost.seconds(coarse, camera)
-    fine_s = check_budget(settings.budget, coarse_s, full_s)
-    return CapturePlan(along, coarse, full, coarse_s, full_s, fine_s, coarse_overlap, apart)
+    return along, coarse, with_margin(full, camera, apart)
 
 
 def _overlap(settings: Settings, step: int) -> float:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.effect_choice import source_with
 from flows.full_look import columns_of_all_seats
 from flows.pointing_stage import load_registration
 from flows.run import SurveyRun
@@ -37,12 +38,21 @@ from storage.stored_tables import read_table
 
 
 def evaluate(
-    run: SurveyRun, produce: Produce, mosaic: StageRef, patches: StageRef, class_map: StageRef, *pointing: StageRef
+    run: SurveyRun,
+    produce: Produce,
+    mosaic: StageRef,
+    patches: StageRef,
+    class_map: StageRef,
+    effects: StageRef,
+    *pointing: StageRef,
 ) -> StageRef | None:
-    """Judge the map by the labels, and what other placements would have given. Not part of the survey's own cost."""
+    """Judge the map by the labels, and what other placements would have given. Not part of the survey's own cost.
+
+    What controls see has the effects of the survey.
+    """
     if not run.scene.labelled:
         return None
-    inputs = [mosaic, patches, class_map, *pointing]
+    inputs = [mosaic, patches, class_map, effects, *pointing]
     _wait_for(inputs)
     off = _map_offset(run, pointing)
     labels = _moved(run, off)
@@ -57,7 +67,8 @@ def evaluate(
         result["none"] = _figures(run, confusion(labels, none.classes, run.weights.config.classes))
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
         if run.settings.controls:
-            result |= _controls(replace(run, source=_sure_source(run, off)), seen, patches, labels, result)
+            source = source_with(_sure_source(run, off), effects)
+            result |= _controls(replace(run, source=source), seen, patches, labels, result)
         write_json(path / "accuracy.json", result)
 
     params = {

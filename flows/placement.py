@@ -83,7 +83,7 @@ def rectify(run: SurveyRun, produce: Produce, raw: StageRef, lookup: StageRef, *
         )  # fmt: skip
         writer = MosaicWriter(
             path / "mosaic.zarr", grid.shape, run.scene.wavelength_nm,
-            fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(run.grid.factor),
+            fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(run.grid.factor), simulation=captured(raw)[0].simulation,
         )  # fmt: skip
         colours, _ = choose_bands(run.scene.wavelength_nm)
         picture = Thumbnail(grid.shape, colours, QUICKLOOK_PX)

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.effect_choice import RECORD as EFFECTS_RECORD
+from flows.effect_choice import load_manifest
 from flows.evaluation import load_accuracy
 from flows.findings import find_out
 from flows.ground_picture import draw_ground
@@ -28,11 +30,11 @@ from flows.run import SurveyRun, now
 from flows.settings import anchor_paths
 from flows.stages import SEATS_AT_ONCE, captured, load_plan
 from flows.survey import Products, StageRunner
+from pipeline.coverage import on_scene
 from pipeline.planning import FinePlan, joined_plan
 from pipeline.rectify.calibrate import of_bands, reflectance
 from pipeline.savings import Entry, capture_savings
 from pipeline.scan import Sweep
-from pipeline.simulator.instrument import ALL_EFFECTS, on_scene
 from storage.attention import load_attention
 from storage.class_maps import ClassMap, load_class_map
 from storage.cubes import RawCube
@@ -41,13 +43,6 @@ from storage.patches import open_patches
 from storage.stored_images import open_image
 
 LIBRARIES = ("spectralzoom", "numpy", "torch", "zarr", "xarray", "prefect")
-VARIANTS = {
-    "slit": "box of the slit's width, 4 Gauss nodes",
-    "smear": "mean over the positions held in one exposure",
-    "throughput": "light by the mirror's area as seen along the ray",
-    "shot": "one normal draw with the counts' skewness",
-    "read": "normal, in the same draw",
-}
 
 
 @dataclass(frozen=True)
@@ -100,7 +95,7 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
     )  # fmt: skip
     return build_receipt(
         header, runner.records.values(), savings, _addresses(products, folder),
-        accuracy=accuracy, effects=_effects(run), findings=find_out(run, products),
+        accuracy=accuracy, simulation=load_manifest(products.effects), findings=find_out(run, products),
     )  # fmt: skip
 
 
@@ -114,6 +109,7 @@ def _versions() -> dict[str, str]:
 
 def _addresses(products: Products, folder: str) -> dict[str, str]:
     named = {
+        "effects": f"{products.effects.uri}/{EFFECTS_RECORD}",
         "raw_coarse": products.raw_coarse.uri,
         "lookup": f"{products.lookup.uri}/lookup.zarr",
         "mosaic": f"{products.mosaic.uri}/mosaic.zarr",
@@ -163,21 +159,6 @@ def _multiply_adds(run: SurveyRun, plans: Sequence[FinePlan]) -> dict[str, Any]:
     return {**Entry(done.total, full.total, "predicted").as_dict(), **asdict(done)}
 
 
-def _effects(run: SurveyRun) -> list[dict[str, Any]]:
-    """Effects that this version simulates, on or off as asked; bounds are not computed yet."""
-    nothing = dict.fromkeys(("bound", "measured", "cost_s", "why"))
-    always = {
-        "rotation": "exact rays through the mirror",
-        "quantisation": f"{run.camera.bits} bits, rounded half to even",
-        "saturation": "clipped at the converter's range",
-    }
-    rows = [{"name": name, "state": "on", "variant": variant, **nothing} for name, variant in always.items()]
-    for name in sorted(ALL_EFFECTS):
-        state = "on" if name in run.source.effects else "off"
-        rows.append({"name": name, "state": state, "variant": VARIANTS[name], **nothing})
-    return rows
-
-
 def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: Receipt) -> QuicklookData:
     """Gather what the four panels show, three bands of it."""
     bands, _ = choose_bands(run.scene.wavelength_nm)
@@ -206,8 +187,15 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         confidence=found.confidence,
         pixel_mrad=run.camera.ifov_rad * 1e3,
         along=run.plan.along,
-        note="" if miou is None else f"mIoU {100 * miou:.1f} %",
+        note="   ·   ".join(_title_notes(run, miou)),
     )
+
+
+def _title_notes(run: SurveyRun, miou: float | None) -> list[str]:
+    """What ends the title line: when a farm that grows was looked at, and how good the map is."""
+    moment = run.settings.moment
+    when = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]
+    return when if miou is None else [*when, f"mIoU {100 * miou:.1f} %"]
 
 
 def _by_strip(cubes: list[RawCube]) -> list[RawCube]:

@@ -86,6 +86,7 @@ class Receipt(TypedDict):
     savings: Savings
     accuracy: NotRequired[Accuracy]
     effects: NotRequired[list[dict[str, Any]]]
+    effects_total: NotRequired[dict[str, Any]]  # sum of the bounds beside the tolerance, and seconds saved
     plan: NotRequired[dict[str, Any]]  # how the fine pass was laid out, and what the other orientation would cost
     pointing: NotRequired[dict[str, Any]]  # only where the mirror may look beside the plan
     lines: NotRequired[dict[str, Any]]  # sweeps with lines lost, repeated, out of order, late or invalid
@@ -128,6 +129,7 @@ _SAVING_FIELDS = ("done", "full", "ratio", "full_is")
 _SPLIT_FIELDS = ("glance", "score", "encode", "decode")
 _STAGE_FIELDS = ("name", "key", "state", "wall_s", "cpu_s", "peak_rss_bytes", "bytes_in", "bytes_out")
 _EFFECT_FIELDS = ("name", "state", "variant", "bound", "measured", "cost_s", "why")
+_TOTAL_FIELDS = ("asked", "tolerance", "unit", "bound", "measured", "on", "off", "cost_s", "saved_s", "saved_cheap_s")
 _HEADER_FIELDS = ("survey", "source", "scene", "seed", "started", "finished", "versions", "settings")
 # what another run of the same seed has otherwise
 _OF_ONE_RUN = ("wall_s", "cpu_s", "peak_rss_bytes", "state", "manifest_sha256")
@@ -141,7 +143,7 @@ def build_receipt(
     products: Mapping[str, str],
     *,
     accuracy: Mapping[str, object] | None = None,
-    effects: Iterable[Mapping[str, object]] | None = None,
+    simulation: Mapping[str, Any] | None = None,
     findings: Mapping[str, object] | None = None,
 ) -> Receipt:
     """Put a receipt together in its fixed order and check that nothing is missing.
@@ -152,8 +154,9 @@ def build_receipt(
         `COSTS` and, where measured, ``segment_wall_s``; each a mapping with the fields of `Saving`.
     accuracy
         Fields of `Accuracy`; None without labels.
-    effects
-        Rows with name, state, variant, bound, measured, cost_s, why; None for a source that is not simulated.
+    simulation
+        ``effects``, rows with name, state, variant, bound, measured, cost_s, why, unit, and ``total``, their sums; None
+        for a source that is not simulated.
     findings
         Parts that not every survey has: `FINDINGS`.
 
@@ -165,8 +168,8 @@ def build_receipt(
     receipt["savings"] = {name: savings[name] for name in (*COSTS, "segment_wall_s") if name in savings}
     if accuracy is not None:
         receipt["accuracy"] = accuracy
-    if effects is not None:
-        receipt["effects"] = list(effects)
+    if simulation is not None:
+        receipt |= {"effects": list(simulation["effects"]), "effects_total": simulation["total"]}
     receipt |= {name: found for name in FINDINGS if (found := (findings or {}).get(name))}
     receipt["products"] = dict(products)
     return check_receipt(json.loads(to_json(receipt)))
@@ -185,6 +188,8 @@ def check_receipt(receipt: Mapping[str, Any]) -> Receipt:
         _check_accuracy(receipt["accuracy"])
     for number, effect in enumerate(receipt.get("effects", ())):
         _need(effect, _EFFECT_FIELDS, f"receipt.effects[{number}]")
+    if "effects_total" in receipt:
+        _need(receipt["effects_total"], _TOTAL_FIELDS, "receipt.effects_total")
     return cast("Receipt", receipt)
 
 
@@ -247,8 +252,6 @@ def comparable(receipt: Receipt) -> dict[str, Any]:
         for stage in receipt["stages"]
     ]
     same["savings"] = _without(receipt["savings"], ("segment_wall_s",))
-    if "effects" in receipt:
-        same["effects"] = [_without(effect, ("cost_s",)) for effect in receipt["effects"]]
     same["products"] = sorted(receipt["products"])
     return same
 

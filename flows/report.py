@@ -14,6 +14,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from flows.effect_table import format_change, total_words
 from flows.figures import DASH, format_bytes, format_percent, format_points, format_seconds
 from flows.finding_words import sentences
 from flows.receipt import Accuracy, Receipt, Saving, Savings
@@ -64,7 +65,7 @@ def render_report(
         _accuracy(receipt["accuracy"]) if "accuracy" in receipt else "",
         *(_figure(picture) for picture in pictures),
         _stages(receipt["stages"]),
-        _effects(receipt["effects"]) if receipt.get("effects") else "",
+        _effects(receipt["effects"], receipt.get("effects_total")) if receipt.get("effects") else "",
         _details("Settings", _flat(receipt["settings"])),
         _details("Versions", receipt["versions"]),
         _details("Files of this survey", receipt["products"]),
@@ -206,17 +207,26 @@ def _stages(stages: Iterable[Mapping[str, Any]]) -> str:
     return _section("What was done", _table([head, *rows]))
 
 
-def _effects(effects: Iterable[Mapping[str, Any]]) -> str:
-    names = ("name", "state", "variant", "bound", "measured", "cost_s", "why")
-    head = _row("th", ["effect", "state", "variant", "bound", "measured", "cost", "why"])
-    rows = [_row("td", [_plain(effect[name]) for name in names]) for effect in effects]
-    return _section("What the simulator took into account", _table([head, *rows]))
-
-
-def _plain(value: object) -> str:
-    if value is None:
-        return DASH
-    return escape(f"{value:.3g}" if isinstance(value, float) else str(value))
+def _effects(effects: Iterable[Mapping[str, Any]], total: Mapping[str, Any] | None) -> str:
+    """What was computed and what left out, effect by effect; receipts of before have no total."""
+    head = _row("th", ["effect", "state", "variant", "bound", "measured", "processor", "why"])
+    rows = [
+        _row(
+            "td",
+            [
+                escape(effect["name"].replace("-", " ")),
+                f'<span class="state {"ran" if effect["state"] == "on" else "off"}">{escape(effect["state"])}</span>',
+                escape(effect["variant"] or ""),
+                escape(format_change(effect["bound"], endless="unit" in effect)),
+                escape(format_change(effect["measured"])),
+                format_seconds(effect["cost_s"]) if effect["cost_s"] else "",
+                f'<span class="words">{escape(effect["why"] or "")}</span>',
+            ],
+        )
+        for effect in effects
+    ]
+    words = "" if total is None else f"<p>{escape(' '.join(total_words(total)))}</p>"
+    return _section("What the simulator took into account", f"{words}{_table([head, *rows])}")
 
 
 def _details(title: str, items: Mapping[str, object]) -> str:
@@ -299,6 +309,7 @@ details td:last-child { white-space: normal; overflow-wrap: anywhere; }
 .bar i { display: block; height: 100%; background: var(--bar); } .bar.over i { background: var(--over); }
 b { font-weight: 600; } code { font-size: .85em; }
 summary { cursor: pointer; font-weight: 600; }
+.words { display: inline-block; min-width: 22rem; white-space: normal; }
 .state { padding: .05rem .5rem; border-radius: .6rem; background: var(--track); font-size: .85rem; }
 .state.ran { color: var(--bar); } .state.failed { color: var(--over); font-weight: 700; }
 @media print { :root { --paper: #fff; --card: #fff; --ink: #000; --soft: #444; --line: #bbb; --bar: #2f7d4f;

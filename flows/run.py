@@ -25,7 +25,7 @@ from pipeline.grid import SceneGrid
 from pipeline.ground import GroundView
 from pipeline.ground_grid import ground_grid
 from pipeline.once import Once
-from pipeline.simulator.instrument import ALL_EFFECTS
+from pipeline.scan import Sweep
 from pipeline.simulator.pointing import PointingErrors
 from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
@@ -38,21 +38,15 @@ SHIPPED = "farm.safetensors"
 Report = Callable[[float], None]  # how far a stage is, 0..1
 
 
-@dataclass(frozen=True)
-class SurveyRun:
-    """Everything a stage may look at. Made by `open_run`, which refuses what cannot work."""
+@dataclass(frozen=True, kw_only=True)
+class CaptureRun:
+    """What deciding on effects and capturing need to know."""
 
     settings: Settings
     archive: Archive
-    source: SimulatedSource
+    source: SimulatedSource  # without effects: which there are is a stage's to decide
     scene: RasterScene
-    described: Description  # what the weights say of themselves
-    load: Once[Weights]
-    weights_key: str
-    grid: SceneGrid
-    plan: CapturePlan
-    notes: tuple[str, ...] = ()
-    refused: str | None = None  # why this machine would refuse the survey; it is planned nevertheless
+    planned: tuple[Sweep, ...]  # that stand for all the rig may take: the coarse pass and the scan of everything
     report: Report = field(default=lambda done: None)
 
     @property
@@ -64,6 +58,29 @@ class SurveyRun:
     def name(self) -> str:
         """What the survey is called: its scene."""
         return Path(self.scene.name).stem
+
+    def source_key(self) -> dict[str, Any]:
+        """What the captured light depends on, beside the sweeps and the effects."""
+        return {
+            "source": self.source.name,
+            "scene": self.scene.key,
+            "seed": self.settings.seed,
+            "camera": asdict(self.camera),
+            "pointing_px": self.settings.pointing_px,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurveyRun(CaptureRun):
+    """Everything a stage may look at. Made by `open_run`, which refuses what cannot work."""
+
+    described: Description  # what the weights say of themselves
+    load: Once[Weights]
+    weights_key: str
+    grid: SceneGrid
+    plan: CapturePlan
+    notes: tuple[str, ...] = ()
+    refused: str | None = None  # why this machine would refuse the survey; it is planned nevertheless
 
     @property
     def weights(self) -> Weights:
@@ -88,16 +105,6 @@ class SurveyRun:
     def angular_grid(self, factor: int = 1) -> AngularGrid:
         """Where pixels of ``factor`` fine px lie."""
         return AngularGrid(self.camera.ifov_rad, self.scene.shape, factor)
-
-    def source_key(self) -> dict[str, Any]:
-        """What the captured light depends on, beside the sweeps."""
-        return {
-            "scene": self.scene.key,
-            "seed": self.settings.seed,
-            "effects": sorted(self.source.effects),
-            "camera": asdict(self.camera),
-            "pointing_px": self.settings.pointing_px,
-        }
 
 
 def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
@@ -129,16 +136,21 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     band_notes = _check_bands(scene, described, path)
     if settings.mask is not None:
         check_mask(settings.mask, scene.shape)
-    effects = _chosen_effects(settings.effects)
     vgg_notes = _check_vgg(settings, None if planning else load)
-    source = SimulatedSource(scene, settings.camera, settings.seed, effects, pointing=_pointing(settings))
+    source = make_source(scene, settings)
     check_memory(settings, source, grid, plan)
     _check_pose(settings, scene.shape)
     key = hashlib.sha256(path.read_bytes()).hexdigest()[:20]
     return SurveyRun(
-        settings, Archive.open(settings.out), source, scene, described, load, key, grid, plan,
-        (*notes, *band_notes, *vgg_notes, *label_notes), refused,
+        settings=settings, archive=Archive.open(settings.out), source=source, scene=scene,
+        planned=(*plan.coarse, *plan.full), described=described, load=load, weights_key=key, grid=grid, plan=plan,
+        notes=(*notes, *band_notes, *vgg_notes, *label_notes), refused=refused,
     )  # fmt: skip
+
+
+def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
+    """Give the simulated rig before a scene, with no effect on: `flows.effect_choice` decides on them."""
+    return SimulatedSource(scene, settings.rig, settings.seed, {}, pointing=_pointing(settings))
 
 
 def _vgg_file(settings: Settings) -> VggFile | None:
@@ -170,13 +182,6 @@ def _check_pose(settings: Settings, shape: tuple[int, int]) -> None:
         ground_grid(view, shape, epsg=settings.map.epsg, resolution_m=settings.map.resolution_m)
 
 
-def _chosen_effects(text: str) -> frozenset[str]:
-    """Effects to simulate: ``auto`` and ``all`` are those built, ``none``, or names with commas."""
-    if text in ("auto", "all"):
-        return ALL_EFFECTS
-    return frozenset() if text == "none" else frozenset(name.strip() for name in text.split(","))
-
-
 def weights_path(settings: Settings) -> Path:
     """Where the weights of a survey lie: those that come with the house for its own scenes.
 
@@ -188,7 +193,7 @@ def weights_path(settings: Settings) -> Path:
         return Path(settings.weights)
     if settings.scene not in BUILT_IN_SCENES:
         raise SettingsError(
-            f"--weights is missing: the weights that come with SpectralZoom know the scene 'farm' only;"
+            f"--weights is missing: the weights that come with SpectralZoom know the built-in farm only;"
             f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
         )
     return Path(str(resources.files("models") / "shipped" / SHIPPED))

@@ -8,9 +8,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from pipeline.errors import BudgetError, SettingsError
+from pipeline.simulator.choice import named_effects
+from pipeline.simulator.effects.registry import BY_NAME
+from pipeline.simulator.probe import Unit
 from storage.block_work import Crew
 
-EFFECTS = ("slit", "smear", "throughput", "shot", "read")
+RENAMED = {"throughput": "vignetting", "read": "read-noise"}  # effects as settings of before called them
 LEAST_MEMORY = 256 * 1024**2
 _BYTES = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12,
           "kib": 2**10, "mib": 2**20, "gib": 2**30, "tib": 2**40}  # fmt: skip
@@ -24,25 +27,43 @@ _OTHER_UNITS: dict[str, tuple[tuple[str, float], ...]] = {
     "hz": (("kilohertz", 1e3),),
     "m": (("millimetres", 1e-3), ("kilometres", 1e3)),
     "deg": (("1e-7 degrees", 1e-7), ("millionths of a degree", 1e-6)),
+    "urad": (("radians", 1e6), ("degrees", 17453.3)),
+    "km": (("metres", 1e-3),),
 }
 
 
 @dataclass(frozen=True)
 class Span:
-    """Least and greatest value of a number, both allowed, and its unit ('' for none)."""
+    """Least and greatest value of a number, both allowed, and its unit ('' for none); ``endless``: infinity is one."""
 
     low: float
     high: float
     unit: str
+    endless: bool = False
 
     def __str__(self) -> str:
-        return f"a number from {self.low:g} to {self.high:g}" + (f" {self.unit}" if self.unit else "")
+        bounded = math.isfinite(self.high)
+        words = f"a number from {self.low:g} to {self.high:g}" if bounded else f"a number of at least {self.low:g}"
+        return words + (f" {self.unit}" if self.unit else "") + (" or inf" if self.endless else "")
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """What a simulation may leave out: the greatest change of any number, in noise sigmas or in DN."""
+
+    value: float = 0.1
+    unit: Unit = "sigma"
+
+    def __str__(self) -> str:
+        return f"{self.value!r}" + ("" if self.unit == "sigma" else "dn")
 
 
 def parse_number(span: Span) -> Callable[[object, str], float]:
     """A parser for finite numbers within ``span``."""
 
     def parse(value: object, place: str) -> float:
+        if span.endless and value in (math.inf, "inf"):
+            return math.inf
         number = _to_float(value)
         if number is None or not span.low <= number <= span.high:
             raise SettingsError(f"{place} must be {span}, got {value!r}{_unit_hint(number, span)}")
@@ -133,13 +154,33 @@ def parse_size(value: object, place: str) -> tuple[int, int]:
 
 
 def parse_effects(value: object, place: str) -> str:
-    """``auto``, ``all``, ``none`` or names of effects with commas between them, in the one fixed order."""
-    names = [name.strip() for name in value.split(",")] if isinstance(value, str) else value
-    if names in (["auto"], ["all"], ["none"]):
-        return str(names[0])
-    if not isinstance(names, list | tuple) or not names or not set(names) <= set(EFFECTS):
-        raise SettingsError(f"{place} must be auto, all, none, or some of {','.join(EFFECTS)}; got {value!r}")
-    return ",".join(name for name in EFFECTS if name in names)
+    """``auto``, ``all``, ``none`` or names of effects with commas between them, in the order of the chain."""
+    names = value.split(",") if isinstance(value, str) else value
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        raise SettingsError(f"{place} must be auto, all, none, or names of effects with commas; got {value!r}")
+    words = [str(name).strip() for name in names if str(name).strip()]
+    for old in [word for word in words if word in RENAMED]:
+        raise SettingsError(f"{place}: the effect {old!r} is now called {RENAMED[old]!r}; got {value!r}")
+    try:
+        chosen = named_effects(",".join(words), list(BY_NAME))
+    except SettingsError as error:
+        raise SettingsError(f"{place}: {error}") from None
+    alone = words in (["auto"], ["all"], ["none"])
+    return words[0] if alone or chosen is None else ",".join(name for name in BY_NAME if name in chosen)
+
+
+def parse_tolerance(value: object, place: str) -> Tolerance:
+    """A number of noise sigmas, or text such as 0.5dn for DN; 0 leaves out nothing, inf all that can be."""
+    found = re.fullmatch(r"([-+0-9.e]+|inf)\s*(dn|sigmas?)?", str(value).strip().lower())
+    amount = None if found is None or isinstance(value, bool) else _to_float(found[1])
+    if found is not None and found[1] == "inf":
+        amount = math.inf
+    if found is None or amount is None or amount < 0:
+        raise SettingsError(
+            f"{place} must be 0 or more, in sigmas of the noise such as 0.1, or in DN such as 0.5dn; inf leaves out all"
+            f" that can be; got {value!r}"
+        )
+    return Tolerance(amount, "dn" if found[2] == "dn" else "sigma")
 
 
 def parse_bands(value: object, place: str) -> tuple[int, ...]:
@@ -193,7 +234,7 @@ def _unit_hint(number: float | None, span: Span) -> str:
     """A guess at the unit in which the number was written, as the end of a message."""
     if number is None:
         return ""
-    for name, factor in _OTHER_UNITS.get(span.unit, ()):
+    for name, factor in _OTHER_UNITS.get(span.unit.lower(), ()):
         if span.low <= number * factor <= span.high:
             return f"; was it given in {name}? then write {number * factor:g}"
     return ""

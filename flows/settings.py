@@ -6,11 +6,14 @@ import difflib
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, asdict, dataclass, field, fields
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal, cast
 
+from flows.rig_settings import field_parsers
 from flows.setting_values import (
     Span,
+    Tolerance,
     parse_bands,
     parse_budget,
     parse_choice,
@@ -21,6 +24,7 @@ from flows.setting_values import (
     parse_size,
     parse_switch,
     parse_text,
+    parse_tolerance,
     parse_wavelengths,
     parse_whole,
 )
@@ -29,6 +33,8 @@ from pipeline.camera import LineCamera
 from pipeline.errors import PoseError, SettingsError
 from pipeline.ground import LIMITS, RigPose
 from pipeline.scan import CostModel
+from pipeline.simulator.farm_laws import FARM_NAMES, SEASON_LAW, USUAL_DAY, USUAL_HOUR, has_days
+from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from storage.block_work import Crew
 
 POLICIES = (
@@ -39,7 +45,7 @@ IN_NAT = ("gain", "entropy")  # policies whose scores are gains, or the most tha
 UNMOVED = ("random", "stratified", "centre", "uniform", "mask")  # policies by place: nothing seen changes them
 ENGINES = ("prefect", "plain")
 KERNELS = ("catmull-rom", "bilinear", "nearest")
-BUILT_IN_SCENES = ("farm",)
+BUILT_IN_SCENES = FARM_NAMES
 BUILT_IN_SOURCES = ("sim", "rig")
 OF_THE_MACHINE = ("scheduler", "workers")  # no byte depends on them; a cluster of that day need not be there today
 _VGG_FROM = {"vgg-static": VGG_FROM, "vgg-trained": TRAINED_VGG_FROM}  # policies that read a file of VGG19
@@ -74,7 +80,8 @@ class Settings:
     rounds: int = 1  # of detail: with 2 half of the seconds are spent first, the rest by what they showed
     threshold: float | None = None  # least expected gain per second of fine capture [nat per px, summed over seats]
     seed: int = 0
-    effects: str = "auto"  # auto, all, none, or names with commas
+    effects: str = "auto"  # of the simulated rig: auto, all, none, or names with commas
+    tol: Tolerance = field(default_factory=Tolerance)  # what leaving effects out may change any number by
     controls: bool = True
     engine: Literal["prefect", "plain"] = "prefect"
     memory: int = 4 * 1024**3  # [bytes]
@@ -83,7 +90,14 @@ class Settings:
     kernel: Literal["catmull-rom", "bilinear", "nearest"] = "catmull-rom"
     pointing_px: float = 0.0  # how far off the mirror may point; above 0 sweeps overlap and their seams are registered
     size: tuple[int, int] | None = None  # (width, height) of the built-in scene [px]
+    day: int | None = None  # of the year, for farm@2: 172 unless given
+    hour: float | None = None  # true solar time, for farm@2: 11 unless given [h]
     camera: LineCamera = field(default_factory=LineCamera)
+    optics: Optics = field(default_factory=Optics)
+    mirror: MirrorMotion = field(default_factory=MirrorMotion)
+    detector: Detector = field(default_factory=Detector)
+    air: Air = field(default_factory=Air)
+    sky: Sky = field(default_factory=Sky)
     cost: CostModel = field(default_factory=CostModel)
     pose: RigPose | None = None  # without one nothing is put on the ground
     map: MapChoice = field(default_factory=MapChoice)
@@ -98,9 +112,30 @@ class Settings:
         """(y, x) of the built-in scene [px], None for its default."""
         return None if self.size is None else (self.size[1], self.size[0])
 
+    @property
+    def moment(self) -> tuple[int, float] | None:
+        """Day of the year and true solar time [h] of the built-in scene; None of a scene that has none."""
+        if not has_days(self.scene):
+            return None
+        return USUAL_DAY if self.day is None else self.day, USUAL_HOUR if self.hour is None else self.hour
+
+    @property
+    def rig(self) -> Rig:
+        """All that the simulator knows of the rig; SettingsError where its parts do not go together."""
+        return Rig(self.camera, self.optics, self.mirror, self.detector, self.air, self.sky)
+
     def to_dict(self) -> dict[str, object]:
         """Plain values for the receipt; `parse_settings` reads them back to the same settings."""
-        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+        return {key: plain_value(value) for key, value in (asdict(self) | {"tol": str(self.tol)}).items()}
+
+
+def plain_value(value: object) -> object:
+    """A value of the settings as JSON knows it: lists, and text for a moment."""
+    if isinstance(value, Mapping):
+        return {key: plain_value(item) for key, item in value.items()}
+    if isinstance(value, datetime):
+        return value.isoformat()
+    return list(value) if isinstance(value, tuple) else value
 
 
 def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | None = None) -> Settings:
@@ -133,7 +168,7 @@ def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None
     Parameters
     ----------
     table
-        Keys and values as in the file, ``camera``, ``cost``, ``pose`` and ``map`` being tables themselves; None in
+        Keys and values as in the file, ``camera``, ``cost``, ``pose`` and the like being tables themselves; None in
         them means not given.
     origin
         Where each (dotted) key came from, for the messages: a file's name or ``flag``.
@@ -212,13 +247,31 @@ def _check_together(settings: Settings, origin: Mapping[str, str]) -> None:
         )
     if settings.size is not None and settings.scene not in BUILT_IN_SCENES:
         raise SettingsError(f"size is for built-in scenes ({', '.join(BUILT_IN_SCENES)}); {settings.scene} has its own")
+    for name, value in {"day": settings.day, "hour": settings.hour}.items():
+        if value is not None and not has_days(settings.scene):
+            raise SettingsError(
+                f"{_place(name, origin.get(name))} = {value:g} is for the scene {SEASON_LAW}, whose fields grow; "
+                f"{settings.scene} is as it is: leave it out"
+            )
     if settings.camera.dark_dn >= settings.camera.full_scale_dn:
         raise SettingsError(
             f"camera.dark_dn = {settings.camera.dark_dn:g} leaves no room below the {settings.camera.full_scale_dn} DN "
             f"of {settings.camera.bits} bits; use a smaller dark level"
         )
+    _check_rig(settings)
     if settings.pose is None and settings.map != MapChoice():
         raise SettingsError("[map] says how to draw the ground, which needs to know where the rig stands: give [pose]")
+
+
+def _check_rig(settings: Settings) -> None:
+    """What no number of the rig can say alone."""
+    near, far = settings.air.nearest_m, settings.air.farthest_m
+    for name, metres in {"nearest_m": near, "farthest_m": far}.items():
+        if metres is not None and settings.air.distance_m is None:
+            raise SettingsError(f"air.{name} = {metres:g} needs air.distance_m, how far the middle of the scene is")
+    distances = settings.rig.distances_m
+    if distances is not None and distances[0] > distances[1]:
+        raise SettingsError(f"air.nearest_m = {distances[0]:g} lies beyond air.farthest_m = {distances[1]:g}")
 
 
 def _check_spending(settings: Settings) -> None:
@@ -314,8 +367,12 @@ _MAP: dict[str, Parser] = {
     "epsg": parse_whole(1024, 32_767, why="the number after EPSG:, such as 32632"),
     "resolution_m": parse_number(Span(1e-4, 1000, "m")),
 }
+_OF_THE_RIG: dict[str, type[Any]] = {
+    "optics": Optics, "mirror": MirrorMotion, "detector": Detector, "air": Air, "sky": Sky,
+}  # fmt: skip
 _TABLES: dict[str, tuple[type[Any], dict[str, Parser]]] = {
     "camera": (LineCamera, _CAMERA),
+    **{name: (make, field_parsers(make)) for name, make in _OF_THE_RIG.items()},
     "cost": (CostModel, _COST),
     "pose": (RigPose, _POSE),
     "map": (MapChoice, _MAP),
@@ -336,6 +393,7 @@ _SURVEY: dict[str, Parser] = {
     "threshold": parse_number(Span(0, 1e9, "nat per second")),
     "seed": parse_whole(0, 2**63 - 1),
     "effects": parse_effects,
+    "tol": parse_tolerance,
     "controls": parse_switch,
     "engine": parse_choice(ENGINES),
     "memory": parse_memory,
@@ -344,5 +402,7 @@ _SURVEY: dict[str, Parser] = {
     "kernel": parse_choice(KERNELS),
     "pointing_px": parse_number(Span(0, 300, "px")),
     "size": parse_size,
+    "day": parse_whole(1, 366, why="of the year, 172 is the 21st of June"),
+    "hour": parse_number(Span(0, 24, "h")),
     **dict.fromkeys(_TABLES, parse_text),  # checked by _parse_table
 }

@@ -23,21 +23,23 @@ class Part:
 
     stage: str
     unit: Unit
-    inputs: int | None = None  # tells apart stages of one name
+    inputs: int | None = None  # these two tell apart stages of one name
+    fine: bool | None = None
     size: Unit | None = None  # the same as for seconds
 
 
 PARTS = {
-    "capture_coarse": Part("capture", "coarse values", 0),
+    "choose_effects": Part("effects", "surveys"),
+    "capture_coarse": Part("capture", "coarse values", fine=False),
     "register_coarse": Part("register", "coarse values", 1),
     "locate": Part("locate", "coarse pixels"),
     "rectify": Part("rectify", "mosaic values"),
     "attend": Part("attend", "pixels", 1),
-    "capture_fine": Part("capture", "fine values", 1),
+    "capture_fine": Part("capture", "fine values", fine=True),
     "register_fine": Part("register", "fine values", 2),
     "cut_patches": Part("patches", "patch values"),
     "attend_again": Part("attend", "operations of the map", 3),
-    "capture_again": Part("capture", "fine values", 1),
+    "capture_again": Part("capture", "fine values", fine=True),
     "register_again": Part("register", "fine values", 2),
     "cut_again": Part("patches", "patch values"),
     "draw_map": Part("segment", "operations of the map", size="pixels"),
@@ -72,7 +74,9 @@ class PastCosts:
         found = [
             store
             for store in self._by_stage.get(part.stage, [])
-            if store.problem is None and part.inputs in (None, len(store.inputs))
+            if store.problem is None
+            and part.inputs in (None, len(store.inputs))
+            and part.fine in (None, _is_fine(store))
         ]
         return sorted(found, key=lambda store: store.created, reverse=True)
 
@@ -151,11 +155,13 @@ class PastCosts:
     def _extent_then(self, record: Store) -> Extent:
         """How much a survey was, as far as a store and those that it rests on tell by their parameters."""
         below = self._below(record)
-        captures = {bool(store.inputs): store for store in below if store.ref.stage == "capture"}
-        passes = [store for store in below if store.ref.stage == "capture" and store.inputs]
+        captures = {_is_fine(store): store for store in below if store.ref.stage == "capture"}
+        passes = [store for store in below if store.ref.stage == "capture" and _is_fine(store)]
         if record.ref.stage in ("capture", "register"):  # of a second round: the first is none of its work
             passes = [store for store in passes if store.ref.key in (record.ref.key, *record.inputs)]
         own = self._extent
+        if record.ref.stage == "effects":  # looks at a few places of a scene, whatever its size
+            return own
         if record.ref.stage == "locate":  # is of a path, and of no field: its own grid is that of coarse pixels
             height, width = record.params["grid"]["shape"]
             factor = own.grid.factor
@@ -193,6 +199,11 @@ def scaled_cost(works: Sequence[float], took: Sequence[float], wanted: float) ->
         start = min(max(took[0] - slope * works[0], 0.0), max(took) / 2)
         start = start if start < took[0] else 0.0
     return start + (took[0] - start) * wanted / works[0]
+
+
+def _is_fine(capture: Store) -> bool:
+    """Whether a stored capture is of a fine pass, which may have no sweep at all."""
+    return not any(sweep["kind"] == "coarse" for sweep in capture.params.get("sweeps", []))
 
 
 def _lines(sweeps: Sequence[dict[str, Any]]) -> int:

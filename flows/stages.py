@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.effect_choice import load_manifest, source_with
 from flows.field_work import FieldWork, region_params
 from flows.region_work import look_at, seat_columns
-from flows.run import SurveyRun
+from flows.run import CaptureRun, SurveyRun
 from models.inference import CoarseLook, Glance, read_glance
 from models.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_seats
 from models.regions import whole_field
@@ -26,6 +28,7 @@ from pipeline.crop_rows import CropRows, find_rows
 from pipeline.orientation import compare_orientations
 from pipeline.planning import FinePlan, plan_fine
 from pipeline.scan import Sweep
+from pipeline.simulator.survey_clock import sweep_starts
 from storage.archive import StageRef, stage_key
 from storage.attention import Attention, write_attention
 from storage.class_maps import ClassNames, create_class_map
@@ -37,8 +40,8 @@ from storage.spool import Spool
 from storage.stored_tables import read_table
 
 VERSIONS = {
-    "capture": 2, "register": 2, "locate": 2, "rectify": 3, "attend": 6, "patches": 3, "segment": 4, "ground": 2,
-    "evaluate": 6,
+    "effects": 1, "capture": 3, "register": 2, "locate": 2, "rectify": 3, "attend": 6, "patches": 3, "segment": 4,
+    "ground": 2, "evaluate": 6,
 }  # fmt: skip
 SEATS_AT_ONCE = 64
 
@@ -46,25 +49,37 @@ Build = Callable[[Path], None]
 Produce = Callable[[str, Build, dict[str, Any], Sequence[StageRef]], StageRef]
 
 
-def capture_coarse(run: SurveyRun, produce: Produce) -> StageRef:
+def capture_coarse(run: SurveyRun, produce: Produce, effects: StageRef) -> StageRef:
     """Sweep the whole field once, fast."""
-    return _capture(run, produce, run.plan.coarse, [])
+    return capture_sweeps(run, produce, run.plan.coarse, [effects])
 
 
-def capture_fine(run: SurveyRun, produce: Produce, attention: StageRef) -> StageRef:
+def capture_fine(run: SurveyRun, produce: Produce, attention: StageRef, effects: StageRef) -> StageRef:
     """Go back for the places that the plan chose."""
-    return _capture(run, produce, load_plan(attention).sweeps, [attention])
+    return capture_sweeps(run, produce, load_plan(attention).sweeps, [attention, effects], begins_s=run.plan.coarse_s)
 
 
-def _capture(run: SurveyRun, produce: Produce, sweeps: list[Sweep], inputs: list[StageRef]) -> StageRef:
-    params = {**run.source_key(), "sweeps": [asdict(sweep) for sweep in sweeps]}
+def capture_again(run: SurveyRun, produce: Produce, attention: StageRef, effects: StageRef) -> StageRef:
+    """Go back a second time, for what the second plan chose; the first has had its half of the seconds."""
+    begins = run.plan.coarse_s + run.plan.fine_s / run.settings.rounds
+    return capture_sweeps(run, produce, load_plan(attention).sweeps, [attention, effects], begins_s=begins)
+
+
+def capture_sweeps(
+    run: CaptureRun, produce: Produce, sweeps: list[Sweep], inputs: list[StageRef], *, begins_s: float = 0.0
+) -> StageRef:
+    """Take some sweeps, one after the other from ``begins_s`` on, with the effects of the last of the inputs."""
+    clock = sweep_starts(sweeps, run.camera, run.settings.cost, after_s=begins_s)
+    params = {**run.source_key(), "sweeps": [asdict(sweep) for sweep in sweeps], "starts_s": list(clock.values())}
     key = stage_key("capture", VERSIONS["capture"], params, [ref.key for ref in inputs])
     total = sum(sweep.lines for sweep in sweeps) or 1
 
     def build(path: Path) -> None:
-        before = 0
+        before, manifest = 0, load_manifest(inputs[-1])
+        lit = replace(run, source=source_with(run.source, inputs[-1], clock))
         for sweep in sweeps:
-            _capture_sweep(run, sweep, path, key, lambda lines, before=before: run.report((before + lines) / total))  # type: ignore[misc]
+            done = partial(_report_lines, run, before, total)
+            _capture_sweep(lit, sweep, path, key, done, effects=manifest)
             before += sweep.lines
 
     ref = produce("capture", build, params, inputs)
@@ -72,10 +87,18 @@ def _capture(run: SurveyRun, produce: Produce, sweeps: list[Sweep], inputs: list
     return ref
 
 
-def _capture_sweep(run: SurveyRun, sweep: Sweep, path: Path, key: str, report: Callable[[int], None]) -> None:
+def _report_lines(run: CaptureRun, before: int, total: int, lines: int) -> None:
+    run.report((before + lines) / total)
+
+
+def _capture_sweep(
+    run: CaptureRun, sweep: Sweep, path: Path, key: str, report: Callable[[int], None], *, effects: Mapping[str, Any]
+) -> None:
     """Lines into the spool one by one, from where a broken capture stopped; then 64 at a time into the cube."""
     references = run.source.references(sweep)
-    header = SweepHeader(sweep, references, run.scene.wavelength_nm, run.scene.fwhm_nm, run.source.name)
+    header = SweepHeader(
+        sweep, references, run.scene.wavelength_nm, run.scene.fwhm_nm, run.source.name, simulation=effects
+    )
     samples, bands = references.dark.shape
     about = {"sweep": asdict(sweep), **run.source_key()}
     with Spool.open(run.archive.spool_folder(key), samples, bands, header=about, name=sweep.name) as spool:

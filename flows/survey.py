@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from flows import placement, stages
+from flows.effect_choice import choose_effects
 from flows.evaluation import evaluate
 from flows.ground_stage import ground
 from flows.pointing_stage import register_coarse, register_fine
@@ -20,6 +21,7 @@ from flows.second_round import attend_again
 from storage.archive import StageRef
 
 STAGES: dict[str, Callable[..., StageRef | None]] = {
+    "choose_effects": choose_effects,
     "capture_coarse": stages.capture_coarse,
     "register_coarse": register_coarse,
     "locate": placement.locate,
@@ -29,7 +31,7 @@ STAGES: dict[str, Callable[..., StageRef | None]] = {
     "register_fine": register_fine,
     "cut_patches": placement.cut_patches,
     "attend_again": attend_again,
-    "capture_again": stages.capture_fine,
+    "capture_again": stages.capture_again,
     "register_again": register_fine,
     "cut_again": placement.cut_again,
     "draw_map": stages.draw_map,
@@ -38,6 +40,7 @@ STAGES: dict[str, Callable[..., StageRef | None]] = {
 }
 OF_ROUND_TWO = ("attend_again", "capture_again", "register_again", "cut_again")
 TITLES = {
+    "choose_effects": "effects that matter",
     "capture_coarse": "coarse sweep",
     "register_coarse": "seams of the coarse sweeps",
     "locate": "lookup",
@@ -70,6 +73,7 @@ class Products:
     ``patches`` are those of all rounds, ``attention``, ``raw_fine`` and ``fine_pointing`` of the first.
     """
 
+    effects: StageRef
     raw_coarse: StageRef
     coarse_pointing: StageRef | None
     lookup: StageRef
@@ -102,27 +106,29 @@ def survey(step: Step, rounds: int = 1) -> Products:
 
     With two rounds the second goes where the first showed that more is to be found.
     """
-    raw = _needed(step("capture_coarse"))
+    effects = _needed(step("choose_effects"))
+    raw = _needed(step("capture_coarse", effects))
     coarse_pointing = step("register_coarse", raw)
     lookup = _needed(step("locate", raw, *_there(coarse_pointing)))
     mosaic = _needed(step("rectify", raw, lookup, *_there(coarse_pointing)))
     attention = _needed(step("attend", mosaic))
-    fine = _needed(step("capture_fine", attention))
+    fine = _needed(step("capture_fine", attention, effects))
     fine_pointing = step("register_fine", fine, mosaic)
     patches = _needed(step("cut_patches", attention, fine, *_there(fine_pointing)))
     second: dict[str, StageRef | None] = {}
     if rounds > 1:
         again = _needed(step("attend_again", mosaic, attention, patches))
-        raw_again = _needed(step("capture_again", again))
+        raw_again = _needed(step("capture_again", again, effects))
         pointing_again = step("register_again", raw_again, mosaic)
         second = {"first_patches": patches, "attention_again": again, "raw_again": raw_again,
                   "pointing_again": pointing_again}  # fmt: skip
         patches = _needed(step("cut_again", again, raw_again, patches, *_there(pointing_again)))
     class_map = _needed(step("draw_map", mosaic, patches))
     ground_map = step("ground", class_map, mosaic)
-    accuracy = step("evaluate", mosaic, patches, class_map, *_there(coarse_pointing))
+    accuracy = step("evaluate", mosaic, patches, class_map, effects, *_there(coarse_pointing))
     return Products(
-        raw, coarse_pointing, lookup, mosaic, attention, fine, fine_pointing, patches, class_map, ground_map, accuracy,
+        effects, raw, coarse_pointing, lookup, mosaic, attention, fine, fine_pointing, patches, class_map, ground_map,
+        accuracy,
         **second,
     )  # fmt: skip
 

@@ -10,7 +10,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Generic, TypeVar
 
 from flows.tradeoff_machine import Copying, describe_machine, mean_load, one_thread
@@ -35,7 +35,7 @@ class Tradeoff(Generic[State, Output]):
 
     A stage whose time is not spent on this machine (capture) gives it by ``modelled_s``; it then counts as the price.
     ``levels`` and ``moved_bytes`` say which floors apply: errors that drown in noise, and the bytes that one unit must
-    at least read and write, priced by a copy of memory in the same rounds.
+    at least read and write, priced by a copy of memory in the same rounds. ``beside`` are more figures.
     """
 
     stage: str
@@ -51,6 +51,7 @@ class Tradeoff(Generic[State, Output]):
     modelled_s: Callable[[State, Setting, Output], float] | None = None
     levels: Callable[[State], tuple[Level, ...]] | None = None
     moved_bytes: float | None = None
+    beside: Mapping[str, Callable[[State, Setting, Output], float]] = field(default_factory=dict, hash=False)
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ class Point:
     ratio: float  # of the price to the first setting's; of processor time its median over the rounds
     modelled_s: float | None
     pareto: bool = False
+    beside: Mapping[str, float] = field(default_factory=dict, hash=False)  # more figures, by name
 
     @property
     def price_s(self) -> float:
@@ -105,7 +107,11 @@ class Result:
 
 
 def _finite(values: Mapping[str, object]) -> dict[str, object]:
-    return {key: None if isinstance(v, float) and not math.isfinite(v) else v for key, v in values.items()}
+    return {key: _finite(v) if isinstance(v, Mapping) else _known(v) for key, v in values.items()}
+
+
+def _known(value: object) -> object:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 _REGISTRY: dict[tuple[str, str], Tradeoff[Any, Any]] = {}
@@ -154,11 +160,14 @@ def measure_tradeoff(tradeoff: Tradeoff[State, Output], *, repeats: int = 5, see
     return Result(*named, repeats, seed, machine, mark_pareto(points), levels, floor)
 
 
-def _judge(tradeoff: Tradeoff[State, Output], state: State, setting: Setting) -> tuple[float, float | None]:
-    """Error and modelled seconds of one setting."""
+def _judge(
+    tradeoff: Tradeoff[State, Output], state: State, setting: Setting
+) -> tuple[float, float | None, dict[str, float]]:
+    """Error, modelled seconds and further figures of one setting."""
     output = tradeoff.run(state, setting)
     modelled = None if tradeoff.modelled_s is None else tradeoff.modelled_s(state, setting, output)
-    return float(tradeoff.judge(state, setting, output)), modelled
+    beside = {name: float(tell(state, setting, output)) for name, tell in tradeoff.beside.items()}
+    return float(tradeoff.judge(state, setting, output)), modelled, beside
 
 
 def _time_in_turn(
@@ -179,11 +188,12 @@ def _time_in_turn(
 
 
 def _point(
-    tradeoff: Tradeoff[State, Output], state: State, number: int, judged: Sequence[tuple[float, float | None]],
+    tradeoff: Tradeoff[State, Output], state: State, number: int,
+    judged: Sequence[tuple[float, float | None, dict[str, float]]],
     clocks: Sequence[Sequence[tuple[float, float]]],
 ) -> Point:  # fmt: skip
     cpu, wall = zip(*clocks[number], strict=True)
-    (error, modelled), first_modelled = judged[number], judged[0][1]
+    (error, modelled, beside), first_modelled = judged[number], judged[0][1]
     prices = zip(cpu, (first for first, _ in clocks[0]), strict=True)
     if modelled is not None and first_modelled is not None:
         prices = zip((modelled,), (first_modelled,), strict=True)
@@ -192,7 +202,7 @@ def _point(
         setting=tradeoff.settings[number], error=error, work=tradeoff.work(state, tradeoff.settings[number]),
         cpu_min_s=min(cpu), cpu_median_s=statistics.median(cpu),
         wall_min_s=min(wall), wall_median_s=statistics.median(wall),
-        ratio=statistics.median(ratios) if ratios else math.nan, modelled_s=modelled,
+        ratio=statistics.median(ratios) if ratios else math.nan, modelled_s=modelled, beside=beside,
     )  # fmt: skip
 
 

@@ -16,6 +16,10 @@ import flows.tradeoff_overlap
 import flows.tradeoff_resample
 import flows.tradeoff_scan_step
 import flows.tradeoff_segment
+import flows.tradeoff_simulate
+import flows.tradeoff_simulate_bands
+import flows.tradeoff_simulate_noise
+import flows.tradeoff_simulate_rays
 import flows.tradeoff_store
 import flows.tradeoff_tie_spacing  # noqa: F401 - each registers its entry
 from flows.tradeoff import find_tradeoffs, measure_tradeoff, registered

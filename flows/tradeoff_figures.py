@@ -26,6 +26,7 @@ _FLOOR = "#007A5A"
 _PAPER, _GRID = "#fbfaf7", "#e3e1d8"
 _ACROSS = 3  # panels in a row
 _UNITS = ((1e6, "ms"), (1e3, "µs"), (1.0, "ns"))
+_SAME = 8  # pixels of the figure apart: a mark lies on another
 _ROOM, _RIGHT_ROOM = 0.18, 0.28  # of the range of the logarithms, beyond points and floors
 
 
@@ -65,11 +66,11 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
     front = sorted((point for point in points if point.pareto), key=lambda point: point.price_s)
     for group, style, line in ((front, _FRONT, 1.4), ([p for p in points if not p.pareto], _BEATEN, 0)):
         axes.plot(*_columns([place[id(point)] for point in group]), linewidth=line, zorder=3, **style)
-    for point in points:
-        beside = (7, 7) if point.pareto else (9, -4)
+    for (x, y), together in _by_place(axes, [(place[id(point)], point) for point in points]):
+        beside = (7, 7) if any(point.pareto for point in together) else (9, -4)
         axes.annotate(
-            str(point.setting), place[id(point)], beside, textcoords="offset points", color=INK, size=10.5, zorder=4,
-            path_effects=[withStroke(linewidth=3, foreground=_PAPER)],
+            ", ".join(str(point.setting) for point in together), (x, y), beside, textcoords="offset points", color=INK,
+            size=10.5, zorder=4, path_effects=[withStroke(linewidth=3, foreground=_PAPER)],
         )  # fmt: skip
     axes.set_title(f"{result.stage}: {result.knob}", loc="left", weight="bold", color=INK, size=13)
     axes.set_xlabel("seconds by the cost model" if unit == "s" else f"{unit} / {result.unit}", color=INK)
@@ -78,6 +79,22 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
     axes.grid(visible=True, which="major", color=_GRID, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def _by_place(
+    axes: Axes, placed: Sequence[tuple[tuple[float, float], Point]]
+) -> list[tuple[tuple[float, float], list[Point]]]:
+    """Points that hide each other come together, at the place of the first."""
+    found: list[tuple[tuple[float, float], list[Point]]] = []
+    for place, point in placed:
+        here = axes.transData.transform(place)
+        near = (together for at, together in found if abs(axes.transData.transform(at) - here).max() < _SAME)
+        together = next(near, None)
+        if together is None:
+            found.append((place, [point]))
+        else:
+            together.append(point)
+    return found
 
 
 def _columns(places: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
@@ -111,10 +128,13 @@ def _draw_levels(axes: Axes, result: Result, places: Sequence[tuple[float, float
         here = across.transform((1, level.error))[1]
         near = [x for x, y in places if abs(across.transform((x, y))[1] - here) < 0.07 * height]
         left = any(math.log(x / axes.get_xlim()[0]) > 0.6 * span for x in near)
+        above = [across.transform((1, other.error))[1] - here for other in result.levels if other.error > level.error]
+        below = min(above, default=height) < 0.06 * height  # there is no room between two lines
         axes.axhline(level.error, color=colour, linewidth=1.1, linestyle=(0, (5, 3)), zorder=1)
         axes.annotate(
-            level.name, (start if left else axes.get_xlim()[1], level.error), (3 if left else -2, 3),
-            textcoords="offset points", ha="left" if left else "right", color=colour, size=9,
+            level.name, (start if left else axes.get_xlim()[1], level.error), (3 if left else -2, -3 if below else 3),
+            textcoords="offset points", ha="left" if left else "right", va="top" if below else "baseline",
+            color=colour, size=9,
         )  # fmt: skip
 
 

@@ -13,14 +13,14 @@ from pipeline.rectify.calibrate import reflectance
 from pipeline.rectify.lookup import grid_lookup
 from pipeline.rectify.resample import resample
 from pipeline.scan import CostModel, Sweep
-from pipeline.simulator.farm import farm_scene
-from pipeline.simulator.instrument import ALL_EFFECTS
+from pipeline.simulator.farm_laws import built_in_farm
+from pipeline.simulator.instrument import QUIET
+from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 SHAPE = (192, 320)
 STEPS = (1, 2, 3, 4, 6, 8)
 BANDS = slice(0, None, 8)
-NOISES = frozenset({"shot", "read"})
 
 Values = NDArray[np.float32]
 
@@ -37,9 +37,9 @@ class Captured:
 
 def _prepare(seed: int) -> Captured:
     camera = LineCamera(samples=SHAPE[1])
-    source = SimulatedSource(farm_scene(seed, shape=SHAPE), camera, seed)
+    source = SimulatedSource(built_in_farm("farm", seed, SHAPE), Rig(camera), seed)
     sweeps = {step: _capture(source, step) for step in STEPS}
-    calm = _capture(replace(source, effects=ALL_EFFECTS - NOISES), 1)
+    calm = _capture(replace(source, chosen=QUIET), 1)
     full = _rectify(camera, *calm)
     noise = float(np.nanstd(sweeps[1][1] - calm[1]) / np.nanstd(full))
     return Captured(camera, sweeps, full, noise)

@@ -13,25 +13,30 @@ from flows.tradeoff import Level, Point, Result, cheapest_within
 
 def print_tradeoff(result: Result, console: Console) -> None:
     """Print the settings from the most to the least exact; those that no other beats are marked."""
+    points = sorted(result.points, key=lambda point: point.error)
+    rows, figures = [_row(point) for point in points], ("error", *result.points[0].beside)
+    narrow = len(figures) > 1
     table = Table(
         title=f"{escape(result.stage)}, {escape(result.knob)}: to be right to ... you pay ...",
-        title_justify="left", title_style="bold",
-        header_style="dim", box=SIMPLE_HEAD, caption=_caption(result), caption_justify="left",
+        title_justify="left", title_style="bold", header_style="dim", box=SIMPLE_HEAD,
+        caption=_caption(result), caption_justify="left", collapse_padding=narrow,
     )  # fmt: skip
-    longest = max(len(str(point.setting)) for point in result.points)
-    headings = ("", result.knob, "error", f"per {result.unit}", "price", "x first", "wall, least", "wall, median")
-    for number, heading in enumerate(headings):
-        left = number < 2
-        table.add_column(escape(heading), justify="left" if left else "right", min_width=longest if number == 1 else 1)
-    for point in sorted(result.points, key=lambda point: point.error):
-        table.add_row(*_row(point), style="" if point.pareto else "dim")
+    walls = () if narrow else ("wall, least", "wall, median")
+    for number, name in enumerate(("", result.knob, *figures, f"per {result.unit}", "price", "x first", *walls)):
+        left, whole = number < 2, 0 < number < 2 + len(figures)
+        heading = name.replace(" ", "\n") if narrow and not left else name
+        least = max(len(word) for word in (*heading.split(), *(row[number] for row in rows))) if whole else 1
+        table.add_column(escape(heading), justify="left" if left else "right", min_width=least)
+    for row, point in zip(rows, points, strict=True):
+        table.add_row(*map(escape, row), style="" if point.pareto else "dim")
     console.print(table)
 
 
 def _row(point: Point) -> list[str]:
-    walls = (_short(seconds) for seconds in (point.wall_min_s, point.wall_median_s))
+    walls = [] if point.beside else [_short(seconds) for seconds in (point.wall_min_s, point.wall_median_s)]
     times = [_short(point.ns_per_unit * 1e-9), _short(point.price_s), f"{point.ratio:.2f}", *walls]
-    return ["●" if point.pareto else "○", escape(str(point.setting)), f"{point.error:.3g}", *times]
+    further = [f"{one:.2g}" for one in point.beside.values()]
+    return ["●" if point.pareto else "○", str(point.setting), f"{point.error:.3g}", *further, *times]
 
 
 def _short(seconds: float) -> str:

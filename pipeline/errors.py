@@ -15,6 +15,7 @@ ArchiveError           the archive cannot be read or written                    
 ChunkError             a region that splits stored chunks                          1
 IncompleteStoreError   a store without a valid manifest, or one that fails it      1
 WorkerError            processes that work for this one died or went away          1
+BoundError             a simulated effect changes more than its bound says         1
 =====================  ==========================================================  ========
 """
 
@@ -77,3 +78,7 @@ class IncompleteStoreError(PipelineError, LookupError):
 
 class WorkerError(PipelineError, RuntimeError):
     """Processes that work for this one died, or their scheduler went away."""
+
+
+class BoundError(PipelineError, ArithmeticError):
+    """A simulated effect, left out or cheapened, changes light by more than its bound says."""

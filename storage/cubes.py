@@ -47,6 +47,7 @@ class SweepHeader:
     fwhm_nm: NDArray[np.float64] | None = None
     source: str = ""  # what the source calls itself
     started: str | None = None  # ISO 8601; None leaves ``time`` counted from the start of the sweep
+    simulation: Mapping[str, Any] | None = None  # what was simulated and what left out; None of a rig
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -148,7 +149,8 @@ class RawCubeWriter:
 def _attributes(header: SweepHeader) -> dict[str, Any]:
     started = {} if header.started is None else {"started": header.started}
     mirror = {"by_mirror": True} if header.references.by_mirror else {}
-    return {"sweep": asdict(header.sweep), "source": header.source, **started, **mirror}
+    simulated = {} if header.simulation is None else {"simulation": dict(header.simulation)}
+    return {"sweep": asdict(header.sweep), "source": header.source, **started, **mirror, **simulated}
 
 
 def _write_references(group: zarr.Group, references: References) -> None:
@@ -202,6 +204,12 @@ class RawCube:
     source: str
     started: str | None
     group: zarr.Group
+
+    @property
+    def simulation(self) -> Mapping[str, Any] | None:
+        """What was simulated and what left out, as its attributes tell; None of a rig's lines."""
+        found = dict(self.group.attrs).get("simulation")
+        return found if isinstance(found, Mapping) else None
 
     @property
     def shape(self) -> tuple[int, int, int]:

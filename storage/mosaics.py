@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zarr
@@ -55,10 +57,12 @@ class MosaicWriter:
         *,
         fwhm_nm: NDArray[np.float64] | None = None,
         grid: AngularGrid | None = None,
+        simulation: Mapping[str, Any] | None = None,
     ) -> None:
         place = {} if grid is None else grid.attributes(shape)
+        simulated = {} if simulation is None else {"simulation": dict(simulation)}
         self.path = path
-        self.group = create_group(path, "mosaic", {**place, **grid_record(grid)})
+        self.group = create_group(path, "mosaic", {**place, **grid_record(grid), **simulated})
         bands = write_bands(self.group, wavelength_nm, fwhm_nm)
         self._shape = (*shape, len(wavelength_nm))
         about = {"long_name": "scene value", "units": "1", "coordinates": bands, **place}

@@ -34,6 +34,7 @@ from pipeline.camera import LineCamera
 from pipeline.errors import SceneError
 from pipeline.once import Once
 from pipeline.simulator.farm_fields import CLASSES, SOWINGS, Canvas, Ground, Mixture, grass, hard_track, paint_parcel
+from pipeline.simulator.farm_laws import FARM_LAW
 from pipeline.simulator.farm_layout import (
     Band,
     Border,
@@ -53,8 +54,6 @@ from pipeline.simulator.farm_layout import (
 from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.spectra import MATERIALS, PANEL_REFLECTANCE, band_centres, spectral_library
-
-FARM_LAW = "farm@1"
 
 PARCEL_AREA_PX = 95_000.0
 PARCEL_SHARES: dict[str, float] = {
@@ -133,9 +132,11 @@ def _draw(seed: int, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArr
     _dig_ponds(stream(seed, "ponds"), canvas, ground, parcels, uses)
     _plant_trees(canvas, ground, crowns)
     canvas.dim(ground.light)
-    planes = np.ascontiguousarray(canvas.materials.T)
+    labels, materials = canvas.classes.argmax(axis=0).astype(np.uint8).reshape(shape), canvas.materials
+    del canvas, ground  # the planes are as large as all of them
+    planes = np.ascontiguousarray(materials.T)
     planes /= planes.sum(axis=1, keepdims=True)
-    return planes.reshape(*shape, -1), canvas.classes.argmax(axis=0).astype(np.uint8).reshape(shape)
+    return planes.reshape(*shape, -1), labels
 
 
 def _weed_rate(parcels: list[Parcel], uses: list[str], shape: tuple[int, int]) -> Field:
@@ -159,17 +160,17 @@ def _plant_weeds(rng: np.random.Generator, canvas: Canvas, rate: Field) -> None:
     species = rng.choice(["weed_leafy", "weed_red", "blossom"], len(kept), p=[0.55, 0.3, 0.15])
     groups = [(name, kept[species == name], 0.9, 2.4) for name in ("weed_leafy", "weed_red", "blossom")]
     for name, where, least, most in [*groups, ("volunteer", single, 1.0, 2.0)]:
-        centres = _centres(where, shape) + rng.uniform(-0.5, 0.5, (len(where), 2))
-        index, cover, _ = _union(*disc_pixels(centres, rng.uniform(least, most, len(where)), shape)[:3])
+        centres = scene_points(where, shape) + rng.uniform(-0.5, 0.5, (len(where), 2))
+        index, cover, _ = union_of_discs(*disc_pixels(centres, rng.uniform(least, most, len(where)), shape)[:3])
         canvas.over(index, 0.92 * cover, {name: np.ones_like(cover)}, "weed")
 
 
-def _centres(index: NDArray[np.intp], shape: tuple[int, int]) -> Points:
+def scene_points(index: NDArray[np.intp], shape: tuple[int, int]) -> Points:
     """Scene coordinates of flat pixel numbers, (n, 2)."""
     return np.stack(np.divmod(index, shape[1]), axis=-1) - (np.array(shape) - 1) / 2
 
 
-def _union(index: NDArray[np.intp], cover: Field, height: Field) -> tuple[NDArray[np.intp], Field, Field]:
+def union_of_discs(index: NDArray[np.intp], cover: Field, height: Field) -> tuple[NDArray[np.intp], Field, Field]:
     """Join discs: each pixel once, with its largest coverage and the height that belongs to it."""
     order = np.lexsort((cover, index))
     last = np.flatnonzero(np.diff(index[order], append=-1))
@@ -179,17 +180,17 @@ def _union(index: NDArray[np.intp], cover: Field, height: Field) -> tuple[NDArra
 def _paint_borders(rng: np.random.Generator, canvas: Canvas, ground: Ground, borders: list[Border]) -> Points:
     """Draw the lines between parcels, roads last; gives the centres of hedge crowns with their radii, (n, 3)."""
     kinds = allot(rng, [border.length for border in borders], BORDER_SHARES)
-    crowns = [_standing_trees(rng, borders)]
+    crowns = [standing_trees(rng, borders)]
     for kind in ("margin", "hedge", "ditch", "road"):
         for border in (b for b, k in zip(borders, kinds, strict=True) if k == kind):
-            band = _wobble(rng, band_pixels(border, 12.0, canvas.shape), 0.8 if kind == "road" else 1.6)
+            band = wobble(rng, band_pixels(border, 12.0, canvas.shape), 0.8 if kind == "road" else 1.6)
             _paint_line(rng, canvas, ground, band, kind)
             if kind == "hedge":
-                crowns.append(_hedge(rng, border))
+                crowns.append(hedge_crowns(rng, border))
     return np.concatenate(crowns)
 
 
-def _wobble(rng: np.random.Generator, band: Band, size: float) -> Band:
+def wobble(rng: np.random.Generator, band: Band, size: float) -> Band:
     """Bend a line a little: two sines of random phase, 37 and 61 px per radian."""
     phases = rng.uniform(0, 2 * np.pi, 2)
     bend = np.sin(band.along / 37 + phases[0]) + np.sin(band.along / 61 + phases[1])
@@ -218,7 +219,7 @@ def _cover(canvas: Canvas, band: Band, half: float, mixture: Mixture, label: str
     canvas.over(band.index[hit], cover[hit], {name: part[hit] for name, part in mixture.items()}, label)
 
 
-def _hedge(rng: np.random.Generator, border: Border) -> Points:
+def hedge_crowns(rng: np.random.Generator, border: Border) -> Points:
     """Crowns along a line: y, x and radius, (n, 3); every twentieth is missing."""
     along = np.arange(0.0, border.length, 5.0)
     along = along[rng.uniform(size=along.size) > 0.05]
@@ -227,7 +228,7 @@ def _hedge(rng: np.random.Generator, border: Border) -> Points:
     return np.column_stack([centres, rng.uniform(4, 7, along.size)])
 
 
-def _standing_trees(rng: np.random.Generator, borders: list[Border]) -> Points:
+def standing_trees(rng: np.random.Generator, borders: list[Border]) -> Points:
     """Single trees beside the lines, one in 320 px: y, x and radius, (n, 3)."""
     trees = [np.zeros((0, 3))]
     for border in borders:
@@ -251,7 +252,7 @@ def _dig_ponds(
         corners = meadows[rng.integers(len(meadows))].corners
         centre = corners.mean(axis=0) + 0.5 * (corners[rng.integers(len(corners))] - corners.mean(axis=0))
         index = disc_pixels(centre[None], np.array([34.0]), shape)[0]
-        distance = np.hypot(*(_centres(index, shape) - centre).T)
+        distance = np.hypot(*(scene_points(index, shape) - centre).T)
         inside = rng.uniform(14, 24) + 1.8 * shore[index] - distance
         canvas.over(index, edge(inside + 4), grass(ground.at(index), 0.15), "grass")
         ponds.append((index, edge(inside)))
@@ -263,9 +264,9 @@ def _plant_trees(canvas: Canvas, ground: Ground, crowns: Points) -> None:
     """Crowns, lit from the south, and their shadows to the north."""
     shape = canvas.shape
     centres, radius = crowns[:, :2], crowns[:, 2]
-    shadow, cover, _ = _union(*disc_pixels(centres - radius[:, None] * [0.8, 0.0], radius, shape)[:3])
+    shadow, cover, _ = union_of_discs(*disc_pixels(centres - radius[:, None] * [0.8, 0.0], radius, shape)[:3])
     canvas.over(shadow, 0.5 * cover, {"shade": np.ones_like(cover)}, None)
-    index, cover, height = _union(*disc_pixels(centres, radius, shape)[:3])
+    index, cover, height = union_of_discs(*disc_pixels(centres, radius, shape)[:3])
     here = ground.at(index)
     shade = np.clip(0.16 - 0.16 * height + 0.07 * here.tuft + 0.04 * here.grain, 0, 0.6)
     canvas.over(index, cover, {"tree": 1 - shade, "shade": shade}, "tree")

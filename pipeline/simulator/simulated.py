@@ -1,46 +1,60 @@
-"""The simulated source: a scene seen through the simulated instrument, digitised with noise that lines own."""
+"""The simulated source: a scene as a rig sees it line by line, with the effects chosen."""
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from itertools import islice
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera, bin_samples, digitise
-from pipeline.errors import SettingsError, ShapeError
+from pipeline.camera import LineCamera
 from pipeline.scan import Sweep, line_positions
-from pipeline.simulator.instrument import ALL_EFFECTS, expected_lines
+from pipeline.simulator.block import Block
+from pipeline.simulator.instrument import BLOCK_LINES, USUAL, check_binning, render_lines, sweep_block
 from pipeline.simulator.pointing import Pointing
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene
+from pipeline.simulator.render import Choice
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scene import Scene
+from pipeline.simulator.white_panel import take_references
 from pipeline.source import Line, References
-
-BLOCK_LINES = 16
 
 
 @dataclass(frozen=True)
 class SimulatedSource:
-    """A source that looks at ``scene``. Quantisation and saturation are always on, for raw lines are uint16.
+    """A source that looks at ``scene`` with ``rig``. Quantisation and saturation are always on: raw lines are uint16.
 
-    Every line draws its noise from a stream of its own, keyed (seed, sweep name, line number): neither the first line
-    asked for nor the order of sweeps changes a line. With ``pointing`` the mirror looks beside the planned positions
-    and still reports those.
+    Every effect draws from streams of its own, keyed (seed, sweep name, effect, line number): neither the first line
+    asked for nor the order of sweeps nor other effects change a line.
+
+    ``chosen`` are the effects that are on, {effect: variant}, in the order of the chain. ``clock`` says when sweeps
+    start, by name, after the survey did [s]; None, and a sweep it does not name, is at once. With ``pointing`` the
+    mirror looks beside the planned positions and still reports those.
     """
 
     scene: Scene
-    camera: LineCamera
+    rig: Rig
     seed: int = 0
-    effects: frozenset[str] = ALL_EFFECTS
+    chosen: Mapping[Any, str] | Choice = USUAL
     name: str = "sim"
+    clock: Mapping[str, float] | None = None
     pointing: Pointing | None = None
 
     def __post_init__(self) -> None:
-        unknown = self.effects - ALL_EFFECTS
-        if unknown:
-            raise SettingsError(f"unknown effects {sorted(unknown)}; choose from {sorted(ALL_EFFECTS)}")
+        _ = self.choice  # refuses variants that effects do not have
+
+    @cached_property
+    def choice(self) -> Choice:
+        """All effects that are on, pointing among them."""
+        chosen = Choice.of(self.chosen)
+        return chosen if self.pointing is None else Choice(((self.pointing, "exact"), *chosen.effects))
+
+    @property
+    def camera(self) -> LineCamera:
+        """The rig's camera."""
+        return self.rig.camera
 
     @property
     def wavelength_nm(self) -> NDArray[np.float64]:
@@ -52,6 +66,21 @@ class SimulatedSource:
         """(y, x) size of the field [px]."""
         return self.scene.shape
 
+    def started_s(self, sweep: Sweep) -> float:
+        """When a sweep starts, after the survey did [s]."""
+        return 0.0 if self.clock is None else float(self.clock.get(sweep.name, 0.0))
+
+    def block(self, sweep: Sweep, lines: range) -> Block:
+        """Some lines of a sweep, as effects ask about them."""
+        return sweep_block(self.scene, self.rig, sweep, lines, seed=self.seed, started_s=self.started_s(sweep))
+
+    def render(self, sweep: Sweep, lines: range, samples: range | None = None) -> NDArray[np.uint16]:
+        """Give raw numbers (line, sample, band) of some lines, and of some binned samples; see `render_lines`."""
+        return render_lines(
+            self.scene, self.rig, self.choice, sweep, lines,
+            seed=self.seed, started_s=self.started_s(sweep), samples=samples,
+        )  # fmt: skip
+
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
         """Give the sweep's lines one by one, from line ``first`` on.
 
@@ -60,64 +89,24 @@ class SimulatedSource:
         ShapeError : sums of ``sweep.binning`` samples at full scale do not fit uint16.
         PoseError : a position of the sweep is out of the mirror's reach.
         """
-        _check_binning(sweep, self.camera)
-        middle = line_positions(sweep, self.camera)
+        camera = self.camera
+        check_binning(sweep, camera)
+        middle = line_positions(sweep, camera)
         for start in range(first, sweep.lines, BLOCK_LINES):
             numbers = range(start, min(start + BLOCK_LINES, sweep.lines))
-            shift = None if self.pointing is None else self.pointing.of_lines(sweep.name, numbers)
-            light = expected_lines(self.scene, self.camera, sweep, numbers, effects=self.effects, shift_px=shift)
-            for number, electrons in zip(numbers, light, strict=True):
-                data = self._read_out(electrons, line_stream(self.seed, sweep.name, number))
+            for number, data in zip(numbers, self.render(sweep, numbers), strict=True):
                 yield Line(
                     number=number,
-                    data=bin_samples(data, sweep.binning),
+                    data=data,
                     mirror_x=float(middle[number, 0]),
                     mirror_y=float(middle[number, 1]),
-                    time_s=(number * self.camera.frame_ms + self.camera.exposure_ms / 2) * 1e-3,
-                    exposure_ms=self.camera.exposure_ms,
+                    time_s=(number * camera.frame_ms + camera.exposure_ms / 2) * 1e-3,
+                    exposure_ms=camera.exposure_ms,
                 )
 
     def references(self, sweep: Sweep) -> References:
-        """Mean dark and white frames with the sweep's binning, free of noise.
-
-        The white frame is scaled to the exposure from a shorter one, so that it does not saturate. It is taken with
-        the mirror at rest.
-        """
-        camera, bands = self.camera, len(self.scene.wavelength_nm)
-        shape = (camera.samples // sweep.binning, bands)
-        dark = np.full(shape, camera.dark_dn * sweep.binning, np.float32)
-        gain = sweep.binning * camera.exposure_ms / DEFAULT_EXPOSURE_MS / camera.electrons_per_dn
-        white = dark + self.scene.panel_electrons.astype(np.float32) * np.float32(gain)
-        panel = self.scene.panel.astype(np.float32)
-        return References(dark=dark, white=white, panel=panel, by_mirror="throughput" in self.effects)
-
-    def _read_out(self, electrons: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint16]:
-        """Digitise one line with the noises that are on, (sample, band) e- -> DN."""
-        shot, read = "shot" in self.effects, "read" in self.effects
-        if shot and read:
-            return digitise(electrons, self.camera, rng)
-        if shot:
-            return digitise(electrons, replace(self.camera, read_noise_e=0.0), rng)
-        if not read:
-            return digitise(electrons, self.camera, None)
-        # The dark level goes in as electrons: noise below zero light is kept, as on the converter.
-        raised = np.maximum(electrons, 0) + np.float32(self.camera.dark_dn * self.camera.electrons_per_dn)
-        raised += rng.standard_normal(electrons.shape, dtype=np.float32) * np.float32(self.camera.read_noise_e)
-        return digitise(raised, replace(self.camera, dark_dn=0.0), None)
-
-
-def line_stream(seed: int, sweep_name: str, number: int) -> np.random.Generator:
-    """Give the counter-based noise stream of one line of one sweep."""
-    key = np.random.SeedSequence(entropy=seed, spawn_key=(zlib.crc32(sweep_name.encode()), number))
-    return np.random.Generator(np.random.Philox(key))
-
-
-def _check_binning(sweep: Sweep, camera: LineCamera) -> None:
-    if sweep.binning > camera.most_binning:
-        raise ShapeError(
-            f"sweep {sweep.name}: sums of {sweep.binning} samples of {camera.bits} bits do not fit uint16; "
-            f"bin at most {camera.most_binning}"
-        )
+        """Mean dark and white frames with the sweep's binning, as the effects that are on have them."""
+        return take_references(self.scene, self.rig, self.choice, sweep)
 
 
 @dataclass(frozen=True)
@@ -150,5 +139,4 @@ class SimulatedSweep:
 
     def read(self, start: int, stop: int) -> NDArray[np.uint16]:
         """Make the lines ``start`` to ``stop``, (line, sample, band) uint16."""
-        lines = islice(self.source.lines(self.sweep, first=start), stop - start)
-        return np.stack([line.data for line in lines])
+        return self.source.render(self.sweep, range(start, min(stop, self.sweep.lines)))

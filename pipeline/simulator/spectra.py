@@ -34,7 +34,7 @@ PANEL_REFLECTANCE = 0.99
 FILL = 0.95  # of the full well, by a perfect white in the brightest band
 TWIN_CENTRE_NM, TWIN_HALF_WIDTH_NM, TWIN_CONTRAST = 715.0, 25.0, 0.10
 
-_GRID_NM: Spectrum = np.arange(400.0, 1031.0)  # room for the upper half of the last band
+GRID_NM: Spectrum = np.arange(400.0, 1031.0)  # room for the upper half of the last band
 _SUN_ZENITH_DEG = 30.0
 
 
@@ -126,10 +126,15 @@ def spectral_library(bands: int) -> SpectralLibrary:
     ------
     WavelengthError : fewer than 2 bands.
     """
+    return seen_in_bands(_reflectance_1nm(), bands)
+
+
+def seen_in_bands(reflectance_1nm: Spectrum, bands: int) -> SpectralLibrary:
+    """See spectra on the 1 nm grid, (material, grid), in ``bands`` equally spaced bands; WavelengthError below 2."""
     wavelength, fwhm = band_centres(bands)
     response = band_response(wavelength, fwhm) * (_photons() * _quantum_efficiency())
     light = response.sum(axis=1)
-    reflectance = _reflectance_1nm() @ response.T / light
+    reflectance = reflectance_1nm @ response.T / light
     parts = (wavelength, fwhm, reflectance, light / light.max())
     for part in parts:
         part.setflags(write=False)
@@ -142,7 +147,7 @@ def band_response(wavelength_nm: Spectrum, fwhm_nm: Spectrum) -> NDArray[np.floa
     A band at 400 nm keeps its upper half: nothing is known below.
     """
     sigma = fwhm_nm[:, None] / np.sqrt(8 * np.log(2))
-    weight = np.exp(-0.5 * ((_GRID_NM - wavelength_nm[:, None]) / sigma) ** 2)
+    weight = np.exp(-0.5 * ((GRID_NM - wavelength_nm[:, None]) / sigma) ** 2)
     return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
@@ -162,31 +167,38 @@ def _photons() -> Spectrum:
         aerosol_turbidity_500nm=0.1,
         dayofyear=172,
     )
-    return np.asarray(np.interp(_GRID_NM, sky["wavelength"], sky["poa_global"][:, 0]) * _GRID_NM)
+    return np.asarray(np.interp(GRID_NM, sky["wavelength"], sky["poa_global"][:, 0]) * GRID_NM)
 
 
 def _quantum_efficiency() -> Spectrum:
     """Silicon sensor behind a grating, assumed: straight lines between values every 100 nm."""
-    return np.interp(_GRID_NM, np.arange(400.0, 1101.0, 100.0), [0.34, 0.66, 0.72, 0.62, 0.47, 0.26, 0.09, 0.01])
+    return np.interp(GRID_NM, np.arange(400.0, 1101.0, 100.0), [0.34, 0.66, 0.72, 0.62, 0.47, 0.26, 0.09, 0.01])
 
 
 @lru_cache(maxsize=1)
 def _reflectance_1nm() -> NDArray[np.float64]:
     """Reflectance of every material on the 1 nm grid, (material, grid)."""
-    from prosail import spectral_lib
-
-    size = len(_GRID_NM)
-    iron = _iron_oxide()
-    dry, wet = iron * spectral_lib.soil.rsoil1[:size], iron * spectral_lib.soil.rsoil2[:size]
-    known: dict[str, Spectrum] = {name: _canopy(canopy) for name, canopy in CANOPIES.items()}
-    for stand in ("dense", "sparse"):
-        known[f"wheat_b_{stand}"] = known[f"wheat_a_{stand}"] * _twin_factor()
-    known |= {"soil_dry": dry, "soil_wet": 0.35 * dry + 0.65 * wet, "gravel": _gravel(), "water": _water()}
-    known |= {"straw": _straw(), "blossom": _blossom(known["weed_leafy"]), "shade": _shade()}
+    known = known_spectra()
     return np.stack([known[name] for name in MATERIALS])
 
 
-def _canopy(canopy: Canopy) -> Spectrum:
+@lru_cache(maxsize=1)
+def known_spectra() -> dict[str, Spectrum]:
+    """Give the reflectance of each of ``MATERIALS`` on the 1 nm grid from 400 to 1030 nm; not to be written to."""
+    from prosail import spectral_lib
+
+    size = len(GRID_NM)
+    iron = _iron_oxide()
+    dry, wet = iron * spectral_lib.soil.rsoil1[:size], iron * spectral_lib.soil.rsoil2[:size]
+    known: dict[str, Spectrum] = {name: canopy_spectrum(canopy) for name, canopy in CANOPIES.items()}
+    for stand in ("dense", "sparse"):
+        known[f"wheat_b_{stand}"] = known[f"wheat_a_{stand}"] * twin_factor()
+    known |= {"soil_dry": dry, "soil_wet": 0.35 * dry + 0.65 * wet, "gravel": _gravel(), "water": _water()}
+    known |= {"straw": _straw(), "blossom": _blossom(known["weed_leafy"]), "shade": _shade()}
+    return known
+
+
+def canopy_spectrum(canopy: Canopy) -> Spectrum:
     """Bidirectional reflectance of a stand, seen straight from above."""
     from prosail import run_prosail
 
@@ -194,46 +206,46 @@ def _canopy(canopy: Canopy) -> Spectrum:
         canopy.n, canopy.cab, canopy.car, canopy.cbrown, canopy.cw, canopy.cm, canopy.lai, canopy.lidfa,
         0.05, _SUN_ZENITH_DEG, 0.0, 0.0, ant=canopy.ant, prospect_version="D", rsoil=1.0, psoil=canopy.dry_soil,
     )  # fmt: skip
-    return np.asarray(spectrum[: len(_GRID_NM)], dtype=np.float64)
+    return np.asarray(spectrum[: len(GRID_NM)], dtype=np.float64)
 
 
-def _twin_factor() -> Spectrum:
+def twin_factor() -> Spectrum:
     """Second wheat over the first: 1 + 0.10 cos^2 within 25 nm of 715 nm, else 1 (law of this project).
 
     As if the red edge lay about 3 nm further to the blue: a variety of the same stature with a little less
     chlorophyll, and nothing else to tell it by.
     """
-    phase = np.clip((_GRID_NM - TWIN_CENTRE_NM) / TWIN_HALF_WIDTH_NM, -1, 1) * (np.pi / 2)
+    phase = np.clip((GRID_NM - TWIN_CENTRE_NM) / TWIN_HALF_WIDTH_NM, -1, 1) * (np.pi / 2)
     return np.asarray(1 + TWIN_CONTRAST * np.cos(phase) ** 2)
 
 
 def _iron_oxide() -> Spectrum:
     """Grey soil to brown loam: a factor of 0.5 in the violet, 1 beyond 700 nm (law of this project)."""
-    return np.asarray(1 - 0.5 / (1 + np.exp((_GRID_NM - 545) / 40)))
+    return np.asarray(1 - 0.5 / (1 + np.exp((GRID_NM - 545) / 40)))
 
 
 def _gravel() -> Spectrum:
     """Limestone gravel: 0.20 at 400 nm, rising towards 0.42 with a scale of 220 nm (law of this project)."""
-    return np.asarray(0.42 - 0.22 * np.exp(-(_GRID_NM - 400) / 220))
+    return np.asarray(0.42 - 0.22 * np.exp(-(GRID_NM - 400) / 220))
 
 
 def _water() -> Spectrum:
     """Ditch: sky on the surface, 0.025 (500 / wavelength)^2; humps at 555 and 705 nm (law of this project)."""
-    hump = 0.020 * np.exp(-(((_GRID_NM - 555) / 70) ** 2)) + 0.008 * np.exp(-(((_GRID_NM - 705) / 18) ** 2))
-    return np.asarray(0.025 * (500 / _GRID_NM) ** 2 + hump)
+    hump = 0.020 * np.exp(-(((GRID_NM - 555) / 70) ** 2)) + 0.008 * np.exp(-(((GRID_NM - 705) / 18) ** 2))
+    return np.asarray(0.025 * (500 / GRID_NM) ** 2 + hump)
 
 
 def _straw() -> Spectrum:
     """Bleached cereal straw: 0.10 at 400 nm to 0.50 by a logistic about 620 nm, 90 nm wide (law of this project)."""
-    return np.asarray(0.08 + 0.42 / (1 + np.exp(-(_GRID_NM - 620) / 90)))
+    return np.asarray(0.08 + 0.42 / (1 + np.exp(-(GRID_NM - 620) / 90)))
 
 
 def _blossom(leaves: Spectrum) -> Spectrum:
     """Mustard in flower: half petals that absorb below 510 nm, half the leaves beneath (law of this project)."""
-    petals = 0.05 + 0.47 / (1 + np.exp(-(_GRID_NM - 512) / 9))
+    petals = 0.05 + 0.47 / (1 + np.exp(-(GRID_NM - 512) / 9))
     return np.asarray(0.5 * petals + 0.5 * leaves)
 
 
 def _shade() -> Spectrum:
     """Ground lit by a little blue sky alone: 0.004 + 0.010 (450 / wavelength)^4 (law of this project)."""
-    return np.asarray(0.004 + 0.010 * (450 / _GRID_NM) ** 4)
+    return np.asarray(0.004 + 0.010 * (450 / GRID_NM) ** 4)

@@ -19,6 +19,7 @@ from pipeline.rectify.seams import Registration, measure_windows, place_images, 
 from pipeline.scan import Sweep, shifted_position
 from pipeline.simulator.farm import farm_scene
 from pipeline.simulator.pointing import ACCURACY_PX, REPEATABILITY_PX, PointingErrors
+from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import raster_from_values, to_bands
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import References
@@ -76,7 +77,7 @@ def make_survey(lines: int = LINES, samples: int = SAMPLES, *, seed: int = 3) ->
     scene = raster_from_values(values, camera, name="farm", wavelength_nm=farm.wavelength_nm[chosen])
     grid = SceneGrid(lines, samples, 32, 4)
     pointing = PointingErrors(ACCURACY_PX, REPEATABILITY_PX, seed=seed)
-    source = SimulatedSource(scene, camera, seed=0, pointing=pointing)
+    source = SimulatedSource(scene, Rig(camera), seed=0, pointing=pointing)
     planned = full_sweeps(grid, camera, "x", overlap_px=LEAST_OVERLAP_PX + 2 * ACCURACY_PX)
     sweeps = tuple(_captured(source, sweep) for sweep in planned)
     broad = tuple(BroadSweep.read(one, camera) for one in sweeps)

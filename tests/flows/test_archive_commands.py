@@ -65,7 +65,7 @@ def test_ls_shows_runs_and_stores(surveyed: Path, capsys: pytest.CaptureFixture[
     out = capsys.readouterr().out
     assert first["id"] in out
     assert content["stages"]["rectify"][0]["key"] in out
-    assert "2 runs, 13 stores" in out
+    assert "2 runs, 14 stores" in out
 
 
 def test_of_many_stores_the_newest_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -215,7 +215,7 @@ def test_verify_repairs_by_surveying_again(archive: Path, capsys: pytest.Capture
     (coarse,) = set(ages) - {uri.rpartition("/")[2] for uri in content["repair"]["remade"]}
     assert ages[coarse] == max(ages.values())
     assert run_verify(archive, QUIET) == DONE
-    assert "17 of 17 stores and runs are as published" in capsys.readouterr().out
+    assert "18 of 18 stores and runs are as published" in capsys.readouterr().out
 
 
 def test_verify_says_what_it_could_not_repair(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -107,7 +107,7 @@ REFUSED = {
         "--pointing-px 200 --budget 1",
         "^--pointing-px 200: .* overlap by 656 px .* give less than 192$",
     ),
-    "unknown effect": (2, "--effects slit,fog", "some of slit,smear,throughput,shot,read; got 'slit,fog'"),
+    "unknown effect": (2, "--effects slit,fog", "--effects: unknown effect 'fog'"),
 }
 
 

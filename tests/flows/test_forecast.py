@@ -77,6 +77,7 @@ def test_without_an_archive_the_plan_makes_none(settings: Settings, tmp_path: Pa
     """The first capture is to run and has its key; what reads a store waits for it, by name; there is no estimate."""
     planned = _plan(settings, tmp_path / "none")
     assert not list(tmp_path.iterdir())
+    assert planned["choose_effects"].state == "to run"
     assert planned["capture_coarse"].state == "to run"
     assert planned["capture_coarse"].why == "nothing stored yet"
     assert planned["capture_coarse"].key is not None
@@ -113,7 +114,7 @@ def test_the_reason_is_what_differs(settings: Settings, archive: Path, make_weig
     assert planned["rectify"].why == "kernel: catmull-rom before, nearest now"
     assert planned["attend"].why == "kernel of rectify: catmull-rom before, nearest now"
     effects = _plan(settings, archive, effects="none")["capture_coarse"].why
-    assert effects == "effects: read, shot, slit, smear, throughput before, none now"
+    assert effects == "asked of effects: auto before, none now"
     assert {(change.where, change.kind) for change in planned["attend"].changes} == {
         ("attend", "input"), ("rectify", "parameter"),
     }  # fmt: skip
@@ -173,7 +174,7 @@ def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
     )
     asked = replace(settings, scene="farm", size=(10240, 10240), labels=None, weights=None, out=str(tmp_path / "a"))
     found = forecast(asked)
-    assert [row.stage for row in found.stages if row.state == "to run"] == ["capture_coarse"]
+    assert [row.stage for row in found.stages if row.state == "to run"] == ["choose_effects", "capture_coarse"]
     assert [row.stage for row in found.stages if row.state == "skipped"] == ON_REQUEST
     with pytest.raises(SettingsError, match="this machine has 9; take a smaller one") as refused:
         open_run(asked)

@@ -82,7 +82,8 @@ def surveyed(survey_png: Any, make_weights: Any, tmp_path: Path) -> Callable[[Wa
         np.save(tmp_path / "waves.npy", scene.raster())
         found = survey_png(
             tmp_path / "archive", scene=str(tmp_path / "waves.npy"), labels=None, wavelengths="500,700",
-            weights=str(make_weights((500.0, 700.0))), effects="slit,smear", policy="random", budget="1",
+            weights=str(make_weights((500.0, 700.0))), effects="rotation,slit,smear", tol="0", policy="random",
+            budget="1",
         ).receipt  # fmt: skip
         mosaic, patches = (
             xr.open_zarr(tmp_path / "archive" / found["products"][name], consolidated=False)

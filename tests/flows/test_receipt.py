@@ -40,17 +40,14 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         "gap_closed": 2 / 3,
         "controls": {"random": {"miou": 0.5625, "spread": 0.0125}, "sobel": {"miou": 0.6, "spread": None}},
     }
-    effects = [
-        {
-            "name": "shot",
-            "state": "on",
-            "variant": "normal",
-            "bound": None,
-            "measured": None,
-            "cost_s": wall,
-            "why": None,
-        }
-    ]
+    row = {
+        "name": "shot", "state": "on", "variant": "exact", "bound": 0.0, "measured": None, "cost_s": 1.5,
+        "why": "asked for", "unit": "sigma",
+    }  # fmt: skip
+    total = {
+        "asked": "auto", "tolerance": 0.1, "unit": "sigma", "bound": 0.08, "measured": 0.03, "within": True, "on": 1,
+        "off": 0, "cost_s": 1.5, "exact_cost_s": 9.0, "cheap_cost_s": 4.0, "saved_s": 7.5, "saved_cheap_s": 2.5,
+    }  # fmt: skip
     stages = [
         StageRecord("capture", "ab12", "ran", wall, wall, 10**9, 0, 10**8, f"{wall:064}"),  # a manifest holds times
         StageRecord("rectify", "cd34", "cached"),
@@ -64,7 +61,7 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         savings,
         {"quicklook": f"runs/{wall}/quicklook.png"},
         accuracy=accuracy if labels else None,
-        effects=effects,
+        simulation={"effects": [row], "total": total},
     )
 
 
@@ -84,6 +81,7 @@ def test_receipt_has_the_fields_of_the_design_in_order():
         "savings",
         "accuracy",
         "effects",
+        "effects_total",
         "products",
     ]
     assert list(receipt["savings"]) == [*COSTS, "segment_wall_s"]
@@ -115,6 +113,7 @@ def test_json_reads_back_to_the_same_receipt():
         ("accuracy", "none", "miou"),
         ("accuracy", "controls", "random", "spread"),
         ("effects", 0, "why"),
+        ("effects_total", "saved_s"),
     ],
 )
 def test_missing_field_is_named(path):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from dataclasses import asdict, fields, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import get_args
 
@@ -11,8 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flows import setting_values
 from flows import settings as settings_module
+from flows.receipt import to_json
+from flows.setting_values import Tolerance
 from flows.settings import MapChoice, Settings, load_settings, parse_settings
 from models import policies
 from pipeline.camera import LineCamera
@@ -20,7 +23,8 @@ from pipeline.errors import BudgetError, SettingsError
 from pipeline.ground import RigPose
 from pipeline.rectify.resample import Kernel
 from pipeline.scan import CostModel
-from pipeline.simulator.instrument import ALL_EFFECTS
+from pipeline.simulator.effects.registry import EFFECTS
+from pipeline.simulator.rig_model import Air, Detector, Optics, Rig, Sky
 
 EXAMPLE = Path(__file__).parents[2] / "survey.example.toml"
 POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 30, "tilt_deg": 40, "height_m": 12}
@@ -50,15 +54,16 @@ def test_every_field_of_the_dataclasses_can_be_set():
     assert {item.name for item in fields(Settings)} == set(settings_module._SURVEY)
     for name, (make, spans) in settings_module._TABLES.items():
         assert {item.name for item in fields(make)} == set(spans), name
-    for name in ("camera", "cost"):
+    for name in ("camera", "cost", "optics", "mirror", "detector", "air", "sky"):
         assert parse_settings({name: asdict(getattr(Settings(), name))}) == Settings()
 
 
 def test_words_are_those_of_the_parts_that_use_them():
     """Policies, effects and kernels that the settings accept are exactly those that exist."""
+    every = ",".join(effect.name for effect in EFFECTS)
+    assert parse_settings({"effects": every}).effects == every
     assert set(settings_module.KERNELS) == set(get_args(Kernel))
     assert settings_module.POLICIES == policies.POLICIES
-    assert set(setting_values.EFFECTS) == ALL_EFFECTS
 
 
 def test_flags_win_over_the_file(toml):
@@ -106,6 +111,8 @@ def test_example_lists_every_setting():
         ("height_m = 12", "'pose.height_m'"),
         ("[map]\nresolution = 0.1", "'map.resolution_m'"),
         ("pointing = 50", "'pointing_px'"),
+        ("[mirror]\nnatural = 20", "'mirror.natural_hz'"),
+        ("smile_nm = 0.2", "'optics.smile_nm'"),
     ],
 )
 def test_unknown_key_is_refused_with_the_nearest(toml, line, near):
@@ -181,7 +188,29 @@ def test_memory_reads_units(text, count):
         ({"policy": "entropi"}, "one of gain, entropy, margin, sobel, .*mask"),
         ({"policy": "mask"}, "needs a mask file"),
         ({"mask": "m.png"}, "policy 'mask' only"),
-        ({"effects": "smear,glare"}, "some of slit,smear,throughput,shot,read"),
+        ({"effects": "smear,glare"}, r"'effects': unknown effect 'glare'"),
+        ({"effects": "smear,turbulance"}, "did you mean 'turbulence'"),
+        ({"effects": "slit,throughput"}, "the effect 'throughput' is now called 'vignetting'"),
+        ({"effects": ["read"]}, "the effect 'read' is now called 'read-noise'"),
+        ({"effects": "auto,slit"}, "'auto' stands alone, got 'auto,slit'"),
+        ({"effects": []}, "no effect is named"),
+        ({"tol": -0.1}, "'tol' must be 0 or more, in sigmas of the noise such as 0.1, or in DN .* got -0.1"),
+        ({"tol": "10%"}, "'tol' must be 0 or more"),
+        ({"tol": True}, "'tol' must be 0 or more"),
+        ({"tol": float("nan")}, "'tol' must be 0 or more"),
+        ({"optics": {"aperture_mm": 0.015}}, "from 0.1 to 1000 mm, got 0.015; was it given in metres.* 15"),
+        ({"optics": {"focus_m": 0}}, "of at least 0.01 m or inf, got 0"),
+        ({"optics": {"fwhm_nm": float("inf")}}, "from 0 to 1000 nm, got inf"),
+        ({"mirror": {"repeatability_urad": -40e-6}}, "from 0 to 100000 urad"),
+        ({"detector": {"noiseless": "maybe"}}, "true or false"),
+        ({"detector": {"unit": 1.5}}, "whole number from 0"),
+        ({"air": {"distance_m": 0}}, "of at least 0.001 m, got 0"),
+        ({"air": {"relief": "hills"}}, "one of flat, step, plane; got 'hills'"),
+        ({"air": {"nearest_m": 3}}, "needs air.distance_m"),
+        ({"air": {"distance_m": 5, "nearest_m": 6, "farthest_m": 4}}, "nearest_m = 6 lies beyond air.farthest_m = 4"),
+        ({"sky": {"started": "noon"}}, "must be a date and time with its zone, such as .* got noon"),
+        ({"sky": {"started": datetime(2026, 6, 1, 12)}}, "needs a time zone: write 2026-06-01T12:00:00Z for UTC"),
+        ({"sky": {"latitude_deg": 520000000}}, "90 deg, got 520000000; was it given in 1e-7 degrees.* 52"),
         ({"bands": [0, 0]}, "names a band twice"),
         ({"bands": "0;1"}, "counted from 0"),
         ({"bands": [0, 1], "wavelengths": [660]}, "each of the 2 bands, got 1"),
@@ -228,6 +257,43 @@ def test_the_commented_pose_of_the_example_is_valid():
     assert set(table["pose"]) | {"range_m"} == {item.name for item in fields(RigPose)}
 
 
+def test_a_rig_is_read_from_its_tables(toml):
+    """Every table becomes its part of the rig; without them it is the rig at rest in calm, clear air."""
+    assert Settings().rig == Rig()
+    found = load_settings(
+        toml(
+            "tol = 0.5\n[optics]\nfocus_m = inf\nsmile_nm = -0.2\n[mirror]\ndamping = 1\n[detector]\nnoiseless = true\n"
+            '[air]\ndistance_m = 30\nrelief = "step"\nnearest_m = 20\n[sky]\nstarted = 2026-06-01T12:00:00+02:00\n'
+        )
+    )
+    rig = found.rig
+    assert (rig.optics, rig.mirror.damping, rig.detector) == (Optics(smile_nm=-0.2), 1.0, Detector(noiseless=True))
+    assert rig.air == Air(distance_m=30.0, relief="step", nearest_m=20.0)
+    assert rig.sky.started == datetime(2026, 6, 1, 10, tzinfo=UTC)
+    assert rig.camera == found.camera
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [
+        (0.1, Tolerance()),
+        ("0.1", Tolerance()),
+        (0, Tolerance(0.0)),
+        ("0.5dn", Tolerance(0.5, "dn")),
+        ("0.5 DN", Tolerance(0.5, "dn")),
+        ("2 sigma", Tolerance(2.0)),
+        ("inf", Tolerance(float("inf"))),
+        (float("inf"), Tolerance(float("inf"))),
+        ("1e-3dn", Tolerance(1e-3, "dn")),
+    ],
+)
+def test_a_tolerance_has_a_unit(given, wanted):
+    """Sigmas of the noise, or DN; what is written of it reads back the same."""
+    found = parse_settings({"tol": given}).tol
+    assert found == wanted
+    assert parse_settings({"tol": str(found)}).tol == wanted
+
+
 def test_file_that_cannot_be_read_is_one_message(toml, tmp_path):
     """A missing file, a folder and broken TOML are settings errors with the path."""
     with pytest.raises(SettingsError, match=r"no settings file .*nowhere\.toml"):
@@ -240,10 +306,10 @@ def test_file_that_cannot_be_read_is_one_message(toml, tmp_path):
 
 def test_text_and_lists_say_the_same():
     """What a flag says with commas is what a file says with a list."""
-    one = load_settings(flags={"bands": "0, 2", "wavelengths": "660,800.5", "size": "300x20", "effects": "read,slit"})
-    two = parse_settings({"bands": [0, 2], "wavelengths": [660, 800.5], "size": [300, 20], "effects": ["slit", "read"]})
+    one = load_settings(flags={"bands": "0, 2", "wavelengths": "660,800.5", "size": "300x20", "effects": "shot,slit"})
+    two = parse_settings({"bands": [0, 2], "wavelengths": [660, 800.5], "size": [300, 20], "effects": ["slit", "shot"]})
     assert one == two
-    assert (one.shape, one.effects) == ((20, 300), "slit,read")
+    assert (one.shape, one.effects) == ((20, 300), "slit,shot")
 
 
 @given(
@@ -254,8 +320,9 @@ def test_text_and_lists_say_the_same():
     exposure=st.floats(0.5, 10_000),
     slew=st.floats(0, 10),
     posed=st.booleans(),
+    tolerance=st.builds(Tolerance, st.floats(0), st.sampled_from(["sigma", "dn"])),
 )
-def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposure, slew, posed):
+def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposure, slew, posed, tolerance):
     """`parse_settings` undoes `to_dict`, so that a receipt's settings can be run again."""
     settings = Settings(
         budget=budget,
@@ -267,8 +334,13 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
         pose=RigPose(**POSE) if posed else None,
         map=MapChoice(resolution_m=0.1 if posed else None),
         pointing_px=slew,
+        tol=tolerance,
+        sky=Sky(started=datetime(2026, 6, 1, 10, tzinfo=UTC) if posed else None, cloud_share=budget),
+        air=Air(distance_m=exposure if posed else None),
+        detector=Detector(well_e=exposure + 1),
     )
     assert parse_settings(settings.to_dict()) == settings
+    assert parse_settings(json.loads(to_json(settings.to_dict()))) == settings
 
 
 @pytest.mark.parametrize("value", ["", 3])

@@ -35,8 +35,10 @@ READERS = ("storage/scan_files.py", "storage/envi_header.py", "storage/envi_cube
            "storage/frame_index.py", "storage/zarr_scenes.py", "storage/raster_files.py", "storage/rasters.py",
            "storage/tiff_files.py", "storage/array_files.py", "storage/mat_files.py", "storage/dataset_layouts.py",
            "storage/wavelengths.py", "storage/scene_toml.py")  # fmt: skip
+SIMULATOR = ("pipeline/simulator", "pipeline/simulator/effects")
 SOURCES = {
-    "capture": (*GEOMETRY, *GATHER, "pipeline/simulator", "storage/cubes.py"),
+    "effects": (*GEOMETRY, *GATHER, *SIMULATOR, "flows/effect_choice.py"),
+    "capture": (*GEOMETRY, *GATHER, *SIMULATOR, "storage/cubes.py"),
     "register": (*RECTIFY, "storage/sightings.py", "flows/pointing_stage.py"),
     "locate": (*RECTIFY, "storage/sightings.py", "storage/lookups.py"),
     "rectify": (*RECTIFY, "storage/sightings.py", "storage/mosaics.py", "storage/mosaic_work.py",
@@ -55,7 +57,11 @@ SOURCES = {
 }  # fmt: skip
 STAGES_FILE, PLACEMENT = "flows/stages.py", "flows/placement.py"
 FUNCTIONS: dict[str, dict[str, tuple[str, ...]]] = {  # of files that several stages share
-    "capture": {STAGES_FILE: ("_capture", "_capture_sweep")},
+    "effects": {},
+    "capture": {
+        STAGES_FILE: ("capture_coarse", "capture_fine", "capture_again", "capture_sweeps", "_capture_sweep"),
+        "flows/effect_choice.py": ("chosen_effects", "source_with"),
+    },
     "register": {PLACEMENT: ("sighted",), STAGES_FILE: ("captured",)},
     "locate": {PLACEMENT: ("sighted", "locate"), STAGES_FILE: ("captured",)},
     "rectify": {PLACEMENT: ("rectify", "_record")},

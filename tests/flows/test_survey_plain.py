@@ -22,12 +22,16 @@ from flows.survey_command import run_survey
 from models.inference import glance
 from models.weights import load_weights
 from pipeline.camera import LineCamera
+from pipeline.coverage import on_scene
 from pipeline.grid import SceneGrid
 from pipeline.scan import CostModel, Sweep
-from pipeline.simulator.instrument import on_scene
+from pipeline.simulator.effects.registry import BY_NAME
 from storage.archive import Archive
 
-STAGES = ["capture_coarse", "locate", "rectify", "attend", "capture_fine", "cut_patches", "draw_map", "evaluate"]
+STAGES = [
+    "choose_effects", "capture_coarse", "locate", "rectify", "attend", "capture_fine", "cut_patches", "draw_map",
+    "evaluate",
+]  # fmt: skip
 ON_REQUEST = ["register_coarse", "register_fine", "ground"]  # skipped without --pointing-px and [pose]
 FARM = (128, 192)
 
@@ -84,7 +88,8 @@ def test_receipt_has_every_field(farm: Done) -> None:
     assert all(stage["manifest_sha256"] is None for stage in receipt["stages"] if stage["state"] == "skipped")
     assert set(receipt["accuracy"]["controls"]) == {"gain", "entropy", "sobel", "random"}
     assert 0 <= receipt["accuracy"]["miou"] <= 1
-    assert {row["name"] for row in receipt["effects"]} >= {"slit", "smear", "shot", "read", "quantisation"}
+    assert {row["name"] for row in receipt["effects"]} == set(BY_NAME)
+    assert receipt["effects_total"]["bound"] <= receipt["effects_total"]["tolerance"] == 0.1
     assert 0 < farm.published.looked_twice < 1
 
 

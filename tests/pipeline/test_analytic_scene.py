@@ -15,6 +15,8 @@ from pipeline.rectify.lookup import grid_lookup
 from pipeline.rectify.mosaic import Part, edge_distance, mosaic
 from pipeline.rectify.resample import Kernel, resample
 from pipeline.scan import Axis, Sweep
+from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource
 
 CAMERA = LineCamera(
@@ -94,7 +96,7 @@ def rectified(
 
 def rectified_strip(scene: Waves, strip: float, along: Axis, *, step: int, kernel: Kernel, spoil: bool) -> Part:
     """One sweep on the grid of the scene: captured, calibrated, looked up, resampled."""
-    source = SimulatedSource(scene, CAMERA, effects=frozenset({"slit", "smear"}))
+    source = SimulatedSource(scene, Rig(CAMERA), chosen=effects_on("rotation", "slit", "smear"))
     sweep = sweep_over(scene, strip, along, step)
     lines = list(source.lines(sweep))
     raw = np.stack([line.data for line in lines])

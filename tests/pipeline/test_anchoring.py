@@ -14,7 +14,9 @@ from pipeline.grid import SceneGrid
 from pipeline.rectify.anchoring import Anchor, anchor_sweep
 from pipeline.rectify.overlaps import BroadSweep
 from pipeline.scan import Axis, Sweep
+from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.pointing import CommonOffset
+from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import RasterScene, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
@@ -46,7 +48,7 @@ def anchored(
 ) -> Anchor:
     """A sweep seen by a mirror that looks beside the plan, on the mosaic of one that does not."""
     seen = textured() if scene is None else scene
-    source = SimulatedSource(seen, CAMERA, 0, frozenset({"read"}), pointing=CommonOffset(offset))
+    source = SimulatedSource(seen, Rig(CAMERA), 0, effects_on("rotation", "read-noise"), pointing=CommonOffset(offset))
     broad = BroadSweep.read(SimulatedSweep(source, sweep), CAMERA)
     return anchor_sweep(broad, CAMERA, replace(GRID, factor=factor), coarse_mean(seen, factor), prior_px=prior_px)
 
@@ -99,7 +101,7 @@ def test_sweep_beyond_the_prior_stays_where_it_was() -> None:
 
 def test_sweep_that_shows_nothing_of_the_mosaic_is_empty() -> None:
     """Without a usable line, beside the field, or on a mosaic that holds nothing, there is nothing to compare."""
-    source = SimulatedSource(textured(), CAMERA, 0, frozenset())
+    source = SimulatedSource(textured(), Rig(CAMERA), 0, effects_on("rotation"))
     broad = BroadSweep.read(SimulatedSweep(source, sweep_of()), CAMERA)
     blind = replace(broad, usable=np.zeros(140, bool))
     mosaic = coarse_mean(textured(), 4)

@@ -16,6 +16,8 @@ from pipeline.rectify.illumination import LightRatio, light_ratio, overlap_light
 from pipeline.rectify.overlaps import Window
 from pipeline.rectify.region import PixelGrid, mosaic_tile, place
 from pipeline.scan import Axis, Sweep
+from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
@@ -95,7 +97,7 @@ def test_drift_between_captured_sweeps_is_taken_out():
     rng = np.random.default_rng(3)
     values = np.kron(rng.uniform(0.3, 1, (15, 26, 8)), np.ones((8, 8, 1)))
     scene = raster_from_values(values, camera, name="t", wavelength_nm=np.linspace(400, 1000, 8))
-    source = SimulatedSource(scene, camera, 0, frozenset({"shot", "read"}))
+    source = SimulatedSource(scene, Rig(camera), 0, effects_on("rotation", "shot", "read-noise"))
     sweeps = full_sweeps(SceneGrid(100, 150, 16, 4), camera, "x", overlap_px=64)[:2]
     light = 1.2 + 0.1 * np.linspace(-1, 1, 8)
 
@@ -145,7 +147,7 @@ def test_crop_rows_are_not_taken_for_light(period: float, along: Axis):
     y, _ = np.mgrid[:150, :208].astype(float)
     rows = 0.3 + 0.25 * np.cos(2 * np.pi * y / period)
     scene = raster_from_values(rows[..., None], camera, name="t", wavelength_nm=np.array([700.0]))
-    source = SimulatedSource(scene, camera, 0, frozenset())
+    source = SimulatedSource(scene, Rig(camera), 0, effects_on("rotation"))
     sweeps = [Sweep(name, "fine", along, at, -64.0 + at, 56) for name, at in (("a", 0.0), ("b", 0.5))]
     placed = [place(SimulatedSweep(source, sweep), camera) for sweep in sweeps]
     (ratio,) = overlap_light(placed, camera, [Window(0, 1, (0.0, 50.0), (-60.0, -12.0))])

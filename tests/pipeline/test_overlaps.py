@@ -18,8 +18,10 @@ from pipeline.rectify.alignment import no_shifts
 from pipeline.rectify.overlaps import BroadSweep, PlacedImage, broad_bands, overlap_windows, places_seen
 from pipeline.rectify.seams import Registration, measure_windows, place_images, register_sweeps
 from pipeline.scan import Axis, Sweep, line_positions, points_of_scan, sweep_to_scene
+from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.pointing import PointingErrors
 from pipeline.simulator.raster import Light
+from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
@@ -38,7 +40,7 @@ def source_of(pointing: PointingErrors | None = None, bands: int = 2, *, turned:
     values = values.T if turned else values
     cube = np.repeat(values[..., None], bands, axis=2)
     scene = raster_from_values(cube, CAMERA, name="t", wavelength_nm=np.linspace(500, 800, bands))
-    return SimulatedSource(scene, CAMERA, 0, frozenset({"read"}), pointing=pointing)
+    return SimulatedSource(scene, Rig(CAMERA), 0, effects_on("rotation", "read-noise"), pointing=pointing)
 
 
 def registered(pointing: PointingErrors, along: Axis, **options: Any) -> tuple[list[Sweep], Registration]:
@@ -118,7 +120,7 @@ def test_windows_lie_where_both_sweeps_look():
 
 def test_broad_image_is_the_mean_of_the_bands():
     """Without noise the image is the scene's mean over bands; lost lines and dead elements leave NaN."""
-    source = replace(source_of(bands=5), effects=frozenset())
+    source = replace(source_of(bands=5), chosen=effects_on("rotation"))
     sweep = full_sweeps(GRID, CAMERA, "x")[0]
 
     @dataclass(frozen=True)
@@ -156,7 +158,9 @@ def test_saturated_samples_are_left_out(factor: int):
     scene = raster_from_values(values, CAMERA, name="t", wavelength_nm=np.array([600.0]))
     bright = replace(scene, light=Once.of(Light(scene.electrons * 2.4, scene.panel_electrons)))
     sweep = Sweep("s", "fine", "x", 0.0, -40.0, 80 // factor, factor, factor)
-    broad = BroadSweep.read(SimulatedSweep(SimulatedSource(bright, CAMERA, 0, frozenset()), sweep), CAMERA)
+    broad = BroadSweep.read(
+        SimulatedSweep(SimulatedSource(bright, Rig(CAMERA), 0, effects_on("rotation")), sweep), CAMERA
+    )
     middle = broad.image.shape[0] // 2, broad.image.shape[1] // 2
     assert np.isnan(broad.image[middle])
     assert np.isfinite(broad.image[0]).all()

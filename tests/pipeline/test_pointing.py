@@ -10,7 +10,9 @@ import pytest
 from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
 from pipeline.scan import Sweep, line_positions
+from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.pointing import PointingErrors
+from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
@@ -23,7 +25,7 @@ def source_of(pointing: PointingErrors | None) -> SimulatedSource:
     y, x = np.mgrid[:120, :760]
     values = (1 + 0.3 * np.cos(y / 7) * np.cos(x / 11))[..., None]
     scene = raster_from_values(values, CAMERA, name="t", wavelength_nm=np.array([500.0]))
-    return SimulatedSource(scene, CAMERA, effects=frozenset({"slit"}), pointing=pointing)
+    return SimulatedSource(scene, Rig(CAMERA), chosen=effects_on("rotation", "slit"), pointing=pointing)
 
 
 def test_errors_do_not_depend_on_what_else_is_asked():

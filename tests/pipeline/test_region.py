@@ -14,6 +14,8 @@ from pipeline.grid import SceneGrid
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.region import mosaic_rows, place, read_seats, seat_pixels
 from pipeline.scan import Sweep
+from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import RasterScene, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from pipeline.source import References
@@ -31,7 +33,7 @@ def smooth_scene(shape: tuple[int, int], bands: int = 2) -> RasterScene:
 
 def looked_at(scene: RasterScene, sweeps: list[Sweep]) -> list[SimulatedSweep]:
     """The sweeps without noise."""
-    source = SimulatedSource(scene, CAMERA, 0, frozenset({"slit", "smear"}))
+    source = SimulatedSource(scene, Rig(CAMERA), 0, effects_on("rotation", "slit", "smear"))
     return [SimulatedSweep(source, sweep) for sweep in sweeps]
 
 

@@ -12,19 +12,22 @@ from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.rectify.calibrate import calibrate
 from pipeline.scan import Sweep, line_positions
+from pipeline.simulator.effects.shot import SHOT
+from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
 
 CAMERA = LineCamera()
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-19.5, lines=40)
-QUIET = frozenset({"slit", "smear"})
+QUIET = ("rotation", "slit", "smear")
 
 
 def source_of(values: np.ndarray, camera: LineCamera = CAMERA, **options: object) -> SimulatedSource:
     """A source that looks at given values (y, x, band)."""
     scene = raster_from_values(values, CAMERA, name="t", wavelength_nm=np.linspace(400, 900, values.shape[2]))
-    return SimulatedSource(scene, camera, **options)  # type: ignore[arg-type]
+    return SimulatedSource(scene, Rig(camera), **options)  # type: ignore[arg-type]
 
 
 def raw_of(source: Source, sweep: Sweep = SWEEP, first: int = 0) -> np.ndarray:
@@ -64,16 +67,16 @@ def test_noise_is_keyed_by_seed_sweep_and_line() -> None:
     assert np.abs(correlation).max() < 5 / np.sqrt(noise.shape[1])
 
 
-@pytest.mark.parametrize("effects", [{"shot", "read"}, {"shot"}, {"read"}, set()])
+@pytest.mark.parametrize("effects", [("shot", "read-noise"), ("shot",), ("read-noise",), ()])
 @pytest.mark.parametrize("level", [0.02, 1.0])
-def test_noise_has_the_stated_variance(effects: set[str], level: float) -> None:
+def test_noise_has_the_stated_variance(effects: tuple[str, ...], level: float) -> None:
     """Mean and variance of a flat scene are those of shot, read and rounding noise, each only when on."""
     values = np.full((40, 40, 8), level)
     values[0, :4] = 1.0  # sets the scale and lies off the lines used
-    source = source_of(values, effects=QUIET | effects)
+    source = source_of(values, chosen=effects_on(*QUIET, *effects))
     dn = raw_of(source)[5:].astype(float)
     electrons = level * float(source.scene.electrons[0])
-    variance = electrons * ("shot" in effects) + CAMERA.read_noise_e**2 * ("read" in effects)
+    variance = electrons * ("shot" in effects) + CAMERA.read_noise_e**2 * ("read-noise" in effects)
     expected = variance / CAMERA.electrons_per_dn**2 + (1 / 12 if effects else 0)
     assert dn.mean() == pytest.approx(64 + electrons / 5, abs=5 * np.sqrt(expected / dn.size) if effects else 0.5)
     assert dn.var() == pytest.approx(expected, rel=0.02, abs=1e-9)
@@ -83,7 +86,7 @@ def test_binned_lines_are_sums_and_saturate_without_wrapping() -> None:
     """Twice the light that fills the well gives sums at full scale, and dark stays dark beside it."""
     values = np.zeros((40, 640, 2))
     values[:, :320] = 1.0
-    source = source_of(values, replace(CAMERA, exposure_ms=400.0), effects=QUIET)
+    source = source_of(values, replace(CAMERA, exposure_ms=400.0), chosen=effects_on(*QUIET))
     raw = raw_of(source, replace(SWEEP, lines=10, step=4, binning=4))
     assert raw.shape == (10, 160, 2)
     assert (raw[:, :79] == 4 * 4095).all()
@@ -96,7 +99,7 @@ def test_binned_lines_are_sums_and_saturate_without_wrapping() -> None:
 def test_references_give_back_scene_values(binning: int, exposure_ms: float) -> None:
     """Calibrated lines are scene values at any exposure and binning; what saturates is marked, not wrong."""
     values = np.random.default_rng(2).uniform(0.2, 1.0, (1, 1, 6)) * np.ones((40, 40, 1))
-    source = source_of(values, replace(CAMERA, exposure_ms=exposure_ms), effects=QUIET)
+    source = source_of(values, replace(CAMERA, exposure_ms=exposure_ms), chosen=effects_on(*QUIET))
     sweep = replace(SWEEP, lines=10, step=binning, binning=binning)
     out, valid = calibrate(raw_of(source, sweep), source.references(sweep), saturated_dn=4095 * binning)
     step = source.scene.panel[0] / source.scene.panel_electrons[0] * CAMERA.electrons_per_dn * 100 / exposure_ms
@@ -109,10 +112,10 @@ def test_calibration_takes_the_mirror_out() -> None:
     """Far from rest the light falls off and the references say so; calibrated lines are scene values again."""
     values = np.random.default_rng(4).uniform(0.2, 0.6, (1, 1, 6)) * np.ones((40, 40, 1))
     sweep = replace(SWEEP, strip_px=2500.0, start_px=-3000.0, lines=20)
-    for effects in (QUIET, QUIET | {"throughput"}):
-        source = source_of(values, effects=effects)
+    for effects in (QUIET, (*QUIET, "vignetting")):
+        source = source_of(values, chosen=effects_on(*effects))
         references, position = source.references(sweep), line_positions(sweep, CAMERA)
-        assert references.by_mirror == ("throughput" in effects)
+        assert references.by_mirror == ("vignetting" in effects)
         out, valid = calibrate(raw_of(source, sweep), references, saturated_dn=4095, position=position)
         assert valid.all()
         step = source.scene.panel[0] / source.scene.panel_electrons[0] * CAMERA.electrons_per_dn
@@ -134,7 +137,7 @@ def test_edges_never_wrap() -> None:
     """Interpolation overshoots at a black and white edge, below zero light and above the well, are clipped."""
     values = np.zeros((40, 640, 1))
     values[:, ::7] = values[::5] = 1.0
-    source = source_of(values, replace(CAMERA, exposure_ms=170.0), effects=frozenset())
+    source = source_of(values, replace(CAMERA, exposure_ms=170.0), chosen=effects_on("rotation"))
     raw = raw_of(source)
     assert raw.min() == 64
     assert raw.max() == 4095
@@ -153,8 +156,10 @@ def test_source_tells_its_field_and_bands() -> None:
 
 
 def test_impossible_settings_are_refused() -> None:
-    """Unknown effects and sums that overflow uint16 are named."""
-    with pytest.raises(SettingsError, match=r"'wind'.*choose from"):
-        source_of(np.ones((8, 8, 1)), effects=frozenset({"wind"}))
+    """Unknown effects and variants, and sums that overflow uint16 are named."""
+    with pytest.raises(SettingsError, match=r"'fog'.*choose from.*slit"):
+        effects_on("slit", "fog")
+    with pytest.raises(SettingsError, match=r"shot has no variant 'rough'"):
+        source_of(np.ones((8, 8, 1)), chosen={SHOT: "rough"})
     with pytest.raises(ShapeError, match="bin at most 16"):
         next(source_of(np.ones((8, 8, 1))).lines(replace(SWEEP, binning=20)))

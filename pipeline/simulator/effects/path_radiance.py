@@ -1,0 +1,152 @@
+"""Path radiance and transmission: the air between rig and scene takes light out of the way and adds its own.
+
+References
+----------
+.. [1] Koschmieder, "Theorie der horizontalen Sichtweite", Beitraege zur Physik der freien Atmosphaere 12, 1924: a
+   contrast of 2 % is left at the visibility V, so that extinction is 3.912 / V.
+.. [2] Bird and Riordan, "Simple solar spectral model for direct and diffuse irradiance on horizontal and tilted
+   planes at the earth's surface for cloudless atmospheres", TR-215-2436, 1984. doi:10.2172/5986936
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.simulator.block import Block
+from pipeline.simulator.daylight import relative_daylight
+from pipeline.simulator.effects.brdf import BRDF
+from pipeline.simulator.effects.cloud import CLOUD
+from pipeline.simulator.effects.drift import daylight_range
+from pipeline.simulator.effects.effect import OFF, Bound, Light
+from pipeline.simulator.effects.sight import has_relief, reach_m, sample_distances, spoken_reach
+from pipeline.simulator.gain_range import GainRange, lights_within, unit_electrons
+from pipeline.simulator.probe import Probe
+from pipeline.simulator.rig_model import Air, Rig
+
+Floats = NDArray[np.float64]
+RANGE, UNIFORM = "range", "uniform"
+KOSCHMIEDER = 3.912  # -ln 0.02 [1]
+_LOOKS = 9  # distances at which the spectrum's course is taken for the bounds of others: it is smooth
+VISIBLE_NM = 550.0  # of the visibility
+ANGSTROM = 1.14  # exponent of a rural aerosol [2]
+RAYLEIGH_PER_KM = 0.043  # of air at sea level at 400 nm; as wavelength^-4
+
+
+@dataclass(frozen=True)
+class PathRadiance:
+    """Light L at a distance d arrives as L exp(-beta d) + H (1 - exp(-beta d)).
+
+    beta is ``extinction_per_m``. H, the light of endless air, is ``air.airlight_share`` of the white panel's and
+    follows the daylight where the sky has a time of day; without the panel's light none is added. ``range`` takes each
+    sample's own distance, ``uniform`` the middle of nearest and farthest. A scene without a distance has no air.
+    """
+
+    name = "path-radiance"
+    variants = (RANGE, UNIFORM)
+    cost_ns = MappingProxyType({RANGE: 3.1, UNIFORM: 0.5})  # of a scene with relief
+
+    def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
+        """Give the cost for the scene's relief: without any, samples share one distance."""
+        return self.cost_ns if has_relief(rig) else dict.fromkeys(self.variants, self.cost_ns[UNIFORM])
+
+    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+        """Bound by the share that is lost, or that a variant misses, times the greatest difference of signal and H.
+
+        Over the noise of the signal that difference is greatest where the signal is greatest, or least.
+        """
+        reach = reach_m(rig)
+        if reach is None:
+            return Bound(0.0, "the scene has no distance")
+        if variant == RANGE or (variant == UNIFORM and reach[0] == reach[1]):
+            return Bound(0.0, "every sample at its own distance")
+        depth = extinction_per_m(rig.air, probe.wavelength_nm)
+        lost = -np.expm1(-depth * reach[1])
+        if variant == UNIFORM:
+            middle = depth * sum(reach) / 2
+            lost = np.maximum(_between(depth * reach[0], middle), _between(middle, depth * reach[1]))
+        worst = float((_contrast(probe, rig) * lost).max(initial=0.0))
+        verb = "takes" if variant == OFF else "at one distance for all is wrong by"
+        most = f"at most {lost.max(initial=0.0):.2%} of the light"
+        return Bound(worst, f"air {verb} {most} and adds its own, over {spoken_reach(reach)}")
+
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        """Give the transmission between the nearest and the farthest distance, and the air's own light."""
+        reach, nm = reach_m(rig), np.asarray(probe.wavelength_nm, np.float64)
+        if reach is None:
+            return GainRange.between(1.0, 1.0, len(nm))
+        passed = np.exp(-np.geomspace(*reach, _LOOKS)[:, None] * extinction_per_m(rig.air, nm))
+        uneven = float(passed.max(initial=0.0) - passed.min(initial=1.0))
+        if probe.white_e is None:
+            return GainRange.of(passed, nm, uneven=uneven)
+        sun = daylight_range(probe, rig)
+        still = rig.air.airlight_share * probe.white_e * (1 - passed)
+        alone = GainRange.of(passed, nm, uneven=uneven, added_e=still)
+        most = sun.greatest.max(initial=1.0)
+        return replace(
+            alone,
+            added_e=alone.added_e * most,
+            added_steepest=alone.added_steepest * most + alone.added_e * sun.steepest,
+            added_bend=alone.added_bend * most + 2 * alone.added_steepest * sun.steepest + alone.added_e * sun.bend,
+        )
+
+    def change(self, light: Light, block: Block, variant: str) -> Light:
+        """Change the light in place."""
+        reach = reach_m(block.rig)
+        if reach is None:
+            return light
+        metres = np.full((1, 1), sum(reach) / 2) if variant == UNIFORM else sample_distances(block)
+        depth = (extinction_per_m(block.rig.air, block.wavelength_nm) * metres[..., None]).astype(np.float32)
+        lost = -np.expm1(-depth)
+        light *= 1 - lost
+        if block.white_e is not None:
+            light += (self._horizon(block) * lost).astype(np.float32, copy=False)
+        return light
+
+    def _horizon(self, block: Block) -> Light:
+        """Light of endless air at a line's time, (line or 1, 1, band) [e-]."""
+        sky, still = block.rig.sky, block.rig.air.airlight_share * np.asarray(block.white_e, np.float64)
+        if sky.started is not None:
+            still = still * relative_daylight(sky, block.wavelength_nm, block.time_s)
+        return np.atleast_2d(still)[:, None].astype(np.float32)
+
+
+PATH_RADIANCE = PathRadiance()
+
+
+def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
+    """Give the extinction of aerosol and molecules near the ground, (band,) [1/m]: 0.17 + 0.012 /km at 23 km, 550 nm.
+
+    The aerosol is Koschmieder's for the visibility [1] at 550 nm, and falls by Angstrom's exponent [2].
+    """
+    aerosol = KOSCHMIEDER / air.visibility_km * (wavelength_nm / VISIBLE_NM) ** -ANGSTROM
+    per_m: Floats = (aerosol + RAYLEIGH_PER_KM * (wavelength_nm / 400.0) ** -4) * 1e-3
+    return per_m
+
+
+def _contrast(probe: Probe, rig: Rig) -> Floats:
+    """Greatest difference of a signal and the light of endless air, over the signal's unit, (band,).
+
+    Daylight multiplies both, and is a gain like any other for the signals above H; clouds and the angle of view change
+    the signal alone, so that H counts over their greatest factor, and the darkest signal after their least.
+    """
+    if probe.white_e is None:
+        return probe.level
+    horizon, (low, high) = rig.air.airlight_share * probe.white_e, lights_within(probe, rig)
+    cloud, view = CLOUD.gain_range(probe, rig), BRDF.gain_range(probe, rig)
+    lit, shaded = np.maximum(cloud.greatest * view.greatest, 1.0), cloud.least * view.least
+    above = probe.level * np.clip(1 - horizon / np.maximum(lit * high, np.finfo(float).tiny), 0.0, 1.0)
+    sun = daylight_range(probe, rig)
+    below = np.maximum(horizon - shaded * low, 0.0) * np.maximum(sun.greatest, 1.0)
+    worst: Floats = np.maximum(above, below / unit_electrons(shaded * np.minimum(sun.least, 1.0) * low, probe, rig))
+    return worst
+
+
+def _between(near: Floats, far: Floats) -> Floats:
+    """Share of the light lost between two optical depths, exp(-near) - exp(-far), however near they lie."""
+    share: Floats = -np.exp(-near) * np.expm1(near - far)
+    return share

@@ -1,0 +1,64 @@
+"""The aperture as the camera sees it: the mirror's disc, foreshortened in the plane of incidence and only there.
+
+At rest that plane holds the scan, so the pupil is an ellipse: the whole diameter along the line, and |n_z| of it, 0.71,
+along the scan. Diffraction is then wider along the scan, defocus wider along the line.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.mirror import direction_to_normal, scene_to_direction
+from pipeline.scan import Sweep
+from pipeline.simulator.probe import Probe
+from pipeline.simulator.rig_model import Rig
+
+Floats = NDArray[np.float64]
+REST_NORMAL: Floats = np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5)])
+
+
+def spread_of_waves(normal: Floats | None = None) -> Floats:
+    """Give the variance that diffraction has along (line, scan), over that of a round pupil of the mirror's diameter.
+
+    A pupil |n_z| wide along (n_x, n_y) and 1 across spreads waves by 1 / n_z^2 and 1; on the camera's own axes that is
+    1 + n_y^2 / n_z^2 and 1 + n_x^2 / n_z^2. The covariance n_x n_y / n_z^2 is left out: it is 0 at rest.
+
+    Parameters
+    ----------
+    normal
+        (..., 3) mirror normals in the camera frame; None is the mirror at rest. Returns (..., 2).
+    """
+    n = REST_NORMAL if normal is None else np.asarray(normal, np.float64)
+    spread: Floats = 1 + (n[..., 1::-1] / n[..., 2:]) ** 2
+    return spread
+
+
+def spread_of_rays(normal: Floats | None = None) -> Floats:
+    """Give the variance of the pupil along (line, scan), over that of a round one: 1 - n_y^2 and 1 - n_x^2, (..., 2).
+
+    The covariance -n_x n_y is left out: it is 0 at rest.
+    """
+    n = REST_NORMAL if normal is None else np.asarray(normal, np.float64)
+    spread: Floats = 1 - n[..., 1::-1] ** 2
+    return spread
+
+
+def normals_met(probe: Probe, rig: Rig) -> Floats:
+    """Give the mirror's normals at rest and at both ends of every sweep, (n, 3).
+
+    Both spreads are monotonic along a sweep (n_x / n_z = 1 / (eta - sqrt(1 + xi^2 + eta^2)) in scene tangents), so the
+    ends hold the extremes.
+    """
+    taken = [sweep for sweep in probe.sweeps if sweep.lines > 0]
+    ends = [(sweep.strip_px, scan) for sweep in taken for scan in sweep.held_px().ravel()[[0, -1]]]
+    tangents = np.array(ends, np.float64).reshape(-1, 2) * rig.camera.ifov_rad
+    return np.concatenate([REST_NORMAL[None], direction_to_normal(scene_to_direction(tangents))])
+
+
+def middle_normal(sweep: Sweep, rig: Rig) -> Floats:
+    """Give the mirror's normal in the middle of a sweep, (3,): one kernel for all its lines, whatever the block."""
+    middle = sweep.start_px + (sweep.lines * sweep.step - 1) / 2
+    tangents = np.array([sweep.strip_px, middle]) * rig.camera.ifov_rad
+    normal: Floats = direction_to_normal(scene_to_direction(tangents))
+    return normal

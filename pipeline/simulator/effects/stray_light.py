@@ -1,0 +1,127 @@
+"""Stray light: a share of all the light in a line is scattered over its detector, samples and bands alike."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import ShapeError
+from pipeline.simulator.block import Block
+from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.probe import Probe
+from pipeline.simulator.rig_model import Optics, Rig
+
+Light = NDArray[np.float32]
+HALO, EVEN = "halo", "even"
+LEAST_MODE = 1e-8  # of a wide Gaussian's cosines; fainter ones are below float32
+
+
+@dataclass(frozen=True)
+class StrayLight:
+    """(1 - f) S + f K S: of the scattered light ``stray_even`` falls evenly, the rest as a Gaussian ``stray_halo_px``
+    wide (sd), reflected at the detector's edges. K has no weight below 0 and keeps all light. A band is a row.
+
+    ``halo`` is exact: the Gaussian passes only the slowest cosines of a frame, so it is a product with few of them.
+    ``even`` lets all of the scattered light fall evenly.
+    """
+
+    name = "stray-light"
+    variants = (HALO, EVEN)
+    cost_ns = MappingProxyType({HALO: 1.2, EVEN: 0.65})
+    whole_line = True  # light comes from all samples: a line is made whole, then cut
+
+    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+        """Bound it by f (S - mean), were all to fall evenly, and what the halo differs from that."""
+        optics = rig.optics
+        if optics.stray_share == 0:
+            return Bound(0.0, "no light is scattered")
+        if variant == HALO:
+            return Bound(0.0, "exact")
+        spread = float(np.max(probe.spread, initial=0))
+        halo = optics.stray_share * (1 - optics.stray_even) * _most_halo(probe, rig, spread)
+        why = f"{optics.stray_share:.2g} of a line's light, signals up to {spread:.3g} {probe.unit} from its mean"
+        if variant == EVEN:
+            return Bound(halo, f"{why}; {1 - optics.stray_even:.2g} of it in a halo")
+        return Bound(optics.stray_share * spread + halo, why)
+
+    def change(self, light: Light, block: Block, variant: str) -> Light:
+        """Give the light after scattering; works in place.
+
+        Raises
+        ------
+        ShapeError : samples of the line are missing.
+        """
+        optics, samples = block.rig.optics, block.rig.camera.samples
+        if optics.stray_share == 0:
+            return light
+        if light.shape[1] != samples:
+            raise ShapeError(
+                f"stray light comes from all {samples} samples of a line, got {light.shape[1]}; "
+                "make whole lines and cut them afterwards, or leave stray-light out"
+            )
+        for line in light:  # line by line: rounding, too, does not depend on the block
+            scattered = _scattered(line, optics) if variant == HALO else _even(line, optics)
+            line *= np.float32(1 - optics.stray_share)
+            line += scattered
+        return light
+
+
+STRAY_LIGHT = StrayLight()
+
+
+def _most_halo(probe: Probe, rig: Rig, spread: float) -> float:
+    """Bound |H - mean| over the unit at any sample, H the halo's own light.
+
+    It is at most the light that the kernel takes elsewhere than an even one would, times the range of signals: the
+    brightest less the darkest, and never more than twice the greatest way from the mean. That is ``spread`` units,
+    each no more than the unit at the brightest sample.
+    """
+    elsewhere = _uneven_share(probe, rig)
+    per_dn = rig.camera.electrons_per_dn
+    range_e, least_e = max(probe.brightest_e - probe.darkest_e, 0.0), probe.unit_least_dn * per_dn
+    most = math.sqrt(1 + range_e / least_e**2) if probe.unit == "sigma" else 1.0
+    return min(elsewhere * probe.added(range_e, per_dn), min(2 * elsewhere, 1) * spread * most)
+
+
+def _uneven_share(probe: Probe, rig: Rig) -> float:
+    """Greatest share of a sample's halo that comes from elsewhere than if it were even: 1 narrow, 0 endless."""
+    width = rig.optics.stray_halo_px
+    even = [1 - _off_even(count, width) for count in (rig.camera.samples, len(probe.wavelength_nm))]
+    return 1 - even[0] * even[1]
+
+
+@lru_cache(maxsize=16)
+def _off_even(count: int, sd_px: float) -> float:
+    waves, passed = _cosines(count, sd_px)
+    kernel = (waves.T * passed) @ waves
+    return float(np.abs(kernel - 1 / count).sum(axis=1).max()) / 2
+
+
+def _even(line: Light, optics: Optics) -> np.float32:
+    return np.float32(optics.stray_share * line.mean(dtype=np.float64))
+
+
+def _scattered(line: Light, optics: Optics) -> Light:
+    """Take a frame to its slowest cosines, weaken them as the kernel f K does, and back: f K S, (sample, band)."""
+    along, along_kept = _cosines(line.shape[0], optics.stray_halo_px)
+    across, across_kept = _cosines(line.shape[1], optics.stray_halo_px)
+    kept = np.outer(along_kept, across_kept) * (1 - optics.stray_even)
+    kept[0, 0] = 1
+    modes = along @ (line @ across.T) * (optics.stray_share * kept).astype(np.float32)
+    back: Light = (along.T @ modes) @ across
+    return back
+
+
+@lru_cache(maxsize=16)
+def _cosines(count: int, sd_px: float) -> tuple[Light, NDArray[np.float64]]:
+    """Orthonormal cosines (mode, count) that a Gaussian reflected at both ends passes, and the share it passes."""
+    passed = np.exp(-((np.pi * sd_px / count * np.arange(count)) ** 2) / 2)
+    modes = np.arange(count)[passed > LEAST_MODE]
+    waves = np.cos(np.pi / count * np.outer(modes, np.arange(count) + 0.5))
+    waves *= np.sqrt(np.where(modes == 0, 1, 2) / count)[:, None]
+    return waves.astype(np.float32), passed[modes]

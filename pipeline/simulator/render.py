@@ -1,0 +1,179 @@
+"""The light that a block of lines gathers, through mirror and slit, with the effects chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SettingsError
+from pipeline.mirror import direction_to_scene, position_to_direction, position_to_normal
+from pipeline.scan import Sweep, line_positions, shifted_position
+from pipeline.simulator.block import Block
+from pipeline.simulator.effects.effect import OFF, Effect
+from pipeline.simulator.effects.pupil import middle_normal
+from pipeline.simulator.effects.slit import box_of, box_parts
+from pipeline.simulator.effects.smear import folded_positions, smeared_positions
+from pipeline.simulator.footprint import Footprint, fold
+from pipeline.simulator.rays import Views, exact_views, straight_views
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene
+from pipeline.simulator.scene_light import Looker
+
+Floats = NDArray[np.float64]
+Light = NDArray[np.float32]
+
+LOOKS = 17  # lines of a sweep and samples of a line that tell how far a footprint's shape varies
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Effects that are on, each with its variant, in the order of the chain; those of the readout may be among them.
+
+    ``slit``, ``smear`` and ``rotation`` are told by their names, the others by what they do.
+    """
+
+    effects: tuple[tuple[Effect, str], ...] = ()
+
+    @staticmethod
+    def of(chosen: Mapping[Any, str] | Choice) -> Choice:
+        """Take a mapping {effect: variant}, in the order of the chain; effects that are off may be among them.
+
+        Raises
+        ------
+        SettingsError : an effect has no such variant.
+        """
+        if isinstance(chosen, Choice):
+            return chosen
+        for effect, variant in chosen.items():
+            if variant not in (*effect.variants, OFF):
+                raise SettingsError(f"effect {effect.name} has no variant {variant!r}; choose from {effect.variants}")
+        return Choice(tuple((effect, variant) for effect, variant in chosen.items() if variant != OFF))
+
+    def variant(self, name: str) -> str:
+        """Give the variant of an effect by its name; off where it is not chosen."""
+        return next((variant for effect, variant in self.effects if effect.name == name), OFF)
+
+    def doing(self, action: str) -> Iterator[tuple[Any, str]]:
+        """Give the effects that have this action, as (effect, variant) in the order of the chain."""
+        return ((effect, variant) for effect, variant in self.effects if hasattr(effect, action))
+
+
+def expected_light(scene: Scene, block: Block, chosen: Mapping[Any, str] | Choice) -> Light:
+    """Give the electrons that the samples of some lines gather on average, before the readout.
+
+    Parameters
+    ----------
+    chosen
+        The effects that are on, in the order of the chain, each with its variant; none is a camera of rays that
+        stands still and whose lines lie straight.
+
+    Returns
+    -------
+    (line, sample, band) float32, the block's samples. [e-]
+
+    Raises
+    ------
+    PoseError : a position, with what aims add, is out of the mirror's reach.
+    SettingsError : an effect has no such variant.
+    """
+    choice = Choice.of(chosen)
+    if block.samples is not None and any(getattr(effect, "whole_line", False) for effect, _ in choice.effects):
+        return expected_light(scene, replace(block, samples=None), choice)[:, block.columns]
+    return _changed(_seen(scene, block, choice), block, choice)
+
+
+def folded_footprint(block: Block, choice: Choice) -> Footprint:
+    """Fold slit, pixel, the blurs that are on and perhaps held positions: the same for all of a sweep, made once."""
+    return _looker_of(block, choice).footprint
+
+
+def held_positions(block: Block, choice: Choice) -> Floats:
+    """Give what the mirror holds in each exposure, aims included, (line, step, 2); each for as long as the others."""
+    position = smeared_positions(block, choice.variant("smear"))
+    for aim, variant in choice.doing("aim"):
+        shift = aim.aim(block, variant)
+        if shift.shape[1] not in (1, position.shape[1]) and block.sweep.step > 1:  # the mirror's course is not followed
+            shift = shift.mean(axis=1, keepdims=True)
+        position = shifted_position(position, shift, block.rig.camera)
+    return position
+
+
+def _seen(scene: Scene, block: Block, choice: Choice) -> Light:
+    """Light of the block through the folded footprint, (line, sample, band)."""
+    steps = [views.flat() for views in _views(block, choice, scene.shape)]
+    exposures = block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
+    light = _looker_of(block, choice).look(scene, steps, along_y=block.sweep.along == "y", exposures=exposures)
+    return light.reshape(len(block.lines), len(block.columns), light.shape[1])
+
+
+def _changed(light: Light, block: Block, choice: Choice) -> Light:
+    """Multiply and change light as the effects do. Factors without bands are gathered: they pass through spectra."""
+    pending: Light | None = None
+    for effect, variant in choice.effects:
+        if hasattr(effect, "gain"):
+            gain = effect.gain(block, variant)
+            if gain.shape[-1] == 1:
+                pending = gain if pending is None else pending * gain
+            else:
+                light *= gain
+        elif hasattr(effect, "change"):
+            if pending is not None and not getattr(effect, "within_spectra", False):
+                light *= pending
+                pending = None
+            light = effect.change(light, block, variant)
+    if pending is not None:
+        light *= pending
+    return light
+
+
+def _views(block: Block, choice: Choice, shape: tuple[int, int]) -> Iterator[Views]:
+    """Where the samples look at each held position, (line, sample) each. [px of the scene]"""
+    position, ifov = held_positions(block, choice), block.rig.camera.ifov_rad
+    size = shape if block.sweep.along == "y" else shape[::-1]
+    displacements = list(choice.doing("displaced"))
+    for step in range(position.shape[1]):
+        views = _tangents(position[:, step, None], block.slopes, exact=choice.variant("rotation") != OFF)
+        along, scan = views.along / ifov, views.scan / ifov
+        for displacement, variant in displacements:
+            beside = displacement.displaced(block, along, scan, variant)
+            along, scan = along + beside[0], scan + beside[1]
+        yield replace(views, along=along + (size[0] - 1) / 2, scan=scan + (size[1] - 1) / 2)
+
+
+def _tangents(position: Floats, slopes: Floats, *, exact: bool) -> Views:
+    if exact:
+        return exact_views(position_to_normal(position), 0.0, slopes)
+    return straight_views(direction_to_scene(position_to_direction(position)), 0.0, slopes)
+
+
+def _looker_of(block: Block, choice: Choice) -> Looker:
+    moments, names = tuple(choice.doing("moments")), tuple(map(choice.variant, ("slit", "smear", "rotation")))
+    return _looker(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names)
+
+
+@lru_cache(maxsize=8)
+def _looker(
+    rig: Rig, sweep: Sweep, wavelengths: bytes, blurs: tuple[tuple[Any, str], ...], names: tuple[str, ...]
+) -> Looker:
+    wavelength, normal = np.frombuffer(wavelengths), middle_normal(sweep, rig)
+    shift, variance = np.zeros((2, len(wavelength))), np.zeros((2, len(wavelength)))
+    for blur, variant in blurs:
+        moments = blur.moments(rig, wavelength, variant, normal)
+        shift, variance = shift + moments.shift, variance + moments.variance
+    slit, smear, rotation = names
+    views = views_all_over(rig, sweep, exact=rotation != OFF)
+    parts = box_parts(slit, rig, views)
+    return Looker(fold(box_of(slit, rig), parts, folded_positions(sweep, smear), shift, variance), views)
+
+
+def views_all_over(rig: Rig, sweep: Sweep, *, exact: bool) -> Views:
+    """Give views all over a sweep: the shape of a footprint varies smoothly between them."""
+    whole = line_positions(replace(sweep, lines=max(sweep.lines, 1)), rig.camera)
+    lines = np.linspace(0, len(whole) - 1, LOOKS).round().astype(np.intp)
+    slopes = np.linspace(-0.5, 0.5, LOOKS) * rig.camera.samples * rig.camera.ifov_rad
+    return _tangents(whole[lines][:, None], slopes, exact=exact).flat()

@@ -1,0 +1,157 @@
+"""Effects: bounds against measured changes over random scenes and rigs, and what the choice of effects saves."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import numpy as np
+from measure import Clock, Row, ratio, time_in_turn
+
+from pipeline.scan import Sweep
+from pipeline.simulator.block import Block
+from pipeline.simulator.chips import candidate_chips, worst_chips
+from pipeline.simulator.choice import Decision, decide
+from pipeline.simulator.effects.effect import Effect, Light
+from pipeline.simulator.effects.registry import EFFECTS
+from pipeline.simulator.effects.rotation import ROTATION
+from pipeline.simulator.effects.slit import SLIT
+from pipeline.simulator.farm import farm_scene
+from pipeline.simulator.probe import Probe
+from pipeline.simulator.readout import read_out
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Air, Rig
+from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+from pipeline.simulator.verification import verify
+from tests.pipeline.simulator.bound_trials import DRAWN, Trial, trials
+from tests.pipeline.simulator.random_cases import random_case
+
+CASES = 200
+MOST_LOOSE = 6.0  # median of bound over measured change
+TOLERANCE = 0.1
+LEAST_SAVED = 3.0
+LOOK = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[1]}
+LINES = range(504, 520)  # of the farm's sweeps that are timed
+RIGS = {"rig at rest": Rig(), "rig 30 m away": Rig(air=Air(distance_m=30.0))}
+
+
+def rows() -> list[Row]:
+    """Bounds by effect and variant, then tolerance and processor time of the farm."""
+    return [*_bounds(range(CASES)), *_farm()]
+
+
+def _bounds(numbers: Sequence[int]) -> list[Row]:
+    found: dict[tuple[str, str], list[tuple[int, Trial]]] = defaultdict(list)
+    began = time.process_time()
+    for number in numbers:
+        for trial in trials(random_case(number)):
+            found[trial.effect, trial.variant].append((number, trial))
+    spent = time.process_time() - began
+    kept = [_of_effect(*key, cases) for key, cases in found.items()]
+    broken = sum(trial.is_broken for cases in found.values() for _, trial in cases)
+    count = sum(map(len, found.values()))
+    return [*kept, Row(
+        f"bounds of effects and variants over {len(numbers)} random scenes and rigs",
+        f"{broken} of {count} broken", "0", broken == 0, f"{spent:.0f} s of processor time",
+    )]  # fmt: skip
+
+
+def _of_effect(name: str, variant: str, cases: list[tuple[int, Trial]]) -> Row:
+    loose = {number: trial.looseness for number, trial in cases if np.isfinite(trial.looseness)}
+    broken = [number for number, trial in cases if trial.is_broken]
+    said = "nothing seen"
+    if loose:
+        worst = max(loose, key=loose.__getitem__)
+        said = f"median {statistics.median(loose.values()):.2g}, {min(loose.values()):.2g} to {loose[worst]:.3g}"
+        said += f" (case {worst})"
+    chance = "; 1 survey of 1000 may" if name in DRAWN else ""
+    return Row(
+        f"bound / measured: {name}, {variant}",
+        f"{len(broken)} of {len(cases)} broken; {said}",
+        f"0 broken{chance}; median <= {MOST_LOOSE:g}",
+        not broken and (not loose or statistics.median(loose.values()) <= MOST_LOOSE),
+        f"seen in {len(loose)}" + (f"; broken in {broken[:5]}" if broken else ""),
+    )
+
+
+def _farm() -> list[Row]:
+    scene = farm_scene(1, (1024, 1280))
+    sweeps = tuple(Sweep(f"strip {strip:g}", "fine", "x", strip, -512.0, 1024) for strip in (-320.0, 320.0))
+    return [row for name, rig in RIGS.items() for row in _of_rig(scene, name, rig, sweeps)]
+
+
+def _of_rig(scene: RasterScene, name: str, rig: Rig, sweeps: tuple[Sweep, ...]) -> list[Row]:
+    clock = time.process_time()
+    probe = probe_scene(scene, rig, sweeps)
+    probed = time.process_time() - clock
+    decision = decide(probe, rig, EFFECTS, TOLERANCE)
+    decided = time.process_time() - clock - probed
+    blocks = [_block(scene, rig, sweep, LINES) for sweep in sweeps]
+    ways = {"auto": decision.chosen, "exact": decision.exact, "cheap": decision.cheap}
+    light = {way: [expected_light(scene, block, chosen) for block in blocks] for way, chosen in ways.items()}
+    apart = {way: _apart(light[way], light["exact"], rig) for way in ("auto", "cheap")}
+    clocks = time_in_turn({way: partial(_image, scene, blocks[0], chosen) for way, chosen in ways.items()}, rounds=3)
+    return [
+        _tolerance_row(name, apart, decision),
+        _cpu_row(name, "cheap", clocks, apart["cheap"]),
+        _cpu_row(name, "exact", clocks, 0.0),
+        _verified(scene, name, decision, probe, f"probe {probed:.1f} s, choice {decided:.2f} s"),
+        Row(f"farm@1, {name}: on", ", ".join(f"{one.name}" for one in decision.taken if one.is_on)),
+    ]
+
+
+def _block(scene: RasterScene, rig: Rig, sweep: Sweep, lines: range) -> Block:
+    white = scene.panel_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
+    return Block(rig, sweep, lines, scene.wavelength_nm, scene.shape, fwhm_nm=scene.fwhm_nm, white_e=white)
+
+
+def _image(scene: RasterScene, block: Block, chosen: Mapping[Effect, str]) -> None:
+    read_out(expected_light(scene, block, chosen), block, chosen)
+
+
+def _apart(light: Sequence[Light], exact: Sequence[Light], rig: Rig) -> float:
+    """Greatest difference over the noise at every sample, on expected light."""
+    pairs = zip(light, exact, strict=True)
+    return max(float((np.abs(one - other) / noise_electrons(other, rig)).max()) for one, other in pairs)
+
+
+def _tolerance_row(name: str, apart: Mapping[str, float], decision: Decision) -> Row:
+    return Row(
+        f"farm@1 1024 x 1280 x 270, {name}, auto at {TOLERANCE} sigma: greatest change of light",
+        f"{apart['auto']:.3g} sigma, bound {decision.error:.3g}",
+        f"<= {TOLERANCE} sigma",
+        apart["auto"] <= decision.error <= TOLERANCE,
+        f"everything on, cheap: {apart['cheap']:.2g} sigma",
+    )
+
+
+def _cpu_row(name: str, against: str, clocks: Mapping[str, Clock], apart: float) -> Row:
+    numbers = len(LINES) * 640 * 270
+    ns = {way: 1e9 * clock.cpu_min_s / numbers for way, clock in clocks.items()}
+    goal = against == "cheap" and RIGS[name] == Rig()
+    what = "each as cheap as a tenth of the tolerance lets it be" if against == "cheap" else "exact"
+    return Row(
+        f"farm@1, {name}, auto: processor time against everything on, {what}",
+        f"1/{ratio(clocks, against, 'auto'):.2f}",
+        f">= {LEAST_SAVED:g} times less" if goal else "",
+        ratio(clocks, against, "auto") >= LEAST_SAVED if goal else None,
+        f"auto {ns['auto']:.1f}, everything {ns[against]:.1f} ns/px*band, readout included",
+    )
+
+
+def _verified(scene: RasterScene, name: str, decision: Decision, probe: Probe, before: str) -> Row:
+    rig, clock = RIGS[name], time.process_time()
+    units = partial(noise_electrons, rig=rig)
+    whole = [_block(scene, rig, sweep, range(sweep.lines)) for sweep in probe.sweeps]
+    chips = worst_chips(candidate_chips(whole, probe.places), lambda chip: expected_light(scene, chip, LOOK), units)
+    measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), chips, units)
+    spent = time.process_time() - clock
+    worst = max(measured.values())
+    return Row(
+        f"farm@1, {name}: verification of the choice, processor time", f"{spent:.1f} s, {worst:.2g} sigma",
+        peers=f"{before}; {len({(chip.sweep.name, chip.lines) for chip in chips.values()})} chips",
+    )  # fmt: skip

@@ -1,0 +1,156 @@
+"""Simulator: a sweep of a large farm, rendered and read out as decided at a tenth of the noise, beside all effects."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from measure import Clock, Row, ratio, time_in_turn
+from numpy.typing import NDArray
+
+from pipeline.scan import Sweep
+from pipeline.simulator.block import Block
+from pipeline.simulator.choice import CHEAP_SHARE, Decision, decide
+from pipeline.simulator.effects.aberration import ABERRATION
+from pipeline.simulator.effects.diffraction import DIFFRACTION
+from pipeline.simulator.effects.effect import Effect
+from pipeline.simulator.effects.keystone import KEYSTONE
+from pipeline.simulator.effects.registry import EFFECTS
+from pipeline.simulator.effects.rotation import ROTATION
+from pipeline.simulator.effects.slit import SLIT
+from pipeline.simulator.farm import farm_scene
+from pipeline.simulator.readout import read_out
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+
+SIZE = 2560  # px of the scene
+LINES, AT_ONCE = 256, 16
+TOLERANCE = 0.1  # sigma
+RATE, SAVED, MEMORY_GIB, RENDER_NS = 60e6, 3.0, 2.0, 7.0
+STRIPS = (-960.0, -320.0, 320.0, 960.0)
+BLURS: dict[Effect, str] = {DIFFRACTION: "airy", ABERRATION: "gaussian", KEYSTONE: "linear"}
+
+
+@dataclass(frozen=True)
+class Survey:
+    """The scene, how it is swept, and what was decided for it."""
+
+    scene: RasterScene
+    rig: Rig
+    sweeps: tuple[Sweep, ...]
+    decision: Decision
+
+    def blocks(self) -> list[Block]:
+        """Lines in the middle of one half of an outer sweep, some at a time."""
+        exposures = self.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
+        white = self.scene.panel_electrons.astype(np.float64) * exposures
+        first = SIZE // 4 - LINES // 2
+        whole = Block(self.rig, self.sweeps[0], range(SIZE), self.scene.wavelength_nm, self.scene.shape, white_e=white)
+        return [replace(whole, lines=range(at, at + AT_ONCE)) for at in range(first, first + LINES, AT_ONCE)]
+
+    @property
+    def values(self) -> int:
+        """Px times bands of all blocks."""
+        return LINES * self.rig.camera.samples * len(self.scene.wavelength_nm)
+
+
+def rows() -> list[Row]:
+    """Rate, share of a copy, savings, memory; and what the footprint's variants cost and miss."""
+    survey = _survey()
+    decision, blocks = survey.decision, survey.blocks()
+    cheap = _cheap(decision)
+    calls: dict[str, Callable[[], object]] = {
+        "auto": partial(_simulated, survey, decision.chosen, blocks),
+        "cheap": partial(_simulated, survey, cheap, blocks[:4]),
+        "exact": partial(_simulated, survey, decision.exact, blocks[:1]),
+        "take": _take(survey),
+    }
+    clocks = time_in_turn(calls, 3)
+    shares = {"auto": 1.0, "cheap": 4 * AT_ONCE / LINES, "exact": AT_ONCE / LINES, "take": 1.0}
+    ns = {name: _ns(clocks[name], survey.values * share) for name, share in shares.items()}
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    rate = 1e9 / ns["auto"]
+    on = ", ".join(f"{effect.name} {variant}" for effect, variant in decision.chosen.items())
+    return [
+        Row(f"{LINES} lines of a {SIZE} x {SIZE} x 270 sweep, auto at {TOLERANCE} sigma: px*bands per CPU second",
+            f"{rate / 1e6:.1f} million ({ns['auto']:.1f} ns)", f">= {RATE / 1e6:.0f} million", rate >= RATE, on),
+        Row("the same over np.take of as many bytes", f"{ratio(clocks, 'auto', 'take'):.1f} x",
+            peers=f"np.take {ns['take']:.2f} ns/px*band"),
+        Row("everything on, each as cheap as a tenth of the tolerance allows, over auto",
+            f"{ns['cheap'] / ns['auto']:.2f} x", f">= {SAVED:g} x", ns["cheap"] >= SAVED * ns["auto"],
+            f"{ns['cheap']:.1f} ns"),
+        Row("everything on and exact, over auto", f"{ns['exact'] / ns['auto']:.2f} x", peers=f"{ns['exact']:.1f} ns"),
+        Row("most memory of the process, scene included", f"{peak:.2f} GiB", f"<= {MEMORY_GIB:g} GiB",
+            peak <= MEMORY_GIB),
+        *_footprints(survey),
+    ]  # fmt: skip
+
+
+def _survey() -> Survey:
+    scene, rig = farm_scene(0, (SIZE, SIZE)), Rig()
+    sweeps = tuple(Sweep(f"strip{n}", "fine", "x", at, -(SIZE - 1) / 2, SIZE) for n, at in enumerate(STRIPS))
+    decision = decide(probe_scene(scene, rig, sweeps), rig, EFFECTS, TOLERANCE)
+    return Survey(scene, rig, sweeps, decision)
+
+
+def _simulated(survey: Survey, chosen: dict[Effect, str], blocks: list[Block]) -> None:
+    for block in blocks:
+        read_out(expected_light(survey.scene, block, chosen), block, chosen)
+
+
+def _cheap(decision: Decision) -> dict[Effect, str]:
+    """Everything that the rig has, each in the cheapest variant whose own error is a tenth of the tolerance at most."""
+    within = CHEAP_SHARE * decision.tolerance
+    menus = [one.menu for one in decision.taken if one.menu.present]
+    return {menu.effect: menu.cheapest_within(within).variant for menu in menus}
+
+
+def _take(survey: Survey) -> Callable[[], None]:
+    """Copy as many rows of bands as there are samples, out of a table larger than the cache."""
+    bands, samples = len(survey.scene.wavelength_nm), survey.rig.camera.samples
+    table = np.random.default_rng(0).random((60_000, bands), np.float32)
+    index = np.random.default_rng(1).integers(0, len(table) - samples, LINES)[:, None] + np.arange(samples)
+    out = np.empty((samples, bands), np.float32)
+
+    def call() -> None:
+        for line in index:
+            np.take(table, line, axis=0, out=out, mode="clip")
+
+    return call
+
+
+def _footprints(survey: Survey) -> list[Row]:
+    """Cost and error of each variant of the slit, sharp and with the rig's blurs, at the corner of the survey."""
+    middle = survey.blocks()[0]
+    corner = replace(middle, lines=range(AT_ONCE))
+    found = []
+    for name, blurs in (("no blur", {}), ("all blurs of the rig", BLURS)):
+        choices: dict[str, dict[Any, str]] = {
+            variant: {ROTATION: "rays", SLIT: variant, **blurs} for variant in SLIT.variants
+        }
+        calls = {variant: partial(expected_light, survey.scene, middle, chosen) for variant, chosen in choices.items()}
+        clocks = time_in_turn(calls, 3)
+        ns = {variant: _ns(clock, survey.values * AT_ONCE / LINES) for variant, clock in clocks.items()}
+        exact, *others = (expected_light(survey.scene, corner, chosen) for chosen in choices.values())
+        errors = [_error(other, exact, survey.rig) for other in others]
+        met = ns["3x1"] <= RENDER_NS if blurs else None
+        found.append(Row(
+            f"footprint, {name}: ns/px*band with {', '.join(SLIT.variants)} boxes",
+            ", ".join(f"{one:.1f}" for one in ns.values()), f"3x1 <= {RENDER_NS:g} ns" if blurs else "", met,
+            "at the survey's corner against 9x3: " + ", ".join(f"{one:.3f}" for one in errors) + " sigma",
+        ))  # fmt: skip
+    return found
+
+
+def _error(light: NDArray[np.float32], exact: NDArray[np.float32], rig: Rig) -> float:
+    return float((np.abs(light - exact) / noise_electrons(exact, rig)).max())
+
+
+def _ns(clock: Clock, values: float) -> float:
+    return clock.cpu_min_s / values * 1e9

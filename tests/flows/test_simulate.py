@@ -1,0 +1,179 @@
+"""`spectralzoom simulate`: a scan as raw cubes, its manifest as table and JSON, a scan broken off, words refused."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from rich.console import Console
+
+from flows import effect_choice
+from flows.effect_table import print_effects
+from pipeline.errors import BoundError
+from pipeline.simulator.effects.registry import EFFECTS
+from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.simulated import SimulatedSource
+
+ASKED = "rotation,vignetting,shot,read-noise"
+
+
+def words(scene_files: Path, out: Path, *more: str) -> list[str]:
+    """A command that scans the small picture coarsely."""
+    return ["simulate", str(scene_files / "scene.png"), "-o", str(out), "--coarse", "--effects", ASKED, *more]
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the scan of this module lies."""
+    return tmp_path_factory.mktemp("simulated") / "scan"
+
+
+@pytest.fixture
+def scan(command_line: Any, scene_files: Path, archive: Path) -> Any:
+    """The scan's record; made by the first test that asks, found by the others."""
+    return json.loads(command_line(*words(scene_files, archive, "--json")).out)
+
+
+def test_the_cubes_are_there_with_their_manifest(scan: Any, archive: Path) -> None:
+    """Every cube opens with plain xarray and says how it was made; the record has the figures of all."""
+    (cube,) = [xr.open_zarr(archive / name, consolidated=False) for name in scan["cubes"]]
+    assert cube["dn"].dims == ("line", "sample", "band")
+    assert scan["lines"] == cube.sizes["line"]
+    assert scan["px_bands"] == cube.sizes["line"] * 640 * 3
+    assert cube.attrs["simulation"] == {"effects": scan["effects"], "total": scan["effects_total"]}
+    assert [row["name"] for row in scan["effects"]] == [effect.name for effect in EFFECTS]
+
+
+def test_a_scan_that_is_there_draws_nothing(
+    scan: Any, command_line: Any, scene_files: Path, archive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is cached, with the same cubes; the table is shown nevertheless, an effect a row and the sums below."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("the scene was looked at")
+
+    monkeypatch.setattr(RasterScene, "sample", refuse)
+    ended = command_line(*words(scene_files, archive))
+    assert (ended.code, ended.out) == (0, "")
+    for name in (
+        *(effect.name for effect in EFFECTS),
+        "already there",
+        "6 of 33 effects are computed",
+        "coarse-0.zarr",
+    ):
+        assert name in " ".join(ended.err.split())
+    again = json.loads(command_line(*words(scene_files, archive, "--json")).out)
+    assert again["cached"]
+    assert again["cpu_s"] is None
+    assert again["cubes"] == scan["cubes"]
+
+
+def test_a_broken_scan_goes_on_where_it_was(
+    command_line: Any, scene_files: Path, tmp_path: Path, scan: Any, archive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lines that were taken are not taken again, and the cube is the same."""
+    real, firsts = SimulatedSource.lines, []
+
+    def breaking(self: SimulatedSource, sweep: Any, first: int = 0) -> Iterator[Any]:
+        firsts.append(first)
+        for line in real(self, sweep, first):
+            if line.number == 7 and len(firsts) == 1:
+                raise KeyboardInterrupt
+            yield line
+
+    monkeypatch.setattr(SimulatedSource, "lines", breaking)
+    ended = command_line(*words(scene_files, tmp_path))
+    assert ended.code == 130
+    assert "the same command goes on from here" in ended.err
+    again = json.loads(command_line(*words(scene_files, tmp_path, "--json")).out)
+    assert firsts == [0, 7]
+    one, other = (
+        xr.open_zarr(root / scan["cubes"][0], consolidated=False)["dn"].values for root in (archive, tmp_path)
+    )
+    assert again["cubes"] == scan["cubes"]
+    assert (one == other).all()
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--effects", "smear,turbulance"], "--effects: unknown effect 'turbulance'; did you mean 'turbulence'?"),
+        (["--effects", "auto,smear"], "--effects: 'auto' stands alone, got 'auto,smear'"),
+        (["--effects", "throughput"], "--effects: the effect 'throughput' is now called 'vignetting'"),
+        (["--tol", "-1"], "--tol must be 0 or more"),
+        (["--size", "64x64"], "size is for built-in scenes"),
+    ],
+)
+def test_wrong_words_are_refused(
+    command_line: Any, scene_files: Path, tmp_path: Path, flags: list[str], message: str
+) -> None:
+    """One message, exit code 2, no archive."""
+    ended = command_line("simulate", scene_files / "scene.png", "-o", tmp_path / "none", *flags)
+    assert ended.code == 2
+    assert message in ended.err
+    assert len(ended.errors) == 1
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_broken_bound_is_one_message(
+    command_line: Any, scene_files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With what to do about it, and exit code 1."""
+
+    def broken(*_: object) -> None:
+        raise BoundError("smile: what was left out changes light by 3; simulate with --tol 0")
+
+    monkeypatch.setattr(effect_choice, "_verified", broken)
+    ended = command_line(*words(scene_files, tmp_path))
+    assert ended.code == 1
+    assert ended.errors == ["smile: what was left out changes light by 3; simulate with --tol 0"]
+
+
+def test_a_file_with_gaps_is_refused_with_the_first(command_line: Any, tmp_path: Path) -> None:
+    """No light is invented; bands are numbered as in the file."""
+    values = np.ones((20, 30, 4), np.float32)
+    values[3, 4, 2], values[7, 8, 2] = np.nan, np.inf
+    np.save(tmp_path / "gaps.npy", values)
+    given = ["simulate", tmp_path / "gaps.npy", "-o", tmp_path / "none", "--bands", "1,2", "--wavelengths", "550,650"]
+    ended = command_line(*given)
+    assert ended.code == 1
+    (message,) = ended.errors
+    assert "has no finite value at row 3, column 4, band 2 (pixels without: 2)" in message
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_scene_of_one_band_is_simulated(command_line: Any, tmp_path: Path) -> None:
+    """What needs neighbouring bands is not there."""
+    np.save(tmp_path / "one.npy", np.random.default_rng(0).uniform(0.1, 1, (20, 30, 1)).astype(np.float32))
+    out = tmp_path / "scan"
+    ended = command_line("simulate", tmp_path / "one.npy", "-o", out, "--coarse", "--wavelengths", "650", "--json")
+    rows = {row["name"]: row for row in json.loads(ended.out)["effects"]}
+    assert (rows["smile"]["reason"], rows["smear"]["state"]) == ("absent", "on")
+
+
+ROW = {"name": "smile", "state": "on", "variant": "cubic", "bound": 0.0, "measured": None, "cost_s": 0.004,
+       "why": "", "reason": "needed", "left_out": 1.4, "magnitude": "smile: 0.3 nm", "unit": "sigma"}  # fmt: skip
+TOTAL = {"asked": "auto", "tolerance": 0.1, "unit": "sigma", "bound": 0.0, "measured": 0.0, "within": True, "on": 1,
+         "off": 1, "saved_s": 1.0, "saved_cheap_s": 0.5}  # fmt: skip
+
+
+@pytest.mark.parametrize("width", [72, 80, 100, 120])
+def test_the_table_fits_the_terminal(width: int) -> None:
+    """Figures are never broken; words stand in the table where there is room, else below it."""
+    said = io.StringIO()
+    absent = ROW | {"name": "wind", "state": "off", "reason": "absent", "magnitude": "the air is calm"}
+    long = ROW | {"name": "thermal-drift", "variant": "positions", "magnitude": "a way of words " * 12}
+    print_effects([ROW, long, absent], TOTAL, Console(file=said, width=width))
+    lines = said.getvalue().splitlines()
+    assert max(map(len, lines)) <= width
+    (row,) = [line for line in lines if line.split()[:2] == ["smile", "cubic"]]
+    assert "< 0.01 s" in row
+    assert ("0.3 nm" in row) == (width >= 100)
+    assert "smile: smile" not in said.getvalue()
+    assert "Not there: wind (the air is calm)." in said.getvalue()

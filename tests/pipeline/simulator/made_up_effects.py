@@ -1,0 +1,69 @@
+"""Effects with bounds and costs as a test says, and a probe of an even scene to ask them with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from pipeline.scan import Sweep
+from pipeline.simulator.block import Block
+from pipeline.simulator.effects.effect import OFF, Bound, Light
+from pipeline.simulator.probe import Probe
+from pipeline.simulator.rig_model import Rig
+
+SWEEP = Sweep("fine-0", "fine", "x", 0.0, -50.0, 100)
+RIG = Rig()
+
+
+@dataclass(frozen=True)
+class MadeUp:
+    """``ways``: (variant, bound, cost) from exact to cheap, bounds per unit of the scene's level."""
+
+    name: str
+    left_out: float
+    ways: tuple[tuple[str, float, float], ...] = (("exact", 0.0, 1.0),)
+
+    @property
+    def variants(self) -> tuple[str, ...]:
+        return tuple(way[0] for way in self.ways)
+
+    @property
+    def cost_ns(self) -> Mapping[str, float]:
+        return MappingProxyType({way[0]: way[2] for way in self.ways})
+
+    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+        bounds = {OFF: self.left_out} | {way[0]: way[1] for way in self.ways}
+        return Bound(bounds[variant] * float(probe.level.max()), f"{self.name} as {variant}")
+
+
+@dataclass(frozen=True)
+class Brightening(MadeUp):
+    """Light times 1 + ``share``; ``left_out`` is what its bound says, right or not."""
+
+    share: float = 0.0
+
+    def gain(self, block: Block, variant: str) -> Light:
+        return np.full((1, 1, 1), 1 + self.share, np.float32)
+
+
+@dataclass(frozen=True)
+class Shift(MadeUp):
+    """A shift along the line by ``left_out`` px."""
+
+    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+        """Slope times way."""
+        return Bound(probe.moved(self.left_out if variant == OFF else 0.0, 0.0), f"{self.left_out:g} px aside")
+
+
+def even_probe(**values: object) -> Probe:
+    """A probe of one band and level 1 without detail."""
+    zeros, ones = np.zeros(1), np.ones(1)
+    probe = Probe(
+        unit="sigma", sweeps=(SWEEP,), wavelength_nm=np.array([550.0]), fwhm_nm=None, level=ones, spread=ones,
+        span=ones, slope=np.zeros((2, 1)), curvature=np.zeros((2, 1)), spectral_slope=zeros, spectral_curvature=zeros,
+        brightest_e=1e4, darkest_e=1e2, unit_least_dn=20.0, lines=100, seconds=10.0,
+    )  # fmt: skip
+    return replace(probe, **values)  # type: ignore[arg-type]

@@ -1,0 +1,95 @@
+"""Light of lines with many bands, and its summary: what the bounds of the spectrometer's effects are held against."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.camera import LineCamera
+from pipeline.once import Once
+from pipeline.scan import Sweep
+from pipeline.simulator.band_differences import second_difference, steepest_difference
+from pipeline.simulator.block import Block
+from pipeline.simulator.probe import Probe, Unit
+from pipeline.simulator.raster import Light as SceneLight
+from pipeline.simulator.raster import Raster
+from pipeline.simulator.rig_model import Optics, Rig
+from pipeline.simulator.scene import RasterScene
+
+Floats = NDArray[np.float64]
+Light = NDArray[np.float32]
+
+SAMPLES = 64
+SWEEP = Sweep("fine", "fine", "x", strip_px=0.0, start_px=-320.0, lines=640)
+READ_E = LineCamera().read_noise_e
+
+
+def rig_with(samples: int = SAMPLES, **optics: float) -> Rig:
+    """A rig of few samples whose optics differ from the usual in these numbers."""
+    return Rig(camera=replace(LineCamera(), samples=samples), optics=replace(Optics(), **optics))
+
+
+def random_light(seed: int, bands: int = 90, samples: int = SAMPLES, lines: int = 6) -> tuple[Floats, Light]:
+    """Wavelengths [nm] at uneven distances, and patches of a few spectra with edges and absorption lines [e-]."""
+    rng = np.random.default_rng(seed)
+    wavelength = 400 + np.cumsum(rng.uniform(1.5, 3.0, bands))
+    place = wavelength[None, :]
+    spectra = np.full((4, bands), 300.0)
+    for _ in range(5):
+        centre, width = rng.uniform(400, 620, (4, 1)), np.exp(rng.uniform(np.log(2), np.log(80), (4, 1)))
+        spectra = spectra + rng.uniform(0, 3000, (4, 1)) / (1 + np.exp(-(place - centre) / width))
+        spectra = spectra * (1 - rng.uniform(0, 0.3, (4, 1)) * np.exp(-(((place - centre) / width) ** 2)))
+    which = rng.integers(0, 4, (lines, -(-samples // 8))).repeat(8, axis=1)[:, :samples]
+    light = spectra[which] * rng.uniform(0.6, 1.4, (lines, samples, 1))
+    return wavelength, light.astype(np.float32)
+
+
+def block_of(
+    rig: Rig, wavelength_nm: Floats, lines: range = range(6), fwhm_nm: Floats | None = None, **more: Any
+) -> Block:
+    """Some lines of the usual sweep."""
+    return Block(rig, SWEEP, lines, wavelength_nm, (640, 640), fwhm_nm=fwhm_nm, **more)
+
+
+def small_scene(fwhm_nm: float | None = None) -> tuple[Floats, RasterScene]:
+    """Wavelengths and a raster of three components whose spectra differ, with a pattern of its own at every pixel."""
+    wavelength, light = random_light(7, bands=40)
+    planes = np.random.default_rng(7).uniform(0.1, 1, (90, 110, 3)).astype(np.float32)
+    spectra = np.ascontiguousarray(light[0, [0, 20, 40]])
+    panel = np.ones(40, np.float32)
+    widths = None if fwhm_nm is None else np.full(40, fwhm_nm)
+    made = Once.of(SceneLight(spectra, spectra.max(axis=0)))
+    return wavelength, RasterScene("small", "small", Raster.of(planes), made, panel, wavelength, widths)
+
+
+def units(light: Light, unit: Unit) -> Floats:
+    """The unit at every sample [e-]: shot and read noise, or one DN."""
+    electrons = np.asarray(light, np.float64)
+    return np.sqrt(electrons + READ_E**2) if unit == "sigma" else np.full(light.shape, LineCamera().electrons_per_dn)
+
+
+def probe_of(
+    light: Light, wavelength_nm: Floats, unit: Unit = "sigma", fwhm_nm: Floats | None = None, sweep: Sweep = SWEEP
+) -> Probe:
+    """Summary of all samples of some lines."""
+    signal, one = np.asarray(light, np.float64), units(light, unit)
+    most = tuple(range(light.ndim - 1))
+    means = signal.mean(axis=(1, 2), keepdims=True)
+    none = np.zeros((2, len(wavelength_nm)))
+    return Probe(
+        unit=unit, sweeps=(sweep,), wavelength_nm=wavelength_nm, fwhm_nm=fwhm_nm, level=(signal / one).max(axis=most),
+        spread=(np.abs(signal - means) / one).max(axis=most), span=np.ptp(signal / one, axis=most), slope=none,
+        curvature=none, spectral_slope=(steepest_difference(signal, wavelength_nm) / one).max(axis=most),
+        spectral_curvature=(np.abs(second_difference(signal, wavelength_nm)) / one).max(axis=most),
+        brightest_e=float(signal.max()), darkest_e=float(signal.min()),
+        unit_least_dn=float(one.min()) / LineCamera().electrons_per_dn, lines=sweep.lines, seconds=64.0,
+    )  # fmt: skip
+
+
+def worst(changed: Light, light: Light, unit: Unit, like: Light | None = None) -> float:
+    """Greatest difference over the unit, which is taken from ``like`` or from ``light``."""
+    way = np.abs(np.asarray(changed, np.float64) - light)
+    return float((way / units(light if like is None else like, unit)).max())

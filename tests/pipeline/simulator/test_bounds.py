@@ -1,0 +1,15 @@
+"""Bounds of all effects in the light on some random scenes and rigs; on 200 in `python tests/benchmarks effects`."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.pipeline.simulator.bound_trials import trials
+from tests.pipeline.simulator.random_cases import random_case
+
+
+@pytest.mark.parametrize("number", range(12))
+def test_no_change_exceeds_what_the_decision_counts(number: int):
+    """Each effect left out, and each variant taken, beside all others exact."""
+    broken = [trial for trial in trials(random_case(number)) if trial.is_broken]
+    assert broken == []

@@ -1,0 +1,286 @@
+"""The decision which effects to compute: laws, cases worked by hand, and the words of what is asked."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import SettingsError
+from pipeline.simulator.choice import Decision, decide, named_effects
+from pipeline.simulator.effects.cloud import CLOUD
+from pipeline.simulator.effects.diffraction import DIFFRACTION
+from pipeline.simulator.effects.keystone import KEYSTONE
+from pipeline.simulator.effects.read_noise import READ_NOISE
+from pipeline.simulator.effects.shot import SHOT
+from pipeline.simulator.options import LEAST_COST_NS, SAFETY, cost_of, list_options
+from pipeline.simulator.rig_model import Detector, Rig, Sky
+from tests.pipeline.simulator.made_up_effects import RIG, Brightening, MadeUp, Shift, even_probe
+
+PROBE = even_probe()
+TOLERANCES = st.floats(0, 5) | st.just(math.inf)
+_BOUNDS = st.sampled_from((0.0, 1e-9, 0.01, 0.1, 0.3, 1.0, math.inf)) | st.floats(1e-4, 3)
+_COSTS = st.sampled_from((0.0, 0.3, 1.0, 7.7, 24.7)) | st.floats(0, 30)
+
+
+@st.composite
+def made_up(draw: st.DrawFn, most: int = 6) -> list[MadeUp]:
+    """Some effects, quantisation perhaps among them, with up to three variants each."""
+    names = draw(st.lists(st.sampled_from([*"abcdefgh", "quantisation"]), unique=True, max_size=most))
+    effects = []
+    for name in names:
+        cheap = [(f"v{i}", draw(_BOUNDS), draw(_COSTS)) for i in range(draw(st.integers(0, 2)))]
+        effects.append(MadeUp(name, draw(_BOUNDS), (("exact", 0.0, draw(_COSTS)), *cheap)))
+    return effects
+
+
+def variants(decision: Decision) -> dict[str, str]:
+    """Option of every effect by name."""
+    return {one.name: one.option.variant for one in decision.taken}
+
+
+@given(made_up(), TOLERANCES)
+@settings(deadline=None)
+def test_errors_never_exceed_the_tolerance(effects: list[MadeUp], tolerance: float):
+    """The bounds of what is left out, with safety, sum up to the tolerance at most."""
+    decision = decide(PROBE, RIG, effects, tolerance)
+    assert decision.error <= tolerance
+    assert decision.error == math.fsum(one.option.error for one in decision.taken)
+
+
+@given(made_up(), TOLERANCES, TOLERANCES)
+@settings(deadline=None)
+def test_larger_tolerance_never_costs_more(effects: list[MadeUp], one: float, other: float):
+    """Whatever may be left out under a tolerance may be left out under a larger one."""
+    strict, loose = (decide(PROBE, RIG, effects, tolerance) for tolerance in sorted((one, other)))
+    assert loose.cost_ns <= strict.cost_ns * (1 + 1e-12)
+    assert strict.cost_ns <= strict.exact_cost_ns * (1 + 1e-12)
+
+
+@given(made_up(), TOLERANCES, st.randoms(use_true_random=False))
+@settings(deadline=None)
+def test_order_of_effects_changes_nothing(effects: list[MadeUp], tolerance: float, random):
+    """Only the names tell effects apart; the decision keeps the order of the chain."""
+    mixed = random.sample(effects, len(effects))
+    first, second = (decide(PROBE, RIG, order, tolerance) for order in (effects, mixed))
+    assert variants(first) == variants(second)
+    assert [one.name for one in second.taken] == [effect.name for effect in mixed]
+
+
+@given(made_up())
+@settings(deadline=None)
+def test_tolerance_of_zero_computes_all_that_the_rig_has(effects: list[MadeUp]):
+    """Exact and on, but for what is absent."""
+    decision = decide(PROBE, RIG, effects, 0.0)
+    for one in decision.taken:
+        has = one.menu.effect.left_out > 0 or one.name == "quantisation"
+        assert one.option.variant == ("exact" if has else "off")
+    assert decision.error == 0
+    assert decision.chosen == decision.exact
+
+
+@given(made_up())
+@settings(deadline=None)
+def test_infinite_tolerance_leaves_only_what_is_stored(effects: list[MadeUp]):
+    """All that may be off is off."""
+    on = [one.name for one in decide(PROBE, RIG, effects, math.inf).taken if one.is_on]
+    assert on == [effect.name for effect in effects if effect.name == "quantisation"]
+
+
+@given(made_up(), TOLERANCES, st.data())
+@settings(deadline=None)
+def test_asking_by_name_switches_on_those_and_no_others(effects: list[MadeUp], tolerance: float, data):
+    """Named ones are on in a variant within the tolerance, where the rig has them; the others are off."""
+    known = [effect.name for effect in effects]
+    named = data.draw(st.lists(st.sampled_from(known), min_size=1, unique=True)) if known else ["all"]
+    decision = decide(PROBE, RIG, effects, tolerance, ", ".join(named))
+    for one in decision.taken:
+        kept = one.name == "quantisation"
+        assert one.is_on == (kept or (one.name in named and one.menu.effect.left_out > 0))
+    assert math.fsum(one.option.error for one in decision.taken if one.is_on) <= tolerance
+
+
+def test_infinite_tolerance_holds_for_bounds_without_limit():
+    """Two of them, both off."""
+    slits = [MadeUp(name, math.inf, (("exact", 0.0, 9.0), ("cheap", math.inf, 1.0))) for name in ("a", "b")]
+    assert variants(decide(PROBE, RIG, slits, math.inf)) == {"a": "off", "b": "off"}
+    assert variants(decide(PROBE, RIG, slits, math.inf, "a,b")) == {"a": "cheap", "b": "cheap"}
+    assert variants(decide(PROBE, RIG, slits, 1e9)) == {"a": "exact", "b": "exact"}
+
+
+def test_all_is_exact_and_none_keeps_what_is_stored():
+    """Both whatever the tolerance is."""
+    effects = [
+        MadeUp("a", 0.01, (("exact", 0.0, 9.0), ("cheap", 0.001, 1.0))),
+        MadeUp("saturation", 0.0),
+        MadeUp("b", 0),
+    ]
+    assert variants(decide(PROBE, RIG, effects, 1.0, "all")) == {"a": "exact", "saturation": "exact", "b": "off"}
+    assert variants(decide(PROBE, RIG, effects, 1.0, "none")) == {"a": "off", "saturation": "exact", "b": "off"}
+
+
+def enumerated_cost(effects: list[MadeUp], tolerance: float) -> float:
+    """The least cost of all combinations of options within the tolerance."""
+    menus = list_options(PROBE, RIG, effects)
+    ways = [menu.variants if menu.name == "quantisation" else (*menu.variants, menu.off) for menu in menus]
+    fitting = (way for way in itertools.product(*ways) if math.fsum(one.error for one in way) <= tolerance)
+    return min(math.fsum(one.cost_ns for one in way) for way in fitting)
+
+
+@given(made_up(5), st.floats(1e-3, 5))
+@settings(deadline=None)
+def test_at_least_half_of_what_can_be_saved_is_saved(effects: list[MadeUp], tolerance: float):
+    """The rule's worst case against an enumeration of all options."""
+    decision = decide(PROBE, RIG, effects, tolerance)
+    best = math.fsum(menu.exact.cost_ns for menu in list_options(PROBE, RIG, effects)) - enumerated_cost(
+        effects, tolerance
+    )
+    saved = math.fsum(one.menu.exact.cost_ns for one in decision.taken) - decision.cost_ns
+    assert saved >= best / 2 - 1e-9
+
+
+def test_dearest_per_bound_goes_first():
+    """Of three that fit two by two, the two that save most per bound are left out; worked by hand."""
+    effects = [MadeUp("blur", 0.05, (("exact", 0.0, 0.9),)), MadeUp("noise", 0.04, (("exact", 0.0, 7.7),)),
+               MadeUp("smile", 0.03, (("exact", 0.0, 0.3),))]  # fmt: skip
+    decision = decide(PROBE, RIG, effects, 0.11)  # 1.2 * (0.05 + 0.04) = 0.108
+    assert variants(decision) == {"blur": "off", "noise": "off", "smile": "exact"}
+    assert decision.error == pytest.approx(0.108)
+    assert decision.cost_ns == pytest.approx(0.3)
+
+
+def test_a_long_step_is_not_shut_out_by_a_short_one():
+    """Leaving out the small effect saves more per bound, leaving out the large one more in all."""
+    small, large = MadeUp("small", 0.01, (("exact", 0.0, 2.0),)), MadeUp("large", 1.0, (("exact", 0.0, 50.0),))
+    assert variants(decide(PROBE, RIG, [small, large], 1.2)) == {"small": "exact", "large": "off"}
+
+
+def test_an_effect_may_return_in_exchange_for_a_dearer_one():
+    """What is off at one tolerance need not be off at every larger one; the cost falls all the same."""
+    small, large = MadeUp("small", 0.01, (("exact", 0.0, 2.0),)), MadeUp("large", 1.0, (("exact", 0.0, 50.0),))
+    strict, loose = (decide(PROBE, RIG, [small, large], tolerance) for tolerance in (0.1, 1.2))
+    assert (variants(strict)["small"], variants(loose)["small"]) == ("off", "exact")
+    assert loose.cost_ns < strict.cost_ns
+
+
+def test_a_variant_is_taken_where_leaving_out_is_too_much():
+    """From exact to cheap, no further."""
+    shot = MadeUp("shot", 2.0, (("poisson", 0.0, 24.7), ("gauss", 0.01, 7.7), ("rough", 0.5, 3.8)))
+    decision = decide(PROBE, RIG, [shot], 0.1)
+    assert variants(decision) == {"shot": "gauss"}
+    assert decision.taken[0].reason == "needed"
+    assert decision.cheap_cost_ns == 24.7  # 0.012 is more than a tenth of the tolerance
+
+
+def test_gains_multiply_the_errors_of_others_but_not_their_own():
+    """Light that is brightened by a quarter carries a shift's error a quarter higher; a unit of DN follows no light."""
+    effects = [MadeUp("read", 0.1), Brightening("vignetting", 0.25, share=0.25), Brightening("cloud", 0.5, share=-0.5)]
+    errors = [menu.off.error for menu in list_options(replace(PROBE, unit="dn"), RIG, effects)]
+    assert errors == pytest.approx([0.1 * SAFETY, 0.25 * 1.5 * SAFETY, 0.5 * 1.25 * SAFETY])
+
+
+def test_a_gain_that_only_darkens_does_not_multiply_errors():
+    """A shadow states its own range; what it takes, left out, counts by the smaller noise of the shadow."""
+    rig = Rig(sky=Sky(cloud_share=0.5))
+    slope = even_probe(slope=np.ones((2, 1)), brightest_e=1e4, darkest_e=1e4)
+    shift, cloud = (menu.off.error for menu in list_options(slope, rig, [Shift("shift", 0.1), CLOUD]))
+    assert shift == pytest.approx(0.1 * SAFETY)
+    assert cloud == pytest.approx(0.5 * SAFETY * math.sqrt((1e4 + 402.083) / (5e3 + 402.083)), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["rotation", "slit", "smear"])
+def test_later_gains_multiply_errors_of_what_the_renderer_does(name: str):
+    """Lines that are not turned, seen in 1.5 times the light, err by 1.5 times; noise that is read out does not."""
+    effects = [MadeUp(name, 0.1), MadeUp("read", 0.1), Brightening("drift", 0.5, share=0.5)]
+    errors = [menu.off.error for menu in list_options(replace(PROBE, unit="dn"), RIG, effects)]
+    assert errors[:2] == pytest.approx([0.15 * SAFETY, 0.1 * SAFETY])
+
+
+@pytest.mark.parametrize(("light_e", "exact_ns"), [(100.0, 10.0), (1.0, 80.0)])
+def test_exact_counts_cost_by_the_light(light_e: float, exact_ns: float):
+    """Few electrons are counted one by one; a third of them dim costs as much of the way."""
+    rig = replace(RIG, detector=Detector(dark_e_per_s=0.0))
+    even = replace(PROBE, usual_e=np.full(9, light_e))
+    mixed = replace(PROBE, usual_e=np.array([1.0, 100.0, 1000.0]))
+    assert list_options(even, rig, [SHOT])[0].exact.cost_ns == pytest.approx(exact_ns)
+    assert list_options(mixed, rig, [SHOT])[0].exact.cost_ns == pytest.approx(10 + 70 / 3)
+
+
+def test_cheap_counts_pay_for_the_exact_ones_where_few_are_expected():
+    """Without read noise to hide them, whole numbers show up to some hundred electrons."""
+    dim, bright = (replace(PROBE, usual_e=np.full(9, light)) for light in (100.0, 1e4))
+    sharp = replace(RIG, camera=replace(RIG.camera, read_noise_e=0.0))
+    costs = [list_options(probe, rig, [SHOT])[0].variants[1].cost_ns for rig in (RIG, sharp) for probe in (dim, bright)]
+    assert costs == pytest.approx([3.9, 3.9, 13.9, 3.9])
+
+
+def test_kernels_that_two_blurs_share_are_paid_once():
+    """Keystone costs little beside the widths of diffraction, and its own price beside one width."""
+
+    def cost(variant: str) -> float:
+        menus = list_options(PROBE, Rig(), [DIFFRACTION, KEYSTONE])
+        widths = {option.variant: option for option in menus[0].variants}
+        taken = {"diffraction": widths[variant], "keystone": menus[1].exact}
+        return cost_of(menus, taken) - taken["diffraction"].cost_ns
+
+    assert cost("airy") == pytest.approx(0.3)
+    assert cost("one-width") == pytest.approx(KEYSTONE.cost_ns["linear"])
+
+
+def test_a_draw_that_two_share_is_paid_once():
+    """Read noise costs nothing in the cheap draw of the shot noise, and its own price beside the exact one."""
+    decision = decide(PROBE, RIG, [SHOT, READ_NOISE], 1e-3)
+    assert decision.cost_ns == pytest.approx(SHOT.cost_ns["gaussian"] + LEAST_COST_NS)
+    assert decision.exact_cost_ns == pytest.approx(SHOT.cost_ns["exact"] + READ_NOISE.cost_ns["exact"])
+
+
+def test_free_effects_go_last():
+    """What costs nothing is left out too, where the others leave room: the scene does not call for it."""
+    free = MadeUp("free", 0.05, (("exact", 0.0, 0.0),))
+    dear = MadeUp("dear", 0.05, (("exact", 0.0, 9.0),))
+    assert variants(decide(PROBE, RIG, [free, dear], 0.12)) == {"free": "off", "dear": "off"}
+    assert variants(decide(PROBE, RIG, [free, dear], 0.11)) == {"free": "exact", "dear": "off"}
+
+
+def test_even_scene_shows_no_geometry_but_the_rig_has_it():
+    """An effect without a trace in the scene is off from the smallest tolerance on, and on at 0."""
+
+    assert decide(PROBE, RIG, [Shift("shift", 1.0)], 1e-300).taken[0].reason == "unseen"
+    assert decide(PROBE, RIG, [Shift("shift", 1.0)], 0.0).taken[0].reason == "exact"
+
+
+@pytest.mark.parametrize(("asked", "words"), [
+    ("vigneting", r"unknown effect 'vigneting'; did you mean 'vignetting'\?"),
+    ("shot,jittr", r"unknown effect 'jittr'; did you mean 'jitter'\?"),
+    ("zzz", "unknown effect 'zzz'; known are shot, jitter, vignetting"),
+    ("auto,shot", "'auto' stands alone, got 'auto,shot'"),
+    (" , ", "no effect is named in ' , '; write auto, all, none, or names"),
+])  # fmt: skip
+def test_unknown_names_are_refused_with_the_nearest(asked: str, words: str):
+    """One error that says what was meant."""
+    with pytest.raises(SettingsError, match=words):
+        named_effects(asked, ["shot", "jitter", "vignetting"])
+
+
+@pytest.mark.parametrize("tolerance", [-0.1, math.nan])
+def test_tolerances_below_zero_are_refused(tolerance: float):
+    """As are those that are no number."""
+    with pytest.raises(SettingsError, match="tolerance must be 0 or more, got"):
+        decide(PROBE, RIG, [], tolerance)
+
+
+def test_bounds_that_are_no_numbers_are_refused_by_name():
+    """Rather than decided on."""
+    with pytest.raises(SettingsError, match=r"effect smear, off: its bound is nan.*smear as off"):
+        decide(PROBE, RIG, [MadeUp("smear", math.nan)], 0.1)
+
+
+def test_names_are_unique():
+    """A second effect of one name would be lost."""
+    with pytest.raises(SettingsError, match="two effects are named 'shot'"):
+        decide(PROBE, RIG, [MadeUp("shot", 1.0), MadeUp("shot", 2.0)], 0.1)

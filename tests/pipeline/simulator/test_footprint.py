@@ -1,0 +1,81 @@
+"""Footprints: few kernels stand for those of all bands, their moments among the bands', one where none differ."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.simulator.footprint import NEGLIGIBLE, Footprint, fold
+from pipeline.simulator.tap_tables import box_weight
+
+PLAIN = ((2.7, 1.0), (1, 1), 1)
+
+
+def folded(shift: np.ndarray, variance: np.ndarray) -> Footprint:
+    """The usual slit with blurs."""
+    return fold(*PLAIN, shift, variance)
+
+
+def transfer(width: float, shift: np.ndarray, variance: np.ndarray, wave: float) -> np.ndarray:
+    """What a box and Gaussians leave of a wave, with its phase; wave in turns per px."""
+    return np.sinc(width * wave) * np.exp(-2 * np.pi**2 * variance * wave**2 - 2j * np.pi * shift * wave)
+
+
+def test_bands_alike_have_one_kernel() -> None:
+    """Equal moments need one kernel, and it has exactly those."""
+    found = folded(np.full((2, 9), 0.1), np.full((2, 9), 0.3))
+    assert found.kernels == 1
+    np.testing.assert_allclose(np.concatenate([found.shift, found.variance])[:, 0], [0.1, 0.1, 0.3, 0.3])
+    np.testing.assert_array_equal(found.mixing, 1.0)
+
+
+@pytest.mark.parametrize("bands", [2, 3])
+def test_few_bands_are_their_own_kernels(bands: int) -> None:
+    """As many kernels as bands at most; each band is then one of them, and exact."""
+    way = np.linspace(-1, 1, bands)
+    found = folded(np.stack([way, 0 * way]), np.stack([way + 2, way + 2]))
+    assert found.kernels == bands
+    np.testing.assert_allclose(found.shift @ found.mixing, [way, 0 * way], atol=1e-12)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    blur=st.floats(0.1, 1),
+    spread=st.floats(0, 0.9),
+    keystone=st.floats(0, 0.5),
+    wave=st.tuples(st.floats(0, 0.5), st.floats(0, 0.5)),
+)
+def test_every_band_passes_waves_as_its_own_kernel(
+    blur: float, spread: float, keystone: float, wave: tuple[float, float]
+) -> None:
+    """Of 60 bands each passes any wave as its box, Gaussian and shift do, but for what is negligible."""
+    grown = np.linspace(1 - spread, 1, 60)
+    variance = blur**2 * np.stack([grown**2, 2 * grown**2])
+    shift = np.stack([keystone * (grown - grown.mean()), np.zeros(60)])
+    found = folded(shift, variance)
+    wanted = transfer(1.0, shift[0], variance[0], wave[0]) * transfer(2.7, shift[1], variance[1], wave[1])
+    kernels = transfer(1.0, found.shift[0], found.variance[0], wave[0]) * transfer(
+        2.7, found.shift[1], found.variance[1], wave[1]
+    )
+    assert found.kernels <= 12
+    np.testing.assert_allclose(found.mixing.sum(axis=0), 1, atol=1e-12)
+    assert np.abs(kernels @ found.mixing - wanted).max() <= 2 * NEGLIGIBLE
+
+
+def test_kernels_misplace_little_of_the_light() -> None:
+    """The usual diffraction and keystone take at most four kernels, whose weights do not run away."""
+    nm = np.linspace(0.4, 1.0, 270)
+    variance = np.stack([0.06 + 0.14 * nm**2, 0.06 + 0.28 * nm**2])
+    shift = np.stack([np.linspace(-0.075, 0.075, 270), np.zeros(270)])
+    found = folded(shift, variance)
+    assert 1 < found.kernels <= 4
+    assert np.abs(found.mixing).sum(axis=0).max() < 2.5
+
+
+def test_no_box_and_no_blur_is_catmull_rom() -> None:
+    """A zero-width slit without blur is a point interpolated."""
+    found = fold((0.0, 0.0), (1, 1), 1, np.zeros((2, 5)), np.zeros((2, 5)))
+    assert (found.kernels, found.variance.max()) == (1, 0)
+    np.testing.assert_allclose(box_weight(np.array([0.0, 0.5, 1.0, 1.5, 2.0]), 0.0), [1, 0.5625, 0, -0.0625, 0])

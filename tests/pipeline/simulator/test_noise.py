@@ -1,0 +1,198 @@
+"""Draws are normal, counts are Poisson, cheap counts are so where their bound holds, and pairs stay pairs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy import stats
+
+from pipeline.simulator.noise import (
+    CHIP_SAMPLES,
+    MOST_VARIATION,
+    PIECE,
+    chip_variation,
+    divergence,
+    least_expected,
+    merged_noise,
+    normal_deviates,
+    photon_counts,
+    rounded_counts,
+    told_apart,
+)
+
+DRAWS = 200_000
+LEVELS = (1.0, 3.0, 10.0, 29.5, 30.0, 50.0, 100.0, 300.0, 1000.0, 3000.0, 10_000.0, 30_000.0, 60_000.0)
+Light = NDArray[np.float32]
+
+
+def deviates(count: int = DRAWS, seed: int = 0) -> Light:
+    """Standard normal numbers of one seed."""
+    return normal_deviates(np.random.Generator(np.random.Philox(seed)), count)
+
+
+def even(level: float, count: int = DRAWS) -> Light:
+    """Light that is the same everywhere."""
+    return np.full(count, level, np.float32)
+
+
+def fit(counts: Light, edges: NDArray[np.float64], chances: NDArray[np.float64]) -> float:
+    """The p-value of a chi-square test of numbers in classes up to and with each edge."""
+    seen = np.bincount(np.searchsorted(edges, counts), minlength=len(edges) + 1)
+    return float(stats.chisquare(seen, chances / chances.sum() * len(counts)).pvalue)
+
+
+def poisson_fit(counts: Light, level: float) -> float:
+    """The p-value of counts against Poisson, in at most 200 classes, the tails of 1e-4 among them."""
+    edges = np.unique(
+        stats.poisson.ppf(np.concatenate([[1e-4, 1e-3], np.linspace(0.005, 0.995, 199), [0.9999]]), level)
+    )
+    return fit(counts, edges, np.diff(stats.poisson.cdf(edges, level), prepend=0, append=1))
+
+
+def test_deviates_are_normal() -> None:
+    """A million deviates in a thousand classes; mean, variance, skew and kurtosis."""
+    drawn = deviates(1_000_000)
+    edges = stats.norm.ppf(np.arange(1, 1000) / 1000)
+    assert fit(drawn, edges, np.full(1000, 1e-3)) > 1e-3
+    z = drawn.astype(np.float64)
+    for moment, truth, sd in ((1, 0, 1), (2, 1, 2**0.5), (3, 0, 15**0.5), (4, 3, 96**0.5)):
+        assert abs((z**moment).mean() - truth) < 4 * sd / 1000
+
+
+def test_deviates_do_not_go_together() -> None:
+    """Neither neighbours nor the two of a pair, nor their squares, are correlated."""
+    drawn = deviates(2 * PIECE)
+    for lag in (1, 2, PIECE // 2, PIECE):
+        one, other = drawn[:-lag], drawn[lag:]
+        assert abs(np.corrcoef(one, other)[0, 1]) < 4 / np.sqrt(len(one))
+        assert abs(np.corrcoef(one**2, other**2)[0, 1]) < 4 / np.sqrt(len(one))
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 7, PIECE, PIECE + 1])
+def test_as_many_deviates_as_asked(count: int) -> None:
+    """Odd counts, none, and those at the end of a piece."""
+    assert deviates(count).shape == (count,)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_exact_counts_are_poisson(level: float) -> None:
+    """Chi-square at 1e-3; mean and variance over the level within 3 sigma of 1."""
+    level = float(np.float32(level))
+    counts = photon_counts(even(level), deviates(seed=int(level)))
+    assert poisson_fit(counts, level) > 1e-3
+    assert abs(counts.mean(dtype=np.float64) / level - 1) < 3 / np.sqrt(DRAWS * level)
+    assert abs(counts.var(dtype=np.float64) / level - 1) < max(0.01, 3 * np.sqrt((2 + 1 / level) / DRAWS))
+
+
+@settings(max_examples=60, deadline=None)
+@given(level=st.floats(2**-7, 2.0**17, width=32), z=st.floats(-6.5, 6.5, width=32))
+def test_exact_counts_are_the_quantile(level: float, z: float) -> None:
+    """The count is the least k with F(k) >= Phi(z)."""
+    (count,) = photon_counts(even(level, 1), even(z, 1))
+    below, upto = stats.poisson.cdf([count - 1, count], level), stats.norm.cdf(z)
+    above, least = stats.poisson.sf([count - 1, count], level), stats.norm.sf(z)
+    slack = 1e-9  # relative, of the nearer tail
+    assert below[0] < upto * (1 + slack) or above[0] > least * (1 - slack)
+    assert below[1] >= upto * (1 - slack) or above[1] <= least * (1 + slack)
+
+
+def test_counts_of_hardly_any_and_very_much_light() -> None:
+    """0, negative and tiny light give 0; 1e9 and more give finite numbers near what is expected."""
+    light = np.array([0, -3, 1e-30, 1e9, 1e20], np.float32)
+    counts = photon_counts(light, np.array([5, 5, 5, 1, 1], np.float32))
+    np.testing.assert_allclose(counts, [0, 0, 0, 1e9 + 1e4**1.125, 1e20], rtol=1e-6)
+    assert not photon_counts(light[:3], even(6.7, 3)).any()
+
+
+def test_more_light_gives_no_fewer_counts() -> None:
+    """One deviate, rising light: counts never fall, through small and large means."""
+    light = np.geomspace(0.1, 1e5, 20_001).astype(np.float32)
+    for z in (-4.0, -1.0, 0.0, 0.7, 5.0):
+        assert (np.diff(photon_counts(light, even(z, len(light)))) >= 0).all()
+
+
+def test_counts_do_not_depend_on_neighbours() -> None:
+    """An element's count is the same among others, in another place, and alone."""
+    light = np.random.default_rng(0).uniform(0, 200, 3 * PIECE // 2).astype(np.float32)
+    z = deviates(len(light))
+    whole = photon_counts(light, z)
+    np.testing.assert_array_equal(photon_counts(light[::-1], z[::-1])[::-1], whole)
+    np.testing.assert_array_equal(photon_counts(light[:7], z[:7]), whole[:7])
+
+
+@pytest.mark.parametrize("level", [700.0, 1000.0, 3000.0, 10_000.0, 60_000.0])
+def test_rounded_counts_are_poisson_where_the_bound_holds(level: float) -> None:
+    """From the least expected electrons on, 2e5 draws pass the test of the exact ones, and hardly one differs."""
+    assert level >= least_expected(0.0)
+    z = deviates(seed=int(level))
+    counts, exact = rounded_counts(even(level), z), photon_counts(even(level), z)
+    assert poisson_fit(counts, level) > 1e-3
+    assert np.abs(counts - exact).max() <= 1
+    assert abs(counts.var(dtype=np.float64) / level - 1) < max(0.01, 3 * np.sqrt(2 / DRAWS))
+
+
+def test_a_plain_normal_draw_would_be_found_out() -> None:
+    """The chi-square test has the power that the bound asks of it: at 50 e- it rejects counts without skew at once."""
+    counts = np.rint(50 + np.sqrt(50) * deviates()).astype(np.float32)
+    assert poisson_fit(counts, 50.0) < 1e-9
+
+
+@pytest.mark.parametrize("level", [0.0, 20.0, 150.0, 400.0, 3000.0, 60_000.0])
+def test_merged_noise_has_the_cumulants_of_both(level: float) -> None:
+    """Mean, variance and third cumulant of Poisson plus normal, 20 e-; within 4 sigma."""
+    drawn = merged_noise(even(level, 1_000_000), 20.0, deviates(1_000_000)).astype(np.float64) - level
+    variance = level + 400
+    assert abs(drawn.mean()) < 4 * np.sqrt(variance / 1e6)
+    assert abs(drawn.var() / variance - 1) < 4 * np.sqrt(2 / 1e6)
+    assert abs((drawn**3).mean() - level) < 4 * np.sqrt(15 * variance**3 / 1e6)
+
+
+def merged_chances(level: float, read: float, edges: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How likely the cheap draw lies below each edge, by solving its square for the deviate."""
+    variance = level + read**2
+    bend, slope = level / (6 * variance), np.sqrt(variance)
+    if bend == 0:
+        return np.asarray(stats.norm.cdf((edges - level) / slope))
+    root = np.sqrt(np.maximum(slope**2 + 4 * bend * (edges - level + bend), 0))
+    return np.asarray(stats.norm.cdf((-slope + root) / (2 * bend)) - stats.norm.cdf((-slope - root) / (2 * bend)))
+
+
+@pytest.mark.parametrize(
+    ("level", "read"),
+    [(level, read) for read in (5.0, 10.0, 20.0, 40.0) for level in (2.0, 40.0, 200.0, 700.0, 5000.0)
+     if level >= least_expected(read)],
+)  # fmt: skip
+def test_divergence_bounds_the_distributions(level: float, read: float) -> None:
+    """Chi-square divergence of the cheap draw's DN from the exact one's is no more than stated, nor much less."""
+    reach = 12 * np.sqrt(level + read**2)
+    edges = np.arange((level - reach) // 5, (level + reach) // 5) * 5.0 + 2.5
+    counts = np.arange(max(int(level - 12 * np.sqrt(level)), 0), int(level + 12 * np.sqrt(level) + 30))
+    exact = stats.norm.cdf((edges[:, None] - counts) / read) @ stats.poisson.pmf(counts, level)
+    p, q = np.diff(exact), np.diff(merged_chances(level, read, edges))
+    met = p > 1e-14
+    found = float(((q - p)[met] ** 2 / p[met]).sum())
+    assert found <= 1.2 * float(divergence(np.array(level), read)) + 1e-12
+
+
+def test_least_expected_keeps_a_patch_within_its_variation() -> None:
+    """At the default read noise cheap draws serve any light; without, from some 700 e- on; the bound is kept."""
+    assert least_expected(20.0) == 0
+    assert 600 < least_expected(0.0) < 3000
+    for read in (0.0, 1.0, 5.0, 20.0):
+        assert chip_variation(read) <= MOST_VARIATION
+    light = np.array(least_expected(0.0))
+    assert np.sqrt(CHIP_SAMPLES * divergence(light, 0.0)) / 2 == pytest.approx(MOST_VARIATION, rel=0.01)
+
+
+def test_told_apart_is_twice_the_total_variation() -> None:
+    """Against the integral of the densities' difference; equal, and one of no spread."""
+    x = np.linspace(-400, 400, 400_001)
+    for sd, other in ((20.0, 22.0), (3.0, 40.0)):
+        apart = np.trapezoid(np.abs(stats.norm.pdf(x, scale=sd) - stats.norm.pdf(x, scale=other)), x)
+        assert told_apart(sd, other) == told_apart(other, sd) == pytest.approx(apart, rel=1e-4)
+    assert told_apart(20, 20) == 0
+    assert told_apart(0, 20) == 2
+    assert told_apart(0, 0) == 0

@@ -1,0 +1,173 @@
+"""Path radiance and transmission: by hand, limits, when it counts, its variants and bounds, and blocks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.once import Once
+from pipeline.simulator.effects.path_radiance import PATH_RADIANCE, extinction_per_m
+from pipeline.simulator.gain_range import fixed_variance
+from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Air
+from pipeline.simulator.scene import RasterScene
+from tests.pipeline.simulator.outdoors import (
+    BANDS,
+    MORNING,
+    NIGHT,
+    NOON,
+    SHAPE,
+    WAVELENGTH,
+    block_of,
+    measured,
+    probe_of,
+    rig_with,
+    white_e,
+)
+
+CLEAR_30_M, HAZY_300_M = Air(30.0, visibility_km=23.0), Air(300.0, visibility_km=5.0)
+SLOPING = Air(30.0, relief="plane", nearest_m=10.0, farthest_m=100.0)
+
+
+def test_extinction_by_hand() -> None:
+    """At 23 km 0.17 /km of aerosol at 550 nm; Rayleigh's 0.043 /km at 400 nm is all that is left without haze."""
+    at_550 = extinction_per_m(Air(visibility_km=23.0), np.array([550.0]))[0] * 1e3
+    assert at_550 == pytest.approx(0.170 + 0.043 * (400 / 550) ** 4, abs=5e-4)
+    clean = extinction_per_m(Air(visibility_km=math.inf), np.array([400.0, 800.0])) * 1e3
+    np.testing.assert_allclose(clean, [0.043, 0.043 / 16])
+
+
+@pytest.mark.parametrize(("metres", "percent"), [(30.0, 0.62), (300.0, 6.0)])
+def test_share_by_hand(metres: float, percent: float) -> None:
+    """In clear air 0.6 % of the light is lost at 30 m and 6 % at 300 m, at 500 nm."""
+    beta = extinction_per_m(Air(visibility_km=23.0), np.array([500.0]))[0]
+    assert -100 * math.expm1(-beta * metres) == pytest.approx(percent, abs=0.05)
+
+
+def test_endless_air_is_the_horizon() -> None:
+    """At infinity every scene is the horizon: 0.3 of the white panel."""
+    rig = rig_with(Air(math.inf))
+    light = PATH_RADIANCE.change(np.full((2, 640, BANDS), 5e3, np.float32), block_of(rig, range(2)), "range")
+    np.testing.assert_allclose(light, np.broadcast_to(0.3 * white_e(), light.shape), rtol=1e-6)
+
+
+def test_near_air_is_nothing() -> None:
+    """A short way changes light by beta d (H - L), in proportion down to where float32 ends."""
+    light = np.zeros((1, 640, BANDS), np.float32)
+    one, less = (
+        PATH_RADIANCE.change(light.copy(), block_of(rig_with(Air(metres)), range(1)), "range")
+        for metres in (1e-3, 1e-9)
+    )
+    np.testing.assert_allclose(one, less * 1e6, rtol=1e-5)
+
+
+def test_what_looks_like_the_horizon_stays() -> None:
+    """Light equal to the horizon's passes as it is."""
+    light = np.tile((0.3 * white_e()).astype(np.float32), (2, 640, 1))
+    seen = PATH_RADIANCE.change(light.copy(), block_of(rig_with(HAZY_300_M), range(2)), "range")
+    np.testing.assert_allclose(seen, light, rtol=1e-6)
+
+
+def test_no_distance_no_air() -> None:
+    """A scene without a distance is light at the aperture."""
+    rig = rig_with()
+    assert PATH_RADIANCE.bound(probe_of(rig), rig).value == 0
+    light = np.full((1, 640, BANDS), 5e3, np.float32)
+    np.testing.assert_array_equal(PATH_RADIANCE.change(light.copy(), block_of(rig, range(1)), "range"), light)
+
+
+def test_without_the_panels_light_none_is_added() -> None:
+    """Transmission alone."""
+    rig = rig_with(HAZY_300_M)
+    seen = PATH_RADIANCE.change(np.ones((1, 640, BANDS), np.float32), block_of(rig, range(1), white_e=None), "range")
+    passed = np.exp(-300 * extinction_per_m(rig.air, WAVELENGTH))
+    np.testing.assert_allclose(seen, np.broadcast_to(passed, seen.shape), rtol=1e-5)
+
+
+def test_short_exposures_need_it_in_haze_but_not_at_30_m() -> None:
+    """At 3 ms lines: off at 30 m in clear air at 0.1 sigma, on at 300 m in haze."""
+    near, far = rig_with(CLEAR_30_M, 3.0), rig_with(HAZY_300_M, 3.0)
+    assert 1.2 * PATH_RADIANCE.bound(probe_of(near), near).value < 0.1
+    assert PATH_RADIANCE.bound(probe_of(far), far).value > 1
+
+
+def test_long_exposures_need_it_even_at_30_m() -> None:
+    """At 100 ms the noise is so low that 30 m of clear air do change more than 0.1 sigma: it could not be left out."""
+    rig = rig_with(CLEAR_30_M)
+    assert measured(PATH_RADIANCE, rig, samples=range(1)) > 0.1
+
+
+@pytest.mark.parametrize("exposure", [3.0, 100.0])
+@pytest.mark.parametrize("air", [CLEAR_30_M, HAZY_300_M, Air(300.0), SLOPING, Air(math.inf)])
+def test_bound_holds_and_is_near(air: Air, exposure: float) -> None:
+    """The change of any material is within the bound, and the bound within 6 times of it."""
+    rig = rig_with(air, exposure)
+    bound, seen = PATH_RADIANCE.bound(probe_of(rig), rig).value, measured(PATH_RADIANCE, rig)
+    assert seen <= 1.2 * bound
+    assert seen > bound / 6
+
+
+def test_air_as_bright_as_the_scene_is_not_seen() -> None:
+    """The bound is on what differs: of a scene that is all like the horizon, nothing; under clouds, their shade."""
+    rig = rig_with(HAZY_300_M, brdf_per_rad=0.0)
+    light = 0.3 * white_e()
+    probe = replace(
+        probe_of(rig), level=light / np.sqrt(light + fixed_variance(rig)), span=0 * light,
+        darkest_e=float(light.min()), brightest_e=float(light.max()),
+    )  # fmt: skip
+    assert PATH_RADIANCE.bound(probe, rig).value == pytest.approx(0, abs=1e-6)
+    shaded = rig_with(HAZY_300_M, cloud_share=0.5)
+    assert PATH_RADIANCE.bound(probe, shaded).value > 1
+
+
+@pytest.mark.parametrize("relief", ["plane", "step"])
+def test_bound_of_one_distance_for_all(relief: str) -> None:
+    """With relief, the middle distance is wrong by no more than its bound; without, it is right."""
+    rig = rig_with(Air(30.0, relief=relief, nearest_m=10.0, farthest_m=100.0))
+    seen = measured(PATH_RADIANCE, rig, "uniform")
+    assert 0 < seen <= 1.2 * PATH_RADIANCE.bound(probe_of(rig), rig, "uniform").value
+    flat = rig_with(CLEAR_30_M)
+    assert PATH_RADIANCE.bound(probe_of(flat), flat, "uniform").value == 0 == measured(PATH_RADIANCE, flat, "uniform")
+
+
+def test_bound_with_the_sun_rising() -> None:
+    """The air's own light rises with the sun, and the bound with it."""
+    rig = rig_with(HAZY_300_M, started=MORNING)
+    seen = measured(PATH_RADIANCE, rig, started_s=14400.0, samples=range(1))
+    assert measured(PATH_RADIANCE, rig_with(HAZY_300_M), samples=range(1)) < seen
+    assert seen <= 1.2 * PATH_RADIANCE.bound(probe_of(rig, seconds=14406.0), rig).value
+
+
+def test_air_is_dark_at_night() -> None:
+    """Nothing is added with the sun down."""
+    block = block_of(rig_with(HAZY_300_M, started=NIGHT), range(2))
+    assert not PATH_RADIANCE.change(np.zeros((2, 640, BANDS), np.float32), block, "range").any()
+
+
+@pytest.mark.parametrize("size", [1, 7])
+def test_blocks_do_not_matter(size: int) -> None:
+    """Lines and samples are the same in blocks of any size."""
+    rig, light = rig_with(SLOPING, started=NOON), np.full((20, 640, BANDS), 5e3, np.float32)
+    whole = PATH_RADIANCE.change(light.copy(), block_of(rig, range(20)), "range")
+    ranges = [range(start, min(start + size, 20)) for start in range(0, 20, size)]
+    parts = [PATH_RADIANCE.change(light[: len(some)].copy(), block_of(rig, some), "range") for some in ranges]
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+    some = PATH_RADIANCE.change(light[:, :7].copy(), block_of(rig, range(20), samples=range(100, 107)), "range")
+    np.testing.assert_array_equal(some, whole[:, 100:107])
+
+
+def test_rendered() -> None:
+    """Through the chain a black scene is the air's own light."""
+    spectra = white_e().astype(np.float32)
+    scene = RasterScene(
+        "black", "black", Raster.of(np.zeros((*SHAPE, 1), np.float32)), Once.of(Light(spectra[None], spectra)),
+        np.ones(BANDS, np.float32), WAVELENGTH,
+    )  # fmt: skip
+    block = block_of(rig_with(HAZY_300_M), range(2), samples=range(4))
+    light = expected_light(scene, block, {PATH_RADIANCE: "range"})
+    lost = -np.expm1(-300 * extinction_per_m(HAZY_300_M, WAVELENGTH))
+    np.testing.assert_allclose(light, np.broadcast_to(0.3 * white_e() * lost, light.shape), rtol=1e-5)

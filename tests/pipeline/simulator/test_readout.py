@@ -1,0 +1,245 @@
+"""From expected electrons to DN: noise by level, well and amplifier, ends of the range, draws that stay put."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+from pipeline.camera import LineCamera
+from pipeline.errors import SceneError, ShapeError
+from pipeline.scan import Sweep
+from pipeline.simulator.block import Block
+from pipeline.simulator.effects.dark_current import DARK_CURRENT
+from pipeline.simulator.effects.defects import DEFECTS, dead_elements, hot_electrons
+from pipeline.simulator.effects.fixed_pattern import PRNU, STRIPING
+from pipeline.simulator.effects.quantisation import QUANTISATION
+from pipeline.simulator.effects.read_noise import READ_NOISE
+from pipeline.simulator.effects.saturation import SATURATION
+from pipeline.simulator.effects.shot import SHOT
+from pipeline.simulator.readout import dark_frame, read_out
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Detector, Rig
+from tests.pipeline.simulator.spectral_light import small_scene
+
+SWEEP = Sweep("fine", "fine", "x", strip_px=0.0, start_px=-32.0, lines=64)
+BANDS = 20
+# Read noise of 0 and wells without end where a test says nothing else; 1 e- is 1 DN, so that DN are counts.
+COUNTING = LineCamera(electrons_per_dn=1.0, bits=16, dark_dn=0.0, read_noise_e=0.0)
+EVERYTHING: dict[Any, str] = {
+    DARK_CURRENT: "exact", DEFECTS: "exact", SHOT: "gaussian", READ_NOISE: "exact", SATURATION: "exact",
+    QUANTISATION: "exact",
+}  # fmt: skip
+ALL_EXACT = EVERYTHING | {SHOT: "exact"}
+
+
+def block_of(
+    rig: Rig, lines: range = range(16), samples: range | None = None, seed: int = 0, bands: int = BANDS
+) -> Block:
+    """Some lines of the sweep."""
+    return Block(rig, SWEEP, lines, np.linspace(400, 1000, bands), (640, 640), seed=seed, samples=samples)
+
+
+def even(level: float, lines: int = 16, bands: int = BANDS) -> NDArray[np.float32]:
+    """Light that is the same everywhere."""
+    return np.full((lines, 640, bands), level, np.float32)
+
+
+def light_of(lines: range, seed: int = 0) -> NDArray[np.float32]:
+    """Light of each line of a scene from 0 to 25,000 e-, some of it negative."""
+    whole = np.random.default_rng(seed).uniform(-100, 25_000, (SWEEP.lines, 640, BANDS))
+    return (whole * np.linspace(0, 1, BANDS))[list(lines)].astype(np.float32)
+
+
+@pytest.mark.parametrize("variant", ["exact", "gaussian"])
+@pytest.mark.parametrize("level", [1.0, 10.0, 100.0, 650.0, 1000.0, 10_000.0, 60_000.0])
+def test_mean_and_variance_follow_the_photon_law(level: float, variant: str) -> None:
+    """2e5 draws: the variance is the mean's and the mean the light's, within 1 % or 3 sigma."""
+    counts = read_out(even(level), block_of(Rig(camera=COUNTING), seed=3), {SHOT: variant}).astype(np.float64)
+    draws = counts.size
+    assert draws >= 200_000
+    assert abs(counts.mean() / level - 1) < 3 / np.sqrt(draws * level)
+    assert abs(counts.var() / level - 1) < max(0.01, 3 * np.sqrt((2 + 1 / level) / draws))
+
+
+@pytest.mark.parametrize("variant", ["exact", "gaussian"])
+@pytest.mark.parametrize("level", [0.0, 30.0, 400.0, 5000.0])
+def test_read_noise_adds_its_variance(level: float, variant: str) -> None:
+    """20 e- in quadrature, and 1/12 of a DN by rounding, whether in one draw with the shot noise or its own."""
+    camera = LineCamera(electrons_per_dn=2.0, bits=16, dark_dn=200.0)
+    raw = read_out(even(level), block_of(Rig(camera=camera)), {SHOT: variant, READ_NOISE: "exact"})
+    electrons = (raw.astype(np.float64) - 200) * 2
+    variance = level + 400 + 4 / 12
+    assert abs(electrons.mean() - level) < 4 * np.sqrt(variance / electrons.size)
+    assert abs(electrons.var() / variance - 1) < 4 * np.sqrt(2 / electrons.size)
+
+
+def test_read_noise_alone() -> None:
+    """Without shot noise it is normal about the light, below zero light too."""
+    camera = LineCamera(electrons_per_dn=1.0, dark_dn=500.0)
+    raw = read_out(even(0), block_of(Rig(camera=camera)), {READ_NOISE: "exact"}).astype(np.float64) - 500
+    assert (
+        stats.kstest(raw.ravel()[:20_000] + np.random.default_rng(0).uniform(-0.5, 0.5, 20_000), "norm", (0, 20)).pvalue
+        > 1e-3
+    )
+    assert raw.min() < -60
+
+
+def test_without_effects_light_is_rounded() -> None:
+    """Half to even, from the dark level on; negative light counts as 0."""
+    light = even(0, 1)
+    light[0, :6, 0] = [-50, 0, 2.5, 7.5, 12.5, 100]
+    assert read_out(light, block_of(Rig(), range(1)), {})[0, :6, 0].tolist() == [64, 64, 64, 66, 66, 84]
+
+
+@pytest.mark.parametrize("chosen", [{}, {SHOT: "exact"}, EVERYTHING], ids=["none", "shot", "everything"])
+def test_all_saturated(chosen: dict[Any, str]) -> None:
+    """Light of 1e9 e- and of 1e20 gives full scale everywhere, whether saturation is chosen or not."""
+    for level in (1e9, 1e20):
+        assert (read_out(even(level, 2), block_of(Rig(), range(2)), chosen) == 4095).all()
+
+
+def test_a_well_overflows_before_the_amplifier() -> None:
+    """Full wells still carry read noise, but no shot noise; with saturation off they never fill."""
+    rig = Rig(detector=Detector(well_e=10_000))
+    chosen = {SHOT: "gaussian", READ_NOISE: "exact", SATURATION: "exact"}
+    full = (read_out(even(15_000), block_of(rig), chosen).astype(np.float64) - 64) * 5
+    assert full.mean() == pytest.approx(10_000, abs=1)
+    assert full.std() == pytest.approx(20, rel=0.02)
+    open_ended = (read_out(even(15_000), block_of(rig), {SHOT: "gaussian"}).astype(np.float64) - 64) * 5
+    assert open_ended.mean() == pytest.approx(15_000, abs=2)
+
+
+def test_dark_current_doubles_every_7_degrees_and_has_shot_noise() -> None:
+    """200 e-/s at 25 deg C: 400 e- in 1 s at 32 deg C, of variance 400."""
+    detector = Detector(temperature_deg_c=32.0)
+    rig = Rig(camera=replace(COUNTING, exposure_ms=1000.0), detector=detector)
+    counts = read_out(even(0), block_of(rig), {DARK_CURRENT: "exact", SHOT: "exact"}).astype(np.float64)
+    assert counts.mean() == pytest.approx(400, abs=0.2)
+    assert counts.var() == pytest.approx(400, rel=0.01)
+
+
+def test_dead_and_hot_elements() -> None:
+    """Dead ones show dark current alone, hot ones 5,000 e- more in 100 ms, the others are as they were."""
+    rig = Rig(detector=Detector(dead_share=0.01, hot_share=0.01))
+    raw = read_out(even(5000, 1), block_of(rig, range(1)), {DARK_CURRENT: "exact", DEFECTS: "exact"})[0]
+    dead, hot = dead_elements(rig, BANDS), hot_electrons(rig, BANDS) > 0
+    assert 0.005 < dead.mean() < 0.015
+    assert 0.005 < hot.mean() < 0.015
+    np.testing.assert_array_equal(raw, 64 + 4 + 1000 * ~dead + 1000 * hot)
+
+
+def test_the_mean_dark_frame_is_that_of_many_lines() -> None:
+    """What a cap on the lens would show: dark level, dark current, hot elements up to full scale."""
+    rig = Rig(camera=LineCamera(exposure_ms=500.0), detector=Detector(hot_share=0.01, dead_share=0.01))
+    block = block_of(rig, range(64))
+    mean = read_out(np.zeros((64, 640, BANDS), np.float32), block, ALL_EXACT).mean(axis=0)
+    expected = dark_frame(block, ALL_EXACT)
+    assert expected.max() == 4095
+    fine = expected < 4000
+    sd = np.sqrt((expected - 64) * 5 + 400) / 5 / 8
+    assert np.abs((mean - expected) / sd)[fine].max() < 5.5
+
+
+def test_an_ideal_sensor_is_silent() -> None:
+    """Neither shot noise, read noise nor dark current, even when asked for; its pattern and its bits stay."""
+    rig = Rig(detector=Detector(noiseless=True))
+    light = light_of(range(4))
+    np.testing.assert_array_equal(
+        read_out(light, block_of(rig, range(4)), EVERYTHING), read_out(light, block_of(rig, range(4)), {})
+    )
+
+
+@pytest.mark.parametrize("chosen", [EVERYTHING, ALL_EXACT], ids=["cheap", "exact"])
+@pytest.mark.parametrize("read", [0.0, 3.0, 20.0])
+def test_blocks_of_any_size_give_the_same_lines(chosen: dict[Any, str], read: float) -> None:
+    """Blocks of 1, 7 and all lines, backwards, and a part of the samples are bit for bit the same."""
+    rig = Rig(camera=LineCamera(read_noise_e=read), detector=Detector(dead_share=0.01, hot_share=0.01, well_e=18_000))
+    lines = range(20)
+    whole = read_out(light_of(lines), block_of(rig, lines), chosen)
+    for size in (1, 7):
+        for start in reversed(lines[::size]):
+            part = range(start, min(start + size, 20))
+            np.testing.assert_array_equal(
+                read_out(light_of(part), block_of(rig, part), chosen), whole[start : part.stop]
+            )
+    for samples in (range(100, 140), range(0, 640, 3)):
+        some = read_out(light_of(lines)[:, list(samples)], block_of(rig, lines, samples), chosen)
+        np.testing.assert_array_equal(some, whole[:, list(samples)])
+
+
+def test_other_effects_do_not_change_the_draws() -> None:
+    """With read noise or dark current off, the shot noise of every element is still that of the same photons."""
+    rig, light = Rig(), even(10_000, 4)
+    noise = {
+        name: read_out(light, block_of(rig, range(4)), chosen).astype(np.float64).ravel()
+        for name, chosen in {
+            "both": {SHOT: "gaussian", READ_NOISE: "exact"},
+            "shot": {SHOT: "gaussian"},
+            "exact": {SHOT: "exact"},
+            "dark": {SHOT: "gaussian", READ_NOISE: "exact", DARK_CURRENT: "exact"},
+        }.items()
+    }
+    for name in ("shot", "exact", "dark"):
+        assert np.corrcoef(noise["both"], noise[name])[0, 1] > 0.999
+    assert np.abs(noise["shot"] - noise["exact"]).max() <= 1
+    assert np.abs(noise["both"] - noise["shot"]).max() <= 3
+    read = {
+        read_out(light, block_of(rig, range(4)), {READ_NOISE: "exact"} | others).tobytes()
+        for others in ({}, {DEFECTS: "exact"}, {SATURATION: "exact"})
+    }
+    assert len(read) == 1
+
+
+def test_seeds_lines_and_sweeps_draw_anew() -> None:
+    """No two lines, sweeps or seeds share their noise; shot and read noise do not either."""
+    rig = Rig()
+    lines = read_out(even(5000, 4), block_of(rig, range(4)), EVERYTHING).astype(np.float64).reshape(4, -1)
+    other = read_out(even(5000, 1), block_of(rig, range(1), seed=1), EVERYTHING).astype(np.float64).reshape(1, -1)
+    elsewhere = Block(rig, replace(SWEEP, name="other"), range(1), np.arange(BANDS) + 400.0, (640, 640))
+    swept = read_out(even(5000, 1), elsewhere, EVERYTHING).astype(np.float64).reshape(1, -1)
+    read = read_out(even(5000, 1), block_of(rig, range(1)), {READ_NOISE: "exact"}).astype(np.float64).reshape(1, -1)
+    together = np.corrcoef(np.concatenate([lines, other, swept, read]))
+    assert np.abs(together - np.eye(7)).max() < 5 / np.sqrt(lines.shape[1])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_light_that_is_not_finite_is_refused(value: float) -> None:
+    """The first such number is named by sweep, line, sample and band."""
+    light = even(100, 4)
+    light[2, 40, 3] = value
+    with pytest.raises(SceneError, match=rf"sweep fine: line 12, sample 140, band 3 expects {value} electrons"):
+        read_out(light[:, :200], block_of(Rig(), range(10, 14), range(100, 300)), EVERYTHING)
+
+
+def test_light_of_another_block_is_refused() -> None:
+    """Shapes are compared, both are named."""
+    with pytest.raises(ShapeError, match=r"\(16, 640, 20\) \(line, sample, band\), got \(3, 640, 20\)"):
+        read_out(even(1, 3), block_of(Rig()), {})
+
+
+def test_one_band_and_an_odd_number_of_elements() -> None:
+    """A camera of 3 samples and one band draws like any other."""
+    rig = Rig(camera=LineCamera(samples=3))
+    block = Block(rig, SWEEP, range(2), np.array([700.0]), (8, 8))
+    assert read_out(np.full((2, 3, 1), 5000, np.float32), block, EVERYTHING).shape == (2, 3, 1)
+
+
+def test_a_scene_through_the_whole_chain() -> None:
+    """Rays, patterns and readout of one block, and of its lines and samples apart, are bit for bit the same."""
+    nm, scene = small_scene()
+    rig = Rig(camera=LineCamera(samples=64))
+    chosen: dict[Any, str] = {PRNU: "exact", STRIPING: "exact"} | EVERYTHING
+
+    def taken(lines: range, samples: range | None = None) -> NDArray[np.uint16]:
+        block = Block(rig, SWEEP, lines, nm, scene.shape, samples=samples)
+        return read_out(expected_light(scene, block, chosen), block, chosen)
+
+    whole = taken(range(12))
+    assert np.ptp(whole) > 50
+    np.testing.assert_array_equal(np.concatenate([taken(range(7)), taken(range(7, 12))]), whole)
+    np.testing.assert_array_equal(taken(range(12), range(8, 24)), whole[:, 8:24])

@@ -1,0 +1,185 @@
+"""Which effects of the readout a scene calls for, and that their bounds hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+from pipeline.camera import LineCamera
+from pipeline.simulator.effects.dark_current import DARK_CURRENT, dark_electrons
+from pipeline.simulator.effects.defects import DEFECTS, dead_elements, hot_electrons
+from pipeline.simulator.effects.quantisation import QUANTISATION
+from pipeline.simulator.effects.read_noise import READ_NOISE
+from pipeline.simulator.effects.saturation import SATURATION
+from pipeline.simulator.effects.shot import SHOT
+from pipeline.simulator.noise import CHIP_SAMPLES, MOST_VARIATION, divergence
+from pipeline.simulator.probe import Probe, Unit
+from pipeline.simulator.readout import read_out
+from pipeline.simulator.rig_model import Detector, Rig
+from tests.pipeline.simulator.spectral_light import block_of, probe_of
+
+TOLERANCE = 0.1 / 1.2  # of 0.1 sigma with the decision's factor of safety
+NM = np.array([500.0, 700.0, 900.0])
+RIG = Rig()
+NOISY = (SHOT, READ_NOISE, DARK_CURRENT)
+
+
+def probe(darkest_e: float, brightest_e: float, unit: Unit = "sigma") -> Probe:
+    """Summary of light from the darkest to the brightest, in every band."""
+    return probe_of(np.linspace(darkest_e, brightest_e, 60).reshape(2, 10, 3).astype(np.float32), NM, unit)
+
+
+def apart(wide: float, narrow: float) -> float:
+    """Twice the total variation of two centred normal distributions, by integration."""
+    x = np.linspace(-8 * wide, 8 * wide, 100_001)
+    return float(np.trapezoid(np.abs(stats.norm.pdf(x, scale=wide) - stats.norm.pdf(x, scale=narrow)), x))
+
+
+def test_a_bright_scene_needs_shot_noise_and_no_read_noise() -> None:
+    """At 10,000 e- 20 e- of read noise make 100 e- into 102 e-."""
+    bright = probe(10_000, 10_000)
+    assert SHOT.bound(bright, RIG).value > TOLERANCE
+    bound = READ_NOISE.bound(bright, RIG)
+    assert bound.value == pytest.approx(0.019, abs=1e-3)
+    assert bound.value < TOLERANCE
+    assert bound.why == "20 e- beside at least 100 e- of shot noise make 102 e-"
+
+
+def test_one_dark_sample_needs_read_noise() -> None:
+    """Read noise is decided by the darkest, shot noise by the brightest sample."""
+    mixed = probe(100, 10_000)
+    assert READ_NOISE.bound(mixed, RIG).value > TOLERANCE
+    assert SHOT.bound(mixed, RIG).value == SHOT.bound(probe(10_000, 10_000), RIG).value
+
+
+@pytest.mark.parametrize("effect", NOISY, ids=[effect.name for effect in NOISY])
+def test_an_ideal_sensor_has_no_noise(effect: Any) -> None:
+    """All three are absent, whatever the scene; a camera without read noise has none either."""
+    assert effect.bound(probe(100, 10_000), Rig(detector=Detector(noiseless=True))).value == 0
+    silent = Rig(camera=LineCamera(read_noise_e=0.0))
+    assert (effect.bound(probe(100, 10_000), silent).value == 0) == (effect is READ_NOISE)
+
+
+def test_a_dim_scene_at_1_s_needs_dark_current() -> None:
+    """200 e- beside 24 e- of noise; a cooled sensor at 100 ms does without."""
+    slow = replace(RIG, camera=LineCamera(exposure_ms=1000.0))
+    bound = DARK_CURRENT.bound(probe(200, 400), slow)
+    assert bound.value > 8
+    assert bound.why == "200 e- in 1000 ms at 25 deg C, beside 24.5 e- of noise"
+    assert DARK_CURRENT.bound(probe(200, 400), Rig(detector=Detector(temperature_deg_c=-30.0))).value < TOLERANCE
+    assert dark_electrons(Rig(detector=Detector(temperature_deg_c=32.0))) == pytest.approx(40)
+
+
+@pytest.mark.parametrize("unit", ["sigma", "dn"])
+@pytest.mark.parametrize(("darkest", "brightest"), [(50.0, 300.0), (1000.0, 1200.0), (10.0, 15_000.0)])
+def test_noise_bounds_are_the_total_variation(unit: Unit, darkest: float, brightest: float) -> None:
+    """At no sample do distributions with and without differ by more; at the worst one they differ by as much."""
+    rig = Rig(detector=Detector(dark_e_per_s=0.0))
+    levels = np.linspace(darkest, brightest, 7)
+    seen = probe(darkest, brightest, unit)
+    for effect, without in ((SHOT, np.full(7, 20.0)), (READ_NOISE, np.sqrt(levels))):
+        total = np.sqrt(levels + 400)
+        scale = total / 5 if unit == "dn" else np.ones(7)
+        found = max(apart(a, b) * one for a, b, one in zip(total, without, scale, strict=True))
+        assert effect.bound(seen, rig).value == pytest.approx(found, rel=2e-3)
+
+
+def test_the_bound_of_the_cheap_draw_is_stated_for_a_patch() -> None:
+    """A number errs by sqrt(divergence) of a sigma at most; a patch of 1e6 by the variation that is said."""
+    bound = SHOT.bound(probe(100, 10_000), RIG, "gaussian")
+    assert bound.value <= 2 * MOST_VARIATION / np.sqrt(CHIP_SAMPLES)
+    assert bound.value >= np.sqrt(divergence(np.geomspace(1, 1e5, 500), 20.0)).max()
+    assert "1e+06 numbers have a total variation of at most 0.05" in bound.why
+    assert "exact below 0 e-, without read noise 681 e-" in bound.why
+    assert SHOT.bound(probe(100, 10_000), RIG, "exact").value == 0
+
+
+def test_dark_current_bound_holds() -> None:
+    """The mean of all numbers moves by no more than said, and by nearly as much at the darkest sample."""
+    light = np.linspace(50, 8000, 6 * 64 * 3).reshape(6, 64, 3).astype(np.float32)
+    rig = Rig(camera=LineCamera(samples=64, exposure_ms=800.0))
+    block = block_of(rig, NM)
+    on, off = (read_out(light, block, chosen).astype(np.float64) for chosen in ({DARK_CURRENT: "exact"}, {}))
+    measured = np.max((on - off) * 5 / np.sqrt(light + 400.0))
+    assert measured <= DARK_CURRENT.bound(probe_of(light, NM), rig).value * 1.02
+    assert measured > DARK_CURRENT.bound(probe_of(light, NM), rig).value / 2
+
+
+def test_defects_bound_holds() -> None:
+    """Dead and hot elements change no number by more than said, in both units."""
+    light = np.random.default_rng(0).uniform(50, 8000, (6, 640, 3)).astype(np.float32)
+    for unit, sigma in (("sigma", np.sqrt(light + 400.0) / 5), ("dn", 1.0)):
+        for detector in (
+            Detector(dead_share=0.01),
+            Detector(hot_share=0.01),
+            Detector(dead_share=0.01, hot_share=0.01),
+        ):
+            rig = Rig(detector=detector)
+            block = block_of(rig, NM)
+            on, off = (read_out(light, block, chosen).astype(np.float64) for chosen in ({DEFECTS: "exact"}, {}))
+            measured = float(np.max(np.abs(on - off) / sigma))
+            bound = DEFECTS.bound(probe_of(light, NM, unit), rig).value  # type: ignore[arg-type]
+            assert measured <= bound * 1.02 + 0.5
+            assert measured > bound / 6
+
+
+def test_defects_of_bands_that_are_not_used_do_not_matter() -> None:
+    """A sensor without defects, or whose masks are empty, has a bound of 0."""
+    assert DEFECTS.bound(probe(100, 1000), RIG).value == 0
+    few = Rig(detector=Detector(dead_share=1e-9, hot_share=1e-9))
+    assert not dead_elements(few, 3).any()
+    assert not hot_electrons(few, 3).any()
+    assert DEFECTS.bound(probe(100, 1000), few).value == 0
+    assert not hot_electrons(Rig(detector=Detector(hot_share=0.1, noiseless=True)), 3).any()
+
+
+def test_more_defects_keep_those_there_were() -> None:
+    """A larger share adds elements; a sensor of another number has others; dead and hot are drawn apart."""
+    few, many, other = (Rig(detector=Detector(dead_share=share, hot_share=share, unit=unit)) for share, unit in
+                        ((0.01, 0), (0.05, 0), (0.05, 1)))  # fmt: skip
+    assert (dead_elements(many, 20) >= dead_elements(few, 20)).all()
+    assert not np.array_equal(dead_elements(many, 20), dead_elements(other, 20))
+    assert not np.array_equal(dead_elements(many, 20), hot_electrons(many, 20) > 0)
+
+
+@pytest.mark.parametrize("unit", ["sigma", "dn"])
+def test_a_bright_roof_saturates(unit: Unit) -> None:
+    """Six deviations below full scale the bound is 0; above it is what is clipped."""
+    well = LineCamera().full_well_e
+    assert SATURATION.bound(probe(100, well - 6.2 * np.sqrt(well + 400) - 20, unit), RIG).value == 0
+    bound = SATURATION.bound(probe(100, 30_000, unit), RIG)
+    lost = 30_000 + 20 - well
+    scale = 5.0 if unit == "dn" else np.sqrt(30_400)
+    assert lost / scale < bound.value < lost / scale + 6.1 * np.sqrt(30_420) / scale
+    assert "above the limit of 2.02e+04 e-" in bound.why
+    ideal = Rig(detector=Detector(noiseless=True))
+    assert SATURATION.bound(replace(probe(100, 30_000, unit), unit_least_dn=0.29), ideal).value == pytest.approx(
+        (lost - 20) / 5 / 0.29
+    )
+    small = Rig(detector=Detector(well_e=5000))
+    assert SATURATION.bound(probe(100, 6000), small).value > 0
+    assert SATURATION.bound(probe(100, 6000), RIG).value == 0
+
+
+def test_quantisation_is_half_a_dn() -> None:
+    """In units of the smallest noise, or one DN; and rounding changes no number by more."""
+    assert QUANTISATION.bound(probe(100, 1000, "dn"), RIG).value == 0.5
+    assert QUANTISATION.bound(probe(0, 1000), RIG).value == pytest.approx(0.5 / 4)
+    light: NDArray[np.float32] = np.random.default_rng(0).uniform(0, 9000, (6, 640, 3)).astype(np.float32)
+    dn = light / 5 + 64
+    assert np.abs(read_out(light, block_of(RIG, NM), {}) - dn).max() <= 0.5
+
+
+@pytest.mark.parametrize("effect", [*NOISY, DEFECTS, SATURATION, QUANTISATION], ids=lambda effect: effect.name)
+def test_every_variant_has_a_cost_and_the_exact_one_no_error(effect: Any) -> None:
+    """Names in kebab-case, variants from exact to cheap, a cost for each."""
+    assert effect.name == effect.name.lower()
+    assert set(effect.cost_ns) == set(effect.variants)
+    assert effect.variants[0] == "exact"
+    rig = Rig(detector=Detector(dead_share=0.01, hot_share=0.01))
+    assert effect.bound(probe(100, 30_000), rig, "exact").value == 0

@@ -1,0 +1,124 @@
+"""Stray light: all light kept, the halo against a Gaussian convolved outright, the bound, and the bright roof."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
+
+from pipeline.errors import SettingsError, ShapeError
+from pipeline.simulator.effects.stray_light import STRAY_LIGHT
+from tests.pipeline.simulator.spectral_light import SAMPLES, block_of, probe_of, random_light, rig_with, worst
+
+
+def scattered(light, variant="halo", **optics):
+    """Light after scattering; the optics' numbers start with stray_."""
+    rig = rig_with(light.shape[1], **{f"stray_{name}": value for name, value in optics.items()})
+    wavelength = np.linspace(400, 1000, light.shape[2])
+    return STRAY_LIGHT.change(light.copy(), block_of(rig, wavelength, range(len(light))), variant)
+
+
+@pytest.mark.parametrize("variant", STRAY_LIGHT.variants)
+@pytest.mark.parametrize("halo_px", [3.0, 64.0, 1e4])
+def test_all_light_is_kept_in_each_line(variant, halo_px):
+    """What leaves a sample lands on the same line's detector, also at its edges, and no light falls below 0."""
+    light = random_light(0)[1]
+    light[:, :3] = 0
+    light[:, :, -1] *= 20
+    made = scattered(light, variant, share=0.3, halo_px=halo_px)
+    np.testing.assert_allclose(made.sum(axis=(1, 2)), light.sum(axis=(1, 2)), rtol=1e-5)
+    assert made.min() > -1e-3
+
+
+def test_halo_is_a_gaussian_reflected_at_the_edges():
+    """The product with few cosines is the plain convolution, sample by sample and band by band, to 1e-5."""
+    light = random_light(1)[1]
+    made = scattered(light, share=0.2, even=0.25, halo_px=6.0)
+    for line, before in zip(made, light.astype(np.float64), strict=True):
+        halo = gaussian_filter(before, 6.0, mode="reflect", truncate=8)
+        np.testing.assert_allclose(line, 0.8 * before + 0.2 * (0.25 * before.mean() + 0.75 * halo), rtol=2e-5)
+
+
+def test_even_share_by_hand():
+    """One line of one sample and bands 0 and 100, a tenth scattered evenly: 5 and 95."""
+    light = np.array([[[0, 100]]], np.float32)
+    np.testing.assert_allclose(scattered(light, "even", share=0.1), [[[5, 95]]], rtol=1e-6)
+    np.testing.assert_allclose(scattered(light, "halo", share=0.1, even=1.0), [[[5, 95]]], rtol=1e-6)
+    alone = np.array([[[70]]], np.float32)
+    np.testing.assert_allclose(scattered(alone, share=0.1), alone, rtol=1e-6)
+
+
+@given(
+    st.integers(0, 10**6), st.floats(1e-4, 0.3), st.floats(0, 1), st.floats(2, 200), st.sampled_from(["sigma", "dn"])
+)
+@settings(max_examples=40, deadline=None)
+def test_bounds_hold(seed, share, even, halo_px, unit):
+    """Neither leaving it out nor letting all of it fall evenly changes more than the bound."""
+    wavelength, light = random_light(seed)
+    if seed % 2:  # a bright roof in some samples
+        light[:, 20:28] = 3e4
+    given_optics = {"share": share, "even": even, "halo_px": halo_px}
+    rig = rig_with(**{f"stray_{name}": value for name, value in given_optics.items()})
+    probe, made = probe_of(light, wavelength, unit), scattered(light, **given_optics)
+    assert worst(made, light, unit) <= STRAY_LIGHT.bound(probe, rig).value + 1e-3
+    plain = scattered(light, "even", **given_optics)
+    assert worst(plain, made, unit, like=light) <= STRAY_LIGHT.bound(probe, rig, "even").value + 1e-3
+
+
+@pytest.mark.parametrize("unit", ["sigma", "dn"])
+def test_bound_is_within_6_times_at_the_median(unit):
+    """Over 30 random scenes the bound is at most 6 times what happens."""
+    ratios = []
+    for seed in range(30):
+        wavelength, light = random_light(seed)
+        share = float(10 ** np.random.default_rng(seed).uniform(-3, -2))
+        made = scattered(light, share=share)
+        bound = STRAY_LIGHT.bound(probe_of(light, wavelength, unit), rig_with(stray_share=share))
+        ratios.append(bound.value / worst(made, light, unit))
+    assert np.median(ratios) < 6
+
+
+def test_bright_roof_switches_it_on():
+    """A roof of 30,000 e- over a tenth of a dark field: 1e-3 of the light is above a tenth of the noise."""
+    light = np.full((4, SAMPLES, 30), 1000, np.float32)
+    roofless = STRAY_LIGHT.bound(probe_of(light, np.linspace(400, 1000, 30)), rig_with())
+    assert roofless.value == pytest.approx(0, abs=1e-9)
+    light[:, 30:36] = 30_000
+    bound = STRAY_LIGHT.bound(probe_of(light, np.linspace(400, 1000, 30)), rig_with())
+    assert bound.value > 0.1
+    assert worst(scattered(light), light, "sigma") > 0.1
+    assert "0.001 of a line's light" in bound.why
+
+
+def test_none_is_scattered():
+    """A share of 0 has a bound of 0 and leaves the light; the exact variant misses nothing."""
+    wavelength, light = random_light(0)
+    assert STRAY_LIGHT.bound(probe_of(light, wavelength), rig_with(stray_share=0.0)).value == 0
+    np.testing.assert_array_equal(scattered(light, share=0.0), light)
+    assert STRAY_LIGHT.bound(probe_of(light, wavelength), rig_with(), "halo").value == 0
+
+
+def test_lines_do_not_matter_to_each_other():
+    """Lines one at a time give the very numbers of all at once."""
+    light = random_light(2, lines=9)[1]
+    whole = scattered(light, share=0.05)
+    for line in range(9):
+        np.testing.assert_array_equal(scattered(light[line : line + 1], share=0.05)[0], whole[line])
+
+
+def test_part_of_a_line_is_refused():
+    """Stray light of samples that are missing cannot be known; the words say what to do."""
+    light = random_light(2)[1]
+    block = block_of(rig_with(), np.linspace(400, 1000, 90), samples=range(10))
+    with pytest.raises(ShapeError, match=r"all 64 samples of a line, got 10; make whole lines"):
+        STRAY_LIGHT.change(light[:, :10], block, "halo")
+
+
+@pytest.mark.parametrize("number", ["stray_halo_px", "smile_nm", "fwhm_nm", "stray_even"])
+@pytest.mark.parametrize("value", [np.inf, -1e9, np.nan])
+def test_numbers_without_sense_are_refused(number, value):
+    """Optics that would make NaN of light are refused with their place and range."""
+    with pytest.raises(SettingsError, match=rf"optics.{number} must be (between|a finite number)"):
+        rig_with(**{number: value})

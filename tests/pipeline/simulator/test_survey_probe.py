@@ -1,0 +1,224 @@
+"""The probe of a scene: what it finds is there, nothing in the image exceeds it, and odd scenes are told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.camera import LineCamera
+from pipeline.errors import SceneError, SettingsError
+from pipeline.once import Once
+from pipeline.scan import Sweep
+from pipeline.simulator.block import Block
+from pipeline.simulator.effects.aberration import ABERRATION
+from pipeline.simulator.effects.diffraction import DIFFRACTION
+from pipeline.simulator.effects.keystone import KEYSTONE
+from pipeline.simulator.effects.registry import EFFECTS
+from pipeline.simulator.effects.rotation import ROTATION
+from pipeline.simulator.effects.slit import SLIT
+from pipeline.simulator.options import SAFETY, list_options
+from pipeline.simulator.probe import Probe
+from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Detector, Rig
+from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.survey_looks import views_of_places
+from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+
+RIG = Rig(camera=LineCamera(samples=96))
+SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-30.0, lines=61)
+BLURS: dict[Any, str] = {DIFFRACTION: "airy", ABERRATION: "gaussian", KEYSTONE: "linear"}
+
+
+def scene_of(values: np.ndarray) -> RasterScene:
+    """A scene of given values (y, x, band)."""
+    return raster_from_values(values, RIG.camera, name="t", wavelength_nm=np.linspace(400, 900, values.shape[2]))
+
+
+def mixed(seed: int, shape: tuple[int, int] = (80, 110), bands: int = 6) -> RasterScene:
+    """Grain, waves, an edge and a point of 3 components, in strengths of their own."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
+    grain = rng.uniform(0, 1, (*shape, 3)) * rng.uniform(0, 0.6)
+    wave = np.sin(2 * np.pi * (y * rng.normal() + x * rng.normal()) / rng.uniform(4, 30))[..., None] * rng.normal(
+        size=3
+    )
+    edge = ((y - 40) * rng.normal() + (x - 55) * rng.normal() > 0)[..., None] * rng.uniform(0, 1, 3)
+    planes = np.clip(0.4 + grain + 0.2 * wave + edge, 0, None).astype(np.float32)
+    planes[rng.integers(20, 60), rng.integers(20, 90)] += rng.uniform(0, 2)
+    electrons = rng.uniform(50, 6e3, (3, bands)).astype(np.float32)
+    return RasterScene(
+        "mixed", f"{seed}", Raster.of(planes), Once.of(Light(electrons, electrons[0])), np.ones(bands, np.float32),
+        np.linspace(400, 1000, bands),
+    )  # fmt: skip
+
+
+def seen(scene: RasterScene, sweep: Sweep, variant: str = "3x1", blurs: dict[Any, str] | None = None) -> np.ndarray:
+    """All lines of a sweep through the footprint."""
+    block = Block(RIG, sweep, range(sweep.lines), scene.wavelength_nm, scene.shape)
+    return expected_light(scene, block, {ROTATION: "rays", SLIT: variant, **(blurs or {})})
+
+
+def test_flat_scene_has_no_slope() -> None:
+    """A flat scene has level but neither slope, curvature, span nor spread along one band."""
+    probe = probe_scene(scene_of(np.full((50, 60, 1), 3.0)), RIG, [SWEEP])
+    assert probe.slope.max() == probe.curvature.max() == probe.span.max() == 0
+    assert probe.spread.max() < 1e-3
+    assert probe.level[0] == pytest.approx(probe.brightest_e / noise_electrons(np.float32([probe.brightest_e]), RIG)[0])
+    assert probe.spectral_slope.shape == (1,)
+    assert set(probe.slit_errors.values()) == {0.0}
+
+
+@pytest.mark.parametrize("along", ["x", "y"])
+def test_wave_has_its_slope_and_curvature(along: str) -> None:
+    """A long wave across the lines has slope and curvature of its amplitude and frequency, and none along them."""
+    y, x = np.mgrid[:120, :120]
+    phase = 2 * np.pi * (y if along == "x" else x) / 24
+    scene = scene_of((1 + 0.5 * np.sin(phase))[..., None])
+    probe = probe_scene(scene, RIG, [replace(SWEEP, along=along)], "dn")
+    passed = np.sinc(RIG.camera.slit_px / 24)
+    high = 0.5 * scene.electrons[0] * passed / RIG.camera.electrons_per_dn
+    assert probe.slope[1, 0] == pytest.approx(high * 2 * np.pi / 24, rel=0.03)
+    assert probe.curvature[1, 0] == pytest.approx(high * (2 * np.pi / 24) ** 2, rel=0.08)
+    assert probe.slope[0, 0] < 0.02 * probe.slope[1, 0]
+    assert probe.span[0] == pytest.approx(2 * high, rel=0.01)
+    assert probe.unit_least_dn == 1.0
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_nothing_in_the_image_exceeds_the_probe(seed: int) -> None:
+    """Levels, spans, differences of neighbours and of variants of the slit stay below 1.05 of the probe's."""
+    scene = mixed(seed)
+    sweep = replace(SWEEP, strip_px=40.0 * (seed % 3), start_px=-30.0 + seed)
+    probe = probe_scene(scene, RIG, [sweep])
+    light = seen(scene, sweep)
+    noise = noise_electrons(light, RIG)
+    level = (light / noise).max(axis=(0, 1))
+    assert (level <= 1.03 * probe.level).all()
+    assert (level >= 0.9 * probe.level).all()
+    assert light.max() <= 1.03 * probe.brightest_e
+    assert light.min() >= 0.97 * probe.darkest_e
+    assert (light.max(axis=(0, 1)) - light.min(axis=(0, 1)) <= 1.05 * probe.span * noise.max(axis=(0, 1))).all()
+    for axis, step in ((1, np.diff(light, axis=0)), (0, np.diff(light, axis=1))):
+        least = np.minimum(noise[1:], noise[:-1]) if axis else np.minimum(noise[:, 1:], noise[:, :-1])
+        assert (np.abs(step) / least).max() <= 1.05 * probe.slope[axis].max()
+    blurred = seen(scene, sweep, "9x3", BLURS)
+    for variant in (*SLIT.variants[1:], "off"):
+        change = np.abs(seen(scene, sweep, variant, BLURS) - blurred) / noise_electrons(blurred, RIG)
+        assert change.max() <= SAFETY * SLIT.bound(probe, RIG, variant).value
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("strip", [300.0, 900.0])
+def test_turned_lines_do_not_exceed_what_the_probe_measured(seed: int, strip: float) -> None:
+    """At strips far from the middle, where lines are turned by 3 and 8 deg, each keeps its bound beside all blurs."""
+    scene = mixed(seed, (80, 2000))
+    sweep = replace(SWEEP, strip_px=strip)
+    probe = probe_scene(scene, RIG, [sweep])
+    light = seen(scene, sweep, "9x3", BLURS)
+    noise = noise_electrons(light, RIG)
+    for variant in (*SLIT.variants[1:], "off"):
+        change = np.abs(seen(scene, sweep, variant, BLURS) - light) / noise
+        bound = SLIT.bound(probe, RIG, variant).value
+        assert 0 < change.max() <= SAFETY * bound
+        assert bound <= 4 * change.max() + 1e-4 * probe.span.max()  # tables round as much
+
+
+def test_places_are_seen_from_the_most_oblique_sweep_that_reaches_them() -> None:
+    """Of two sweeps that overlap, the finer one and the one whose lines are turned more."""
+    scene = mixed(1, (80, 1000))
+    fine = replace(SWEEP, name="a", strip_px=360.0)
+    coarse = replace(SWEEP, name="b", kind="coarse", strip_px=420.0, lines=15, step=4, binning=4)
+    found = views_of_places(np.array([[40.0, 890.0]]), scene, RIG.camera, (fine, coarse))
+    assert set(found.sweep) == {0, 1}
+    assert set(found.strip_px[found.sweep == 1]) == {420.0}
+
+
+def test_bands_at_the_same_wavelength_have_finite_derivatives() -> None:
+    """Detectors that overlap repeat wavelengths and step back; across such a seam there is no derivative."""
+    scene = replace(mixed(2, bands=4), wavelength_nm=np.array([500.0, 510.0, 510.0, 505.0]))
+    probe = probe_scene(scene, RIG, [SWEEP])
+    assert np.isfinite(probe.spectral_slope).all()
+    assert np.isfinite(probe.spectral_curvature).all()
+    assert probe.spectral_slope[1] > 0
+
+
+def test_probe_finds_a_single_bright_pixel_in_a_large_scene() -> None:
+    """One bright pixel among 360 000 is found by its level and its slope."""
+    values = np.full((600, 600, 2), 1.0)
+    values[431, 222] = 5.0
+    scene = scene_of(values)
+    sweeps = [replace(SWEEP, name=f"{n}", strip_px=n, start_px=-300, lines=600) for n in (-252.0, -160.0, -64.0, 90.0)]
+    probe = probe_scene(scene, RIG, sweeps)
+    assert probe.brightest_e > 1.5 * scene.electrons[0]
+    assert probe.slope.min() > 10
+    assert [431.0, 222.0] in probe.places.tolist()  # for whoever verifies: nobody looks for them twice
+
+
+def test_usual_light_is_that_along_the_lines() -> None:
+    """Half of the scene is dark and half bright: so are the quantiles, from least to greatest."""
+    values = np.ones((80, 110, 1))
+    values[:, 55:] = 3.0
+    scene = scene_of(values)
+    usual = probe_scene(scene, RIG, [SWEEP]).usual_e
+    assert usual is not None
+    assert (np.diff(usual) >= 0).all()
+    assert 0.4 < (usual < 2 * scene.electrons[0]).mean() < 0.6
+
+
+def test_coarse_sweeps_are_looked_at_where_they_hold() -> None:
+    """A coarse sweep's probe is that of a fine one over the same path."""
+    scene = mixed(3)
+    fine = probe_scene(scene, RIG, [SWEEP])
+    coarse = probe_scene(scene, RIG, [replace(SWEEP, kind="coarse", lines=15, step=4, binning=4)])
+    np.testing.assert_allclose(coarse.slope, fine.slope, rtol=0.2)
+    assert (coarse.lines, coarse.sweeps[0].step) == (15, 4)
+
+
+def test_unit_of_a_noiseless_rig_is_the_quantisation() -> None:
+    """Without noise one sigma is that of rounding to DN."""
+    noiseless = replace(RIG, detector=Detector(noiseless=True))
+    np.testing.assert_allclose(noise_electrons(np.float32([0.0, 9e3]), noiseless), 5 / np.sqrt(12), rtol=1e-6)
+    np.testing.assert_allclose(noise_electrons(np.float32([-5.0]), RIG), np.sqrt(400 + 25 / 12), rtol=1e-6)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_number_that_is_not_finite_is_refused_with_its_place(bad: float) -> None:
+    """A scene with NaN or infinity is refused, and the message says where."""
+    planes = np.ones((70, 40, 3), np.float32)
+    planes[41, 17, 2] = bad
+    light = np.ones((3, 4), np.float32)
+    scene = RasterScene(
+        "holey", "k", Raster.of(planes), Once.of(Light(light, light[0])), np.ones(4, np.float32), np.arange(4) + 400.0
+    )
+    with pytest.raises(SceneError, match="holey is not finite at row 41, column 17, component 2"):
+        probe_scene(scene, RIG, [SWEEP])
+
+
+def test_probe_of_a_noiseless_rig_is_finite() -> None:
+    """Its unit is that of quantisation, wherever there is no light either, and every effect has a bound."""
+    values = np.zeros((60, 60, 3))
+    values[30:] = 1.0
+    noiseless = replace(RIG, detector=Detector(noiseless=True))
+    probe = probe_scene(scene_of(values), noiseless, [SWEEP])
+    found = [probe.level, probe.spread, probe.span, probe.slope, probe.curvature, probe.spectral_slope,
+             probe.spectral_curvature, list(probe.slit_errors.values())]  # fmt: skip
+    assert all(np.isfinite(one).all() for one in found)
+    assert probe.unit_least_dn == pytest.approx(1 / np.sqrt(12))
+    assert all(np.isfinite(menu.off.error) for menu in list_options(probe, noiseless, EFFECTS))
+
+
+def test_no_lines_are_refused() -> None:
+    """Without a line there is nothing to look at."""
+    with pytest.raises(SettingsError, match="expected lines to take, got none"):
+        probe_scene(mixed(0), RIG, [replace(SWEEP, lines=0)])
+
+
+def test_sweep_beside_the_scene_is_flat() -> None:
+    """Lines that miss the scene see its repeated edge; the probe is finite."""
+    probe: Probe = probe_scene(mixed(1), RIG, [replace(SWEEP, strip_px=900.0, start_px=800.0)])
+    assert np.isfinite(probe.slope).all()
+    assert np.isfinite(probe.level).all()

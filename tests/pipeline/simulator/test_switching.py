@@ -1,0 +1,172 @@
+"""Which effects a scene and a rig call for, at a tenth of the noise: one test for every case of the design's table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from functools import cache
+
+import numpy as np
+import pytest
+
+from pipeline.camera import LineCamera
+from pipeline.once import Once
+from pipeline.scan import Sweep
+from pipeline.simulator.block import Block
+from pipeline.simulator.chips import candidate_chips, worst_chips
+from pipeline.simulator.choice import Decision, decide
+from pipeline.simulator.effects.effect import Light as Light32
+from pipeline.simulator.effects.registry import EFFECTS
+from pipeline.simulator.effects.rotation import ROTATION
+from pipeline.simulator.effects.slit import SLIT
+from pipeline.simulator.manifest import TOTAL
+from pipeline.simulator.options import SAFETY
+from pipeline.simulator.probe import Probe
+from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Air, Detector, Optics, Rig, Sky
+from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+from pipeline.simulator.verification import verify
+
+TOLERANCE = 0.1
+CAMERA = LineCamera()
+WAVELENGTHS = np.array([500.0, 550.0, 600.0])
+SWEEPS = (Sweep("near", "fine", "x", 0.0, -30.0, 60), Sweep("far", "fine", "x", 0.0, 400.0, 60))
+NOON = datetime(2026, 6, 21, 11, 20, tzinfo=UTC)
+LOW_SUN = datetime(2026, 6, 21, 5, 20, tzinfo=UTC)  # about 20 deg high at 52 N, 10 E
+DIM, BRIGHT, ROOF = 50.0, 10_000.0, 40_000.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene of so many electrons at the exposure, perhaps with a gentle texture or a roof, and a rig."""
+
+    electrons: float = 2_000.0
+    texture: float = 0.0  # amplitude of waves of 40 px, over the electrons
+    roof_e: float = 0.0
+    rig: Rig = field(default_factory=lambda: Rig(camera=CAMERA))
+    seconds: float | None = None  # from the first line to the last; None is that of the sweeps
+
+
+def scene_of(case: Case) -> RasterScene:
+    """Pixels of one component that all bands show alike."""
+    y, x = np.mgrid[:1000, :680]
+    plane = case.electrons * (1 + case.texture * np.sin(2 * np.pi * (x + y) / 40))
+    if case.roof_e:
+        plane[490:510, 70:90] = case.roof_e
+    spectra = np.full((1, 3), DEFAULT_EXPOSURE_MS / case.rig.camera.exposure_ms, np.float32)
+    light = Light(spectra, 2 * case.electrons * spectra[0])  # the scene reflects about half
+    raster = Raster.of(plane[..., None].astype(np.float32))
+    return RasterScene("case", "case", raster, Once.of(light), np.ones(3, np.float32), WAVELENGTHS)
+
+
+@cache
+def probed(case: Case) -> Probe:
+    """What the probe sees of a case."""
+    probe = probe_scene(scene_of(case), case.rig, SWEEPS)
+    return probe if case.seconds is None else replace(probe, seconds=case.seconds)
+
+
+@cache
+def decided(case: Case) -> Decision:
+    """What the rule makes of a case."""
+    return decide(probed(case), case.rig, EFFECTS, TOLERANCE)
+
+
+def rig_of(*, exposure_ms: float = 100.0, **parts: object) -> Rig:
+    """A rig with some parts other than the defaults."""
+    return Rig(camera=replace(CAMERA, exposure_ms=exposure_ms), **parts)  # type: ignore[arg-type]
+
+
+FLAT = Case()
+NOISELESS = Case(rig=rig_of(detector=Detector(noiseless=True)))
+BRIGHT_FLAT = Case(BRIGHT)
+DIM_1_S = Case(DIM, rig=rig_of(exposure_ms=1000.0))
+FAST = Case(texture=0.01, rig=rig_of(exposure_ms=3.0))
+SLOW = Case(texture=0.01)
+CALM_30_M = Case(300.0, 0.02, rig=rig_of(air=Air(distance_m=30.0)))
+BRIGHTER_30_M = replace(CALM_30_M, electrons=2_000.0)
+HAZY_300_M = Case(DIM, 0.08, rig=rig_of(air=Air(distance_m=300.0, visibility_km=2.0, turbulence_cn2=1e-12)))
+FOUR_HOURS = Case(rig=rig_of(sky=Sky(started=LOW_SUN)), seconds=4 * 3600.0)
+ONE_SWEEP_AT_NOON = Case(rig=rig_of(sky=Sky(started=NOON)), seconds=6.0)
+BRIGHT_ROOF = Case(roof_e=ROOF)
+DEPTH_STEP = Case(  # focused where it looks: at infinity, all of it were a blur of 33 px
+    texture=0.2, rig=rig_of(air=Air(distance_m=3.0, nearest_m=2.0, relief="step"), optics=Optics(focus_m=3.0))
+)
+
+
+@pytest.mark.parametrize(("case", "on", "off"), [
+    pytest.param(FLAT, "vignetting,shot,read-noise,prnu,striping",
+                 "slit,smear,diffraction,defocus,aberration,keystone,turbulence,rotation", id="flat field"),
+    pytest.param(NOISELESS, "", "shot,read-noise,dark-current", id="noiseless"),
+    pytest.param(BRIGHT_FLAT, "shot", "read-noise", id="10,000 electrons"),
+    pytest.param(DIM_1_S, "dark-current", "", id="dim at 1 s"),
+    pytest.param(FAST, "lag", "", id="3 ms lines"),
+    pytest.param(SLOW, "", "lag", id="100 ms lines"),
+    pytest.param(CALM_30_M, "", "wind,turbulence,path-radiance", id="30 m calm"),
+    pytest.param(HAZY_300_M, "path-radiance,turbulence", "", id="300 m hazy"),
+    pytest.param(FOUR_HOURS, "drift", "", id="sun at 20 deg over 4 h"),
+    pytest.param(ONE_SWEEP_AT_NOON, "", "drift", id="6 s at noon"),
+    pytest.param(BRIGHT_ROOF, "stray-light,saturation", "", id="bright roof"),
+    pytest.param(DEPTH_STEP, "parallax", "", id="depth step at 3 m"),
+])  # fmt: skip
+def test_scene_and_rig_switch_effects(case: Case, on: str, off: str):
+    """As the design's table says, of a rig that is as its defaults but for what the row names."""
+    states = {one.name: one.is_on for one in decided(case).taken}
+    assert [name for name in on.split(",") if name and not states[name]] == []
+    assert [name for name in off.split(",") if name and states[name]] == []
+    assert decided(case).error <= TOLERANCE
+
+
+@pytest.mark.parametrize("case", [
+    pytest.param(FLAT, id="flat field"), pytest.param(NOISELESS, id="noiseless"),
+    pytest.param(BRIGHT_FLAT, id="10,000 electrons"), pytest.param(DIM_1_S, id="dim at 1 s"),
+    pytest.param(FAST, id="3 ms lines"), pytest.param(SLOW, id="100 ms lines"),
+    pytest.param(CALM_30_M, id="30 m calm"), pytest.param(HAZY_300_M, id="300 m hazy"),
+    pytest.param(FOUR_HOURS, id="sun at 20 deg over 4 h"), pytest.param(ONE_SWEEP_AT_NOON, id="6 s at noon"),
+    pytest.param(BRIGHT_ROOF, id="bright roof"), pytest.param(DEPTH_STEP, id="depth step at 3 m"),
+])  # fmt: skip
+def test_what_is_left_out_keeps_its_bounds_on_the_worst_chips(case: Case):
+    """Rendered with everything on and with the choice, effect by effect and all together."""
+    scene, rig, decision = scene_of(case), case.rig, decided(case)
+    white = scene.panel_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
+    ends = (0.0, 0.0 if case.seconds is None else case.seconds - rig.camera.scan_seconds(SWEEPS[1].lines))
+    whole = [
+        Block(rig, sweep, range(sweep.lines), WAVELENGTHS, scene.shape, started_s=start, white_e=white)
+        for sweep, start in zip(SWEEPS, ends, strict=True)
+    ]
+    candidates = candidate_chips(whole, probed(case).places, lines=1)
+
+    def units(light: Light32) -> Light32:
+        return noise_electrons(light, rig)
+
+    footprint = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[-1]}
+    chips = worst_chips(candidates, lambda chip: expected_light(scene, chip, footprint), units)
+    measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), chips, units)
+    assert 0 <= measured[TOTAL] <= decision.error + 1e-3
+
+
+def test_clear_air_of_30_m_is_seen_in_brighter_light():
+    """0.6 % of 2,000 electrons, less what the air adds, are 0.11 deviations of their noise: more than the tolerance."""
+    decision = decided(BRIGHTER_30_M)
+    path = next(one for one in decision.taken if one.name == "path-radiance")
+    assert path.is_on
+    light, horizon, lost = 2_000.0 * 1.02, 0.3 * 4_000.0, 6.2e-3
+    assert path.menu.off.error / SAFETY == pytest.approx(lost * (light - horizon) / np.sqrt(light + 402), rel=0.1)
+    assert path.menu.off.error > TOLERANCE
+
+
+@pytest.mark.parametrize(("case", "reached"), [(BRIGHT_ROOF, True), (FLAT, False)])
+def test_manifest_says_whether_saturation_is_reached(case: Case, reached: bool):
+    """It is on in any case."""
+    menu = next(one.menu for one in decided(case).taken if one.name == "saturation")
+    assert (menu.off.error > 0) == reached
+    assert ("above the limit" if reached else "stay below") in menu.off.why
+
+
+def test_flat_scene_of_tolerance_0_has_everything_on():
+    """A probe of some places does not prove that a scene is flat."""
+    probe = probe_scene(scene_of(FLAT), FLAT.rig, SWEEPS)
+    on = {one.name for one in decide(probe, FLAT.rig, EFFECTS, 0.0).taken if one.is_on}
+    assert {"slit", "rotation", "diffraction", "aberration", "keystone", "lag", "stray-light", "smile"} <= on
