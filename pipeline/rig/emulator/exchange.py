@@ -1,0 +1,47 @@
+"""What passes between the parts of the emulated controller: modes, requests, replies in time."""
+
+from __future__ import annotations
+
+import errno
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+from pipeline.rig.pro_mode import Damaged, Frame
+
+
+class Mode(Enum):
+    """How the controller is spoken to."""
+
+    SIMPLE = "simple"
+    PRO = "pro"
+    PRO_CRC = "pro, requests checked"
+
+
+class Chunk(NamedTuple):
+    """Bytes that the controller sends, so long after it took the request. [s]"""
+
+    delay_s: float
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Request:
+    """What came: a line of simple mode without its end, a frame, or bytes between boundaries that are none."""
+
+    mode: Mode
+    line: str = ""
+    frame: Frame | None = None
+    damaged: Damaged | None = None
+
+    @property
+    def command(self) -> int | None:
+        """Command of the frame."""
+        return None if self.frame is None else self.frame.command
+
+
+class VanishedError(OSError):
+    """The device went away: no port knows it any more."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(errno.EIO, why)
