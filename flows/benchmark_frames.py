@@ -12,17 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.survey_scene import check_labels, judged_labels
-from flows.training_data import TrainingData, farm_data, open_training_data
-from models.examples import normalised, observe
+from flows.training_data import TrainingData, farm_test_data, open_training_data
+from flows.training_look import observe_scene
+from models.examples import normalised
 from models.holes import patches_of
 from models.inference import CoarseLook, Glance, glance_of_columns
 from models.weights import AnyWeights, Description, Weights, describe_weights, load_any_weights
 from pipeline.camera import LineCamera
 from pipeline.errors import PipelineError, SceneError, SettingsError, WeightsError
 from pipeline.grid import SceneGrid
+from pipeline.simulator.farm_laws import FARM_NAMES
 from pipeline.simulator.scene import RasterScene
 
-FARM_TEST_SEED = 300_000  # of farm scenes to judge on: neither trained on, nor validated on, nor shown
 FARM_TEST_SCENES = 4
 
 
@@ -151,15 +152,14 @@ def open_frames(
     SettingsError : a choice that does not go with the data set.
     SceneError : no scene, or a name that it has not.
     """
-    if dataset != "farm":
+    if dataset not in FARM_NAMES:
         data = open_training_data(dataset, 0, scenes, camera, **choices)
         return _only(dataset, data, frames)
-    open_training_data("farm", 0, 1, camera, **choices)  # refuses choices that are for files
+    open_training_data(dataset, 0, 1, camera, **choices)  # refuses choices that are for files
     count = FARM_TEST_SCENES if scenes is None else scenes
     if count < 1:
         raise SettingsError(f"--scenes must be at least 1, got {count}")
-    seeds = tuple(str(FARM_TEST_SEED + number) for number in range(count))
-    return _only(dataset, TrainingData(farm_data(0, 0, camera).law, seeds, (), (), camera), frames)
+    return _only(dataset, farm_test_data(dataset, count, camera), frames)
 
 
 def _only(dataset: str, data: TrainingData, frames: tuple[str, ...]) -> TrainingData:
@@ -196,7 +196,7 @@ def sight_of(scene: RasterScene, name: str, weights: AnyWeights, camera: LineCam
     config = weights.config
     grid = SceneGrid(*scene.shape, config.patch, config.factor)
     rng = np.random.default_rng([seed, 0xE7A1, zlib.crc32(name.encode())])
-    observed = observe(scene, camera, grid, weights.basis, rng)
+    observed = observe_scene(scene, camera, grid, weights.basis, rng)
     _, reached = weights.basis.matrix(scene.wavelength_nm)
     example = normalised(observed, weights.normalisation, reached)
     labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))

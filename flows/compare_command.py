@@ -18,6 +18,7 @@ from flows.receipt import to_json
 from flows.settings import BUILT_IN_SCENES
 from pipeline.errors import ArchiveError, SceneError, ShapeError
 from pipeline.grid import UNLABELLED
+from pipeline.simulator.farm_laws import law_of_key
 from storage.addresses import in_text
 from storage.archive import Archive
 from storage.changes import ABSENT, flatten
@@ -89,7 +90,11 @@ def _is_same_field(old: Run, new: Run) -> bool:
 
 
 def _field_key(run: Run) -> str:
-    return str(run.receipt.get("scene", run.uri)).split("/bands=")[0].split("/only=")[0]
+    """What names the land: not the bands, nor the day and hour at which a farm was looked at."""
+    key = str(run.receipt.get("scene", run.uri)).split("/bands=")[0].split("/only=")[0]
+    if law_of_key(key) is None:
+        return key
+    return "/".join(part for part in key.split("/") if not part.startswith(("day=", "hour=")))
 
 
 def _field_words(run: Run) -> str:

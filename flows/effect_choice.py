@@ -18,7 +18,7 @@ from flows.run import CaptureRun
 from flows.settings import plain_value
 from pipeline.errors import IncompleteStoreError
 from pipeline.simulator.block import Block
-from pipeline.simulator.chips import candidate_chips, worst_chips
+from pipeline.simulator.chips import Floats, candidate_chips, worst_chips
 from pipeline.simulator.choice import Decision, decide
 from pipeline.simulator.effects.effect import Effect, Light
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
@@ -28,7 +28,6 @@ from pipeline.simulator.instrument import sweep_block
 from pipeline.simulator.manifest import list_effects, sum_up
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scouting import telling_places
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.simulator.survey_clock import sweep_starts
 from pipeline.simulator.survey_probe import noise_electrons, probe_scene
@@ -62,7 +61,7 @@ def choose_effects(run: CaptureRun, produce: Produce) -> StageRef:
         probe = probe_scene(run.scene, rig, run.planned, tolerance.unit)
         decision = decide(probe, rig, EFFECTS, tolerance.value, asked)
         run.report(DRAFT)
-        measured = _verified(run, decision)
+        measured = _verified(run, decision, probe.places)
         manifest = {"effects": list_effects(decision, measured), "total": sum_up(decision, measured)}
         (path / RECORD).write_text(to_json(manifest), encoding="utf-8")
         run.report(VERIFIED)
@@ -117,8 +116,8 @@ def source_with(
     return replace(source, chosen=chosen_effects(effects), clock=clock)
 
 
-def _verified(run: CaptureRun, decision: Decision) -> dict[str, float]:
-    """Measure what is left out on the worst chips of the scene, in the unit of the tolerance."""
+def _verified(run: CaptureRun, decision: Decision, places: Floats) -> dict[str, float]:
+    """Measure what is left out on the worst chips of the scene, about places of it, in the unit of the tolerance."""
     scene, rig = run.scene, run.settings.rig
 
     def units(light: Light) -> Light:
@@ -134,7 +133,7 @@ def _verified(run: CaptureRun, decision: Decision) -> dict[str, float]:
         run.report(DRAFT + (VERIFIED - DRAFT) * renders / (renders + len(EFFECTS)))  # how many there will be is open
         return expected_light(scene, block, chosen)
 
-    candidates = candidate_chips(_whole_sweeps(run), telling_places(scene, rig.camera, run.planned))
+    candidates = candidate_chips(_whole_sweeps(run), places)
     worst = worst_chips(candidates, lambda block: expected_light(scene, block, LOOK), units)
     return verify(decision, render, worst, units)
 

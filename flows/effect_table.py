@@ -13,25 +13,72 @@ from rich.table import Table
 from flows.figures import DASH, format_seconds
 from pipeline.simulator.manifest import UNIT_WORDS
 
+WIDE = 100  # characters, from which words fit into the table
 COLOURS = {"on": "green", "off": "dim"}
+_KEY = (
+    "left out: what any number would change by at most without the effect [{unit}]; error: by what is done instead of"
+    " the exact; measured: the same on the worst lines of the scene."
+)
+Row = Mapping[str, Any]
 
 
-def print_effects(effects: Iterable[Mapping[str, Any]], total: Mapping[str, Any], console: Console) -> None:
-    """Print a row for every effect, and below what all come to."""
-    table = Table(header_style="dim", box=SIMPLE_HEAD, collapse_padding=True)
-    for name in ("effect", "state", "variant", "bound", "measured", "CPU", "why"):
-        figure = name in ("bound", "measured", "CPU")
+def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
+    """Print a row for every effect that the rig has, what it has none of, and below what all come to.
+
+    On a narrow terminal the words stand below the table.
+    """
+    rows = list(effects)
+    there = [row for row in rows if row["reason"] != "absent"]
+    wide = console.width >= WIDE
+    table = Table(header_style="dim", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=wide)
+    for name in ("effect", "computed", "left out", "error", "measured", "CPU", *(["why"] if wide else [])):
+        figure = name in ("left out", "error", "measured", "CPU")
         table.add_column(name, justify="right" if figure else "left", no_wrap=name != "why", overflow="fold")
-    for effect in effects:
-        colour = COLOURS[effect["state"]]
-        table.add_row(
-            escape(effect["name"]), f"[{colour}]{effect['state']}[/]", escape(effect["variant"] or ""),
-            format_change(effect["bound"], endless=True), format_change(effect["measured"]),
-            format_seconds(effect["cost_s"]) if effect["cost_s"] else "", escape(effect["why"]),
-        )  # fmt: skip
+    for row in there:
+        table.add_row(*_figures(row, total), *([escape(_words(row))] if wide else []))
     console.print(table)
+    console.print(escape(_KEY.format(unit=UNIT_WORDS[total["unit"]])), style="dim", highlight=False)
+    if not wide:
+        for row in there:
+            console.print(f"[bold]{escape(row['name'])}[/]: {escape(_words(row))}", highlight=False)
+    absent = [f"{row['name']} ({row['magnitude']})" for row in rows if row["reason"] == "absent"]
+    if absent:
+        console.print(f"[bold]Not there[/]: {escape(', '.join(absent))}.", highlight=False)
     for sentence in total_words(total):
         console.print(escape(sentence), highlight=False)
+
+
+def _figures(row: Row, total: Row) -> list[str]:
+    """Name, variant or off, what leaving it out would change, what is changed, measured, seconds."""
+    beyond = row["state"] == "off" and total["tolerance"] is not None and not _within(row["bound"], total["tolerance"])
+    colour = "yellow" if beyond else COLOURS[row["state"]]
+    return [
+        escape(row["name"]), f"[{colour}]{escape(row['variant'] or 'off')}[/]",
+        format_change(row["left_out"], endless=True), format_change(row["bound"], endless=True),
+        "" if row["measured"] is None else format_change(row["measured"]), _cpu(row["cost_s"]),
+    ]  # fmt: skip
+
+
+def _within(bound: float | None, tolerance: float) -> bool:
+    return bound is not None and bound <= tolerance
+
+
+def _cpu(seconds: float) -> str:
+    """Nothing where nothing is spent; never a bare 0."""
+    if not seconds:
+        return ""
+    return "< 0.01 s" if seconds < 0.01 else format_seconds(seconds)
+
+
+def _words(row: Row) -> str:
+    """How large an effect is, and why it is nevertheless there or left out where its figures do not tell."""
+    said = {
+        "exact": "", "needed": "", "small": "", "unseen": "the scene shows nothing of it: ",
+        "spent": "the tolerance is spent where it saves more: ",
+        "asked": "asked for: ", "unasked": "not asked for: ", "always": "always there: ",
+    }[row["reason"]]  # fmt: skip
+    magnitude: str = row["magnitude"]
+    return said + magnitude.removeprefix(f"{row['name']}: ")
 
 
 def format_change(value: float | None, *, endless: bool = False) -> str:

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache
 from importlib import resources
 from pathlib import Path, PurePath
+from typing import Any
 
 from flows.run import SHIPPED
 from flows.settings import BUILT_IN_SCENES, OF_THE_MACHINE, Settings, parse_settings
 from flows.stages import VERSIONS
 from flows.survey import STAGES
 from pipeline.errors import SettingsError
-from pipeline.simulator.farm import FARM_LAW
+from pipeline.simulator.farm_laws import USUAL_DAY, USUAL_HOUR, farm_law, has_days, law_of_key
 from storage.keys import canonical_json
 from storage.lineage import Catalogue
 from storage.records import Run
 
 # what the light of a field depends on; surveys that agree in these are generations of one
 OF_THE_LIGHT = (
-    "scene", "bands", "wavelengths", "source", "seed", "effects", "size", "camera", "pointing_px", "pose",
+    "scene", "bands", "wavelengths", "source", "seed", "effects", "size", "day", "hour", "camera", "pointing_px",
+    "pose",
 )  # fmt: skip
 WEIGHED = ("attend", "segment", "evaluate")  # stages of which the weights are a parameter
 
@@ -39,11 +42,28 @@ def newest_runs(catalogue: Catalogue) -> list[Generation]:
     found: dict[str, Generation] = {}
     for run in catalogue.runs:  # oldest first
         name = str(run.receipt.get("survey") or run.facts.get("survey") or run.folder.name)
-        light = {key: run.settings.get(key) for key in OF_THE_LIGHT}
-        field = canonical_json([name, light if run.settings else run.uri])
+        field = canonical_json([name, _light_of(run) if run.settings else run.uri])
         found.pop(field, None)
         found[field] = Generation(name, run)
     return list(found.values())
+
+
+def _light_of(run: Run) -> dict[str, Any]:
+    """What the light of a run depends on, with the farm by its law: ``farm`` has not always meant the present one."""
+    settings = {**run.settings, **_scene_of(run)}
+    light = {key: settings.get(key) for key in OF_THE_LIGHT}
+    if has_days(str(settings.get("scene"))):
+        usual = {"day": USUAL_DAY, "hour": USUAL_HOUR}
+        light |= {key: value if light[key] is None else light[key] for key, value in usual.items()}
+    return light
+
+
+def _scene_of(run: Run) -> Mapping[str, str]:
+    """The scene of a run's settings, where it is a built-in farm: the law that the run was drawn by."""
+    scene = run.settings.get("scene")
+    if scene not in BUILT_IN_SCENES:
+        return {}
+    return {"scene": law_of_key(str(run.receipt.get("scene"))) or farm_law(str(scene))}
 
 
 def is_called(generation: Generation, pattern: str) -> bool:
@@ -56,6 +76,8 @@ def is_called(generation: Generation, pattern: str) -> bool:
 def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
     """The settings of a run for another survey into the archive ``out``, with other weights if they are given.
 
+    A farm is asked for by the law that the run was drawn by: it is the same land, whatever ``farm`` means by now.
+
     Raises
     ------
     SettingsError, BudgetError : the run's settings cannot be read, or are not of this version.
@@ -63,7 +85,7 @@ def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
     if not run.settings:
         raise SettingsError(f"the settings of {run.uri} cannot be read ({run.problem}); survey this field by hand")
     here = {*Settings.__dataclass_fields__} - {*OF_THE_MACHINE}
-    known = {name: value for name, value in run.settings.items() if name in here}
+    known = {name: value for name, value in run.settings.items() if name in here} | {**_scene_of(run)}
     return parse_settings({**known, "out": str(out), **({} if weights is None else {"weights": str(weights)})})
 
 
@@ -91,9 +113,10 @@ def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
 
     What lies in a scene's file is not looked at.
     """
-    farm = settings.scene not in BUILT_IN_SCENES or str(run.receipt.get("scene")).startswith(FARM_LAW)
+    drawn_by = law_of_key(str(run.receipt.get("scene")))
+    of_this_law = settings.scene not in BUILT_IN_SCENES or drawn_by == farm_law(settings.scene)
     stale = stale_stores(catalogue, catalogue.named_and_below[run.uri], weights_key(settings))
-    return farm and not stale and is_whole(catalogue, run)
+    return of_this_law and not stale and is_whole(catalogue, run)
 
 
 def would_remake(catalogue: Catalogue, run: Run, stage: str, settings: Settings) -> bool:

@@ -40,7 +40,7 @@ def evaluate(
     Parameters
     ----------
     dataset
-        `farm`, a folder of labelled scenes, or one scene file.
+        `farm` (or `farm@1`, `farm@2`), a folder of labelled scenes, or one scene file.
     weights
         A file of weights. Several are seeds of one training, or of frames left out in turn: each frame is judged by
         those that never saw it.

@@ -187,8 +187,15 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         confidence=found.confidence,
         pixel_mrad=run.camera.ifov_rad * 1e3,
         along=run.plan.along,
-        note="" if miou is None else f"mIoU {100 * miou:.1f} %",
+        note="   ·   ".join(_title_notes(run, miou)),
     )
+
+
+def _title_notes(run: SurveyRun, miou: float | None) -> list[str]:
+    """What ends the title line: when a farm that grows was looked at, and how good the map is."""
+    moment = run.settings.moment
+    when = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]
+    return when if miou is None else [*when, f"mIoU {100 * miou:.1f} %"]
 
 
 def _by_strip(cubes: list[RawCube]) -> list[RawCube]:

@@ -193,7 +193,7 @@ def weights_path(settings: Settings) -> Path:
         return Path(settings.weights)
     if settings.scene not in BUILT_IN_SCENES:
         raise SettingsError(
-            f"--weights is missing: the weights that come with SpectralZoom know the scene 'farm' only;"
+            f"--weights is missing: the weights that come with SpectralZoom know the built-in farm only;"
             f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
         )
     return Path(str(resources.files("models") / "shipped" / SHIPPED))

@@ -33,6 +33,7 @@ from pipeline.camera import LineCamera
 from pipeline.errors import PoseError, SettingsError
 from pipeline.ground import LIMITS, RigPose
 from pipeline.scan import CostModel
+from pipeline.simulator.farm_laws import FARM_NAMES, SEASON_LAW, USUAL_DAY, USUAL_HOUR, has_days
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from storage.block_work import Crew
 
@@ -44,7 +45,7 @@ IN_NAT = ("gain", "entropy")  # policies whose scores are gains, or the most tha
 UNMOVED = ("random", "stratified", "centre", "uniform", "mask")  # policies by place: nothing seen changes them
 ENGINES = ("prefect", "plain")
 KERNELS = ("catmull-rom", "bilinear", "nearest")
-BUILT_IN_SCENES = ("farm",)
+BUILT_IN_SCENES = FARM_NAMES
 BUILT_IN_SOURCES = ("sim", "rig")
 OF_THE_MACHINE = ("scheduler", "workers")  # no byte depends on them; a cluster of that day need not be there today
 _VGG_FROM = {"vgg-static": VGG_FROM, "vgg-trained": TRAINED_VGG_FROM}  # policies that read a file of VGG19
@@ -89,6 +90,8 @@ class Settings:
     kernel: Literal["catmull-rom", "bilinear", "nearest"] = "catmull-rom"
     pointing_px: float = 0.0  # how far off the mirror may point; above 0 sweeps overlap and their seams are registered
     size: tuple[int, int] | None = None  # (width, height) of the built-in scene [px]
+    day: int | None = None  # of the year, for farm@2: 172 unless given
+    hour: float | None = None  # true solar time, for farm@2: 11 unless given [h]
     camera: LineCamera = field(default_factory=LineCamera)
     optics: Optics = field(default_factory=Optics)
     mirror: MirrorMotion = field(default_factory=MirrorMotion)
@@ -108,6 +111,13 @@ class Settings:
     def shape(self) -> tuple[int, int] | None:
         """(y, x) of the built-in scene [px], None for its default."""
         return None if self.size is None else (self.size[1], self.size[0])
+
+    @property
+    def moment(self) -> tuple[int, float] | None:
+        """Day of the year and true solar time [h] of the built-in scene; None of a scene that has none."""
+        if not has_days(self.scene):
+            return None
+        return USUAL_DAY if self.day is None else self.day, USUAL_HOUR if self.hour is None else self.hour
 
     @property
     def rig(self) -> Rig:
@@ -237,6 +247,12 @@ def _check_together(settings: Settings, origin: Mapping[str, str]) -> None:
         )
     if settings.size is not None and settings.scene not in BUILT_IN_SCENES:
         raise SettingsError(f"size is for built-in scenes ({', '.join(BUILT_IN_SCENES)}); {settings.scene} has its own")
+    for name, value in {"day": settings.day, "hour": settings.hour}.items():
+        if value is not None and not has_days(settings.scene):
+            raise SettingsError(
+                f"{_place(name, origin.get(name))} = {value:g} is for the scene {SEASON_LAW}, whose fields grow; "
+                f"{settings.scene} is as it is: leave it out"
+            )
     if settings.camera.dark_dn >= settings.camera.full_scale_dn:
         raise SettingsError(
             f"camera.dark_dn = {settings.camera.dark_dn:g} leaves no room below the {settings.camera.full_scale_dn} DN "
@@ -386,5 +402,7 @@ _SURVEY: dict[str, Parser] = {
     "kernel": parse_choice(KERNELS),
     "pointing_px": parse_number(Span(0, 300, "px")),
     "size": parse_size,
+    "day": parse_whole(1, 366, why="of the year, 172 is the 21st of June"),
+    "hour": parse_number(Span(0, 24, "h")),
     **dict.fromkeys(_TABLES, parse_text),  # checked by _parse_table
 }

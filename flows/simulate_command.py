@@ -8,11 +8,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
 from flows.capture_plan import lay_out_sweeps
 from flows.effect_choice import choose_effects, load_manifest
+from flows.effect_comparison import Comparison, compare_with_everything
 from flows.effect_table import print_effects
 from flows.figures import format_bytes, format_seconds
 from flows.progress import StageProgress
@@ -21,12 +23,14 @@ from flows.settings import Settings
 from flows.stages import VERSIONS, Build, capture_sweeps
 from flows.survey_scene import farm_refusal, open_scene
 from models.process import keep_freed_memory, use_one_thread
-from pipeline.errors import SettingsError
+from pipeline.errors import ArchiveError, SceneError, SettingsError
 from pipeline.grid import SceneGrid
 from pipeline.scan import Sweep
+from pipeline.simulator.manifest import UNIT_WORDS
 from storage.archive import Archive, StageRef
+from storage.scene_files import load_scene_file
 
-TITLES = {"effects": "effects that matter", "capture": "scan"}
+TITLES = {"effects": "effects that matter", "capture": "scan", "comparison": "the same with everything on"}
 PATCH, FACTOR = 16, 4  # of the weights that come with the house: scans are those of its surveys
 
 
@@ -54,14 +58,20 @@ class _Maker:
         return replace(self.run, report=lambda done: self.progress.show(name, done))
 
 
-def run_simulate(settings: Settings, console: Console, *, coarse: bool = False) -> dict[str, Any]:
+def run_simulate(
+    settings: Settings, console: Console, *, coarse: bool = False, picture: Path | None = None
+) -> dict[str, Any]:
     """Scan a scene into an archive, with progress on ``console``; give the record that --json prints.
+
+    With a ``picture`` (PNG) the scan is held against one with everything on.
 
     Raises
     ------
     BoundError : what would be left out changes the worst part of the scene by more than its bound says.
     SettingsError, SceneError, ArchiveError : what was asked for cannot be.
     """
+    if picture is not None:
+        _check_picture(picture)
     use_one_thread()
     keep_freed_memory()
     with console.status("opening the scene"):
@@ -73,9 +83,55 @@ def run_simulate(settings: Settings, console: Console, *, coarse: bool = False) 
         make = _Maker(run, progress)
         effects = choose_effects(make.watching("effects"), make)
         raw = capture_sweeps(make.watching("capture"), make, sweeps, [effects])
-    record = _record(run, sweeps, effects, raw, make.spent)
+        record = _record(run, sweeps, effects, raw, make.spent)
+        found = None if picture is None else _compare(make, sweeps, effects, console)
     _print(record, console)
-    return record
+    if picture is None or found is None:
+        return record
+    _draw(picture, found, settings)
+    _print_comparison(found, picture, console)
+    return record | {"comparison": {**found.record(), "picture": str(picture)}}
+
+
+def _compare(make: _Maker, sweeps: Sequence[Sweep], effects: StageRef, console: Console) -> Comparison:
+    """Take the lines with everything on as well."""
+
+    def say(words: str) -> None:
+        console.print(f"[dim]everything on, exact: {escape(words)}[/]", highlight=False)
+
+    make.progress.show("comparison", 0.0)
+    found = compare_with_everything(make.watching("comparison"), sweeps, effects, say)
+    make.progress.show("comparison", 1.0, ended=True)
+    return found
+
+
+def _check_picture(path: Path) -> None:
+    """Refuse what cannot be written before minutes are spent on it."""
+    if path.suffix.lower() != ".png":
+        raise SettingsError(f"--compare writes a PNG, got {path}; name a file that ends with .png")
+    if path.is_dir():
+        raise SettingsError(f"--compare {path} is a folder; name a file in it, such as {path / 'difference.png'}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab"):
+            pass
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    if not path.stat().st_size:
+        path.unlink()
+
+
+def _unwritable(path: Path, error: OSError) -> ArchiveError:
+    return ArchiveError(f"cannot write to {path}: {error.strerror}; choose another --compare")
+
+
+def _draw(path: Path, found: Comparison, settings: Settings) -> None:
+    from flows.effect_picture import Words, draw_comparison
+
+    try:
+        draw_comparison(path, found, Words(f"{Path(settings.scene).stem}, seed {settings.seed}", settings.effects))
+    except OSError as error:
+        raise _unwritable(path, error) from error
 
 
 def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[CaptureRun, list[Sweep], tuple[str, ...]]:
@@ -86,12 +142,27 @@ def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[Captur
     if refused is not None:
         raise SettingsError(refused)
     scene, notes = open_scene(settings)
+    if scene.filled_px:
+        raise SceneError(_gap(settings))
     _, coarse_pass, full = lay_out_sweeps(settings, SceneGrid(*scene.shape, PATCH, FACTOR))
     run = CaptureRun(
         settings=settings, archive=Archive.open(settings.out), source=make_source(scene, settings), scene=scene,
         planned=(*coarse_pass, *full),
     )  # fmt: skip
     return run, coarse_pass if coarse else full, notes
+
+
+def _gap(settings: Settings) -> str:
+    """Where a file first has no value. A survey goes on without; a simulation would have to invent light."""
+    file = load_scene_file(settings.scene, bands=settings.bands, wavelengths=settings.wavelengths)
+    missing = ~np.isfinite(file.values)
+    row, column, band = (int(one) for one in np.unravel_index(int(missing.argmax()), missing.shape))
+    number = band if settings.bands is None else settings.bands[band]
+    pixels = int(missing.any(axis=2).sum())
+    return (
+        f"{settings.scene} has no finite value at row {row}, column {column}, band {number} (pixels without: {pixels}),"
+        " and a simulation invents no light; fill or crop it, or choose other --bands"
+    )
 
 
 def _record(
@@ -131,3 +202,16 @@ def _print(record: Mapping[str, Any], console: Console) -> None:
     )
     for name in record["cubes"]:
         console.print(f"  {escape(str(Path(record['path']) / Path(name).name))}", highlight=False, soft_wrap=True)
+
+
+def _print_comparison(found: Comparison, picture: Path, console: Console) -> None:
+    unit = UNIT_WORDS[found.unit]
+    which = "all" if found.lines == found.of_lines else f"{found.lines} of the {found.of_lines}"
+    bound = "there is no bound" if found.bound is None else f"the bound is {found.bound:.2g}"
+    console.print(
+        f"Everything on, exact, takes {format_seconds(found.exact_cpu_s)} of CPU for {which} lines, these effects"
+        f" {format_seconds(found.cpu_s)}: {found.ratio:.1f} times less. Light differs by {found.measured:.2g} {unit}"
+        f" at most ({bound}).",
+        highlight=False,
+    )
+    console.print(f"  {escape(str(picture))}", highlight=False, soft_wrap=True)

@@ -21,9 +21,12 @@ def simulate(
     tol: str | None = None,
     seed: str | None = None,
     size: str | None = None,
+    day: str | None = None,
+    hour: str | None = None,
     bands: str | None = None,
     wavelengths: str | None = None,
     exposure_ms: str | None = None,
+    compare: Path | None = None,
     as_json: AsJson = False,
 ) -> int:
     """Simulate a scan of all of SCENE with the effects that matter to it, and tell which were left out and why.
@@ -33,7 +36,8 @@ def simulate(
     Parameters
     ----------
     scene
-        `farm` (built in), or an image or cube file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr.
+        `farm` (built in; also `farm@1`, `farm@2`), or an image or cube file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat,
+        ENVI, Zarr.
     out
         Archive for the raw cubes: a folder, or s3://bucket/prefix.
     coarse
@@ -51,21 +55,28 @@ def simulate(
         Of the scene `farm` and of all that is drawn by chance; 0 by default.
     size
         Of the scene `farm`, width x height [px]: 1280x1024 by default.
+    day
+        Of the year, 1 to 366, for the scene `farm@2`: 172 by default.
+    hour
+        True solar time [h], for the scene `farm@2`: 11 by default; the sun stands in the south at 12.
     bands
         Bands of the file (or of the farm's 270) to use, from 0: 0,1
     wavelengths
         Their centre wavelengths [nm]: 660,800
     exposure_ms
         Exposure of a line [ms]; 100 by default.
+    compare
+        A PNG to write: lines with everything on and exact, the same as simulated, and where they differ, with the times
+        of both. Takes all lines once more both ways, or as many as about a minute allows.
     """
     from flows.settings import load_settings
     from flows.simulate_command import run_simulate
 
     flags = {
-        "scene": scene, "out": out, "effects": effects, "tol": tol, "seed": seed, "size": size, "bands": bands,
-        "wavelengths": wavelengths, "camera.exposure_ms": exposure_ms,
+        "scene": scene, "out": out, "effects": effects, "tol": tol, "seed": seed, "size": size, "day": day,
+        "hour": hour, "bands": bands, "wavelengths": wavelengths, "camera.exposure_ms": exposure_ms,
     }  # fmt: skip
-    record = run_simulate(load_settings(settings, flags), stderr, coarse=coarse)
+    record = run_simulate(load_settings(settings, flags), stderr, coarse=coarse, picture=compare)
     if as_json:
         print_json(record)
     return 0

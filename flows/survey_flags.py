@@ -15,7 +15,8 @@ class SurveyFlags:
     """What was given of a survey's settings; None where nothing was."""
 
     scene: str | None = None
-    """`farm` (built in), or an image or cube file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr."""
+    """`farm` (built in; also `farm@1`, `farm@2`), or an image or cube file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat, ENVI,
+    Zarr."""
     labels: str | None = None
     """File of class colours or numbers on the scene's pixels; accuracy is reported then."""
     bands: str | None = None
@@ -66,6 +67,10 @@ class SurveyFlags:
     """How far off the mirror may point [px]; above 0 sweeps overlap by more and their seams are registered."""
     size: str | None = None
     """Of the scene `farm`, width x height [px]: 1280x1024 by default."""
+    day: str | None = None
+    """Of the year, 1 to 366, for the scene `farm@2`: 172 by default."""
+    hour: str | None = None
+    """True solar time [h], for the scene `farm@2`: 11 by default; the sun stands in the south at 12."""
     exposure_ms: str | None = None
     """Exposure of a line [ms]; 100 by default."""
 

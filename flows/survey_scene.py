@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import UTC, timedelta
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +14,16 @@ from models.weights import Description
 from pipeline.errors import SceneError, SettingsError
 from pipeline.grid import UNLABELLED
 from pipeline.once import Once
-from pipeline.simulator.farm import farm_scene
+from pipeline.simulator.farm_laws import FARM_SHAPE, built_in_farm, law_of_key
 from pipeline.simulator.raster import Light
 from pipeline.simulator.scene import RasterScene
 from storage.declared_sizes import machine_bytes
 from storage.raster_files import load_raster
 from storage.scene_files import load_scene_file
 
-FARM_BYTES_PER_PX = 570  # peak of a survey of 2560 x 2560 px without controls, 3.76 GB
+# Peak of a survey of farm@2 without controls: 1.58 GB for 1280 x 1024 px, 4.12 GB for 2560 x 2560 px
+FARM_BYTES, FARM_BYTES_PER_PX = 1_000_000_000, 490
+SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and whoever rounds it [h]
 
 
 def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
@@ -32,7 +35,7 @@ def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
     SettingsError : what was given does not go with a built-in scene.
     """
     if settings.scene in BUILT_IN_SCENES:
-        return _open_farm(settings), ()
+        return _open_farm(settings), _notes_of_moment(settings)
     file = load_scene_file(
         settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths
     )
@@ -44,12 +47,28 @@ def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
 def _open_farm(settings: Settings) -> RasterScene:
     for name, value in {"labels": settings.labels, "wavelengths": settings.wavelengths}.items():
         if value is not None:
-            raise SettingsError(f"--{name} is for scene files; the scene 'farm' brings its own")
-    if settings.shape is None:
-        farm = farm_scene(settings.seed, camera=settings.camera)
-    else:
-        farm = farm_scene(settings.seed, shape=settings.shape, camera=settings.camera)
+            raise SettingsError(f"--{name} is for scene files; the scene '{settings.scene}' brings its own")
+    farm = built_in_farm(
+        settings.scene, settings.seed, settings.shape or FARM_SHAPE,
+        camera=settings.camera, day=settings.day, hour=settings.hour,
+    )  # fmt: skip
     return farm if settings.bands is None else _some_bands(farm, settings.bands)
+
+
+def _notes_of_moment(settings: Settings) -> tuple[str, ...]:
+    """Say where plants and shadows are not those of the moment at which the sky's light begins."""
+    started, moment = settings.sky.started, settings.moment
+    if started is None or moment is None:
+        return ()
+    sun = started.astimezone(UTC) + timedelta(hours=settings.sky.longitude_deg / 15)
+    day, hour = moment
+    at = sun.hour + sun.minute / 60
+    if day == sun.timetuple().tm_yday and abs(hour - at) < SAME_HOUR:
+        return ()
+    return (
+        f"plants and shadows are of day {day}, {hour:g} h, while the light drifts as from sky.started, day "
+        f"{sun.timetuple().tm_yday}, {at:.1f} h solar time",
+    )
 
 
 def farm_refusal(settings: Settings) -> str | None:
@@ -57,7 +76,7 @@ def farm_refusal(settings: Settings) -> str | None:
     if settings.scene not in BUILT_IN_SCENES or settings.shape is None:
         return None
     height, width = settings.shape
-    needed = height * width * FARM_BYTES_PER_PX
+    needed = FARM_BYTES + height * width * FARM_BYTES_PER_PX
     there = machine_bytes()
     if needed <= there:
         return None
@@ -71,7 +90,7 @@ def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
     """The same field seen by a camera with some of the bands."""
     count, chosen = len(scene.wavelength_nm), list(bands)
     if not all(0 <= band < count for band in bands):
-        raise SettingsError(f"--bands {','.join(map(str, bands))}: the scene 'farm' has bands 0 to {count - 1}")
+        raise SettingsError(f"--bands {','.join(map(str, bands))}: the built-in farm has bands 0 to {count - 1}")
     return replace(
         scene,
         key=f"{scene.key}/only={','.join(map(str, bands))}",
@@ -97,6 +116,9 @@ def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
     if missing:
         known = ", ".join(weights.class_names)
         raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; use weights for these")
+    law, learnt = law_of_key(scene.key), law_of_key(str(weights.record.get("data")))
+    if None not in (law, learnt) and law != learnt:
+        return (f"the weights were trained on {learnt}, the scene is of {law}: expect a poorer map",)
     split = weights.record.get("split", {})
     if scene.key in split.get("pixels", {}):
         return ("accuracy is counted on the labelled pixels that the weights were not trained on",)

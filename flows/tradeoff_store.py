@@ -18,7 +18,7 @@ from pipeline.coverage import cheapest_full, coarse_sweeps
 from pipeline.grid import SceneGrid
 from pipeline.rectify.region import mosaic_rows
 from pipeline.scan import CostModel
-from pipeline.simulator.farm import farm_scene
+from pipeline.simulator.farm_laws import built_in_farm
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from storage.codec_trials import CODECS, store_in_memory
@@ -51,7 +51,7 @@ class Stored:
 
 def _prepare(seed: int) -> Captured:
     weights = load_weights(Path(str(resources.files("models") / "shipped" / SHIPPED)))
-    camera, scene = LineCamera(), farm_scene(seed, shape=SHAPE)
+    camera, scene = LineCamera(), built_in_farm("farm", seed, SHAPE)
     grid = SceneGrid(*SHAPE, weights.config.patch, weights.config.factor)
     source = SimulatedSource(scene, Rig(camera), seed)
     along, full, _ = cheapest_full(grid, camera, CostModel())

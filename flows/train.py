@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from flows.train_figures import validate
 from flows.train_start import joined_split, open_start, refuse_seen
 from flows.training_data import TrainingData, open_training_data, pack_mask, trained_pixels
-from models.examples import Observation, measured_normalisation, normalised, observe
+from flows.training_look import observe_scene
+from models.examples import Observation, measured_normalisation, normalised
 from models.sizes import PRESETS, Positions, Preset, SegmenterConfig
 from models.spectral import SpectralBasis
 from models.training import Progress, TrainingSettings, train
@@ -21,6 +22,7 @@ from models.weights import AnyWeights, save_weights, with_record
 from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, SettingsError
 from pipeline.grid import SceneGrid
+from pipeline.simulator.farm_laws import FARM_NAMES
 from pipeline.simulator.scene import RasterScene
 
 FRAME_CROP, FARM_CROP = 384, 256  # px
@@ -35,7 +37,7 @@ class TrainRequest:
     out: Path
     hold_out: tuple[str, ...] = ()
     validation: int | None = None
-    scenes: int | None = None  # of the built-in farm; 24 where None
+    scenes: int | None = None  # of a built-in farm; by its law where None
     patch: int | None = None
     factor: int = 4
     columns: int = 24
@@ -158,7 +160,7 @@ def _observe_all(
         about = known
         grid = SceneGrid(*scene.shape, known.patch, request.factor)
         rng = np.random.default_rng([request.settings.seed, 0x0B5, number])
-        seen.append(observe(scene, request.camera, grid, known.basis, rng))
+        seen.append(observe_scene(scene, request.camera, grid, known.basis, rng))
     if about is None:
         raise SceneError(f"{request.dataset} has no scene to train on")
     return seen, about
@@ -169,7 +171,7 @@ def _common(request: TrainRequest, scene: RasterScene) -> _About:
     if len(scene.class_names) < 2:
         raise SceneError(f"scene {scene.name} has {len(scene.class_names)} class; training needs two or more")
     basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns)
-    patch = request.patch or suggested_patch(scene.shape, built_in=request.dataset == "farm")
+    patch = request.patch or suggested_patch(scene.shape, built_in=request.dataset in FARM_NAMES)
     about = _About(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
     _config(request, about)  # refuses sizes that do not fit before the first look
     return about
@@ -184,7 +186,7 @@ def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
 
 def usual_crop(dataset: str, preset: Preset) -> int:
     """Size of the crops to train on [px]: whole scenes for the paper's network, as far as they are square."""
-    return WHOLE_CROP if preset == "paper" else FARM_CROP if dataset == "farm" else FRAME_CROP
+    return WHOLE_CROP if preset == "paper" else FARM_CROP if dataset in FARM_NAMES else FRAME_CROP
 
 
 def _check_alike(scene: RasterScene, about: _About) -> None:

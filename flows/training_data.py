@@ -14,14 +14,18 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, SettingsError
 from pipeline.grid import UNLABELLED
-from pipeline.simulator.farm import FARM_LAW, farm_scene
+from pipeline.simulator.farm_laws import FARM_LAW, FARM_NAMES, SEASON_LAW, built_in_farm, farm_law, has_days
 from pipeline.simulator.scene import RasterScene, raster_from_values
 from storage.datasets import DataSet, load_data_set
 from storage.scene_files import SceneFile
 
-FARM_SCENES, FARM_VALIDATION = 24, 3
+FARM_SCENES, FARM_VALIDATION = {FARM_LAW: 24, SEASON_LAW: 48}, 3
 FARM_SHAPE = (512, 640)  # of a training scene [px]
 FARM_TRAIN_SEED, FARM_VALIDATION_SEED = 100_000, 200_000  # surveys are shown on small seeds
+FARM_TEST_SEED = 300_000  # of farm scenes to judge on: neither trained on, nor validated on, nor shown
+SEASON_DAYS = (96, 304)  # of training scenes: April to October
+SEASON_HOURS = (9, 15)  # true solar time
+_GOLDEN, _SILVER = 0.6180339887, 0.4142135624  # steps round a circle that no number of points comes back on
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,8 @@ class TrainingData:
             yield self._farm(name) if self.files is None else self._file(name)
 
     def _farm(self, name: str) -> RasterScene:
-        return farm_scene(int(name), shape=FARM_SHAPE, camera=self.camera)
+        seed, day, hour = read_farm_name(name)
+        return built_in_farm(self.law, seed, FARM_SHAPE, camera=self.camera, day=day, hour=hour)
 
     def _file(self, name: str) -> RasterScene:
         if self.files is None:
@@ -65,15 +70,44 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
     )
 
 
-def farm_data(scenes: int, validation: int, camera: LineCamera) -> TrainingData:
-    """Farm scenes on seeds far from those that surveys are shown on."""
-    return TrainingData(
-        law=FARM_LAW,
-        train=tuple(str(FARM_TRAIN_SEED + i) for i in range(scenes)),
-        validation=tuple(str(FARM_VALIDATION_SEED + i) for i in range(validation)),
-        held_out=(),
-        camera=camera,
-    )
+def farm_data(name: str, scenes: int | None, validation: int, camera: LineCamera) -> TrainingData:
+    """Scenes of the farm of a name, on seeds far from those that surveys are shown on, and on days if it has any."""
+    law = farm_law(name)
+    count = FARM_SCENES[law] if scenes is None else scenes
+    train = farm_looks(law, FARM_TRAIN_SEED, count)
+    return TrainingData(law, train, farm_looks(law, FARM_VALIDATION_SEED, validation, odd=True), (), camera)
+
+
+def farm_test_data(name: str, scenes: int, camera: LineCamera) -> TrainingData:
+    """Scenes of the farm of a name to judge weights on, all of them in ``train``."""
+    law = farm_law(name)
+    return TrainingData(law, farm_looks(law, FARM_TEST_SEED, scenes, odd=True), (), (), camera)
+
+
+def farm_looks(law: str, first_seed: int, count: int, *, odd: bool = False) -> tuple[str, ...]:
+    """Name scenes of a farm: seeds one after the other, and for one with days a day of the season and an hour to each.
+
+    Days go round the season by the golden section, so that any number of scenes covers it evenly. Weights learn on even
+    days and are judged on odd ones.
+    """
+    if not has_days(law):
+        return tuple(str(first_seed + i) for i in range(count))
+    (first, last), (morning, evening) = SEASON_DAYS, SEASON_HOURS
+    names = []
+    for i in range(count):
+        day = first + 2 * int((0.5 + i * _GOLDEN) % 1 * ((last - first) // 2)) + odd
+        hour = morning + int((0.5 + i * _SILVER) % 1 * (evening - morning + 1))
+        names.append(f"{first_seed + i}-day-{day}-hour-{hour}")
+    return tuple(names)
+
+
+def read_farm_name(name: str) -> tuple[int, int | None, float | None]:
+    """Seed, day and hour of a name that `farm_looks` gave; None for those that its farm has not."""
+    seed, _, rest = name.partition("-day-")
+    if not rest:
+        return int(seed), None, None
+    day, _, hour = rest.partition("-hour-")
+    return int(seed), int(day), float(hour)
 
 
 def file_data(files: DataSet, validation: int, camera: LineCamera) -> TrainingData:
@@ -95,20 +129,19 @@ def file_data(files: DataSet, validation: int, camera: LineCamera) -> TrainingDa
 def open_training_data(
     dataset: str, validation: int | None, scenes: int | None, camera: LineCamera, **choices: object
 ) -> TrainingData:
-    """Name the data: ``farm``, or a path with the choices of `load_data_set`.
+    """Name the data: a built-in farm, or a path with the choices of `load_data_set`.
 
     Without a number, one scene in eight (4 at most) goes to validation; a data set of one scene has none.
 
     Raises
     ------
-    SettingsError : a choice that is for files was made for ``farm``, or the other way round.
+    SettingsError : a choice that is for files was made for a farm, or the other way round.
     """
-    if dataset == "farm":
+    if dataset in FARM_NAMES:
         _refuse_choices(choices)
-        count = FARM_SCENES if scenes is None else scenes
-        return farm_data(count, FARM_VALIDATION if validation is None else validation, camera)
+        return farm_data(dataset, scenes, FARM_VALIDATION if validation is None else validation, camera)
     if scenes is not None:
-        raise SettingsError(f"--scenes is for the built-in farm; {dataset} has its own scenes")
+        raise SettingsError(f"--scenes is for the built-in farms; {dataset} has its own scenes")
     files = load_data_set(Path(dataset), **choices)  # type: ignore[arg-type]
     share = min(4, len(files.train_names) // 8)
     return file_data(files, share if validation is None else validation, camera)

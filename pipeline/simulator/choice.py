@@ -152,6 +152,8 @@ def named_effects(asked: str, known: Sequence[str]) -> frozenset[str] | None:
     if words in (["auto"], ["all"], ["none"]):
         return {"auto": None, "all": frozenset(known), "none": frozenset[str]()}[words[0]]
     for word in words:
+        if word in ("auto", "all", "none"):
+            raise SettingsError(f"{word!r} stands alone, got {asked!r}; leave it or the names out")
         if word not in known:
             near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
             hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"

@@ -34,6 +34,7 @@ from pipeline.camera import LineCamera
 from pipeline.errors import SceneError
 from pipeline.once import Once
 from pipeline.simulator.farm_fields import CLASSES, SOWINGS, Canvas, Ground, Mixture, grass, hard_track, paint_parcel
+from pipeline.simulator.farm_laws import FARM_LAW
 from pipeline.simulator.farm_layout import (
     Band,
     Border,
@@ -53,8 +54,6 @@ from pipeline.simulator.farm_layout import (
 from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.spectra import MATERIALS, PANEL_REFLECTANCE, band_centres, spectral_library
-
-FARM_LAW = "farm@1"
 
 PARCEL_AREA_PX = 95_000.0
 PARCEL_SHARES: dict[str, float] = {
@@ -133,9 +132,11 @@ def _draw(seed: int, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArr
     _dig_ponds(stream(seed, "ponds"), canvas, ground, parcels, uses)
     _plant_trees(canvas, ground, crowns)
     canvas.dim(ground.light)
-    planes = np.ascontiguousarray(canvas.materials.T)
+    labels, materials = canvas.classes.argmax(axis=0).astype(np.uint8).reshape(shape), canvas.materials
+    del canvas, ground  # the planes are as large as all of them
+    planes = np.ascontiguousarray(materials.T)
     planes /= planes.sum(axis=1, keepdims=True)
-    return planes.reshape(*shape, -1), canvas.classes.argmax(axis=0).astype(np.uint8).reshape(shape)
+    return planes.reshape(*shape, -1), labels
 
 
 def _weed_rate(parcels: list[Parcel], uses: list[str], shape: tuple[int, int]) -> Field:

@@ -23,6 +23,7 @@ from pipeline.camera import LineCamera
 from pipeline.once import Once
 from pipeline.simulator.farm import CLASS_COLOURS
 from pipeline.simulator.farm_fields import CLASSES, Ground
+from pipeline.simulator.farm_laws import SEASON_LAW, USUAL_DAY, USUAL_HOUR
 from pipeline.simulator.farm_layout import stream
 from pipeline.simulator.farm_plan import FarmPlan, farm_plan
 from pipeline.simulator.raster import Light, Raster
@@ -34,8 +35,6 @@ from pipeline.simulator.season_spectra import season_library
 from pipeline.simulator.season_weeds import plant_weeds
 from pipeline.simulator.spectra import PANEL_REFLECTANCE, band_centres
 
-SEASON_LAW = "farm@2"
-
 
 def farm_on_day(
     seed: int,
@@ -43,8 +42,8 @@ def farm_on_day(
     bands: int = 270,
     camera: LineCamera | None = None,
     *,
-    day: int = 172,
-    hour: float = 11.0,
+    day: int = USUAL_DAY,
+    hour: float = USUAL_HOUR,
 ) -> RasterScene:
     """Give a farm on a day: equal arguments give the same scene, bit for bit. It is drawn when first looked at.
 

@@ -92,6 +92,28 @@ def fixed_variance(rig: Rig) -> float:
     return camera.read_noise_e**2 + camera.electrons_per_dn**2 / 12
 
 
+def unit_electrons(light_e: Floats, probe: Probe, rig: Rig) -> Floats:
+    """Give the unit of the probe at some light [e-]; what does not follow the light is the smallest unit met."""
+    if probe.unit == "sigma" and not rig.detector.noiseless:
+        return np.sqrt(np.maximum(light_e, 0.0) + fixed_variance(rig))
+    return np.full_like(light_e, probe.unit_least_dn * rig.camera.electrons_per_dn)
+
+
+def lights_within(probe: Probe, rig: Rig) -> tuple[Floats, Floats]:
+    """Give least and greatest light of every band, (band,) each [e-]: where level and span have their units from.
+
+    With U(S)^2 = S + n, the greatest S has level S / U(S), and the least a difference of span U to it, or a smaller.
+    """
+    if probe.unit != "sigma" or rig.detector.noiseless:
+        unit = unit_electrons(probe.level, probe, rig)
+        high, way = probe.level * unit, probe.span * unit
+    else:
+        fixed, level, span = fixed_variance(rig), probe.level**2, probe.span**2
+        high = (level + np.sqrt(level * (level + 4 * fixed))) / 2
+        way = (np.sqrt(span * (span + 4 * (high + fixed))) - span) / 2
+    return np.maximum(high - way, probe.darkest_e), high
+
+
 def light_after(probe: Probe, ranges: Iterable[GainRange], rig: Rig) -> Probe:
     """Give the probe of light after some gains, their greatest factors taken off: those are for `Growth`.
 

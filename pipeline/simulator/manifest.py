@@ -19,7 +19,8 @@ def list_effects(decision: Decision, measured: Mapping[str, float] | None = None
     Each has ``name``; ``state`` (on or off); ``variant`` (None where off); ``bound`` on the change of any number by
     treating the effect so, in ``unit``, with the factor of safety: 0 where it is exact or absent, None where there is
     none; ``measured``, the same on chips of the scene (None where not verified); ``cost_s``, estimated CPU seconds of
-    all sweeps; ``why``.
+    all sweeps; ``why`` in a sentence, and its parts: ``reason`` (see `choice.Taken`), ``left_out``, the bound on what
+    leaving it out would change, and ``magnitude``, how large it is here, in the words of its own bound.
 
     Parameters
     ----------
@@ -65,6 +66,9 @@ def _row(one: Taken, decision: Decision, measured: float | None) -> dict[str, An
         "measured": measured,
         "cost_s": _seconds(decision.cost_of(one), decision),
         "why": explain(one, decision),
+        "reason": one.reason,
+        "left_out": _finite(one.menu.off.error),
+        "magnitude": one.menu.off.why,
         "unit": decision.unit,
     }
 

@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.errors import SettingsError
+from pipeline.simulator.coloured_light import light_through
 from pipeline.simulator.effects.effect import OFF, Bound, Effect, Merged
 from pipeline.simulator.gain_range import GainRange, Growth, light_after
 from pipeline.simulator.probe import Probe
@@ -32,6 +33,7 @@ SAFETY = 1.2  # maxima are read off a sample of the scene, derivatives off diffe
 LEAST_COST_NS = 1e-3  # nothing that is computed is free: of two that bound alike, the one without cost stays on longer
 ALWAYS_ON = frozenset({"quantisation", "saturation"})  # raw lines are whole numbers of few bits
 LINEAR_ACTIONS = ("aim", "displaced", "moments", "gain", "change")
+LIGHT_EFFECTS = frozenset({"slit", "smear", "rotation"})  # that the renderer itself does
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,11 @@ class Menu:
         return min((option for option in self.variants if option.error <= error), key=_by_cost, default=self.exact)
 
 
+def acts_on_light(effect: Effect) -> bool:
+    """Whether it comes before the readout: what it changes, later gains multiply."""
+    return effect.name in LIGHT_EFFECTS or any(hasattr(effect, action) for action in LINEAR_ACTIONS)
+
+
 def list_options(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> tuple[Menu, ...]:
     """Ask every effect for the bounds of its options; errors are in the unit of the probe.
 
@@ -87,29 +94,33 @@ def list_options(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> tuple[Men
     present = [_is_present(effect, probe, rig) for effect in effects]
     ranges = [_gain_range(one, probe, rig) if there else None for one, there in zip(effects, present, strict=True)]
     growth = Growth(probe, rig)
+    blurs = [effect for effect, there in zip(effects, present, strict=True) if there and hasattr(effect, "moments")]
+    through = light_through(probe, rig, blurs)
     menus = []
     for place, effect in enumerate(effects):
         arriving = probe
-        if (hasattr(effect, "change") or hasattr(effect, "gain")) and any(ranges[:place]):
-            arriving = light_after(probe, [one for one in ranges[:place] if one is not None], rig)
+        if hasattr(effect, "change") or hasattr(effect, "gain"):
+            arriving = light_after(through, [one for one in ranges[:place] if one is not None], rig)
         gain = _gain_beside(effect, ranges, place, growth)
         menus.append(_menu(effect, arriving, rig, present[place], gain))
     return tuple(menus)
 
 
 def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) -> Menu:
+    costs = effect.cost_at(probe, rig) if hasattr(effect, "cost_at") else effect.cost_ns
+
     def option(variant: str) -> Option:
         bound = _checked_bound(effect, probe, rig, variant)
         error = bound.value * gain * SAFETY if bound.value else 0.0
-        return Option(variant, error, _cost_ns(effect, variant), bound.why)
+        return Option(variant, error, _cost_ns(costs, variant), bound.why)
 
-    exact = Option(effect.variants[0], 0.0, _cost_ns(effect, effect.variants[0]), "exact")
+    exact = Option(effect.variants[0], 0.0, _cost_ns(costs, effect.variants[0]), "exact")
     merged: Merged | None = effect.merged(rig) if hasattr(effect, "merged") else None
     return Menu(effect, (exact, *map(option, effect.variants[1:])), option(OFF), present, merged)
 
 
-def _cost_ns(effect: Effect, variant: str) -> float:
-    return 0.0 if variant == OFF else max(effect.cost_ns[variant], LEAST_COST_NS)
+def _cost_ns(costs: Mapping[str, float], variant: str) -> float:
+    return 0.0 if variant == OFF else max(costs[variant], LEAST_COST_NS)
 
 
 def _checked_bound(effect: Effect, probe: Probe, rig: Rig, variant: str) -> Bound:
@@ -161,7 +172,7 @@ def _gain_range(effect: Effect, probe: Probe, rig: Rig) -> GainRange | None:
 
 def _gain_beside(effect: Effect, ranges: Sequence[GainRange | None], place: int, growth: Growth) -> float:
     """By what all others multiply the error of an effect."""
-    if not any(hasattr(effect, action) for action in LINEAR_ACTIONS):
+    if not acts_on_light(effect):
         return 1.0
     beside = [one for other, one in enumerate(ranges) if one is not None and other != place]
     greatest = [np.maximum(one.greatest, 1.0) for one in beside]

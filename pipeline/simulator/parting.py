@@ -16,7 +16,7 @@ from pipeline.simulator.tap_tables import box_weight
 Floats = NDArray[np.float64]
 Parts = tuple[int, int]
 
-LADDER: tuple[Parts, ...] = ((1, 1), (2, 1), (3, 1), (4, 2), (9, 3))  # across and along; the last is taken as exact
+LADDER: tuple[Parts, ...] = ((1, 1), (2, 1), (3, 1), (5, 2), (9, 3))  # across and along; the last is taken as exact
 _FINER = (18, 6)  # than any; what they are held against
 _PHASES = (0.0, 0.5)  # of the pixels, along either axis
 

@@ -41,6 +41,8 @@ class Probe:
     seconds: float  # from the first line to the last
     white_e: Floats | None = None  # (band,) electrons of the white panel in one exposure; None where not known
     slit_errors: Mapping[str, float] = field(default_factory=dict)  # measured change by variant of the slit, or off
+    usual_e: Floats | None = None  # evenly spaced quantiles of the light along the lines; None where not known
+    places: Floats = field(default_factory=lambda: np.zeros((0, 2)))  # the telling ones, rows and columns, worst first
 
     def moved(self, along_px: float, scan_px: float) -> float:
         """Bound what a shift of the image by at most so much changes: slope times way, never more than the span."""

@@ -84,13 +84,7 @@ def expected_light(scene: Scene, block: Block, chosen: Mapping[Any, str] | Choic
     choice = Choice.of(chosen)
     if block.samples is not None and any(getattr(effect, "whole_line", False) for effect, _ in choice.effects):
         return expected_light(scene, replace(block, samples=None), choice)[:, block.columns]
-    light = _seen(scene, block, choice)
-    for effect, variant in choice.effects:
-        if hasattr(effect, "gain"):
-            light *= effect.gain(block, variant)
-        elif hasattr(effect, "change"):
-            light = effect.change(light, block, variant)
-    return light
+    return _changed(_seen(scene, block, choice), block, choice)
 
 
 def folded_footprint(block: Block, choice: Choice) -> Footprint:
@@ -115,6 +109,26 @@ def _seen(scene: Scene, block: Block, choice: Choice) -> Light:
     exposures = block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
     light = _looker_of(block, choice).look(scene, steps, along_y=block.sweep.along == "y", exposures=exposures)
     return light.reshape(len(block.lines), len(block.columns), light.shape[1])
+
+
+def _changed(light: Light, block: Block, choice: Choice) -> Light:
+    """Multiply and change light as the effects do. Factors without bands are gathered: they pass through spectra."""
+    pending: Light | None = None
+    for effect, variant in choice.effects:
+        if hasattr(effect, "gain"):
+            gain = effect.gain(block, variant)
+            if gain.shape[-1] == 1:
+                pending = gain if pending is None else pending * gain
+            else:
+                light *= gain
+        elif hasattr(effect, "change"):
+            if pending is not None and not getattr(effect, "within_spectra", False):
+                light *= pending
+                pending = None
+            light = effect.change(light, block, variant)
+    if pending is not None:
+        light *= pending
+    return light
 
 
 def _views(block: Block, choice: Choice, shape: tuple[int, int]) -> Iterator[Views]:

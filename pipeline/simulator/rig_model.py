@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import Field, dataclass, field, fields
 from datetime import UTC, datetime
 from typing import Any, Literal
 
@@ -20,7 +20,10 @@ Relief = Literal["flat", "step", "plane"]
 
 
 def stated(default: float, unit: str, source: Source, least: float = 0.0, most: float = math.inf) -> Any:
-    """A number of the rig: its default, its unit, where the default comes from, and the range that makes sense."""
+    """A number of the rig: its default, its unit, where the default comes from, and the range that makes sense.
+
+    It is finite, unless its default is infinity.
+    """
     return field(default=default, metadata={"unit": unit, "source": source, "least": least, "most": most})
 
 
@@ -28,10 +31,10 @@ def stated(default: float, unit: str, source: Source, least: float = 0.0, most: 
 class Optics:
     """Mirror as a stop, lens, slit spectrograph."""
 
-    aperture_mm: float = stated(15.0, "mm", "data sheet", 0.1)  # of the mirror, the aperture stop
+    aperture_mm: float = stated(15.0, "mm", "data sheet", 0.1, 1e3)  # of the mirror, the aperture stop
     focus_m: float = stated(math.inf, "m", "assumed", 0.01)  # distance that is sharp
-    aberration_px: float = stated(0.2, "px", "assumed")  # sd of the lens's own blur
-    keystone_px: float = stated(0.15, "px", "assumed")  # shift along the line from the first wavelength to the last
+    aberration_px: float = stated(0.2, "px", "assumed", 0.0, 1e3)  # sd of the lens's own blur
+    keystone_px: float = stated(0.15, "px", "assumed", 0.0, 1e3)  # shift along the line, first wavelength to last
     smile_nm: float = stated(0.3, "nm", "assumed", -100.0, 100.0)  # how much longer wavelengths are at a line's ends
     fwhm_nm: float = stated(6.0, "nm", "data sheet", 0.0, 1e3)  # width of a band
     stray_share: float = stated(1e-3, "", "assumed", 0.0, 0.5)  # of all light of a line, spread over its detector
@@ -57,13 +60,13 @@ class MirrorMotion:
 class Detector:
     """What the sensor adds to the camera's own read noise, gain and well."""
 
-    dark_e_per_s: float = stated(200.0, "e-/s", "assumed")  # at 25 deg C
+    dark_e_per_s: float = stated(200.0, "e-/s", "assumed", 0.0, 1e9)  # at 25 deg C
     temperature_deg_c: float = stated(25.0, "deg C", "assumed", -80.0, 80.0)
     response_share: float = stated(0.01, "", "assumed", 0.0, 0.5)  # sd of a pixel's gain (PRNU)
     stripe_share: float = stated(0.002, "", "assumed", 0.0, 0.5)  # sd of the gain that a sample's whole column shares
     dead_share: float = stated(0.0, "", "assumed", 0.0, 0.5)
     hot_share: float = stated(0.0, "", "assumed", 0.0, 0.5)
-    hot_e_per_s: float = stated(5e4, "e-/s", "assumed")  # more than a sound element's dark current, at 25 deg C
+    hot_e_per_s: float = stated(5e4, "e-/s", "assumed", 0.0, 1e9)  # beyond a sound element's, at 25 deg C
     well_e: float = stated(math.inf, "e-", "assumed", 1.0)  # that an element holds; inf: the converter clips first
     noiseless: bool = False  # an ideal sensor, for references: no shot noise, read noise or dark current
     unit: int = 0  # which copy of the sensor: its fixed pattern follows from this number
@@ -78,10 +81,10 @@ class Air:
     nearest_m: float | None = None  # None is distance_m
     farthest_m: float | None = None
     lever_m: float = stated(0.1, "m", "assumed", 0.0, 10.0)  # virtual pinhole behind the pivot
-    visibility_km: float = stated(23.0, "km", "assumed", 0.05)
+    visibility_km: float = stated(23.0, "km", "assumed", 0.05, 1e6)
     airlight_share: float = stated(0.3, "", "assumed", 0.0, 5.0)  # light of endless air over the white panel's
     vapour_g_per_m3: float = stated(10.0, "g/m^3", "assumed", 0.0, 100.0)  # of water, absolute humidity
-    turbulence_cn2: float = stated(1e-13, "m^(-2/3)", "assumed")
+    turbulence_cn2: float = stated(1e-13, "m^(-2/3)", "assumed", 0.0, 1e-6)
     wind_amplitude_m: float = stated(0.0, "m", "assumed", 0.0, 100.0)  # of the canopy's sway
     wind_hz: float = stated(1.0, "Hz", "assumed", 0.0, 50.0)
 
@@ -112,8 +115,11 @@ class Rig:
     sky: Sky = field(default_factory=Sky)
 
     def __post_init__(self) -> None:
-        for place, value, least, most in self._numbers():
-            if not least <= value <= most:  # refuses NaN
+        for place, item, value in self._numbers():
+            if math.isnan(value) or (math.isinf(value) and item.default != math.inf):
+                raise SettingsError(f"{place} must be a finite number, got {value:g}")
+            least, most = item.metadata.get("least", -math.inf), item.metadata.get("most", math.inf)
+            if not least <= value <= most:
                 raise SettingsError(f"{place} must be between {least:g} and {most:g}, got {value:g}")
         for name in ("distance_m", "nearest_m", "farthest_m"):
             metres = getattr(self.air, name)
@@ -122,12 +128,12 @@ class Rig:
         if self.sky.started is not None and self.sky.started.tzinfo is None:
             raise SettingsError(f"sky.started needs a time zone, got {self.sky.started}; add +00:00 for UTC")
 
-    def _numbers(self) -> Iterator[tuple[str, float, float, float]]:
-        for part in ("optics", "mirror", "detector", "air", "sky"):
+    def _numbers(self) -> Iterator[tuple[str, Field[Any], float]]:
+        """Give the camera's numbers, and all that have a range, with their places as settings name them."""
+        for part in ("camera", "optics", "mirror", "detector", "air", "sky"):
             for item in fields(getattr(self, part)):
-                if "least" in item.metadata:
-                    value = float(getattr(getattr(self, part), item.name))
-                    yield f"{part}.{item.name}", value, item.metadata["least"], item.metadata["most"]
+                if part == "camera" or "least" in item.metadata:
+                    yield f"{part}.{item.name}", item, float(getattr(getattr(self, part), item.name))
 
     @property
     def distances_m(self) -> tuple[float, float] | None:

@@ -1,4 +1,4 @@
-"""Random streams of the simulator: counter-based, one for each use, so that no draw depends on what else is drawn."""
+"""Random streams of the simulator: one for each use by its own key, so that no draw depends on what else is drawn."""
 
 from __future__ import annotations
 
@@ -27,4 +27,5 @@ def _word(name: str) -> int:
 
 
 def _stream(entropy: int, *key: int) -> np.random.Generator:
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence(entropy=entropy, spawn_key=key)))
+    """Give a stream whose key is hashed to its state; words of SFC64 take half the time of a counter-based Philox."""
+    return np.random.Generator(np.random.SFC64(np.random.SeedSequence(entropy=entropy, spawn_key=key)))

@@ -16,6 +16,7 @@ from pipeline.simulator.effects.defocus import DEFOCUS
 from pipeline.simulator.effects.diffraction import DIFFRACTION
 from pipeline.simulator.effects.effect import OFF, Moments
 from pipeline.simulator.effects.keystone import KEYSTONE
+from pipeline.simulator.effects.pupil import middle_normal
 from pipeline.simulator.effects.slit import SLIT, box_of, box_parts
 from pipeline.simulator.effects.turned import UPRIGHT
 from pipeline.simulator.footprint import Footprint, fold
@@ -40,10 +41,13 @@ Light = NDArray[np.float32]
 
 MOST_VALUES = 1_000_000  # samples times bands; each is seen a few times over, a fraction of a px apart
 MOST_SAMPLES = 12_000
+USUAL_LIGHTS = 101  # quantiles of the light that are kept
 FINEST_SAMPLES = 1000  # at which variants of the slit are held against the finest
 _LEAST_OF_SWEEP = 50
 _LOOK, _CLOSE = (2, 1), (3, 1)  # boxes that are looked through, and that tell where variants differ
 _ROUNDING = 2e-6  # of the level: less is rounding of float32
+_ALIKE = 0.02  # share by which blurs may differ and count as one
+_OPTICS = (DIFFRACTION, DEFOCUS, ABERRATION, KEYSTONE)
 _NEAR, _FAR = 0.25, 0.5  # px by which the footprint is shifted
 _PHASES = tuple(((along, scan), (0.0, 0.0)) for along in (0.0, 0.5) for scan in (0.0, 0.5))  # at which boxes differ
 
@@ -80,11 +84,13 @@ def probe_scene(scene: Scene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "s
     seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _LOOK, None, scene), _shifts())
     means = seen[0, : len(lines.slope)].reshape(-1, line_samples(camera) * bands).mean(axis=1)
     errors = _slit_errors(scene, rig, views, taken, unit)
-    return replace(_summed_up(scene, rig, taken, unit, seen, means), slit_errors=errors)
+    usual = np.quantile(seen[0, : len(lines.slope)], np.linspace(0, 1, USUAL_LIGHTS)).astype(np.float64)
+    summed = _summed_up(scene, rig, taken, unit, seen, means)
+    return replace(summed, slit_errors=errors, usual_e=usual, places=places)
 
 
 def _slit_errors(scene: Scene, rig: Rig, views: SampleViews, sweeps: tuple[Sweep, ...], unit: Unit) -> dict[str, float]:
-    """Greatest change by every variant of the slit, over the unit: off, or against the finest; with blurs and without.
+    """Greatest change by every variant of the slit, over the unit: off, or against the finest, beside the rig's blurs.
 
     Each sweep is seen through the boxes that a variant takes for it. Scenes without pixels know no boxes.
     """
@@ -92,7 +98,7 @@ def _slit_errors(scene: Scene, rig: Rig, views: SampleViews, sweeps: tuple[Sweep
     views = views.chosen(_roughest(scene, rig, views, unit))
     whole = [views_all_over(rig, sweep, exact=True) for sweep in sweeps]
     errors = dict.fromkeys((*SLIT.variants[1:], OFF), 0.0)
-    for moments in (None, _blurs(rig, scene.wavelength_nm)):
+    for moments in _blurs(rig, scene.wavelength_nm, sweeps):
         boxes = {parts: _footprint(SLIT.variants[0], rig, parts, moments, scene) for parts in ladder}
         finest = light_seen(scene, rig.camera, views, boxes[LADDER[-1]], _PHASES)
         scale = _unit(finest, rig, unit)
@@ -136,10 +142,19 @@ def _footprint(variant: str, rig: Rig, parts: tuple[int, int], moments: Moments 
     return fold(box_of(variant, rig), parts, 1, shift, variance)
 
 
-def _blurs(rig: Rig, wavelength_nm: Floats) -> Moments:
-    """All that the rig's optics blur and shift, with the mirror at rest."""
-    blurs = (DIFFRACTION, DEFOCUS, ABERRATION, KEYSTONE)
-    found = [blur.moments(rig, wavelength_nm, blur.variants[0]) for blur in blurs]
+def _blurs(rig: Rig, wavelength_nm: Floats, sweeps: Sequence[Sweep]) -> list[Moments]:
+    """All that the rig's optics blur and shift in the sweeps where that is least and most; once where it is the same.
+
+    The slit's variants stand beside all other effects: what leaving out a blur changes is bounded for any slit.
+    """
+    found = [_moments(rig, wavelength_nm, middle_normal(sweep, rig)) for sweep in sweeps]
+    found.sort(key=lambda one: float(one.variance.sum()))
+    least, most = found[0], found[-1]
+    return [least] if np.allclose(least.variance, most.variance, rtol=_ALIKE) else [least, most]
+
+
+def _moments(rig: Rig, wavelength_nm: Floats, normal: Floats) -> Moments:
+    found = [blur.moments(rig, wavelength_nm, blur.variants[0], normal) for blur in _OPTICS]
     none = np.zeros((2, len(wavelength_nm)))
     return Moments(sum((one.shift for one in found), none), sum((one.variance for one in found), none))
 

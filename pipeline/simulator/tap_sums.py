@@ -152,10 +152,12 @@ class Gatherer:
 
 def _joint(turn: Light, run: Light) -> Light:
     """Sum of products (across * along, n) over the parts of weights (across, part, n) and (along, part, n)."""
+    import torch
+
     joint = np.multiply(turn[:, None, 0], run[None, :, 0])
-    part = np.empty_like(joint)
+    total, across, along = (torch.from_numpy(one) for one in (joint, turn, run))
     for number in range(1, turn.shape[1]):
-        joint += np.multiply(turn[:, None, number], run[None, :, number], out=part)
+        total.addcmul_(across[:, None, number], along[None, :, number])
     return joint.reshape(-1, turn.shape[2])
 
 

@@ -17,11 +17,12 @@ Floats = NDArray[np.float64]
 Weights = NDArray[np.float32]
 
 PER_PX = 128  # rows of a table; between them weights are linear, right to 8e-6 of a kernel's curvature
-SCALE_STEP = 1 / 2048  # from one tabulated scale to the next; the nearest is taken
-_WORKED_OUT = 8  # every so many of them are worked out, those between are linear: right to 2e-6
-TAIL = 3e-5  # share of a kernel's weight, by size, that may lie beyond its taps; what is left is scaled to sum 1
-TAIL_WEIGHT = 2e-5  # of any one tap beyond them: weights jump by so much where a tap comes in
-TABULATED = 1e-4  # share of the light, by size, that a table of either axis misplaces at most, scales apart
+SCALE_STEP = 1 / 4096  # from one tabulated scale to the next; the nearest is taken
+_WORKED_OUT = 16  # every so many of them are worked out, those between are linear: right to 2e-6
+TAIL = 5e-6  # share of a kernel's weight, by size, that may lie beyond its taps; what is left is scaled to sum 1
+TAIL_WEIGHT = 5e-6  # of any one tap beyond them: weights jump by so much where a tap comes in
+TABULATED = 2e-5  # share of the light, by size, that a table of either axis misplaces at most, but for what follows
+BETWEEN_ROWS = 1 / (4 * PER_PX**2)  # variance that a kernel gains between two rows at most: half of either [px^2]
 _SDS = 6.5  # of a Gaussian: nothing beyond
 
 
@@ -102,6 +103,8 @@ class TapTable:
 
     def read(self, off: Weights, scale_row: NDArray[np.intp]) -> Weights:
         """Give the weights (tap, kernel, part, n) of positions (kernel, part, n) ``off`` px beside their pixel."""
+        import torch
+
         row = (off + np.float32(self.left - self.first)) * np.float32(PER_PX)
         np.clip(row, 0, self.rows - 2, out=row)
         index = row.astype(np.intp)
@@ -111,9 +114,7 @@ class TapTable:
         np.take(self.weight, index, axis=1, out=weight, mode="clip")
         index += 1
         np.take(self.weight, index, axis=1, out=beyond, mode="clip")
-        beyond -= weight
-        beyond *= row
-        weight += beyond
+        torch.from_numpy(weight).lerp_(torch.from_numpy(beyond), torch.from_numpy(row))
         return weight
 
 

@@ -15,13 +15,12 @@ from pipeline.simulator.chips import Units
 from pipeline.simulator.choice import Decision, Taken
 from pipeline.simulator.effects.effect import OFF, Effect, Light
 from pipeline.simulator.manifest import TOTAL, UNIT_WORDS
-from pipeline.simulator.options import LINEAR_ACTIONS
+from pipeline.simulator.options import acts_on_light
 
 Floats = NDArray[np.float64]
 Render = Callable[[Block, Mapping[Effect, str]], Light]
 
 ROUNDING = 4e-6  # of the light: float32 sums over the rays of a footprint
-LIGHT_EFFECTS = frozenset({"slit", "smear", "rotation"})  # that the renderer itself does
 
 
 @dataclass(frozen=True)
@@ -92,8 +91,7 @@ def _once_each(chips: Mapping[str, Block]) -> dict[str, Block]:
 
 
 def _changes_light(one: Taken) -> bool:
-    linear = one.name in LIGHT_EFFECTS or any(hasattr(one.menu.effect, action) for action in LINEAR_ACTIONS)
-    return linear and one.menu.present and one.option is not one.menu.exact
+    return acts_on_light(one.menu.effect) and one.menu.present and one.option is not one.menu.exact
 
 
 def _with(decision: Decision, inexact: Sequence[Taken]) -> dict[Effect, str]:

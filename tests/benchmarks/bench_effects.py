@@ -20,11 +20,11 @@ from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.effects.rotation import ROTATION
 from pipeline.simulator.effects.slit import SLIT
 from pipeline.simulator.farm import farm_scene
+from pipeline.simulator.probe import Probe
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Rig
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.scouting import telling_places
 from pipeline.simulator.survey_probe import noise_electrons, probe_scene
 from pipeline.simulator.verification import verify
 from tests.pipeline.simulator.bound_trials import DRAWN, Trial, trials
@@ -99,7 +99,7 @@ def _of_rig(scene: RasterScene, name: str, rig: Rig, sweeps: tuple[Sweep, ...]) 
         _tolerance_row(name, apart, decision),
         _cpu_row(name, "cheap", clocks, apart["cheap"]),
         _cpu_row(name, "exact", clocks, 0.0),
-        _verified(scene, name, decision, sweeps, f"probe {probed:.1f} s, choice {decided:.2f} s"),
+        _verified(scene, name, decision, probe, f"probe {probed:.1f} s, choice {decided:.2f} s"),
         Row(f"farm@1, {name}: on", ", ".join(f"{one.name}" for one in decision.taken if one.is_on)),
     ]
 
@@ -143,12 +143,11 @@ def _cpu_row(name: str, against: str, clocks: Mapping[str, Clock], apart: float)
     )
 
 
-def _verified(scene: RasterScene, name: str, decision: Decision, sweeps: tuple[Sweep, ...], before: str) -> Row:
+def _verified(scene: RasterScene, name: str, decision: Decision, probe: Probe, before: str) -> Row:
     rig, clock = RIGS[name], time.process_time()
     units = partial(noise_electrons, rig=rig)
-    whole = [_block(scene, rig, sweep, range(sweep.lines)) for sweep in sweeps]
-    places = telling_places(scene, rig.camera, sweeps)
-    chips = worst_chips(candidate_chips(whole, places), lambda chip: expected_light(scene, chip, LOOK), units)
+    whole = [_block(scene, rig, sweep, range(sweep.lines)) for sweep in probe.sweeps]
+    chips = worst_chips(candidate_chips(whole, probe.places), lambda chip: expected_light(scene, chip, LOOK), units)
     measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), chips, units)
     spent = time.process_time() - clock
     worst = max(measured.values())

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from flows import benchmark_work
 from flows.benchmark_costs import Prices
-from flows.benchmark_frames import FARM_TEST_SEED, open_candidates
+from flows.benchmark_frames import open_candidates
 from flows.benchmark_request import EvaluateRequest
 from flows.benchmark_rows import ORACLE, Trial, captured_px, judge_frame, placings
 from flows.benchmark_series import collect_row
@@ -23,12 +23,14 @@ from flows.benchmark_timing import Rounds, cpu_seconds, row_seconds
 from flows.cli import main
 from flows.evaluate_command import evaluate_weights, run_evaluate
 from flows.train import TrainRequest, train_weights
-from flows.training_data import pack_mask
+from flows.training_data import farm_test_data, pack_mask
 from models.metrics import average_accuracy, kappa, mean_iou, overall_accuracy
 from models.training import TrainingSettings
 from models.weights import load_weights, save_weights
+from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, SettingsError, WeightsError
 from pipeline.simulator.farm_fields import CLASSES
+from pipeline.simulator.instrument import USUAL
 from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_field, write_weights
 from tests.models.conftest import make_weights
 
@@ -340,11 +342,12 @@ def test_everything_timed_goes_in_turn():
 def test_the_farm_is_judged_on_seeds_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Small built-in fields, neither trained on nor shown, noisy: with equal time beside equal exposure."""
     monkeypatch.setattr("flows.training_data.FARM_SHAPE", (32, 48))
+    monkeypatch.setattr("flows.training_look.chosen_effects", lambda *given: USUAL)  # choosing takes seconds a look
     made, weights = make_weights(classes=len(CLASSES), columns=6), tmp_path / "w.safetensors"
     save_weights(replace(made, class_names=CLASSES), weights)
     quick = {**QUICK, "policies": ("entropy",), "shares": (0.25,), "timed_frames": 0, "equal_time": True}
     content = evaluate_weights(EvaluateRequest("farm", (weights,), scenes=2, **quick))
-    assert content["frames"] == [str(FARM_TEST_SEED), str(FARM_TEST_SEED + 1)]
+    assert content["frames"] == [*farm_test_data("farm", 2, LineCamera()).train]
     assert 0 <= _row(content, "none", 0.0)["miou"] <= 1
     assert content["equal_time"][0]["frames"] == 2
 

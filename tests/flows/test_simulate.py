@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import xarray as xr
+from rich.console import Console
 
 from flows import effect_choice
+from flows.effect_table import print_effects
 from pipeline.errors import BoundError
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.scene import RasterScene
@@ -100,6 +104,7 @@ def test_a_broken_scan_goes_on_where_it_was(
     ("flags", "message"),
     [
         (["--effects", "smear,turbulance"], "--effects: unknown effect 'turbulance'; did you mean 'turbulence'?"),
+        (["--effects", "auto,smear"], "--effects: 'auto' stands alone, got 'auto,smear'"),
         (["--effects", "throughput"], "--effects: the effect 'throughput' is now called 'vignetting'"),
         (["--tol", "-1"], "--tol must be 0 or more"),
         (["--size", "64x64"], "size is for built-in scenes"),
@@ -128,3 +133,47 @@ def test_a_broken_bound_is_one_message(
     ended = command_line(*words(scene_files, tmp_path))
     assert ended.code == 1
     assert ended.errors == ["smile: what was left out changes light by 3; simulate with --tol 0"]
+
+
+def test_a_file_with_gaps_is_refused_with_the_first(command_line: Any, tmp_path: Path) -> None:
+    """No light is invented; bands are numbered as in the file."""
+    values = np.ones((20, 30, 4), np.float32)
+    values[3, 4, 2], values[7, 8, 2] = np.nan, np.inf
+    np.save(tmp_path / "gaps.npy", values)
+    given = ["simulate", tmp_path / "gaps.npy", "-o", tmp_path / "none", "--bands", "1,2", "--wavelengths", "550,650"]
+    ended = command_line(*given)
+    assert ended.code == 1
+    (message,) = ended.errors
+    assert "has no finite value at row 3, column 4, band 2 (pixels without: 2)" in message
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_scene_of_one_band_is_simulated(command_line: Any, tmp_path: Path) -> None:
+    """What needs neighbouring bands is not there."""
+    np.save(tmp_path / "one.npy", np.random.default_rng(0).uniform(0.1, 1, (20, 30, 1)).astype(np.float32))
+    out = tmp_path / "scan"
+    ended = command_line("simulate", tmp_path / "one.npy", "-o", out, "--coarse", "--wavelengths", "650", "--json")
+    rows = {row["name"]: row for row in json.loads(ended.out)["effects"]}
+    assert (rows["smile"]["reason"], rows["smear"]["state"]) == ("absent", "on")
+
+
+ROW = {"name": "smile", "state": "on", "variant": "cubic", "bound": 0.0, "measured": None, "cost_s": 0.004,
+       "why": "", "reason": "needed", "left_out": 1.4, "magnitude": "smile: 0.3 nm", "unit": "sigma"}  # fmt: skip
+TOTAL = {"asked": "auto", "tolerance": 0.1, "unit": "sigma", "bound": 0.0, "measured": 0.0, "within": True, "on": 1,
+         "off": 1, "saved_s": 1.0, "saved_cheap_s": 0.5}  # fmt: skip
+
+
+@pytest.mark.parametrize("width", [72, 80, 100, 120])
+def test_the_table_fits_the_terminal(width: int) -> None:
+    """Figures are never broken; words stand in the table where there is room, else below it."""
+    said = io.StringIO()
+    absent = ROW | {"name": "wind", "state": "off", "reason": "absent", "magnitude": "the air is calm"}
+    long = ROW | {"name": "thermal-drift", "variant": "positions", "magnitude": "a way of words " * 12}
+    print_effects([ROW, long, absent], TOTAL, Console(file=said, width=width))
+    lines = said.getvalue().splitlines()
+    assert max(map(len, lines)) <= width
+    (row,) = [line for line in lines if line.split()[:2] == ["smile", "cubic"]]
+    assert "< 0.01 s" in row
+    assert ("0.3 nm" in row) == (width >= 100)
+    assert "smile: smile" not in said.getvalue()
+    assert "Not there: wind (the air is calm)." in said.getvalue()

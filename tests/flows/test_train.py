@@ -51,7 +51,7 @@ def test_sizes_that_do_not_fit_are_refused_before_the_first_look(
     tmp_path: Path, sizes: dict[str, int], monkeypatch: pytest.MonkeyPatch
 ):
     """No scene is looked at for a segmenter that cannot be built."""
-    monkeypatch.setattr(flow, "observe", lambda *args: pytest.fail("a scene was looked at"))
+    monkeypatch.setattr(flow, "observe_scene", lambda *args: pytest.fail("a scene was looked at"))
     with pytest.raises(SettingsError, match="choose another --patch or --factor"):
         train_weights(_request(tmp_path, **sizes))
 

@@ -22,7 +22,7 @@ class Aberration:
 
     name = "aberration"
     variants = ("gaussian",)
-    cost_ns = MappingProxyType({"gaussian": 1.9})
+    cost_ns = MappingProxyType({"gaussian": 0.3})
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
         """Give the blur, equal in all bands."""

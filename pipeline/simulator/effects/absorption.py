@@ -9,6 +9,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Bound, Light
-from pipeline.simulator.effects.sight import reach_m, sample_distances, spoken_reach
+from pipeline.simulator.effects.sight import has_relief, reach_m, sample_distances, spoken_reach
 from pipeline.simulator.gain_range import GainRange
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
@@ -50,7 +51,11 @@ class Absorption:
 
     name = "absorption"
     variants = (RANGE, UNIFORM)
-    cost_ns = MappingProxyType({RANGE: 3.0, UNIFORM: 0.2})  # range: of a scene with relief
+    cost_ns = MappingProxyType({RANGE: 2.7, UNIFORM: 0.2})  # of a scene with relief
+
+    def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
+        """Give the cost for the scene's relief: without any, samples share one distance."""
+        return self.cost_ns if has_relief(rig) else dict.fromkeys(self.variants, self.cost_ns[UNIFORM])
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
         """Bound by level times the share that gases take, or that a variant misses."""

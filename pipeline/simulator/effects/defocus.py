@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator.effects.blurring import blurred_bound, even
-from pipeline.simulator.effects.effect import OFF, Bound, Moments
+from pipeline.simulator.effects.diffraction import AIRY, DIFFRACTION
+from pipeline.simulator.effects.effect import OFF, Bound, Merged, Moments
 from pipeline.simulator.effects.pupil import normals_met, spread_of_rays
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
@@ -23,7 +24,11 @@ class Defocus:
 
     name = "defocus"
     variants = ("disc",)
-    cost_ns = MappingProxyType({"disc": 3.5})
+    cost_ns = MappingProxyType({"disc": 1.1})
+
+    def merged(self, rig: Rig) -> Merged:
+        """Give what it costs in the kernels that diffraction needs anyway."""
+        return Merged(DIFFRACTION.name, AIRY, 0.4)
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
         """Give the blur, equal in all bands; ``normal`` (3,) is the mirror's in the camera frame, None at rest."""

@@ -80,14 +80,6 @@ def daylight_range(probe: Probe, rig: Rig) -> GainRange:
     return GainRange.of(light, nm, uneven=float(np.ptp(light, axis=1).max(initial=0.0)))
 
 
-def greatest_daylight(probe: Probe, rig: Rig) -> float:
-    """Give the most light of any band in the survey, over that at its start; 1 without a time of day."""
-    if rig.sky.started is None:
-        return 1.0
-    times = knots_within(rig.sky, probe.seconds + rig.camera.frame_ms * 1e-3)
-    return max(float(relative_daylight(rig.sky, probe.wavelength_nm, some).max(initial=0.0)) for some in _parts(times))
-
-
 def _daylight(sky: Sky, wavelength_nm: Floats, seconds: Floats, variant: str) -> Floats:
     """Give (time, band), or (time, 1), over the light at the start."""
     if variant == LINEAR:

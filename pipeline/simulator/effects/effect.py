@@ -36,7 +36,7 @@ class Bound:
 
 
 class Merged(NamedTuple):
-    """What an effect costs beside a variant of another, with which it shares a draw. [ns]"""
+    """What an effect costs beside a variant of another, with which it shares a draw, or kernels. [ns]"""
 
     other: str
     variant: str
@@ -44,7 +44,11 @@ class Merged(NamedTuple):
 
 
 class Effect(Protocol):
-    """What the decision needs to know. ``variants`` go from exact to cheap; off is none of them."""
+    """What the decision needs to know. ``variants`` go from exact to cheap; off is none of them.
+
+    One that shares its work with another's says so by ``merged(rig)``; one whose cost depends on the light gives it by
+    ``cost_at(probe, rig)``, like ``cost_ns``.
+    """
 
     @property
     def name(self) -> str:

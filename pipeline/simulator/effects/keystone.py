@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator.effects.blurring import UNITS
-from pipeline.simulator.effects.effect import OFF, Bound, Moments
+from pipeline.simulator.effects.diffraction import AIRY, DIFFRACTION
+from pipeline.simulator.effects.effect import OFF, Bound, Merged, Moments
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -29,7 +30,11 @@ class Keystone:
 
     name = "keystone"
     variants = ("linear",)
-    cost_ns = MappingProxyType({"linear": 2.8})
+    cost_ns = MappingProxyType({"linear": 4.0})
+
+    def merged(self, rig: Rig) -> Merged:
+        """Give what it costs in the kernels that diffraction needs anyway."""
+        return Merged(DIFFRACTION.name, AIRY, 0.3)
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
         """Give the shift of each band."""

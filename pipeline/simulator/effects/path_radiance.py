@@ -10,6 +10,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -18,10 +19,12 @@ from numpy.typing import NDArray
 
 from pipeline.simulator.block import Block
 from pipeline.simulator.daylight import relative_daylight
-from pipeline.simulator.effects.drift import daylight_range, greatest_daylight
+from pipeline.simulator.effects.brdf import BRDF
+from pipeline.simulator.effects.cloud import CLOUD
+from pipeline.simulator.effects.drift import daylight_range
 from pipeline.simulator.effects.effect import OFF, Bound, Light
-from pipeline.simulator.effects.sight import reach_m, sample_distances, spoken_reach
-from pipeline.simulator.gain_range import GainRange
+from pipeline.simulator.effects.sight import has_relief, reach_m, sample_distances, spoken_reach
+from pipeline.simulator.gain_range import GainRange, lights_within, unit_electrons
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Air, Rig
 
@@ -45,12 +48,16 @@ class PathRadiance:
 
     name = "path-radiance"
     variants = (RANGE, UNIFORM)
-    cost_ns = MappingProxyType({RANGE: 3.3, UNIFORM: 0.2})  # range: of a scene with relief
+    cost_ns = MappingProxyType({RANGE: 3.1, UNIFORM: 0.5})  # of a scene with relief
+
+    def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
+        """Give the cost for the scene's relief: without any, samples share one distance."""
+        return self.cost_ns if has_relief(rig) else dict.fromkeys(self.variants, self.cost_ns[UNIFORM])
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
-        """Bound by the greater of signal and H, times the share that is lost, or that a variant misses.
+        """Bound by the share that is lost, or that a variant misses, times the greatest difference of signal and H.
 
-        Signals are of one sign, so loss and gain never add up.
+        Over the noise of the signal that difference is greatest where the signal is greatest, or least.
         """
         reach = reach_m(rig)
         if reach is None:
@@ -62,7 +69,7 @@ class PathRadiance:
         if variant == UNIFORM:
             middle = depth * sum(reach) / 2
             lost = np.maximum(_between(depth * reach[0], middle), _between(middle, depth * reach[1]))
-        worst = max(probe.scaled(lost), _airlight(probe, rig, lost))
+        worst = float((_contrast(probe, rig) * lost).max(initial=0.0))
         verb = "takes" if variant == OFF else "at one distance for all is wrong by"
         most = f"at most {lost.max(initial=0.0):.2%} of the light"
         return Bound(worst, f"air {verb} {most} and adds its own, over {spoken_reach(reach)}")
@@ -121,12 +128,22 @@ def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
     return per_m
 
 
-def _airlight(probe: Probe, rig: Rig, lost: Floats) -> float:
-    """Greatest light that the air adds, over the smallest unit met."""
+def _contrast(probe: Probe, rig: Rig) -> Floats:
+    """Greatest difference of a signal and the light of endless air, over the signal's unit, (band,).
+
+    Daylight multiplies both, and is a gain like any other for the signals above H; clouds and the angle of view change
+    the signal alone, so that H counts over their greatest factor, and the darkest signal after their least.
+    """
     if probe.white_e is None:
-        return 0.0
-    added = rig.air.airlight_share * greatest_daylight(probe, rig) * float((probe.white_e * lost).max(initial=0.0))
-    return probe.added(added, rig.camera.electrons_per_dn)
+        return probe.level
+    horizon, (low, high) = rig.air.airlight_share * probe.white_e, lights_within(probe, rig)
+    cloud, view = CLOUD.gain_range(probe, rig), BRDF.gain_range(probe, rig)
+    lit, shaded = np.maximum(cloud.greatest * view.greatest, 1.0), cloud.least * view.least
+    above = probe.level * np.clip(1 - horizon / np.maximum(lit * high, np.finfo(float).tiny), 0.0, 1.0)
+    sun = daylight_range(probe, rig)
+    below = np.maximum(horizon - shaded * low, 0.0) * np.maximum(sun.greatest, 1.0)
+    worst: Floats = np.maximum(above, below / unit_electrons(shaded * np.minimum(sun.least, 1.0) * low, probe, rig))
+    return worst
 
 
 def _between(near: Floats, far: Floats) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -10,11 +11,21 @@ import numpy as np
 from pipeline.simulator.effects.dark_current import dark_electrons
 from pipeline.simulator.effects.defects import most_hot_electrons
 from pipeline.simulator.effects.effect import OFF, Bound
-from pipeline.simulator.noise import CHIP_SAMPLES, MOST_VARIATION, chip_variation, least_expected, told_apart
+from pipeline.simulator.effects.saturation import well_reached
+from pipeline.simulator.noise import (
+    CHIP_SAMPLES,
+    LEAST_MERGED_READ_E,
+    MOST_VARIATION,
+    SERIES_FROM_E,
+    chip_variation,
+    least_expected,
+    told_apart,
+)
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
 EXACT, GAUSSIAN = "exact", "gaussian"
+DIM_NS = 80.0  # of an exact count below `SERIES_FROM_E`, in lines of any light
 
 
 @dataclass(frozen=True)
@@ -27,7 +38,21 @@ class Shot:
 
     name = "shot"
     variants = (EXACT, GAUSSIAN)
-    cost_ns = MappingProxyType({EXACT: 10.0, GAUSSIAN: 3.9})
+    cost_ns = MappingProxyType({EXACT: 10.0, GAUSSIAN: 3.9})  # of light above `SERIES_FROM_E`
+
+    def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
+        """Give the cost at the light along the probe's lines: few electrons are counted one by one.
+
+        Cheap draws pay for the exact ones that stand in for them where too few electrons are expected.
+        """
+        if probe.usual_e is None:
+            return self.cost_ns
+        expected = probe.usual_e + dark_electrons(rig)
+        counted = self.cost_ns[EXACT] + (DIM_NS - self.cost_ns[EXACT]) * float((expected < SERIES_FROM_E).mean())
+        read = rig.camera.read_noise_e
+        merged = read >= LEAST_MERGED_READ_E and not well_reached(rig, read)
+        dim = float((expected < least_expected(read if merged else 0.0)).mean())
+        return {EXACT: counted, GAUSSIAN: self.cost_ns[GAUSSIAN] + dim * counted}
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
         """Bound it at the brightest sample, where it is the greatest share of all noise."""

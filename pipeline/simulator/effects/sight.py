@@ -24,6 +24,12 @@ def reach_m(rig: Rig) -> tuple[float, float] | None:
     return min(*ends, FARTHEST_M), min(max(ends), FARTHEST_M)
 
 
+def has_relief(rig: Rig) -> bool:
+    """Whether samples see the scene at more than one distance."""
+    reach = reach_m(rig)
+    return reach is not None and reach[0] != reach[1]
+
+
 def sample_distances(block: Block) -> Floats:
     """Give the distance where each sample looks by the plan, (line, sample) [m]; (1, 1) where all of it is the same."""
     ends = reach_m(block.rig)

@@ -18,7 +18,7 @@ from pipeline.simulator.rig_model import Rig
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
 CUBIC, LINEAR = "cubic", "linear"
-GROUP = 16  # samples at a time: they stay in the processor's cache
+GROUP = 32  # samples at a time: they stay in the processor's cache
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,8 @@ class Smile:
 
     name = "smile"
     variants = (CUBIC, LINEAR)
-    cost_ns = MappingProxyType({CUBIC: 2.8, LINEAR: 1.6})
+    within_spectra = True  # a factor of a whole spectrum passes through
+    cost_ns = MappingProxyType({CUBIC: 0.9, LINEAR: 0.5})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
         """Bound it by I' s, and a cubic beside its chord by I'' s (h - s) / 2 in a gap h between bands."""
@@ -83,14 +84,14 @@ def wavelength_shift(samples: int, smile_nm: float) -> Floats:
 
 def _mix_bands(light: Light, made: Light, first: int, weights: Light) -> None:
     """Sum shifted bands times weights into ``made``: tap k takes band b + first + k for band b."""
-    bands = light.shape[-1]
-    np.multiply(light, weights[-first], out=made)
-    part = np.empty_like(made)
-    for tap, weight in enumerate(weights, start=first):
-        if tap != 0:
+    import torch
+
+    bands, (from_light, into, shares) = light.shape[-1], map(torch.from_numpy, (light, made, weights))
+    torch.mul(from_light, shares[-first], out=into)
+    for tap, share in enumerate(shares, start=first):
+        if tap != 0:  # one pass over the light, not a product and a sum
             low, high = max(0, -tap), bands - max(0, tap)
-            taken = light[..., low + tap : high + tap]
-            made[..., low:high] += np.multiply(taken, weight[:, low:high], out=part[..., low:high])
+            into[..., low:high].addcmul_(from_light[..., low + tap : high + tap], share[:, low:high])
 
 
 @lru_cache(maxsize=4)
@@ -113,7 +114,9 @@ def _tap_weights(
         weights[-first, :, run] = 0
     for run, off, weight in taps:
         weights[off - first, sample, np.arange(run.start, run.stop)] += weight
-    return first, weights.astype(np.float32)
+    used = np.flatnonzero(weights.any(axis=(1, 2)))
+    low, high = min(used[0], -first), max(used[-1], -first)
+    return first + int(low), weights[low : high + 1].astype(np.float32)
 
 
 def _run_taps(wavelength: Floats, shift: Floats, variant: str) -> list[tuple[NDArray[np.int64], Floats]]:

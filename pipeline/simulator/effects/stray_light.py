@@ -65,9 +65,9 @@ class StrayLight:
                 "make whole lines and cut them afterwards, or leave stray-light out"
             )
         for line in light:  # line by line: rounding, too, does not depend on the block
-            scattered = _scattered(line, optics) if variant == HALO else line.mean(dtype=np.float64)
+            scattered = _scattered(line, optics) if variant == HALO else _even(line, optics)
             line *= np.float32(1 - optics.stray_share)
-            line += (scattered * np.float32(optics.stray_share)).astype(np.float32)
+            line += scattered
         return light
 
 
@@ -102,13 +102,17 @@ def _off_even(count: int, sd_px: float) -> float:
     return float(np.abs(kernel - 1 / count).sum(axis=1).max()) / 2
 
 
+def _even(line: Light, optics: Optics) -> np.float32:
+    return np.float32(optics.stray_share * line.mean(dtype=np.float64))
+
+
 def _scattered(line: Light, optics: Optics) -> Light:
-    """Take a frame to its slowest cosines, weaken them as the kernel K does, and back: K S, (sample, band)."""
+    """Take a frame to its slowest cosines, weaken them as the kernel f K does, and back: f K S, (sample, band)."""
     along, along_kept = _cosines(line.shape[0], optics.stray_halo_px)
     across, across_kept = _cosines(line.shape[1], optics.stray_halo_px)
     kept = np.outer(along_kept, across_kept) * (1 - optics.stray_even)
     kept[0, 0] = 1
-    modes = along @ (line @ across.T) * kept.astype(np.float32)
+    modes = along @ (line @ across.T) * (optics.stray_share * kept).astype(np.float32)
     back: Light = (along.T @ modes) @ across
     return back
 

@@ -14,10 +14,12 @@ from hypothesis import strategies as st
 from pipeline.errors import SettingsError
 from pipeline.simulator.choice import Decision, decide, named_effects
 from pipeline.simulator.effects.cloud import CLOUD
+from pipeline.simulator.effects.diffraction import DIFFRACTION
+from pipeline.simulator.effects.keystone import KEYSTONE
 from pipeline.simulator.effects.read_noise import READ_NOISE
 from pipeline.simulator.effects.shot import SHOT
-from pipeline.simulator.options import LEAST_COST_NS, SAFETY, list_options
-from pipeline.simulator.rig_model import Rig, Sky
+from pipeline.simulator.options import LEAST_COST_NS, SAFETY, cost_of, list_options
+from pipeline.simulator.rig_model import Detector, Rig, Sky
 from tests.pipeline.simulator.made_up_effects import RIG, Brightening, MadeUp, Shift, even_probe
 
 PROBE = even_probe()
@@ -191,6 +193,45 @@ def test_a_gain_that_only_darkens_does_not_multiply_errors():
     assert cloud == pytest.approx(0.5 * SAFETY * math.sqrt((1e4 + 402.083) / (5e3 + 402.083)), rel=1e-6)
 
 
+@pytest.mark.parametrize("name", ["rotation", "slit", "smear"])
+def test_later_gains_multiply_errors_of_what_the_renderer_does(name: str):
+    """Lines that are not turned, seen in 1.5 times the light, err by 1.5 times; noise that is read out does not."""
+    effects = [MadeUp(name, 0.1), MadeUp("read", 0.1), Brightening("drift", 0.5, share=0.5)]
+    errors = [menu.off.error for menu in list_options(replace(PROBE, unit="dn"), RIG, effects)]
+    assert errors[:2] == pytest.approx([0.15 * SAFETY, 0.1 * SAFETY])
+
+
+@pytest.mark.parametrize(("light_e", "exact_ns"), [(100.0, 10.0), (1.0, 80.0)])
+def test_exact_counts_cost_by_the_light(light_e: float, exact_ns: float):
+    """Few electrons are counted one by one; a third of them dim costs as much of the way."""
+    rig = replace(RIG, detector=Detector(dark_e_per_s=0.0))
+    even = replace(PROBE, usual_e=np.full(9, light_e))
+    mixed = replace(PROBE, usual_e=np.array([1.0, 100.0, 1000.0]))
+    assert list_options(even, rig, [SHOT])[0].exact.cost_ns == pytest.approx(exact_ns)
+    assert list_options(mixed, rig, [SHOT])[0].exact.cost_ns == pytest.approx(10 + 70 / 3)
+
+
+def test_cheap_counts_pay_for_the_exact_ones_where_few_are_expected():
+    """Without read noise to hide them, whole numbers show up to some hundred electrons."""
+    dim, bright = (replace(PROBE, usual_e=np.full(9, light)) for light in (100.0, 1e4))
+    sharp = replace(RIG, camera=replace(RIG.camera, read_noise_e=0.0))
+    costs = [list_options(probe, rig, [SHOT])[0].variants[1].cost_ns for rig in (RIG, sharp) for probe in (dim, bright)]
+    assert costs == pytest.approx([3.9, 3.9, 13.9, 3.9])
+
+
+def test_kernels_that_two_blurs_share_are_paid_once():
+    """Keystone costs little beside the widths of diffraction, and its own price beside one width."""
+
+    def cost(variant: str) -> float:
+        menus = list_options(PROBE, Rig(), [DIFFRACTION, KEYSTONE])
+        widths = {option.variant: option for option in menus[0].variants}
+        taken = {"diffraction": widths[variant], "keystone": menus[1].exact}
+        return cost_of(menus, taken) - taken["diffraction"].cost_ns
+
+    assert cost("airy") == pytest.approx(0.3)
+    assert cost("one-width") == pytest.approx(KEYSTONE.cost_ns["linear"])
+
+
 def test_a_draw_that_two_share_is_paid_once():
     """Read noise costs nothing in the cheap draw of the shot noise, and its own price beside the exact one."""
     decision = decide(PROBE, RIG, [SHOT, READ_NOISE], 1e-3)
@@ -217,7 +258,7 @@ def test_even_scene_shows_no_geometry_but_the_rig_has_it():
     ("vigneting", r"unknown effect 'vigneting'; did you mean 'vignetting'\?"),
     ("shot,jittr", r"unknown effect 'jittr'; did you mean 'jitter'\?"),
     ("zzz", "unknown effect 'zzz'; known are shot, jitter, vignetting"),
-    ("auto,shot", "unknown effect 'auto'.*one of auto, all, none alone"),
+    ("auto,shot", "'auto' stands alone, got 'auto,shot'"),
     (" , ", "no effect is named in ' , '; write auto, all, none, or names"),
 ])  # fmt: skip
 def test_unknown_names_are_refused_with_the_nearest(asked: str, words: str):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.once import Once
-from pipeline.simulator.effects.drift import DRIFT, greatest_daylight
+from pipeline.simulator.effects.drift import DRIFT, daylight_range
 from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.scene import RasterScene
@@ -48,7 +48,7 @@ def test_no_time_no_drift() -> None:
     rig = rig_with()
     assert DRIFT.bound(probe_of(rig), rig).value == 0
     assert (DRIFT.gain(block_of(rig), "spectral") == 1).all()
-    assert greatest_daylight(probe_of(rig), rig) == 1
+    assert (daylight_range(probe_of(rig), rig).greatest == 1).all()
 
 
 @pytest.mark.parametrize("started", [NOON, MORNING, NIGHT])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.simulator.band_differences import second_difference, steepest_difference
-from pipeline.simulator.gain_range import GainRange, Growth, fixed_variance, light_after
+from pipeline.simulator.gain_range import GainRange, Growth, fixed_variance, light_after, lights_within, unit_electrons
 from pipeline.simulator.rig_model import Rig
 from tests.pipeline.simulator.made_up_effects import RIG, even_probe
 
@@ -62,3 +62,13 @@ def test_what_a_shadow_takes_counts_by_the_noise_within_it():
     probe, rig = even_probe(darkest_e=1e4), Rig()
     lost = 1e4 / np.sqrt(1e4 + fixed_variance(rig)) / 2 * Growth(probe, rig).of_gain(GainRange.between(0.5, 1, 1), 1.0)
     assert lost == pytest.approx(5e3 / np.sqrt(5e3 + fixed_variance(rig)))
+
+
+@pytest.mark.parametrize("unit", ["sigma", "dn"])
+def test_least_and_greatest_light_follow_from_level_and_span(unit: str):
+    """Two lights of every band, their level and span in either unit: solved back to the lights."""
+    low, high = np.array([5.0, 200.0, 3_000.0]), np.array([5.0, 900.0, 20_000.0])
+    probe = even_probe(unit=unit, unit_least_dn=1.0, darkest_e=0.0, brightest_e=2e4)
+    level, span = high / unit_electrons(high, probe, RIG), (high - low) / unit_electrons(low, probe, RIG)
+    found = lights_within(replace(probe, level=level, span=span), RIG)
+    np.testing.assert_allclose(found, [low, high], rtol=1e-9)

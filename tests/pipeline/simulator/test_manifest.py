@@ -11,7 +11,7 @@ from pipeline.simulator.choice import decide
 from pipeline.simulator.manifest import list_effects, sum_up
 from tests.pipeline.simulator.made_up_effects import RIG, MadeUp, Shift, even_probe
 
-FIELDS = {"name", "state", "variant", "bound", "measured", "cost_s", "why", "unit"}
+FIELDS = {"name", "state", "variant", "bound", "measured", "cost_s", "why", "reason", "left_out", "magnitude", "unit"}
 PROBE = even_probe()
 EFFECTS = [
     MadeUp("wind", 0.0),
@@ -36,6 +36,13 @@ def test_rows_have_the_fields_of_a_receipt_and_plain_values():
     assert json.loads(json.dumps(rows, allow_nan=False)) == rows
     assert [row["name"] for row in rows] == [effect.name for effect in EFFECTS]
     assert [row["measured"] for row in rows if row["name"] in ("blur", "shot")] == [0.01, None]
+
+
+def test_rows_have_the_parts_of_their_reasons():
+    """What leaving an effect out would do also where it is on, and the words of its bound by themselves."""
+    rows = {row["name"]: row for row in list_effects(decide(PROBE, RIG, EFFECTS, 0.1))}
+    parts = [[rows[name][part] for part in ("reason", "left_out", "magnitude")] for name in ("wind", "shot")]
+    assert parts == [["absent", 0.0, "wind as off"], ["needed", pytest.approx(2.4), "shot as off"]]
 
 
 def test_totals_add_up():

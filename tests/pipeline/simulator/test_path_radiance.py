@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pipeline.once import Once
 from pipeline.simulator.effects.path_radiance import PATH_RADIANCE, extinction_per_m
+from pipeline.simulator.gain_range import fixed_variance
 from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air
@@ -107,6 +109,19 @@ def test_bound_holds_and_is_near(air: Air, exposure: float) -> None:
     bound, seen = PATH_RADIANCE.bound(probe_of(rig), rig).value, measured(PATH_RADIANCE, rig)
     assert seen <= 1.2 * bound
     assert seen > bound / 6
+
+
+def test_air_as_bright_as_the_scene_is_not_seen() -> None:
+    """The bound is on what differs: of a scene that is all like the horizon, nothing; under clouds, their shade."""
+    rig = rig_with(HAZY_300_M, brdf_per_rad=0.0)
+    light = 0.3 * white_e()
+    probe = replace(
+        probe_of(rig), level=light / np.sqrt(light + fixed_variance(rig)), span=0 * light,
+        darkest_e=float(light.min()), brightest_e=float(light.max()),
+    )  # fmt: skip
+    assert PATH_RADIANCE.bound(probe, rig).value == pytest.approx(0, abs=1e-6)
+    shaded = rig_with(HAZY_300_M, cloud_share=0.5)
+    assert PATH_RADIANCE.bound(probe, shaded).value > 1
 
 
 @pytest.mark.parametrize("relief", ["plane", "step"])

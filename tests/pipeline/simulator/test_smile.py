@@ -23,6 +23,8 @@ from tests.pipeline.simulator.spectral_light import (
     worst,
 )
 
+ROUNDED = 1e-3  # DN: two of the last places of 16,384 electrons in float32
+
 
 def bent(light, wavelength, smile_nm, variant="cubic", **more):
     """Light after smile."""
@@ -85,13 +87,13 @@ def test_detectors_do_not_mix():
 @given(st.integers(0, 10**6), st.floats(-3, 3), st.sampled_from(["sigma", "dn"]))
 @settings(max_examples=40, deadline=None)
 def test_bounds_hold(seed, smile_nm, unit):
-    """Neither leaving smile out nor lines for cubics changes more than the bound, factor 1.2."""
+    """Neither leaving smile out nor lines for cubics changes more than the bound, factor 1.2, and what floats round."""
     wavelength, light = random_light(seed)
     rig, probe = rig_with(smile_nm=smile_nm), probe_of(light, wavelength, unit)
     made = bent(light, wavelength, smile_nm)
-    assert worst(made, light, unit) <= 1.2 * SMILE.bound(probe, rig).value + 1e-4
+    assert worst(made, light, unit) <= 1.2 * SMILE.bound(probe, rig).value + ROUNDED
     linear = bent(light, wavelength, smile_nm, "linear")
-    assert worst(linear, made, unit, like=light) <= 1.2 * SMILE.bound(probe, rig, "linear").value + 1e-4
+    assert worst(linear, made, unit, like=light) <= 1.2 * SMILE.bound(probe, rig, "linear").value + ROUNDED
 
 
 @pytest.mark.parametrize("variant", ["off", "linear"])

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.camera import footprint_kernel
-from pipeline.simulator.tap_tables import TapTable, blurred_weight, box_weight
+from pipeline.simulator.tap_tables import SCALE_STEP, TapTable, blurred_weight, box_weight
 
 DISTANCE = np.linspace(-5, 5, 401)
 
@@ -72,7 +72,7 @@ def test_scale_in_the_middle_of_two_is_off_by_little() -> None:
     table = TapTable.of(2.7, np.array([0.1]), 1, (1.0, 1.03), 0.0)
     off = np.zeros((1, 1, 1), np.float32)
     for number, most in ((3.0, 2e-5), (3.5, 1e-3)):
-        scale = np.array([table.least_scale + number / 2048])
+        scale = np.array([table.least_scale + number * SCALE_STEP])
         weight = table.read(off, table.scale_rows(scale[None]))[:, 0, 0, 0]
         distance, kernel = blurred_weight(2.7 * scale[0], np.array([0.1 * scale[0] ** 2]))
         wanted = np.interp(table.left - np.arange(table.taps), distance, kernel[0])

@@ -11,7 +11,7 @@ import pytest
 from pipeline.camera import LineCamera
 from pipeline.scan import Sweep, sweep_to_scene
 from pipeline.simulator.block import Block
-from pipeline.simulator.effects.wind import WIND, line_to_line_px, sway_px
+from pipeline.simulator.effects.wind import WIND, line_to_line_px, sway_px, within_exposure_px
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Air, Rig
 
@@ -42,6 +42,16 @@ def test_sizes():
     assert line_to_line_px(Rig(air=BREEZE)) == pytest.approx(2 * 6.306 * math.sin(0.1 * math.pi), abs=0.01)
     size = np.hypot(*shown(BREEZE))
     assert size.max() == pytest.approx(6.306, rel=0.01)
+
+
+@pytest.mark.parametrize(("exposure_ms", "share"), [(3.0, 0.0188), (100.0, 0.618), (2000.0, 2.0)])
+def test_the_smear_that_is_not_modelled_is_told(exposure_ms: float, share: float):
+    """Little of the sway in 3 ms, most of it in 100 ms, all of its way in 2 s; the reason gives the px."""
+    rig = Rig(camera=LineCamera(exposure_ms=exposure_ms), air=BREEZE)
+    assert within_exposure_px(rig) == pytest.approx(share * sway_px(rig), rel=5e-3)
+    assert (
+        f"up to {within_exposure_px(rig):.2g} px of smear within an exposure" in WIND.bound(probe((1.0, 1.0)), rig).why
+    )
 
 
 def test_lines_follow_the_wave_and_no_faster():

@@ -1,0 +1,118 @@
+"""How scenes look in training and where weights are judged: coarsely and finely everywhere, on spectral columns.
+
+Built-in farms are seen through the rig as a survey captures them: effects are chosen for each scene as surveys choose
+them by default, then the coarse pass and the scan of everything are rendered, calibrated and rectified. A camera has
+looked at scene files already: they pass the footprint and the noise alone, by `models.examples.observe`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.examples import Observation, observe
+from models.spectral import SpectralBasis, project
+from pipeline.camera import LineCamera
+from pipeline.coverage import cheapest_full, coarse_sweeps
+from pipeline.errors import SceneError
+from pipeline.grid import UNLABELLED, SceneGrid, pad_by_reflection
+from pipeline.rectify.region import mosaic_rows
+from pipeline.scan import CostModel, Sweep
+from pipeline.simulator.choice import decide
+from pipeline.simulator.effects.registry import EFFECTS
+from pipeline.simulator.farm_laws import law_of_key
+from pipeline.simulator.render import Choice
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from pipeline.simulator.survey_clock import sweep_starts
+from pipeline.simulator.survey_probe import probe_scene
+from pipeline.source import References
+
+TOLERANCE_SIGMA = 0.1  # of a survey, unless it says otherwise
+_ROWS = 64  # rectified at a time
+
+Columns = NDArray[np.float32]
+
+
+class _Taken(SimulatedSweep):
+    """A sweep whose lines are kept once they are made."""
+
+    @cached_property
+    def raw(self) -> NDArray[np.uint16]:
+        """All lines, (line, sample, band)."""
+        return self.source.render(self.sweep, range(self.sweep.lines))
+
+    @cached_property
+    def references(self) -> References:
+        """Dark and white frames."""
+        return self.source.references(self.sweep)
+
+    def read(self, start: int, stop: int) -> NDArray[np.uint16]:
+        """Give the lines ``start`` to ``stop``, (line, sample, band) uint16."""
+        return self.raw[start:stop]
+
+
+def observe_scene(
+    scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
+) -> Observation:
+    """Look at a labelled scene, and project what was seen onto the basis; the noise follows from ``rng``.
+
+    Raises
+    ------
+    SceneError : the scene has no labels, or a pixel that no line reached.
+    """
+    if law_of_key(scene.key) is None:
+        return observe(scene, camera, grid, basis, rng)
+    return observe_farm(scene, camera, grid, basis, int(rng.integers(2**31)))
+
+
+def observe_farm(
+    scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, seed: int
+) -> Observation:
+    """Survey a labelled scene with every line there is, and project both passes onto the basis.
+
+    ``seed`` is that of a survey: of the noise and all else that is drawn by chance.
+
+    Raises
+    ------
+    SceneError : the scene has no labels, or a pixel that no line reached.
+    """
+    if scene.labels is None:
+        raise SceneError(f"scene {scene.name} has no labels; training needs them")
+    rig, cost = Rig(camera), CostModel()
+    along, full, _ = cheapest_full(grid, camera, cost)
+    coarse = coarse_sweeps(grid, camera, along)
+    planned = [*coarse, *full]
+    chosen = chosen_effects(scene, rig, planned)
+    source = SimulatedSource(scene, rig, seed, chosen, clock=sweep_starts(planned, camera, cost))
+    matrix, _ = basis.matrix(scene.wavelength_nm)
+    height, width = grid.padded_shape
+    small = (height // grid.factor, width // grid.factor)
+    labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
+    labels[: grid.height, : grid.width] = scene.labels
+    return Observation(
+        scene.name,
+        np.asarray(pad_by_reflection(_columns(source, full, grid, matrix), grid.padded_shape), np.float32),
+        np.asarray(pad_by_reflection(_columns(source, coarse, grid, matrix), small), np.float32),
+        labels,
+        (grid.height, grid.width),
+    )
+
+
+def chosen_effects(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep]) -> Choice:
+    """Choose effects as a survey does that takes these sweeps, without its look at the worst lines."""
+    return Choice.of(decide(probe_scene(scene, rig, sweeps, "sigma"), rig, EFFECTS, TOLERANCE_SIGMA).chosen)
+
+
+def _columns(source: SimulatedSource, sweeps: Sequence[Sweep], grid: SceneGrid, matrix: Columns) -> Columns:
+    """The rectified pass on the basis, (y, x, column)."""
+    taken = [_Taken(source, sweep) for sweep in sweeps]
+    rows = [project(part, matrix) for _, part, _ in mosaic_rows(taken, source.camera, grid, rows=_ROWS)]
+    seen = np.concatenate(rows)
+    if not np.isfinite(seen).all():
+        raise SceneError(f"scene {source.scene.name} has pixels that no line reached; training needs all of it")
+    return seen

@@ -1,0 +1,76 @@
+"""Whether the choice of effects changes the map: the shipped model on a survey with `auto` and on everything, exact.
+
+Both surveys have one seed and the same streams. Cheap shot noise takes the read noise into its draw, so that a part of
+the difference is that of another draw of the noise: the row without it leaves all else exact.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from measure import Row
+from numpy.typing import NDArray
+from rich.console import Console
+
+from flows.settings import load_settings
+from flows.survey_command import run_survey
+from models.process import use_one_thread
+from storage.class_maps import load_class_map
+
+SIZE, SEEDS, TOLERANCE = "640x512", (1, 2), 0.1
+NOISE_ALONE = "0.001"  # sigma: nothing but the variant of the shot noise fits
+GOAL = 0.995
+
+Classes = NDArray[np.uint8]
+
+
+def rows() -> list[Row]:
+    """Share of pixels with the same class, and of those that differ how many lie where two classes meet."""
+    use_one_thread()
+    return [row for seed in SEEDS for row in _of_seed(seed)]
+
+
+def _of_seed(seed: int) -> list[Row]:
+    exact, miou = _mapped(seed, effects="all")
+    auto, auto_miou = _mapped(seed, effects="auto", tol=str(TOLERANCE))
+    redrawn, _ = _mapped(seed, effects="auto", tol=NOISE_ALONE)
+    same, apart = float((auto == exact).mean()), auto != exact
+    at_border = float(_borders(exact)[apart].mean()) if apart.any() else 1.0
+    return [
+        Row(
+            f"farm {SIZE}, seed {seed}, auto at {TOLERANCE} sigma against everything on: px of the same class",
+            f"{same:.2%}",
+            f">= {GOAL:.1%}",
+            same >= GOAL,
+            f"{at_border:.0%} of the others where two classes meet; mIoU {100 * auto_miou:.2f}, {100 * miou:.2f}",
+        ),
+        Row(
+            f"farm {SIZE}, seed {seed}, the same with another draw of the noise alone",
+            f"{float((redrawn == exact).mean()):.2%}",
+        ),
+    ]
+
+
+def _mapped(seed: int, **flags: str) -> tuple[Classes, float]:
+    """Class map (y, x) of a survey, and its mean IoU."""
+    with tempfile.TemporaryDirectory() as folder:
+        given = {"scene": "farm", "size": SIZE, "seed": str(seed), "engine": "plain", "controls": False, "out": folder}
+        published = run_survey(load_settings(None, {**given, **flags}), Console(quiet=True))
+        (path,) = Path(folder).glob("stages/segment/*/class_map.zarr")
+        miou = published.receipt["accuracy"]["miou"]
+        return load_class_map(path).classes, float("nan") if miou is None else miou
+
+
+def _borders(classes: Classes) -> NDArray[np.bool_]:
+    """Pixels that touch one of another class, above, below or beside."""
+    found = np.zeros(classes.shape, bool)
+    for axis in (0, 1):
+        differs = np.diff(classes.astype(np.int16), axis=axis) != 0
+        pad = [(0, 0), (0, 0)]
+        pad[axis] = (0, 1)
+        found |= np.pad(differs, pad)
+        pad[axis] = (1, 0)
+        found |= np.pad(differs, pad)
+    return found

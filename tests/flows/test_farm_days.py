@@ -1,0 +1,185 @@
+"""The farm that grows, through the settings: one land on all days, keys that tell them, and what learns from it."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flows.compare_command import find_run, run_compare
+from flows.generations import asked_again, newest_runs
+from flows.settings import Settings, parse_settings
+from flows.survey_scene import check_labels, farm_refusal, open_scene
+from flows.training_data import farm_data, farm_looks, farm_test_data, read_farm_name
+from flows.training_look import observe_scene
+from models.examples import observe
+from models.sizes import SegmenterConfig
+from models.spectral import SpectralBasis
+from models.weights import Description
+from pipeline.camera import LineCamera
+from pipeline.errors import ArchiveError, SceneError, SettingsError
+from pipeline.grid import SceneGrid
+from pipeline.simulator.farm_fields import CLASSES
+from pipeline.simulator.farm_laws import FARM_LAW, SEASON_LAW, built_in_farm
+from pipeline.simulator.farm_sun import sun_over_farm
+from pipeline.simulator.scene import RasterScene
+from storage.archive import Archive
+from storage.lineage import Catalogue
+
+LINES = ("track", "water")  # classes of what no day moves
+BANDS = (20, 60, 110, 160, 210, 250)
+
+
+def _settings(**table: Any) -> Settings:
+    return parse_settings({"scene": SEASON_LAW, "size": "240x200", "bands": BANDS, **table})
+
+
+def _lines(scene: RasterScene) -> np.ndarray[Any, Any]:
+    """Where tracks and water lie."""
+    assert scene.labels is not None
+    return np.isin(scene.labels, [CLASSES.index(name) for name in LINES])
+
+
+def test_two_days_of_a_field_are_one_land() -> None:
+    """Tracks and ditches lie where they lay; what grows between them has changed."""
+    june, april = (open_scene(_settings(seed=5, day=day))[0] for day in (172, 100))
+    there, then = _lines(june), _lines(april)
+    assert np.count_nonzero(there & then) > 0.8 * np.count_nonzero(there | then) > 1000
+    assert np.mean(june.labels != april.labels) > 0.1
+
+
+def test_day_and_hour_stand_in_the_key() -> None:
+    """Whose scene is kept is told by them; those of farm@1 stay what they were."""
+    given: list[dict[str, int]] = [{}, {"day": 173}, {"hour": 9}, {"day": 172, "hour": 11}]
+    assert len({open_scene(_settings(**moment))[0].key for moment in given}) == 3
+    key = open_scene(_settings(day=173))[0].key
+    assert key.startswith("farm@2/seed=0/day=173/shape=200x240/hour=11/bands=270")
+    first = open_scene(_settings(scene=FARM_LAW))[0].key
+    assert first == "farm@1/seed=0/shape=200x240/bands=270/full_well=20155/only=20,60,110,160,210,250"
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"scene": FARM_LAW, "day": 5}, "'day' = 5 is for the scene farm@2, whose fields grow; farm@1 is as it is"),
+        ({"scene": "field.png", "hour": 9.5}, "'hour' = 9.5 is for the scene farm@2"),
+        ({"scene": SEASON_LAW, "day": 0}, "'day' must be a whole number from 1 to 366, got 0; of the year"),
+        ({"scene": SEASON_LAW, "hour": 25}, "'hour' must be a number from 0 to 24 h"),
+    ],
+)
+def test_days_that_are_none_are_refused(table: dict[str, Any], words: str) -> None:
+    """By the settings, before any scene is opened."""
+    with pytest.raises(SettingsError, match=words):
+        parse_settings(table)
+
+
+def test_night_is_refused_before_anything_is_drawn() -> None:
+    """The scene says how high the sun has to be."""
+    with pytest.raises(SceneError, match="sun"):
+        open_scene(_settings(day=355, hour=3))
+
+
+def test_two_moments_are_told_apart() -> None:
+    """Where the light drifts as on another day than plants and shadows are of, a note says so."""
+    said = {
+        text: open_scene(_settings(sky={"started": datetime.fromisoformat(text)}))[1]
+        for text in ("2026-06-21T12:20:00+02:00", "2026-08-21T12:20:00+02:00", "2026-06-21T18:00:00+02:00")
+    }
+    assert [len(notes) for notes in said.values()] == [0, 1, 1]
+    assert "of day 172, 11 h, while the light drifts as from sky.started, day 233" in list(said.values())[1][0]
+
+
+def test_weights_of_another_farm_are_told() -> None:
+    """They know the classes, but not how these look."""
+    scene = built_in_farm(SEASON_LAW, 0, (20, 30))
+    for law, count in ((FARM_LAW, 1), (SEASON_LAW, 0), ("folder", 0)):
+        config = SegmenterConfig(classes=len(CLASSES), columns=6, patch=8, factor=2, width=4)
+        weights = Description(config, SpectralBasis(450, 850, 6), CLASSES, {"data": law})
+        assert len(check_labels(scene, weights)) == count
+
+
+def _publish(archive: Archive, key: str, **settings: Any) -> str:
+    receipt = {"survey": "farm", "scene": key, "settings": settings, "products": {"class_map": "stages/segment/aaaa/m"}}
+    with archive.new_run("farm") as draft:
+        draft.write_file("receipt.json", json.dumps(receipt))
+        return draft.id
+
+
+def test_days_of_one_land_are_compared(tmp_path: Path) -> None:
+    """The run before of the same land counts, whatever day and hour it is of; another seed's does not."""
+    archive = Archive.open(tmp_path)
+    made = [
+        _publish(archive, f"farm@2/seed={seed}/day={day}/shape=8x8/hour=11/bands=9", scene="farm@2", day=day)
+        for seed, day in ((0, 100), (1, 150), (0, 200))
+    ]
+    catalogue = Catalogue.read(tmp_path)
+    assert find_run(catalogue, "previous").folder.name == made[0]
+    with pytest.raises(SceneError, match="of different fields"):
+        run_compare(tmp_path, made[1], made[2])
+    with pytest.raises(ArchiveError, match="missing or damaged"):  # of one field: it comes as far as the maps
+        run_compare(tmp_path, made[0], made[2])
+
+
+def test_a_farm_is_asked_for_again_by_its_law(tmp_path: Path) -> None:
+    """Whatever ``farm`` means by now, the land is the run's; the default day is the same field as when it is named."""
+    archive = Archive.open(tmp_path)
+    second = "farm@2/seed=0/day=172/shape=8x8/hour=11/bands=9"
+    made = [
+        _publish(archive, "farm@1/seed=0/shape=8x8/bands=9", scene="farm"),
+        _publish(archive, second, scene="farm"),
+        _publish(archive, second, scene="farm@2", day=172),
+        _publish(archive, second.replace("172", "173"), scene="farm@2", day=173),
+        _publish(archive, "farm@1/seed=0/shape=8x8/bands=9", scene="farm@1"),
+    ]
+    newest = newest_runs(Catalogue.read(tmp_path))
+    assert [one.run.folder.name for one in newest] == made[2:]
+    again = [asked_again(run, tmp_path, None) for run in Catalogue.read(tmp_path).runs]
+    assert [(one.scene, one.day) for one in again] == [
+        (FARM_LAW, None), (SEASON_LAW, None), (SEASON_LAW, 172), (SEASON_LAW, 173), (FARM_LAW, None)
+    ]  # fmt: skip
+
+
+def test_training_days_cover_the_season() -> None:
+    """Each month from April to October has some, at hours with enough sun, and none is one that is judged on."""
+    data = farm_data(SEASON_LAW, None, 3, LineCamera())
+    learnt = [read_farm_name(name) for name in data.train]
+    judged = [read_farm_name(name) for name in (*data.validation, *farm_test_data(SEASON_LAW, 4, LineCamera()).train)]
+    assert np.histogram([day or 0 for _, day, _ in learnt], np.linspace(91, 305, 8))[0].min() >= 5
+    for _, day, hour in (*learnt, *judged):
+        assert day is not None
+        assert hour is not None
+        assert sun_over_farm(day, hour).elevation_deg > 15
+    assert not {day for _, day, _ in learnt} & {day for _, day, _ in judged}
+    assert len({seed for seed, _, _ in (*learnt, *judged)}) == len(learnt) + len(judged)
+    assert data.law == SEASON_LAW
+
+
+def test_names_of_farm_scenes_are_read_back() -> None:
+    """And the first farm's are their seeds alone."""
+    assert farm_looks(FARM_LAW, 7, 2) == ("7", "8")
+    assert read_farm_name("7") == (7, None, None)
+    assert read_farm_name("100003-day-168-hour-14") == (100_003, 168, 14.0)
+
+
+def test_training_sees_the_farm_through_the_rig() -> None:
+    """Beside the footprint and the noise alone, blur and shading count, by little."""
+    scene, camera = open_scene(_settings(seed=5, size="96x64"))[0], LineCamera(samples=96)
+    grid, basis = SceneGrid(*scene.shape, 8, 4), SpectralBasis.spanning(scene.wavelength_nm, 6)
+    seen = observe_scene(scene, camera, grid, basis, np.random.default_rng(3))
+    plain = observe(scene, camera, grid, basis, np.random.default_rng(3))
+    np.testing.assert_array_equal(seen.labels, plain.labels)
+    for ours, theirs in ((seen.fine, plain.fine), (seen.coarse, plain.coarse)):
+        assert ours.shape == theirs.shape
+        assert 0.01 * theirs.std() < np.abs(ours - theirs).mean() < 0.2 * theirs.std()
+
+
+@pytest.mark.parametrize(("size", "measured"), [("1280x1024", 1.58e9), ("2560x2560", 4.12e9)])
+def test_a_machine_too_small_for_a_farm_is_told(size: str, measured: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By what a survey of it took; one with a tenth more is enough."""
+    for there, refused in ((measured, True), (1.1 * measured, False)):
+        monkeypatch.setattr("flows.survey_scene.machine_bytes", lambda there=there: int(there))
+        assert (farm_refusal(_settings(size=size)) is not None) == refused
