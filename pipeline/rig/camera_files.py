@@ -50,6 +50,17 @@ def fetch_files(
         _fetch(server, file, kept, progress, clock)
 
 
+def log_in(server: FileServer) -> str:
+    """Log in to the server, look at nothing, and give its welcome.
+
+    Raises
+    ------
+    DeviceRefused : it takes another password. RigError : no FTP. DeadlinePassed, DeviceGone : it is not there.
+    """
+    with _session(server) as session:
+        return session.getwelcome().removeprefix("220").strip() or "logged in"
+
+
 def _fetch(server: FileServer, file: RemoteFile, kept: Kept, progress: Progress | None, clock: Clock) -> None:
     failed = 0
     while True:

@@ -8,6 +8,7 @@ DeadlinePassed      no whole answer before the deadline, and nothing can have mo
 DeviceRefused       the device answered that it did not do it; ``code`` is its number where it gave one
 StateUnknown        a motion was sent and not acknowledged: it may have happened. Motions stay frozen until a
                     person has looked and says so
+NotKept             the disk here did not take what a device sent; the device still has it
 RigError            everything else: an answer that is not one, a wrong device, a path that was not kept
 ==================  =======================================================================================
 """
@@ -39,3 +40,7 @@ class DeviceRefused(RigError):  # noqa: N818 - the name says what is the case
 
 class StateUnknown(RigError):  # noqa: N818 - the name says what is the case
     """A device may or may not have moved; motions are frozen until a person says otherwise."""
+
+
+class NotKept(RigError):  # noqa: N818 - the name says what is the case
+    """What a device sent could not be kept here: the disk refuses. The device still has it."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 # positions (line, 2) and times (line,) of mid exposure -> lines (line, sample, band) uint16
 Floats = NDArray[Any]  # float64
+Ints = NDArray[np.int64]
 Lines = Callable[[Floats, Floats], NDArray[np.uint16]]
 Positions = Callable[[Floats], Floats]
 
@@ -81,12 +82,27 @@ class EmulatedCapture:
 
     def take(self, now_s: float, positions: Positions, lines: Lines) -> None:
         """Look, for all frames that are over by now and not taken yet."""
-        due = self.due(now_s)
-        while self._taken < due:
-            numbers = np.arange(self._taken, min(self._taken + _BLOCK, due))
-            middle_s = self.began_s + numbers * self.period_s + self.exposure_s / 2
-            self._lines.append(np.asarray(lines(positions(middle_s), middle_s), np.uint16))
-            self._taken += len(numbers)
+        while len(numbers := self.pending(now_s)):
+            middle_s = self.middle_s(numbers)
+            self.put(lines(positions(middle_s), middle_s))
+
+    def pending(self, now_s: float, most: int = _BLOCK) -> Ints:
+        """Numbers of the next frames, ``most`` at most, that are over by now and not taken yet."""
+        return np.arange(self._taken, max(min(self._taken + most, self.due(now_s)), self._taken))
+
+    def middle_s(self, numbers: Ints) -> Floats:
+        """Mid exposure of frames. [s]"""
+        middle: Floats = self.began_s + numbers * self.period_s + self.exposure_s / 2
+        return middle
+
+    def put(self, lines: NDArray[Any]) -> None:
+        """Take the next frames, (line, sample, band)."""
+        self._lines.append(np.asarray(lines, np.uint16))
+        self._taken += len(lines)
+
+    def drop(self) -> None:
+        """Have the files no longer; the capture is over."""
+        self._lines, self._whole = [], {}
 
     def files(self) -> dict[str, bytes]:
         """Names without the folder, and contents, of what has been taken."""

@@ -129,7 +129,10 @@ def _file_server(device: CameraDevice, address: tuple[str, int], user: tuple[str
             from pyftpdlib.servers import FTPServer
     except ImportError as error:
         raise RigError("the emulated camera's files need pyftpdlib; install it: pip install 'pyftpdlib>=2'") from error
-    logging.getLogger("pyftpdlib").setLevel(logging.ERROR)
+    chatter = logging.getLogger("pyftpdlib")
+    chatter.setLevel(logging.ERROR)
+    if not chatter.handlers:
+        chatter.addHandler(logging.NullHandler())  # else it turns itself up to everything, on stderr
     authorizer = DummyAuthorizer()
     authorizer.add_user(*user, homedir=".", perm="elr")
     transfer = type("CameraTransfer", (_BreakingTransfer, DTPHandler), {"device": device})

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
-from pipeline.rig.pro_mode import Damaged, Frame
+from pipeline.rig.pro_mode import Command, Damaged, Frame
 
 
 class Mode(Enum):
@@ -38,6 +38,14 @@ class Request:
     def command(self) -> int | None:
         """Command of the frame."""
         return None if self.frame is None else self.frame.command
+
+    @property
+    def words(self) -> str:
+        """What was asked, for people: the line, or the command's name."""
+        if self.frame is None:
+            return self.line or "bytes that are no frame"
+        known = {command.value: command.name for command in Command}
+        return known.get(self.frame.command, f"command {self.frame.command:02X}").lower().replace("_", " ")
 
 
 class VanishedError(OSError):

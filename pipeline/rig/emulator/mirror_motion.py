@@ -83,6 +83,11 @@ class AxisMotion:
         places: Floats = np.asarray(self._command)[at] + off * (1 - rise) + np.asarray(self._rate)[at] * impulse
         return np.where(still, np.asarray(self._command)[at], places)
 
+    def commands(self, times_s: ArrayLike) -> Floats:
+        """Give where the axis was sent to at times (...); times before the oldest that is remembered get the oldest."""
+        at = np.searchsorted(np.asarray(self._time), np.asarray(times_s, np.float64), side="right") - 1
+        return np.asarray(self._command)[np.clip(at, 0, None)]
+
     def place(self, time_s: float) -> float:
         """Give where the axis was at one time, which is faster for the time after the last command."""
         if time_s < self._time[-1]:
