@@ -24,7 +24,7 @@ from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 PATH = Path(str(resources.files("models") / "shipped" / SHIPPED))
-SHAPE = (384, 448)
+SHAPE = (512, 640)  # smaller farms hold too few pixels of rare classes to rank placements by them
 
 
 @pytest.fixture(scope="module")

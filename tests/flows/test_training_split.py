@@ -12,7 +12,7 @@ from PIL import Image
 from flows.run import open_run
 from flows.settings import load_settings
 from flows.train import TrainRequest, train_weights
-from flows.training_data import open_training_data, pack_mask, unpack_mask
+from flows.training_data import open_training_data, pack_mask, read_farm_name, unpack_mask
 from models.training import TrainingSettings
 from models.weights import load_weights
 from pipeline.camera import LineCamera
@@ -115,6 +115,6 @@ def test_masks_pack_and_unpack() -> None:
 def test_farm_scenes_are_apart_from_surveys() -> None:
     """Training and validation seeds of the farm are disjoint, and far above those a user tries."""
     data = open_training_data("farm", None, 24, LineCamera())
-    seeds = [int(name) for name in (*data.train, *data.validation)]
+    seeds = [read_farm_name(name)[0] for name in (*data.train, *data.validation)]
     assert len(set(seeds)) == len(seeds)
     assert min(seeds) >= 100_000

@@ -327,12 +327,13 @@ def test_a_scheduler_that_goes_away_is_one_error(tmp_path: Path) -> None:
 
 
 INTERRUPTED = """
-import sys, time
+import signal, sys, time
 from functools import partial
 from pathlib import Path
 from storage.block_work import Crew, run_blocks
 from tests.storage.test_block_work import touch_slowly
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs have it ignored
     try:
         run_blocks(partial(touch_slowly, Path(sys.argv[1])), range(1000), Crew("processes", 2))
     except KeyboardInterrupt:

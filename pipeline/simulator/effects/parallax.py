@@ -42,7 +42,7 @@ class Parallax:
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
         """Bound by slope times the displacement at the lines' ends of the part farthest from the scene's distance."""
-        share = _greatest_share(rig.air)
+        share = greatest_share(rig.air)
         if variant != OFF or share == 0 or not probe.sweeps:
             return Bound(0.0, "all of the scene is at one distance" if variant == OFF else "exact")
         along, scan = (share * half for half in _half_lines(probe, rig))
@@ -72,7 +72,7 @@ def closeness(air: Air, row: Floats) -> Floats:
     return inverse
 
 
-def _greatest_share(air: Air) -> float:
+def greatest_share(air: Air) -> float:
     """Greatest displacement per px of way from the line's centre."""
     if air.distance_m is None:
         return 0.0

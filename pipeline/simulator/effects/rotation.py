@@ -32,7 +32,8 @@ class Rotation:
         if variant != OFF:
             return Bound(0.0, "rays are exact")
         along, scan = _farthest(probe.sweeps, rig.camera, beside_plan_px(probe, rig))
-        why = f"lines are turned and stretched by at most {along:.3g} px along and {scan:.3g} px along the scan"
+        most = f"{round(along, 9):.3g} px along and {round(scan, 9):.3g} px along the scan"
+        why = f"lines are turned and stretched by at most {most}"
         # The footprint does not lie turned either: the same as one box that does not.
         shape = MARGIN * probe.slit_errors.get(UPRIGHT, 0.0)
         return Bound(probe.moved(along, scan) + shape, why)

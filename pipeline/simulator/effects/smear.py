@@ -13,7 +13,9 @@ from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.effects.lag import transient
 from pipeline.simulator.effects.line_ends import at_line_ends, end_gains
+from pipeline.simulator.effects.parallax import PARALLAX, greatest_share
 from pipeline.simulator.effects.staircase import beside_plan
+from pipeline.simulator.effects.wind import sway_gradient
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -41,12 +43,15 @@ class Smear:
             return Bound(0.0, "the mirror stands still while a line is exposed" if variance == 0 else "exact")
         if variant == FOLDED:
             along, scan = _beside(probe.sweeps, rig)
+            along, scan = along + sway_gradient(rig), scan + sway_gradient(rig) + greatest_share(rig.air)
             way, area = np.abs(np.arange(most) - (most - 1) / 2).mean(), 2 * variance
             by_scan = np.minimum(probe.slope[1] * way, probe.curvature[1] * area) * scan
             course = at_line_ends(probe.sweeps, rig.camera, 0.0, _uneven_course(probe.sweeps, rig))
             by_course = probe.slope[0] * course[0] + probe.slope[1] * course[1]
             change = np.minimum(probe.slope[0] * way * along + by_scan + by_course, probe.span)
-            return Bound(float(change.max(initial=0.0)), f"lines of an exposure lie as one, {most} px")
+            # at a step of the relief up to half of the positions see the other depth, at most twice as far off
+            step = PARALLAX.bound(probe, rig).value if rig.air.relief == "step" else 0.0
+            return Bound(float(change.max(initial=0.0)) + step, f"lines of an exposure lie as one, {most} px")
         both = np.zeros(probe.slope.shape)
         both[1] = variance
         return Bound(probe.blurred(both), f"the mirror moves {most} px in an exposure")

@@ -65,6 +65,11 @@ def sway_px(rig: Rig) -> float:
     return 0.0 if air.distance_m is None else air.wind_amplitude_m / (air.distance_m * rig.camera.ifov_rad)
 
 
+def sway_gradient(rig: Rig) -> float:
+    """Give by how much the sway differs from one px to the next at most, 2 pi A over the length of a gust."""
+    return 2 * math.pi * rig.air.wind_amplitude_m / GUST_M if sway_px(rig) else 0.0
+
+
 def line_to_line_px(rig: Rig) -> float:
     """Give the most that the crop moves from one line to the next, 2 A |sin(pi f t_frame)| / (d IFOV). [px]"""
     return 2 * sway_px(rig) * abs(math.sin(math.pi * sways_per_line(rig)))
