@@ -101,20 +101,16 @@ def run_all(
     A field whose ledger cannot be written is told of and left for the next time; the others go on.
     """
     outcomes: list[Outcome] = []
-    while True:
-        waiting = [(due, name) for name in schedules for due in _to_run(schedules[name], lock_of(name), tell)]
-        ended = 0
-        for due, name in sorted(waiting, key=lambda one: one[0]):  # of one due time, fields in the order given
-            try:
-                outcome = run_due(schedules[name], due, lock_of(name), survey)
-            except PipelineError as error:
-                tell(f"{name}: {error}")
-                continue
-            outcomes.append(outcome)
-            ended += outcome.ending is not None
-            tell(outcome.words())
-        if not ended:
-            return outcomes
+    waiting = [(due, name) for name in schedules for due in _to_run(schedules[name], lock_of(name), tell)]
+    for due, name in sorted(waiting, key=lambda one: one[0]):  # of one due time, fields in the order given
+        try:
+            outcome = run_due(schedules[name], due, lock_of(name), survey)
+        except PipelineError as error:
+            tell(f"{name}: {error}")
+            continue
+        outcomes.append(outcome)
+        tell(outcome.words())
+    return outcomes
 
 
 def _to_run(schedule: FieldSchedule, lock: RigLock, tell: Tell) -> list[datetime]:

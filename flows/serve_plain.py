@@ -28,9 +28,11 @@ def serve_plain(
         schedule.open()
     try:
         while until is None or watch.now() < until:
-            for outcome in run_all(schedules, lambda name: locks[name], survey, tell):
+            outcomes = run_all(schedules, lambda name: locks[name], survey, tell)
+            for outcome in outcomes:
                 note(outcome)
-            watch.sleep(_pause(schedules.values(), watch.now()).total_seconds())
+            if not any(outcome.ending for outcome in outcomes):  # else others may have become due meanwhile
+                watch.sleep(_pause(schedules.values(), watch.now()).total_seconds())
     finally:
         for schedule in schedules.values():
             schedule.close()
