@@ -56,8 +56,8 @@ def test_a_scheduled_run_by_prefect(
     assert [line["event"] for line in lines] == ["opened", "begun", "done"]
     assert [path.name.split("-")[1] for path in Archive.open(one.archive).runs()] == ["north"]
     with get_client(sync_client=True) as client:
-        runs = client.read_flow_runs()
-        assert {run.name for run in runs if run.parameters.get("settings") == str(file)} == {"survey-north"}
+        runs = [run for run in client.read_flow_runs() if run.parameters.get("settings") == str(file)]
+        assert {run.name for run in runs} == {"survey-north"}
         assert {"survey-north", "savings-north"} <= {found.key for found in client.read_artifacts()}
         client.set_flow_run_state(runs[0].id, Running(), force=True)
         told = runs[0].parameters

@@ -29,8 +29,9 @@ def check_rig(answers: bool) -> None:
 
 # (2) A server for the tests of one file: its files are in a folder that goes away. It takes seconds to start, and each
 # flow a second more for its heartbeat, which is switched off here: share the fixture, and keep such tests few.
+# ``prefect_home`` (conftest.py) comes before anything imports Prefect, which reads its settings only then.
 @pytest.fixture(scope="module")
-def server() -> Iterator[None]:
+def server(prefect_home: Path) -> Iterator[None]:
     """Flows of this module run on a throw-away server."""
     from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
     from prefect.testing.utilities import prefect_test_harness
