@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from flows.effect_choice import load_manifest, source_with
 from flows.field_work import FieldWork, region_params
 from flows.region_work import look_at, seat_columns
+from flows.rendered_lines import take_lines
 from flows.rig_run import RIG_RECORD, capture_source, rig_record
 from flows.run import CaptureRun, SurveyRun
 from models.inference import CoarseLook, Glance, read_glance
@@ -30,7 +31,7 @@ from pipeline.orientation import compare_orientations
 from pipeline.planning import FinePlan, plan_fine
 from pipeline.scan import Sweep
 from pipeline.simulator.survey_clock import sweep_starts
-from pipeline.source import Source
+from pipeline.source import Line, Source
 from storage.archive import StageRef, stage_key
 from storage.attention import Attention, write_attention
 from storage.class_maps import ClassNames, create_class_map
@@ -109,9 +110,12 @@ def _capture_sweep(
     samples, bands = references.dark.shape
     about = {"sweep": asdict(sweep), **run.source_key()}
     with Spool.open(run.archive.spool_folder(key), samples, bands, header=about, name=sweep.name) as spool:
-        for line in source.lines(sweep, first=spool.count):
+
+        def take(line: Line) -> None:
             spool.append(line)
             report(spool.count)
+
+        take_lines(source, sweep, take, run.settings.crew, first=spool.count)
         spool.sync()
         with RawCubeWriter(path / f"{sweep.name}.zarr", header) as cube:
             for block in spool.blocks(SHARD_ROWS):

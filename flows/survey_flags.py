@@ -64,7 +64,7 @@ class SurveyFlags:
     scheduler: str | None = None
     """Who does that work: `threads` (default), `processes`, or a dask scheduler elsewhere, tcp://host:port"""
     workers: str | None = None
-    """Tiles or regions at a time; one a core by default."""
+    """Tiles, regions or blocks of simulated lines at a time; one a core by default."""
     kernel: str | None = None
     """How lines are read between samples: catmull-rom (default), bilinear, or nearest, which mixes no spectra."""
     pointing_px: str | None = None
