@@ -42,6 +42,7 @@ GOES_ON = (
     "export",
     "reprocess",
     "simulate",
+    "serve",
 )  # verbs that keep what they have done when they are interrupted
 
 

@@ -13,6 +13,8 @@ from cyclopts import CycloptsError
 
 import flows.archive_verbs
 import flows.model_verbs
+import flows.rig_verbs
+import flows.serve_verb
 import flows.simulate_verb  # noqa: F401 - each registers its verbs
 from flows.app import GOES_ON, AsJson, OutFile, app, parse_numbers, parse_wholes, print_json, say, split_list, stderr
 from flows.survey_flags import SurveyFlags
@@ -30,10 +32,13 @@ def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_js
     settings
         A survey's TOML file; flags win over it. Without one, flags and defaults alone.
     """
+    from flows.schedule_lock import rig_to_oneself
     from flows.settings import load_settings
     from flows.survey_command import run_survey
 
-    published = run_survey(load_settings(settings, flags.by_setting()), stderr)
+    asked = load_settings(settings, flags.by_setting())
+    with rig_to_oneself(asked, "a survey by hand"):
+        published = run_survey(asked, stderr)
     if as_json:
         print_json(published.receipt)
     return 0

@@ -49,6 +49,8 @@ DRAFT, VERIFIED = 0.3, 1.0
 def choose_effects(run: CaptureRun, produce: Produce) -> StageRef:
     """Decide for scene and rig which effects to simulate, and check it on the worst chips of the scene.
 
+    Where a rig takes the lines there is nothing to decide.
+
     Raises
     ------
     BoundError : what would be left out changes a chip by more than its bound says.
@@ -56,8 +58,11 @@ def choose_effects(run: CaptureRun, produce: Produce) -> StageRef:
     """
     tolerance, asked = run.settings.tol, run.settings.effects
 
+    if run.rig is not None:
+        return produce("effects", _write_nothing, {"source": run.source.name}, [])
+
     def build(path: Path) -> None:
-        rig = run.settings.rig
+        rig = run.settings.simulated_rig
         probe = probe_scene(run.scene, rig, run.planned, tolerance.unit)
         decision = decide(probe, rig, EFFECTS, tolerance.value, asked)
         run.report(DRAFT)
@@ -72,10 +77,15 @@ def choose_effects(run: CaptureRun, produce: Produce) -> StageRef:
         "asked": asked,
         "tol": str(tolerance),
         "camera": asdict(run.camera),
-        "rig": rig_table(run.settings.rig),
+        "rig": rig_table(run.settings.simulated_rig),
         "sweeps": [asdict(sweep) for sweep in run.planned],
     }
     return produce("effects", build, params, [])
+
+
+def _write_nothing(path: Path) -> None:
+    """The manifest of a rig, of which nothing is simulated."""
+    (path / RECORD).write_text(to_json({"effects": [], "total": None}), encoding="utf-8")
 
 
 def rig_table(rig: Rig) -> dict[str, Any]:
@@ -118,7 +128,7 @@ def source_with(
 
 def _verified(run: CaptureRun, decision: Decision, places: Floats) -> dict[str, float]:
     """Measure what is left out on the worst chips of the scene, about places of it, in the unit of the tolerance."""
-    scene, rig = run.scene, run.settings.rig
+    scene, rig = run.scene, run.settings.simulated_rig
 
     def units(light: Light) -> Light:
         if decision.unit == "sigma":
@@ -140,7 +150,7 @@ def _verified(run: CaptureRun, decision: Decision, places: Floats) -> dict[str, 
 
 def _whole_sweeps(run: CaptureRun) -> list[Block]:
     """Every sweep as one block, each after those before it."""
-    scene, rig, clock = run.scene, run.settings.rig, sweep_starts(run.planned, run.camera, run.settings.cost)
+    scene, rig, clock = run.scene, run.settings.simulated_rig, sweep_starts(run.planned, run.camera, run.settings.cost)
     return [
         sweep_block(scene, rig, sweep, range(sweep.lines), seed=run.settings.seed, started_s=clock[sweep.name])
         for sweep in run.planned

@@ -6,12 +6,13 @@ No ``from __future__ import annotations`` here: Prefect reads the signatures.
 import atexit
 import os
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from flows.survey import Products, StageRunner, survey
+from flows.survey import Products, StageRunner, Step, survey
 from pipeline.errors import PipelineError
 from storage.archive import StageRef
 from storage.staging import remove_tree, take_lock
@@ -46,6 +47,8 @@ def survey_with_prefect(runner: StageRunner) -> Products:
     EngineUnavailable : the server did not start; nothing of the survey has run.
     PipelineError : from a stage, as with the plain engine.
     """
+    if inside_flow():
+        return survey(_task_step(runner), runner.run.settings.rounds)
     with _prefect_home(runner.run.archive.root):
         try:
             from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
@@ -56,12 +59,19 @@ def survey_with_prefect(runner: StageRunner) -> Products:
             return _run_flow(runner)
 
 
-def _run_flow(runner: StageRunner) -> Products:
-    from prefect import flow, task
-    from prefect.cache_policies import NO_CACHE
+def inside_flow() -> bool:
+    """Whether this is the body of a Prefect flow, which then holds the survey's tasks."""
+    if "prefect" not in sys.modules:
+        return False
+    from prefect.context import FlowRunContext
 
-    started: list[bool] = []
-    left: list[Products] = []
+    return FlowRunContext.get() is not None
+
+
+def _task_step(runner: StageRunner) -> Step:
+    """What runs a stage as a Prefect task of the flow that it is called in."""
+    from prefect import task
+    from prefect.cache_policies import NO_CACHE
 
     def stage(name: str, inputs: dict[str, str]) -> dict[str, str] | None:
         """One stage of the survey: addresses and keys in, an address and a key out."""
@@ -76,11 +86,20 @@ def _run_flow(runner: StageRunner) -> Products:
         found = one(name, {ref.uri: ref.key for ref in inputs})
         return None if found is None else _ref(runner, found["uri"])
 
+    return step
+
+
+def _run_flow(runner: StageRunner) -> Products:
+    from prefect import flow
+
+    started: list[bool] = []
+    left: list[Products] = []
+
     @flow(name="survey", flow_run_name=f"survey-{runner.run.name}", persist_result=False, validate_parameters=False)
     def survey_flow(scene: str, seed: int, budget: float) -> None:
         """Sweep coarsely, look again where it changes the map, draw the map."""
         started.append(True)
-        left.append(survey(step, runner.run.settings.rounds))
+        left.append(survey(_task_step(runner), runner.run.settings.rounds))
 
     settings = runner.run.settings
     try:

@@ -24,7 +24,7 @@ from storage.records import Run
 # what the light of a field depends on; surveys that agree in these are generations of one
 OF_THE_LIGHT = (
     "scene", "bands", "wavelengths", "source", "seed", "effects", "size", "day", "hour", "camera", "pointing_px",
-    "pose",
+    "pose", "visit",
 )  # fmt: skip
 WEIGHED = ("attend", "segment", "evaluate")  # stages of which the weights are a parameter
 

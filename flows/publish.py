@@ -86,6 +86,7 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
     run = runner.run
     accuracy = None if products.accuracy is None else load_accuracy(products.accuracy)
     savings = _savings(run, products, plan)
+    simulation = None if run.rig else load_manifest(products.effects)
     if accuracy is not None and "segment_wall_s" in accuracy:
         savings["segment_wall_s"] = accuracy.pop("segment_wall_s")
     header = Header(
@@ -95,7 +96,7 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
     )  # fmt: skip
     return build_receipt(
         header, runner.records.values(), savings, _addresses(products, folder),
-        accuracy=accuracy, simulation=load_manifest(products.effects), findings=find_out(run, products),
+        accuracy=accuracy, simulation=simulation, findings=find_out(run, products),
     )  # fmt: skip
 
 

@@ -75,7 +75,7 @@ def render_report(
         title=escape(receipt["survey"]),
         about=escape(about),
         headline=escape(headline(receipt, looked_twice)),
-        style=_STYLE,
+        style=PAGE_STYLE,
         body="\n".join(section for section in sections if section),
     )
 
@@ -278,7 +278,7 @@ $body
 </html>
 """)  # noqa: RUF001
 
-_STYLE = """
+PAGE_STYLE = """
 :root { color-scheme: light dark; --paper: #fbfaf7; --card: #ffffff; --ink: #22241f; --soft: #6a6d64; --line: #e3e1d8;
   --bar: #2f7d4f; --over: #c2571a; --track: #e9e7de; }
 @media (prefers-color-scheme: dark) { :root { --paper: #161815; --card: #1e211d; --ink: #ecebe4; --soft: #a3a69b;

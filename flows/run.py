@@ -9,12 +9,13 @@ from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flows.capture_plan import CapturePlan, check_memory, plan_capture
+from flows.rig_run import for_rig, rig_source
 from flows.settings import BUILT_IN_SCENES, Settings
 from flows.survey_scene import check_labels, check_mask, farm_refusal, judged_labels, open_scene
 from models.vgg_file import VggFile
@@ -33,6 +34,9 @@ from storage.archive import Archive
 from storage.layout import AngularGrid
 from storage.raster_files import load_raster
 
+if TYPE_CHECKING:
+    from pipeline.rig.rig_source import RigSource
+
 SHIPPED = "farm.safetensors"
 
 Report = Callable[[float], None]  # how far a stage is, 0..1
@@ -48,6 +52,7 @@ class CaptureRun:
     scene: RasterScene
     planned: tuple[Sweep, ...]  # that stand for all the rig may take: the coarse pass and the scan of everything
     report: Report = field(default=lambda done: None)
+    rig: RigSource | None = None  # takes the lines, where one does; then ``source`` only stands for their plan
 
     @property
     def camera(self) -> LineCamera:
@@ -56,8 +61,8 @@ class CaptureRun:
 
     @property
     def name(self) -> str:
-        """What the survey is called: its scene."""
-        return Path(self.scene.name).stem
+        """What the survey is called: its field, or its scene."""
+        return self.settings.name or Path(self.scene.name).stem
 
     def source_key(self) -> dict[str, Any]:
         """What the captured light depends on, beside the sweeps and the effects."""
@@ -67,6 +72,7 @@ class CaptureRun:
             "seed": self.settings.seed,
             "camera": asdict(self.camera),
             "pointing_px": self.settings.pointing_px,
+            **({} if self.settings.visit is None else {"visit": self.settings.visit}),
         }
 
 
@@ -116,8 +122,7 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     ------
     PipelineError : the first thing that cannot be used; see `pipeline.errors` for the kinds.
     """
-    if settings.source != "sim":
-        raise SettingsError(f"--source {settings.source}: this version has the simulated source only; use --source sim")
+    settings = for_rig(settings)
     path = weights_path(settings)
     described, load = describe_weights(path), Once(lambda: load_weights(path))
     check_two_scale(described.config, path)
@@ -138,19 +143,24 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
         check_mask(settings.mask, scene.shape)
     vgg_notes = _check_vgg(settings, None if planning else load)
     source = make_source(scene, settings)
+    rig = rig_source(scene, settings) if settings.source == "rig" else None
     check_memory(settings, source, grid, plan)
     _check_pose(settings, scene.shape)
     key = hashlib.sha256(path.read_bytes()).hexdigest()[:20]
     return SurveyRun(
-        settings=settings, archive=Archive.open(settings.out), source=source, scene=scene,
+        settings=settings, archive=Archive.open(settings.out), source=source, rig=rig, scene=scene,
         planned=(*plan.coarse, *plan.full), described=described, load=load, weights_key=key, grid=grid, plan=plan,
         notes=(*notes, *band_notes, *vgg_notes, *label_notes), refused=refused,
     )  # fmt: skip
 
 
 def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
-    """Give the simulated rig before a scene, with no effect on: `flows.effect_choice` decides on them."""
-    return SimulatedSource(scene, settings.rig, settings.seed, {}, pointing=_pointing(settings))
+    """Give the simulated rig before a scene, with no effect on: `flows.effect_choice` decides on them.
+
+    Where a rig takes the lines it stands for the plan of them alone: sizes, paths and memory.
+    """
+    pointing = _pointing(settings) if settings.source == "sim" else None
+    return SimulatedSource(scene, settings.simulated_rig, settings.seed, {}, name=settings.source, pointing=pointing)
 
 
 def _vgg_file(settings: Settings) -> VggFile | None:

@@ -12,6 +12,7 @@ from pipeline.simulator.choice import named_effects
 from pipeline.simulator.effects.registry import BY_NAME
 from pipeline.simulator.probe import Unit
 from storage.block_work import Crew
+from storage.staging import is_name
 
 RENAMED = {"throughput": "vignetting", "read": "read-noise"}  # effects as settings of before called them
 LEAST_MEMORY = 256 * 1024**2
@@ -101,6 +102,14 @@ def parse_text(value: object, place: str) -> str:
     if not isinstance(value, str) or not value.strip():
         raise SettingsError(f"{place} must be text that is not empty, got {value!r}")
     return value
+
+
+def parse_name(value: object, place: str) -> str:
+    """A name that a file can have too: of letters, digits, '_', '-' and '.'."""
+    text = parse_text(value, place)
+    if not is_name(text):
+        raise SettingsError(f"{place} must be a name of letters, digits, '_', '-' and '.', got {value!r}")
+    return text
 
 
 def parse_switch(value: object, place: str) -> bool:

@@ -10,6 +10,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal, cast
 
+from flows.device_settings import MOST_PAIRS, RIG
 from flows.rig_settings import field_parsers
 from flows.setting_values import (
     Span,
@@ -19,6 +20,7 @@ from flows.setting_values import (
     parse_choice,
     parse_effects,
     parse_memory,
+    parse_name,
     parse_number,
     parse_scheduler,
     parse_size,
@@ -32,6 +34,7 @@ from models.vgg_sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.camera import LineCamera
 from pipeline.errors import PoseError, SettingsError
 from pipeline.ground import LIMITS, RigPose
+from pipeline.rig.survey_rig import SurveyRig
 from pipeline.scan import CostModel
 from pipeline.simulator.farm_laws import FARM_NAMES, SEASON_LAW, USUAL_DAY, USUAL_HOUR, has_days
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
@@ -47,9 +50,10 @@ ENGINES = ("prefect", "plain")
 KERNELS = ("catmull-rom", "bilinear", "nearest")
 BUILT_IN_SCENES = FARM_NAMES
 BUILT_IN_SOURCES = ("sim", "rig")
+RIG_FIELD = "field"  # the scene of which only the rig knows more than size and bands
 OF_THE_MACHINE = ("scheduler", "workers")  # no byte depends on them; a cluster of that day need not be there today
 _VGG_FROM = {"vgg-static": VGG_FROM, "vgg-trained": TRAINED_VGG_FROM}  # policies that read a file of VGG19
-_PATHS = ("scene", "labels", "source", "out", "mask", "vgg", "weights")
+_PATHS = ("scene", "labels", "out", "mask", "vgg", "weights")
 
 Parser = Callable[[object, str], object]
 
@@ -66,6 +70,8 @@ class MapChoice:
 class Settings:
     """All that one survey needs to know. Make it by `load_settings` or `parse_settings`: they check; this does not."""
 
+    name: str | None = None  # what the field is called; by default as its scene
+    visit: str | None = None  # which look at it: another one is captured anew, the same one is gone on with
     scene: str = "farm"  # built-in name or a file
     labels: str | None = None
     bands: tuple[int, ...] | None = None  # of the file, counted from 0
@@ -99,6 +105,7 @@ class Settings:
     air: Air = field(default_factory=Air)
     sky: Sky = field(default_factory=Sky)
     cost: CostModel = field(default_factory=CostModel)
+    rig: SurveyRig = field(default_factory=SurveyRig)  # for source "rig"
     pose: RigPose | None = None  # without one nothing is put on the ground
     map: MapChoice = field(default_factory=MapChoice)
 
@@ -120,13 +127,15 @@ class Settings:
         return USUAL_DAY if self.day is None else self.day, USUAL_HOUR if self.hour is None else self.hour
 
     @property
-    def rig(self) -> Rig:
+    def simulated_rig(self) -> Rig:
         """All that the simulator knows of the rig; SettingsError where its parts do not go together."""
         return Rig(self.camera, self.optics, self.mirror, self.detector, self.air, self.sky)
 
     def to_dict(self) -> dict[str, object]:
-        """Plain values for the receipt; `parse_settings` reads them back to the same settings."""
-        return {key: plain_value(value) for key, value in (asdict(self) | {"tol": str(self.tol)}).items()}
+        """Plain values for the receipt, no password; `parse_settings` reads them back to the same settings."""
+        plain = {key: plain_value(value) for key, value in (asdict(self) | {"tol": str(self.tol)}).items()}
+        cast("dict[str, object]", plain["rig"]).pop("password")  # receipts are passed on
+        return plain
 
 
 def plain_value(value: object) -> object:
@@ -245,7 +254,9 @@ def _check_together(settings: Settings, origin: Mapping[str, str]) -> None:
             f"{_place('wavelengths', origin.get('wavelengths'))} must have one value for each of the "
             f"{len(bands)} bands, got {len(wavelengths)}"
         )
-    if settings.size is not None and settings.scene not in BUILT_IN_SCENES:
+    if settings.scene == RIG_FIELD and settings.source != "rig":
+        raise SettingsError(f"scene {RIG_FIELD!r} is what stands before a rig: give --source rig, or a file")
+    if settings.size is not None and settings.scene not in (*BUILT_IN_SCENES, RIG_FIELD):
         raise SettingsError(f"size is for built-in scenes ({', '.join(BUILT_IN_SCENES)}); {settings.scene} has its own")
     for name, value in {"day": settings.day, "hour": settings.hour}.items():
         if value is not None and not has_days(settings.scene):
@@ -259,6 +270,7 @@ def _check_together(settings: Settings, origin: Mapping[str, str]) -> None:
             f"of {settings.camera.bits} bits; use a smaller dark level"
         )
     _check_rig(settings)
+    _check_devices(settings)
     if settings.pose is None and settings.map != MapChoice():
         raise SettingsError("[map] says how to draw the ground, which needs to know where the rig stands: give [pose]")
 
@@ -269,9 +281,18 @@ def _check_rig(settings: Settings) -> None:
     for name, metres in {"nearest_m": near, "farthest_m": far}.items():
         if metres is not None and settings.air.distance_m is None:
             raise SettingsError(f"air.{name} = {metres:g} needs air.distance_m, how far the middle of the scene is")
-    distances = settings.rig.distances_m
+    distances = settings.simulated_rig.distances_m
     if distances is not None and distances[0] > distances[1]:
         raise SettingsError(f"air.nearest_m = {distances[0]:g} lies beyond air.farthest_m = {distances[1]:g}")
+
+
+def _check_devices(settings: Settings) -> None:
+    """What the rig's devices ask of the other settings."""
+    pairs = settings.cost.vector_pairs
+    if settings.source == "rig" and not 2 <= pairs <= MOST_PAIRS:
+        raise SettingsError(
+            f"cost.vector_pairs = {pairs}: the mirror's vector memory takes 2 to {MOST_PAIRS} pairs; give what it has"
+        )
 
 
 def _check_spending(settings: Settings) -> None:
@@ -305,7 +326,7 @@ def _read_toml(path: Path) -> dict[str, object]:
 
 def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
     """Relative paths of a file's settings, made to start at the file's folder."""
-    named = {*BUILT_IN_SCENES, *BUILT_IN_SOURCES}
+    named = {*BUILT_IN_SCENES, RIG_FIELD}
     anchored = dict(table)
     for key in _PATHS:
         value = table.get(key)
@@ -374,15 +395,18 @@ _TABLES: dict[str, tuple[type[Any], dict[str, Parser]]] = {
     "camera": (LineCamera, _CAMERA),
     **{name: (make, field_parsers(make)) for name, make in _OF_THE_RIG.items()},
     "cost": (CostModel, _COST),
+    "rig": (SurveyRig, RIG),
     "pose": (RigPose, _POSE),
     "map": (MapChoice, _MAP),
 }
 _SURVEY: dict[str, Parser] = {
+    "name": parse_name,
+    "visit": parse_text,
     "scene": parse_text,
     "labels": parse_text,
     "bands": parse_bands,
     "wavelengths": parse_wavelengths,
-    "source": parse_text,
+    "source": parse_choice(BUILT_IN_SOURCES),
     "out": parse_text,
     "budget": parse_budget,
     "policy": parse_choice(POLICIES),

@@ -26,6 +26,7 @@ def simulate(
     bands: str | None = None,
     wavelengths: str | None = None,
     exposure_ms: str | None = None,
+    workers: str | None = None,
     compare: Path | None = None,
     as_json: AsJson = False,
 ) -> int:
@@ -65,6 +66,8 @@ def simulate(
         Their centre wavelengths [nm]: 660,800
     exposure_ms
         Exposure of a line [ms]; 100 by default.
+    workers
+        Blocks of lines to render at a time; one a core by default. The same bytes come out.
     compare
         A PNG to write: lines with everything on and exact, the same as simulated, and where they differ, with the times
         of both. Takes all lines once more both ways, or as many as about a minute allows.
@@ -75,6 +78,7 @@ def simulate(
     flags = {
         "scene": scene, "out": out, "effects": effects, "tol": tol, "seed": seed, "size": size, "day": day,
         "hour": hour, "bands": bands, "wavelengths": wavelengths, "camera.exposure_ms": exposure_ms,
+        "workers": workers,
     }  # fmt: skip
     record = run_simulate(load_settings(settings, flags), stderr, coarse=coarse, picture=compare)
     if as_json:

@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from flows.effect_choice import load_manifest, source_with
 from flows.field_work import FieldWork, region_params
 from flows.region_work import look_at, seat_columns
+from flows.rendered_lines import take_lines
+from flows.rig_run import RIG_RECORD, capture_source, rig_record
 from flows.run import CaptureRun, SurveyRun
 from models.inference import CoarseLook, Glance, read_glance
 from models.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_seats
@@ -29,6 +31,7 @@ from pipeline.orientation import compare_orientations
 from pipeline.planning import FinePlan, plan_fine
 from pipeline.scan import Sweep
 from pipeline.simulator.survey_clock import sweep_starts
+from pipeline.source import Line, Source
 from storage.archive import StageRef, stage_key
 from storage.attention import Attention, write_attention
 from storage.class_maps import ClassNames, create_class_map
@@ -77,10 +80,13 @@ def capture_sweeps(
     def build(path: Path) -> None:
         before, manifest = 0, load_manifest(inputs[-1])
         lit = replace(run, source=source_with(run.source, inputs[-1], clock))
-        for sweep in sweeps:
-            done = partial(_report_lines, run, before, total)
-            _capture_sweep(lit, sweep, path, key, done, effects=manifest)
-            before += sweep.lines
+        with capture_source(lit, key) as source:
+            for sweep in sweeps:
+                done = partial(_report_lines, run, before, total)
+                _capture_sweep(lit, source, sweep, path, key=key, report=done, effects=manifest)
+                before += sweep.lines
+            if run.rig is not None:
+                write_json(path / RIG_RECORD, rig_record(source))
 
     ref = produce("capture", build, params, inputs)
     run.archive.drop_spool(key)
@@ -92,19 +98,24 @@ def _report_lines(run: CaptureRun, before: int, total: int, lines: int) -> None:
 
 
 def _capture_sweep(
-    run: CaptureRun, sweep: Sweep, path: Path, key: str, report: Callable[[int], None], *, effects: Mapping[str, Any]
-) -> None:
+    run: CaptureRun, source: Source, sweep: Sweep, path: Path, *, key: str, report: Callable[[int], None],
+    effects: Mapping[str, Any],
+) -> None:  # fmt: skip
     """Lines into the spool one by one, from where a broken capture stopped; then 64 at a time into the cube."""
-    references = run.source.references(sweep)
+    references = source.references(sweep)
+    simulation = None if run.rig else effects
     header = SweepHeader(
-        sweep, references, run.scene.wavelength_nm, run.scene.fwhm_nm, run.source.name, simulation=effects
+        sweep, references, run.scene.wavelength_nm, run.scene.fwhm_nm, source.name, simulation=simulation
     )
     samples, bands = references.dark.shape
     about = {"sweep": asdict(sweep), **run.source_key()}
     with Spool.open(run.archive.spool_folder(key), samples, bands, header=about, name=sweep.name) as spool:
-        for line in run.source.lines(sweep, first=spool.count):
+
+        def take(line: Line) -> None:
             spool.append(line)
             report(spool.count)
+
+        take_lines(source, sweep, take, run.settings.crew, first=spool.count)
         spool.sync()
         with RawCubeWriter(path / f"{sweep.name}.zarr", header) as cube:
             for block in spool.blocks(SHARD_ROWS):

@@ -12,6 +12,7 @@ from flows.receipt_table import headline, print_table
 from flows.run import SurveyRun, now, open_run
 from flows.settings import Settings
 from flows.survey import TITLES, Products, StageRunner, survey
+from flows.survey_artifacts import progress_shown
 from models.process import keep_freed_memory, use_one_thread
 
 
@@ -41,11 +42,13 @@ def run_survey(settings: Settings, console: Console) -> Published:
 
 def _survey_and_publish(run: SurveyRun, settings: Settings, console: Console, started: str) -> Published:
     """Run the stages with a bar each, then draw and publish what they left."""
+    shown = progress_shown(run.name)
     with StageProgress(console, TITLES) as progress:
 
         def watch(stage: str, state: str, done: float) -> None:
             running = state == "running"
             progress.show(stage, done, "" if running else state, ended=not running)
+            shown(stage, state, done)
 
         runner = StageRunner(run, watch)
         products = _run(runner, settings.engine, console)

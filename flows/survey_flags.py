@@ -14,6 +14,10 @@ IN_TABLES = {"exposure_ms": "camera.exposure_ms"}  # flags of what a settings fi
 class SurveyFlags:
     """What was given of a survey's settings; None where nothing was."""
 
+    name: str | None = None
+    """What the field is called; as its scene by default."""
+    visit: str | None = None
+    """Which look at the field, in any words: another one is captured anew, the same one is gone on with."""
     scene: str | None = None
     """`farm` (built in; also `farm@1`, `farm@2`), or an image or cube file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat, ENVI,
     Zarr."""
@@ -24,7 +28,7 @@ class SurveyFlags:
     wavelengths: str | None = None
     """Their centre wavelengths [nm]: 660,800"""
     source: str | None = None
-    """`sim`, the simulated rig."""
+    """`sim`, the simulated rig (default), or `rig`, the one that the settings' table [rig] names."""
     out: str | None = None
     """Archive: a folder, or s3://bucket/prefix; `archive` by default."""
     budget: str | None = None
@@ -60,7 +64,7 @@ class SurveyFlags:
     scheduler: str | None = None
     """Who does that work: `threads` (default), `processes`, or a dask scheduler elsewhere, tcp://host:port"""
     workers: str | None = None
-    """Tiles or regions at a time; one a core by default."""
+    """Tiles, regions or blocks of simulated lines at a time; one a core by default."""
     kernel: str | None = None
     """How lines are read between samples: catmull-rom (default), bilinear, or nearest, which mixes no spectra."""
     pointing_px: str | None = None

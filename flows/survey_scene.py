@@ -8,7 +8,8 @@ from datetime import UTC, timedelta
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings import BUILT_IN_SCENES, Settings
+from flows.rig_run import field_before_rig
+from flows.settings import BUILT_IN_SCENES, RIG_FIELD, Settings
 from flows.training_data import scene_of_file, unpack_mask
 from models.weights import Description
 from pipeline.errors import SceneError, SettingsError
@@ -34,6 +35,8 @@ def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
     SceneError, WavelengthError : the file cannot be used.
     SettingsError : what was given does not go with a built-in scene.
     """
+    if settings.scene == RIG_FIELD:
+        return field_before_rig(settings), ()
     if settings.scene in BUILT_IN_SCENES:
         return _open_farm(settings), _notes_of_moment(settings)
     file = load_scene_file(

@@ -196,16 +196,16 @@ def _run_on_threads(
 
 
 def block_graph(block: Callable[..., int], count: int, workers: int) -> dict[str, tuple[Any, ...]]:
-    """The dask graph of ``count`` blocks: one task each, that waits for those ``workers`` before it."""
+    """The dask graph of ``count`` blocks: one task each, that waits for all that lie ``workers`` before it."""
     return {
         f"block {number}": (block, number, *(f"block {at}" for at in _awaited(number, workers)))
         for number in range(count)
     }
 
 
-def _awaited(number: int, workers: int) -> list[int]:
-    """Blocks to wait for; two in a row are enough, for they waited for all before."""
-    return [at for at in (number - workers, number - workers - 1) if at >= 0]
+def _awaited(number: int, workers: int) -> range:
+    """Blocks to wait for: as many as there are workers, for the last of them has waited for all before."""
+    return range(max(number - 2 * workers + 1, 0), number - workers + 1)
 
 
 def check_sendable(what: str, value: object) -> None:

@@ -30,6 +30,7 @@ OWNERS = {
     "dask": ("storage", "flows"),
     "obstore": ("storage",),
     "serial": ("pipeline/rig",),
+    "pyftpdlib": ("pipeline/rig",),
     "torch": ("models", "pipeline/rectify", "pipeline/simulator"),
 }
 DISTRIBUTIONS = {

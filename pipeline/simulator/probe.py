@@ -46,7 +46,7 @@ class Probe:
 
     def moved(self, along_px: float, scan_px: float) -> float:
         """Bound what a shift of the image by at most so much changes: slope times way, never more than the span."""
-        steep = self.slope[0] * abs(along_px) + self.slope[1] * abs(scan_px)
+        steep = _times(self.slope[0], abs(along_px)) + _times(self.slope[1], abs(scan_px))
         return float(np.minimum(steep, self.span).max(initial=0.0))
 
     def blurred(self, variance_px2: Floats) -> float:
@@ -54,8 +54,8 @@ class Probe:
 
         E|x| is at most s; the smaller bound takes over where the image is a step or a point.
         """
-        by_curvature = self.curvature * variance_px2 / 2
-        by_slope = self.slope * np.sqrt(variance_px2)
+        by_curvature = _times(self.curvature, variance_px2 / 2)
+        by_slope = _times(self.slope, np.sqrt(variance_px2))
         return float(np.minimum(np.minimum(by_curvature, by_slope).sum(axis=0), self.span).max(initial=0.0))
 
     def scaled(self, share: float | Floats) -> float:
@@ -65,3 +65,8 @@ class Probe:
     def added(self, electrons: float, electrons_per_dn: float) -> float:
         """Bound what adding so many electrons changes."""
         return abs(electrons) / electrons_per_dn / self.unit_least_dn
+
+
+def _times(steep: Floats, way: Floats | float) -> Floats:
+    """Their product; 0 where there is no way, however steep it is."""
+    return np.multiply(steep, way, out=np.zeros(np.shape(steep)), where=np.not_equal(way, 0))

@@ -89,20 +89,30 @@ class SimulatedSource:
         ShapeError : sums of ``sweep.binning`` samples at full scale do not fit uint16.
         PoseError : a position of the sweep is out of the mirror's reach.
         """
-        camera = self.camera
-        check_binning(sweep, camera)
-        middle = line_positions(sweep, camera)
+        check_binning(sweep, self.camera)
         for start in range(first, sweep.lines, BLOCK_LINES):
-            numbers = range(start, min(start + BLOCK_LINES, sweep.lines))
-            for number, data in zip(numbers, self.render(sweep, numbers), strict=True):
-                yield Line(
-                    number=number,
-                    data=data,
-                    mirror_x=float(middle[number, 0]),
-                    mirror_y=float(middle[number, 1]),
-                    time_s=(number * camera.frame_ms + camera.exposure_ms / 2) * 1e-3,
-                    exposure_ms=camera.exposure_ms,
-                )
+            yield from self.lines_of(sweep, range(start, min(start + BLOCK_LINES, sweep.lines)))
+
+    def lines_of(self, sweep: Sweep, numbers: range) -> list[Line]:
+        """Give some lines of the sweep, as `lines` does. Threads may ask at the same time.
+
+        Raises
+        ------
+        ShapeError : sums of ``sweep.binning`` samples at full scale do not fit uint16.
+        PoseError : a position of the sweep is out of the mirror's reach.
+        """
+        camera, middle = self.camera, line_positions(sweep, self.camera)
+        return [
+            Line(
+                number=number,
+                data=data,
+                mirror_x=float(middle[number, 0]),
+                mirror_y=float(middle[number, 1]),
+                time_s=(number * camera.frame_ms + camera.exposure_ms / 2) * 1e-3,
+                exposure_ms=camera.exposure_ms,
+            )
+            for number, data in zip(numbers, self.render(sweep, numbers), strict=True)
+        ]
 
     def references(self, sweep: Sweep) -> References:
         """Mean dark and white frames with the sweep's binning, as the effects that are on have them."""

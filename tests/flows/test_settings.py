@@ -259,14 +259,14 @@ def test_the_commented_pose_of_the_example_is_valid():
 
 def test_a_rig_is_read_from_its_tables(toml):
     """Every table becomes its part of the rig; without them it is the rig at rest in calm, clear air."""
-    assert Settings().rig == Rig()
+    assert Settings().simulated_rig == Rig()
     found = load_settings(
         toml(
             "tol = 0.5\n[optics]\nfocus_m = inf\nsmile_nm = -0.2\n[mirror]\ndamping = 1\n[detector]\nnoiseless = true\n"
             '[air]\ndistance_m = 30\nrelief = "step"\nnearest_m = 20\n[sky]\nstarted = 2026-06-01T12:00:00+02:00\n'
         )
     )
-    rig = found.rig
+    rig = found.simulated_rig
     assert (rig.optics, rig.mirror.damping, rig.detector) == (Optics(smile_nm=-0.2), 1.0, Detector(noiseless=True))
     assert rig.air == Air(distance_m=30.0, relief="step", nearest_m=20.0)
     assert rig.sky.started == datetime(2026, 6, 1, 10, tzinfo=UTC)

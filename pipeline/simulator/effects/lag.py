@@ -8,6 +8,7 @@ known at any time. In units of 1 / natural frequency it is x'' + 2 zeta x' + x =
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -51,18 +52,24 @@ class Lag:
         """Bound by slope times the greatest shift of any line, or times the greatest difference of the variants."""
         if variant == EXACT:
             return Bound(0.0, "exact")
-        worst = 0.0
-        for sweep in {(one.lines, one.step): one for one in probe.sweeps if one.lines}.values():
-            numbers = np.arange(sweep.lines)
-            off = transient(rig, sweep, numbers, EXACT)
-            if variant == EULER:
-                off = off - transient(rig, sweep, numbers, EULER)
-            worst = max(worst, float(np.abs(off).mean(axis=1).max()))
+        worst = greatest_lag_px(rig, probe.sweeps, variant)
         moved = at_line_ends(probe.sweeps, rig.camera, 0.0, worst)
         return Bound(probe.moved(*moved), f"lines lie up to {worst:.2g} px off {_reason(rig, variant)}")
 
 
 LAG = Lag()
+
+
+def greatest_lag_px(rig: Rig, sweeps: Iterable[Sweep], variant: str = OFF) -> float:
+    """Give the greatest shift along the scan of any line, or the greatest difference of a variant to the exact one."""
+    worst = 0.0
+    for sweep in {(one.lines, one.step): one for one in sweeps if one.lines}.values():
+        numbers = np.arange(sweep.lines)
+        off = transient(rig, sweep, numbers, EXACT)
+        if variant == EULER:
+            off = off - transient(rig, sweep, numbers, EULER)
+        worst = max(worst, float(np.abs(off).mean(axis=1).max()))
+    return worst
 
 
 def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64], variant: str = EXACT) -> Floats:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.blurring import UNITS
 from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.effects.sight import FARTHEST_M
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -62,10 +63,12 @@ TURBULENCE = Turbulence()
 def turbulence_px(rig: Rig) -> float:
     """Give the standard deviation of the angle of arrival per axis, sqrt(2.91 Cn2 d D^(-1/3)), from the farthest part.
 
-    D is the aperture as seen at rest, 10.6 mm of 15; a scene without a distance has none. [px]
+    D is the aperture as seen at rest, 10.6 mm of 15; a scene without a distance has none. No way through the air is
+    longer than `FARTHEST_M`, however far the scene is. [px]
     """
     if rig.distances_m is None:
         return 0.0
+    metres = min(max(rig.distances_m), FARTHEST_M)
     aperture_m = rig.optics.aperture_mm * 1e-3 * _REST
-    angle = math.sqrt(2.91 * rig.air.turbulence_cn2 * max(rig.distances_m) * aperture_m ** (-1 / 3))
+    angle = math.sqrt(2.91 * rig.air.turbulence_cn2 * metres * aperture_m ** (-1 / 3))
     return angle / rig.camera.ifov_rad

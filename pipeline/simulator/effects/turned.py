@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from pipeline.simulator.effects.lag import greatest_lag_px
+from pipeline.simulator.effects.turbulence import turbulence_px
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -13,12 +15,13 @@ _RAY_PER_TILT = 2.6  # a ray turns by twice the tilt; the scene plane is oblique
 
 
 def beside_plan_px(probe: Probe, rig: Rig) -> tuple[float, float]:
-    """Give how far beside its plan the mirror may look by drift, hysteresis and jitter, along and scan. [px]
+    """Give how far beside its plan the rig may look by drift, hysteresis, jitter, turbulence and lag. [px]
 
-    Lines lie turned by where the mirror looks: the farther from the middle, the more.
+    Along the line and the scan. Lines lie turned by where the mirror looks: the farther from the middle, the more.
     """
     mirror, lines = rig.mirror, max(sum(sweep.lines for sweep in probe.sweeps), 1)
     drift = mirror.drift_px_per_min / 60 * (probe.seconds + rig.camera.frame_ms * 1e-3)
     jitter = _RAY_PER_TILT * mirror.repeatability_urad * 1e-6 / rig.camera.ifov_rad
-    way = drift + mirror.hysteresis_px + jitter * math.sqrt(2 * math.log(lines / 1e-3))
-    return way, way
+    drawn = (jitter + turbulence_px(rig)) * math.sqrt(2 * math.log(lines / 1e-3))
+    way = drift + mirror.hysteresis_px + drawn
+    return way, way + greatest_lag_px(rig, probe.sweeps)

@@ -2,16 +2,16 @@
 
 ``frameIndex_<n>.txt`` lies beside ``raw_<n>``: a heading, then a line a frame with its number and its time in
 microseconds. Versions of the camera's program differ in what stands between the two (a tab or spaces) and in the line
-ends; frames may be missing or listed twice. Tested on small files made in these layouts.
+ends; frames may be missing or listed twice. Lines of text come in here; files are opened in storage. Tested on small
+indices made in these layouts.
 """
 
 from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,28 +55,33 @@ class _Rows:
     odd: int = 0  # lines that are no frame
 
 
-def load_frame_index(path: Path) -> FrameIndex:
-    """Read one index. Lines that are no frame are passed over and counted; of a frame listed twice the first counts.
+def parse_frame_index(lines: Iterable[str], name: str = "the frame index", where: str = "") -> FrameIndex:
+    """Read an index's lines; what is no frame is passed over and counted, of a frame listed twice the first counts.
+
+    Parameters
+    ----------
+    name
+        What notes call it.
+    where
+        What messages call it, where its name alone does not say.
 
     Raises
     ------
-    SceneError : the file cannot be read, or no line of it is a frame.
+    SceneError : no line is a frame.
     """
-    try:
-        with path.open(encoding="utf-8-sig", errors="replace") as file:
-            rows = _rows(iter(lambda: file.readline(LONGEST_LINE), ""))
-    except OSError as error:
-        raise SceneError(f"{path} cannot be read: {error}; take it away to go on without times") from error
+    rows = _rows(lines)
     if not rows.frame:
-        raise SceneError(f"{path} lists no frame, expected lines of number and microseconds; take it away or repair it")
+        raise SceneError(
+            f"{where or name} lists no frame, expected lines of number and microseconds; take it away or repair it"
+        )
     numbers, first = np.unique(np.array(rows.frame, np.int64), return_index=True)
-    notes = [f"{path.name}: {rows.odd} lines are no frames"] if rows.odd else []
+    notes = [f"{name}: {rows.odd} lines are no frames"] if rows.odd else []
     if len(numbers) < len(rows.frame):
-        notes.append(f"{path.name}: {len(rows.frame) - len(numbers)} frames are listed twice, the first counts")
+        notes.append(f"{name}: {len(rows.frame) - len(numbers)} frames are listed twice, the first counts")
     exposures = None if rows.exposure_ms is None else np.array(rows.exposure_ms)[first]
     stamps = np.array(rows.stamp, np.int64)[first]
     if (np.diff(stamps) < 0).any():
-        notes.append(f"{path.name}: time goes back {np.count_nonzero(np.diff(stamps) < 0)} times")
+        notes.append(f"{name}: time goes back {np.count_nonzero(np.diff(stamps) < 0)} times")
     return FrameIndex(numbers, stamps, exposures, tuple(notes))
 
 
@@ -110,7 +115,7 @@ def _count_notes(inside: NDArray[np.bool_], lines: int) -> tuple[str, ...]:
     return (*notes, *([f"the frame index lists {beyond} frames beyond the lines"] if beyond else []))
 
 
-def _rows(lines: Iterator[str]) -> _Rows:
+def _rows(lines: Iterable[str]) -> _Rows:
     """Numbers of all lines that are frames; other lines are counted."""
     rows = _Rows()
     column, scale = None, 1.0

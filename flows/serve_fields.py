@@ -1,0 +1,126 @@
+"""The fields of a schedule: their settings, checked before anything is served, and one survey of one of them."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+
+from rich.console import Console
+
+from flows.field_schedule import FieldSchedule, SystemWallClock, WallClock
+from flows.schedule_lock import RigLock, rig_lock
+from flows.schedule_state import moment_words
+from flows.schedule_times import Timetable
+from flows.settings import Settings, load_settings
+from pipeline.errors import ArchiveError, PipelineError, SettingsError
+from pipeline.simulator.farm_laws import has_days
+from storage.archive import Archive
+from storage.ledger import Ledger
+from storage.staging import take_lock
+
+
+@dataclass(frozen=True)
+class ServedField:
+    """One field: its name, its file of settings and what stands in it."""
+
+    name: str
+    file: Path
+    settings: Settings
+
+    @property
+    def archive(self) -> Path:
+        """Folder of the archive, or of its working copy."""
+        return Archive.open(self.settings.out).root
+
+    def schedule(self, timetable: Timetable, late: float, clock: WallClock | None = None) -> FieldSchedule:
+        """The field's schedule and ledger."""
+        return FieldSchedule(Ledger(self.archive, self.name), timetable, late, clock or SystemWallClock())
+
+    def lock(self) -> RigLock:
+        """The lock of the rig that looks at it."""
+        return rig_lock(self.settings, self.archive)
+
+    def settings_of(self, due: datetime, timetable: Timetable) -> Settings:
+        """What the survey of a due time is asked for: a visit of its own; a farm that grows is as on that day."""
+        asked = replace(self.settings, name=self.name, visit=moment_words(due))
+        if has_days(asked.scene) and asked.day is None:
+            asked = replace(asked, day=due.astimezone(timetable.zone).timetuple().tm_yday)
+        return asked
+
+
+def load_field(file: Path, out: str | None = None) -> ServedField:
+    """Read one field's settings; ``out`` wins over the file's archive.
+
+    Raises
+    ------
+    SettingsError : the file cannot be used, or says neither what to look at nor that a rig looks.
+    """
+    settings = load_settings(file, {"out": out})
+    said = tomllib.loads(file.read_text(encoding="utf-8"))
+    if "scene" not in said and settings.source != "rig":
+        raise SettingsError(
+            f"{file} says neither scene nor source = 'rig': nothing to look at; give the field's scene, or its rig"
+        )
+    name = settings.name or re.sub(r"[^A-Za-z0-9_.-]+", "-", file.stem).strip("-.") or "field"
+    return ServedField(name, file.absolute(), settings)
+
+
+def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedField]:
+    """Read the settings of every field, in turn, and see whether they can be surveyed; nothing is captured.
+
+    Raises
+    ------
+    PipelineError : there are none, two are called the same, or the first that cannot be surveyed, named.
+    """
+    if not files:
+        raise SettingsError("no fields: give the settings file of one or more, such as serve north.toml --every 30m")
+    fields = [load_field(file, out) for file in files]
+    for number, one in enumerate(fields):
+        same = [other for other in fields[:number] if other.name == one.name]
+        if same:
+            raise SettingsError(
+                f'{same[0].file} and {one.file} are both called {one.name}: give one of them another name = "..."'
+            )
+        _check(one)
+    return fields
+
+
+def _check(one: ServedField) -> None:
+    from flows.run import open_run
+
+    try:
+        open_run(replace(one.settings, name=one.name), planning=True)  # no device is asked before its first survey
+    except PipelineError as error:
+        raise type(error)(f"{one.file}: {error}") from error
+
+
+def survey_field(one: ServedField, due: datetime, timetable: Timetable, console: Console) -> Path:
+    """Survey a field for a due time; gives the folder of the published run."""
+    from flows.survey_command import run_survey
+
+    return run_survey(one.settings_of(due, timetable), console).folder
+
+
+@contextmanager
+def alone_on(fields: Sequence[ServedField]) -> Iterator[None]:
+    """Keep another serve off the archives of these fields while the block runs.
+
+    Raises
+    ------
+    ArchiveError : another serves one of them.
+    """
+    roots: Mapping[Path, str] = {one.archive: str(one.settings.out) for one in fields}
+    with ExitStack() as held:
+        for root, name in roots.items():
+            release = take_lock(root / ".locks" / "serve.lock", wait=False)
+            if release is None:
+                raise ArchiveError(
+                    f"another serve works on the archive {name}: give all its fields to that one, or end it first"
+                )
+            held.callback(release)
+        yield

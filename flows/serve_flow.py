@@ -1,0 +1,158 @@
+"""The flows that Prefect runs on a schedule or on request: a field's survey, and the reprocessing of an archive.
+
+No ``from __future__ import annotations`` here: Prefect reads the signatures. What is done is in plain functions.
+"""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+
+from prefect import State, flow
+from prefect.concurrency.sync import concurrency
+from prefect.context import FlowRunContext
+from prefect.states import Completed, Failed
+from rich.console import Console
+
+from flows.archive_commands import FAILED, PARTLY
+from flows.field_schedule import FieldSchedule
+from flows.notices import send_notice
+from flows.publish import Published
+from flows.reprocess_command import ReprocessRequest, run_reprocess
+from flows.schedule_runs import Outcome, run_due
+from flows.schedule_state import read_moment
+from flows.schedule_times import parse_timetable
+from flows.serve_fields import ServedField, load_field
+from flows.survey_artifacts import publish_artifacts
+from flows.survey_command import run_survey
+from pipeline.errors import PipelineError, RigError, SettingsError
+from storage.archive import Archive
+from storage.staging import take_lock
+
+LIMIT = "rig"  # a Prefect concurrency limit that shows who waits; the kernel's lock decides
+REPROCESS_LOCK = "reprocess-flow.lock"
+
+
+@flow(name="survey", flow_run_name="survey-{field}", persist_result=False)
+def survey_scheduled(
+    field: str,
+    settings: str,
+    out: str | None = None,
+    cron: str | None = None,
+    every: str | None = None,
+    timezone: str = "UTC",
+    late: float = 0.5,
+    notify: str | None = None,
+    due: str | None = None,
+) -> State:
+    """Survey one field: for the due time that this run was scheduled for, or at once where it was asked for by hand."""
+    try:
+        one = load_field(Path(settings), out)
+        if one.name != field:
+            raise SettingsError(f"{settings} is of the field {one.name}, not {field}; give the deployment its name")
+        schedule = one.schedule(parse_timetable(cron, every, timezone), late)
+        moment = read_moment(due) or _scheduled()
+        if moment is None:
+            return _by_hand(one, schedule)
+        schedule.join()
+        outcome = _run(one, schedule, moment)
+    except PipelineError as error:
+        return Failed(message=str(error))
+    if outcome.ending is not None:
+        send_notice(notify, outcome, one.settings.out)
+    return _state(outcome)
+
+
+def _run(one: ServedField, schedule: FieldSchedule, moment: datetime) -> Outcome:
+    waiting = [*schedule.state().open, *schedule.pending()]
+    known = next((found for found in waiting if abs((found - moment).total_seconds()) < 1), None)
+    if known is None:
+        line = schedule.state().ended.get(moment, {})
+        return Outcome(one.name, moment, None, str(line.get("reason") or "it is accounted for in the ledger already"))
+    with _shown_in_queue():
+        return run_due(schedule, known, one.lock(), lambda field, due: _survey(one, schedule, due), facts=_flow_run())
+
+
+def _survey(one: ServedField, schedule: FieldSchedule, due: datetime) -> Path:
+    published = run_survey(one.settings_of(due, schedule.timetable), Console(stderr=True))
+    _show(published, one)
+    return published.folder
+
+
+def _show(published: Published, one: ServedField) -> None:
+    with suppress(Exception):  # a server that is gone: the archive has it all
+        publish_artifacts(published, one.name, one.settings.out)
+
+
+def _by_hand(one: ServedField, schedule: FieldSchedule) -> State:
+    """A survey that somebody asked for on Prefect's pages: it has no due time, and waits for nobody."""
+    lock = one.lock()
+    if not lock.take(f"{one.name}, by hand"):
+        raise RigError(f"the rig is in use by {lock.holder()}; run again when that survey has ended")
+    try:
+        folder = _survey(one, schedule, datetime.now(UTC).replace(microsecond=0))
+    finally:
+        lock.release()
+    return Completed(message=f"runs/{folder.name}")
+
+
+@contextmanager
+def _shown_in_queue() -> Iterator[None]:
+    """Take a place in Prefect's queue of the rig, where it has one; without one, or with a stale one, go on."""
+    with ExitStack() as held:
+        with suppress(Exception):
+            held.enter_context(concurrency(LIMIT, occupy=1, timeout_seconds=5, lease_duration=60))
+        yield
+
+
+def _scheduled() -> datetime | None:
+    """The time that Prefect's scheduler meant; None of a run that it did not make."""
+    context = FlowRunContext.get()
+    if context is None or context.flow_run is None or not context.flow_run.auto_scheduled:
+        return None
+    expected = context.flow_run.expected_start_time
+    return None if expected is None else datetime.fromtimestamp(expected.timestamp(), UTC)
+
+
+def _flow_run() -> dict[str, object]:
+    context = FlowRunContext.get()
+    known = None if context is None or context.flow_run is None else str(context.flow_run.id)
+    return {} if known is None else {"flow_run": known}
+
+
+def _state(outcome: Outcome) -> State:
+    if outcome.ending == "failed":
+        return Failed(message=outcome.reason)
+    if outcome.ending == "done":
+        return Completed(message=outcome.run)
+    return Completed(name="Skipped", message=outcome.reason or "it is accounted for already")
+
+
+@flow(name="reprocess", flow_run_name="reprocess-{archive}", persist_result=False)
+def reprocess_archive(
+    archive: str,
+    since: str | None = None,
+    stage: str | None = None,
+    field: str | None = None,
+    failed: bool = False,
+    weights: str | None = None,
+    dry_run: bool = False,
+) -> State:
+    """Survey every field of an archive again: light is found there, only what has changed is made anew."""
+    request = ReprocessRequest(
+        archive, since, stage, field, failed, None if weights is None else Path(weights), dry_run
+    )
+    try:
+        lock = Archive.open(archive, create=False, write=False).root / ".locks" / REPROCESS_LOCK
+        release = take_lock(lock, wait=False)
+        if release is None:
+            return Completed(name="Skipped", message="this archive is being reprocessed already")
+        try:
+            code = run_reprocess(request, Console(stderr=True))
+        finally:
+            release()
+    except PipelineError as error:
+        return Failed(message=str(error))
+    if code == FAILED:
+        return Failed(message="no field could be reprocessed; reprocess-TIME.json beside the archive says why")
+    return Completed(message="some fields failed: see reprocess-TIME.json" if code == PARTLY else "done")

@@ -1,0 +1,44 @@
+"""Schedules without a server: this process waits until fields are due and surveys them in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from datetime import datetime, timedelta
+
+from flows.field_schedule import FieldSchedule, SystemWallClock, WallClock
+from flows.schedule_lock import RigLock
+from flows.schedule_runs import Outcome, Survey, Tell, run_all
+
+LOOK_AGAIN = timedelta(seconds=30)  # a clock that jumps, or a run that died, is seen after this at the latest
+
+
+def serve_plain(
+    schedules: Mapping[str, FieldSchedule],
+    locks: Mapping[str, RigLock],
+    survey: Survey,
+    tell: Tell,
+    *,
+    clock: WallClock | None = None,
+    note: Callable[[Outcome], None] = lambda outcome: None,
+    until: datetime | None = None,
+) -> None:
+    """Serve schedules until ``until``, or until interrupted; then they are closed, and what began is resumed later."""
+    watch = clock or SystemWallClock()
+    for schedule in schedules.values():
+        schedule.open()
+    try:
+        while until is None or watch.now() < until:
+            outcomes = run_all(schedules, lambda name: locks[name], survey, tell)
+            for outcome in outcomes:
+                note(outcome)
+            if not any(outcome.ending for outcome in outcomes):  # else others may have become due meanwhile
+                watch.sleep(_pause(schedules.values(), watch.now()).total_seconds())
+    finally:
+        for schedule in schedules.values():
+            schedule.close()
+
+
+def _pause(schedules: Iterable[FieldSchedule], now: datetime) -> timedelta:
+    due = [schedule.timetable.next_after(now) for schedule in schedules]
+    soonest = min((one - now for one in due if one is not None), default=LOOK_AGAIN)
+    return min(soonest, LOOK_AGAIN)

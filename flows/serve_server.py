@@ -1,0 +1,106 @@
+"""The Prefect server of a schedule: the one that PREFECT_API_URL names, or one of our own on this machine."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from flows.engine import QUIET, end_with_us
+from pipeline.errors import SettingsError
+
+HOST = "127.0.0.1"
+STARTED_WITHIN_S = 120.0
+POLL_S = "2"  # how often Prefect looks for due runs; by its own default the next field waits up to 10 s
+
+
+class LocalServer:
+    """A server process with its files in a folder; started again where it has died."""
+
+    def __init__(self, home: Path, port: int) -> None:
+        self.url, self._home, self._port = f"http://{HOST}:{port}/api", home, port
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def keep_up(self) -> bool:
+        """Start it where it does not run; whether it was started."""
+        if self._process is not None and self._process.poll() is None:
+            return False
+        self._home.mkdir(parents=True, exist_ok=True)
+        words = [sys.executable, "-m", "prefect", "server", "start", "--host", HOST, "--port", str(self._port)]
+        with (self._home / "server.log").open("ab") as log:
+            self._process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        end_with_us(self._process.pid)
+        return True
+
+    def wait(self) -> bool:
+        """Wait until it answers; False where it has not within two minutes, or has ended."""
+        end = time.monotonic() + STARTED_WITHIN_S
+        while time.monotonic() < end:
+            with suppress(OSError), urllib.request.urlopen(f"{self.url}/health", timeout=2) as answer:
+                if answer.status == 200:
+                    return True
+            if self._process is None or self._process.poll() is not None:
+                return False
+            time.sleep(0.2)
+        return False
+
+    def stop(self) -> None:
+        """End it."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(10)
+                return
+            self._process.kill()
+            self._process.wait()
+
+
+@contextmanager
+def server_for(home: Path, port: int) -> Iterator[LocalServer | None]:
+    """Have a server while the block runs, and name it to Prefect, here and in processes started from here.
+
+    None where PREFECT_API_URL names one, which is left as it is. Nothing outside this machine is asked.
+
+    Raises
+    ------
+    SettingsError : the port is taken, or the server did not start.
+    """
+    if os.environ.get("PREFECT_API_URL"):
+        yield None
+        return
+    server = LocalServer(home, port)
+    _check_free(port)
+    wanted = {
+        **QUIET, "PREFECT_HOME": str(home), "PREFECT_API_URL": server.url, "PREFECT_SERVER_UI_V2_ENABLED": "false",
+        "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false", "PREFECT_RUNNER_POLL_FREQUENCY": POLL_S,
+    }  # fmt: skip
+    added = {name: value for name, value in wanted.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        server.keep_up()
+        if not server.wait():
+            raise SettingsError(
+                f"the Prefect server did not start; see {home / 'server.log'}, or go without one: --engine plain"
+            )
+        yield server
+    finally:
+        server.stop()
+        for name in added:
+            os.environ.pop(name, None)
+
+
+def _check_free(port: int) -> None:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except (OSError, OverflowError) as error:
+            raise SettingsError(
+                f"--port {port} cannot be used ({error}): give another, or name the server there in PREFECT_API_URL"
+            ) from error

@@ -1,0 +1,174 @@
+"""One capture after the other on a rig: path up, mirror to its start, both begun in order, and the end taken down."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.camera import LineCamera
+from pipeline.errors import RigError
+from pipeline.rig.capture_journal import CaptureJournal, LoggedPath, Taken
+from pipeline.rig.capture_names import capture_prefix
+from pipeline.rig.capture_paths import CapturePath
+from pipeline.rig.clock import Clock
+from pipeline.rig.kept_files import Kept
+from pipeline.rig.line_camera import Capture, LineCameraDevice
+from pipeline.rig.line_positions import MirrorTrack
+from pipeline.rig.registers import Trigger
+from pipeline.rig.steering import MotionLog, Steering
+from pipeline.rig.survey_rig import SurveyRig
+from pipeline.scan import Sweep
+
+LOG = logging.getLogger(__name__)
+REST = Sweep("references", "fine", "x", 0.0, 0.0, 1)
+SLACK_S = 5.0  # by which a capture may take longer than its frames
+POLL_S = 0.05
+_CELL = np.dtype(">f4")
+
+
+@dataclass(frozen=True)
+class RigDevices:
+    """Both devices, connected, and the clock that their drivers go by."""
+
+    steering: Steering
+    camera: LineCameraDevice
+    clock: Clock
+
+    def close(self) -> None:
+        """Let go of both, whatever either says."""
+        for device in (self.steering, self.camera):
+            try:
+                device.close()
+            except RigError as error:
+                LOG.warning("while letting go of the rig: %s", error)
+
+
+class CaptureRunner:
+    """Runs captures on devices that are connected, and takes down what they acknowledge."""
+
+    def __init__(
+        self, devices: RigDevices, kept: Kept, journal: CaptureJournal, camera: LineCamera, rig: SurveyRig
+    ) -> None:
+        self.devices = devices
+        self._kept, self._journal = kept, journal
+        self._camera, self._rig = camera, rig
+        self._configured = False
+
+    def take(self, path: CapturePath) -> Taken:
+        """Take the lines of a path, and wait until they are on the camera.
+
+        Motions and the capture are sent once. Where something fails after the mirror or the camera has begun, both are
+        told to stop.
+
+        Raises
+        ------
+        StateUnknown, DeviceRefused, DeadlinePassed, DeviceGone, RigError
+        """
+        steering, prefix = self.devices.steering, capture_prefix(path.sweep, path.first)
+        self._configure()
+        steering.load_path(path.cells)
+        steering.goto(*(float(place) for place in path.cells[0]))
+        steering.settle(self._rig.settle_s)
+        with self._stopped_on_error():
+            if path.triggered:
+                run_s = self._run(path)
+                capture = self.devices.camera.capture(path.lines, prefix=prefix)
+            else:
+                steering.start_log(self._log_rate_hz(path.lines))
+                capture = self.devices.camera.capture(path.lines, prefix=prefix)
+                run_s = self._run(path)
+            taken = _taken(path, capture, run_s)
+            self._journal.began(taken)
+            self.wait(taken)
+        return self._end(taken)
+
+    def wait(self, taken: Taken) -> None:
+        """Wait until a capture is over; one that goes on too long is stopped, and what it has counts."""
+        camera, clock = self.devices.camera, self.devices.clock
+        until = clock.now() + self._seconds(taken.stop - taken.first) + SLACK_S
+        while camera.is_capturing():
+            if clock.now() >= until:
+                LOG.warning("the capture %s goes on for too long and is stopped", taken.folder)
+                camera.stop()
+                return
+            clock.sleep(min(max(until - SLACK_S - clock.now(), POLL_S), 1.0))
+
+    def recovered(self, taken: Taken) -> Taken:
+        """Take down the end of a capture whose process did not live to see it; nothing has played since."""
+        self.wait(taken)
+        if not taken.triggered or taken.index_at_end is not None:
+            return taken
+        return self._journal.ended(replace(taken, index_at_end=self.devices.steering.index()))
+
+    def look_at_rest(self, prefix: str) -> str:
+        """Take one frame with the mirror at 0; 0 (unless the settings say otherwise), and give its folder."""
+        self._configure()
+        if self._rig.white_at_rest:
+            self.devices.steering.park()
+            self.devices.steering.settle(self._rig.settle_s)
+        with self._stopped_on_error():
+            capture = self.devices.camera.capture(1, prefix=prefix)
+            at = (capture.sent_s, capture.acknowledged_s)
+            self.wait(Taken(REST, 0, 1, capture.folder, False, at, at))
+        return capture.folder
+
+    def log_of(self, taken: Taken) -> MirrorTrack | None:
+        """Read the mirror's log of a capture; None where there is none."""
+        if taken.log is None:
+            return None
+        data = self._kept.read(taken.log.name, 0, self._kept.size(taken.log.name))
+        position = np.frombuffer(data[: len(data) // 8 * 8], _CELL).reshape(-1, 2).astype(np.float64)
+        return MirrorTrack(np.arange(len(position)) / taken.log.rate_hz, position)
+
+    def _configure(self) -> None:
+        if not self._configured:
+            self.devices.camera.configure(self._camera.exposure_ms, self._camera.frame_ms)
+        self._configured = True
+
+    def _run(self, path: CapturePath) -> tuple[float, float]:
+        clock, trigger = self.devices.clock, Trigger.RISING_EDGE if path.triggered else Trigger.OFF
+        sent = clock.now()
+        self.devices.steering.run(0, len(path.cells), path.rate_hz, 1, trigger)
+        return sent, clock.now()
+
+    def _end(self, taken: Taken) -> Taken:
+        steering = self.devices.steering
+        if taken.triggered:
+            taken = replace(taken, index_at_end=steering.index())
+        else:
+            taken = replace(taken, log=self._keep_log(taken.folder, steering.read_log()))
+        steering.halt()
+        return self._journal.ended(taken)
+
+    def _keep_log(self, folder: str, log: MotionLog) -> LoggedPath:
+        name = f"{folder}/mirror_log"
+        self._kept.append(name, log.position.astype(_CELL).tobytes())
+        return LoggedPath(name, log.rate_hz, log.started_s, log.start_error_s)
+
+    def _log_rate_hz(self, lines: int) -> float:
+        """As fast as the logger goes, or so that it holds the whole capture."""
+        return min(self._rig.log_rate_hz, (self._rig.log_samples - 1) / (self._seconds(lines) + SLACK_S))
+
+    def _seconds(self, lines: int) -> float:
+        return lines * self._camera.frame_ms * 1e-3
+
+    @contextmanager
+    def _stopped_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            for stop in (self.devices.camera.stop, self.devices.steering.halt):
+                with suppress(RigError):
+                    stop()
+            raise
+
+
+def _taken(path: CapturePath, capture: Capture, run_s: tuple[float, float]) -> Taken:
+    return Taken(
+        path.sweep, path.first, path.stop, capture.folder, path.triggered, run_s,
+        (capture.sent_s, capture.acknowledged_s),
+    )  # fmt: skip

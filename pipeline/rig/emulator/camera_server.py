@@ -1,0 +1,255 @@
+"""The emulated camera on the network: its control socket and its files over FTP, on free ports of this machine.
+
+The files stay in memory. pyftpdlib serves them and is imported when a server starts.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import socket
+import stat
+import threading
+import warnings
+from contextlib import suppress
+from typing import Any
+
+from pipeline.errors import RigError
+from pipeline.rig.emulator.camera_device import CameraDevice
+from pipeline.rig.emulator.camera_faults import CameraFault
+from pipeline.rig.kept_files import RemoteFile
+
+LOG = logging.getLogger(__name__)
+_SLICE_S = 0.05  # how soon threads see that they are to end
+
+
+class CameraServer:
+    """Both ports of a device, until ``close``. Also a context.
+
+    Parameters
+    ----------
+    port, file_port
+        Of the control socket and of FTP; 0 takes a free one.
+
+    Raises
+    ------
+    RigError : a port is taken, or pyftpdlib is not installed.
+    """
+
+    def __init__(
+        self, device: CameraDevice, *, host: str = "127.0.0.1", port: int = 0, file_port: int = 0,
+        user: str = "ftpuser", password: str = "ftpuser",
+    ) -> None:  # fmt: skip
+        self.device = device
+        self.host = host
+        self._ended = threading.Event()
+        self._threads: list[threading.Thread] = []
+        try:
+            self._listener = socket.create_server((host, port))
+        except OSError as error:
+            raise RigError(
+                f"{host}:{port} cannot be listened on ({error}); take another port, or 0 for a free one"
+            ) from error
+        try:
+            self._files = _file_server(device, (host, file_port), (user, password))
+        except BaseException:
+            self._listener.close()
+            raise
+        self._listener.settimeout(_SLICE_S)
+        self.port = int(self._listener.getsockname()[1])
+        self.file_port = int(self._files.socket.getsockname()[1])
+        for serve in (self._serve_control, self._serve_files):
+            self._start(serve)
+
+    def __enter__(self) -> CameraServer:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Hang up on everyone, and let go of the ports."""
+        self._ended.set()
+        for thread in self._threads:
+            thread.join(timeout=10)
+        self._listener.close()
+
+    def _start(self, serve: Any, *arguments: Any) -> None:
+        thread = threading.Thread(target=serve, args=arguments, daemon=True, name="emulated camera")
+        self._threads.append(thread)
+        thread.start()
+
+    def _serve_control(self) -> None:
+        while not self._ended.is_set():
+            with suppress(TimeoutError):
+                connection, _ = self._listener.accept()
+                self._start(self._talk, connection)
+
+    def _talk(self, connection: socket.socket) -> None:
+        """One client, until it says exit, goes away, or the server closes."""
+        talk = self.device.connection()
+        with connection, suppress(OSError):
+            connection.settimeout(_SLICE_S)
+            chunks, goes_on = self.device.greet(), True
+            while goes_on and not self._ended.is_set():
+                for chunk in chunks:
+                    self.device.clock.sleep(chunk.delay_s)
+                    connection.sendall(chunk.data)
+                chunks = []
+                with suppress(TimeoutError):
+                    data = connection.recv(4096)
+                    if not data:
+                        return
+                    chunks, goes_on = talk.feed(data)
+            for chunk in chunks:
+                connection.sendall(chunk.data)
+
+    def _serve_files(self) -> None:
+        while not self._ended.is_set():
+            self._files.serve_forever(timeout=_SLICE_S, blocking=False)
+        self._files.close_all()
+
+
+def remote_files(device: CameraDevice, folder: str) -> list[RemoteFile]:
+    """A device's files in a folder, as a listing has them."""
+    return [
+        RemoteFile(name, len(data), False)
+        for name, data in sorted(device.files().items()) if name.startswith(folder + "/")
+    ]  # fmt: skip
+
+
+def _file_server(device: CameraDevice, address: tuple[str, int], user: tuple[str, str]) -> Any:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # asyncore, which Python 3.11 still has
+            from pyftpdlib.authorizers import DummyAuthorizer
+            from pyftpdlib.filesystems import AbstractedFS
+            from pyftpdlib.handlers import DTPHandler, FTPHandler
+            from pyftpdlib.ioloop import IOLoop
+            from pyftpdlib.servers import FTPServer
+    except ImportError as error:
+        raise RigError("the emulated camera's files need pyftpdlib; install it: pip install 'pyftpdlib>=2'") from error
+    chatter = logging.getLogger("pyftpdlib")
+    chatter.setLevel(logging.ERROR)
+    if not chatter.handlers:
+        chatter.addHandler(logging.NullHandler())  # else it turns itself up to everything, on stderr
+    authorizer = DummyAuthorizer()
+    authorizer.add_user(*user, homedir=".", perm="elr")
+    transfer = type("CameraTransfer", (_BreakingTransfer, DTPHandler), {"device": device})
+    handler = type(
+        "CameraFileHandler",
+        (_RefusingHandler, FTPHandler),
+        {
+            "device": device, "authorizer": authorizer, "dtp_handler": transfer, "use_sendfile": False,
+            "abstracted_fs": type("CameraFolders", (_FilesInMemory, AbstractedFS), {"device": device}),
+            "auth_failed_timeout": 0, "banner": "emulated camera",
+        },
+    )  # fmt: skip
+    try:
+        return FTPServer(address, handler, ioloop=IOLoop())
+    except OSError as error:
+        raise RigError(f"{address[0]}:{address[1]} cannot be listened on ({error}); take another port") from error
+
+
+class _RefusingHandler:
+    """Closes connections for files while that fault strikes."""
+
+    device: CameraDevice
+
+    def handle(self) -> None:
+        if self.device.faults.strikes(CameraFault.REFUSES_FILES):
+            self.close()  # type: ignore[attr-defined]
+            return
+        super().handle()  # type: ignore[misc]
+
+
+class _BreakingTransfer:
+    """Closes a transfer half way while that fault strikes, and the session with it."""
+
+    device: CameraDevice
+
+    def push_with_producer(self, producer: Any) -> None:
+        if self.device.faults.strikes(CameraFault.BREAKS_OFF):
+            producer = _HalfOf(producer, self)
+        super().push_with_producer(producer)  # type: ignore[misc]
+
+
+class _HalfOf:
+    """What a producer gives of a file up to half of what is left of it."""
+
+    def __init__(self, producer: Any, transfer: Any) -> None:
+        self._transfer = transfer
+        rest = producer.file.read()
+        self._data = rest[: len(rest) // 2]
+
+    def more(self) -> bytes:
+        data: bytes = self._data[:65536]
+        self._data = self._data[65536:]
+        if not data:
+            self._transfer.cmd_channel.close()
+        return data
+
+
+class _NamedBytes(io.BytesIO):
+    """A file in memory with the name that servers ask for."""
+
+    def __init__(self, name: str, data: bytes) -> None:
+        super().__init__(data)
+        self.name = name
+
+
+class _FilesInMemory:
+    """A device's files as a read-only file system."""
+
+    device: CameraDevice
+    cwd: str
+
+    def ftp2fs(self, path: str) -> str:
+        return str(self.ftpnorm(path))  # type: ignore[attr-defined]
+
+    def fs2ftp(self, path: str) -> str:
+        return path
+
+    def validpath(self, path: str) -> bool:
+        return True
+
+    def realpath(self, path: str) -> str:
+        return path
+
+    def chdir(self, path: str) -> None:
+        self.cwd = path
+
+    def isfile(self, path: str) -> bool:
+        return path in self.device.files()
+
+    def isdir(self, path: str) -> bool:
+        return path in self.device.folders()
+
+    def lexists(self, path: str) -> bool:
+        return self.isfile(path) or self.isdir(path)
+
+    def getsize(self, path: str) -> int:
+        return len(self._content(path))
+
+    def open(self, name: str, mode: str) -> io.BytesIO:
+        return _NamedBytes(name, self._content(name))
+
+    def listdir(self, path: str) -> list[str]:
+        under = path.rstrip("/") + "/"
+        every = [*self.device.files(), *self.device.folders()]
+        return sorted({name[len(under) :].split("/")[0] for name in every if name.startswith(under) and name != under})
+
+    def stat(self, path: str) -> Any:
+        import os
+
+        mode = stat.S_IFDIR | 0o555 if self.isdir(path) else stat.S_IFREG | 0o444
+        size = 0 if self.isdir(path) else self.getsize(path)
+        return os.stat_result((mode, 0, 0, 1, 0, 0, size, 0, 0, 0))
+
+    lstat = stat
+
+    def _content(self, path: str) -> bytes:
+        try:
+            return self.device.files()[path]
+        except KeyError:
+            raise FileNotFoundError(2, "No such file", path) from None

@@ -1,0 +1,108 @@
+"""What the camera's replies say: whether they belong to a command, refusals in words that help, and their responses."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from pipeline.errors import RigError
+from pipeline.rig.headwall_replies import Said
+from pipeline.rig.kept_files import RemoteFile
+from pipeline.rig.refusals import DeviceRefused
+
+# words of a refusal -> what to do about it
+_REMEDIES = (
+    (("full", "space", "storage"), "copy the folders on the camera's disk to another and delete them there"),
+    (("busy", "already", "progress", "in use"), "wait until it is done (isCapturing), or stop it (stopCapture)"),
+    (("exposure", "period"), "give an exposure that is not longer than the frame period, both in ms"),
+    (("folder", "directory", "file", "path"), "list the folder above it and take a name from there"),
+)
+
+
+class MisfitError(Exception):
+    """A response that is no answer to this command."""
+
+
+def other_command(said: Said, name: str) -> str:
+    """Why this is no reply to the command; empty where it may be one."""
+    return f"a reply to {said.command}" if said.command not in ("", name) else ""
+
+
+def response_of(said: Said, name: str, port: str) -> Any:
+    """The response of a reply that says success.
+
+    Raises
+    ------
+    DeviceRefused : the reply says no; the message says what to do. RigError : it is no reply.
+    """
+    if said.reply is None:
+        raise RigError(
+            f"{port} answered {name} with {said.text[:200]!r}, expected JSON; is this the camera's control port?"
+        )
+    success = said.reply.get("success")
+    if not isinstance(success, bool):
+        raise RigError(f"{port} answered {name} with {said.text[:200]!r}, expected success true or false")
+    if not success:
+        words = str(said.reply.get("errorMessage") or "no reason given")
+        lower = words.lower()
+        remedy = next(
+            (what for keys, what in _REMEDIES if any(key in lower for key in keys)), "see the camera's manual"
+        )
+        raise DeviceRefused(f"the camera at {port} refused {name}: {words}; {remedy}")
+    return said.reply.get("response")
+
+
+def as_folder(response: Any) -> str:
+    """The folder of a capture.
+
+    Raises
+    ------
+    MisfitError : this answers another command.
+    """
+    folder = response.get("folder") if isinstance(response, dict) else None
+    if not isinstance(folder, str) or not folder:
+        raise MisfitError("a reply without a folder")
+    return folder
+
+
+def as_truth(response: Any) -> bool:
+    """Whether it captures.
+
+    Raises
+    ------
+    MisfitError : this answers another command.
+    """
+    value = response.get("capturing") if isinstance(response, dict) else response
+    if not isinstance(value, bool):
+        raise MisfitError("a reply that is neither true nor false")
+    return value
+
+
+def as_stopped(response: Any) -> bool:
+    """Whether something was stopped; success alone counts as that."""
+    return response if isinstance(response, bool) else True
+
+
+def as_listing(response: Any) -> list[RemoteFile]:
+    """Entries of a folder, by name.
+
+    Raises
+    ------
+    MisfitError : this answers another command.
+    """
+    if not isinstance(response, list):
+        raise MisfitError("a reply that is no list")
+    found = []
+    for entry in response:
+        name = entry.get("name") if isinstance(entry, dict) else None
+        if not isinstance(name, str):
+            raise MisfitError("a list of something else than files")
+        found.append(RemoteFile(re.sub("/{2,}", "/", name), _size(entry.get("size")), bool(entry.get("isDirectory"))))
+    return sorted(found, key=lambda entry: entry.name)
+
+
+def _size(value: Any) -> int | None:
+    try:
+        return max(int(value), 0)
+    except (TypeError, ValueError):
+        return None

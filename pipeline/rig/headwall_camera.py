@@ -1,0 +1,125 @@
+"""The camera's driver: control socket and files together, as a line camera for surveys."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pipeline.errors import RigError
+from pipeline.rig.camera_cubes import CapturedLines, Read, read_capture, read_references
+from pipeline.rig.camera_files import FileServer, fetch_files
+from pipeline.rig.camera_limits import CameraLimits
+from pipeline.rig.camera_references import MeanFrame, mean_frame
+from pipeline.rig.clock import SYSTEM_CLOCK, Clock
+from pipeline.rig.headwall_control import ControlPatience, HeadwallControl
+from pipeline.rig.kept_files import Kept, Progress, RemoteFile
+from pipeline.rig.line_camera import Capture
+from pipeline.rig.socket_transport import SocketTransport
+
+
+@dataclass(frozen=True)
+class CameraAddress:
+    """Where the camera is; as its maker sets it, unless changed there."""
+
+    host: str = "10.0.65.50"
+    port: int = 8100
+    connect_s: float = 3.0
+
+
+class HeadwallCamera:
+    """A :class:`pipeline.rig.line_camera.LineCameraDevice`. Nothing is connected before the first command."""
+
+    def __init__(self, control: HeadwallControl, server: FileServer, clock: Clock = SYSTEM_CLOCK) -> None:
+        self.control = control
+        self.server = server
+        self.clock = clock
+
+    @classmethod
+    def at(
+        cls, address: CameraAddress, server: FileServer, *, patience: ControlPatience | None = None,
+        limits: CameraLimits | None = None, clock: Clock = SYSTEM_CLOCK,
+    ) -> HeadwallCamera:  # fmt: skip
+        """A camera on the network."""
+
+        def connect() -> SocketTransport:
+            return SocketTransport(address.host, address.port, clock, connect_s=address.connect_s)
+
+        return cls(HeadwallControl(connect, clock=clock, patience=patience, limits=limits), server, clock)
+
+    def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
+        """Set both times [ms]; see :meth:`HeadwallControl.configure`."""
+        self.control.configure(exposure_ms, frame_period_ms)
+
+    def capture(self, frames: int, *, cubes: int = 1, prefix: str = "") -> Capture:
+        """Begin to take lines, once; see :meth:`HeadwallControl.capture`."""
+        return self.control.capture(frames, cubes=cubes, prefix=prefix)
+
+    def is_capturing(self) -> bool:
+        """Whether lines are being taken."""
+        return self.control.is_capturing()
+
+    def stop(self) -> bool:
+        """End a capture; False where none ran."""
+        return self.control.stop_capture()
+
+    def wait(self, at_most_s: float, *, every_s: float = 0.2) -> None:
+        """Wait until no capture runs.
+
+        Raises
+        ------
+        RigError : one still runs after ``at_most_s``.
+        """
+        until = self.clock.now() + at_most_s
+        while self.is_capturing():
+            if self.clock.now() >= until:
+                raise RigError(f"the capture still runs after {at_most_s:g} s; wait longer, or stop it")
+            self.clock.sleep(every_s)
+
+    def fetch(self, folder: str, kept: Kept, progress: Progress | None = None) -> CapturedLines:
+        """Get a finished capture's files, small ones first, and give its lines; a later call continues.
+
+        Raises
+        ------
+        RigError : the capture still runs, or its files do not belong together.
+        DeviceRefused, DeadlinePassed, DeviceGone
+        """
+        files = self._finished(folder)
+        fetch_files(self.server, sorted(files, key=_rawness), kept, progress, clock=self.clock)
+        return read_capture([file.name for file in files], _reader(kept))
+
+    def references(self, folder: str, kept: Kept) -> dict[str, MeanFrame]:
+        """Mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``; empty without any.
+
+        Raises
+        ------
+        RigError, DeviceRefused, DeadlinePassed, DeviceGone
+        """
+        files = [file for file in self._finished(folder) if _base(file).lower().startswith(("dark", "white"))]
+        fetch_files(self.server, files, kept, clock=self.clock)
+        cubes = read_references([file.name for file in files], _reader(kept))
+        return {kind: mean_frame(cube.values) for kind, cube in cubes.items()}
+
+    def acknowledge_state(self, reason: str) -> None:
+        """Allow captures again after one whose reply was lost."""
+        self.control.acknowledge_state(reason)
+
+    def close(self) -> None:
+        """Hang up; a capture goes on."""
+        self.control.close()
+
+    def _finished(self, folder: str) -> list[RemoteFile]:
+        if self.is_capturing():
+            raise RigError(f"a capture still runs, so files of {folder} may grow; wait for its end, or stop it")
+        return [file for file in self.control.list_files(folder) if not file.folder]
+
+
+def _base(file: RemoteFile) -> str:
+    return file.name.rsplit("/", 1)[-1]
+
+
+def _rawness(file: RemoteFile) -> tuple[bool, str]:
+    base = _base(file).lower()
+    return base.startswith("raw_") and not base.endswith(".hdr"), file.name
+
+
+def _reader(kept: Kept) -> Read:
+    return lambda name: kept.read(name, 0, kept.size(name))

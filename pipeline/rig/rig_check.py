@@ -1,0 +1,227 @@
+"""What `rig check` asks of both devices. Nothing moves and nothing is set, unless the square is asked for."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+from pipeline.errors import PipelineError, RigError
+from pipeline.rig.camera_files import FileServer, log_in
+from pipeline.rig.headwall_camera import HeadwallCamera
+from pipeline.rig.mirror_controller import MirrorController
+
+Verdict = Literal["ok", "warn", "fail"]
+Device = Literal["mirror", "camera"]
+
+KNOWN_MODELS = ("MR-E", "MRE")  # begin the ids of the controllers that the documents are of
+SQUARE = ((0.03, 0.03), (0.03, -0.03), (-0.03, -0.03), (-0.03, 0.03))  # within 0.05 of the middle
+NEAR, FAR = (
+    0.002,
+    0.02,
+)  # of the disk's radius: a position read back is right within one, and elsewhere beyond the other
+SETTLE_S = 2.0
+LOG_HZ, LOGGED = 1000.0, 8
+MOST_NAMED = 5  # entries of a listing, warnings
+CONNECT = "connect"
+PRO_MODE = "it may be in pro mode"  # of the warning when a controller does not answer in simple mode
+LOOK_AT_LINE = "look at cable, plugs and earth if this comes again"
+
+
+@dataclass(frozen=True)
+class CheckRow:
+    """One thing that was asked, what came, and what to do where that is not right."""
+
+    device: Device
+    asked: str
+    came: str
+    verdict: Verdict = "ok"
+    mend: str = ""
+
+    def record(self) -> dict[str, str]:
+        """As plain values."""
+        return asdict(self)
+
+
+def failed(device: Device, asked: str, error: PipelineError) -> CheckRow:
+    """Give the row of an error: what is wrong, and behind its semicolon what to do."""
+    came, _, mend = str(error).partition("; ")
+    return CheckRow(device, asked, came, "fail", mend)
+
+
+def works(rows: Sequence[CheckRow], device: Device) -> bool:
+    """Whether a device was asked something and nothing failed."""
+    verdicts = [row.verdict for row in rows if row.device == device]
+    return bool(verdicts) and "fail" not in verdicts
+
+
+def check_mirror(connect: Callable[[], MirrorController], *, move: bool = False) -> list[CheckRow]:
+    """Ask a mirror controller who it is and how it is; with ``move`` send it round a small square.
+
+    ``connect`` opens the port and greets the device there. It is closed again. Errors become rows.
+    """
+    rows: list[CheckRow] = []
+    with _warnings(rows, "mirror"):
+        try:
+            mirror = connect()
+        except RigError as error:
+            rows.append(failed("mirror", CONNECT, error))
+            return rows
+        try:
+            _ask_mirror(mirror, rows, move=move)
+        finally:
+            mirror.close()
+    return rows
+
+
+def check_camera(camera: HeadwallCamera, server: FileServer) -> list[CheckRow]:
+    """Ask a camera whether it captures and what it holds, and log in to its files. Errors become rows."""
+    rows: list[CheckRow] = []
+    with _warnings(rows, "camera"):
+        try:
+            rows.append(_capturing(camera))
+            _row(rows, "camera", "list its files", lambda: _listing(camera))
+        except RigError as error:
+            rows.append(failed("camera", CONNECT, error))
+        finally:
+            camera.close()
+        _row(rows, "camera", f"log in to its files, port {server.port}", lambda: log_in(server))
+    return rows
+
+
+def _ask_mirror(mirror: MirrorController, rows: list[CheckRow], *, move: bool) -> None:
+    rows.append(_identity(mirror))
+    try:
+        rows.append(_status(mirror))
+        playing = mirror.is_playing()
+        rows.append(_playing(playing))
+        if not playing:
+            rows.append(CheckRow("mirror", "temperature", f"{mirror.temperature():.1f} deg C"))
+    except RigError as error:
+        rows.append(failed("mirror", "status", error))
+    if not move:
+        return
+    if any(row.verdict == "fail" for row in rows) or playing:
+        rows.append(CheckRow("mirror", "move", "nothing was moved", "warn", "mend what is told above first"))
+        return
+    _move(mirror, rows)
+
+
+def _identity(mirror: MirrorController) -> CheckRow:
+    found, expected = mirror.identity(), mirror.settings.expected_id
+    words = f"{found.device or 'no id'}, version {found.version or 'unknown'}, serial {found.serial or 'unknown'}"
+    if expected or found.device.upper().startswith(KNOWN_MODELS):
+        return CheckRow("mirror", "identity", words)
+    mend = (
+        f"expected an id that begins with {KNOWN_MODELS[0]}: is another device at this port? If it is the mirror, set "
+        "rig.expected_id to a part of its id"
+    )
+    return CheckRow("mirror", "identity", f"firmware not known: {words}", "fail", mend)
+
+
+def _status(mirror: MirrorController) -> CheckRow:
+    status = mirror.status()
+    if status.stops_motion:
+        return CheckRow("mirror", "status", status.sentence, "fail", "mend that first: motions are refused with it")
+    if status:
+        return CheckRow("mirror", "status", status.sentence, "warn", "have a look at the mirror before a survey")
+    return CheckRow("mirror", "status", status.sentence)
+
+
+def _playing(playing: bool) -> CheckRow:
+    if playing:
+        mend = "is another program at work? Else halt it: a survey would"
+        return CheckRow("mirror", "path", "a path plays", "warn", mend)
+    return CheckRow("mirror", "path", "no path plays")
+
+
+def _move(mirror: MirrorController, rows: list[CheckRow]) -> None:
+    """Send the mirror to the corners of a square and back to the middle; stops at the first error."""
+    for x, y in (*SQUARE, (0.0, 0.0)):
+        asked = f"go to {x:g}; {y:g}"
+        try:
+            mirror.goto(x, y)
+            mirror.settle(SETTLE_S)
+            rows.append(_arrived(asked, (x, y), _position(mirror)))
+        except RigError as error:
+            rows.append(failed("mirror", asked, error))
+            return
+
+
+def _position(mirror: MirrorController) -> tuple[float, float]:
+    """Where the mirror says it is, by its log."""
+    mirror.start_log(LOG_HZ)
+    mirror.wire.clock.sleep(2 * LOGGED / LOG_HZ)
+    x, y = mirror.read_log(LOGGED).position.astype(float).mean(axis=0)
+    return float(x), float(y)
+
+
+def _arrived(asked: str, wanted: tuple[float, float], found: tuple[float, float]) -> CheckRow:
+    off = math.dist(wanted, found)
+    words = f"read back {found[0]:.4f}; {found[1]:.4f}, {off:.1g} off"
+    if not off <= FAR:
+        mend = "it is not where it was sent: look at the mirror head and its cable before it moves again"
+        return CheckRow("mirror", asked, words, "fail", mend)
+    if off > NEAR:
+        return CheckRow("mirror", asked, words, "warn", "further off than 0.15 deg would explain: is it in tune?")
+    return CheckRow("mirror", asked, words)
+
+
+def _capturing(camera: HeadwallCamera) -> CheckRow:
+    asked = "whether it captures"
+    if camera.is_capturing():
+        return CheckRow("camera", asked, "a capture runs", "warn", "is another program at work? Else stop it")
+    return CheckRow("camera", asked, "no capture runs")
+
+
+def _listing(camera: HeadwallCamera) -> str:
+    names = [file.name for file in camera.control.list_files("/")]
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return f"{', '.join(names[:MOST_NAMED])}{more}" if names else "nothing there"
+
+
+def _row(rows: list[CheckRow], device: Device, asked: str, ask: Callable[[], str]) -> None:
+    try:
+        rows.append(CheckRow(device, asked, ask()))
+    except RigError as error:
+        rows.append(failed(device, asked, error))
+
+
+@contextmanager
+def _warnings(rows: list[CheckRow], device: Device) -> Iterator[None]:
+    """Make a row of what the drivers warned of: answers that were late, damaged, or not asked for."""
+    logger, heard = logging.getLogger("pipeline.rig"), _Heard()
+    logger.addHandler(heard)
+    try:
+        yield
+    finally:
+        logger.removeHandler(heard)
+        words = _but_for_modes(heard.words, rows) if device == "mirror" else heard.words
+        if words and rows and rows[0].asked != CONNECT:  # that row says it all
+            more = f"; and {len(words) - MOST_NAMED} more" if len(words) > MOST_NAMED else ""
+            came = "; ".join(one.partition("; ")[0] for one in words[:MOST_NAMED])
+            rows.append(CheckRow(device, "bytes on the line", came + more, "warn", LOOK_AT_LINE))
+
+
+def _but_for_modes(words: list[str], rows: list[CheckRow]) -> list[str]:
+    """Leave out the silence of a controller that was in pro mode, which is no fault, and say that it was."""
+    found = next((place for place, one in enumerate(words) if PRO_MODE in one), None)
+    if found is None or not works(rows, "mirror"):
+        return words
+    rows.insert(1, CheckRow("mirror", "mode", "it was in pro mode, as drivers leave it"))
+    return [one for one in words[found + 1 :] if "changing to simple mode" not in one]
+
+
+class _Heard(logging.Handler):
+    """Keeps warnings in words."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.words: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep one."""
+        self.words.append(record.getMessage())

@@ -1,0 +1,72 @@
+"""Settings of the rig that a survey looks through, the table [rig]: where its devices are, what to believe of them.
+
+Written for the documented protocols and tested against emulators; never run on hardware. ``provenance`` says which of
+the assumed values somebody has confirmed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from pipeline.rig.camera_files import FileServer
+from pipeline.rig.mirror_settings import MirrorSettings
+from pipeline.rig.steering import ReadBack
+from pipeline.vector_memory import Ends
+
+if TYPE_CHECKING:
+    from pipeline.rig.headwall_camera import CameraAddress
+
+Pulses = Literal["position", "frame", "none"]
+
+
+@dataclass(frozen=True)
+class SurveyRig:
+    """Both devices, the cable between them, and the white panel."""
+
+    port: str = "/dev/ttyACM0"  # of the mirror controller, or an address such as socket://host:port
+    baud: int = 115200
+    expected_id: str = ""
+    deadline_s: float = 1.0
+    retries: int = 2
+    quiet_s: float = 0.1
+    with_crc: bool = True
+    strict_crc: bool = False
+    ends: Ends = "exclusive"
+    read_back: ReadBack = "sampled"
+    check_status: bool = True
+    park_at_close: bool = False
+    log_rate_hz: float = 10000.0
+    log_samples: int = 2000
+    host: str = "10.0.65.50"  # of the camera
+    control_port: int = 8100
+    file_port: int = 21
+    user: str = "ftpuser"
+    password: str = "ftpuser"
+    connect_s: float = 3.0
+    stall_s: float = 10.0
+    pulses: Pulses = "position"  # at the mirror's trigger input: one a held position, one a frame, or none
+    settle_s: float = 2.0  # most that the mirror may take to come to rest
+    panel: float = 1.0  # value of the white panel
+    white_at_rest: bool = True  # the white frame was taken through the mirror at 0; 0
+    provenance: str = "assumed"
+
+    def mirror(self, vector_pairs: int) -> MirrorSettings:
+        """Give the settings of the mirror's driver; SettingsError where they are out of range."""
+        return MirrorSettings(
+            self.port, self.baud, self.expected_id, self.deadline_s, self.retries, self.quiet_s, self.with_crc,
+            self.strict_crc, self.ends, vector_pairs, self.read_back, self.check_status, self.park_at_close,
+            self.log_rate_hz, self.log_samples, self.provenance,
+        )  # fmt: skip
+
+    @property
+    def camera(self) -> CameraAddress:
+        """Where the camera's control socket is."""
+        from pipeline.rig.headwall_camera import CameraAddress  # loads scipy, which reading settings does not need
+
+        return CameraAddress(self.host, self.control_port, self.connect_s)
+
+    @property
+    def files(self) -> FileServer:
+        """Where the camera's files are."""
+        return FileServer(self.host, self.file_port, self.user, self.password, self.stall_s)

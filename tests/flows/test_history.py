@@ -1,0 +1,144 @@
+"""A field's history: rows of runs and ledger, a page that loads nothing, an index with links that lead somewhere."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.field_history import FieldHistory, read_histories
+from flows.history_page import render_history, render_index, way_to
+from flows.line_chart import line_chart
+from storage.archive import Archive
+from storage.ledger import Ledger
+
+BAD = '<script>alert("1")</script>&'
+
+
+class Addresses(HTMLParser):
+    """Collects what a page would load or link, and that its tags close in order."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.loaded: list[str] = []
+        self.open: list[str] = []
+        self.feed(page)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Remember addresses; tags without an end are not open."""
+        self.links += [str(value) for name, value in attrs if name == "href" and tag == "a"]
+        self.loaded += [str(value) for name, value in attrs if name in ("src", "href", "xlink:href") and tag != "a"]
+        assert tag not in ("script", "link", "iframe", "style") or tag == "style"
+        if tag != "meta":
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Nothing is open after it."""
+
+    def handle_endtag(self, tag: str) -> None:
+        """The innermost open tag closes."""
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> Path:
+    """Two surveys of one field, one of another, and a ledger that knows the first and three troubles."""
+    root = tmp_path_factory.mktemp("history") / "archive"
+    first = survey_png(root, name="north", visit="a").folder
+    survey_png(root, name="north", visit="b")
+    survey_png(root, name="south")
+    ledger = Ledger(root, "north")
+    due = {"at": "2026-06-01T10:00:20Z", "due": "2026-06-01T10:00:00Z"}
+    ledger.append({"event": "begun", **due, "attempt": 1})
+    ledger.append({"event": "done", **due, "attempts": 2, "run": f"runs/{first.name}", "seconds": 3.0})
+    ledger.append({"event": "failed", **due, "due": "2026-06-01T11:00:00Z", "reason": f"no reply {BAD}"})
+    ledger.append({"event": "skipped", **due, "due": "2026-06-01T12:00:00Z", "reason": "the rig was in use"})
+    ledger.append({"event": "passed", "at": due["at"], "after": "2026-06-01T12:00:00Z", "until": "2026-07-01T12:00:00Z",
+                   "count": 720, "reason": "asleep"})  # fmt: skip
+    return root
+
+
+def test_runs_and_ledger_are_one_history(archive: Path) -> None:
+    """Runs on schedule and by hand are of the field; what was due is counted; shares of the map add up."""
+    north, south = read_histories(Archive.open(archive))
+    assert (north.field, south.field) == ("north", "south")
+    assert north.counts == {"done": 1, "skipped": 721, "failed": 1}
+    assert [row["due"] for row in north.runs] == ["2026-06-01T10:00:00Z", None]
+    assert sum(north.runs[0]["areas"].values()) == pytest.approx(1.0)
+    assert north.runs[0]["miou"] is not None
+    assert south.counts == {"done": 0, "skipped": 0, "failed": 0}
+
+
+def test_a_page_loads_nothing_and_leads_to_reports(archive: Path, command_line: Any, tmp_path: Path) -> None:
+    """From disk, without script; every word is escaped; each link is a file that is there."""
+    page = tmp_path / "pages" / "history.html"
+    ended = command_line("report", archive, "--field", "north", "-o", page)
+    assert ended.code == 0, ended.err
+    text = page.read_text(encoding="utf-8")
+    found = Addresses(text)
+    assert found.loaded == []
+    assert BAD not in text
+    assert "&lt;script&gt;" in text
+    assert not re.search(r"https?://|@import|url\(", text)
+    assert len(found.links) == 2
+    assert all((page.parent / link).is_file() for link in found.links)
+    assert all(words in text for words in ("720 skipped", "no reply", "Share of the map", "attempt 2", "<svg"))
+
+
+def test_the_index_leads_to_every_field(archive: Path, command_line: Any, tmp_path: Path) -> None:
+    """Without a field there is a page for each, and one that tells how all of them fare."""
+    page = tmp_path / "index.html"
+    ended = command_line("report", archive, "-o", page)
+    assert ended.code == 0, ended.err
+    found = Addresses(page.read_text(encoding="utf-8"))
+    assert sorted(found.links) == ["index-north.html", "index-south.html"]
+    assert all((tmp_path / link).is_file() for link in found.links)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        ("--field nrth -o {0}/x.html", 1, "no field of .* is called 'nrth'; did you mean north?"),
+        ("-o {0}", 2, "is a folder, expected the file to write"),
+        ("-o {0}/x.pdf", 2, "expected a page's name that ends in .html"),
+        ("-o {1}/x.html", 2, "lies in the archive"),
+    ],
+)
+def test_a_report_that_cannot_be_written(
+    archive: Path, command_line: Any, tmp_path: Path, words: str, code: int, message: str
+) -> None:
+    """One message, the exit code, and no file."""
+    ended = command_line("report", archive, *words.format(tmp_path, archive).split())
+    assert (ended.code, len(ended.errors)) == (code, 1)
+    assert re.search(message, ended.errors[0]), ended.errors[0]
+    assert not list(tmp_path.glob("*.html"))
+
+
+def test_a_field_without_anything_has_a_page() -> None:
+    """A schedule that has just begun, and an archive without fields."""
+    page = render_history(FieldHistory("new", "archive", [], []), "")
+    Addresses(page)
+    assert "nothing to draw yet" in page
+    Addresses(render_index([], "archive", {}))
+
+
+def test_a_chart_has_a_line_for_each_series() -> None:
+    """One point is drawn too, and names are escaped."""
+    chart = line_chart({"soil <b>": [(0.0, 1.0), (86400.0, 0.5)], "crop": [(0.0, 0.2)]}, "Share", "%")
+    assert chart.count("<polyline") == 2
+    assert chart.count("<circle") == 3
+    assert "soil &lt;b&gt;" in chart
+    assert "100 %" in chart
+
+
+def test_the_way_to_an_archive(tmp_path: Path) -> None:
+    """Relative where page and archive lie together, so that both can be moved."""
+    assert way_to(tmp_path / "archive", tmp_path / "x.html") == "archive"
+    assert way_to(tmp_path / "archive", tmp_path / "pages" / "x.html") == "../archive"
+    assert way_to(tmp_path / "my field", tmp_path / "x.html") == "my%20field"

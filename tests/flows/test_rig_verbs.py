@@ -1,0 +1,229 @@
+"""`rig check` and `rig emulate` on the command line, through a real pty and real sockets."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+from rich.console import Console
+
+from flows.rig_emulation import EmulateRequest, emulated_settings, run_emulate
+from flows.settings import load_settings
+from pipeline.rig.emulator.emulated_rig import EmulatedRig, ServedRig
+from pipeline.rig.emulator.fast_clock import FastClock
+from pipeline.rig.emulator.faults import make_fault
+from pipeline.rig.pro_mode import Command
+from tests.flows.conftest import CommandLine
+from tests.rig.small_rig import small_source
+
+SETS = {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
+NOWHERE = "127.0.0.1:1:1"
+
+
+@contextmanager
+def served(*faults: str) -> Iterator[ServedRig]:
+    """An emulated rig behind ports, whose faults strike at the first occasion."""
+    struck = [make_fault(name, at=0) for name in faults]
+    with EmulatedRig(small_source(), FastClock(20.0), mirror_faults=struck).serve() as rig:
+        yield rig
+
+
+def camera_of(rig: ServedRig) -> str:
+    """Its address, as the flag takes it."""
+    return f"{rig.host}:{rig.camera_port}:{rig.file_port}"
+
+
+def still(rig: ServedRig) -> bool:
+    """Whether the mirror was told nothing but its mode."""
+    return not any(act.request.command in SETS for act in rig.rig.mirror.acts)
+
+
+def test_rig_in_order(command_line: CommandLine) -> None:
+    """A table of what was asked and came, exit code 0, and nothing moved."""
+    with served() as rig:
+        ended = command_line("rig", "check", "--port", rig.port, "--camera", camera_of(rig))
+        assert ended.code == 0
+        assert "MR-E-2" in ended.out
+        assert "nothing to mend" in ended.out
+        assert still(rig)
+
+
+def test_settings_file_says_where_both_are(command_line: CommandLine, tmp_path: Path) -> None:
+    """Flags win over it; the square is gone round on request, and the record is one JSON object."""
+    with served() as rig:
+        file = tmp_path / "field.toml"
+        file.write_text(
+            f'source = "rig"\n[rig]\nport = "/dev/ttyNONE"\nhost = "{rig.host}"\ncontrol_port = {rig.camera_port}\n'
+            f"file_port = {rig.file_port}\n"
+        )
+        ended = command_line("rig", "check", file, "--port", rig.port, "--move", "--json")
+        record = json.loads(ended.out)
+        assert ended.code == record["exit_code"] == 0
+        assert (record["failed"], record["warned"], record["move"]) == (0, 0, True)
+        assert [row["asked"] for row in record["rows"] if row["asked"].startswith("go to")][-1] == "go to 0; 0"
+        assert record["port"] == rig.port
+        assert record["camera"] == f"{rig.host}:{rig.camera_port}"
+        assert not still(rig)
+
+
+@pytest.mark.parametrize(
+    ("fault", "came", "mend"),
+    [
+        ("modem", "/dev/", ""),
+        ("echo", "/dev/", ""),
+        ("wrong-firmware", "firmware not known: LENS-DRIVER-4, version 0.0.1", "rig.expected_id"),
+        ("mirror-warm", "the mirror is too warm", "motions are refused"),
+    ],
+)
+def test_other_devices_and_states_fail_and_nothing_moves(
+    command_line: CommandLine, fault: str, came: str, mend: str
+) -> None:
+    """One row that failed says which; the exit code is 1, and the square that was asked for is not begun."""
+    with served(fault) as rig:
+        ended = command_line("rig", "check", "--port", rig.port, "--move", "--json")
+        (row,) = [row for row in json.loads(ended.out)["rows"] if row["verdict"] == "fail"]
+        assert ended.code == 1
+        assert came in row["came"]
+        assert mend in row["mend"]
+        assert still(rig)
+
+
+def refused(number: int) -> Any:
+    """An opening of ports that the system refuses."""
+
+    def open_port(*_: Any, **__: Any) -> Any:
+        raise serial.SerialException(number, os.strerror(number))
+
+    return open_port
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [
+        (errno.ENOENT, "there is no port /dev/ttyACM7"),
+        (errno.EACCES, "no permission for /dev/ttyACM7"),
+        (errno.EBUSY, "/dev/ttyACM7 is in use by another program"),
+    ],
+)
+def test_ports_that_cannot_be_opened(
+    command_line: CommandLine, monkeypatch: pytest.MonkeyPatch, number: int, words: str
+) -> None:
+    """One message each, exit code 1."""
+    monkeypatch.setattr(serial, "serial_for_url", refused(number))
+    ended = command_line("rig", "check", "--port", "/dev/ttyACM7")
+    assert ended.code == 1
+    assert words in ended.out
+    assert "Traceback" not in ended.err
+
+
+def test_port_that_another_program_has(command_line: CommandLine) -> None:
+    """It is not shared: two would mix their motions."""
+    with served() as rig, serial.Serial(rig.port, exclusive=True):
+        ended = command_line("rig", "check", "--port", rig.port)
+        assert ended.code == 1
+        assert "in use by another program" in ended.out
+
+
+def test_one_of_two_devices_is_partly(command_line: CommandLine) -> None:
+    """A camera that cannot be reached beside a mirror that works: exit code 3; alone: 1."""
+    with served() as rig:
+        ended = command_line("rig", "check", "--port", rig.port, "--camera", NOWHERE, "--json")
+        record = json.loads(ended.out)
+        assert ended.code == record["exit_code"] == 3
+        failed = [row for row in record["rows"] if row["verdict"] == "fail"]
+        assert [row["device"] for row in failed] == ["camera", "camera"]
+        assert "no connection to 127.0.0.1:1" in failed[0]["came"]
+        assert "is the camera on" in failed[0]["mend"]
+    assert command_line("rig", "check", "--camera", NOWHERE).code == 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("check", "--camera", "host:99999"), ("check", "--camera", ":80"), ("check", "no.toml"),
+        ("check", "--port", "nonsense://x"), ("check", "--prot", "x"), ("nonsense",),
+        ("emulate", "--faults", "nonsense"), ("emulate", "--speed", "0"), ("emulate", "--baud", "-1"),
+        ("emulate", "--size", "12"), ("emulate", "-o", "/nowhere/x.toml"), ("emulate", "--seed", "x"),
+    ],
+)  # fmt: skip
+def test_usage_errors(command_line: CommandLine, words: tuple[str, ...]) -> None:
+    """One message and exit code 2, before anything is drawn or connected."""
+    ended = command_line("rig", *words)
+    assert ended.code == 2
+    assert len(ended.errors) == 1
+
+
+def test_unknown_key_of_the_rig_is_refused(command_line: CommandLine, tmp_path: Path) -> None:
+    """With the nearest that there is."""
+    file = tmp_path / "field.toml"
+    file.write_text('[rig]\nprot = "/dev/ttyACM0"\n')
+    ended = command_line("rig", "check", file)
+    assert ended.code == 2
+    assert "rig.port" in ended.errors[0]
+
+
+def test_faults_are_listed(command_line: CommandLine) -> None:
+    """All of both devices, for people and programs."""
+    ended = command_line("rig", "emulate", "--faults", "list", "--json")
+    names = [row["name"] for row in json.loads(ended.out)["faults"]]
+    assert {"reset-in-upload", "camera-full", "never-stable"} <= set(names)
+    table = command_line("rig", "emulate", "--faults", "list")
+    assert table.code == 0
+    assert "camera-cut-cube" in table.out
+
+
+def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: CommandLine, tmp_path: Path) -> None:
+    """The file is a survey's settings, and both devices are where it says, until the emulation ends."""
+    file = tmp_path / "emulated.toml"
+    settings = emulated_settings(None, {"size": "64x48", "bands": "40,90", "effects": "none", "seed": "3"})
+    request = EmulateRequest(settings, ("split-replies:1",), 0, 20.0, file)
+    ended, codes = threading.Event(), []
+    console = Console(quiet=True)
+    thread = threading.Thread(target=lambda: codes.append(run_emulate(request, console, as_json=True, ended=ended)))
+    thread.start()
+    try:
+        while thread.is_alive() and not file.exists():
+            thread.join(0.05)
+        assert load_settings(file).rig.provenance == "emulated"
+        told = tomllib.loads(file.read_text())
+        assert {key: told[key] for key in ("scene", "size", "bands", "seed", "source")} == {
+            "scene": "farm", "size": "64x48", "bands": [40, 90], "seed": 3, "source": "rig",
+        }  # fmt: skip
+        assert command_line("rig", "check", file).code == 0
+    finally:
+        ended.set()
+        thread.join()
+    assert codes == [0]
+    assert command_line("rig", "check", file).code == 1
+
+
+def test_emulation_ends_in_order() -> None:
+    """At Ctrl-C: exit code 0, and the port is gone."""
+    words = ["rig", "emulate", "--size", "48x48", "--bands", "40", "--effects", "none"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "flows.cli", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        lines = iter(process.stdout.readline, "")
+        table = "".join(next(lines) for _ in range(7))
+        port = tomllib.loads(table)["rig"]["port"]
+        assert Path(port).exists()
+        process.send_signal(signal.SIGINT)
+        _, words_left = process.communicate(timeout=30)
+    assert process.returncode == 0
+    assert "closed" in words_left
+    assert "Traceback" not in words_left
+    with pytest.raises(serial.SerialException):
+        serial.Serial(port)

@@ -1,0 +1,148 @@
+"""Laws of schedules: every due time is accounted for exactly once, whatever happens to clock and process."""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flows.field_schedule import FieldSchedule
+from flows.schedule_lock import RigLock
+from flows.schedule_runs import run_all
+from flows.schedule_times import parse_every, parse_timetable
+from pipeline.errors import RigError, SettingsError
+from storage.ledger import Ledger
+from tests.flows.schedule_days import NOON, HandClock, accounted
+
+CRONS = ("*/20 * * * *", "0 * * * *", "30 2 * * *", "15 1-3 * * *", "0 6 * * 1", "0 0 1 * *")
+ZONES = ("UTC", "Europe/Berlin", "America/New_York", "Australia/Lord_Howe")
+CHANGES = (datetime(2026, 3, 28, 20, tzinfo=UTC), datetime(2026, 10, 24, 20, tzinfo=UTC), NOON)
+
+
+class Killed(BaseException):
+    """Stands for a process that was killed."""
+
+
+steps = st.lists(
+    st.one_of(
+        st.tuples(st.just("wait"), st.integers(1, 5000)),
+        st.tuples(st.just("jump"), st.integers(-20_000, 200_000)),
+        st.tuples(st.just("run"), st.sampled_from(["well", "fails", "killed", "long"])),
+        st.tuples(st.just("start"), st.just(0)),
+        st.tuples(st.just("look"), st.just(0)),
+    ),
+    max_size=25,
+)
+
+
+def do(schedule: FieldSchedule, clock: HandClock, step: tuple[str, object], lock: RigLock) -> None:
+    """One thing that happens to a schedule."""
+
+    def survey(field: str, due: datetime) -> Path:
+        clock.sleep(5000 if step[1] == "long" else 30)
+        if step[1] == "fails":
+            raise RigError("no reply")
+        if step[1] == "killed":
+            raise Killed
+        return Path("run")
+
+    if step[0] == "wait":
+        clock.sleep(float(str(step[1])))
+    elif step[0] == "jump":
+        clock.moment += timedelta(seconds=int(str(step[1])))
+    elif step[0] == "start":
+        schedule.open()
+    elif step[0] == "look":
+        schedule.pending()
+    else:
+        with suppress(Killed):
+            run_all({schedule.field: schedule}, lambda name: lock, survey, lambda words: None)
+
+
+@given(
+    cron=st.sampled_from(CRONS), zone=st.sampled_from(ZONES), start=st.sampled_from(CHANGES), steps=steps,
+    late=st.sampled_from([0.1, 0.5, 1.0]),
+)  # fmt: skip
+@settings(max_examples=30, deadline=None)
+def test_every_due_time_is_accounted_for_exactly_once(
+    cron: str, zone: str, start: datetime, steps: list[tuple[str, object]], late: float
+) -> None:
+    """Waiting, jumps of the clock, kills, restarts and changes of the hour: none is missing, and none is twice."""
+    with tempfile.TemporaryDirectory() as folder:
+        clock, lock = HandClock(start), RigLock(Path(folder) / "rig.lock")
+        schedule = FieldSchedule(Ledger(Path(folder), "north"), parse_timetable(cron, None, zone), late, clock)
+        schedule.open()
+        for step in steps:
+            do(schedule, clock, step, lock)
+        latest = max(clock.moment, start)
+        clock.moment = latest + timedelta(days=40)  # when nothing can be pending, and nothing be resumed
+        schedule.reap()
+        schedule.close()
+        assert not schedule.state().open
+        found = accounted(schedule.ledger.lines(), schedule.timetable)
+        due = list(schedule.timetable.due_between(start, clock.moment))
+        assert [(one, found[one]) for one in due if found[one] != 1] == []
+
+
+@given(zone=st.sampled_from(ZONES), cron=st.sampled_from(CRONS), day=st.integers(0, 364), split=st.integers(0, 400_000))
+@settings(max_examples=60, deadline=None)
+def test_due_times_do_not_depend_on_when_they_are_asked_for(zone: str, cron: str, day: int, split: int) -> None:
+    """Those of a span are those of its parts, they rise, and none is told twice, also where clocks change."""
+    table = parse_timetable(cron, None, zone)
+    start = datetime(2026, 1, 1, tzinfo=UTC) + timedelta(days=day)
+    middle, end = start + timedelta(seconds=split), start + timedelta(seconds=400_000)
+    whole = list(table.due_between(start, end))
+    assert whole == [*table.due_between(start, middle), *table.due_between(middle, end)]
+    assert all(one < two for one, two in pairwise(whole))
+
+
+def test_a_day_has_one_run_at_half_past_two_also_when_clocks_change() -> None:
+    """In spring, when there is no half past two, it is due when the lost hour ends; in autumn once."""
+    table = parse_timetable("30 2 * * *", None, "Europe/Berlin")
+    spring = list(table.due_between(datetime(2026, 3, 28, 12, tzinfo=UTC), datetime(2026, 3, 29, 12, tzinfo=UTC)))
+    autumn = list(table.due_between(datetime(2026, 10, 24, 12, tzinfo=UTC), datetime(2026, 10, 25, 12, tzinfo=UTC)))
+    assert spring == [datetime(2026, 3, 29, 1, 0, tzinfo=UTC)]
+    assert autumn == [datetime(2026, 10, 25, 0, 30, tzinfo=UTC)]
+
+
+def test_every_counts_from_the_same_moment_for_all() -> None:
+    """Due times of an interval do not depend on when a schedule began."""
+    table = parse_timetable(None, "30m", "UTC")
+    assert table.next_after(NOON + timedelta(minutes=7)) == NOON + timedelta(minutes=30)
+    assert table.next_after(NOON) == NOON + timedelta(minutes=30)
+
+
+@pytest.mark.parametrize(
+    ("cron", "every", "zone", "words"),
+    [
+        (None, None, None, "needs --cron or --every, got neither"),
+        ("* * * * *", "30m", None, "got both"),
+        ("hourly", None, None, "expected five fields, .* got 1"),
+        ("61 * * * *", None, None, "Bad minute"),
+        ("0 0 31 2 *", None, "UTC", "Bad day-of-month"),
+        (None, "30", None, "expected a number and s, m, h or d"),
+        (None, "1s", None, "expected 10s to 366d"),
+        (None, "999999999999999999999d", None, "expected 10s to 366d"),
+        ("0 6 * * *", None, "Mars/Olympus", "is no time zone"),
+    ],
+)
+def test_nonsense_is_refused(cron: str | None, every: str | None, zone: str | None, words: str) -> None:
+    """One message that says what is expected."""
+    with pytest.raises(SettingsError, match=words):
+        parse_timetable(cron, every, zone)
+
+
+def test_times_read_back_as_they_were_written() -> None:
+    """The ledger's words of a timetable give the same timetable."""
+    from flows.schedule_times import read_timetable
+
+    for table in (parse_timetable("0 6 * * 1", None, "Europe/Berlin"), parse_timetable(None, "90s", "UTC")):
+        assert read_timetable(table.to_dict()) == table
+    assert read_timetable({"cron": "nonsense"}) is None
+    assert parse_every("1.5h") == timedelta(minutes=90)

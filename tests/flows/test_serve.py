@@ -1,0 +1,265 @@
+"""Serving: what is refused before anything runs, the watcher without a server, and one survey by Prefect's flow."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from datetime import UTC, datetime, timedelta
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from threading import Thread
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from flows.field_schedule import FieldSchedule
+from flows.notices import send_notice
+from flows.schedule_runs import Outcome
+from flows.schedule_times import parse_timetable
+from flows.serve_fields import ServedField, alone_on, load_fields
+from flows.serve_plain import serve_plain
+from flows.serve_prefect import ServeRequest, Watcher
+from flows.settings import Settings
+from flows.survey_artifacts import MOST_BYTES, artifact_key, savings_rows, small_jpeg, survey_markdown
+from pipeline.errors import ArchiveError
+from storage.archive import Archive
+from tests.flows.schedule_days import NOON, HandClock
+
+EVERY = parse_timetable(None, "20m", "UTC")
+
+
+@pytest.fixture
+def field_file(tmp_path: Path, scene_files: Path, weights: Path) -> Callable[..., Path]:
+    """Write a field's settings, with other lines before them."""
+
+    def write(stem: str = "north", lines: str = "", **changes: str | None) -> Path:
+        values: dict[str, str | None] = {
+            "scene": str(scene_files / "scene.png"), "weights": str(weights), "budget": "0.8",
+            "out": str(tmp_path / "archive"), **changes,
+        }  # fmt: skip
+        path = tmp_path / f"{stem}.toml"
+        told = "\n".join(f'{key} = "{value}"' for key, value in values.items() if value is not None)
+        path.write_text(f"{lines}\n{told}\n")
+        return path
+
+    return write
+
+
+BAD = {
+    "no fields": ((), "--every 30m", 2, "no fields: give the settings file of one or more"),
+    "cron nonsense": (("north",), "--cron hourly", 2, "--cron 'hourly': expected five fields"),
+    "neither": (("north",), "", 2, "needs --cron or --every, got neither"),
+    "both": (("north",), "--every 30m --cron *", 2, "got both"),
+    "no such file": (("nowhere",), "--every 30m", 2, "no settings file .*nowhere.toml"),
+    "unknown key": (("typo",), "--every 30m", 2, "unknown setting 'sceene' in .*typo.toml; did you mean 'scene'"),
+    "neither scene nor rig": (("blind",), "--every 30m", 2, "blind.toml says neither scene nor source = 'rig'"),
+    "scene missing": (("gone",), "--every 30m", 1, "gone.toml: there is no file .*gone.png"),
+    "twice": (("north", "north"), "--every 30m", 2, "are both called north"),
+    "late": (("north",), "--every 30m --late 1.5", 2, "--late 1.5: expected a share of the interval"),
+    "limit": (("north",), "--every 30m --limit 0", 2, "--limit 0: expected 1 or more"),
+    "zone": (("north",), "--cron '0_6_*_*_*' --timezone Mars", 2, "'Mars' is no time zone"),
+    "address": (("north",), "--every 30m --notify ftp://x", 2, "expected https://HOST/PATH"),
+    "name": (("named",), "--every 30m", 2, "'name' in .*named.toml must be a name of letters, digits"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_refused_before_anything_is_served(
+    case: str, field_file: Callable[..., Path], tmp_path: Path, command_line: Any
+) -> None:
+    """One clear message and the right exit code; no archive and no server is left."""
+    names, words, code, message = BAD[case]
+    field_file("north")
+    field_file("typo", lines='sceene = "x"')
+    field_file("blind", scene=None)
+    field_file("gone", scene="gone.png")
+    field_file("named", name="../north")
+    given = [word.strip("'").replace("_", " ") for word in words.split()]
+    ended = command_line("serve", *(tmp_path / f"{name}.toml" for name in names), *given)
+    assert (ended.code, len(ended.errors)) == (code, 1), ended.err
+    assert re.search(message, ended.errors[0]), ended.errors[0]
+    assert not (tmp_path / "archive" / "schedule").exists()
+
+
+def test_two_serves_on_one_archive(field_file: Callable[..., Path], command_line: Any) -> None:
+    """The second is refused, and nothing of the first is changed."""
+    file = field_file()
+    with alone_on(load_fields([file])):
+        ended = command_line("serve", file, "--every", "30m", "--engine", "plain")
+    assert (ended.code, len(ended.errors)) == (1, 1)
+    assert "another serve works on the archive" in ended.errors[0]
+
+
+def test_the_flag_for_the_archive_wins(field_file: Callable[..., Path], tmp_path: Path) -> None:
+    """Fields keep their own archives, unless one is given for all."""
+    files = [field_file("north"), field_file("south", out=str(tmp_path / "other"))]
+    assert [Path(one.settings.out).name for one in load_fields(files)] == ["archive", "other"]
+    assert {one.settings.out for one in load_fields(files, "all")} == {"all"}
+
+
+def test_a_farm_that_grows_is_seen_on_its_day() -> None:
+    """Each due time is a visit of its own; the built-in farm is as on that day, unless the settings say another."""
+    due = datetime(2026, 2, 1, 23, 30, tzinfo=UTC)
+    one = ServedField("farm", Path("farm.toml"), Settings(scene="farm@2"))
+    berlin = parse_timetable("30 0 * * *", None, "Europe/Berlin")
+    asked = one.settings_of(due, berlin)
+    assert (asked.name, asked.visit, asked.day) == ("farm", "2026-02-01T23:30:00Z", 33)
+    fixed = ServedField("farm", Path("farm.toml"), Settings(scene="farm@2", day=172))
+    assert fixed.settings_of(due, berlin).day == 172
+
+
+def test_plain_serving_surveys_fields_in_turn_and_each_visit_anew(
+    field_file: Callable[..., Path], tmp_path: Path, survey_png: Any
+) -> None:
+    """Two fields, two due times: four published runs, each with light of its own, and ledgers that name them."""
+    fields = {one.name: one for one in load_fields([field_file("north"), field_file("south")])}
+    clock = HandClock()
+    schedules = {name: one.schedule(EVERY, 0.5, clock) for name, one in fields.items()}
+
+    def survey(name: str, due: datetime) -> Path:
+        asked = fields[name].settings_of(due, EVERY)
+        return Path(survey_png(tmp_path / "archive", name=name, visit=asked.visit).folder)
+
+    serve_plain(
+        schedules, {name: one.lock() for name, one in fields.items()}, survey, lambda words: None, clock=clock,
+        until=NOON + timedelta(minutes=41),
+    )  # fmt: skip
+    archive = Archive.open(tmp_path / "archive")
+    assert [path.name.split("-")[1] for path in archive.runs()] == ["north", "south", "north", "south"]
+    for name, schedule in schedules.items():
+        lines = schedule.ledger.lines()
+        assert [line["event"] for line in lines] == ["opened", "begun", "done", "begun", "done", "closed"], name
+        assert all((archive.root / line["run"]).is_dir() for line in lines if line["event"] == "done")
+    receipts = [json.loads((path / "receipt.json").read_text()) for path in archive.runs()]
+    assert (
+        len({receipt["products"]["raw_coarse"] for receipt in receipts}) == 2
+    )  # one for each visit: here both fields are one scene
+    assert [finding for finding in archive.verify_all() if finding.problem] == []
+
+
+class AClient:
+    """Stands for a Prefect client: keeps what it was asked for."""
+
+    def __init__(self, state: str = "CRASHED") -> None:
+        self.asked: list[dict[str, Any]] = []
+        self._state = state
+
+    def read_deployment_by_name(self, name: str) -> SimpleNamespace:
+        """A deployment."""
+        return SimpleNamespace(id=name)
+
+    def create_flow_run_from_deployment(self, deployment: str, parameters: dict[str, Any]) -> None:
+        """Note it."""
+        self.asked.append({"deployment": deployment, **parameters})
+
+    def read_flow_run(self, known: str) -> SimpleNamespace:
+        """A run in the state given."""
+        return SimpleNamespace(state=SimpleNamespace(type=SimpleNamespace(value=self._state)))
+
+
+def watcher(file: Path, clock: HandClock, client: AClient) -> tuple[Watcher, FieldSchedule, ServedField]:
+    """A watcher of one field, with its schedule open."""
+    (one,) = load_fields([file])
+    schedule = one.schedule(EVERY, 0.5, clock)
+    schedule.open()
+    request = ServeRequest(fields=[one], timetable=EVERY, late=0.5)
+    return (
+        Watcher(request, {one.name: schedule}, lambda words: None, lambda: nullcontext(client)), schedule, one
+    )  # fmt: skip
+
+
+def test_what_prefect_did_not_start_is_asked_for_once(field_file: Callable[..., Path]) -> None:
+    """After a grace a due run that nobody began is asked for by name and due time, and not again at every look."""
+    clock, client = HandClock(), AClient()
+    watch, _, _ = watcher(field_file(), clock, client)
+    clock.sleep(20 * 60 + 10)
+    assert watch.look() == []
+    clock.sleep(60)
+    assert watch.look() == [("north", NOON + timedelta(minutes=20))]
+    clock.sleep(30)
+    assert watch.look() == []
+    assert [(one["deployment"], one["due"]) for one in client.asked] == [("survey/north", "2026-06-01T12:20:00Z")]
+
+
+@pytest.mark.parametrize(("state", "resumed"), [("CRASHED", True), ("CANCELLED", False)])
+def test_a_crashed_run_is_resumed_a_cancelled_one_is_not(
+    field_file: Callable[..., Path], state: str, resumed: bool
+) -> None:
+    """While its lock is held it lives; when that is free it is asked for again, unless somebody cancelled it."""
+    clock, client = HandClock(), AClient(state)
+    watch, schedule, one = watcher(field_file(), clock, client)
+    clock.sleep(20 * 60)
+    lock = one.lock()
+    assert lock.take("a survey")
+    schedule.begin(clock.now(), flow_run="abc")
+    clock.sleep(60)
+    assert watch.look() == []
+    lock.release()
+    assert bool(watch.look()) is resumed
+    assert bool(schedule.state().open) is resumed
+    if not resumed:
+        assert schedule.ledger.lines()[-1]["reason"] == "it was cancelled in Prefect"
+
+
+def test_the_picture_of_an_artifact_is_small(survey_png: Any, tmp_path: Path) -> None:
+    """At most 100 KiB in the text, whatever the picture; the text has the receipt's figures and where the report is."""
+    noise = np.random.default_rng(0).integers(0, 256, (1500, 2000, 3), dtype=np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(noise).save(file, "PNG")
+    assert len(base64.b64encode(small_jpeg(file.getvalue()))) <= MOST_BYTES
+    published = survey_png(tmp_path)
+    text = survey_markdown(published, "archive/runs/x")
+    assert "data:image/jpeg;base64," in text
+    assert "archive/runs/x/report.html" in text
+    assert all(row["cost"] in text for row in savings_rows(published.receipt))
+    assert artifact_key("North_field 7") == "north-field-7"
+
+
+@pytest.fixture
+def listener() -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """An address on this machine, and what was posted to it."""
+    posted: list[dict[str, Any]] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            posted.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+            self.send_response(204)
+            self.end_headers()
+
+        def log_message(self, *words: object) -> None:
+            pass
+
+    server = HTTPServer(("127.0.0.1", 0), Handler)
+    thread = Thread(target=server.serve_forever)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}/", posted
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+def test_notices_are_of_trouble_only_and_never_needed(listener: tuple[str, list[dict[str, Any]]]) -> None:
+    """Failed and skipped runs are posted where an address was given; one that does not answer is nothing."""
+    address, posted = listener
+    failed, done = Outcome("north", NOON, "failed", "no reply"), Outcome("north", NOON, "done")
+    assert send_notice(address, failed, "archive")
+    assert not send_notice(address, done, "archive")
+    assert not send_notice(None, failed, "archive")
+    assert not send_notice("http://127.0.0.1:9/", failed, "archive")
+    assert [(one["field"], one["ending"], one["reason"]) for one in posted] == [("north", "failed", "no reply")]
+
+
+def test_alone_means_alone(field_file: Callable[..., Path]) -> None:
+    """The lock of a serve is free again after it."""
+    fields = load_fields([field_file()])
+    with alone_on(fields), pytest.raises(ArchiveError, match="another serve"), alone_on(fields):
+        pass
+    with alone_on(fields):
+        pass

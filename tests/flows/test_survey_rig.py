@@ -1,0 +1,217 @@
+"""A survey through an emulated rig: the class map of the simulated source, and bad input told in one message."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import flows.rig_run
+from flows.effect_choice import chosen_effects
+from flows.publish import Published
+from flows.run import make_source
+from flows.settings import Settings, load_settings
+from flows.survey_command import run_survey
+from flows.survey_scene import open_scene
+from pipeline.errors import SettingsError
+from pipeline.rig.capture_runner import RigDevices
+from pipeline.rig.clock import SYSTEM_CLOCK, ManualClock
+from pipeline.rig.emulator.camera_faults import CameraFault
+from pipeline.rig.emulator.emulated_rig import EmulatedRig
+from pipeline.rig.emulator.fast_clock import FastClock
+from pipeline.rig.mirror_controller import MirrorController
+from pipeline.rig.refusals import DeviceGone
+from pipeline.rig.transport import SerialTransport
+from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.scene import RasterScene, raster_from_values
+from storage.archive import Archive
+from storage.class_maps import load_class_map
+from storage.cubes import open_raw_cube
+from tests.conftest import patchy_scene
+from tests.flows.conftest import CommandLine
+
+QUIET = Console(quiet=True)
+SMALL: dict[str, Any] = {
+    "size": "128x128", "bands": "40,90,150,200", "engine": "plain", "controls": False,
+    "budget": 0.8, "rig.panel": 0.99,  # of the farm's white panel
+    "effects": "rotation,slit,smear,vignetting,shot,read-noise",
+}  # fmt: skip
+
+
+def small_settings(out: Path, **changed: Any) -> Settings:
+    """Settings of a tiny survey."""
+    return load_settings(None, {**SMALL, "out": str(out), **changed})
+
+
+@contextmanager
+def emulated(
+    settings: Settings, effects: Any, patch: pytest.MonkeyPatch, *, scene: RasterScene | None = None
+) -> Iterator[EmulatedRig]:
+    """Devices of surveys are emulated ones before a scene, the settings' by default, with effects."""
+    seen = open_scene(settings)[0] if scene is None else scene
+    whole = EmulatedRig(replace(make_source(seen, settings), chosen=effects), ManualClock(10.0))
+    with whole.in_process() as line:
+
+        def open_devices(told: Settings, *_: object) -> RigDevices:
+            line.transport = type(line.transport)(whole.mirror, line.clock)
+            mirror = MirrorController(line.transport, told.rig.mirror(told.cost.vector_pairs), line.clock)
+            mirror.connect()
+            return RigDevices(mirror, line.camera(), line.clock)
+
+        patch.setattr(flows.rig_run, "open_devices", open_devices)
+        yield whole
+
+
+def coarse_captures(rig: EmulatedRig) -> int:
+    """How often the camera was told to take coarse lines."""
+    return sum(said.startswith("capture(") and "coarse" in said for said in rig.camera.commands)
+
+
+def class_map_of(published: Published, out: Path) -> np.ndarray[Any, Any]:
+    """The survey's map, (y, x)."""
+    classes = load_class_map(out / published.receipt["products"]["class_map"]).classes
+    return np.asarray(classes)
+
+
+def test_class_map_is_that_of_the_simulated_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Coarse sweep, attention, plan and fine sweeps through emulated devices give the same map."""
+    simulated = run_survey(small_settings(tmp_path / "sim"), QUIET)
+    archive = Archive.open(tmp_path / "sim")
+    effects = chosen_effects(next(ref for ref in archive.refs("effects")))
+    settings = small_settings(tmp_path / "rig", source="rig", visit="first")
+    with emulated(settings, effects, monkeypatch) as rig:
+        published = run_survey(settings, QUIET)
+        captures = [said for said in rig.camera.commands if "capture(" in said]
+    assert sum("fine-" in said for said in captures) > 0
+    np.testing.assert_array_equal(class_map_of(published, tmp_path / "rig"), class_map_of(simulated, tmp_path / "sim"))
+
+
+def test_visits_are_captured_and_broken_ones_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A survey whose camera goes away is gone on with by the same command; another visit is captured anew.
+
+    The receipt says that nothing was simulated and holds no password; files of the camera go with the spool.
+    """
+    settings = small_settings(tmp_path, source="rig", visit="first", **{"rig.password": "secret", "budget": 0.5})
+    with emulated(settings, {}, monkeypatch) as rig:
+        rig.camera.faults.left.update({CameraFault.REFUSES_FILES: 3})
+        rig.camera.faults.passes = 6  # files: four of the references, two of the coarse sweep
+        with pytest.raises(DeviceGone, match="camera's file server"):
+            run_survey(settings, QUIET)
+        published = run_survey(settings, QUIET)
+        assert coarse_captures(rig) == 1
+        assert "effects" not in published.receipt
+        assert published.receipt["source"] == "rig"
+        assert published.receipt["settings"]["visit"] == "first"
+        assert "secret" not in (published.folder / "receipt.json").read_text()
+        assert not list((tmp_path / "spool").iterdir())
+        run_survey(replace(settings, visit="second"), QUIET)
+        assert coarse_captures(rig) == 2
+    assert {finding.kind for finding in Archive.open(tmp_path).verify_all()} == {"whole"}
+
+
+def test_field_without_a_picture_is_surveyed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path):
+    """A field of which only size and bands are known: what the rig sees of it is mapped, and nothing judged."""
+    told = {"scene": "field", "bands": None, "wavelengths": "640,550,460", "weights": str(weights), "effects": None}
+    settings = small_settings(tmp_path, source="rig", **told)
+    scene = raster_from_values(
+        patchy_scene((128, 128), 3, 1)[0], settings.camera, name="x", wavelength_nm=np.array([640.0, 550.0, 460.0])
+    )
+    with emulated(settings, {}, monkeypatch, scene=scene):
+        published = run_survey(settings, QUIET)
+    assert len(np.unique(class_map_of(published, tmp_path))) > 1
+    assert published.receipt["scene"].startswith("field/")
+    assert published.receipt["settings"]["visit"]  # the date, so that a later survey is another look
+
+
+def test_survey_over_a_pty_and_sockets_gives_the_same_lines(tmp_path: Path):
+    """Devices behind a real pty, a control socket and FTP, their clock sped up: every line is the simulated one."""
+    settings = small_settings(tmp_path, source="rig", visit="first", budget=0.5)
+    scene, _ = open_scene(settings)
+    source = replace(make_source(scene, settings), chosen=effects_on("rotation", "slit", "smear", "shot"))
+    with EmulatedRig(source, FastClock(40)).serve() as served:
+        rig = {"port": served.port, "host": served.host, "control_port": served.camera_port,
+               "file_port": served.file_port}  # fmt: skip
+        told = {f"rig.{name}": value for name, value in rig.items()}
+        published = run_survey(small_settings(tmp_path, source="rig", visit="first", budget=0.5, **told), QUIET)
+    cube = open_raw_cube(tmp_path / published.receipt["products"]["raw_coarse"] / "coarse-0.zarr")
+    np.testing.assert_array_equal(cube.read(0, cube.sweep.lines), source.render(cube.sweep, range(cube.sweep.lines)))
+    assert cube.valid_line.all()
+    told = json.loads((tmp_path / published.receipt["products"]["raw_coarse"] / "rig.json").read_text())
+    assert [one["method"] for one in told["captures"]] == ["trigger"]
+    assert told["rig"]["provenance"] == "assumed"
+
+
+BAD: dict[str, tuple[dict[str, Any], str]] = {
+    "exposure in seconds": ({"camera.exposure_ms": 0.1}, r"exposure.ms must be a number from 0.5 .*seconds"),
+    "unknown key": ({"rig.prot": "/dev/ttyUSB0"}, r"unknown setting .*prot.*did you mean 'rig.port'"),
+    "unknown word": ({"rig.pulses": "some"}, r"pulses must be one of position, frame, none; got 'some'"),
+    "port number": ({"rig.control_port": 0}, r"control.port must be a whole number from 1 to 65535, got 0"),
+    "settling in ms": ({"rig.settle_s": 200}, r"settle.s must be a number from 0.01 to 60 s, got 200.*milliseconds"),
+    "no such source": ({"source": "rigg"}, r"source must be one of sim, rig; got 'rigg'"),
+    "memory too large": ({"source": "rig", "cost.vector_pairs": 9000}, r"cost.vector_pairs = 9000: .* 2 to 8191 pairs"),
+    "field without size": (
+        {"source": "rig", "scene": "field", "bands": None, "size": None, "weights": "x"}, r"give its size"
+    ),
+    "field without rig": ({"scene": "field", "bands": None}, r"scene 'field' is what stands before a rig"),
+    "frame period of the camera": (
+        {"source": "rig", "camera.exposure_ms": 9500, "camera.readout_ms": 900}, r"frame period of 10400 ms is above"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("changed", "message"), BAD.values(), ids=BAD)
+def test_bad_setting_is_refused_in_one_message(tmp_path: Path, changed: dict[str, Any], message: str, weights: Path):
+    """What cannot be meant is refused before a device is opened, with what it should be; no archive is made."""
+    told = {**changed, **({"weights": str(weights)} if "weights" in changed else {})}
+    with pytest.raises(SettingsError, match=message):
+        run_survey(small_settings(tmp_path / "out", **told), QUIET)
+    assert not (tmp_path / "out").exists()
+
+
+def free_port() -> int:
+    """A port of this machine that nothing listens at."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return int(listener.getsockname()[1])
+
+
+def told_on_the_command_line(command_line: CommandLine, tmp_path: Path, **rig: Any) -> str:
+    """The one error of a survey with such a rig, which ends with 1 and leaves no run."""
+    table = "".join(f"{name} = {value!r}\n" for name, value in rig.items())
+    plain = {name: value for name, value in SMALL.items() if "." not in name}
+    rest = "".join(f"{name} = {value!r}\n".replace("False", "false") for name, value in plain.items())
+    (tmp_path / "rig.toml").write_text(f'source = "rig"\n{rest}[rig]\n{table}')
+    ended = command_line("survey", tmp_path / "rig.toml", "--out", tmp_path / "archive")
+    assert ended.code == 1
+    assert len(ended.errors) == 1
+    assert not list((tmp_path / "archive" / "runs").glob("*/receipt.json"))
+    return ended.errors[0]
+
+
+def test_no_such_port(command_line: CommandLine, tmp_path: Path):
+    """A port that is not there."""
+    error = told_on_the_command_line(command_line, tmp_path, port="/dev/ttyNONE")
+    assert "/dev/ttyNONE" in error
+
+
+def test_port_in_use_and_camera_unreachable(command_line: CommandLine, tmp_path: Path):
+    """Another program holds the mirror's port; it lets go, and then nobody answers for the camera. Nothing moves."""
+    scene, _ = open_scene(small_settings(tmp_path))
+    rig = EmulatedRig(make_source(scene, small_settings(tmp_path)), SYSTEM_CLOCK)
+    with rig.serve() as served:
+        told = {"port": served.port, "host": "127.0.0.1", "control_port": free_port(), "connect_s": 0.5}
+        other = SerialTransport(served.port, 115200)
+        assert "in use" in told_on_the_command_line(command_line, tmp_path, **told)
+        other.close()
+        error = told_on_the_command_line(command_line, tmp_path, **told)
+        assert f"127.0.0.1:{told['control_port']}" in error
+        assert not rig.mirror.state.players[0].running
+        assert rig.mirror.state.positions(rig.clock.now()).tolist() == [0.0, 0.0]

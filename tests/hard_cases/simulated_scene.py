@@ -1,0 +1,79 @@
+"""Small scenes and rigs for the simulator's hard cases, and what leaving out each effect changes."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.camera import LineCamera
+from pipeline.once import Once
+from pipeline.scan import Sweep
+from pipeline.simulator.block import Block
+from pipeline.simulator.choice import Decision, decide
+from pipeline.simulator.effects.effect import Effect
+from pipeline.simulator.effects.registry import EFFECTS
+from pipeline.simulator.instrument import sweep_block
+from pipeline.simulator.options import acts_on_light
+from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
+from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+
+ROUNDING = 4e-6  # of the light over its noise: sums of float32 in another order
+CAMERA = LineCamera(samples=64)
+RIG = Rig(camera=CAMERA)
+SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-15.5, lines=30)
+NOON = datetime(2026, 6, 21, 11, 20, tzinfo=UTC)
+EVERYTHING = Rig(  # that a rig may have
+    camera=CAMERA,
+    mirror=MirrorMotion(positions_per_line=0.7, repeatability_urad=40.0, hysteresis_px=2.0, drift_px_per_min=1.0),
+    detector=Detector(dead_share=0.01, hot_share=0.01),
+    air=Air(distance_m=300.0, nearest_m=100.0, relief="plane", wind_amplitude_m=0.02),
+    sky=Sky(started=NOON, cloud_share=0.3, hot_spot=0.1),
+)
+
+
+def scene_of(values: NDArray[np.floating], electrons: float = 5000.0) -> RasterScene:
+    """A scene whose value 1 gives so many electrons in every band; the bands are 6 nm wide."""
+    bands = values.shape[2]
+    light = np.full(bands, electrons, np.float32)
+    return RasterScene(
+        "t", "t", Raster.of(values.astype(np.float32)), Once.of(Light(light, light)), np.ones(bands, np.float32),
+        np.linspace(450, 850, bands), fwhm_nm=np.full(bands, 6.0),
+    )  # fmt: skip
+
+
+def block_of(scene: RasterScene, rig: Rig, lines: range = range(0, 30, 5), sweep: Sweep = SWEEP) -> Block:
+    """Some lines of a sweep."""
+    return sweep_block(scene, rig, sweep, lines)
+
+
+def decided(scene: RasterScene, rig: Rig, tolerance: float = 0.1, sweep: Sweep = SWEEP) -> Decision:
+    """What the rule makes of a scene and a rig."""
+    return decide(probe_scene(scene, rig, [sweep]), rig, EFFECTS, tolerance)
+
+
+def left_out(scene: RasterScene, rig: Rig) -> dict[str, tuple[float, float]]:
+    """Change and what the decision counts for it: by every effect of the light when it is off, and by ``all`` as taken.
+
+    Changes are over the noise of each sample of a few lines, beside all other effects in their exact variants.
+    """
+    decision, block = decided(scene, rig), block_of(scene, rig)
+    exact = expected_light(scene, block, decision.exact)
+    noise = noise_electrons(exact, rig)
+    slack = ROUNDING * float((np.abs(exact) / noise).max())
+
+    def change(chosen: dict[Effect, str]) -> float:
+        light = expected_light(scene, block, chosen)
+        assert np.isfinite(light).all()
+        return float((np.abs(light - exact) / noise).max())
+
+    found = {"all": (change(decision.chosen), decision.error + slack)}
+    for menu in (one.menu for one in decision.taken):
+        if menu.present and acts_on_light(menu.effect):
+            rest = {effect: way for effect, way in decision.exact.items() if effect is not menu.effect}
+            found[menu.name] = (change(rest), menu.off.error + slack)
+    return found

@@ -1,0 +1,200 @@
+"""Hard cases of the simulator's mirror and weather: damping 1, stiff steps, sunset and night, endless distance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+from pipeline.simulator.choice import Decision, decide
+from pipeline.simulator.daylight import sun_elevation_deg
+from pipeline.simulator.effects.defocus import DEFOCUS
+from pipeline.simulator.effects.drift import DRIFT
+from pipeline.simulator.effects.lag import LAG
+from pipeline.simulator.effects.parallax import PARALLAX
+from pipeline.simulator.effects.path_radiance import PATH_RADIANCE
+from pipeline.simulator.effects.registry import EFFECTS
+from pipeline.simulator.effects.rotation import ROTATION
+from pipeline.simulator.effects.turbulence import TURBULENCE, turbulence_px
+from pipeline.simulator.farm_on_day import farm_on_day
+from pipeline.simulator.farm_sun import LOWEST_SUN_DEG, sun_over_farm
+from pipeline.simulator.readout import read_out
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Air, MirrorMotion, Optics, Rig, Sky
+from pipeline.simulator.survey_probe import probe_scene
+from tests.hard_cases.simulated_scene import CAMERA, RIG, SWEEP, block_of, decided, left_out, scene_of
+
+TEXTURE = scene_of(np.random.default_rng(0).uniform(0.2, 1, (60, 80, 3)))
+FLAT = scene_of(np.ones((60, 80, 3)))
+EVENING = Sky(started=datetime(2026, 6, 21, 19, 30, tzinfo=UTC))  # about half an hour before sunset at 52 N, 10 E
+NIGHT = Sky(started=datetime(2026, 6, 21, 23, 20, tzinfo=UTC))
+
+
+def moving(exposure_ms: float, **mirror: float) -> Rig:
+    """A rig whose mirror moves otherwise."""
+    return replace(RIG, camera=replace(CAMERA, exposure_ms=exposure_ms), mirror=MirrorMotion(**mirror))
+
+
+@cache
+def damped(damping: float) -> tuple[NDArray[np.float32], Decision]:
+    """Light with the lag at 3 ms lines, and what is decided."""
+    rig = moving(3.0, damping=damping)
+    return expected_light(TEXTURE, block_of(TEXTURE, rig), {LAG: "exact", ROTATION: "rays"}), decided(TEXTURE, rig)
+
+
+@pytest.mark.parametrize("damping", [1 - 1.2e-16, 1 + 2.3e-16, 1 - 1e-9, 1 + 1e-9])
+def test_critical_damping_is_the_limit_from_both_sides(damping: float) -> None:
+    """At damping 1 and a hair beside it light, bound and decision are alike, and lag is on at 3 ms lines."""
+    (light, decision), (limit, critical) = damped(damping), damped(1.0)
+    assert damping != 1
+    np.testing.assert_allclose(light, limit, rtol=1e-5)
+    assert LAG in critical.chosen
+    assert decision.chosen == critical.chosen
+    assert decision.error == pytest.approx(critical.error, rel=1e-6)
+
+
+@pytest.mark.parametrize("damping", [0.01, 1.0, 10.0])
+def test_stiff_mirror_stands_where_it_is_told(damping: float) -> None:
+    """One of 1e5 Hz is at rest long before a line of 1 s is over: no lag, exact or by Euler's steps."""
+    rig = moving(1000.0, damping=damping, natural_hz=1e5)
+    block = block_of(TEXTURE, rig)
+    plain = expected_light(TEXTURE, block, {ROTATION: "rays"})
+    for variant in LAG.variants:
+        light = expected_light(TEXTURE, block, {LAG: variant, ROTATION: "rays"})
+        np.testing.assert_allclose(light, plain, rtol=2e-6)
+    assert LAG not in decided(TEXTURE, rig).chosen
+
+
+@pytest.mark.parametrize(("natural_hz", "damping", "exposure_ms"), [
+    (1e5, 10.0, 1000.0), (1e5, 0.01, 3.0), (5.0, 0.01, 100.0), (5.0, 2.0, 3.0), (1.0, 10.0, 3.0), (0.1, 10.0, 3.0)
+])  # fmt: skip
+def test_mirrors_stiff_and_slack_keep_every_bound(natural_hz: float, damping: float, exposure_ms: float) -> None:
+    """From a lag of nothing to one of 10,000 px, where lines lie turned otherwise than planned."""
+    for change, counted in left_out(TEXTURE, moving(exposure_ms, damping=damping, natural_hz=natural_hz)).values():
+        assert change <= counted < math.inf
+
+
+def sunset_s() -> float:
+    """When the sun reaches the horizon, after the evening's start [s]."""
+    seconds = np.arange(3600.0)
+    return float(seconds[sun_elevation_deg(EVENING, seconds) <= 0][0])
+
+
+def test_light_goes_out_at_the_horizon() -> None:
+    """Before sunset there is light, the less the later; from sunset on there is none, and only noise is read."""
+    rig = replace(RIG, sky=EVENING)
+    levels = []
+    for beside in (-600.0, -60.0, -10.0, 10.0, 600.0, 4 * 3600.0):
+        block = replace(block_of(FLAT, rig, range(1)), started_s=sunset_s() + beside)
+        light = expected_light(FLAT, block, {DRIFT: "spectral"})
+        assert np.isfinite(light).all()
+        levels.append(float(light.max()))
+    assert levels == sorted(levels, reverse=True)
+    assert levels[2] > 0
+    assert levels[3:] == [0, 0, 0]
+    assert (read_out(light, block, {}) == 64).all()
+
+
+@pytest.mark.parametrize("variant", DRIFT.variants)
+def test_survey_into_the_night_loses_all_of_its_light(variant: str) -> None:
+    """Left out, drift errs by the whole level; it is on, and no variant errs by more than that."""
+    rig = replace(RIG, sky=EVENING)
+    probe = replace(probe_scene(FLAT, rig, [SWEEP]), seconds=2 * 3600.0)
+    assert DRIFT.bound(probe, rig).value == pytest.approx(probe.level.max())
+    assert DRIFT.bound(probe, rig, variant).value <= probe.level.max() * (1 + 1e-9)
+    decision = decide(probe, rig, EFFECTS, 0.1)
+    assert DRIFT in decision.chosen
+    assert decision.error <= 0.1
+
+
+@pytest.mark.parametrize("sky", [NIGHT, replace(EVENING, started=datetime(2026, 6, 21, 19, 50, tzinfo=UTC))])
+def test_survey_in_the_dark_keeps_every_bound(sky: Sky) -> None:
+    """By night and at sunset, with clouds, a hot spot and air: all light is finite, and within what was counted."""
+    rig = replace(RIG, sky=replace(sky, cloud_share=0.5, hot_spot=0.2), air=Air(distance_m=300.0))
+    found = left_out(TEXTURE, rig)
+    assert {"drift", "cloud", "brdf", "path-radiance"} <= set(found)
+    for change, counted in found.values():
+        assert change <= counted < math.inf
+
+
+def test_farm_needs_a_sun_that_stands_high_enough() -> None:
+    """Up to the hour at which the sun is 5 deg high the farm is drawn; before it, and by night, the hour is refused."""
+    low, high = 0.0, 12.0
+    for _ in range(40):
+        middle = (low + high) / 2
+        try:
+            sun_over_farm(172, middle)
+            high = middle
+        except SceneError:
+            low = middle
+    scene = farm_on_day(0, (12, 16), bands=2, day=172, hour=high)
+    assert sun_over_farm(172, high).elevation_deg == pytest.approx(LOWEST_SUN_DEG, abs=1e-6)
+    assert np.isfinite(scene.planes).all()
+    for hour in (low, 0.0, math.nan):
+        with pytest.raises(SceneError, match=r"of day 172 the sun stands at .* needs at least 5; take an hour nearer"):
+            farm_on_day(0, (12, 16), bands=2, day=172, hour=hour)
+
+
+@pytest.mark.parametrize("distance_m", [30.0, 1e300, math.inf])
+def test_in_focus_there_is_no_blur(distance_m: float) -> None:
+    """Focused where it looks, at infinity too, defocus is absent and blurs nothing."""
+    rig = replace(RIG, air=Air(distance_m=distance_m), optics=Optics(focus_m=distance_m))
+    assert {one.name: one.reason for one in decided(TEXTURE, rig, 0.0).taken}["defocus"] == "absent"
+    assert not DEFOCUS.moments(rig, TEXTURE.wavelength_nm, "disc").variance.any()
+
+
+@cache
+def seen_from(distance_m: float, focus_m: float) -> tuple[NDArray[np.float32], Decision]:
+    """Light with everything on and exact, and what is decided."""
+    rig = replace(RIG, air=Air(distance_m=distance_m, wind_amplitude_m=0.1), optics=Optics(focus_m=focus_m))
+    decision = decided(TEXTURE, rig)
+    return expected_light(TEXTURE, block_of(TEXTURE, rig), decision.exact), decision
+
+
+@pytest.mark.parametrize("focus_m", [30.0, math.inf])
+@pytest.mark.parametrize("distance_m", [1e9, 1e300])
+def test_distance_goes_to_infinity_without_a_jump(distance_m: float, focus_m: float) -> None:
+    """Beyond the air's end light and decision are those of infinity, where nothing but the air is left to see."""
+    (light, decision), (limit, endless) = seen_from(distance_m, focus_m), seen_from(math.inf, focus_m)
+    assert np.isfinite(limit).all()
+    np.testing.assert_allclose(light, limit, rtol=1e-5)
+    assert decision.error == pytest.approx(endless.error, rel=0.01)
+    assert PATH_RADIANCE in endless.chosen
+    assert (DEFOCUS in endless.chosen) == (focus_m == 30.0)
+
+
+@pytest.mark.parametrize("relief", ["flat", "plane", "step"])
+def test_scene_that_reaches_to_the_horizon_keeps_every_bound(relief: str) -> None:
+    """Its farthest part at infinity: the ends of lines there lie a lever over the distance off, and all is finite."""
+    air = Air(distance_m=30.0, nearest_m=20.0, farthest_m=math.inf, relief=relief)  # type: ignore[arg-type]
+    rig = replace(RIG, air=air)
+    found = left_out(TEXTURE, rig)
+    for change, counted in found.values():
+        assert change <= counted < math.inf
+    block = block_of(TEXTURE, rig)
+    along = np.array([[-31.5, 31.5]])
+    moved, _ = PARALLAX.displaced(block, along, np.full((1, 2), -29.5), "exact")
+    lever = air.lever_m * (0 if relief == "flat" else -1 / 30)
+    np.testing.assert_allclose(moved, lever * along, atol=1e-12)
+
+
+def test_flat_scene_at_infinity_shows_no_turbulence() -> None:
+    """Infinite ways through the air and a slope of 0 are no NaN: unseen."""
+    rig = replace(RIG, air=Air(distance_m=math.inf))
+    assert math.isfinite(turbulence_px(rig))
+    assert TURBULENCE.bound(probe_scene(FLAT, rig, [SWEEP]), rig).value == 0
+
+
+def test_turbulence_turns_the_ends_of_lines() -> None:
+    """Looking beside the plan turns a line of 640 samples: the bound of leaving out rotation counts that."""
+    air = Air(distance_m=300.0, visibility_km=1e6, airlight_share=0.0, vapour_g_per_m3=0.0)
+    rig = Rig(air=air, optics=Optics(focus_m=300.0, aberration_px=0.0, stray_share=0.0))
+    scene = scene_of(np.random.default_rng(0).uniform(0.2, 1, (60, 680, 1)))
+    change, counted = left_out(scene, rig)["rotation"]
+    assert 0.05 < change <= counted

@@ -1,0 +1,85 @@
+"""Exchanges with the mirror controller, as bytes written by hand from the protocol, not by the encoder."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pipeline.rig.mirror_controller import MirrorController
+from pipeline.rig.mirror_settings import MirrorSettings
+from tests.rig.scripted import Pair, ScriptedTransport
+
+
+def pair(sent: str, received: str) -> Pair:
+    """A pair from hexadecimal."""
+    return bytes.fromhex(sent), bytes.fromhex(received)
+
+
+GREET: Pair = (b"START\r\n", b"OK\r\n")
+WHO: list[Pair] = [
+    (b"GETID\r\n", b"MR-E-2\r\n"), (b"GETVERSION\r\n", b"1.2.4065\r\n"), (b"GETSN\r\n", b"ABCD0123\r\n"),
+]  # fmt: skip
+ENTER: Pair = (b"GOPROCRC\r\n", b"OK\r\n")
+LEAVE = pair("7E 00 06 02 00 00 A1 48 7E", "7E 00 06 00 03 A0 7E")
+WELL = pair("7E 00 02 02 00 00 A0 78 7E", "7E 00 02 04 00 00 00 00 F0 22 7E")
+WARM = pair("7E 00 02 02 00 00 A0 78 7E", "7E 00 02 04 00 00 00 04 F1 E1 7E")
+UNREST = pair("7E 00 02 02 00 00 A0 78 7E", "7E 00 02 04 00 00 00 10 F1 EE 7E")
+TRIMMED = pair("7E 00 02 02 00 00 A0 78 7E", "7E 00 02 04 00 00 00 80 F1 82 7E")
+CONNECT: list[Pair] = [GREET, *WHO, ENTER, WELL]
+IDLE = pair("7E 00 13 06 00 02 68 01 69 01 FC E9 7E", "7E 00 13 0A 00 02 00 00 00 00 00 00 00 00 FD 43 7E")
+PLAYING = pair("7E 00 13 06 00 02 68 01 69 01 FC E9 7E", "7E 00 13 0A 00 02 00 00 00 01 00 00 00 01 01 43 7E")
+DONE = "7E 00 12 00 0C A0 7E"  # several registers were set
+GOTO = (  # positions 0.5 and -0.25, control C0 and C1, inputs 50 and 51, both units stopped
+    "7E 00 12 32 00 08 50 02 51 02 40 02 40 00 40 07 40 05 68 01 69 01 3F 00 00 00 BE 80 00 00 00 00 00 C0"
+    " 00 00 00 50 00 00 00 C1 00 00 00 51 00 00 00 00 00 00 00 00 BA 0A 7E"
+)
+PARK = (
+    "7E 00 12 32 00 08 50 02 51 02 40 02 40 00 40 07 40 05 68 01 69 01 00 00 00 00 00 00 00 00 00 00 00 C0"
+    " 00 00 00 50 00 00 00 C1 00 00 00 51 00 00 00 00 00 00 00 00 4D 90 7E"
+)
+PATH = [[0.5, -0.25], [0, 0], [1, 0]]
+LOAD = pair(
+    "7E 00 14 1D 26 00 00 00 18 3F 00 00 00 00 00 00 00 3F 80 00 00 BE 80 00 00 00 00 00 00 00 00 00 00 DC 2D 7E",
+    "7E 00 14 00 0F 00 7E",
+)
+READ_BACK = pair(
+    "7E 00 15 05 26 00 00 00 18 4D 59 7E",
+    "7E 00 15 18 3F 00 00 00 00 00 00 00 3F 80 00 00 BE 80 00 00 00 00 00 00 00 00 00 00 81 75 7E",
+)
+HALT = pair("7E 00 12 0E 00 02 68 01 69 01 00 00 00 00 00 00 00 00 BE 49 7E", DONE)
+# Positions 1 to 3 of 3 at 10 Hz, twice, by rising edges: X from cell 1 up to cell 3, Y from 4 up to 6.
+SET_X = pair(
+    "7E 00 12 26 00 06 68 00 68 02 68 03 68 04 68 07 68 08"
+    " 00 00 00 02 00 00 00 01 00 00 00 03 41 20 00 00 00 00 00 02 00 00 00 02 1A 92 7E",
+    DONE,
+)
+SET_Y = pair(
+    "7E 00 12 26 00 06 69 00 69 02 69 03 69 04 69 07 69 08"
+    " 00 00 00 02 00 00 00 04 00 00 00 06 41 20 00 00 00 00 00 02 00 00 00 02 3E 75 7E",
+    DONE,
+)
+SET_X_INCLUSIVE = pair(
+    "7E 00 12 26 00 06 68 00 68 02 68 03 68 04 68 07 68 08"
+    " 00 00 00 02 00 00 00 01 00 00 00 02 41 20 00 00 00 00 00 02 00 00 00 02 18 13 7E",
+    DONE,
+)
+SET_Y_INCLUSIVE = pair(
+    "7E 00 12 26 00 06 69 00 69 02 69 03 69 04 69 07 69 08"
+    " 00 00 00 02 00 00 00 04 00 00 00 05 41 20 00 00 00 00 00 02 00 00 00 02 3B B6 7E",
+    DONE,
+)
+RUN = (  # control C0 and C1, inputs 68 and 69, both units running
+    "7E 00 12 26 00 06 40 02 40 00 40 07 40 05 68 01 69 01"
+    " 00 00 00 C0 00 00 00 68 00 00 00 C1 00 00 00 69 00 00 00 01 00 00 00 01 AE E3 7E"
+)
+STOP_LOG = pair("7E 00 12 08 00 01 24 10 00 00 00 00 10 78 7E", DONE)
+SET_LOG = pair(  # X feedback into slot 0, Y feedback into slot 1, 1000 Hz
+    "7E 00 12 14 00 03 24 00 24 01 24 11 00 00 23 02 00 00 23 03 44 7A 00 00 B7 2F 7E", DONE
+)
+START_LOG = pair("7E 00 12 08 00 01 24 10 00 00 00 01 D1 B8 7E", DONE)
+
+
+def connected(transport: ScriptedTransport, **settings: Any) -> MirrorController:
+    """A controller that has been connected; the script begins with CONNECT, and CRCs in it have to fit."""
+    mirror = MirrorController(transport, MirrorSettings(**{"strict_crc": True, **settings}), transport.clock)
+    mirror.connect()
+    return mirror

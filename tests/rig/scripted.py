@@ -1,0 +1,92 @@
+"""A transport that knows beforehand what is sent and what comes back, and fails on every byte that differs."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from pipeline.rig.clock import ManualClock
+
+
+@dataclass(frozen=True)
+class Late:
+    """Bytes that can be read ``after_s`` after the request was sent."""
+
+    after_s: float
+    data: bytes
+
+
+Reply = bytes | Late | Exception
+Pair = tuple[bytes, bytes | Sequence[Reply]]
+
+
+class ScriptedTransport:
+    """Plays (sent, received) pairs. What is received may come in parts, late, or be an error; waiting takes no time.
+
+    ``stale`` lies on the line at first.
+    """
+
+    port = "scripted"
+
+    def __init__(self, pairs: Sequence[Pair], clock: ManualClock, stale: bytes = b"") -> None:
+        self.clock = clock
+        self.drained = b""
+        self.sent = 0
+        self.closed = False
+        self._pairs = deque(pairs)
+        self._line: deque[tuple[float, bytes | Exception]] = deque([(clock.now(), stale)] if stale else [])
+
+    def write(self, data: bytes, deadline: float) -> None:
+        """Take a request: the next one, to the byte."""
+        assert self.clock.now() < deadline
+        assert self._pairs, f"nothing more was expected, {data.hex(' ')} was sent"
+        expected, received = self._pairs.popleft()
+        assert data == expected, f"expected {expected.hex(' ')}, {data.hex(' ')} was sent"
+        self.sent += 1
+        for part in [received] if isinstance(received, bytes) else received:
+            after, reply = (part.after_s, part.data) if isinstance(part, Late) else (0.0, part)
+            if reply:
+                self._line.append((self.clock.now() + after, reply))
+
+    def read(self, at_most: int, deadline: float) -> bytes:
+        """Give the next part, at the time that it comes."""
+        if not self._line or self._line[0][0] > deadline:
+            self.clock.sleep(deadline - self.clock.now())
+            return b""
+        when, reply = self._line.popleft()
+        self.clock.sleep(when - self.clock.now())
+        if isinstance(reply, Exception):
+            raise reply
+        if reply[at_most:]:
+            self._line.appendleft((when, reply[at_most:]))
+        return reply[:at_most]
+
+    def drain(self) -> bytes:
+        """Give what came already."""
+        found = b""
+        while self._line and self._line[0][0] <= self.clock.now():
+            reply = self._line.popleft()[1]
+            assert isinstance(reply, bytes)
+            found += reply
+        self.drained += found
+        return found
+
+    def close(self) -> None:
+        """Note that the port was let go of."""
+        self.closed = True
+
+    def check(self) -> None:
+        """Fail on requests that were not sent, and on bytes that were not read."""
+        assert not self._pairs, f"{self._pairs[0][0].hex(' ')} was not sent"
+        assert not self._line, f"{self._line[0][1]!r} was not read"
+
+
+@contextmanager
+def scripted(pairs: Sequence[Pair], *, stale: bytes = b"", drained: bytes = b"") -> Iterator[ScriptedTransport]:
+    """Play pairs and fail at the end on what was not sent or read. ``drained`` is what has to be thrown away unread."""
+    transport = ScriptedTransport(pairs, ManualClock(), stale)
+    yield transport
+    transport.check()
+    assert transport.drained == drained

@@ -1,0 +1,94 @@
+"""A small scene before an emulated rig in this process, and the source of lines that looks through it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pipeline.camera import LineCamera
+from pipeline.rig.capture_runner import RigDevices
+from pipeline.rig.clock import ManualClock
+from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
+from pipeline.rig.emulator.camera_server import CameraServer
+from pipeline.rig.emulator.emulated_rig import EmulatedRig, InProcessRig
+from pipeline.rig.emulator.fault import Fault
+from pipeline.rig.kept_files import Kept, KeptInMemory
+from pipeline.rig.mirror_controller import MirrorController
+from pipeline.rig.rig_source import RigSource, RigView
+from pipeline.rig.survey_rig import SurveyRig
+from pipeline.scan import Sweep
+from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scene import raster_from_values
+from pipeline.simulator.simulated import SimulatedSource
+
+CAMERA = LineCamera(samples=48)
+NAMES = ("rotation", "slit", "smear", "vignetting", "shot", "read-noise")
+COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -21.5, 10, 4, 4)
+FINE = Sweep("fine-3", "fine", "x", 3.25, -7.5, 17)
+
+
+def small_source(**changed: Any) -> SimulatedSource:
+    """A simulated source of 40 x 48 px and 3 bands, with usual effects."""
+    rng = np.random.default_rng(11)
+    scene = raster_from_values(
+        rng.uniform(20, 200, (40, 48, 3)), CAMERA, name="small", wavelength_nm=np.array([460.0, 550.0, 640.0])
+    )
+    return replace(SimulatedSource(scene, Rig(CAMERA), 5, effects_on(*NAMES)), **changed)
+
+
+@dataclass
+class SmallRig:
+    """An emulated rig and what is needed to look through it."""
+
+    line: InProcessRig
+    settings: SurveyRig
+    vector_pairs: int
+    view: RigView
+    opened: int = 0
+
+    @property
+    def emulated(self) -> EmulatedRig:
+        """Both emulated devices."""
+        return self.line.rig
+
+    @property
+    def captures(self) -> list[str]:
+        """Capture commands that the camera took, references left out."""
+        return [said for said in self.emulated.camera.commands if "capture(" in said and "references" not in said]
+
+    def devices(self) -> RigDevices:
+        """Connect to both."""
+        self.opened += 1
+        self.line.transport = type(self.line.transport)(self.emulated.mirror, self.line.clock)
+        mirror = MirrorController(self.line.transport, self.settings.mirror(self.vector_pairs), self.line.clock)
+        mirror.connect()
+        return RigDevices(mirror, self.line.camera(), self.line.clock)
+
+    def source(self, kept: Kept | None = None) -> RigSource:
+        """A source that looks through the rig; another call is another process."""
+        return RigSource(
+            self.view, self.devices, KeptInMemory() if kept is None else kept, rig=self.settings,
+            vector_pairs=self.vector_pairs,
+        )  # fmt: skip
+
+
+@contextmanager
+def small_rig(
+    source: SimulatedSource | None = None, *, faults: dict[CameraFault, int] | None = None, passes: int = 0,
+    mirror_faults: Sequence[Fault] = (), vector_pairs: int = 1500, **settings: Any,
+) -> Iterator[SmallRig]:  # fmt: skip
+    """An emulated rig before a source's scene, until the context ends."""
+    looked = small_source() if source is None else source
+    rig = EmulatedRig(
+        looked, ManualClock(50.0), mirror_faults=mirror_faults, wired=settings.get("pulses", "position"),
+        camera_faults=CameraFaults(dict(faults or {}), 0, passes),
+    )  # fmt: skip
+    view = RigView(looked.camera, looked.wavelength_nm, looked.field_shape)
+    with rig.in_process() as line:
+        assert isinstance(line.server, CameraServer)
+        yield SmallRig(line, SurveyRig(**settings), vector_pairs, view)

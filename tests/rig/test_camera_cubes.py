@@ -1,0 +1,142 @@
+"""Bytes of a capture's files come out as the lines that went in, whatever is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.errors import RigError
+from pipeline.rig.camera_cubes import cube_lines, parse_cube_header, read_capture, read_references
+
+HEADER = (
+    "ENVI\n; a comment\ninterleave = bil\ndata type = 12\nlines = {lines}\nsamples = 5\nbands = 3\nbyte order = 0\n"
+    "header offset = 0\nwavelength = {{\n400.5,\n500,\n600\n}}\n"
+)
+
+
+def numbers(lines: int, first: int = 0) -> NDArray[np.uint16]:
+    """Lines (line, sample, band) of which each number is another."""
+    return (np.arange(lines * 15) + first * 15).reshape(lines, 5, 3).astype(np.uint16)
+
+
+def bil(values: NDArray[np.uint16]) -> bytes:
+    """Their bytes, band after band within each line."""
+    return values.transpose(0, 2, 1).astype("<u2").tobytes()
+
+
+def folder(**files: bytes) -> tuple[list[str], Callable[[str], bytes]]:
+    """Names and a reader of files, whose names have _ for dots and a folder before them."""
+    content = {f"/c/{name.replace('__', '.')}": data for name, data in files.items()}
+    return list(content), content.__getitem__
+
+
+def header(lines: int) -> bytes:
+    """A header as the camera writes it, in bytes."""
+    return HEADER.format(lines=lines).encode()
+
+
+def test_header_by_hand() -> None:
+    """Sizes, byte order, offset and wavelengths are read; band after band stands within a line."""
+    found = parse_cube_header(HEADER.format(lines=1).replace("\n", "\r\n"), "raw_0.hdr")
+    assert (found.samples, found.lines, found.bands, found.offset, found.line_bytes) == (5, 1, 3, 0, 30)
+    assert found.wavelength_nm is not None
+    assert found.wavelength_nm.tolist() == [400.5, 500, 600]
+    values = cube_lines(found, bytes(range(30))).values
+    assert values[0, 1, 0] == 0x0302
+    assert values[0, 0, 1] == 0x0B0A
+
+
+def test_big_endian_with_an_offset() -> None:
+    """Byte order and header offset are followed."""
+    text = HEADER.format(lines=2).replace("byte order = 0", "byte order = 1").replace("offset = 0", "offset = 7")
+    data = b"7 bytes" + numbers(2).transpose(0, 2, 1).astype(">u2").tobytes()
+    np.testing.assert_array_equal(cube_lines(parse_cube_header(text, "h"), data).values, numbers(2))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("ENVI", "EVNI", "begins with 'EVNI"), ("bil", "bsq", "expected bil and 12"),
+        ("type = 12", "type = 4", "expected bil and 12"), ("samples = 5", "samples = x", "samples = 'x', expected"),
+        ("samples = 5\n", "", "samples = None"), ("order = 0", "order = 2", "expected 0 or 1"),
+        ("bands = 3", "bands = 0", "at least one of each"),
+    ],
+)  # fmt: skip
+def test_headers_that_cameras_do_not_write(old: str, new: str, words: str) -> None:
+    """Anything else than 16-bit lines is refused with what stands there."""
+    with pytest.raises(RigError, match=words):
+        parse_cube_header(HEADER.format(lines=1).replace(old, new), "raw_0.hdr")
+
+
+def test_parts_in_order() -> None:
+    """Parts follow each other by their first frames, with times by their indices in both layouts."""
+    names, read = folder(
+        raw_4=bil(numbers(2, 4)), raw_4__hdr=header(2), frameIndex_4__txt=b"Frame Timestamp\r\n4 140\r\n5 150\r\n",
+        raw_0=bil(numbers(4)), raw_0__hdr=header(4), frameIndex_0__txt=b"Frame\tTime\n0\t100\n1\t110\n1\t115\n3\t130\n",
+        imu_gps__txt=b"Roll\n",
+    )  # fmt: skip
+    found = read_capture(names, read)
+    np.testing.assert_array_equal(found.values, numbers(6))
+    assert found.times.frame.tolist() == [0, 1, -1, 3, 4, 5]
+    assert found.times.stamp_us.tolist() == [100, 110, -1, 130, 140, 150]
+    assert found.valid.all()
+    assert "frameIndex_0.txt: 1 frames are listed twice, the first counts" in found.notes
+
+
+def test_cut_off_within_a_line() -> None:
+    """Lines that are whole are kept, the others are 0 and not valid, and a note says it."""
+    names, read = folder(
+        raw_0=bil(numbers(4))[:-40], raw_0__hdr=header(4), frameIndex_0__txt=b"f t\n0 1\n1 2\n2 3\n3 4\n"
+    )
+    found = read_capture(names, read)
+    assert found.valid.tolist() == [True, True, False, False]
+    np.testing.assert_array_equal(found.values[:2], numbers(2))
+    assert not found.values[2:].any()
+    assert found.times.stamp_us.tolist() == [1, 2, -1, -1]
+    assert "raw_0 is cut off: 2 of 4 lines are whole" in found.notes
+
+
+def test_lines_between_parts_in_no_file() -> None:
+    """A part whose name says a later frame leaves lines that are not valid."""
+    names, read = folder(raw_0=bil(numbers(2)), raw_0__hdr=header(2), raw_3=bil(numbers(1, 3)), raw_3__hdr=header(1))
+    found = read_capture(names, read)
+    assert found.valid.tolist() == [True, True, False, True]
+    assert "1 lines before raw_3 are in no file" in found.notes
+    assert "there is no frame index for raw_0" in found.notes
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        ({}, "no whole line in an empty folder"),
+        ({"raw_0": b"", "raw_0__hdr": header(0)}, "no whole line in raw_0, raw_0.hdr"),
+        ({"raw_0": bil(numbers(1))}, "has no header raw_0.hdr"),
+        (
+            {"raw_0": bil(numbers(1)), "raw_0__hdr": header(1), "raw_1": bil(numbers(1)),
+             "raw_1__hdr": header(1).replace(b"samples = 5\nbands = 3", b"samples = 3\nbands = 5")},
+            "they are of several captures",
+        ),
+        (
+            {name: bil(numbers(1)) for name in ("raw_0", "raw_900000")}
+            | {name: header(1) for name in ("raw_0__hdr", "raw_900000__hdr")},
+            "899999 lines before raw_900000",
+        ),
+    ],
+)  # fmt: skip
+def test_captures_that_are_none(files: dict[str, bytes], words: str) -> None:
+    """What cannot be put together is refused with what is wrong."""
+    with pytest.raises(RigError, match=words):
+        read_capture(*folder(**files))
+
+
+def test_references_of_a_folder() -> None:
+    """Dark and white cubes are found by how their names begin; two of a kind are refused."""
+    names, read = folder(darkReference=bil(numbers(2)), darkReference__hdr=header(2))
+    assert list(read_references(names, read)) == ["dark"]
+    np.testing.assert_array_equal(read_references(names, read)["dark"].values, numbers(2))
+    names, read = folder(dark=bil(numbers(1)), dark__hdr=header(1), darkRef=bil(numbers(1)), darkRef__hdr=header(1))
+    with pytest.raises(RigError, match="two dark references"):
+        read_references(names, read)

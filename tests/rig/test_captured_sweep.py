@@ -1,0 +1,76 @@
+"""Frames of a capture and lines of its sweep: what the camera dropped is not valid, what contradicts is not used."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.rig.camera_cubes import CapturedLines
+from pipeline.rig.capture_journal import Taken
+from pipeline.rig.capture_paths import next_path
+from pipeline.rig.captured_sweep import UntiedError, place_lines
+from pipeline.rig.frame_index import LineTimes
+from tests.rig.small_rig import CAMERA, COARSE, FINE
+
+PATH = next_path(FINE, 3, CAMERA, vector_pairs=7, triggered=True)  # lines 3 to 9
+TAKEN = Taken(FINE, 3, 9, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=6)
+
+
+def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
+    """A capture with these frames, numbers as the index has them, and lines missing at its end."""
+    count = len(numbers) + lost
+    told = np.array(numbers + [-1] * lost, np.int64)
+    valid = np.arange(count) < len(numbers)
+    stamps = np.where(told >= 0, 10**15 + told * 100_000, -1)
+    return CapturedLines(
+        np.zeros((count, 48, 3), np.uint16), valid, first, LineTimes(told, stamps, np.full(count, np.nan), ()), None, ()
+    )
+
+
+def test_dropped_frame_is_a_line_without_a_row():
+    """Frame 2 is missing: the rows behind it belong to the lines that they were taken for."""
+    placed = place_lines(frames([0, 1, 3, 4, 5]), PATH, TAKEN, CAMERA, None)
+    assert placed.row.tolist() == [0, 1, -1, 2, 3, 4]
+    assert [placed.is_valid(line) for line in range(6)] == [True, True, False, True, True, True]
+    np.testing.assert_array_equal(placed.tied.position, PATH.middle[[0, 1, 3, 4, 5]].astype(np.float64))
+
+
+def test_numbers_count_from_the_captures_first_frame():
+    """A camera that numbers frames since it was switched on."""
+    placed = place_lines(frames([70, 71, 72, 73, 74, 75], first=70), PATH, TAKEN, CAMERA, None)
+    assert placed.row.tolist() == list(range(6))
+
+
+def test_lines_lost_at_the_end_are_not_given():
+    """What a cube promises and does not hold is left for another capture, though the mirror stepped for it."""
+    placed = place_lines(frames([0, 1, 2, 3], lost=2), PATH, TAKEN, CAMERA, None)
+    assert placed.row.tolist() == [0, 1, 2, 3]
+
+
+def test_whole_capture_without_an_index_is_in_order():
+    """As many rows as lines leave no doubt; fewer do."""
+    unnumbered = frames([-1] * 6)
+    assert place_lines(unnumbered, PATH, TAKEN, CAMERA, None).row.tolist() == list(range(6))
+    with pytest.raises(UntiedError, match="fetch frameIndex"):
+        place_lines(frames([-1] * 5), PATH, replace(TAKEN, index_at_end=None), CAMERA, None)
+
+
+@pytest.mark.parametrize("index", [0, 5, 7])
+def test_mirror_that_stepped_otherwise_is_not_believed(index: int):
+    """One edge too few or too many: which lines are off is not known."""
+    with pytest.raises(UntiedError, match=rf"stands at cell {index} of its path, after 6 frames cell 6 was expected"):
+        place_lines(frames(list(range(6))), PATH, replace(TAKEN, index_at_end=index), CAMERA, None)
+
+
+def test_paths_take_whole_lines():
+    """A line's held positions are never parted, and the lead-in cell has its room."""
+    path = next_path(COARSE, 2, CAMERA, vector_pairs=12, triggered=True)
+    assert (path.first, path.stop, path.cells.shape) == (2, 4, (9, 2))
+    assert path.cells[0].tolist() == path.cells[1].tolist()
+    assert path.frames_at(8) == 2
+    assert path.frames_at(7) is None
+    free = next_path(COARSE, 2, CAMERA, vector_pairs=13, triggered=False)
+    assert free.cells.shape == (12, 2)
+    assert free.rate_hz == 40.0

@@ -1,0 +1,181 @@
+"""Every fault of the emulated controller, with many seeds, against the driver: whole sessions on their own clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from pipeline.errors import RigError
+from pipeline.rig.clock import ManualClock
+from pipeline.rig.emulator.faults import KINDS, make_fault
+from pipeline.rig.emulator.in_process import InProcessTransport
+from pipeline.rig.emulator.mirror_device import MirrorDevice
+from pipeline.rig.mirror_controller import MirrorController
+from pipeline.rig.mirror_settings import MirrorSettings
+from pipeline.rig.pro_mode import Command, Frame, FrameReader
+from pipeline.rig.pro_payloads import cell_int, read_registers
+from pipeline.rig.refusals import StateUnknown
+from pipeline.rig.registers import VectorRegister, X, Y
+
+SEEDS = range(20)
+SETTINGS = MirrorSettings(expected_id="MR-E", read_back="all")
+PATH = np.stack([np.linspace(-0.5, 0.5, 47), np.linspace(0.3, 0.1, 47)], axis=-1)
+MOST_QUIET = 6  # times the time of silence that is waited for before a request
+EPSILON_S = 1e-6
+STATIC = (X.static_xy, Y.static_xy)
+RUNS = (X.vector(VectorRegister.RUN), Y.vector(VectorRegister.RUN))
+ALWAYS_FATAL = ("mute", "gone-before", "gone-within", "gone-after", "hangs", "echo", "modem", "wrong-firmware")
+
+
+def moves(data: bytes) -> bool:
+    """Whether a write of the driver moves the mirror."""
+    if data[:2] in (b"X=", b"Y=", b"XY") or data.startswith(b"RESET"):
+        return True
+    for found in FrameReader().feed(data):
+        if isinstance(found, Frame) and found.command == Command.SET_VALUES:
+            for register, cell in read_registers(found.payload, with_cells=True):
+                if register in STATIC or (register in RUNS and cell_int(cell)):
+                    return True
+    return False
+
+
+@dataclass
+class Session:
+    """A driver, a controller with one fault, and what was seen of them."""
+
+    name: str
+    seed: int
+    at: int | None = None  # opportunity at which the fault strikes; None leaves it to the seed
+    baud: int = 0
+    quiet_s: list[float] = field(default_factory=list)  # of each transaction, until its first byte was sent
+    waits_s: list[float] = field(default_factory=list)  # and from then on
+    errors: list[RigError] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.clock = ManualClock()
+        self.fault = make_fault(self.name, self.seed, self.at)
+        self.device = MirrorDevice(self.clock, [self.fault])
+        self.transport = InProcessTransport(self.device, self.clock, self.baud)
+        self.driver = MirrorController(self.transport, SETTINGS, self.clock)
+        self.times()
+
+    def times(self) -> None:
+        """Take the time of each transaction: in all, and from its first byte on."""
+        exchange, write = self.driver.wire.exchange, self.transport.write
+        first: list[float] = []
+
+        def written(data: bytes, deadline: float) -> None:
+            first.append(self.clock.now())
+            write(data, deadline)
+
+        def timed(*given: object) -> object:
+            began = self.clock.now()
+            first.clear()
+            try:
+                return exchange(*given)  # type: ignore[arg-type]
+            finally:
+                self.quiet_s.append((first or [began])[0] - began)
+                self.waits_s.append(self.clock.now() - (first or [began])[0])
+
+        self.transport.write = written  # type: ignore[method-assign]
+        self.driver.wire.exchange = timed  # type: ignore[method-assign, assignment]
+
+    def does(self, act: Callable[[], object], motions: int) -> bool:
+        """Do one thing; say whether it went well. It sends no more motions than it has."""
+        sent = len(self.transport.sent)
+        try:
+            act()
+        except RigError as error:
+            self.errors.append(error)
+        assert sum(map(moves, self.transport.sent[sent:])) <= motions
+        return not self.errors
+
+    def goes(self, x: float, y: float) -> None:
+        """Go somewhere, and be sent there where it was acknowledged."""
+        self.driver.goto(x, y)
+        if "disconnected" not in self.name:
+            went = [axis.commanded for axis in self.device.state.axes]
+            assert went == [float(np.float32(x)), float(np.float32(y))]
+
+    def loads(self) -> None:
+        """Load a path; what was acknowledged is there."""
+        self.driver.load_path(PATH)
+        held = self.device.state.memory[: PATH.size]
+        np.testing.assert_array_equal(held, PATH.T.ravel().astype(np.float32))
+
+    def plays(self) -> None:
+        """Play the path; where it was acknowledged, the mirror ends where the path does."""
+        self.driver.run(0, len(PATH), 100.0)
+        self.clock.advance(1.0)
+        assert not self.driver.is_playing()
+        if "disconnected" not in self.name:
+            np.testing.assert_allclose(self.device.positions(self.clock.now()), PATH[-1], atol=1e-5)
+
+    def run(self) -> None:
+        """Do what a survey does, until something fails, and let go."""
+        steps: list[tuple[Callable[[], object], int]] = [
+            (self.driver.connect, 0), (self.driver.status, 0), (lambda: self.goes(0.1, -0.2), 1),
+            (lambda: self.driver.settle(1.0), 0), (self.loads, 0), (lambda: self.driver.start_log(100.0), 0),
+            (self.plays, 1), (self.driver.index, 0), (self.driver.read_log, 0), (self.driver.temperature, 0),
+            (self.driver.park, 1),
+        ]  # fmt: skip
+        for act, motions in steps:
+            if not self.does(act, motions):
+                break
+        self.ends()
+
+    def ends(self) -> None:
+        """An unknown state stays frozen, and the port is let go in any state."""
+        if self.errors and isinstance(self.errors[0], StateUnknown):
+            sent = len(self.transport.sent)
+            with pytest.raises(StateUnknown, match="acknowledge_state"):
+                self.driver.goto(0.0, 0.0)
+            assert not any(map(moves, self.transport.sent[sent:]))
+        self.driver.close()
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_no_fault_hangs_moves_twice_or_loses_what_was_acknowledged(name: str) -> None:
+    """Twenty sessions with each fault: each ends well, or with one error that says where and what to do."""
+    struck = 0
+    for seed in SEEDS:
+        session = Session(name, seed)
+        session.run()
+        struck += session.fault.chance.struck > 0
+        assert max(session.quiet_s) <= MOST_QUIET * SETTINGS.quiet_s, (seed, max(session.quiet_s))
+        assert max(session.waits_s) <= SETTINGS.deadline_s + EPSILON_S, (seed, max(session.waits_s))
+        for error in session.errors:
+            words = str(error)
+            assert "emulator" in words, words
+            assert "Traceback" not in words
+            assert "\n" not in words
+            assert 20 < len(words) < 600, words
+        if KINDS[name].harmless:
+            assert not session.errors, (seed, session.errors)
+        if session.fault.chance.struck and name in ALWAYS_FATAL:
+            assert session.errors, seed
+    assert struck >= len(SEEDS) // 2, f"{name} struck in {struck} of {len(SEEDS)} sessions"
+
+
+@pytest.mark.parametrize("name", ["no-reply", "just-late-reply", "reply-byte-lost", "silent-reset", "gone-after"])
+def test_no_reply_of_a_session_can_be_spared(name: str) -> None:
+    """The fault strikes each request in turn, motions among them: nothing moves twice or is lost unseen."""
+    kinds = set()
+    for at in range(200):
+        session = Session(name, seed=at, at=at, baud=115200)
+        session.run()
+        if not session.fault.chance.struck:
+            break
+        kinds |= {type(error) for error in session.errors}
+        assert max(session.waits_s) <= SETTINGS.deadline_s + EPSILON_S
+    assert at > 30
+    assert StateUnknown in kinds or name == "just-late-reply"  # which mostly still comes in time
+
+
+def test_there_are_as_many_kinds_as_promised() -> None:
+    """At least 30 kinds, each with a line of words."""
+    assert len(KINDS) >= 30
+    assert all(kind.words and "\n" not in kind.words and len(kind.words) < 100 for kind in KINDS.values())

@@ -1,0 +1,234 @@
+"""The control client sends the documented bytes once or again as it may, and says what it found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import pytest
+
+from pipeline.errors import RigError, SettingsError
+from pipeline.rig.clock import Clock, ManualClock
+from pipeline.rig.headwall_control import ControlPatience, HeadwallControl
+from pipeline.rig.line_camera import CaptureUnknown
+from pipeline.rig.refusals import DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
+from tests.rig.scripted import Late, Pair, Reply, ScriptedTransport
+
+HELLO = b"Hyperspec\r\nhpi> "
+LIST_ROOT = b'listFiles("/captured")\r'
+CAPTURE = b'capture({"prefix": "f1", "maxCubes": 1, "maxFramesPerCube": 500})\r'
+IS_CAPTURING = b"isCapturing\r"
+
+
+def said(command: bytes, response: bytes) -> bytes:
+    """A reply as the camera writes it."""
+    return command + b'\n{"success": true, "response": ' + response + b', "errorMessage": ""}\r\nhpi> '
+
+
+def refused(command: bytes, why: bytes) -> bytes:
+    """A refusal."""
+    return command + b'\n{"success": false, "response": null, "errorMessage": "' + why + b'"}\r\nhpi> '
+
+
+@contextmanager
+def talk(*connections: Sequence[Pair], retries: int = 2, hello: bytes = HELLO) -> Iterator[HeadwallControl]:
+    """A client whose connections follow these scripts, all of which must be used up."""
+    clock = ManualClock()
+    scripts = [ScriptedTransport(pairs, clock, hello) for pairs in connections]
+    waiting = iter(scripts)
+    yield HeadwallControl(lambda: next(waiting), clock=clock, patience=ControlPatience(5.0, retries, 0.5))
+    for script in scripts:
+        script.check()
+
+
+@pytest.mark.parametrize("echo", [True, False])
+def test_every_command(echo: bool) -> None:
+    """Each command and its reply, with the command repeated or not."""
+
+    def answer(command: bytes, response: bytes) -> Pair:
+        return command, said(command if echo else b"", response)
+
+    listing = b'[{"name": "/captured//a/raw_0", "size": 12, "mtime": 1.5, "isDirectory": false}, ' \
+              b'{"name": "/captured/a/b", "isDirectory": true}]'  # fmt: skip
+    with talk([
+        answer(b'configure({"exposure": 10.5, "framePeriod": 11})\r', b"{}"), answer(LIST_ROOT, b"[]"),
+        answer(CAPTURE, b'{"folder": "/captured/f1_0"}'), answer(IS_CAPTURING, b"true"),
+        answer(b"stopCapture\r", b"true"), answer(b'listFiles("/captured/a")\r', listing), (b"exit\r", b""),
+    ]) as control:  # fmt: skip
+        control.configure(10.5, 11)
+        assert control.capture(500, prefix="f1").folder == "/captured/f1_0"
+        assert control.is_capturing()
+        assert control.stop_capture()
+        files = [(file.name, file.size, file.folder) for file in control.list_files("/captured/a")]
+        assert files == [("/captured/a/b", None, True), ("/captured/a/raw_0", 12, False)]
+        control.close()
+        assert control.greeting == "Hyperspec"
+
+
+def test_greeting_in_pieces() -> None:
+    """Greeting, prompt and reply may be cut anywhere, also within the prompt."""
+    whole = said(IS_CAPTURING, b"false")
+    pieces: list[Reply] = [whole[at : at + 1] for at in range(len(whole))]
+    with talk([(IS_CAPTURING, pieces)], hello=b"hpi> ") as control:
+        assert not control.is_capturing()
+
+
+@pytest.mark.parametrize(
+    "stale",
+    [said(b"stopCapture\r", b"true"), said(b"", b'{"folder": "/captured/x"}'), said(b"", b"[]")],
+)
+def test_replies_to_others_are_passed_over(stale: bytes) -> None:
+    """A reply that names another command, or that cannot be one to this, is not taken for it; merged ones neither."""
+    for replies in ([stale, said(IS_CAPTURING, b"false")], [stale + said(IS_CAPTURING, b"false")]):
+        with talk([(IS_CAPTURING, replies)]) as control:
+            assert not control.is_capturing()
+
+
+def test_late_reply_is_never_the_next_ones() -> None:
+    """After a reply that did not come in time the connection is a new one."""
+    with talk(
+        [(b"isCapturing\r", b"")], [(b"isCapturing\r", said(IS_CAPTURING, b"true"))]
+    ) as control:  # fmt: skip
+        assert control.is_capturing()
+        assert control.clock.now() == pytest.approx(5.5)
+
+
+def test_a_read_gives_up() -> None:
+    """Reads are asked again as often as set, then the deadline is told with what came."""
+    pair = (IS_CAPTURING, b"isCapturing\r\n{")
+    with talk([pair], [pair], retries=1) as control, pytest.raises(DeadlinePassed, match=r"within 5 s .*14 bytes came"):
+        control.is_capturing()
+
+
+@pytest.mark.parametrize("reply", [b"Segmentation fault\r\nhpi> ", b'{"response": true}\r\nhpi> ', b"{]\r\nhpi> "])
+def test_no_json(reply: bytes) -> None:
+    """What is no reply is told as it came."""
+    with talk([(IS_CAPTURING, reply)], retries=0) as control, pytest.raises(RigError, match="expected"):
+        control.is_capturing()
+
+
+def test_wrong_device() -> None:
+    """Somebody who sends no prompt is not the camera."""
+    with talk([], retries=0, hello=b"SSH-2.0\r\n") as control, pytest.raises(DeadlinePassed, match="control port"):
+        control.is_capturing()
+
+
+@pytest.mark.parametrize(
+    ("why", "remedy"),
+    [
+        (b"disk full", "copy the folders"), (b"busy capturing", "stopCapture"),
+        (b"exposure longer than frame period", "not longer than the frame period"), (b"oh", "manual"),
+    ],
+)  # fmt: skip
+def test_refusals(why: bytes, remedy: str) -> None:
+    """A capture that is refused did not begin: told once with what to do, nothing frozen, nothing sent again."""
+    with (
+        talk([(LIST_ROOT, said(LIST_ROOT, b"[]")), (CAPTURE, refused(CAPTURE, why))]) as control,
+        pytest.raises(DeviceRefused, match=f"refused capture: {why.decode()}; .*{remedy}"),
+    ):
+        control.capture(500, prefix="f1")
+    assert control.unknown == ""
+
+
+def test_capture_without_a_reply() -> None:
+    """It is sent once; the camera is asked what it does, that is told, and motions are refused until acknowledged."""
+    listed = b'[{"name": "/captured/f1_0", "isDirectory": true}]'
+    with talk(
+        [(LIST_ROOT, said(LIST_ROOT, b"[]")), (CAPTURE, b"")],
+        [
+            (IS_CAPTURING, said(IS_CAPTURING, b"true")), (LIST_ROOT, said(LIST_ROOT, listed)),
+            (b"stopCapture\r", said(b"stopCapture\r", b"true")), (LIST_ROOT, said(LIST_ROOT, listed)),
+            (CAPTURE, said(CAPTURE, b'{"folder": "/captured/f1_1"}')),
+        ],
+    ) as control:  # fmt: skip
+        with pytest.raises(CaptureUnknown, match=r"asked again it captures, .*/captured/f1_0") as caught:
+            control.capture(500, prefix="f1")
+        assert (caught.value.capturing, caught.value.folders) == (True, ("/captured/f1_0",))
+        for refused_now in (lambda: control.capture(500, prefix="f1"), lambda: control.configure(10, 10)):
+            with pytest.raises(StateUnknown, match="acknowledge_state"):
+                refused_now()
+        assert control.stop_capture()
+        control.acknowledge_state("stopped")
+        assert control.capture(500, prefix="f1").folder == "/captured/f1_1"
+
+
+def test_capture_and_then_nobody() -> None:
+    """Where the camera does not answer afterwards either, that is what is told."""
+    gone = DeviceGone("the connection was lost")
+    pairs: list[Pair] = [(LIST_ROOT, said(LIST_ROOT, b"[]")), (CAPTURE, [gone])]
+    with (
+        talk(pairs, [(IS_CAPTURING, [gone])], retries=0) as control,
+        pytest.raises(CaptureUnknown, match="asked again it does not answer") as caught,
+    ):
+        control.capture(500, prefix="f1")
+    assert caught.value.capturing is None
+
+
+def test_capture_that_is_interrupted() -> None:
+    """Ctrl-C while the reply is awaited leaves captures frozen, since one may run."""
+    pairs: list[Pair] = [(LIST_ROOT, said(LIST_ROOT, b"[]")), (CAPTURE, b"")]
+    with talk(pairs) as control:
+        control.clock.sleep = Interrupting(control.clock)  # type: ignore[method-assign]
+        with pytest.raises(KeyboardInterrupt):
+            control.capture(500, prefix="f1")
+        with pytest.raises(StateUnknown, match="the wait for its reply was interrupted"):
+            control.capture(500, prefix="f1")
+
+
+class Interrupting:
+    """Sleeping that a person ends, once there is something to wait for."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._sleep = clock.sleep
+
+    def __call__(self, seconds: float) -> None:
+        """Sleep, or be interrupted."""
+        if seconds > 1:
+            raise KeyboardInterrupt
+        self._sleep(seconds)
+
+
+def test_stale_bytes_are_dropped() -> None:
+    """What lies on the line before a command is thrown away, not taken for its reply."""
+    extra = said(IS_CAPTURING, b"true")
+    torn = said(IS_CAPTURING, b"false") + extra[:20]
+    with talk([(IS_CAPTURING, torn), (IS_CAPTURING, said(IS_CAPTURING, b"false"))]) as control:
+        assert not control.is_capturing()
+        assert not control.is_capturing()
+    with talk(
+        [(IS_CAPTURING, [said(IS_CAPTURING, b"false"), Late(0.0, extra)]), (IS_CAPTURING, said(IS_CAPTURING, b"false"))]
+    ) as control:
+        assert not control.is_capturing()
+        assert not control.is_capturing()
+
+
+def test_stop_where_none_runs() -> None:
+    """A refusal to stop where nothing runs is no failure."""
+    with talk([
+        (b"stopCapture\r", refused(b"stopCapture\r", b"not capturing")), (IS_CAPTURING, said(IS_CAPTURING, b"false")),
+    ]) as control:  # fmt: skip
+        assert not control.stop_capture()
+
+
+@pytest.mark.parametrize(
+    ("exposure", "period", "words"),
+    [
+        (0.003, 0.003, r"exposure of 0.003 ms is below 0.5 ms; it is given in ms: 0.003 s would be 3"),
+        (3, 0.003, r"frame period of 0.003 ms is below 2.857 ms"),
+        (20, 10, r"exposure of 20 ms does not fit a frame period of 10 ms; take a period of at least 20"),
+        (0, 10, "expected exposure above 0 ms, got 0"),
+        (float("nan"), 10, "above 0 ms, got nan"),
+        (100_000, 100_000, "100000 us would be 100"),
+    ],
+)
+def test_times_that_cannot_be_meant(exposure: float, period: float, words: str) -> None:
+    """Seconds for milliseconds and exposures that do not fit are refused before anything is sent."""
+    with talk() as control, pytest.raises(SettingsError, match=words):
+        control.configure(exposure, period)
+
+
+@pytest.mark.parametrize(("frames", "cubes", "prefix"), [(-1, 1, ""), (1, -1, ""), (1, 1, "../x"), (1.5, 1, "")])
+def test_captures_that_cannot_be_meant(frames: int, cubes: int, prefix: str) -> None:
+    """Numbers and prefixes that cannot be meant are refused before anything is sent."""
+    with talk() as control, pytest.raises(SettingsError, match="expected"):
+        control.capture(frames, cubes=cubes, prefix=prefix)

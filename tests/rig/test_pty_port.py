@@ -1,0 +1,156 @@
+"""The emulated controller behind a pty, spoken to by pyserial and by the driver as a real port is."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import serial
+
+from pipeline.errors import RigError, SettingsError
+from pipeline.rig.clock import SYSTEM_CLOCK
+from pipeline.rig.emulator.fast_clock import FastClock
+from pipeline.rig.emulator.faults import make_fault
+from pipeline.rig.emulator.mirror_device import MirrorDevice
+from pipeline.rig.emulator.pty_port import EmulatedPort
+from pipeline.rig.mirror_port import open_mirror
+from pipeline.rig.mirror_settings import MirrorSettings
+from pipeline.rig.refusals import DeviceGone
+
+GET = bytes.fromhex("7e 00 11 02 50 01 59 3c 7e")
+GOT = bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e")
+
+
+@contextmanager
+def opened(*faults: str, baud: int = 0) -> Iterator[tuple[EmulatedPort, serial.Serial]]:
+    """An emulated port with faults that strike at once, and a user of it."""
+    device = MirrorDevice(SYSTEM_CLOCK, [make_fault(name, at=0) for name in faults])
+    with (
+        EmulatedPort(device, baud=baud) as port,
+        serial.Serial(port.path, 115200, timeout=2.0, write_timeout=0.5, exclusive=True) as user,
+    ):
+        yield port, user
+
+
+def descriptors() -> int:
+    """Open files of this process."""
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def test_both_modes_speak_through_the_pty() -> None:
+    """No byte is changed on the way, neither line ends nor 03 or 1A."""
+    with opened() as (_, user):
+        user.write(b"START\r\n")
+        assert user.read_until(b"\n") == b"OK\r\n"
+        user.write(b"GOPROCRC\r\n" + GET)
+        assert user.read(4 + len(GOT)) == b"OK\r\n" + GOT
+        user.write(bytes.fromhex("7e 00 03 1a 11 13 0a 0d 7e") + GET)
+        assert user.read_until(GOT).endswith(GOT)
+
+
+def test_two_users_cannot_have_one_port() -> None:
+    """The second one that wants it for itself is refused."""
+    with opened() as (port, _), pytest.raises(serial.SerialException, match="lock"):
+        serial.Serial(port.path, exclusive=True)
+
+
+def test_a_port_can_be_used_again_and_the_controller_goes_on() -> None:
+    """A user who goes and one who comes find the controller as it was left: in pro mode."""
+    device = MirrorDevice(SYSTEM_CLOCK)
+    with EmulatedPort(device) as port:
+        for sent, back in ((b"GOPRO\r\n", b"OK\r\n"), (GET, GOT)):
+            with serial.Serial(port.path, 115200, timeout=2.0, exclusive=True) as user:
+                user.write(sent)
+                assert user.read(len(back)) == back
+
+
+def test_nothing_is_left_behind() -> None:
+    """After closing, twice even, there are as many threads and open files as before."""
+    before = (threading.active_count(), descriptors())
+    port = EmulatedPort(MirrorDevice(SYSTEM_CLOCK))
+    for _ in range(3):
+        path = port.open()
+        with pytest.raises(RigError, match=f"{path} is open"):
+            port.open()
+        port.close()
+        port.close()
+    assert (threading.active_count(), descriptors()) == before
+
+
+@pytest.mark.parametrize("name", ["gone-before", "gone-after"])
+def test_a_device_that_goes_takes_the_port_with_it(name: str) -> None:
+    """The user's next read or write fails as with a pulled cable, and the port still closes cleanly."""
+    before = threading.active_count()
+    with opened(name) as (_, user):
+        user.write(b"START\r\n")
+        with pytest.raises((serial.SerialException, OSError)):
+            user.read(1)
+    assert threading.active_count() == before
+
+
+def test_a_port_that_hangs_makes_writing_block() -> None:
+    """Once the system's own room is full, writing times out; nothing is answered."""
+    with opened("hangs") as (_, user):
+        user.write(b"START\r\n")
+        with pytest.raises(serial.SerialTimeoutException):
+            user.write(bytes(1 << 20))
+        user.reset_output_buffer()
+
+
+def test_bytes_keep_to_the_speed() -> None:
+    """At 2400 baud 7 bytes there and 4 back take at least 11 times 10 bits."""
+    with opened(baud=2400) as (_, user):
+        began = SYSTEM_CLOCK.now()
+        user.write(b"START\r\n")
+        assert user.read_until(b"\n") == b"OK\r\n"
+        assert SYSTEM_CLOCK.now() - began >= 110 / 2400
+
+
+def test_the_driver_drives_it() -> None:
+    """The driver connects, moves, loads and lets go, through a real pty."""
+    device = MirrorDevice(SYSTEM_CLOCK)
+    with EmulatedPort(device) as port, open_mirror(MirrorSettings(port=port.path)) as mirror:
+        assert mirror.identity().device == "MR-E-2"
+        mirror.goto(0.1, -0.2)
+        mirror.settle(2.0)
+        assert device.positions(SYSTEM_CLOCK.now()) == pytest.approx((0.1, -0.2), abs=1e-3)
+        mirror.load_path([(0.0, 0.0), (0.1, 0.1)], "all")
+
+
+def test_the_driver_says_that_the_cable_was_pulled() -> None:
+    """A device that goes is told as such, with what to do."""
+    device = MirrorDevice(SYSTEM_CLOCK, [make_fault("gone-before", at=5)])
+    with EmulatedPort(device) as port, pytest.raises(DeviceGone, match=f"{port.path} went away"):
+        open_mirror(MirrorSettings(port=port.path)).goto(0.0, 0.0)
+
+
+def test_emulated_time_may_run_faster() -> None:
+    """A clock at 100 times the speed lets a minute of the mirror pass in less than a second."""
+    clock = FastClock(100.0)
+    began = clock.now()
+    clock.sleep(10.0)
+    assert clock.now() - began >= 10.0
+    with pytest.raises(SettingsError, match="speed above 0"):
+        FastClock(0.0)
+    device = MirrorDevice(clock)
+    with EmulatedPort(device) as port, serial.Serial(port.path, timeout=2.0) as user:
+        user.write(b"X=0.5\r\n")
+        assert user.read_until(b"\n") == b"OK\r\n"
+        clock.sleep(5.0)
+        user.write(b"STATUS\r\n")
+        assert user.read_until(b"\n") == b"00000000\r\n"
+
+
+def test_without_ptys_there_is_one_clear_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the system has no pty left, the error says so."""
+
+    def none() -> None:
+        raise OSError("out of pty devices")
+
+    monkeypatch.setattr(os, "openpty", none)
+    with pytest.raises(RigError, match="no pty for the emulated port: out of pty devices"):
+        EmulatedPort(MirrorDevice(SYSTEM_CLOCK)).open()

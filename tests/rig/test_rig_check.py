@@ -1,0 +1,201 @@
+"""What is asked of a rig before a survey: rows that say what came and what to mend, and nothing moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.errors import RigError
+from pipeline.rig.camera_files import FileServer, log_in
+from pipeline.rig.capture_names import capture_prefix
+from pipeline.rig.clock import ManualClock
+from pipeline.rig.emulator.camera_device import CameraUnit
+from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
+from pipeline.rig.emulator.emulated_rig import EmulatedRig, InProcessRig
+from pipeline.rig.emulator.exchange import Mode
+from pipeline.rig.emulator.faults import make_fault
+from pipeline.rig.mirror_controller import MirrorController
+from pipeline.rig.mirror_settings import MirrorSettings
+from pipeline.rig.pro_mode import Command
+from pipeline.rig.refusals import DeviceGone, DeviceRefused
+from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, works
+from tests.rig.small_rig import FINE, small_source
+
+SETS = {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
+
+
+@contextmanager
+def rig(*faults: str, camera: CameraFaults | None = None) -> Iterator[InProcessRig]:
+    """An emulated rig whose mirror's faults strike at the first occasion."""
+    struck = [make_fault(name, at=0) for name in faults]
+    whole = EmulatedRig(small_source(), ManualClock(), mirror_faults=struck, camera_faults=camera)
+    with whole.in_process() as line:
+        yield line
+
+
+def mirror_rows(line: InProcessRig, *, move: bool = False, expected_id: str = "") -> list[CheckRow]:
+    """Check the mirror of a rig."""
+
+    def connect() -> MirrorController:
+        mirror = MirrorController(line.transport, MirrorSettings(expected_id=expected_id), line.clock)
+        mirror.connect()
+        return mirror
+
+    return check_mirror(connect, move=move)
+
+
+def told(rows: list[CheckRow], verdict: str) -> list[str]:
+    """What was asked where a verdict fell."""
+    return [row.asked for row in rows if row.verdict == verdict]
+
+
+def set_anything(line: InProcessRig) -> bool:
+    """Whether the mirror was told anything but its mode."""
+    return any(act.request.command in SETS or "=" in act.request.line for act in line.rig.mirror.acts)
+
+
+def test_mirror_in_order() -> None:
+    """Everything that was asked, in order; nothing was set, and the port is let go of."""
+    with rig() as line:
+        rows = mirror_rows(line)
+        assert [row.asked for row in rows] == ["identity", "status", "path", "temperature"]
+        assert {row.verdict for row in rows} == {"ok"}
+        assert rows[0].came == "MR-E-2, version EMULATOR 1.0, serial EMUL0001"
+        assert rows[3].came == "25.0 deg C"
+        assert works(rows, "mirror")
+        assert not works(rows, "camera")
+        assert not set_anything(line)
+        with pytest.raises(DeviceGone, match="closed"):
+            line.transport.drain()
+
+
+def test_square_is_gone_round_and_read_back() -> None:
+    """Four corners within 0.05 and the middle, each found where it was sent."""
+    assert np.hypot(*np.transpose(SQUARE)).max() < 0.05
+    with rig() as line:
+        rows = mirror_rows(line, move=True)
+        moves = [row for row in rows if row.asked.startswith("go to")]
+        assert [row.asked for row in moves][-1] == "go to 0; 0"
+        assert len(moves) == 5
+        assert {row.verdict for row in rows} == {"ok"}
+        assert "read back 0.0300; -0.0300" in moves[1].came
+        assert np.abs(line.rig.mirror.positions(line.clock.now())).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("fault", "asked", "mend"),
+    [
+        ("wrong-firmware", "identity", "rig.expected_id"),
+        ("mirror-warm", "status", "motions are refused"),
+        ("disconnected", "status", "motions are refused"),
+        ("modem", "connect", ""),
+        ("echo", "connect", ""),
+        ("mute", "connect", "is the controller on"),
+        ("gone-before", "connect", "cable"),
+    ],
+)
+def test_faults_fail_and_nothing_moves(fault: str, asked: str, mend: str) -> None:
+    """One row that failed, with what to mend; a square that was asked for is not begun."""
+    with rig(fault) as line:
+        rows = mirror_rows(line, move=True)
+        assert told(rows, "fail") == [asked]
+        assert mend in next(row.mend for row in rows if row.verdict == "fail")
+        assert not works(rows, "mirror")
+        assert not set_anything(line)
+        if asked != "connect":
+            assert "move" in told(rows, "warn")
+
+
+def test_expected_id_is_taken_for_the_mirror() -> None:
+    """A controller of another name is no failure where the settings name it, and one where they name another."""
+    with rig("wrong-firmware") as line:
+        assert works(mirror_rows(line, expected_id="LENS"), "mirror")
+    with rig() as line:
+        rows = mirror_rows(line, expected_id="MR-9")
+        assert "expected a controller whose id holds 'MR-9'" in rows[0].came
+
+
+def test_controller_in_pro_mode_is_no_fault() -> None:
+    """As the check before left it: a row says so, and no line is blamed."""
+    with rig() as line:
+        line.rig.mirror.set_mode(Mode.PRO_CRC)
+        rows = mirror_rows(line)
+        assert [row.asked for row in rows] == ["identity", "mode", "status", "path", "temperature"]
+        assert {row.verdict for row in rows} == {"ok"}
+
+
+def test_damaged_answers_are_told() -> None:
+    """An answer that was lost and asked for again is a warning about the line."""
+    with rig("reply-byte-lost") as line:
+        rows = mirror_rows(line)
+        assert told(rows, "warn") == ["bytes on the line"]
+        assert works(rows, "mirror")
+
+
+def test_mirror_that_never_rests() -> None:
+    """The square ends at its first corner, with what is wrong."""
+    with rig("never-stable") as line:
+        rows = mirror_rows(line, move=True)
+        assert told(rows, "fail") == ["go to 0.03; 0.03"]
+        assert "not at rest" in rows[-1].came
+
+
+def test_mirror_elsewhere_fails() -> None:
+    """A motion that the device took for a trimmed one is not walked on from."""
+    with rig("trimmed") as line:
+        assert told(mirror_rows(line, move=True), "fail") == ["go to 0.03; 0.03"]
+
+
+def test_path_that_plays_is_left_alone() -> None:
+    """It is told, the temperature is not asked for, and no square is begun."""
+    with rig() as line:
+        for player in line.rig.mirror.state.players:
+            player.start, player.end, player.running, player.frequency_hz = 0, 10, True, 1.0
+        rows = mirror_rows(line, move=True)
+        assert told(rows, "warn") == ["path", "move"]
+        assert "temperature" not in [row.asked for row in rows]
+        assert not set_anything(line)
+
+
+def test_camera_in_order() -> None:
+    """Whether it captures, what is there, and its files' server; a capture that runs is told and left alone."""
+    with rig() as line:
+        rows = check_camera(line.camera(), line.files)
+        assert [row.asked.partition(",")[0] for row in rows] == [
+            "whether it captures", "list its files", "log in to its files",
+        ]  # fmt: skip
+        assert {row.verdict for row in rows} == {"ok"}
+        line.camera().capture(5, prefix=capture_prefix(FINE))
+        assert told(check_camera(line.camera(), line.files), "warn") == ["whether it captures"]
+        assert line.rig.camera.is_capturing()
+
+
+def test_camera_out_of_order() -> None:
+    """No control, no files, another password: a row each, and the other is asked all the same."""
+    with rig(camera=CameraFaults.of({CameraFault.HANGS_UP: 9})) as line:
+        assert told(check_camera(line.camera(), line.files), "fail") == ["connect"]
+    with rig() as line:
+        gone = FileServer("127.0.0.1", 1)
+        assert told(check_camera(line.camera(), gone), "fail") == ["log in to its files, port 1"]
+        other = replace(line.files, password="other")
+        with pytest.raises(DeviceRefused, match="password"):
+            log_in(other)
+        assert log_in(line.files) == "emulated camera"
+
+
+def test_error_without_a_remedy_is_a_row() -> None:
+    """Nothing is lost of a message without a semicolon."""
+    from pipeline.rig.rig_check import failed
+
+    assert failed("mirror", "connect", RigError("no")) == CheckRow("mirror", "connect", "no", "fail", "")
+
+
+def test_empty_camera_has_nothing() -> None:
+    """A listing without entries says so."""
+    with rig() as line:
+        line.rig.camera.unit = CameraUnit(root="/")
+        assert [row.came for row in check_camera(line.camera(), line.files)][1] == "nothing there"

@@ -1,0 +1,125 @@
+"""The rig as a source: lines through emulated devices are those of the simulated source, bit for bit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from pipeline.errors import RigError
+from pipeline.rig.steering import wire_positions
+from pipeline.scan import Sweep, line_positions
+from pipeline.source import Line
+from tests.rig.small_rig import CAMERA, COARSE, FINE, small_rig, small_source
+
+
+def assert_same(found: list[Line], sweep: Sweep, first: int = 0) -> None:
+    """The simulated source's lines: numbers bit for bit, positions at the wire's precision, times to a microsecond."""
+    expected = list(small_source().lines(sweep, first))
+    assert [line.number for line in found] == [line.number for line in expected]
+    np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
+    wired = wire_positions(line_positions(sweep, CAMERA)[first:])
+    np.testing.assert_array_equal([(line.mirror_x, line.mirror_y) for line in found], wired.astype(np.float64))
+    np.testing.assert_allclose([line.time_s for line in found], [line.time_s for line in expected], atol=1e-6)
+    assert all(line.valid and line.exposure_ms == CAMERA.exposure_ms for line in found)
+
+
+@pytest.mark.parametrize("sweep", [COARSE, FINE], ids=lambda sweep: sweep.kind)
+def test_lines_are_those_of_the_simulated_source(sweep: Sweep):
+    """Coarse lines that hold four positions each and are summed by four, and fine ones."""
+    with small_rig() as rig:
+        assert_same(list(rig.source().lines(sweep)), sweep)
+        assert len(rig.captures) == 1
+
+
+@pytest.mark.parametrize(("sweep", "captures"), [(COARSE, 3), (FINE, 2)], ids=lambda value: getattr(value, "kind", ""))
+def test_loads_of_the_vector_memory_change_no_line(sweep: Sweep, captures: int):
+    """A sweep in several loads gives the same numbers: noise is keyed by the sweep's name and the line's number.
+
+    Its time is the camera's own, so a load in the midst of a sweep shows in it.
+    """
+    with small_rig(vector_pairs=17) as rig:
+        found = list(rig.source().lines(sweep))
+        assert len(rig.captures) == captures
+    expected = list(small_source().lines(sweep))
+    np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
+    late = np.array([line.time_s for line in found]) - [line.time_s for line in expected]
+    assert abs(late[0]) < 1e-6
+    assert (np.diff(late) > -2e-6).all()
+    assert np.count_nonzero(np.diff(late) > 0.01) == captures - 1
+
+
+def test_lines_from_the_middle_of_a_sweep():
+    """A sweep that is gone on with has the lines that it would have had."""
+    with small_rig() as rig:
+        source = rig.source()
+        found = list(source.lines(FINE, first=9))
+        assert list(source.lines(FINE, first=FINE.lines)) == []
+    expected = list(small_source().lines(FINE, 9))
+    np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
+    assert [line.number for line in found] == list(range(9, FINE.lines))
+
+
+def test_references_are_the_mean_of_the_cameras_frames():
+    """Dark and white are those of the simulated source to the frames' rounding, for every binning from one capture."""
+    with small_rig(panel=2.0) as rig:
+        source = rig.source()
+        for sweep in (COARSE, FINE):
+            found, expected = source.references(sweep), small_source().references(sweep)
+            np.testing.assert_allclose(found.dark, expected.dark, atol=sweep.binning / 64)
+            np.testing.assert_allclose(found.white, expected.white, atol=sweep.binning / 64)
+            assert found.panel.tolist() == [2.0] * 3
+            assert found.by_mirror
+            assert found.bad is None
+        assert sum("references" in said for said in rig.emulated.camera.commands if "capture(" in said) == 1
+
+
+def test_without_pulses_lines_lie_where_the_log_measured():
+    """A path that runs by its own clock: lines are placed by the mirror's log, within what software timing leaves."""
+    with small_rig(pulses="none", log_samples=16000) as rig:
+        source = rig.source()
+        found = list(source.lines(COARSE))
+    assert [line.number for line in found] == list(range(COARSE.lines))
+    assert all(line.valid for line in found)
+    off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - line_positions(COARSE, CAMERA)
+    assert 1e-6 < np.hypot(*off.T).max() * 11275 < 3  # about as many px as a unit of the disk has
+    (told,) = source.record["captures"]
+    assert (told["method"], told["sweep"], told["first"], told["stop"]) == ("log", "coarse-0", 0, 10)
+    assert 0 < told["residual_px"] < 3
+    assert any("software timing" in note for note in told["notes"])
+
+
+def test_one_pulse_a_frame_steps_fine_sweeps_only():
+    """Coarse lines hold several positions each, so there the path runs by its own clock."""
+    with small_rig(pulses="frame", log_samples=16000) as rig:
+        source = rig.source()
+        assert_same(list(source.lines(FINE)), FINE)
+        list(source.lines(COARSE))
+        assert [told["method"] for told in source.record["captures"]] == ["trigger", "log"]
+
+
+def test_devices_are_let_go_of_whatever_ends_a_look():
+    """A consumer that stops early, or an error, leaves no device held; a session holds them over several calls."""
+    with small_rig() as rig:
+        source = rig.source()
+        lines = source.lines(FINE)
+        assert len(list(islice(lines, 3))) == 3
+        lines.close()  # type: ignore[attr-defined]
+        with pytest.raises(RigError, match="closed"):
+            rig.line.transport.drain()
+        assert_same(list(source.lines(FINE)), FINE)
+        assert rig.opened == 2
+        with source.session():
+            source.references(FINE)
+            list(source.lines(COARSE))
+        assert rig.opened == 3
+
+
+def test_lines_of_another_size_are_refused():
+    """A camera that gives other lines than the settings say ends the sweep, with what to set."""
+    with small_rig() as rig:
+        rig.view = replace(rig.view, wavelength_nm=np.array([500.0, 600.0]))
+        with pytest.raises(RigError, match=r"holds lines of \(48, 3\) \(sample, band\), the settings say \(48, 2\)"):
+            list(rig.source().lines(FINE))

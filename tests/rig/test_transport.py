@@ -1,0 +1,169 @@
+"""Serial ports: a pseudo terminal in place of the device, and every way in which a port is not there."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import sys
+import threading
+import tty
+from collections.abc import Iterator
+
+import pytest
+import serial
+
+from pipeline.errors import SettingsError
+from pipeline.rig.clock import SYSTEM_CLOCK
+from pipeline.rig.refusals import DeadlinePassed, DeviceGone
+from pipeline.rig.transport import SerialTransport
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo terminals are of POSIX systems")
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[int, str]]:
+    """The device's end of a pseudo terminal, and the name of the driver's."""
+    device, driver = os.openpty()
+    tty.setraw(driver)
+    yield device, os.ttyname(driver)
+    os.close(driver)
+    if device not in _CLOSED:
+        os.close(device)
+    _CLOSED.discard(device)
+
+
+_CLOSED: set[int] = set()
+
+
+def soon(seconds: float = 5.0) -> float:
+    """A deadline that a working line never meets."""
+    return SYSTEM_CLOCK.now() + seconds
+
+
+@pytest.mark.parametrize("baud", [115200, 256000])
+def test_bytes_pass_both_ways(ends: tuple[int, str], baud: int):
+    """All 256 values, at speeds that the system has a name for and that it has none for."""
+    device, name = ends
+    line = SerialTransport(name, baud)
+    line.write(bytes(range(256)), soon())
+    assert os.read(device, 1000) == bytes(range(256))
+    os.write(device, bytes(range(256)))
+    got = b""
+    while len(got) < 256:
+        got += line.read(100, soon())
+    assert got == bytes(range(256))
+    line.close()
+
+
+def test_reading_ends_at_the_deadline(ends: tuple[int, str]):
+    """Nothing comes: nothing is given, and a deadline that has passed is not waited for."""
+    line = SerialTransport(ends[1], 115200)
+    assert line.read(10, SYSTEM_CLOCK.now() + 0.03) == b""
+    assert line.read(10, SYSTEM_CLOCK.now() - 1) == b""
+    with pytest.raises(DeadlinePassed, match="no time was left to send 1 bytes"):
+        line.write(b"x", SYSTEM_CLOCK.now() - 1)
+    line.close()
+
+
+def test_draining_gives_what_is_there(ends: tuple[int, str]):
+    """Without waiting, and once."""
+    line = SerialTransport(ends[1], 115200)
+    os.write(ends[0], b"stale")
+    assert line.read(1, soon()) == b"s"
+    assert line.drain() == b"tale"
+    assert line.drain() == b""
+    line.close()
+
+
+def test_a_port_in_use_is_refused(ends: tuple[int, str]):
+    """Two programs would mix their motions; when the first lets go, the second gets it."""
+    first = SerialTransport(ends[1], 115200)
+    with pytest.raises(DeviceGone, match="is in use by another program; close that"):
+        SerialTransport(ends[1], 115200)
+    first.close()
+    SerialTransport(ends[1], 115200).close()
+
+
+def test_a_device_that_goes_away_is_said(ends: tuple[int, str]):
+    """The cable was pulled: reading, writing and draining say so."""
+    line = SerialTransport(ends[1], 115200)
+    os.close(ends[0])
+    _CLOSED.add(ends[0])
+    for call in (lambda: line.read(1, soon()), lambda: line.write(b"x", soon()), line.drain):
+        with pytest.raises(DeviceGone, match=r"went away .*cable.*connect again"):
+            call()
+    line.close()
+
+
+def test_a_full_line_does_not_hold_up(ends: tuple[int, str]):
+    """A device that takes no bytes costs the write's own time, not forever."""
+    line = SerialTransport(ends[1], 115200)
+    with pytest.raises(DeadlinePassed, match=r"did not take 1000000 bytes within 0.25 s"):
+        line.write(bytes(1_000_000), soon())
+    line.close()
+
+
+def test_no_port_says_which_there_are(monkeypatch: pytest.MonkeyPatch):
+    """None, others, or the controller under another name."""
+
+    class Port:
+        """What pyserial lists."""
+
+        def __init__(self, device: str, vid: int | None, pid: int | None) -> None:
+            self.device, self.vid, self.pid = device, vid, pid
+
+    other, mirror = Port("/dev/ttyUSB3", 0x0403, 0x6001), Port("/dev/ttyACM7", 0x0483, 0xA31E)
+    for ports, words in (
+        ([], "this machine has no serial port"),
+        ([other], "there are /dev/ttyUSB3; is the controller on"),
+        ([other, mirror], "a mirror controller is at /dev/ttyACM7: set the port to that"),
+    ):
+        monkeypatch.setattr("serial.tools.list_ports.comports", lambda ports=ports: ports)
+        with pytest.raises(DeviceGone, match=f"no port /dev/no-such-port; {words}"):
+            SerialTransport("/dev/no-such-port", 115200)
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [(errno.EACCES, "no permission for x; add this user"), (errno.EBUSY, "in use"), (errno.EIO, "cannot be opened")],
+)
+def test_other_refusals_to_open_say_what_to_do(monkeypatch: pytest.MonkeyPatch, number: int, words: str):
+    """What the system says, in words that help."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise serial.SerialException(number, "could not open port x")
+
+    monkeypatch.setattr("serial.serial_for_url", refuse)
+    with pytest.raises(DeviceGone, match=words):
+        SerialTransport("x", 115200)
+
+
+def test_addresses_that_mean_nothing_are_settings(ends: tuple[int, str]):
+    """A kind of address that pyserial does not have, and a speed below 0."""
+    with pytest.raises(SettingsError, match=r"an address that pyserial knows, .* got 'nonsense://x'"):
+        SerialTransport("nonsense://x", 115200)
+    with pytest.raises(SettingsError, match=r"and a speed, got .* at -5"):
+        SerialTransport(ends[1], -5)
+
+
+def test_a_socket_is_a_port_too():
+    """The same driver reaches a device over the network, or an emulator."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+
+        def echo() -> None:
+            with server.accept()[0] as peer:
+                peer.sendall(peer.recv(100))
+                peer.recv(1)
+
+        thread = threading.Thread(target=echo)
+        thread.start()
+        line = SerialTransport(f"socket://127.0.0.1:{port}", 115200)
+        line.write(b"START\r\n", soon())
+        got = b""
+        while len(got) < 7:
+            got += line.read(100, soon())
+        assert got == b"START\r\n"
+        line.close()
+        thread.join(5)
