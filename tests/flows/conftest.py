@@ -41,9 +41,9 @@ def command_line(capfd: pytest.CaptureFixture[str]) -> CommandLine:
     return run
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="session", autouse=True)
 def prefect_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Prefect's files in a folder of their own. Set before anything imports it, as it reads its settings only then."""
+    """Prefect's files in a folder of their own. Set before any test imports it, as it reads its settings only then."""
     home = tmp_path_factory.mktemp("prefect")
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {**QUIET, "PREFECT_HOME": str(home)}.items():
