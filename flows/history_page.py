@@ -16,6 +16,7 @@ from flows.field_history import FieldHistory, day_of
 from flows.figures import DASH, format_percent, format_points
 from flows.finding_words import LEAST_HECTARES, area_words
 from flows.line_chart import line_chart
+from flows.page_parts import page_row, page_section, page_table
 from flows.schedule_state import read_moment
 
 MOST_ROWS = 1000  # of each table; older ones are counted
@@ -28,17 +29,17 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
     told = ", ".join(f"{count} {word}" for word, count in counts.items())
     lead = f"{len(history.runs)} runs in the archive. Of what was due on schedule: {told}."
     body = [
-        _section("Class areas", _areas(history.runs)),
-        _section("Spent, as a share of scanning everything", _savings(history.runs)),
-        _section("Failures and skipped runs", _troubles(history.events)),
-        _section("Runs", _runs(history.runs, runs_at)),
+        page_section("Class areas", _areas(history.runs)),
+        page_section("Spent, as a share of scanning everything", _savings(history.runs)),
+        page_section("Failures and skipped runs", _troubles(history.events)),
+        page_section("Runs", _runs(history.runs, runs_at)),
     ]
     return _page(history.field, "SpectralZoom field", lead, history.archive, "\n".join(body))
 
 
 def render_index(histories: Sequence[FieldHistory], archive: str, pages: Mapping[str, str]) -> str:
     """All fields of an archive, with what became of their runs; ``pages`` are the files of their histories."""
-    head = _row("th", ["field", "runs", "newest", "done", "skipped", "failed", "last trouble"])
+    head = page_row("th", ["field", "runs", "newest", "done", "skipped", "failed", "last trouble"])
     rows = []
     for one in histories:
         newest = max((str(row["created"]) for row in one.runs), default="")
@@ -46,8 +47,8 @@ def render_index(histories: Sequence[FieldHistory], archive: str, pages: Mapping
         cells = [_link(pages[one.field], one.field), str(len(one.runs)), escape(_short(newest) or DASH)]
         cells += [str(count) for count in one.counts.values()]
         cells.append(f'<span class="words">{escape(str(trouble.get("reason") or ""))}</span>')
-        rows.append(_row("td", cells))
-    body = _section("Fields", _table([head, *rows]) if rows else "<p>There are no fields yet.</p>")
+        rows.append(page_row("td", cells))
+    body = page_section("Fields", page_table([head, *rows]) if rows else "<p>There are no fields yet.</p>")
     return _page("Fields", "SpectralZoom archive", f"{len(histories)} fields.", archive, body)
 
 
@@ -96,7 +97,7 @@ def _troubles(events: Sequence[Mapping[str, Any]]) -> str:
     found = [event for event in events if event["event"] != "done"]
     if not found:
         return "<p>None.</p>"
-    head = _row("th", ["due", "what", "why"])
+    head = page_row("th", ["due", "what", "why"])
     rows = []
     for event in reversed(found[-MOST_ROWS:]):
         what, when = str(event["event"]), _short(str(event.get("due", "")))
@@ -104,16 +105,16 @@ def _troubles(events: Sequence[Mapping[str, Any]]) -> str:
             what = f"{'very many' if event.get('count') is None else event['count']} skipped"
             when = f"{_short(str(event.get('after', '')))} to {_short(str(event.get('until', '')))}"
         why = f'<span class="words">{escape(str(event.get("reason", "")))}</span>'
-        rows.append(_row("td", [escape(when), f'<span class="state {escape(what)}">{escape(what)}</span>', why]))
-    return _table([head, *rows]) + _rest(len(found))
+        rows.append(page_row("td", [escape(when), f'<span class="state {escape(what)}">{escape(what)}</span>', why]))
+    return page_table([head, *rows]) + _rest(len(found))
 
 
 def _runs(runs: Sequence[Mapping[str, Any]], runs_at: str) -> str:
     if not runs:
         return "<p>There are no runs yet.</p>"
-    head = _row("th", ["published", "due", "time at the camera", "mIoU", "largest classes"])
+    head = page_row("th", ["published", "due", "time at the camera", "mIoU", "largest classes"])
     rows = [_run_row(row, runs_at) for row in reversed(runs[-MOST_ROWS:])]
-    return _table([head, *rows]) + _rest(len(runs))
+    return page_table([head, *rows]) + _rest(len(runs))
 
 
 def _run_row(row: Mapping[str, Any], runs_at: str) -> str:
@@ -127,7 +128,7 @@ def _run_row(row: Mapping[str, Any], runs_at: str) -> str:
     again = f" (attempt {row['attempts']})" if (row["attempts"] or 1) > 1 else ""
     cells = [link, escape(due + again), format_percent(row["savings"]["capture_s"])]
     cells += [format_points(row["miou"]), f'<span class="words">{escape(areas)}</span>']
-    return _row("td", cells)
+    return page_row("td", cells)
 
 
 def _rest(count: int) -> str:
@@ -150,18 +151,6 @@ def way_to(archive: Path, page: Path) -> str:
 
 def _link(address: str, words: str) -> str:
     return f'<a href="{escape(address)}">{escape(words)}</a>'
-
-
-def _section(title: str, body: str) -> str:
-    return f"<section><h2>{escape(title)}</h2>{body}</section>"
-
-
-def _table(rows: Sequence[str]) -> str:
-    return f'<div class="wide"><table>{"".join(rows)}</table></div>'
-
-
-def _row(tag: str, cells: Sequence[str]) -> str:
-    return "<tr>" + "".join(f"<{tag}>{cell}</{tag}>" for cell in cells) + "</tr>"
 
 
 def _page(title: str, kicker: str, lead: str, about: str, body: str) -> str:

@@ -17,6 +17,7 @@ from typing import Any
 from flows.effect_table import format_change, total_words
 from flows.figures import DASH, format_bytes, format_percent, format_points, format_seconds
 from flows.finding_words import sentences
+from flows.page_parts import page_row, page_section, page_table
 from flows.receipt import Accuracy, Receipt, Saving, Savings
 from flows.receipt_table import COST_LABELS, control_seats, headline
 
@@ -85,7 +86,7 @@ def _found(receipt: Receipt) -> str:
     words = sentences(receipt)
     if not words:
         return ""
-    return _section("How it was captured", "".join(f"<p>{escape(sentence)}</p>" for sentence in words))
+    return page_section("How it was captured", "".join(f"<p>{escape(sentence)}</p>" for sentence in words))
 
 
 def _figure(picture: Picture) -> str:
@@ -101,7 +102,7 @@ def _savings(savings: Savings) -> str:
         done, full = savings["segment_wall_s"]["done"], savings["segment_wall_s"]["full"]
         entry: Saving = {"done": done, "full": full, "ratio": done / full if full else None, "full_is": "measured"}
         rows.append(_saving_row("time of the model", format_seconds, entry))
-    head = _row("th", ["", "share of everything", "this survey", "everything", "everything is"])
+    head = page_row("th", ["", "share of everything", "this survey", "everything", "everything is"])
     split = savings["multiply_adds"]
     parts: Mapping[str, Any] = split
     shares = ", ".join(
@@ -111,12 +112,12 @@ def _savings(savings: Savings) -> str:
     )
     note = f"<p class=note>Of the multiply-adds: {shares}.</p>" if shares else ""
     words = "Everything: the cheapest scan of the whole field at full resolution, with the same settings."
-    return _section("What it cost", f"<p>{words}</p>{_table([head, *rows])}{note}")
+    return page_section("What it cost", f"<p>{words}</p>{page_table([head, *rows])}{note}")
 
 
 def _saving_row(label: str, show: Any, entry: Saving) -> str:
     cells = [_bar(entry["ratio"]), escape(show(entry["done"])), escape(show(entry["full"])), escape(entry["full_is"])]
-    return _row("td", [escape(label), *cells])
+    return page_row("td", [escape(label), *cells])
 
 
 def _bar(share: float | None, words: str | None = None) -> str:
@@ -142,8 +143,8 @@ def _accuracy(accuracy: Accuracy) -> str:
     gap = accuracy["gap_closed"]
     words = "The score is the mean over classes of overlap / union of map and truth (mIoU), in points of 100."
     closed = "" if gap is None else f" The detail captured closed {format_percent(gap)} of the gap from none to all."
-    return _section(
-        "How good the map is", f"<p>{words}{closed}</p>{_table(rows)}{_control_words(accuracy)}{_classes(accuracy)}"
+    return page_section(
+        "How good the map is", f"<p>{words}{closed}</p>{page_table(rows)}{_control_words(accuracy)}{_classes(accuracy)}"
     )
 
 
@@ -163,14 +164,14 @@ def _control_words(accuracy: Mapping[str, Any]) -> str:
 def _score_row(label: str, miou: float | None, spread: float | None = None, *, strong: bool = False) -> str:
     """``label`` may hold markup of ours when ``strong``; else it is escaped."""
     text = format_points(miou) + ("" if spread is None else f" ± {format_points(spread)}")
-    return _row("td", [label if strong else escape(label), _bar(miou, text)])
+    return page_row("td", [label if strong else escape(label), _bar(miou, text)])
 
 
 def _classes(accuracy: Accuracy) -> str:
-    head = _row("th", ["class", "this survey", "none", "all"])
+    head = page_row("th", ["class", "this survey", "none", "all"])
     none, full = accuracy["none"]["per_class_iou"], accuracy["all"]["per_class_iou"]
     rows = [
-        _row(
+        page_row(
             "td",
             [
                 escape(name.replace("_", " ")),
@@ -183,13 +184,13 @@ def _classes(accuracy: Accuracy) -> str:
     ]
     counted = sum(value is not None for value in accuracy["per_class_iou"].values())
     note = f"<p class=note>{counted} of {len(rows)} classes are in the map or the truth and count in the mean.</p>"
-    return f"<h3>Class by class</h3>{_table([head, *rows])}{note}"
+    return f"<h3>Class by class</h3>{page_table([head, *rows])}{note}"
 
 
 def _stages(stages: Iterable[Mapping[str, Any]]) -> str:
-    head = _row("th", ["stage", "state", "wall", "processor", "peak memory", "read", "written", "key"])
+    head = page_row("th", ["stage", "state", "wall", "processor", "peak memory", "read", "written", "key"])
     rows = [
-        _row(
+        page_row(
             "td",
             [
                 escape(stage["name"]),
@@ -204,14 +205,14 @@ def _stages(stages: Iterable[Mapping[str, Any]]) -> str:
         )
         for stage in stages
     ]
-    return _section("What was done", _table([head, *rows]))
+    return page_section("What was done", page_table([head, *rows]))
 
 
 def _effects(effects: Iterable[Mapping[str, Any]], total: Mapping[str, Any] | None) -> str:
     """What was computed and what left out, effect by effect; receipts of before have no total."""
-    head = _row("th", ["effect", "state", "variant", "bound", "measured", "processor", "why"])
+    head = page_row("th", ["effect", "state", "variant", "bound", "measured", "processor", "why"])
     rows = [
-        _row(
+        page_row(
             "td",
             [
                 escape(effect["name"].replace("-", " ")),
@@ -226,12 +227,14 @@ def _effects(effects: Iterable[Mapping[str, Any]], total: Mapping[str, Any] | No
         for effect in effects
     ]
     words = "" if total is None else f"<p>{escape(' '.join(total_words(total)))}</p>"
-    return _section("What the simulator took into account", f"{words}{_table([head, *rows])}")
+    return page_section("What the simulator took into account", f"{words}{page_table([head, *rows])}")
 
 
 def _details(title: str, items: Mapping[str, object]) -> str:
-    rows = [_row("td", [escape(str(name)), f"<code>{escape(_words(value))}</code>"]) for name, value in items.items()]
-    return f"<details><summary>{escape(title)}</summary>{_table(rows)}</details>"
+    rows = [
+        page_row("td", [escape(str(name)), f"<code>{escape(_words(value))}</code>"]) for name, value in items.items()
+    ]
+    return f"<details><summary>{escape(title)}</summary>{page_table(rows)}</details>"
 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, object]:
@@ -245,19 +248,6 @@ def _flat(settings: Mapping[str, Any]) -> dict[str, object]:
 
 def _words(value: object) -> str:
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-
-
-def _section(title: str, body: str) -> str:
-    return f"<section><h2>{escape(title)}</h2>{body}</section>"
-
-
-def _table(rows: Iterable[str]) -> str:
-    return f'<div class="wide"><table>{"".join(rows)}</table></div>'
-
-
-def _row(tag: str, cells: Iterable[str]) -> str:
-    """A table row of cells that are already escaped."""
-    return "<tr>" + "".join(f"<{tag}>{cell}</{tag}>" for cell in cells) + "</tr>"
 
 
 _PAGE = Template("""<!doctype html>
