@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from flows.ground_stage import STORE
+from flows.orientation_stage import load_orientation
 from flows.placement import line_facts, seen_shares
 from flows.pointing_stage import load_registration
 from flows.run import SurveyRun
-from flows.stages import load_orientation, load_plan
+from flows.stages import load_plan
 from flows.survey import Products
 from pipeline.planning import FinePlan, joined_plan
 from storage.archive import StageRef
@@ -45,7 +46,7 @@ def _plan(run: SurveyRun, products: Products) -> dict[str, Any]:
     Of two rounds the score is that of the first look, and the other orientation that of the first round.
     """
     attention = products.attention
-    plans, turned = [load_plan(attention) for attention in products.attentions], load_orientation(attention)
+    plans, turned = [load_plan(attention) for attention in products.attentions], load_orientation(products.turned)
     plan = joined_plan(plans)
     if len(plans) > 1:
         plan = replace(plan, worth=_worth_by_first_look(plan, attention))

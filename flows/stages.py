@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from flows.effect_choice import load_manifest, source_with
 from flows.field_work import FieldWork, region_params
+from flows.rectify_ahead import Arrived, rectifying_ahead
 from flows.region_work import look_at, seat_columns
 from flows.rendered_lines import take_lines
 from flows.rig_run import RIG_RECORD, capture_source, rig_record
@@ -26,8 +28,6 @@ from flows.run import CaptureRun, SurveyRun
 from models.inference import CoarseLook, Glance, read_glance
 from models.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_seats
 from models.regions import whole_field
-from pipeline.crop_rows import CropRows, find_rows
-from pipeline.orientation import compare_orientations
 from pipeline.planning import FinePlan, plan_fine
 from pipeline.scan import Sweep
 from pipeline.simulator.survey_clock import sweep_starts
@@ -36,25 +36,24 @@ from storage.archive import StageRef, stage_key
 from storage.attention import Attention, write_attention
 from storage.class_maps import ClassNames, create_class_map
 from storage.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
-from storage.layout import SHARD_ROWS
-from storage.mosaic_strips import mosaic_brightness
 from storage.patches import open_patches
 from storage.spool import Spool
 from storage.stored_tables import read_table
 
 VERSIONS = {
     "effects": 1, "capture": 3, "register": 2, "locate": 2, "rectify": 3, "attend": 6, "patches": 3, "segment": 4,
-    "ground": 2, "evaluate": 6,
+    "orientation": 1, "ground": 2, "evaluate": 6,
 }  # fmt: skip
 SEATS_AT_ONCE = 64
 
 Build = Callable[[Path], None]
+Follow = Callable[[Source, str], AbstractContextManager[Arrived]]  # of the source of a capture, and its key
 Produce = Callable[[str, Build, dict[str, Any], Sequence[StageRef]], StageRef]
 
 
 def capture_coarse(run: SurveyRun, produce: Produce, effects: StageRef) -> StageRef:
     """Sweep the whole field once, fast."""
-    return capture_sweeps(run, produce, run.plan.coarse, [effects])
+    return capture_sweeps(run, produce, run.plan.coarse, [effects], follow=partial(rectifying_ahead, run))
 
 
 def capture_fine(run: SurveyRun, produce: Produce, attention: StageRef, effects: StageRef) -> StageRef:
@@ -69,9 +68,13 @@ def capture_again(run: SurveyRun, produce: Produce, attention: StageRef, effects
 
 
 def capture_sweeps(
-    run: CaptureRun, produce: Produce, sweeps: list[Sweep], inputs: list[StageRef], *, begins_s: float = 0.0
-) -> StageRef:
-    """Take some sweeps, one after the other from ``begins_s`` on, with the effects of the last of the inputs."""
+    run: CaptureRun, produce: Produce, sweeps: list[Sweep], inputs: list[StageRef], *, begins_s: float = 0.0,
+    follow: Follow = lambda source, key: nullcontext(lambda name, count: None),
+) -> StageRef:  # fmt: skip
+    """Take some sweeps, one after the other from ``begins_s`` on, with the effects of the last of the inputs.
+
+    ``follow`` is told of each line that is in the spool.
+    """
     clock = sweep_starts(sweeps, run.camera, run.settings.cost, after_s=begins_s)
     params = {**run.source_key(), "sweeps": [asdict(sweep) for sweep in sweeps], "starts_s": list(clock.values())}
     key = stage_key("capture", VERSIONS["capture"], params, [ref.key for ref in inputs])
@@ -80,9 +83,9 @@ def capture_sweeps(
     def build(path: Path) -> None:
         before, manifest = 0, load_manifest(inputs[-1])
         lit = replace(run, source=source_with(run.source, inputs[-1], clock))
-        with capture_source(lit, key) as source:
+        with capture_source(lit, key) as source, follow(source, key) as arrived:
             for sweep in sweeps:
-                done = partial(_report_lines, run, before, total)
+                done = partial(_report_lines, run, arrived, sweep.name, before / total, total)
                 _capture_sweep(lit, source, sweep, path, key=key, report=done, effects=manifest)
                 before += sweep.lines
             if run.rig is not None:
@@ -93,15 +96,16 @@ def capture_sweeps(
     return ref
 
 
-def _report_lines(run: CaptureRun, before: int, total: int, lines: int) -> None:
-    run.report((before + lines) / total)
+def _report_lines(run: CaptureRun, arrived: Arrived, name: str, before: float, total: int, lines: int) -> None:
+    arrived(name, lines)
+    run.report(before + lines / total)
 
 
 def _capture_sweep(
     run: CaptureRun, source: Source, sweep: Sweep, path: Path, *, key: str, report: Callable[[int], None],
     effects: Mapping[str, Any],
 ) -> None:  # fmt: skip
-    """Lines into the spool one by one, from where a broken capture stopped; then 64 at a time into the cube."""
+    """Lines into the spool and then the cube, one by one, from where a broken capture stopped."""
     references = source.references(sweep)
     simulation = None if run.rig else effects
     header = SweepHeader(
@@ -109,17 +113,21 @@ def _capture_sweep(
     )
     samples, bands = references.dark.shape
     about = {"sweep": asdict(sweep), **run.source_key()}
-    with Spool.open(run.archive.spool_folder(key), samples, bands, header=about, name=sweep.name) as spool:
+    folder = run.archive.spool_folder(key)
+    with (
+        Spool.open(folder, samples, bands, header=about, name=sweep.name) as spool,
+        RawCubeWriter(path / f"{sweep.name}.zarr", header) as cube,
+    ):
 
         def take(line: Line) -> None:
             spool.append(line)
+            cube.write([line])
             report(spool.count)
 
+        for block in spool.blocks():
+            cube.write(block)
+        report(spool.count)
         take_lines(source, sweep, take, run.settings.crew, first=spool.count)
-        spool.sync()
-        with RawCubeWriter(path / f"{sweep.name}.zarr", header) as cube:
-            for block in spool.blocks(SHARD_ROWS):
-                cube.write(block)
 
 
 def captured(ref: StageRef) -> list[RawCube]:
@@ -153,12 +161,6 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
         shape = run.grid.seat_shape
         write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), settings.policy))
         write_plan(path, plan)
-        turned = compare_orientations(
-            run.grid, run.camera, settings.cost, run.plan.along, scores, budget_s=budget_s, plan=plan,
-            rows=_crop_rows(mosaic), overlap_px=run.plan.overlap_px, margin_px=run.plan.margin_px,
-            threshold=settings.threshold,
-        )  # fmt: skip
-        write_json(path / "orientation.json", asdict(turned) | {"sentence": turned.sentence})
 
     params = {
         "weights": run.weights_key,
@@ -189,11 +191,6 @@ def _scores(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.flo
     return score_seats(policy, Glance(run.grid, nothing, nothing), seed=run.settings.seed, mask=run.mask)
 
 
-def _crop_rows(mosaic: StageRef) -> CropRows:
-    """Crop rows as the coarse mosaic shows them, all bands together."""
-    return find_rows(mosaic_brightness(mosaic.path / "mosaic.zarr"))
-
-
 def write_plan(folder: Path, plan: FinePlan) -> None:
     """Write the plan of an attention store; of a threshold only where there was one."""
     content = asdict(plan) | {"seats": plan.seats.tolist()}
@@ -206,11 +203,6 @@ def load_plan(attention: StageRef) -> FinePlan:
     plan = read_table(attention.path / "plan.json")
     kept = {"sweeps": [Sweep(**sweep) for sweep in plan["sweeps"]], "seats": np.array(plan["seats"], np.intp)}
     return FinePlan(**(plan | kept))
-
-
-def load_orientation(attention: StageRef) -> dict[str, Any]:
-    """Read what the other orientation of the line would have shown, and which way crop rows run."""
-    return read_table(attention.path / "orientation.json")
 
 
 def patch_columns(run: SurveyRun, patches: StageRef, seen: CoarseLook) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

@@ -14,6 +14,7 @@ from flows import placement, stages
 from flows.effect_choice import choose_effects
 from flows.evaluation import evaluate
 from flows.ground_stage import ground
+from flows.orientation_stage import compare_turned
 from flows.pointing_stage import register_coarse, register_fine
 from flows.receipt import StageRecord, State
 from flows.run import SurveyRun
@@ -35,6 +36,7 @@ STAGES: dict[str, Callable[..., StageRef | None]] = {
     "register_again": register_fine,
     "cut_again": placement.cut_again,
     "draw_map": stages.draw_map,
+    "compare_turned": compare_turned,
     "ground": ground,
     "evaluate": evaluate,
 }
@@ -54,6 +56,7 @@ TITLES = {
     "register_again": "these sweeps on the mosaic",
     "cut_again": "fine patches of both rounds",
     "draw_map": "class map",
+    "compare_turned": "what lines turned by 90° would show",
     "ground": "map on the ground",
     "evaluate": "accuracy (not part of the survey)",
 }
@@ -83,6 +86,7 @@ class Products:
     fine_pointing: StageRef | None
     patches: StageRef
     class_map: StageRef
+    turned: StageRef
     ground_map: StageRef | None
     accuracy: StageRef | None
     first_patches: StageRef | None = None  # these and those below: only with two rounds
@@ -124,11 +128,12 @@ def survey(step: Step, rounds: int = 1) -> Products:
                   "pointing_again": pointing_again}  # fmt: skip
         patches = _needed(step("cut_again", again, raw_again, patches, *_there(pointing_again)))
     class_map = _needed(step("draw_map", mosaic, patches))
+    turned = _needed(step("compare_turned", mosaic, attention))
     ground_map = step("ground", class_map, mosaic)
     accuracy = step("evaluate", mosaic, patches, class_map, effects, *_there(coarse_pointing))
     return Products(
-        effects, raw, coarse_pointing, lookup, mosaic, attention, fine, fine_pointing, patches, class_map, ground_map,
-        accuracy,
+        effects, raw, coarse_pointing, lookup, mosaic, attention, fine, fine_pointing, patches, class_map, turned,
+        ground_map, accuracy,
         **second,
     )  # fmt: skip
 

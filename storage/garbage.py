@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from pipeline.errors import SettingsError
-from storage.addresses import StageRef
+from storage.addresses import AHEAD_SUFFIX, StageRef
 from storage.archive import Archive
 from storage.lineage import Catalogue
 from storage.records import Store
@@ -161,12 +161,12 @@ def _obstacle(archive: Archive, catalogue: Catalogue, staying: set[str]) -> str 
 
 
 def _spools(archive: Archive, catalogue: Catalogue) -> list[Removal]:
-    """Spools whose lines are published."""
+    """Spools whose lines are published, and mosaics made ahead of these."""
     published = {store.ref.key for store in catalogue.stores.values() if store.problem is None}
     return [
         Removal(f"spool/{path.name}", "spool", bytes_below(path), "its lines are published")
         for path in sorted((archive.root / "spool").glob("*"))
-        if path.name in published
+        if path.name.removesuffix(AHEAD_SUFFIX) in published
     ]
 
 
@@ -204,7 +204,7 @@ def _remove(archive: Archive, removal: Removal) -> bool:
     path = archive.root / removal.uri
     if removal.what == "spool":
         check_name(path.name)
-        lock = archive.root / ".locks" / f"capture-{path.name}.lock"
+        lock = archive.root / ".locks" / f"capture-{path.name.removesuffix(AHEAD_SUFFIX)}.lock"
     else:
         lock = _lock_of(archive.root, path)
     release = take_lock(lock, wait=False)

@@ -243,6 +243,17 @@ class Spool:
         staged.replace(self.path.with_suffix(".hdr"))
 
 
+def read_spooled(folder: Path, name: str, shape: tuple[int, int], lines: slice) -> NDArray[np.uint16]:
+    """Raw numbers of some lines of a spool, (line, sample, band), also while more are appended.
+
+    ``shape`` is (sample, band) of a line. What is read was written by the same process: no CRC is compared.
+    """
+    samples, bands = shape
+    count = (lines.stop - lines.start) * samples * bands
+    numbers = np.fromfile(folder / f"{name}.bil", "<u2", count, offset=lines.start * samples * bands * 2)
+    return np.ascontiguousarray(numbers.reshape(-1, bands, samples).transpose(0, 2, 1), np.uint16)
+
+
 @contextmanager
 def _refusals(path: Path, lines: int) -> Iterator[None]:
     """Turn a disk's refusal into a RigError that says how many lines are safe."""

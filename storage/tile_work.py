@@ -5,7 +5,7 @@ A tile is a shard of the mosaic and a task of dask: whoever makes it writes file
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -76,6 +76,7 @@ def write_mosaic(
     memory: int,
     crew: Crew = THREADS,
     seen: Thumbnail | None = None,
+    there: Collection[tuple[int, int]] = (),
     report: Callable[[float], None] = lambda done: None,
 ) -> TileBudget:
     """Rectify and blend sweeps into a stored mosaic. Whoever makes the tiles, the same bytes come out.
@@ -90,8 +91,10 @@ def write_mosaic(
         Who makes tiles, and how many at a time; fewer are made where memory holds fewer.
     seen
         Filled with the pixels that it shows.
+    there
+        First row and column of tiles that are written already: they are left as they are, and ``seen`` without them.
     report
-        Called with the share done after each tile, from the calling thread.
+        Called with the share of the others done after each tile, from the calling thread.
 
     Returns
     -------
@@ -106,6 +109,7 @@ def write_mosaic(
     opened = work.open() if isinstance(work, MosaicRecipe) else work
     tiles = plan_tiles(opened.placed, opened.camera, opened.grid, writer.tile_shape)
     budget = tile_budget(opened, tiles, writer.tile_shape, memory=memory, crew=crew)
+    tiles = [tile for tile in tiles if (tile.rows.start, tile.columns.start) not in there]
 
     def show(rows: slice, columns: slice, part: NDArray[np.float32] | None) -> None:
         if seen is not None and part is not None:
@@ -113,7 +117,7 @@ def write_mosaic(
 
     cut = None if seen is None else seen.cut
     if crew.shares_memory:
-        made = _Opened(opened, writer, LineCache(budget.cache), cut)
+        made = OpenMosaic(opened, writer, LineCache(budget.cache), cut)
         run_blocks(
             made.tile, tiles, Crew(workers=budget.workers), keep=False, report=report,
             each=lambda tile, part: show(tile.rows, tile.columns, part),
@@ -145,7 +149,7 @@ class TileMaker:
         return _opened(self).at(*place)
 
 
-class _Opened:
+class OpenMosaic:
     """A mosaic in the making: what is read, what is written, and the raw lines between."""
 
     def __init__(self, work: MosaicWork, writer: MosaicWriter, cache: LineCache, cut: ThumbnailCut | None) -> None:
@@ -181,9 +185,9 @@ def let_tiles_go() -> None:
 
 
 @lru_cache(maxsize=1)
-def _opened(maker: TileMaker) -> _Opened:
+def _opened(maker: TileMaker) -> OpenMosaic:
     """What a maker needs, opened once in this process; the one before it is let go."""
-    return _Opened(maker.recipe.open(), MosaicWriter.reopen(maker.out), LineCache(maker.cache), maker.cut)
+    return OpenMosaic(maker.recipe.open(), MosaicWriter.reopen(maker.out), LineCache(maker.cache), maker.cut)
 
 
 def tile_budget(

@@ -230,13 +230,13 @@ def test_plan_as_json_and_as_a_table(settings: Settings, archive: Path, capsys: 
     assert run_plan(asked, as_json=True) == 0
     content = json.loads(capsys.readouterr().out)
     ahead = [row for row in content["stages"] if row["state"] in ("to run", "blocked")]
-    assert content["to_make"] == content["estimated"] == len(ahead) == 6
+    assert content["to_make"] == content["estimated"] == len(ahead) == 7
     assert content["seconds"] == pytest.approx(sum(row["seconds"] for row in ahead))
     assert content["bytes"] == sum(row["bytes"] for row in ahead)
     assert run_plan(asked) == 0
     shown = capsys.readouterr().out
     assert all(row["stage"] in shown for row in content["stages"])
-    assert "6 stages to make, about" in shown
+    assert "7 stages to make, about" in shown
     run_plan(replace(settings, out=str(archive)))
     assert "everything is stored" in capsys.readouterr().out
 

@@ -28,7 +28,7 @@ READ = ("models/spectral.py", "models/sizes.py", "models/tokens.py", "models/enc
         "models/segmenter.py", "models/inference.py", "models/regions.py", "models/weights.py", "pipeline/grid.py",
         "flows/region_work.py", "storage/mosaic_strips.py")  # fmt: skip
 PLANNING = ("pipeline/planning.py", "pipeline/runs.py", "pipeline/covering.py", "pipeline/spending.py",
-            "pipeline/strips.py", "pipeline/orientation.py", "pipeline/crop_rows.py")  # fmt: skip
+            "pipeline/strips.py")  # fmt: skip
 GATHER = ("pipeline/rectify/resample.py", "pipeline/rectify/kernels.py", "pipeline/rectify/line_table.py",
           "pipeline/rectify/alignment.py")  # fmt: skip
 READERS = ("storage/scan_files.py", "storage/envi_header.py", "storage/envi_cubes.py", "storage/headwall_folders.py",
@@ -48,6 +48,8 @@ SOURCES = {
                "models/vgg_saliency.py", "storage/attention.py"),
     "patches": (*RECTIFY, "pipeline/strips.py", "storage/sightings.py", "storage/patches.py"),
     "segment": (*READ, "flows/field_work.py", "storage/class_maps.py"),
+    "orientation": (*PLANNING, "pipeline/orientation.py", "pipeline/crop_rows.py", "storage/mosaic_strips.py",
+                    "storage/attention.py", "flows/orientation_stage.py"),
     "ground": ("pipeline/ground.py", "pipeline/ground_grid.py", "pipeline/projection.py", *GATHER,
                "storage/georeference.py", "storage/ground_maps.py", "flows/ground_stage.py", "flows/panels.py",
                "flows/tones.py"),
@@ -65,12 +67,13 @@ FUNCTIONS: dict[str, dict[str, tuple[str, ...]]] = {  # of files that several st
     "register": {PLACEMENT: ("sighted",), STAGES_FILE: ("captured",)},
     "locate": {PLACEMENT: ("sighted", "locate"), STAGES_FILE: ("captured",)},
     "rectify": {PLACEMENT: ("rectify", "_record")},
-    "attend": {STAGES_FILE: ("attend", "_scores", "_crop_rows", "write_plan", "load_plan")},
+    "attend": {STAGES_FILE: ("attend", "_scores", "write_plan", "load_plan")},
     "patches": {
         PLACEMENT: ("sighted", "cut_patches", "cut_again", "_fill", "_Kept", "_along_scan", "seen_shares"),
         STAGES_FILE: ("load_plan", "captured"),
     },
     "segment": {STAGES_FILE: ("draw_map",)},
+    "orientation": {STAGES_FILE: ("load_plan",)},
     "ground": {},
     "evaluate": {STAGES_FILE: ("glance_at", "patch_columns")},
     "ingest": {"flows/ingest_command.py": ("hash_files", "_opened", "_key")},

@@ -30,7 +30,7 @@ from storage.archive import Archive
 
 STAGES = [
     "choose_effects", "capture_coarse", "locate", "rectify", "attend", "capture_fine", "cut_patches", "draw_map",
-    "evaluate",
+    "compare_turned", "evaluate",
 ]  # fmt: skip
 ON_REQUEST = ["register_coarse", "register_fine", "ground"]  # skipped without --pointing-px and [pose]
 FARM = (128, 192)

@@ -1,0 +1,181 @@
+"""A mosaic made ahead: tiles whose lines have all arrived, rectified while the capture goes on.
+
+Nothing rests on it. Tiles are made of lines in the spool, lying as the plan has them; they are taken over only where
+each line turned out to lie there, and then they are, byte for byte, what would be made afterwards. Whatever goes wrong
+with it leaves the mosaic to be made in its turn.
+
+::
+
+    <folder>/mosaic.zarr    tiles that are ready
+    <folder>/seen.npy       what the thumbnail shows of them
+    <folder>/ahead.json     which they are and what they were made of; written last
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.camera import LineCamera
+from pipeline.rectify.line_cache import LineCache
+from pipeline.rectify.placed import PixelGrid, Placed, place
+from pipeline.rectify.tiles import Tile, lines_needed, plan_tiles
+from pipeline.scan import Sweep
+from pipeline.source import References
+from storage.block_work import Crew
+from storage.lookups import path_digest
+from storage.mosaic_work import MosaicWork
+from storage.mosaics import MosaicWriter
+from storage.spool import read_spooled
+from storage.staging import remove_tree
+from storage.tile_work import OpenMosaic, Thumbnail, tile_budget
+
+MOSAIC, SEEN, RECORD = "mosaic.zarr", "seen.npy", "ahead.json"
+LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class PlannedLines:
+    """A sweep's lines where the plan has them, read from its spool while that grows: a `pipeline.source.SweepLines`."""
+
+    spool: Path  # folder
+    sweep: Sweep
+    references: References
+    position: NDArray[np.float64]  # (line, 2)
+
+    @property
+    def time_s(self) -> NDArray[np.float64]:
+        """(line,) unknown."""
+        return np.full(len(self.position), np.nan)
+
+    @property
+    def valid_line(self) -> NDArray[np.bool_]:
+        """(line,) all of them: else the mosaic is not taken over."""
+        return np.ones(len(self.position), np.bool_)
+
+    def read(self, start: int, stop: int) -> NDArray[np.uint16]:
+        """Raw numbers of lines that have arrived, (line, sample, band)."""
+        return read_spooled(self.spool, self.sweep.name, self.references.dark.shape, slice(start, stop))
+
+
+@dataclass(frozen=True)
+class AheadOf:
+    """What a mosaic is made of beside its lines: it is taken over for the same alone."""
+
+    camera: LineCamera
+    grid: PixelGrid
+    kernel: str
+
+    def facts(self, paths: Mapping[str, str]) -> dict[str, Any]:
+        """The same in plain values, with the digest of each sweep's path."""
+        told = {"camera": asdict(self.camera), "grid": asdict(self.grid), "kernel": self.kernel, "paths": dict(paths)}
+        plain: dict[str, Any] = json.loads(json.dumps(told))
+        return plain
+
+
+class MosaicAhead:
+    """Makes tiles on a thread of its own as lines arrive. Use as a context manager: its end stops the work.
+
+    Parameters
+    ----------
+    begin
+        Makes the writer of the mosaic at a path.
+    memory
+        What this may take [bytes]; where not even a tile fits SettingsError is raised.
+    """
+
+    def __init__(
+        self, folder: Path, work: MosaicWork, begin: Callable[[Path], MosaicWriter], seen: Thumbnail, *, memory: int
+    ) -> None:
+        remove_tree(folder)
+        folder.mkdir(parents=True)
+        writer = begin(folder / MOSAIC)
+        tiles = plan_tiles(work.placed, work.camera, work.grid, writer.tile_shape)
+        budget = tile_budget(work, tiles, writer.tile_shape, memory=memory, crew=Crew(workers=1))
+        self._folder, self._work, self._seen = folder, work, seen
+        self._opened = OpenMosaic(work, writer, LineCache(budget.cache), seen.cut)
+        self._waiting = [(tile, lines_needed(work.placed, tile)) for tile in tiles]
+        self._here = {one.lines.sweep.name: 0 for one in work.placed}
+        self._made: list[tuple[int, int]] = []
+        self._thread = ThreadPoolExecutor(1, "mosaic-ahead")
+        self._begun: list[Future[None]] = []
+
+    def __enter__(self) -> MosaicAhead:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._thread.shutdown(cancel_futures=True)
+        failed = next((one.exception() for one in self._begun if one.done() and not one.cancelled()), None)
+        if kind is not None or failed is not None:
+            LOG.info("the mosaic is made after its lines: %s", failed or "their capture broke off")
+            remove_tree(self._folder)
+            return
+        try:
+            self._keep()
+        except OSError as error:
+            LOG.info("the mosaic is made after its lines: %s", error)
+            remove_tree(self._folder)
+
+    def arrived(self, name: str, count: int) -> None:
+        """Take note that the first ``count`` lines of a sweep are in its spool."""
+        self._here[name] = count
+        here, waiting = list(self._here.values()), []
+        for tile, needed in self._waiting:
+            if all(least <= count for least, count in zip(needed, here, strict=True)):
+                self._begun.append(self._thread.submit(self._make, tile))
+            else:
+                waiting.append((tile, needed))
+        self._waiting = waiting
+
+    def _make(self, tile: Tile) -> None:
+        part = self._opened.tile(tile)
+        if part is not None:
+            self._seen.put(tile.rows, tile.columns, part)
+        self._made.append((tile.rows.start, tile.columns.start))
+
+    def _keep(self) -> None:
+        np.save(self._folder / SEEN, self._seen.image)
+        work = self._work
+        paths = {one.lines.sweep.name: path_digest(one.lines.position) for one in work.placed}
+        facts = AheadOf(work.camera, work.grid, work.kernel).facts(paths)
+        (self._folder / RECORD).write_text(json.dumps({**facts, "tiles": self._made}))
+
+
+def place_as_planned(lines: PlannedLines, camera: LineCamera, grid: PixelGrid) -> Placed:
+    """Find where a sweep's lines will lie, with the tables that it will be looked up by."""
+    find = partial(place, lines, camera, shift_px=np.zeros_like(lines.position))
+    found = find(grid=grid)
+    return found if all(table is not None for _, table in found.tracks) else find()
+
+
+def take_over(
+    folder: Path, out: Path, wanted: AheadOf, paths: Mapping[str, str], seen: Thumbnail
+) -> Sequence[tuple[int, int]]:
+    """Move a mosaic made ahead to ``out``, and what the thumbnail shows of it into that.
+
+    Returns
+    -------
+    First row and column of each tile that is ready; none, and nothing moved, where there is no such mosaic, or lines
+    lie elsewhere than it was made of.
+    """
+    try:
+        record = json.loads((folder / RECORD).read_text())
+        image = np.load(folder / SEEN)
+    except (OSError, ValueError):
+        return []
+    tiles = [(int(row), int(column)) for row, column in record.pop("tiles")]
+    if record != wanted.facts(paths) or image.shape != seen.image.shape or not tiles:
+        return []
+    (folder / RECORD).unlink()
+    (folder / MOSAIC).rename(out)
+    seen.image[...] = image
+    return tiles

@@ -1,0 +1,187 @@
+"""How long a rig waits between its last coarse line and the first position of the fine pass, on one emulated here.
+
+Run alone, python tests/benchmarks/bench_latency.py [--px 2560] [--after] prints where the time goes; with --after no
+tile of the mosaic is made while lines arrive.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
+
+if __name__ == "__main__":  # as a command of its own; one thread, as the figures are meant
+    for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(_name, "1")
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from measure import Row
+
+if TYPE_CHECKING:
+    from flows.run import SurveyRun
+    from flows.settings import Settings
+    from pipeline.rig.capture_runner import RigDevices
+    from pipeline.rig.emulator.emulated_rig import EmulatedRig
+
+PX, MOST_S = 2560, 5.0
+
+
+@dataclass
+class Moments:
+    """When what happened, by the wall clock; ``stages`` are wall seconds of each."""
+
+    last_exposure: float = 0.0
+    last_line: float = 0.0
+    first_request: float = 0.0
+    stages: dict[str, float] = field(default_factory=dict)
+    tiles_ahead: int = 0
+    coarse_s: float = 0.0
+
+    @property
+    def waited_s(self) -> float:
+        """From the last coarse line in the spool to the first position that is sent for a fine one."""
+        return self.first_request - self.last_line
+
+
+def rows() -> list[Row]:
+    """The wait with tiles made ahead, and without."""
+    ahead, after = (measure(PX, ahead=ahead) for ahead in (True, False))
+    what = f"rig, {PX} x {PX} x 270: last coarse line to first patch request"
+    share = f"{ahead.waited_s / ahead.coarse_s:.1%} of the coarse pass's {ahead.coarse_s:.0f} s"
+    told = f"{ahead.waited_s:.2f} s ({share})"
+    peers = f"{after.waited_s:.2f} s with nothing rectified while lines arrive"
+    read = f"{ahead.last_line - ahead.last_exposure:.2f} s"
+    return [
+        Row(what, told, f"<= {MOST_S:g} s", ahead.waited_s <= MOST_S, peers),
+        Row("the same: last exposure to last coarse line (files over FTP, this machine)", read),
+    ]
+
+
+def measure(px: int, *, ahead: bool) -> Moments:
+    """Survey a farm through an emulated rig as far as the first fine position."""
+    from flows import stages
+    from flows.settings import load_settings
+
+    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
+        told = {"size": f"{px}x{px}", "source": "rig", "visit": "first", "out": name, "engine": "plain",
+                "controls": False, "rig.panel": 0.99}  # fmt: skip
+        settings = load_settings(None, told)
+        moments = Moments()
+        stack.enter_context(_watched(moments))
+        if not ahead:
+            stack.enter_context(patch.object(stages, "rectifying_ahead", _nothing_ahead))
+        _survey(stack, settings, moments)
+        return moments
+
+
+@contextmanager
+def _nothing_ahead(run: SurveyRun, source: Any, key: str) -> Iterator[Any]:
+    yield lambda name, count: None
+
+
+class _AskedError(Exception):
+    """The fine pass was asked for: the rest of the survey is not measured."""
+
+
+@contextmanager
+def _watched(moments: Moments) -> Iterator[None]:
+    """Take the time of exposures, lines and the first path of a fine sweep; count what was made ahead."""
+    from flows import placement
+    from pipeline.rig.capture_runner import CaptureRunner
+    from storage.spool import Spool
+
+    append, take, take_mosaic = Spool.append, CaptureRunner.take, placement.take_mosaic
+
+    def appended(spool: Spool, line: Any) -> None:
+        append(spool, line)
+        moments.last_line = time.perf_counter()
+
+    def taken(runner: CaptureRunner, path: Any) -> Any:
+        if path.sweep.kind == "fine":
+            moments.first_request = time.perf_counter()
+            raise _AskedError
+        done = take(runner, path)
+        moments.last_exposure = time.perf_counter()
+        return done
+
+    def counted(*given: Any) -> Any:
+        there = take_mosaic(*given)
+        moments.tiles_ahead = len(there)
+        return there
+
+    with (
+        patch.object(Spool, "append", appended),
+        patch.object(CaptureRunner, "take", taken),
+        patch.object(placement, "take_mosaic", counted),
+    ):
+        yield
+
+
+def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
+    from flows.effect_choice import chosen_effects
+    from flows.run import make_source, open_run
+    from flows.survey import StageRunner, survey
+    from pipeline.rig.clock import ManualClock
+    from pipeline.rig.emulator.emulated_rig import EmulatedRig
+
+    run = open_run(settings)
+    moments.coarse_s = run.plan.coarse_s
+    begun: dict[str, float] = {}
+
+    def watch(stage: str, state: str, done: float) -> None:
+        now = time.perf_counter()
+        begun.setdefault(stage, now)
+        if state != "running":
+            moments.stages[stage] = now - begun[stage]
+
+    step = StageRunner(run, watch)
+    effects = step("choose_effects")
+    assert effects is not None
+    source = make_source(run.scene, settings)
+    rig = EmulatedRig(replace(source, chosen=chosen_effects(effects)), ManualClock(10.0))
+    line = stack.enter_context(rig.in_process())
+    stack.enter_context(patch("flows.rig_run.open_devices", _devices(rig, line)))
+    try:
+        survey(step)
+    except _AskedError:
+        return
+
+
+def _devices(rig: EmulatedRig, line: Any) -> Callable[..., RigDevices]:
+    from pipeline.rig.capture_runner import RigDevices
+    from pipeline.rig.mirror_controller import MirrorController
+
+    def open_devices(told: Settings, *_: object) -> RigDevices:
+        line.transport = type(line.transport)(rig.mirror, line.clock)
+        mirror = MirrorController(line.transport, told.rig.mirror(told.cost.vector_pairs), line.clock)
+        mirror.connect()
+        return RigDevices(mirror, line.camera(), line.clock)
+
+    return open_devices
+
+
+def main() -> int:
+    """Print one measurement, stage by stage."""
+    parser = argparse.ArgumentParser(description="The wait between the coarse and the fine pass.")
+    parser.add_argument("--px", type=int, default=PX)
+    parser.add_argument("--after", action="store_true", help="rectify nothing while lines arrive")
+    asked = parser.parse_args()
+    found = measure(asked.px, ahead=not asked.after)
+    for stage, seconds in found.stages.items():
+        print(f"{stage:18} {seconds:8.2f} s")
+    print(f"tiles made ahead   {found.tiles_ahead}")
+    print(f"last exposure to last line {found.last_line - found.last_exposure:.2f} s")
+    print(f"last line to first patch request {found.waited_s:.2f} s, {found.waited_s / found.coarse_s:.2%} of the pass")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
