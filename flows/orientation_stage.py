@@ -32,7 +32,7 @@ def compare_turned(run: SurveyRun, produce: Produce, mosaic: StageRef, attention
         )  # fmt: skip
         write_json(path / FILE, asdict(turned) | {"sentence": turned.sentence})
 
-    return produce("orientation", build, {}, [mosaic, attention])  # all it depends on are parameters of attention
+    return produce("turned", build, {}, [mosaic, attention])  # all it depends on are parameters of attention
 
 
 def load_orientation(turned: StageRef) -> dict[str, Any]:

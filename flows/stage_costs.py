@@ -43,7 +43,7 @@ PARTS = {
     "register_again": Part("register", "fine values", 2),
     "cut_again": Part("patches", "patch values"),
     "draw_map": Part("segment", "operations of the map", size="pixels"),
-    "compare_turned": Part("orientation", "pixels"),
+    "compare_turned": Part("turned", "pixels"),
     "ground": Part("ground", "pixels"),
     "evaluate": Part("evaluate", "operations of a glance", size="surveys"),
 }

@@ -65,7 +65,7 @@ def test_ls_shows_runs_and_stores(surveyed: Path, capsys: pytest.CaptureFixture[
     out = capsys.readouterr().out
     assert first["id"] in out
     assert content["stages"]["rectify"][0]["key"] in out
-    assert "2 runs, 14 stores" in out
+    assert "2 runs, 16 stores" in out
 
 
 def test_of_many_stores_the_newest_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -154,7 +154,7 @@ def test_a_run_is_explained_by_its_command_and_stores(surveyed: Path, capsys: py
     """Each store opens once; what nothing else was made of is at the top."""
     (first, _) = (run["id"] for run in contents(Archive.open(surveyed))["runs"])
     content = _json(capsys, lambda: run_explain(surveyed, first, as_json=True))
-    assert [tree["stage"] for tree in content["lineage"]] == ["evaluate"]
+    assert [tree["stage"] for tree in content["lineage"]] == ["evaluate", "turned"]
     assert "--budget 0.8" in content["run"]["command"]
     run_explain(surveyed, first)
     out = capsys.readouterr().out
@@ -190,7 +190,7 @@ def test_gc_keeps_what_surveys_name(archive: Path, capsys: pytest.CaptureFixture
     shutil.rmtree(Archive.open(archive).runs()[0])
     assert _json(capsys, lambda: run_gc(archive, QUIET, as_json=True))["removals"] == []
     planned = _json(capsys, lambda: run_gc(archive, QUIET, keep_days=0, dry_run=True, as_json=True))
-    assert len(planned["removals"]) == 5
+    assert len(planned["removals"]) == 6
     done = _json(capsys, lambda: run_gc(archive, QUIET, keep_days=0, as_json=True))
     assert done["removals"] == planned["removals"]
     assert done["bytes"] == sum(one["size"] for one in done["removals"]) > 10_000
@@ -215,7 +215,7 @@ def test_verify_repairs_by_surveying_again(archive: Path, capsys: pytest.Capture
     (coarse,) = set(ages) - {uri.rpartition("/")[2] for uri in content["repair"]["remade"]}
     assert ages[coarse] == max(ages.values())
     assert run_verify(archive, QUIET) == DONE
-    assert "18 of 18 stores and runs are as published" in capsys.readouterr().out
+    assert "20 of 20 stores and runs are as published" in capsys.readouterr().out
 
 
 def test_verify_says_what_it_could_not_repair(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
