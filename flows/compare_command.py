@@ -15,7 +15,7 @@ from flows.archive_commands import PIPED_WIDTH, check_outside
 from flows.comparison_table import SAVINGS, change_words, panel_words, show_comparison
 from flows.difference_picture import MapPair, draw_difference
 from flows.receipt import to_json
-from flows.settings import BUILT_IN_SCENES
+from flows.setting_keys import BUILT_IN_SCENES
 from pipeline.errors import ArchiveError, SceneError, ShapeError
 from pipeline.grid import UNLABELLED
 from pipeline.simulator.farm_laws import law_of_key

@@ -12,7 +12,8 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from flows.run import SHIPPED
-from flows.settings import BUILT_IN_SCENES, OF_THE_MACHINE, Settings, parse_settings
+from flows.setting_keys import BUILT_IN_SCENES
+from flows.settings import OF_THE_MACHINE, Settings, parse_settings
 from flows.stages import VERSIONS
 from flows.survey import STAGES
 from pipeline.errors import SettingsError

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from flows.capture_plan import CapturePlan, check_memory, plan_capture
 from flows.rig_run import for_rig, rig_source
-from flows.settings import BUILT_IN_SCENES, Settings
+from flows.setting_keys import BUILT_IN_SCENES
+from flows.settings import Settings
 from flows.survey_scene import check_labels, check_mask, farm_refusal, judged_labels, open_scene
 from models.vgg_file import VggFile
 from models.weights import Description, Weights, check_two_scale, describe_weights, load_weights

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.rig_run import field_before_rig
-from flows.settings import BUILT_IN_SCENES, RIG_FIELD, Settings
+from flows.setting_keys import BUILT_IN_SCENES, RIG_FIELD
+from flows.settings import Settings
 from flows.training_data import scene_of_file, unpack_mask
 from models.weights import Description
 from pipeline.errors import SceneError, SettingsError

@@ -7,6 +7,7 @@ sweeps, each by itself, beside their places: what registration is there to find.
 from __future__ import annotations
 
 import zlib
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -27,7 +28,7 @@ _MOST_DEVIATES = 6.0  # beyond, one line in 5e8 lies
 Floats = NDArray[np.float64]
 
 
-class Pointing:
+class Pointing(ABC):
     """How far a mirror looks beside the places that it reports: an aim of the chain, on wherever there is one."""
 
     name = "pointing"
@@ -35,13 +36,13 @@ class Pointing:
     cost_ns = MappingProxyType({"exact": 0.2})
 
     @property
+    @abstractmethod
     def reach_px(self) -> tuple[float, float]:
         """How far it looks beside at most, along the line and the scan [px]."""
-        raise NotImplementedError
 
+    @abstractmethod
     def of_lines(self, sweep_name: str, lines: range) -> Floats:
         """Give the error of some lines of a sweep, (line, 2) along the line and the scan [px]."""
-        raise NotImplementedError
 
     def aim(self, block: Block, variant: str) -> Floats:
         """Give the error of a block's lines, (line, 1, 2) along the line and the scan. [px]"""

@@ -14,7 +14,7 @@ import pytest
 
 from flows import cli
 from flows.app import app, print_json
-from flows.settings import _SURVEY, _TABLES
+from flows.setting_keys import SURVEY, TABLES
 from flows.survey_flags import IN_TABLES
 
 ONE_THREAD = """
@@ -51,7 +51,7 @@ def _flags(verb: str) -> dict[str, str | None]:
 @pytest.mark.parametrize("verb", ["survey", "plan"])
 def test_a_survey_can_be_planned_by_its_own_words(verb: str) -> None:
     """Every setting that is in no table has its flag, in both verbs."""
-    assert {f"--{name.replace('_', '-')}" for name in {*_SURVEY, *IN_TABLES} - set(_TABLES)} <= set(_flags(verb))
+    assert {f"--{name.replace('_', '-')}" for name in {*SURVEY, *IN_TABLES} - set(TABLES)} <= set(_flags(verb))
 
 
 @pytest.mark.parametrize("verb", VERBS)

@@ -13,7 +13,8 @@ import xarray as xr
 
 from flows.ground_stage import STORE, coarse_colours, ground, survey_grid
 from flows.run import SurveyRun
-from flows.settings import MapChoice, Settings
+from flows.setting_keys import MapChoice
+from flows.settings import Settings
 from pipeline.errors import PoseError
 from pipeline.grid import UNLABELLED, SceneGrid
 from pipeline.ground import RigPose, pixel_places

@@ -13,10 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flows import settings as settings_module
+from flows import setting_keys
 from flows.receipt import to_json
+from flows.setting_keys import MapChoice
 from flows.setting_values import Tolerance
-from flows.settings import MapChoice, Settings, load_settings, parse_settings
+from flows.settings import Settings, load_settings, parse_settings
 from models import policies
 from pipeline.camera import LineCamera
 from pipeline.errors import BudgetError, SettingsError
@@ -51,8 +52,8 @@ def test_nothing_given_is_the_default():
 
 def test_every_field_of_the_dataclasses_can_be_set():
     """No field of the survey, the camera or the cost model lacks its check."""
-    assert {item.name for item in fields(Settings)} == set(settings_module._SURVEY)
-    for name, (make, spans) in settings_module._TABLES.items():
+    assert {item.name for item in fields(Settings)} == set(setting_keys.SURVEY)
+    for name, (make, spans) in setting_keys.TABLES.items():
         assert {item.name for item in fields(make)} == set(spans), name
     for name in ("camera", "cost", "optics", "mirror", "detector", "air", "sky"):
         assert parse_settings({name: asdict(getattr(Settings(), name))}) == Settings()
@@ -62,8 +63,8 @@ def test_words_are_those_of_the_parts_that_use_them():
     """Policies, effects and kernels that the settings accept are exactly those that exist."""
     every = ",".join(effect.name for effect in EFFECTS)
     assert parse_settings({"effects": every}).effects == every
-    assert set(settings_module.KERNELS) == set(get_args(Kernel))
-    assert settings_module.POLICIES == policies.POLICIES
+    assert set(setting_keys.KERNELS) == set(get_args(Kernel))
+    assert setting_keys.POLICIES == policies.POLICIES
 
 
 def test_flags_win_over_the_file(toml):
@@ -93,8 +94,8 @@ def test_example_lists_every_setting():
     """Those without a default, and whole tables, stand in comments."""
     lines = [line.removeprefix("# ") for line in EXAMPLE.read_text(encoding="utf-8").splitlines()]
     named = {line.partition("=")[0].strip() for line in lines if "=" in line}
-    assert {item.name for item in fields(Settings)} - set(settings_module._TABLES) <= named
-    for name, (_, spans) in settings_module._TABLES.items():
+    assert {item.name for item in fields(Settings)} - set(setting_keys.TABLES) <= named
+    for name, (_, spans) in setting_keys.TABLES.items():
         assert f"[{name}]" in lines
         assert set(spans) <= named, name
 
