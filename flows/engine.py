@@ -73,8 +73,10 @@ def _task_step(runner: StageRunner) -> Step:
     from prefect import task
     from prefect.cache_policies import NO_CACHE
 
-    def stage(name: str, inputs: dict[str, str]) -> dict[str, str] | None:
-        """One stage of the survey: addresses and keys in, an address and a key out."""
+    before: list[dict[str, str]] = []  # what the last task returned: by this very object Prefect knows it again
+
+    def stage(name: str, inputs: dict[str, str], after: list[dict[str, str]]) -> dict[str, str] | None:
+        """One stage of the survey: addresses and keys in, an address and a key out; ``after`` draws the time line."""
         ref = runner(name, *(_ref(runner, uri) for uri in inputs))
         return None if ref is None else {"uri": ref.uri, "key": ref.key}
 
@@ -83,8 +85,11 @@ def _task_step(runner: StageRunner) -> Step:
             name=name, task_run_name=f"{name}-{runner.run.name}", cache_policy=NO_CACHE, persist_result=False,
             retries=RETRIES.get(name, 0), retry_delay_seconds=RETRY_DELAY_S, retry_condition_fn=_may_help,
         )(stage)  # fmt: skip
-        found = one(name, {ref.uri: ref.key for ref in inputs})
-        return None if found is None else _ref(runner, found["uri"])
+        found = one(name, {ref.uri: ref.key for ref in inputs}, before)
+        if found is None:
+            return None
+        before[:] = [found]
+        return _ref(runner, found["uri"])
 
     return step
 

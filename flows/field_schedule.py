@@ -68,22 +68,30 @@ class FieldSchedule:
         """What the ledger says by now."""
         return read_state(self.ledger.lines())
 
-    def open(self) -> None:
-        """Begin to serve, or go on where a process died that served; what it missed is accounted for."""
+    def open(self, first: datetime | None = None) -> None:
+        """Begin to serve, or go on where a process died that served; what it missed is accounted for.
+
+        ``first`` is a due time that is served still, though it may have come already.
+        """
         with self.ledger.held():
             state, now = self._state_now()
             same = state.timetable == self.timetable and state.late == self.late
             if state.serving and state.timetable is not None:
-                self._pass_over(state, now, NOT_SERVED, keep=same)
+                before = now if first is None else min(now, first - timedelta.resolution)
+                self._pass_over(state, now, NOT_SERVED, keep=same, until=before)
             if not (state.serving and same):
-                facts = {"schedule": self.timetable.to_dict(), "late": self.late}
-                self._write("opened", now, **facts, host=platform.node(), pid=os.getpid())
+                facts = {"schedule": self.timetable.to_dict(), "late": self.late, "host": platform.node()}
+                known = {} if first is None else {"first": moment_words(first)}
+                self._write("opened", now, **facts, **known, pid=os.getpid())
 
-    def join(self) -> None:
-        """Serve as part of what serves the field already; open the schedule where nothing does, or by another one."""
+    def join(self, due: datetime) -> None:
+        """Serve a due time as part of what serves the field; open the schedule where nothing does, or by another one.
+
+        What started the run for that time was scheduling before it, with or without a line in the ledger.
+        """
         state = self.state()
         if not state.serving or state.timetable != self.timetable or state.late != self.late:
-            self.open()
+            self.open(due)
 
     def close(self) -> None:
         """Stop serving: nothing is due from now on."""
@@ -147,14 +155,20 @@ class FieldSchedule:
             return f"{gone}, and the next one was due before it could be resumed; what it captured is kept"
         return None
 
-    def _pass_over(self, state: ScheduleState, now: datetime, why: str, *, keep: bool) -> list[datetime]:
-        """Account for due times until now that have not begun; with ``keep`` those that may begin are given instead."""
+    def _pass_over(
+        self, state: ScheduleState, now: datetime, why: str, *, keep: bool, until: datetime | None = None
+    ) -> list[datetime]:
+        """Account for due times until now that have not begun; with ``keep`` those that may begin are given instead.
+
+        With ``until`` only for those until then.
+        """
         timetable = state.timetable or self.timetable
         if state.since is None:
             return []
-        passed = list(islice(timetable.due_between(state.since, now), MOST_LINES + 1))
+        end = now if until is None else until
+        passed = list(islice(timetable.due_between(state.since, end), MOST_LINES + 1))
         if len(passed) > MOST_LINES:
-            return self._pass_many(state, now, why, keep=keep)
+            return self._pass_many(state, now, why, keep=keep, end=end)
         kept: list[datetime] = []
         for due in passed:
             if due in state.ended or due in state.begun:
@@ -166,16 +180,16 @@ class FieldSchedule:
                 state.ended[due] = {"event": "skipped"}
         return kept
 
-    def _pass_many(self, state: ScheduleState, now: datetime, why: str, *, keep: bool) -> list[datetime]:
+    def _pass_many(self, state: ScheduleState, now: datetime, why: str, *, keep: bool, end: datetime) -> list[datetime]:
         """One line for very many due times; a newest one that may still begin is left out of it."""
         timetable, since = state.timetable or self.timetable, state.since
         assert since is not None
         count, looked, last, before = 0, 0, since, since
-        for due in islice(timetable.due_between(since, now), MOST_COUNTED):
+        for due in islice(timetable.due_between(since, end), MOST_COUNTED):
             count += due not in state.ended and due not in state.begun
             looked, last, before = looked + 1, due, last
         if looked == MOST_COUNTED:  # counting them all would take too long
-            self._write("passed", now, after=moment_words(since), until=moment_words(now), count=None, reason=why)
+            self._write("passed", now, after=moment_words(since), until=moment_words(end), count=None, reason=why)
             return []
         fresh = last not in state.ended and last not in state.begun
         spared = keep and fresh and now <= timetable.latest_start(last, state.late)

@@ -11,16 +11,17 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 
-from flows.field_schedule import WallClock
+from flows.field_schedule import SystemWallClock, WallClock
 from flows.settings import Settings
 from pipeline.errors import RigError
 from storage.staging import take_lock
 
 MACHINE_WIDE = Path("/run/lock")
 ASK_AGAIN_S = 1.0
+A_LOOK = timedelta(seconds=1)
 
 
 @dataclass
@@ -64,6 +65,11 @@ class RigLock:
             clock.sleep(ASK_AGAIN_S)
         return True
 
+    def take_soon(self, words: str = "") -> bool:
+        """Take it now or in a moment: a schedule that only looks whether the rig is free holds it for that long."""
+        clock = SystemWallClock()
+        return self.wait(clock.now() + A_LOOK, clock, words)
+
     def release(self) -> None:
         """Let go; harmless where it is not held."""
         release, self._release = self._release, None
@@ -99,7 +105,7 @@ def rig_to_oneself(settings: Settings, words: str) -> Iterator[None]:
         yield
         return
     lock = rig_lock(settings, Path())
-    if not lock.take(words):
+    if not lock.take_soon(words):
         raise RigError(f"the rig is in use by {lock.holder()}; wait until that survey has ended, or end it")
     try:
         yield

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any, Literal
 
 from flows.schedule_times import Timetable, read_timetable
@@ -79,7 +79,8 @@ def _open(state: ScheduleState, at: datetime, line: Mapping[str, Any]) -> None:
     late = line.get("late")
     state.late = float(late) if isinstance(late, int | float) else 0.0
     if not state.serving:  # what would have been due while nothing was scheduled was not due
-        _reach(state, at)
+        first = read_moment(line.get("first"))
+        _reach(state, at if first is None else min(at, first - timedelta.resolution))
     state.serving, state.opened = True, at
 
 

@@ -110,9 +110,9 @@ def read_timetable(content: Mapping[str, Any]) -> Timetable | None:
     try:
         every, zone = content.get("every_s"), str(content.get("timezone", "UTC"))
         if every is not None:
-            return parse_timetable(None, f"{float(every):g}s", zone)
+            return parse_timetable(None, exact_words(timedelta(seconds=float(every))), zone)
         return parse_timetable(content.get("cron"), None, zone)
-    except (SettingsError, TypeError, ValueError):
+    except (SettingsError, TypeError, ValueError, OverflowError):
         return None
 
 
@@ -132,6 +132,11 @@ def every_words(span: timedelta) -> str:
     seconds = span.total_seconds()
     unit = next((unit for unit in ("d", "h", "m") if seconds % UNITS_S[unit] == 0), "s")
     return f"{seconds / UNITS_S[unit]:g}{unit}"
+
+
+def exact_words(span: timedelta) -> str:
+    """A span in seconds, for `parse_every`: nothing of it is rounded."""
+    return f"{span.total_seconds():.6f}".rstrip("0").rstrip(".") + "s"
 
 
 def _cron(text: str) -> str:

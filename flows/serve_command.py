@@ -17,7 +17,8 @@ from flows.schedule_runs import Outcome, Tell
 from flows.schedule_times import parse_timetable
 from flows.serve_fields import alone_on, load_fields, survey_field
 from flows.serve_plain import serve_plain
-from flows.serve_prefect import ServeRequest, serve_prefect
+from flows.serve_prefect import serve_prefect
+from flows.serve_request import ServeRequest
 from pipeline.errors import SettingsError
 from storage.object_places import is_remote
 
@@ -62,12 +63,10 @@ def run_serve(choice: ServeChoice, console: Console) -> int:
         notify=notify,
     )  # fmt: skip
     with alone_on(fields), _stopped_cleanly(tell):
-        names = ", ".join(one.name for one in fields)
-        tell(f"serving {names}, {timetable.words()}; stop with Ctrl-C, the same command goes on")
         if choice.engine == "prefect":
-            tell(f"Prefect's pages: http://127.0.0.1:{choice.port}, unless PREFECT_API_URL names another server")
             serve_prefect(request, tell)
         else:
+            tell(request.headline)
             _serve_plain(request, console, tell)
     return 0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -17,7 +17,7 @@ from flows.schedule_lock import RigLock, rig_lock
 from flows.schedule_state import moment_words
 from flows.schedule_times import Timetable
 from flows.settings import Settings, load_settings
-from pipeline.errors import ArchiveError, PipelineError, SettingsError
+from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
 from pipeline.simulator.farm_laws import has_days
 from storage.archive import Archive
 from storage.ledger import Ledger
@@ -108,13 +108,15 @@ def survey_field(one: ServedField, due: datetime, timetable: Timetable, console:
 
 @contextmanager
 def alone_on(fields: Sequence[ServedField]) -> Iterator[None]:
-    """Keep another serve off the archives of these fields while the block runs.
+    """Keep another serve off the archives and the rigs of these fields while the block runs.
 
     Raises
     ------
-    ArchiveError : another serves one of them.
+    ArchiveError : another serves one of the archives.
+    RigError : another serves one of the rigs.
     """
     roots: Mapping[Path, str] = {one.archive: str(one.settings.out) for one in fields}
+    rigs = {one.lock().path: one.settings.rig.port for one in fields if one.settings.source == "rig"}
     with ExitStack() as held:
         for root, name in roots.items():
             release = take_lock(root / ".locks" / "serve.lock", wait=False)
@@ -123,4 +125,19 @@ def alone_on(fields: Sequence[ServedField]) -> Iterator[None]:
                     f"another serve works on the archive {name}: give all its fields to that one, or end it first"
                 )
             held.callback(release)
+        for path, port in rigs.items():
+            held.callback(_alone_on_rig(path.with_suffix(".serve"), str(port)))
         yield
+
+
+def _alone_on_rig(path: Path, port: str) -> Callable[[], None]:
+    try:
+        release = take_lock(path, wait=False)
+    except OSError as error:
+        raise RigError(
+            f"cannot use the lock {path}: {error.strerror}; it may belong to another user: end that user's serve, or "
+            f"remove the file when there is none"
+        ) from error
+    if release is None:
+        raise RigError(f"another serve uses the rig at {port}: give all its fields to that one, or end it first")
+    return release

@@ -3,9 +3,10 @@
 No ``from __future__ import annotations`` here: Prefect reads the signatures. What is done is in plain functions.
 """
 
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from prefect import State, flow
@@ -15,10 +16,11 @@ from prefect.states import Completed, Failed
 from rich.console import Console
 
 from flows.archive_commands import FAILED, PARTLY
-from flows.field_schedule import FieldSchedule
+from flows.field_schedule import FieldSchedule, WallClock
 from flows.notices import send_notice
 from flows.publish import Published
 from flows.reprocess_command import ReprocessRequest, run_reprocess
+from flows.schedule_news import ScheduleNews
 from flows.schedule_runs import Outcome, run_due
 from flows.schedule_state import read_moment
 from flows.schedule_times import parse_timetable
@@ -31,6 +33,8 @@ from storage.staging import take_lock
 
 LIMIT = "rig"  # a Prefect concurrency limit that shows who waits; the kernel's lock decides
 REPROCESS_LOCK = "reprocess-flow.lock"
+A_LOOK_S = 1.0
+AHEAD = timedelta(minutes=2)  # a run that is begun earlier than this was begun by hand
 
 
 @flow(name="survey", flow_run_name="survey-{field}", persist_result=False)
@@ -52,14 +56,15 @@ def survey_scheduled(
             raise SettingsError(f"{settings} is of the field {one.name}, not {field}; give the deployment its name")
         schedule = one.schedule(parse_timetable(cron, every, timezone), late)
         moment = read_moment(due) or _scheduled()
-        if moment is None:
+        if moment is None or not _wait_for(moment, schedule.clock):
             return _by_hand(one, schedule)
-        schedule.join()
+        news = ScheduleNews({field: schedule}, lambda name, error: None)
+        schedule.join(moment)
         outcome = _run(one, schedule, moment)
     except PipelineError as error:
         return Failed(message=str(error))
-    if outcome.ending is not None:
-        send_notice(notify, outcome, one.settings.out)
+    for known in news.fresh():
+        send_notice(notify, known, one.settings.out)
     return _state(outcome)
 
 
@@ -87,7 +92,7 @@ def _show(published: Published, one: ServedField) -> None:
 def _by_hand(one: ServedField, schedule: FieldSchedule) -> State:
     """A survey that somebody asked for on Prefect's pages: it has no due time, and waits for nobody."""
     lock = one.lock()
-    if not lock.take(f"{one.name}, by hand"):
+    if not lock.take_soon(f"{one.name}, by hand"):
         raise RigError(f"the rig is in use by {lock.holder()}; run again when that survey has ended")
     try:
         folder = _survey(one, schedule, datetime.now(UTC).replace(microsecond=0))
@@ -99,10 +104,23 @@ def _by_hand(one: ServedField, schedule: FieldSchedule) -> State:
 @contextmanager
 def _shown_in_queue() -> Iterator[None]:
     """Take a place in Prefect's queue of the rig, where it has one; without one, or with a stale one, go on."""
-    with ExitStack() as held:
-        with suppress(Exception):
-            held.enter_context(concurrency(LIMIT, occupy=1, timeout_seconds=5, lease_duration=60))
+    held = ExitStack()
+    with suppress(Exception):
+        held.enter_context(concurrency(LIMIT, occupy=1, timeout_seconds=5, lease_duration=60))
+    try:
         yield
+    finally:
+        with suppress(Exception):  # a server that has gone meanwhile: the place is free when its lease is over
+            held.close()
+
+
+def _wait_for(moment: datetime, clock: WallClock) -> bool:
+    """Wait until a due time has come: Prefect begins runs up to seconds before it. False where it is far away."""
+    if moment - clock.now() > AHEAD:
+        return False
+    while (left := (moment - clock.now()).total_seconds()) > 0:
+        clock.sleep(min(left, 1.0))
+    return True
 
 
 def _scheduled() -> datetime | None:
@@ -145,6 +163,9 @@ def reprocess_archive(
     try:
         lock = Archive.open(archive, create=False, write=False).root / ".locks" / REPROCESS_LOCK
         release = take_lock(lock, wait=False)
+        if release is None:  # it may be but the watcher's look
+            time.sleep(A_LOOK_S)
+            release = take_lock(lock, wait=False)
         if release is None:
             return Completed(name="Skipped", message="this archive is being reprocessed already")
         try:

@@ -7,6 +7,7 @@ from datetime import datetime, timedelta
 
 from flows.field_schedule import FieldSchedule, SystemWallClock, WallClock
 from flows.schedule_lock import RigLock
+from flows.schedule_news import ScheduleNews
 from flows.schedule_runs import Outcome, Survey, Tell, run_all
 
 LOOK_AGAIN = timedelta(seconds=30)  # a clock that jumps, or a run that died, is seen after this at the latest
@@ -23,13 +24,16 @@ def serve_plain(
     until: datetime | None = None,
 ) -> None:
     """Serve schedules until ``until``, or until interrupted; then they are closed, and what began is resumed later."""
-    watch = clock or SystemWallClock()
+    watch, news = clock or SystemWallClock(), ScheduleNews(schedules, lambda name, error: tell(f"{name}: {error}"))
     for schedule in schedules.values():
         schedule.open()
     try:
         while until is None or watch.now() < until:
             outcomes = run_all(schedules, lambda name: locks[name], survey, tell)
-            for outcome in outcomes:
+            ran = {(outcome.field, outcome.due) for outcome in outcomes}
+            for outcome in news.fresh():  # also what was skipped, or found dead
+                if (outcome.field, outcome.due) not in ran:
+                    tell(outcome.words())
                 note(outcome)
             if not any(outcome.ending for outcome in outcomes):  # else others may have become due meanwhile
                 watch.sleep(_pause(schedules.values(), watch.now()).total_seconds())

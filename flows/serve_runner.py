@@ -63,13 +63,13 @@ def main(text: str) -> None:
 
     from flows.schedule_times import parse_timetable
     from flows.serve_fields import load_field
-    from flows.serve_prefect import ServeRequest, deployments
+    from flows.serve_request import ServeRequest, deployments
 
     words = json.loads(text)
     request = ServeRequest(
         fields=[load_field(Path(file), words["out"]) for file in words["files"]],
         timetable=parse_timetable(words["cron"], words["every"], words["timezone"]),
-        late=words["late"], limit=words["limit"], out=words["out"], notify=words["notify"],
+        late=words["late"], limit=words["limit"], out=words["out"],
     )  # fmt: skip
     with suppress(KeyboardInterrupt):
         serve(*deployments(request), limit=request.limit, print_starting_message=False)

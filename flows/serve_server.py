@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -17,6 +18,7 @@ from pipeline.errors import SettingsError
 
 HOST = "127.0.0.1"
 STARTED_WITHIN_S = 120.0
+PATIENCE_S = 10.0  # with a server that is named
 POLL_S = "2"  # how often Prefect looks for due runs; by its own default the next field waits up to 10 s
 
 
@@ -61,6 +63,11 @@ class LocalServer:
             self._process.wait()
 
 
+def pages_of(server: LocalServer | None) -> str:
+    """Where the pages of a server are to be seen: one of our own, or the one that PREFECT_API_URL names."""
+    return (os.environ["PREFECT_API_URL"] if server is None else server.url).rstrip("/").removesuffix("/api")
+
+
 @contextmanager
 def server_for(home: Path, port: int) -> Iterator[LocalServer | None]:
     """Have a server while the block runs, and name it to Prefect, here and in processes started from here.
@@ -69,9 +76,10 @@ def server_for(home: Path, port: int) -> Iterator[LocalServer | None]:
 
     Raises
     ------
-    SettingsError : the port is taken, or the server did not start.
+    SettingsError : the port is taken, the server did not start, or the one that is named does not answer.
     """
-    if os.environ.get("PREFECT_API_URL"):
+    if named := os.environ.get("PREFECT_API_URL"):
+        _check_answers(named)
         yield None
         return
     server = LocalServer(home, port)
@@ -93,6 +101,19 @@ def server_for(home: Path, port: int) -> Iterator[LocalServer | None]:
         server.stop()
         for name in added:
             os.environ.pop(name, None)
+
+
+def _check_answers(url: str) -> None:
+    try:
+        with urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=PATIENCE_S):
+            return
+    except urllib.error.HTTPError:  # it is there, and wants to know who asks
+        return
+    except (OSError, ValueError) as error:
+        raise SettingsError(
+            f"no Prefect server answers at {url}, which PREFECT_API_URL names ({error}): start it, or unset the "
+            f"variable and have one started here"
+        ) from error
 
 
 def _check_free(port: int) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, cast
 
-from flows.figures import format_percent, format_points
+from flows.figures import format_percent
 from flows.finding_words import sentences
 from flows.publish import Published
 from flows.receipt import Receipt, Saving
@@ -25,7 +25,7 @@ def publish_artifacts(published: Published, field: str, archive: str) -> None:
 
     key, where = artifact_key(field), f"{archive}/runs/{published.folder.name}"
     text = survey_markdown(published, where)
-    create_markdown_artifact(text, key=f"survey-{key}", description=headline(published.receipt, published.looked_twice))
+    create_markdown_artifact(text, key=f"survey-{key}", description=where)
     create_table_artifact(savings_rows(published.receipt), key=f"savings-{key}", description=where)
 
 
@@ -46,7 +46,6 @@ def survey_markdown(published: Published, where: str) -> str:
         f"![the survey at a glance](data:image/jpeg;base64,{data})", "",
         f"| {' | '.join(columns)} |", f"|{'---|' * len(columns)}",
         *(f"| {' | '.join(row[name] for name in columns)} |" for row in rows), "",
-        *_accuracy(receipt),
         *(f"- {_plain(sentence)}" for sentence in sentences(receipt)), "",
         f"Report: `{where}/report.html`", "", f"Receipt: `{where}/receipt.json`",
     ]  # fmt: skip
@@ -85,11 +84,6 @@ def small_jpeg(png: bytes) -> bytes:
             if len(file.getvalue()) * 4 / 3 <= MOST_BYTES - 4:
                 return file.getvalue()
     return file.getvalue()
-
-
-def _accuracy(receipt: Receipt) -> list[str]:
-    found: Any = receipt.get("accuracy")
-    return [] if found is None else [f"mIoU {format_points(found['miou'])} of 100.", ""]
 
 
 def _plain(text: str) -> str:

@@ -49,3 +49,20 @@ def prefect_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         for name, value in {**QUIET, "PREFECT_HOME": str(home)}.items():
             patch.setenv(name, value)
         yield home
+
+
+@pytest.fixture
+def field_file(tmp_path: Path, scene_files: Path, weights: Path) -> Callable[..., Path]:
+    """Write a field's settings, with other lines before them."""
+
+    def write(stem: str = "north", lines: str = "", **changes: str | None) -> Path:
+        values: dict[str, str | None] = {
+            "scene": str(scene_files / "scene.png"), "weights": str(weights), "budget": "0.8",
+            "out": str(tmp_path / "archive"), **changes,
+        }  # fmt: skip
+        path = tmp_path / f"{stem}.toml"
+        told = "\n".join(f'{key} = "{value}"' for key, value in values.items() if value is not None)
+        path.write_text(f"{lines}\n{told}\n")
+        return path
+
+    return write

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
@@ -15,10 +16,10 @@ from hypothesis import strategies as st
 from flows.field_schedule import FieldSchedule
 from flows.schedule_lock import RigLock
 from flows.schedule_runs import run_all
-from flows.schedule_times import parse_every, parse_timetable
+from flows.schedule_times import exact_words, parse_every, parse_timetable, read_timetable
 from pipeline.errors import RigError, SettingsError
 from storage.ledger import Ledger
-from tests.flows.schedule_days import NOON, HandClock, accounted
+from tests.flows.schedule_days import NOON, HandClock, accounted, field_schedule
 
 CRONS = ("*/20 * * * *", "0 * * * *", "30 2 * * *", "15 1-3 * * *", "0 6 * * 1", "0 0 1 * *")
 ZONES = ("UTC", "Europe/Berlin", "America/New_York", "Australia/Lord_Howe")
@@ -146,3 +147,36 @@ def test_times_read_back_as_they_were_written() -> None:
         assert read_timetable(table.to_dict()) == table
     assert read_timetable({"cron": "nonsense"}) is None
     assert parse_every("1.5h") == timedelta(minutes=90)
+
+
+@pytest.mark.parametrize("every", ["10s", "90.5s", "20m", "11d", "12d", "30d", "366d", "1234567s"])
+def test_long_spans_keep_every_second(every: str) -> None:
+    """What goes to other processes and into ledgers is the span itself, also where it has seven digits of seconds."""
+    given = parse_timetable(None, every, "UTC")
+    assert given.every is not None
+    assert parse_every(exact_words(given.every)) == given.every
+    assert read_timetable(json.loads(json.dumps(given.to_dict()))) == given
+
+
+@pytest.mark.parametrize("before", ["never served", "closed", "served by another schedule", "served less patiently"])
+def test_the_first_due_time_of_a_deployment_is_served(tmp_path: Path, before: str) -> None:
+    """A run that Prefect started opens the schedule that it is of, and is to be run; it is not skipped for that."""
+    clock = HandClock()
+    if before != "never served":
+        other = {"served by another schedule": {"every": "15m"}, "served less patiently": {"late": 0.1}}
+        old = field_schedule(tmp_path, clock, **other.get(before, {}))  # type: ignore[arg-type]
+        old.open()
+        if before == "closed":
+            old.close()
+    schedule = field_schedule(tmp_path, clock)
+    due = NOON + timedelta(minutes=20)
+    clock.moment = due + timedelta(seconds=7)
+    schedule.join(due)
+    assert schedule.pending() == [due]
+    assert schedule.begin(due) == 1
+    assert schedule.end(due, "done", run="runs/one")
+    assert due not in [one for one in schedule.state().ended if schedule.state().ended[one]["event"] == "skipped"]
+    clock.sleep(20 * 60)
+    schedule.join(due + timedelta(minutes=20))
+    assert schedule.pending() == [due + timedelta(minutes=20)]
+    assert [line["event"] for line in schedule.ledger.lines()].count("opened") == (1 if before == "never served" else 2)

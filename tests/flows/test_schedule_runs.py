@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections import Counter
 from dataclasses import replace
 from datetime import datetime, timedelta
@@ -278,6 +279,18 @@ def test_the_kernel_frees_the_rig_of_a_killed_process(tmp_path: Path) -> None:
     process.stdout.close()
     assert lock.take()
     lock.release()
+
+
+def test_a_survey_by_hand_outlasts_a_look(tmp_path: Path) -> None:
+    """A schedule that looks whether the rig is free does not keep a survey off; one that surveys does."""
+    looking, survey = RigLock(tmp_path / "rig.lock"), RigLock(tmp_path / "rig.lock")
+    assert looking.take("a look at the schedule")
+    later = threading.Timer(0.2, looking.release)
+    later.start()
+    assert survey.take_soon("by hand")
+    later.join()
+    assert not RigLock(tmp_path / "rig.lock").take_soon("another")
+    survey.release()
 
 
 def test_each_rig_has_one_lock(tmp_path: Path) -> None:

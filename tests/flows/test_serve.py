@@ -1,4 +1,4 @@
-"""Serving: what is refused before anything runs, the watcher without a server, and one survey by Prefect's flow."""
+"""Serving: what is refused before anything runs, plain serving, artifacts and notices."""
 
 from __future__ import annotations
 
@@ -6,26 +6,23 @@ import base64
 import io
 import json
 import re
-from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from threading import Thread
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from flows.field_schedule import FieldSchedule
+from flows import schedule_lock
 from flows.notices import send_notice
 from flows.schedule_runs import Outcome
 from flows.schedule_times import parse_timetable
 from flows.serve_fields import ServedField, alone_on, load_fields
 from flows.serve_plain import serve_plain
-from flows.serve_prefect import ServeRequest, Watcher
 from flows.settings import Settings
 from flows.survey_artifacts import MOST_BYTES, artifact_key, savings_rows, small_jpeg, survey_markdown
 from pipeline.errors import ArchiveError
@@ -35,25 +32,10 @@ from tests.flows.schedule_days import NOON, HandClock
 EVERY = parse_timetable(None, "20m", "UTC")
 
 
-@pytest.fixture
-def field_file(tmp_path: Path, scene_files: Path, weights: Path) -> Callable[..., Path]:
-    """Write a field's settings, with other lines before them."""
-
-    def write(stem: str = "north", lines: str = "", **changes: str | None) -> Path:
-        values: dict[str, str | None] = {
-            "scene": str(scene_files / "scene.png"), "weights": str(weights), "budget": "0.8",
-            "out": str(tmp_path / "archive"), **changes,
-        }  # fmt: skip
-        path = tmp_path / f"{stem}.toml"
-        told = "\n".join(f'{key} = "{value}"' for key, value in values.items() if value is not None)
-        path.write_text(f"{lines}\n{told}\n")
-        return path
-
-    return write
-
-
 BAD = {
     "no fields": ((), "--every 30m", 2, "no fields: give the settings file of one or more"),
+    "every nothing": (("north",), "--every 0s", 2, "--every '0s': expected 10s to 366d"),
+    "cron of no minute": (("north",), "--cron '61_*_*_*_*'", 2, "--cron '61 .*': Bad minute; expected such as"),
     "cron nonsense": (("north",), "--cron hourly", 2, "--cron 'hourly': expected five fields"),
     "neither": (("north",), "", 2, "needs --cron or --every, got neither"),
     "both": (("north",), "--every 30m --cron *", 2, "got both"),
@@ -64,7 +46,7 @@ BAD = {
     "twice": (("north", "north"), "--every 30m", 2, "are both called north"),
     "late": (("north",), "--every 30m --late 1.5", 2, "--late 1.5: expected a share of the interval"),
     "limit": (("north",), "--every 30m --limit 0", 2, "--limit 0: expected 1 or more"),
-    "zone": (("north",), "--cron '0_6_*_*_*' --timezone Mars", 2, "'Mars' is no time zone"),
+    "zone": (("north",), "--cron '0_6_*_*_*' --timezone Mars/Olympus", 2, "'Mars/Olympus' is no time zone"),
     "address": (("north",), "--every 30m --notify ftp://x", 2, "expected https://HOST/PATH"),
     "name": (("named",), "--every 30m", 2, "'name' in .*named.toml must be a name of letters, digits"),
 }
@@ -95,6 +77,46 @@ def test_two_serves_on_one_archive(field_file: Callable[..., Path], command_line
         ended = command_line("serve", file, "--every", "30m", "--engine", "plain")
     assert (ended.code, len(ended.errors)) == (1, 1)
     assert "another serve works on the archive" in ended.errors[0]
+
+
+def test_two_serves_of_one_rig(
+    field_file: Callable[..., Path], tmp_path: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also with archives of their own the second is refused: a rig is served once."""
+    monkeypatch.setattr(schedule_lock, "MACHINE_WIDE", tmp_path)
+    rig = '[rig]\nport = "/dev/ttyNONE"\nhost = "192.0.2.1"\n'
+    files = [field_file(name, out=str(tmp_path / name), source="rig") for name in ("north", "south")]
+    for file in files:
+        file.write_text(file.read_text() + rig)
+    with alone_on(load_fields(files[:1])):
+        ended = command_line("serve", files[1], "--every", "30m", "--engine", "plain")
+    assert (ended.code, len(ended.errors)) == (1, 1), ended.err
+    assert "another serve uses the rig at /dev/ttyNONE: give all its fields to that one" in ended.errors[0]
+
+
+@pytest.mark.parametrize(
+    ("url", "words", "message"),
+    [
+        (
+            "http://127.0.0.1:9/api",
+            (),
+            "no Prefect server answers at http://127.0.0.1:9/api, which PREFECT_",
+        ),
+        ("", ("--port", 70000), "--port 70000 cannot be used"),
+    ],
+)
+def test_a_server_that_cannot_be_had(
+    url: str, words: Sequence[object], message: str, field_file: Callable[..., Path], command_line: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """One message, before anything is said to be served; the field's ledger has no line."""
+    monkeypatch.setenv("PREFECT_API_URL", url)
+    file = field_file()
+    ended = command_line("serve", file, "--every", "30m", *words)
+    assert (ended.code, len(ended.errors)) == (2, 1), ended.err
+    assert message in " ".join(ended.errors[0].split())
+    assert "serving" not in ended.err
+    assert load_fields([file])[0].schedule(EVERY, 0.5).ledger.lines() == []
 
 
 def test_the_flag_for_the_archive_wins(field_file: Callable[..., Path], tmp_path: Path) -> None:
@@ -142,70 +164,6 @@ def test_plain_serving_surveys_fields_in_turn_and_each_visit_anew(
         len({receipt["products"]["raw_coarse"] for receipt in receipts}) == 2
     )  # one for each visit: here both fields are one scene
     assert [finding for finding in archive.verify_all() if finding.problem] == []
-
-
-class AClient:
-    """Stands for a Prefect client: keeps what it was asked for."""
-
-    def __init__(self, state: str = "CRASHED") -> None:
-        self.asked: list[dict[str, Any]] = []
-        self._state = state
-
-    def read_deployment_by_name(self, name: str) -> SimpleNamespace:
-        """A deployment."""
-        return SimpleNamespace(id=name)
-
-    def create_flow_run_from_deployment(self, deployment: str, parameters: dict[str, Any]) -> None:
-        """Note it."""
-        self.asked.append({"deployment": deployment, **parameters})
-
-    def read_flow_run(self, known: str) -> SimpleNamespace:
-        """A run in the state given."""
-        return SimpleNamespace(state=SimpleNamespace(type=SimpleNamespace(value=self._state)))
-
-
-def watcher(file: Path, clock: HandClock, client: AClient) -> tuple[Watcher, FieldSchedule, ServedField]:
-    """A watcher of one field, with its schedule open."""
-    (one,) = load_fields([file])
-    schedule = one.schedule(EVERY, 0.5, clock)
-    schedule.open()
-    request = ServeRequest(fields=[one], timetable=EVERY, late=0.5)
-    return (
-        Watcher(request, {one.name: schedule}, lambda words: None, lambda: nullcontext(client)), schedule, one
-    )  # fmt: skip
-
-
-def test_what_prefect_did_not_start_is_asked_for_once(field_file: Callable[..., Path]) -> None:
-    """After a grace a due run that nobody began is asked for by name and due time, and not again at every look."""
-    clock, client = HandClock(), AClient()
-    watch, _, _ = watcher(field_file(), clock, client)
-    clock.sleep(20 * 60 + 10)
-    assert watch.look() == []
-    clock.sleep(60)
-    assert watch.look() == [("north", NOON + timedelta(minutes=20))]
-    clock.sleep(30)
-    assert watch.look() == []
-    assert [(one["deployment"], one["due"]) for one in client.asked] == [("survey/north", "2026-06-01T12:20:00Z")]
-
-
-@pytest.mark.parametrize(("state", "resumed"), [("CRASHED", True), ("CANCELLED", False)])
-def test_a_crashed_run_is_resumed_a_cancelled_one_is_not(
-    field_file: Callable[..., Path], state: str, resumed: bool
-) -> None:
-    """While its lock is held it lives; when that is free it is asked for again, unless somebody cancelled it."""
-    clock, client = HandClock(), AClient(state)
-    watch, schedule, one = watcher(field_file(), clock, client)
-    clock.sleep(20 * 60)
-    lock = one.lock()
-    assert lock.take("a survey")
-    schedule.begin(clock.now(), flow_run="abc")
-    clock.sleep(60)
-    assert watch.look() == []
-    lock.release()
-    assert bool(watch.look()) is resumed
-    assert bool(schedule.state().open) is resumed
-    if not resumed:
-        assert schedule.ledger.lines()[-1]["reason"] == "it was cancelled in Prefect"
 
 
 def test_the_picture_of_an_artifact_is_small(survey_png: Any, tmp_path: Path) -> None:

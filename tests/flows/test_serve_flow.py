@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import importlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from flows import serve_fields
 from flows.schedule_state import moment_words
 from flows.schedule_times import parse_timetable
 from flows.serve_fields import load_fields
 from storage.archive import Archive
 from storage.ledger import Ledger
+from storage.staging import take_lock
+from tests.flows.schedule_days import NOON, HandClock
 
 
 @pytest.fixture
@@ -34,7 +38,7 @@ def test_a_scheduled_run_by_prefect(
     from prefect.states import Running
 
     from flows.serve_flow import survey_scheduled
-    from flows.serve_prefect import reap_flow_runs
+    from flows.serve_watcher import reap_flow_runs
 
     file = tmp_path / "north.toml"
     file.write_text(
@@ -72,3 +76,79 @@ def test_a_wrong_field_is_a_failed_run(on_server: Path, tmp_path: Path) -> None:
     state = survey_scheduled(field="north", settings=str(tmp_path / "none.toml"), every="1h", return_state=True)
     assert state.is_failed()
     assert "no settings file" in str(state.message)
+
+
+def test_a_run_that_prefect_begins_early_waits(
+    on_server: Path, field_file: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Prefect begins runs up to seconds before their time: the survey is of that time, and done once."""
+    from flows import serve_flow
+
+    clock, due = HandClock(NOON + timedelta(minutes=20) - timedelta(seconds=0.3)), NOON + timedelta(minutes=20)
+    monkeypatch.setattr(serve_fields, "SystemWallClock", lambda: clock)
+    monkeypatch.setattr(serve_flow, "_survey", lambda one, schedule, asked: Path(f"{asked:%H%M}"))
+    file = field_file()
+    given: dict[str, Any] = {"field": "north", "settings": str(file), "every": "20m"}
+    state = serve_flow.survey_scheduled(**given, due=moment_words(due), return_state=True)
+    assert (state.name, state.message) == ("Completed", "runs/1220")
+    lines = load_fields([file])[0].schedule(parse_timetable(None, "20m", "UTC"), 0.5).ledger.lines()
+    assert [(line["event"], line.get("due")) for line in lines[1:]] == [
+        ("begun", "2026-06-01T12:20:00Z"), ("done", "2026-06-01T12:20:00Z"),
+    ]  # fmt: skip
+    far = moment_words(due + timedelta(hours=1))
+    state = serve_flow.survey_scheduled(**given, due=far, return_state=True)
+    assert state.is_completed()
+    assert len(load_fields([file])[0].schedule(parse_timetable(None, "20m", "UTC"), 0.5).ledger.lines()) == len(lines)
+
+
+def test_one_reprocessing_at_a_time(on_server: Path, tmp_path: Path) -> None:
+    """A second one of an archive is skipped and says why; the lock is free again after a run."""
+    from flows.serve_flow import REPROCESS_LOCK, reprocess_archive
+
+    out = tmp_path / "archive"
+    lock = Archive.open(out).root / ".locks" / REPROCESS_LOCK
+    release = take_lock(lock, wait=False)
+    assert release is not None
+    state = reprocess_archive(archive=str(out), return_state=True)
+    assert (state.name, state.message) == ("Skipped", "this archive is being reprocessed already")
+    release()
+    assert [reprocess_archive(archive=str(out), return_state=True).name for _ in range(2)] == ["Completed"] * 2
+
+
+def test_deployments_of_the_file_fit_the_flows(prefect_home: Path, field_file: Callable[..., Path]) -> None:
+    """In prefect.yaml entrypoints can be imported, parameters are those of the flows, and cron is told twice alike."""
+    import yaml
+
+    root = Path(__file__).parents[2]
+    content = yaml.safe_load((root / "prefect.yaml").read_text(encoding="utf-8"))
+    assert {one["name"] for one in content["deployments"]} == {"north", "archive"}
+    for one in content["deployments"]:
+        file, _, name = one["entrypoint"].partition(":")
+        assert (root / file).is_file()
+        flow = getattr(importlib.import_module(file.removesuffix(".py").replace("/", ".")), name)
+        assert one["parameters"].keys() <= flow.parameters.properties.keys()
+        assert set(flow.parameters.required or ()) <= one["parameters"].keys()
+        flow.validate_parameters(one["parameters"])
+        assert one["work_pool"] == content["definitions"]["pool"]
+    north = content["deployments"][0]
+    (schedule,) = north["schedules"]
+    given = north["parameters"]
+    assert (given["field"], given["cron"], given["timezone"]) == (
+        north["name"], schedule["cron"], schedule["timezone"],
+    )  # fmt: skip
+    assert parse_timetable(given["cron"], None, given["timezone"]).next_after(NOON) is not None
+
+
+def test_deployments_of_serve_fit_the_flows(prefect_home: Path, field_file: Callable[..., Path]) -> None:
+    """A deployment for each field with its own parameters and schedule, and one to reprocess the archive."""
+    from flows.serve_request import ServeRequest, deployments
+
+    fields = load_fields([field_file("north"), field_file("south")])
+    table = parse_timetable(None, "30d", "UTC")
+    made = deployments(ServeRequest(fields=fields, timetable=table, late=0.5))
+    assert [f"{one.flow_name}/{one.name}" for one in made] == ["survey/north", "survey/south", "reprocess/archive"]
+    north, _, archive = made
+    assert (north.parameters["field"], north.parameters["every"]) == ("north", "2592000s")
+    assert north.schedules[0].schedule.interval == timedelta(days=30)
+    assert archive.parameters == {"archive": fields[0].settings.out}
+    assert not archive.schedules

@@ -1,0 +1,217 @@
+"""What looks after a schedule on Prefect: it skips and reaps by the ledgers, and asks for runs that did not come.
+
+A server that is away is told of; what could not be done is done at the next look.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from flows.field_schedule import FieldSchedule
+from flows.notices import send_notice
+from flows.schedule_lock import RigLock
+from flows.schedule_news import ScheduleNews
+from flows.schedule_runs import Tell
+from flows.schedule_state import moment_words
+from flows.schedule_times import EPOCH
+from flows.serve_fields import ServedField
+from flows.serve_request import ServeRequest
+from storage.staging import take_lock
+
+GRACE = timedelta(seconds=45)  # after a due time Prefect's own scheduler is given so long
+ASK_AGAIN = timedelta(minutes=3)
+UNHEARD = timedelta(minutes=1)
+
+
+@dataclass
+class Watcher:
+    """Looks at the ledgers every now and then, with and without Prefect: skips, reaps, and asks for what was missed."""
+
+    request: ServeRequest
+    schedules: Mapping[str, FieldSchedule]
+    tell: Tell
+    client_of: Callable[[], Any] = field(default=lambda: _client())
+    asked: dict[tuple[str, datetime], datetime] = field(default_factory=dict)
+    attempts: dict[tuple[str, datetime], int] = field(default_factory=dict)
+    news: ScheduleNews = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.news = ScheduleNews(self.schedules, lambda name, error: self.tell(f"{name}: {error}"))
+
+    def prepare(self) -> None:
+        """At the start: the limit that shows the queue, and runs that are told as alive and are not."""
+        from flows.serve_flow import LIMIT
+
+        with self._errors("Prefect"), self.client_of() as client:
+            client.upsert_global_concurrency_limit_by_name(LIMIT, 1)
+        for one in self.request.fields:
+            self._alone(one, lambda one=one: self._reap_prefect(one))  # type: ignore[misc]
+
+    def tell_news(self) -> None:
+        """Tell how runs ended since the last time, a line each, and give notice where an address was given."""
+        archives = {one.name: one.settings.out for one in self.request.fields}
+        for outcome in self.news.fresh():
+            self.tell(outcome.words())
+            send_notice(self.request.notify, outcome, archives[outcome.field])
+
+    def unheard(self) -> bool:
+        """Whether a run that was asked for has not begun in time though nothing else runs: told once for each."""
+        late: list[tuple[str, datetime]] = []
+        if self.busy():  # they wait for their turn, and the runner has a survey under way
+            return False
+        for (name, due), asked in self.asked.items():
+            state, now = self.schedules[name].state(), self.schedules[name].clock.now()
+            began = due in state.ended or len(state.begun.get(due, ())) > self.attempts.get((name, due), 0)
+            if not began and now - asked > UNHEARD:
+                late.append((name, due))
+        for one in late:
+            del self.asked[one]
+        return bool(late)
+
+    def busy(self) -> bool:
+        """Whether another survey would have to wait: all rigs are in use, or as much runs as may run at a time."""
+        rigs = {lock.path: lock for lock in (one.lock() for one in self.request.fields)}
+        archives = {one.archive for one in self.request.fields}
+        looking = 0
+        for lock in rigs.values():
+            with self._errors("the rig"):
+                looking += not lock.take("a look at the schedule")
+            lock.release()
+        reprocessing = sum(self._is_reprocessed(archive) for archive in archives)
+        return looking == len(rigs) or looking + reprocessing >= self.request.limit
+
+    def _is_reprocessed(self, archive: Path) -> bool:
+        from flows.serve_flow import REPROCESS_LOCK
+
+        with self._errors("reprocess"):
+            release = take_lock(archive / ".locks" / REPROCESS_LOCK, wait=False)
+            if release is None:
+                return True
+            release()
+        return False
+
+    def look(self) -> list[tuple[str, datetime]]:
+        """Once over all fields; gives the runs that were asked for."""
+        full = self.busy()
+        missed: list[tuple[str, datetime]] = []
+        for one in self.request.fields:
+            schedule = self.schedules[one.name]
+            with self._errors(one.name):
+                resumed: list[datetime] = []
+                free = self._alone(one, lambda r=resumed, s=schedule: r.extend(s.reap(self._why)))  # type: ignore[misc]
+                why = None if free else f"the rig was in use by {one.lock().holder()}"
+                now = schedule.clock.now()
+                waiting = [due for due in schedule.pending(why) if now - due >= GRACE]
+                missed += [(one.name, due) for due in (*resumed, *(waiting if free else ()))]
+        asked = [(name, due) for name, due in missed if not full and self._is_to_be_asked(name, due)]
+        for name, due in asked:
+            with self._errors("Prefect"):
+                self._ask(name, due)
+        return asked
+
+    def _is_to_be_asked(self, name: str, due: datetime) -> bool:
+        now = self.schedules[name].clock.now()
+        if now - self.asked.get((name, due), EPOCH) < ASK_AGAIN:
+            return False
+        self.asked[name, due] = now
+        self.attempts[name, due] = len(self.schedules[name].state().begun.get(due, ()))
+        return True
+
+    def _ask(self, name: str, due: datetime) -> None:
+        """Have a run that crashed, or that Prefect did not start, run now."""
+        one = next(one for one in self.request.fields if one.name == name)
+        with self.client_of() as client:
+            deployment = client.read_deployment_by_name(f"survey/{name}")
+            parameters = {**self.request.parameters(one), "due": moment_words(due)}
+            client.create_flow_run_from_deployment(deployment.id, parameters=parameters)
+        self.tell(f"{name}: the run due {due:%H:%M:%S} UTC is asked for again")
+
+    def _alone(self, one: ServedField, work: Callable[[], object]) -> bool:
+        """Do it while no survey holds the field's rig; False where one does."""
+        lock: RigLock = one.lock()
+        if not lock.take("a look at the schedule"):
+            return False
+        try:
+            with self._errors(one.name):
+                work()
+        finally:
+            lock.release()
+        return True
+
+    def _why(self, line: Mapping[str, Any]) -> str | None:
+        """Why a run is not to be resumed: somebody cancelled it."""
+        known = line.get("flow_run")
+        with suppress(Exception), self.client_of() as client:
+            state = client.read_flow_run(known).state if known else None
+            if state is not None and state.type.value in ("CANCELLED", "CANCELLING"):
+                return "it was cancelled in Prefect"
+        return None
+
+    def _reap_prefect(self, one: ServedField) -> None:
+        with self.client_of() as client:
+            for name in reap_flow_runs(client, one.name, str(one.file)):
+                self.tell(f"{one.name}: the flow run {name} was told as running and is gone: crashed")
+        self._reap_reprocess(one)
+
+    def _reap_reprocess(self, one: ServedField) -> None:
+        from flows.serve_flow import REPROCESS_LOCK
+
+        release = take_lock(one.archive / ".locks" / REPROCESS_LOCK, wait=False)
+        if release is not None:
+            try:
+                with self.client_of() as client:
+                    reap_flow_runs(client, None, str(one.settings.out))
+            finally:
+                release()
+
+    def _errors(self, what: str) -> _Told:
+        return _Told(self.tell, what)
+
+
+@dataclass
+class _Told:
+    """Tells of an error and goes on: what is missed now is done at the next look."""
+
+    tell: Tell
+    what: str
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> bool:
+        if not isinstance(error, Exception):
+            return False
+        self.tell(f"{self.what}: {error}")
+        return True
+
+
+def reap_flow_runs(client: Any, field: str | None, what: str) -> list[str]:
+    """Set flow runs that Prefect believes alive to Crashed; only for whoever holds their lock. Gives their names.
+
+    Of the survey of ``field`` by the settings file ``what``, or of the reprocessing of the archive ``what``.
+    """
+    from prefect.client.schemas.filters import FlowFilter, FlowFilterName, FlowRunFilter, FlowRunFilterState
+    from prefect.client.schemas.filters import FlowRunFilterStateType as StateFilter
+    from prefect.client.schemas.objects import StateType
+    from prefect.states import Crashed
+
+    flow = FlowFilter(name=FlowFilterName(any_=["reprocess" if field is None else "survey"]))
+    alive = FlowRunFilter(state=FlowRunFilterState(type=StateFilter(any_=[StateType.RUNNING, StateType.PENDING])))
+    key = "archive" if field is None else "settings"
+    reaped: list[str] = []
+    for run in client.read_flow_runs(flow_filter=flow, flow_run_filter=alive):
+        if run.parameters.get(key) == what and run.parameters.get("field") in (field, None):
+            client.set_flow_run_state(run.id, Crashed(message="its process was gone: its lock is free"), force=True)
+            reaped.append(run.name)
+    return reaped
+
+
+def _client() -> Any:
+    from prefect.client.orchestration import get_client
+
+    return get_client(sync_client=True)
