@@ -38,6 +38,7 @@ RIG: dict[str, Parser] = {
     "connect_s": parse_number(Span(0.1, 60, "s")),
     "stall_s": parse_number(Span(0.1, 600, "s")),
     "pulses": parse_choice(("position", "frame", "none")),
+    "log_pulses": parse_switch,
     "settle_s": parse_number(Span(0.01, 60, "s")),
     "panel": parse_number(Span(1e-6, 1e6, "")),
     "white_at_rest": parse_switch,

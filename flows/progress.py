@@ -20,6 +20,7 @@ class StageProgress:
         self.console, self.titles = console, titles or {}
         self._tasks: dict[str, TaskID] = {}
         self._said: dict[str, float] = {}
+        self._now: tuple[str, float] | None = None  # the stage that runs, and how far it is
         self._bars = Progress(
             TextColumn("{task.description:<34}"), BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("left"),
             TimeRemainingColumn(), TextColumn("{task.fields[words]}"), console=console, disable=not console.is_terminal,
@@ -36,6 +37,7 @@ class StageProgress:
 
     def show(self, stage: str, done: float, words: str = "", *, ended: bool = False) -> None:
         """Say how far a stage is, 0..1, with a word or figure beside it; ``ended`` also where it failed half-way."""
+        self._now = None if ended else (stage, done)
         title = self.titles.get(stage, stage)
         if stage not in self._tasks:
             self._tasks[stage] = self._bars.add_task(title, total=1.0, words="")
@@ -45,3 +47,8 @@ class StageProgress:
         if not self.console.is_terminal and (ended or due):
             self._said[stage] = time.monotonic()
             self.console.print(f"{title}: {done:.0%} {escape(words)}".rstrip(), highlight=False, soft_wrap=True)
+
+    def say(self, words: str) -> None:
+        """Put words beside the stage that runs, as far as it is; nothing where none runs."""
+        if self._now is not None:
+            self.show(*self._now, words)

@@ -46,11 +46,12 @@ def rectifying_ahead(run: SurveyRun, source: Source, key: str) -> Iterator[Arriv
     """Make tiles of the mosaic while the block captures the coarse sweeps under ``key``; gives what is to be told.
 
     Nothing is made ahead of a simulated capture, which uses the processor itself, nor where lines lie elsewhere than
-    planned for all one knows: seams to be registered, or a mirror that no pulse steps.
+    planned for all one knows: seams to be registered, or a mirror that no pulse steps or whose log says where it was.
     """
     from pipeline.rig.capture_paths import can_trigger, planned_positions  # loads scipy, which a plan does without
 
-    steady = all(can_trigger(run.settings.rig.pulses, sweep) for sweep in run.plan.coarse)
+    rig = run.settings.rig
+    steady = not rig.log_pulses and all(can_trigger(rig.pulses, sweep) for sweep in run.plan.coarse)
     if run.rig is None or run.settings.pointing_px or not steady:
         yield lambda name, count: None
         return

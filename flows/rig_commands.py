@@ -74,7 +74,7 @@ def run_check(request: CheckRequest, console: Console, *, as_json: bool = False)
     """Check the devices, with a table on stdout; 0 where nothing failed, 3 where one of two works, 1 otherwise."""
     rig = request.rig
     asked: dict[Device, bool] = {"mirror": request.mirror, "camera": request.camera}
-    settings = rig.mirror(request.vector_pairs)
+    settings = replace(rig.mirror(request.vector_pairs), park_at_close=False)  # the square ends at 0; 0 by itself
     rows: list[CheckRow] = []
     if request.mirror:
         with console.status(f"asking the mirror at {rig.port}"):

@@ -15,7 +15,8 @@ from rich.markup import escape
 
 from flows.app import print_json
 from flows.emulated_scene import emulated_source
-from flows.settings import BUILT_IN_SCENES, Settings, load_settings
+from flows.setting_keys import BUILT_IN_SCENES
+from flows.settings import Settings, load_settings
 from pipeline.errors import SettingsError
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, ServedRig
 from pipeline.rig.emulator.fast_clock import FastClock

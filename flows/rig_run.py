@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from flows.settings import RIG_FIELD, Settings
+from flows.setting_keys import RIG_FIELD
+from flows.settings import Settings
 from pipeline.errors import SettingsError
 from pipeline.once import Once
 from pipeline.rig.camera_limits import CameraLimits, check_times
@@ -61,7 +62,7 @@ def open_devices(settings: Settings, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
     from pipeline.rig.mirror_port import open_mirror
 
     rig = settings.rig
-    mirror = open_mirror(rig.mirror(settings.cost.vector_pairs), clock)
+    mirror = open_mirror(rig.mirror(settings.cost.vector_pairs), clock, known=True)
     limits = CameraLimits(most_rate_hz=settings.camera.max_rate_hz)
     camera = HeadwallCamera.at(rig.camera, rig.files, limits=limits, clock=clock)
     devices = RigDevices(mirror, camera, clock)
@@ -83,6 +84,7 @@ def capture_source(run: CaptureRun, key: str) -> Iterator[Source]:
         yield run.source
         return
     source = run.rig.keeping(FetchedFiles(run.archive.spool_folder(key) / FETCHED))
+    run.report(0.0)  # a rig is at work long before its first line is here
     with source.session():
         yield source
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from rich.console import Console
 from rich.markup import escape
 
@@ -50,7 +52,8 @@ def _survey_and_publish(run: SurveyRun, settings: Settings, console: Console, st
             progress.show(stage, done, "" if running else state, ended=not running)
             shown(stage, state, done)
 
-        runner = StageRunner(run, watch)
+        rig = None if run.rig is None else run.rig.saying(progress.say)
+        runner = StageRunner(replace(run, rig=rig), watch)
         products = _run(runner, settings.engine, console)
     with console.status("drawing pictures and report"):
         published = publish_run(runner, products, started)

@@ -14,6 +14,7 @@ from pipeline.rig.kept_files import Kept, Progress, RemoteFile
 from pipeline.rig.refusals import DeadlinePassed, DeviceGone, DeviceRefused
 
 LOG = logging.getLogger(__name__)
+NOT_LOGGED_IN = 530  # of FTP: user or password is not taken, whatever file is asked for
 
 
 @dataclass(frozen=True)

@@ -37,12 +37,16 @@ class Taken:
 
 @dataclass(frozen=True)
 class LoggedPath:
-    """A log of measured positions that is kept beside the files, (sample, 2) big-endian float32."""
+    """A log of measured positions that is kept beside the files: (sample, 2) big-endian float32.
+
+    ``index_name`` is where the cells that were played are, (sample,) big-endian int32; empty where nobody asked.
+    """
 
     name: str
     rate_hz: float
     started_s: float
     start_error_s: float
+    index_name: str = ""
 
 
 class CaptureJournal:

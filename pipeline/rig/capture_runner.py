@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 
@@ -13,11 +13,11 @@ from pipeline.camera import LineCamera
 from pipeline.errors import RigError
 from pipeline.rig.capture_journal import CaptureJournal, LoggedPath, Taken
 from pipeline.rig.capture_names import capture_prefix
-from pipeline.rig.capture_paths import CapturePath
+from pipeline.rig.capture_paths import LEAD, CapturePath
 from pipeline.rig.clock import Clock
 from pipeline.rig.kept_files import Kept
 from pipeline.rig.line_camera import Capture, LineCameraDevice
-from pipeline.rig.line_positions import MirrorTrack
+from pipeline.rig.line_positions import MirrorTrack, line_edges
 from pipeline.rig.registers import Trigger
 from pipeline.rig.steering import MotionLog, Steering
 from pipeline.rig.survey_rig import SurveyRig
@@ -26,8 +26,15 @@ from pipeline.scan import Sweep
 LOG = logging.getLogger(__name__)
 REST = Sweep("references", "fine", "x", 0.0, 0.0, 1)
 SLACK_S = 5.0  # by which a capture may take longer than its frames
+WRITING_S = 120.0  # that a camera may go on writing what it has, once it was told to stop
 POLL_S = 0.05
-_CELL = np.dtype(">f4")
+_CELL, _INDEX = np.dtype(">f4"), np.dtype(">i4")
+
+Say = Callable[[str], None]  # what the rig is at, in a few words
+
+
+def say_nothing(words: str) -> None:
+    """Tell nobody what the rig is at."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +58,12 @@ class CaptureRunner:
     """Runs captures on devices that are connected, and takes down what they acknowledge."""
 
     def __init__(
-        self, devices: RigDevices, kept: Kept, journal: CaptureJournal, camera: LineCamera, rig: SurveyRig
-    ) -> None:
+        self, devices: RigDevices, kept: Kept, journal: CaptureJournal, camera: LineCamera, rig: SurveyRig, *,
+        say: Say = say_nothing,
+    ) -> None:  # fmt: skip
         self.devices = devices
         self._kept, self._journal = kept, journal
-        self._camera, self._rig = camera, rig
+        self._camera, self._rig, self._say = camera, rig, say
         self._configured = False
 
     def take(self, path: CapturePath) -> Taken:
@@ -70,11 +78,15 @@ class CaptureRunner:
         """
         steering, prefix = self.devices.steering, capture_prefix(path.sweep, path.first)
         self._configure()
-        steering.load_path(path.cells)
+        steering.load_path(
+            path.cells, progress=lambda done, total: self._say(f"path to the mirror: {done} of {total} cells")
+        )
         steering.goto(*(float(place) for place in path.cells[0]))
         steering.settle(self._rig.settle_s)
         with self._stopped_on_error():
             if path.triggered:
+                if self._rig.log_pulses:
+                    steering.start_log(self._log_rate_hz(path.lines), with_index=True)
                 run_s = self._run(path)
                 capture = self.devices.camera.capture(path.lines, prefix=prefix)
             else:
@@ -87,15 +99,27 @@ class CaptureRunner:
         return self._end(taken)
 
     def wait(self, taken: Taken) -> None:
-        """Wait until a capture is over; one that goes on too long is stopped, and what it has counts."""
+        """Wait until a capture is over; one that goes on too long is stopped, and what it has counts.
+
+        Raises
+        ------
+        RigError : it does not end, though it was told to. DeviceRefused, DeadlinePassed, DeviceGone
+        """
         camera, clock = self.devices.camera, self.devices.clock
-        until = clock.now() + self._seconds(taken.stop - taken.first) + SLACK_S
+        began, wanted = clock.now(), self._seconds(taken.stop - taken.first)
+        until, stopped = began + wanted + SLACK_S, False
         while camera.is_capturing():
+            self._say(f"capturing {taken.stop - taken.first} lines: {clock.now() - began:.0f} of {wanted:.0f} s")
             if clock.now() >= until:
+                if stopped:
+                    raise RigError(
+                        f"the camera still captures {taken.folder}, {WRITING_S:g} s after it was told to stop; see "
+                        "what it does, then run again: what it has is fetched then"
+                    )
                 LOG.warning("the capture %s goes on for too long and is stopped", taken.folder)
                 camera.stop()
-                return
-            clock.sleep(min(max(until - SLACK_S - clock.now(), POLL_S), 1.0))
+                until, stopped = clock.now() + WRITING_S, True
+            clock.sleep(min(max(began + wanted - clock.now(), POLL_S), 1.0))
 
     def recovered(self, taken: Taken) -> Taken:
         """Take down the end of a capture whose process did not live to see it; nothing has played since."""
@@ -122,7 +146,12 @@ class CaptureRunner:
             return None
         data = self._kept.read(taken.log.name, 0, self._kept.size(taken.log.name))
         position = np.frombuffer(data[: len(data) // 8 * 8], _CELL).reshape(-1, 2).astype(np.float64)
-        return MirrorTrack(np.arange(len(position)) / taken.log.rate_hz, position)
+        time_s = np.arange(len(position)) / taken.log.rate_hz
+        if not taken.log.index_name:
+            return MirrorTrack(time_s, position)
+        data = self._kept.read(taken.log.index_name, 0, self._kept.size(taken.log.index_name))
+        index = np.frombuffer(data[: len(data) // 4 * 4], _INDEX).astype(np.int64)
+        return MirrorTrack(time_s, position, line_edges(index, time_s[: len(index)], LEAD, taken.sweep.step))
 
     def _configure(self) -> None:
         if not self._configured:
@@ -139,7 +168,7 @@ class CaptureRunner:
         steering = self.devices.steering
         if taken.triggered:
             taken = replace(taken, index_at_end=steering.index())
-        else:
+        if self._rig.log_pulses or not taken.triggered:
             taken = replace(taken, log=self._keep_log(taken.folder, steering.read_log()))
         steering.halt()
         return self._journal.ended(taken)
@@ -147,7 +176,10 @@ class CaptureRunner:
     def _keep_log(self, folder: str, log: MotionLog) -> LoggedPath:
         name = f"{folder}/mirror_log"
         self._kept.append(name, log.position.astype(_CELL).tobytes())
-        return LoggedPath(name, log.rate_hz, log.started_s, log.start_error_s)
+        index_name = "" if log.index is None else f"{folder}/mirror_index"
+        if log.index is not None:
+            self._kept.append(index_name, log.index.astype(_INDEX).tobytes())
+        return LoggedPath(name, log.rate_hz, log.started_s, log.start_error_s, index_name)
 
     def _log_rate_hz(self, lines: int) -> float:
         """As fast as the logger goes, or so that it holds the whole capture."""

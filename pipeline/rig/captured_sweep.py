@@ -75,7 +75,11 @@ def _numbers(captured: CapturedLines, held: int, lines: int) -> NDArray[np.int64
 def _tied(
     frames: FrameTimes, path: CapturePath, taken: Taken, camera: LineCamera, track: MirrorTrack | None, *, total: int
 ) -> LinePositions:
-    """Positions by the edges that stepped the mirror, else by its log, else by the commands' times."""
+    """Positions by edges in the mirror's log, else by the edges that stepped it, by its log, by the commands' times."""
+    commands = commands_of(taken)
+    if taken.log is not None:  # then it, and not the path, was begun before the capture
+        began = (taken.log.started_s - taken.log.start_error_s, taken.log.started_s)
+        commands = CommandTimes(began, taken.capture_s)
     if taken.triggered:
         counted = None if taken.index_at_end is None else path.frames_at(taken.index_at_end)
         taken_in_all = max(total, int(frames.number.max()) + 1)
@@ -85,10 +89,11 @@ def _tied(
                 f"{taken_in_all * path.sweep.step} was expected: edges were lost, or are not one a position (see "
                 f"pulses in [rig])"
             )
+        if track is not None and track.edge_s is not None and len(track.edge_s):
+            return lines_by_log(frames, camera, track, commands=commands)
         sent = PlayedPath(path.middle.astype(np.float64), path.rate_hz)
         last = None if counted is None else int(frames.number.max())
         return lines_by_trigger(frames, camera, sent, index_at_end=last)
     if track is not None and taken.log is not None and len(track.position) > 1:
-        began = (taken.log.started_s - taken.log.start_error_s, taken.log.started_s)
-        return lines_by_log(frames, camera, track, commands=CommandTimes(began, taken.capture_s))
+        return lines_by_log(frames, camera, track, commands=commands)
     return lines_by_commands(frames, camera, path.played, commands_of(taken))

@@ -62,28 +62,6 @@ class LinePositions:
     notes: tuple[str, ...] = ()
 
 
-def tie_lines(
-    frames: FrameTimes, camera: LineCamera, path: PlayedPath, *, triggered: bool = False,
-    index_at_end: int | None = None, track: MirrorTrack | None = None, commands: CommandTimes | None = None,
-) -> LinePositions:  # fmt: skip
-    """Tie lines to positions by the best that there is: a log with edges, then a trigger, a log, and the commands.
-
-    A log measures where the mirror was, a trigger only where it was sent; that, not the clocks, decides between them.
-
-    Raises
-    ------
-    RigError : there is none of them, or that which there is contradicts itself.
-    """
-    edges = track is not None and track.edge_s is not None and len(track.edge_s) > 0
-    if track is not None and (edges or (commands is not None and not triggered)):
-        return lines_by_log(frames, camera, track, commands=commands)
-    if triggered:
-        return lines_by_trigger(frames, camera, path, index_at_end=index_at_end)
-    if commands is None:
-        raise RigError("no trigger, no log and no command times: nothing ties lines to positions; log the next run")
-    return lines_by_commands(frames, camera, path, commands)
-
-
 def lines_by_trigger(
     frames: FrameTimes, camera: LineCamera, path: PlayedPath, *, index_at_end: int | None = None
 ) -> LinePositions:
@@ -191,11 +169,17 @@ def lines_by_commands(
     )  # fmt: skip
 
 
-def index_steps(index: Ints, time_s: Floats) -> Floats:
-    """Give the times at which a logged vector index changed, half a sample before it was first seen. [s]"""
-    step = np.flatnonzero(np.diff(index) != 0) + 1
-    times: Floats = (time_s[step] + time_s[step - 1]) / 2
-    return times
+def line_edges(index: Ints, time_s: Floats, first: int, step: int) -> Floats:
+    """Give the times of lines' first edges by a log of the path's index under an external trigger. [s]
+
+    Line 0 begins with the cell ``first``, each further one ``step`` cells later; an edge was half a sample before its
+    cell, or a later one, was first seen.
+    """
+    reached = np.maximum.accumulate(index) if len(index) else index
+    cells = np.arange(first, int(reached[-1]) + 1 if len(reached) else 0, step)
+    seen = np.searchsorted(reached, cells)
+    edges: Floats = (time_s[seen] + time_s[np.maximum(seen - 1, 0)]) / 2
+    return edges
 
 
 def _by_offset(

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from pipeline.errors import RigError, ShapeError
 from pipeline.rig import simple_mode
-from pipeline.rig.pro_mode import ERROR_FLAG, Damaged, ErrorCode, Frame, FrameReader, encode, error_words
+from pipeline.rig.pro_mode import ERROR_FLAG, Command, Damaged, ErrorCode, Frame, FrameReader, encode, error_words
 from pipeline.rig.pro_payloads import cell_int
 from pipeline.rig.refusals import DeviceRefused
 from pipeline.rig.registers import Status
@@ -86,7 +86,10 @@ class ProLink:
         if found.command == sent.command | ERROR_FLAG:
             raise self._refusal(found, name)
         if found.command != sent.command:
-            LOG.warning("%s, while waiting for %s: an answer to command %02X", port, name, found.command)
+            # lines that were said to a controller in pro mode are complained about when a frame follows
+            usual = sent.command == Command.SET_MODE and found.command & ERROR_FLAG
+            level = logging.INFO if usual else logging.WARNING
+            LOG.log(level, "%s, while waiting for %s: an answer to command %02X", port, name, found.command)
             return None
         try:
             return parse(found.payload)
@@ -125,7 +128,7 @@ class SimpleLink:
         ------
         DeadlinePassed : nothing answered. RigError, DeviceRefused : something else did.
         """
-        self._do(simple_mode.START, "read")
+        self._do(simple_mode.START, "greeting")
 
     def text(self, request: str) -> str:
         """Ask for the controller's id, version or serial number.

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
 from pipeline.rig.links import ProLink, SimpleLink
-from pipeline.rig.mirror_modes import Modes, check_identity
+from pipeline.rig.mirror_modes import Modes, check_identity, check_model
 from pipeline.rig.mirror_settings import MirrorSettings
 from pipeline.rig.motion_log import Logger
 from pipeline.rig.path_player import PathPlayer, Play, hold_values, run_values
@@ -58,17 +58,22 @@ class MirrorController:
     ) -> None:
         self.close()
 
-    def connect(self) -> Identity:
+    def connect(self, *, known: bool = False) -> Identity:
         """Find the controller in whichever mode it is, and bring it to pro mode. Nothing moves.
+
+        With ``known`` only the models that the documents are of are taken, or the one that the settings expect.
 
         Raises
         ------
         DeadlinePassed, DeviceGone : nothing answers. RigError : another device does.
         """
-        self._pairs = 0
-        self._identity = self._modes.connect()
-        check_identity(self._identity, self.wire.port, self.settings.expected_id)
-        return self._identity
+        self._pairs, self._identity = 0, None
+        found = self._modes.connect()
+        check_identity(found, self.wire.port, self.settings.expected_id)
+        if known:
+            check_model(found, self.wire.port, self.settings.expected_id)
+        self._identity = found  # not before: closing parks what is connected, and another device is not moved
+        return found
 
     def identity(self) -> Identity:
         """What the controller said it is when it was connected.
@@ -80,6 +85,11 @@ class MirrorController:
         self._check_connected()
         assert self._identity is not None
         return self._identity
+
+    @property
+    def found_in_pro(self) -> bool:
+        """Whether it was in pro mode as it was connected: an earlier session, or another program, had been there."""
+        return self._modes.found_in_pro
 
     def status(self) -> Status:
         """Status bits, now."""
@@ -194,10 +204,10 @@ class MirrorController:
         self._check_connected()
         return self._player.index()
 
-    def start_log(self, rate_hz: float | None = None) -> None:
-        """Begin to log measured positions, at the rate of the settings if none is given."""
+    def start_log(self, rate_hz: float | None = None, *, with_index: bool = False) -> None:
+        """Begin to log measured positions, and the cells that are played, at the settings' rate if none is given."""
         self._check_connected()
-        self._log.start(self.settings.log_rate_hz if rate_hz is None else rate_hz)
+        self._log.start(self.settings.log_rate_hz if rate_hz is None else rate_hz, with_index=with_index)
 
     def read_log(self, samples: int | None = None) -> MotionLog:
         """End the log and fetch ``samples`` of it, or as many as the time since its start has.

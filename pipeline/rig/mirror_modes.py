@@ -14,6 +14,7 @@ from pipeline.rig.refusals import DeadlinePassed, DeviceRefused
 from pipeline.rig.steering import Identity
 
 LOG = logging.getLogger(__name__)
+KNOWN_MODELS = ("MR-E", "MRE")  # begin the ids of the controllers that the documents are of
 
 
 class Modes:
@@ -21,6 +22,7 @@ class Modes:
 
     def __init__(self, pro: ProLink) -> None:
         self.pro = pro
+        self.found_in_pro = False  # at the last connect, where an earlier session had left it
         self._lines = SimpleLink(pro.wire)
 
     def connect(self) -> Identity:
@@ -33,11 +35,13 @@ class Modes:
         DeviceGone : the port went away.
         """
         with self.pro.wire.lock:
+            self.found_in_pro = False
             try:
                 self._greet()
             except DeadlinePassed:
-                LOG.warning("%s does not answer in simple mode; it may be in pro mode", self.pro.wire.port)
+                LOG.info("%s does not answer in simple mode; it may be in pro mode", self.pro.wire.port)
                 self._leave_pro()
+                self.found_in_pro = True
             words = (simple_mode.ID, simple_mode.VERSION, simple_mode.SERIAL)
             device, version, serial = (self._text(word) for word in words)
             self._enter_pro()
@@ -69,7 +73,7 @@ class Modes:
         try:
             self._lines.start()
         except DeviceRefused as error:  # the greeting ended a line that somebody had begun
-            LOG.warning("%s; greeting it once more", error)
+            LOG.info("%s; greeting it once more", error)
             self._lines.start()
 
     def _enter_pro(self) -> None:
@@ -101,4 +105,18 @@ def check_identity(identity: Identity, port: str, expected: str) -> None:
     if expected.lower() not in identity.device.lower():
         raise RigError(
             f"expected a controller whose id holds {expected!r} on {port}, got {identity.device!r}; is this the mirror?"
+        )
+
+
+def check_model(identity: Identity, port: str, expected: str) -> None:
+    """Refuse to move what is no controller that the documents are of, unless the settings expect it by its id.
+
+    Raises
+    ------
+    RigError : another model, or another device altogether.
+    """
+    if not expected and not identity.device.upper().startswith(KNOWN_MODELS):
+        raise RigError(
+            f"firmware not known on {port}: {identity.words}; expected an id that begins with {KNOWN_MODELS[0]}: is "
+            "another device at this port? If it is the mirror, set rig.expected_id to a part of its id"
         )

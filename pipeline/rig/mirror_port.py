@@ -8,8 +8,8 @@ from pipeline.rig.mirror_settings import MirrorSettings
 from pipeline.rig.transport import SerialTransport
 
 
-def open_mirror(settings: MirrorSettings, clock: Clock = SYSTEM_CLOCK) -> MirrorController:
-    """Open the port that the settings name and connect to the controller there. Nothing moves.
+def open_mirror(settings: MirrorSettings, clock: Clock = SYSTEM_CLOCK, *, known: bool = False) -> MirrorController:
+    """Open the port that the settings name and connect to the controller there, see its connect. Nothing moves.
 
     Raises
     ------
@@ -17,7 +17,7 @@ def open_mirror(settings: MirrorSettings, clock: Clock = SYSTEM_CLOCK) -> Mirror
     """
     mirror = MirrorController(SerialTransport(settings.port, settings.baud, clock), settings, clock)
     try:
-        mirror.connect()
+        mirror.connect(known=known)
     except BaseException:
         mirror.close()
         raise

@@ -23,7 +23,11 @@ class DeviceGone(RigError):  # noqa: N818 - the name says what is the case
 
 
 class DeadlinePassed(RigError):  # noqa: N818 - the name says what is the case
-    """A device did not answer in time, and nothing can have moved."""
+    """A device did not answer in time, and nothing can have moved; ``silent`` says that not a byte came."""
+
+    def __init__(self, message: str, *, silent: bool = False) -> None:
+        super().__init__(message)
+        self.silent = silent
 
 
 class DeviceRefused(RigError):  # noqa: N818 - the name says what is the case

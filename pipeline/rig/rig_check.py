@@ -13,11 +13,11 @@ from pipeline.errors import PipelineError, RigError
 from pipeline.rig.camera_files import FileServer, log_in
 from pipeline.rig.headwall_camera import HeadwallCamera
 from pipeline.rig.mirror_controller import MirrorController
+from pipeline.rig.mirror_modes import check_model
 
 Verdict = Literal["ok", "warn", "fail"]
 Device = Literal["mirror", "camera"]
 
-KNOWN_MODELS = ("MR-E", "MRE")  # begin the ids of the controllers that the documents are of
 SQUARE = ((0.03, 0.03), (0.03, -0.03), (-0.03, -0.03), (-0.03, 0.03))  # within 0.05 of the middle
 NEAR, FAR = (
     0.002,
@@ -27,7 +27,6 @@ SETTLE_S = 2.0
 LOG_HZ, LOGGED = 1000.0, 8
 MOST_NAMED = 5  # entries of a listing, warnings
 CONNECT = "connect"
-PRO_MODE = "it may be in pro mode"  # of the warning when a controller does not answer in simple mode
 LOOK_AT_LINE = "look at cable, plugs and earth if this comes again"
 
 
@@ -94,6 +93,8 @@ def check_camera(camera: HeadwallCamera, server: FileServer) -> list[CheckRow]:
 
 def _ask_mirror(mirror: MirrorController, rows: list[CheckRow], *, move: bool) -> None:
     rows.append(_identity(mirror))
+    if mirror.found_in_pro:
+        rows.append(CheckRow("mirror", "mode", "it was in pro mode, as drivers leave it"))
     try:
         rows.append(_status(mirror))
         playing = mirror.is_playing()
@@ -111,15 +112,12 @@ def _ask_mirror(mirror: MirrorController, rows: list[CheckRow], *, move: bool) -
 
 
 def _identity(mirror: MirrorController) -> CheckRow:
-    found, expected = mirror.identity(), mirror.settings.expected_id
-    words = f"{found.device or 'no id'}, version {found.version or 'unknown'}, serial {found.serial or 'unknown'}"
-    if expected or found.device.upper().startswith(KNOWN_MODELS):
-        return CheckRow("mirror", "identity", words)
-    mend = (
-        f"expected an id that begins with {KNOWN_MODELS[0]}: is another device at this port? If it is the mirror, set "
-        "rig.expected_id to a part of its id"
-    )
-    return CheckRow("mirror", "identity", f"firmware not known: {words}", "fail", mend)
+    found = mirror.identity()
+    try:
+        check_model(found, mirror.wire.port, mirror.settings.expected_id)
+    except RigError as error:
+        return failed("mirror", "identity", error)
+    return CheckRow("mirror", "identity", found.words)
 
 
 def _status(mirror: MirrorController) -> CheckRow:
@@ -199,20 +197,11 @@ def _warnings(rows: list[CheckRow], device: Device) -> Iterator[None]:
         yield
     finally:
         logger.removeHandler(heard)
-        words = _but_for_modes(heard.words, rows) if device == "mirror" else heard.words
+        words = heard.words
         if words and rows and rows[0].asked != CONNECT:  # that row says it all
             more = f"; and {len(words) - MOST_NAMED} more" if len(words) > MOST_NAMED else ""
             came = "; ".join(one.partition("; ")[0] for one in words[:MOST_NAMED])
             rows.append(CheckRow(device, "bytes on the line", came + more, "warn", LOOK_AT_LINE))
-
-
-def _but_for_modes(words: list[str], rows: list[CheckRow]) -> list[str]:
-    """Leave out the silence of a controller that was in pro mode, which is no fault, and say that it was."""
-    found = next((place for place, one in enumerate(words) if PRO_MODE in one), None)
-    if found is None or not works(rows, "mirror"):
-        return words
-    rows.insert(1, CheckRow("mirror", "mode", "it was in pro mode, as drivers leave it"))
-    return [one for one in words[found + 1 :] if "changing to simple mode" not in one]
 
 
 class _Heard(logging.Handler):

@@ -26,13 +26,14 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera, bin_samples
 from pipeline.errors import RigError
+from pipeline.rig.camera_files import NOT_LOGGED_IN
 from pipeline.rig.camera_references import as_references
 from pipeline.rig.capture_journal import CaptureJournal, Taken
 from pipeline.rig.capture_names import REFERENCES
 from pipeline.rig.capture_paths import CapturePath, can_trigger, next_path, path_of
-from pipeline.rig.capture_runner import CaptureRunner, RigDevices
+from pipeline.rig.capture_runner import CaptureRunner, RigDevices, Say, say_nothing
 from pipeline.rig.captured_sweep import PlacedLines, UntiedError, place_lines
-from pipeline.rig.kept_files import Kept, Progress
+from pipeline.rig.kept_files import Kept
 from pipeline.rig.refusals import DeviceRefused, StateUnknown
 from pipeline.rig.survey_rig import SurveyRig
 from pipeline.scan import Sweep
@@ -63,18 +64,21 @@ class RigSource:
         Where the camera's files and the journal go. With that of an earlier process its captures are gone on with.
     vector_pairs
         Positions that the mirror's memory holds.
+    say
+        Called with what the rig is at, in a few words, while no line comes: a path goes up, lines are captured, files
+        are fetched.
     """
 
     name = "rig"
 
     def __init__(
         self, view: RigView, open_devices: Callable[[], RigDevices], kept: Kept, *, rig: SurveyRig | None = None,
-        vector_pairs: int = 1500, progress: Progress | None = None,
+        vector_pairs: int = 1500, say: Say = say_nothing,
     ) -> None:  # fmt: skip
         self.view = view
         self.rig = SurveyRig() if rig is None else rig
         self.vector_pairs = vector_pairs
-        self._open, self._kept, self._progress = open_devices, kept, progress
+        self._open, self._kept, self._say = open_devices, kept, say
         self._journal = CaptureJournal(kept)
         self._unknown: list[str] = []  # why nobody knows what the rig does; shared by all that are made from this one
         self._runner: CaptureRunner | None = None
@@ -98,14 +102,22 @@ class RigSource:
     @property
     def record(self) -> dict[str, Any]:
         """What captures with this ``kept`` were like: how lines were tied to the mirror, by which settings."""
-        told = {name: getattr(self.rig, name) for name in ("pulses", "ends", "read_back", "strict_crc", "provenance")}
+        told = {
+            name: getattr(self.rig, name)
+            for name in ("pulses", "log_pulses", "ends", "read_back", "strict_crc", "provenance")
+        }
         return {"rig": told, "references": list(self._panel_notes), "captures": self._journal.captures}
 
     def keeping(self, kept: Kept) -> RigSource:
         """Give the same source with its files elsewhere."""
-        other = RigSource(
-            self.view, self._open, kept, rig=self.rig, vector_pairs=self.vector_pairs, progress=self._progress
-        )
+        return self._like(kept, self._say)
+
+    def saying(self, say: Say) -> RigSource:
+        """Give the same source that tells somebody what the rig is at."""
+        return self._like(self._kept, say)
+
+    def _like(self, kept: Kept, say: Say) -> RigSource:
+        other = RigSource(self.view, self._open, kept, rig=self.rig, vector_pairs=self.vector_pairs, say=say)
         other._unknown = self._unknown
         return other
 
@@ -125,7 +137,7 @@ class RigSource:
             raise StateUnknown(f"nothing more is sent to the rig: {self._unknown[0]}; look at it, then run again")
         devices = self._open()
         try:
-            self._runner = CaptureRunner(devices, self._kept, self._journal, self.camera, self.rig)
+            self._runner = CaptureRunner(devices, self._kept, self._journal, self.camera, self.rig, say=self._say)
             yield self._runner
         except StateUnknown as error:
             self._unknown.append(str(error))
@@ -158,6 +170,8 @@ class RigSource:
                         yield found
                         line += 1
                 except (UntiedError, DeviceRefused) as error:
+                    if isinstance(error, DeviceRefused) and error.code == NOT_LOGGED_IN:
+                        raise  # the capture is there, and waits for another password
                     why = str(error)
                 barren = 0 if line > before else barren + 1
                 if line < taken.stop:
@@ -195,7 +209,7 @@ class RigSource:
     def _read(self, runner: CaptureRunner, taken: Taken, line: int) -> Iterator[Line]:
         """Fetch a capture and give its lines from ``line`` on."""
         try:
-            captured = runner.devices.camera.fetch(taken.folder, self._kept, self._progress)
+            captured = runner.devices.camera.fetch(taken.folder, self._kept, self._fetched)
         except RigError as error:
             if type(error) is not RigError:  # a device that is gone, or a disk that is full: nothing is wrong with it
                 raise
@@ -205,6 +219,9 @@ class RigSource:
         placed = place_lines(captured, path, taken, self.camera, runner.log_of(taken))
         self._journal.tied(taken, placed.tied, captured.notes)
         yield from self._given(captured.values, placed, path, line)
+
+    def _fetched(self, name: str, held: int, size: int) -> None:
+        self._say(f"fetching {name.rpartition('/')[2]}: {held / 1e6:.1f} of {size / 1e6:.1f} MB")
 
     def _given(self, values: NDArray[np.uint16], placed: PlacedLines, path: CapturePath, line: int) -> Iterator[Line]:
         """Lines from ``line`` on; one that the camera dropped, or that nothing places, is there and not valid."""

@@ -25,6 +25,11 @@ class Identity:
     version: str
     serial: str
 
+    @property
+    def words(self) -> str:
+        """All of it, for people."""
+        return f"{self.device or 'no id'}, version {self.version or 'unknown'}, serial {self.serial or 'unknown'}"
+
 
 @dataclass(frozen=True)
 class MotionLog:
@@ -39,6 +44,7 @@ class MotionLog:
     rate_hz: float
     started_s: float
     start_error_s: float
+    index: NDArray[np.int64] | None = None  # (sample,) cell of the path that X played, where it was asked for
 
     @property
     def time_s(self) -> NDArray[np.float64]:
@@ -78,8 +84,8 @@ class Steering(Protocol):
     def index(self) -> int:
         """Position of the loaded path that plays now."""
 
-    def start_log(self, rate_hz: float | None = None) -> None:
-        """Begin to log measured positions."""
+    def start_log(self, rate_hz: float | None = None, *, with_index: bool = False) -> None:
+        """Begin to log measured positions, and the cells that are played."""
 
     def read_log(self, samples: int | None = None) -> MotionLog:
         """End the log and fetch it."""

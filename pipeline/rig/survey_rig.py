@@ -46,6 +46,7 @@ class SurveyRig:
     connect_s: float = 3.0
     stall_s: float = 10.0
     pulses: Pulses = "position"  # at the mirror's trigger input: one a held position, one a frame, or none
+    log_pulses: bool = False  # with pulses read the mirror's log too: lines lie where it measured, tied by its edges
     settle_s: float = 2.0  # most that the mirror may take to come to rest
     panel: float = 1.0  # value of the white panel
     white_at_rest: bool = True  # the white frame was taken through the mirror at 0; 0

@@ -17,7 +17,9 @@ from pipeline.rig.transport import Transport
 LOG = logging.getLogger(__name__)
 BITS_PER_BYTE = 10  # a start bit, eight of data, a stop bit
 
-Kind = Literal["read", "write", "motion"]
+# a greeting is a read that a device in another mode does not answer, and before which others may have left bytes
+Kind = Literal["greeting", "read", "write", "motion"]
+_READS = ("greeting", "read")
 Answer = TypeVar("Answer")
 # Takes bytes as they come and gives the answer once it is whole.
 Receiver = Callable[[bytes], Answer | None]
@@ -79,9 +81,9 @@ class Wire:
         with self.lock:
             if kind == "motion":
                 self.check_known(name)
-            self._empty_line(f"before {name}")
+            self._empty_line(f"before {name}", level=logging.INFO if kind == "greeting" else logging.WARNING)
             deadline = self.clock.now() + self.patience.deadline_s
-            left = 1 + (self.patience.retries if kind == "read" else 0)
+            left = 1 + (self.patience.retries if kind in _READS else 0)
             while True:
                 silence_s = (deadline - self.clock.now()) / left
                 try:
@@ -91,9 +93,10 @@ class Wire:
                     if kind == "motion" and not refused:
                         raise self._freeze(name, error) from error
                     left -= 1
-                    if kind != "read" or left == 0 or not _may_ask_again(error):
+                    if kind not in _READS or left == 0 or not _may_ask_again(error):
                         raise
-                    LOG.warning("%s; asking again", error)
+                    usual = kind == "greeting" and isinstance(error, DeadlinePassed) and error.silent
+                    LOG.log(logging.INFO if usual else logging.WARNING, "%s; asking again", error)
                     self._empty_line("before asking again", deadline)
                     if self.clock.now() >= deadline:
                         raise
@@ -104,9 +107,9 @@ class Wire:
     def acknowledge_state(self, reason: str) -> None:
         """Allow motions again: a person has looked at the mirror, and ``reason`` says what was found."""
         with self.lock:
+            self._empty_line("after the state was acknowledged")
             if self.unknown:
                 LOG.warning("motions of %s are allowed again: %s (frozen since: %s)", self.port, reason, self.unknown)
-            self._empty_line("after the state was acknowledged")
             self.unknown = ""
 
     def _freeze(self, name: str, error: RigError) -> StateUnknown:
@@ -135,17 +138,18 @@ class Wire:
                 return answer
         raise DeadlinePassed(
             f"no answer to {name} from {self.port} within {self.clock.now() - began:.3g} s ({_said(came)}); is the "
-            f"controller on, its cable in, and the port's speed right?"
+            f"controller on, its cable in, and the port's speed right?",
+            silent=not came,
         )
 
     def _given(self, receiver: Receiver[Answer], part: bytes) -> Answer | None:
         try:
             return receiver(part)
-        except RigError:  # an answer all the same
+        except DeviceRefused:  # an answer all the same; of what is none, the answer may still come
             self._owed -= 1
             raise
 
-    def _empty_line(self, when: str, latest: float = math.inf) -> None:
+    def _empty_line(self, when: str, latest: float = math.inf, *, level: int = logging.WARNING) -> None:
         """Drop what is on the line. Where an answer is still owed, wait for silence: it would pass for the next one."""
         stale = self.transport.drain()
         now = self.clock.now()
@@ -157,7 +161,7 @@ class Wire:
         self._owed = 0
         if stale:
             self.bytes_received += len(stale)
-            LOG.warning("%s: dropped %d stale bytes %s: %s", self.port, len(stale), when, stale[:64].hex(" "))
+            LOG.log(level, "%s: dropped %d stale bytes %s: %s", self.port, len(stale), when, stale[:64].hex(" "))
 
     def check_known(self, name: str) -> None:
         """Refuse a motion where the state is unknown.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 
+import pytest
 from rich.console import Console
 
 from flows.progress import StageProgress
@@ -33,3 +34,28 @@ def test_words_on_a_bar_are_not_markup() -> None:
     with StageProgress(Console(file=out, force_terminal=True, width=160, color_system=None)) as progress:
         progress.show("looking", 0.5, "[red]field[/]")
     assert "[red]field[/]" in out.getvalue()
+
+
+def test_words_go_beside_the_stage_that_runs() -> None:
+    """What is said while nothing counts stands beside the stage that runs, and nowhere once that has ended."""
+    out = io.StringIO()
+    with StageProgress(Console(file=out, force_terminal=True, width=160, color_system=None)) as progress:
+        progress.say("before any stage")
+        progress.show("looking", 0.25)
+        progress.say("fetching 3 of 55 MB")
+        progress.show("looking", 1.0, "ran", ended=True)
+        progress.say("afterwards")
+    assert "before any stage" not in out.getvalue()
+    assert "afterwards" not in out.getvalue()
+    assert "looking" in out.getvalue()
+    assert "ran" in out.getvalue()
+
+
+def test_a_log_says_what_a_long_stage_is_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there is no terminal the words come with the line that is due."""
+    out = io.StringIO()
+    monkeypatch.setattr("flows.progress.LINE_EVERY_S", -1.0)
+    with StageProgress(Console(file=out), {"capture": "coarse sweep"}) as progress:
+        progress.show("capture", 0.0)
+        progress.say("fetching 3 of 55 MB")
+    assert out.getvalue().splitlines()[-1] == "coarse sweep: 0% fetching 3 of 55 MB"

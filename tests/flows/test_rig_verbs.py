@@ -78,12 +78,21 @@ def test_settings_file_says_where_both_are(command_line: CommandLine, tmp_path: 
         assert not still(rig)
 
 
+def test_nothing_moves_where_surveys_park(command_line: CommandLine, tmp_path: Path) -> None:
+    """Settings with which a survey parks the mirror at its end are none for a check."""
+    with served() as rig:
+        file = tmp_path / "field.toml"
+        file.write_text(f'[rig]\nport = "{rig.port}"\npark_at_close = true\n')
+        assert command_line("rig", "check", file, "--camera", camera_of(rig)).code == 0
+        assert still(rig)
+
+
 @pytest.mark.parametrize(
     ("fault", "came", "mend"),
     [
         ("modem", "/dev/", ""),
         ("echo", "/dev/", ""),
-        ("wrong-firmware", "firmware not known: LENS-DRIVER-4, version 0.0.1", "rig.expected_id"),
+        ("wrong-firmware", "LENS-DRIVER-4, version 0.0.1", "rig.expected_id"),
         ("mirror-warm", "the mirror is too warm", "motions are refused"),
     ],
 )

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import json
+import re
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,8 +15,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import serial
 from rich.console import Console
 
+import flows.progress
 import flows.rig_run
 from flows.effect_choice import chosen_effects
 from flows.publish import Published
@@ -22,16 +27,25 @@ from flows.settings import Settings, load_settings
 from flows.survey_command import run_survey
 from flows.survey_scene import open_scene
 from pipeline.errors import SettingsError
+from pipeline.rig.camera_references import mean_frame
+from pipeline.rig.capture_names import REFERENCES
 from pipeline.rig.capture_runner import RigDevices
 from pipeline.rig.clock import SYSTEM_CLOCK, ManualClock
 from pipeline.rig.emulator.camera_faults import CameraFault
 from pipeline.rig.emulator.emulated_rig import EmulatedRig
 from pipeline.rig.emulator.fast_clock import FastClock
+from pipeline.rig.emulator.faults import make_fault
+from pipeline.rig.emulator.scene_camera import REFERENCE_FRAMES
+from pipeline.rig.emulator.scene_view import SceneView
 from pipeline.rig.mirror_controller import MirrorController
+from pipeline.rig.pro_mode import Command
 from pipeline.rig.refusals import DeviceGone
 from pipeline.rig.transport import SerialTransport
+from pipeline.scan import Sweep
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.simulated import SimulatedSource
+from pipeline.source import References
 from storage.archive import Archive
 from storage.class_maps import load_class_map
 from storage.cubes import open_raw_cube
@@ -57,7 +71,8 @@ def emulated(
 ) -> Iterator[EmulatedRig]:
     """Devices of surveys are emulated ones before a scene, the settings' by default, with effects."""
     seen = open_scene(settings)[0] if scene is None else scene
-    whole = EmulatedRig(replace(make_source(seen, settings), chosen=effects), ManualClock(10.0))
+    source = replace(make_source(seen, settings), chosen=effects)
+    whole = EmulatedRig(source, ManualClock(10.0), wired=settings.rig.pulses)
     with whole.in_process() as line:
 
         def open_devices(told: Settings, *_: object) -> RigDevices:
@@ -92,6 +107,106 @@ def test_class_map_is_that_of_the_simulated_source(tmp_path: Path, monkeypatch: 
         captures = [said for said in rig.camera.commands if "capture(" in said]
     assert sum("fine-" in said for said in captures) > 0
     np.testing.assert_array_equal(class_map_of(published, tmp_path / "rig"), class_map_of(simulated, tmp_path / "sim"))
+
+
+def rows_of(archive: Path, published: Published) -> dict[str, Any]:
+    """Numbers of all lines of a survey, by stage and sweep."""
+    found = {}
+    for name, folder in published.receipt["products"].items():
+        for path in sorted((archive / folder).glob("*.zarr")) if name.startswith("raw_") else ():
+            cube = open_raw_cube(path)
+            assert cube.valid_line.all()
+            found[f"{name} {path.stem}"] = cube.read(0, cube.sweep.lines)
+    return found
+
+
+def references_of_frames(patch: pytest.MonkeyPatch) -> None:
+    """Have the simulated source refer to the means of whole-numbered frames, as a camera's references are."""
+    exact = SimulatedSource.references
+
+    def references(source: SimulatedSource, sweep: Sweep) -> References:
+        if sweep.name == REFERENCES:  # what the frames are made of
+            return exact(source, sweep)
+        frames = SceneView(source).references((source.camera.exposure_ms, source.camera.frame_ms), REFERENCE_FRAMES)
+        dark, white = (
+            mean_frame(frames[name]).mean.reshape(-1, sweep.binning, len(source.wavelength_nm)).sum(axis=1)
+            for name in ("darkReference", "whiteReference")
+        )
+        return replace(exact(source, sweep), dark=dark, white=white)
+
+    patch.setattr(SimulatedSource, "references", references)
+
+
+TWO_ROUNDS: dict[str, Any] = {"rounds": 2, "budget": 0.9, "cost.reload_s": 0.1}  # what a scene so small has lines for
+
+
+@pytest.mark.parametrize(
+    ("changed", "engine", "captures"), [(TWO_ROUNDS, "plain", 3), ({}, "prefect", 2)], ids=["two rounds", "Prefect"]
+)
+def test_every_line_is_the_simulated_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: dict[str, Any], engine: str, captures: int
+) -> None:
+    """Going back twice, and by Prefect: the rig gives each line of the simulated survey, and the map is the same."""
+    with pytest.MonkeyPatch.context() as patch:
+        references_of_frames(patch)
+        simulated = run_survey(small_settings(tmp_path / "sim", **changed), QUIET)
+    effects = chosen_effects(next(ref for ref in Archive.open(tmp_path / "sim").refs("effects")))
+    settings = small_settings(tmp_path / "rig", source="rig", visit="first", engine=engine, **changed)
+    with emulated(settings, effects, monkeypatch):
+        published = run_survey(settings, QUIET)
+    expected = rows_of(tmp_path / "sim", simulated)
+    found = rows_of(tmp_path / "rig", published)
+    assert list(found) == list(expected)
+    assert len({name.split()[0] for name in found}) == captures
+    for name, rows in expected.items():
+        np.testing.assert_array_equal(found[name], rows, err_msg=name)
+    np.testing.assert_array_equal(class_map_of(published, tmp_path / "rig"), class_map_of(simulated, tmp_path / "sim"))
+
+
+def test_pulses_of_frames_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """One pulse a frame, as cameras give: fine lines are stepped by it, coarse ones lie where the mirror's log says."""
+    settings = small_settings(tmp_path, source="rig", visit="first", **{"rig.pulses": "frame", "effects": "none"})
+    with emulated(settings, {}, monkeypatch):
+        published = run_survey(settings, QUIET)
+    told = {
+        name: json.loads((tmp_path / published.receipt["products"][name] / "rig.json").read_text())["captures"]
+        for name in ("raw_coarse", "raw_fine")
+    }
+    assert {one["method"] for one in told["raw_coarse"]} == {"log"}
+    assert {one["method"] for one in told["raw_fine"]} == {"trigger"}
+    assert max(one["residual_px"] for one in told["raw_coarse"]) < 16  # a coarse line
+    truth = run_survey(small_settings(tmp_path / "sim", effects="none"), QUIET)
+    alike = class_map_of(published, tmp_path) == class_map_of(truth, tmp_path / "sim")
+    assert alike.mean() > 0.9
+    assert {finding.kind for finding in Archive.open(tmp_path).verify_all()} == {"whole"}
+
+
+def test_log_beside_pulses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Every capture is tied by the edges in the mirror's log: lines are the planned ones, where it measured them."""
+    told = {"rig.log_pulses": True, "rig.log_samples": 16000, "effects": "none"}
+    settings = small_settings(tmp_path, source="rig", visit="first", **told)
+    with emulated(settings, {}, monkeypatch):
+        published = run_survey(settings, QUIET)
+    record = json.loads((tmp_path / published.receipt["products"]["raw_coarse"] / "rig.json").read_text())
+    assert record["rig"]["log_pulses"]
+    assert [one["method"] for one in record["captures"]] == ["log"]
+    assert all(one["drift_ppm"] is not None and one["residual_px"] < 2 for one in record["captures"])
+    assert {finding.kind for finding in Archive.open(tmp_path).verify_all()} == {"whole"}
+
+
+def test_what_the_rig_is_at_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Long before the first line: the path goes up, lines are captured, files are fetched, each with how far it is."""
+    out = io.StringIO()
+    monkeypatch.setattr(flows.progress, "LINE_EVERY_S", -1.0)  # every word, as bars on a terminal show them
+    settings = small_settings(tmp_path, source="rig", visit="first", budget=0.5)
+    with emulated(settings, {}, monkeypatch):
+        run_survey(settings, Console(file=out, width=200))
+    told = [line.removeprefix("coarse sweep: 0% ") for line in out.getvalue().splitlines() if "sweep: 0% " in line]
+    kinds = [re.sub(r"\d[\d.]*", "N", words) for words in told]
+    wanted = ["path to the mirror: N of N cells", "capturing N lines: N of N s", "fetching raw_N: N of N MB"]
+    coarse = kinds[kinds.index(wanted[0]) :]  # behind the references
+    assert [kind for kind in dict.fromkeys(coarse) if kind in wanted] == wanted
+    assert any(re.fullmatch(r"fetching raw_0: (\d+\.\d) of \1 MB", words) for words in told)
 
 
 def test_visits_are_captured_and_broken_ones_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -151,6 +266,9 @@ def test_survey_over_a_pty_and_sockets_gives_the_same_lines(tmp_path: Path):
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {
     "exposure in seconds": ({"camera.exposure_ms": 0.1}, r"exposure.ms must be a number from 0.5 .*seconds"),
+    "exposure in microseconds": ({"camera.exposure_ms": 100_000}, r"exposure.ms must be a number .*got 100000"),
+    "exposure in another unit": ({"camera.exposure_s": 0.1}, r"unknown setting .*exposure.s.*'camera.exposure_ms'"),
+    "a map without a pose": ({"source": "rig", "map.resolution_m": 0.5}, r"where the rig stands: give .pose."),
     "unknown key": ({"rig.prot": "/dev/ttyUSB0"}, r"unknown setting .*prot.*did you mean 'rig.port'"),
     "unknown word": ({"rig.pulses": "some"}, r"pulses must be one of position, frame, none; got 'some'"),
     "port number": ({"rig.control_port": 0}, r"control.port must be a whole number from 1 to 65535, got 0"),
@@ -185,7 +303,7 @@ def free_port() -> int:
 
 def told_on_the_command_line(command_line: CommandLine, tmp_path: Path, **rig: Any) -> str:
     """The one error of a survey with such a rig, which ends with 1 and leaves no run."""
-    table = "".join(f"{name} = {value!r}\n" for name, value in rig.items())
+    table = "".join(f"{name} = {json.dumps(value)}\n" for name, value in rig.items())
     plain = {name: value for name, value in SMALL.items() if "." not in name}
     rest = "".join(f"{name} = {value!r}\n".replace("False", "false") for name, value in plain.items())
     (tmp_path / "rig.toml").write_text(f'source = "rig"\n{rest}[rig]\n{table}')
@@ -200,6 +318,45 @@ def test_no_such_port(command_line: CommandLine, tmp_path: Path):
     """A port that is not there."""
     error = told_on_the_command_line(command_line, tmp_path, port="/dev/ttyNONE")
     assert "/dev/ttyNONE" in error
+
+
+def test_what_is_no_serial_port(command_line: CommandLine, tmp_path: Path):
+    """A name that opens and is none."""
+    error = told_on_the_command_line(command_line, tmp_path, port="/dev/null")
+    assert "/dev/null cannot be opened" in error
+    assert "is it a serial port" in error
+
+
+def test_port_without_permission(command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """What the system refuses to this user says which group is let in."""
+
+    def refused(*_: Any, **__: Any) -> Any:
+        raise serial.SerialException(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(serial, "serial_for_url", refused)
+    assert "no permission for /dev/ttyACM7; add this user to" in told_on_the_command_line(
+        command_line, tmp_path, port="/dev/ttyACM7"
+    )
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("wrong-firmware", "firmware not known on /dev/"), ("modem", "is this the mirror controller?"),
+        ("echo", "is this the mirror controller?"), ("mute", "no answer to"),
+    ],
+)  # fmt: skip
+def test_another_device_is_not_moved(command_line: CommandLine, tmp_path: Path, fault: str, words: str):
+    """What answers as no mirror controller does, or as none that is known, is told nothing but who it should say."""
+    settings = small_settings(tmp_path)
+    scene, _ = open_scene(settings)
+    rig = EmulatedRig(make_source(scene, settings), FastClock(20), mirror_faults=[make_fault(fault, at=0)])
+    with rig.serve() as served:
+        told = {"port": served.port, "host": served.host, "control_port": served.camera_port, "park_at_close": True}
+        assert words in told_on_the_command_line(command_line, tmp_path, **told)
+    asked = {act.request.command for act in rig.mirror.acts}
+    assert not asked & {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
+    assert not any("=" in act.request.line for act in rig.mirror.acts)
 
 
 def test_port_in_use_and_camera_unreachable(command_line: CommandLine, tmp_path: Path):

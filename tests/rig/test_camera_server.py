@@ -221,3 +221,14 @@ def test_silence_on_a_real_socket() -> None:
         assert not driver.is_capturing()
         driver.close()
     assert device.commands[:2] == ["isCapturing", "isCapturing"]
+
+
+def test_closing_does_not_wait_for_what_is_late() -> None:
+    """A reply that a fault holds back for a minute holds back nobody who closes the camera."""
+    device = CameraDevice(scene_lines(), SYSTEM_CLOCK, faults=CameraFaults.of({CameraFault.LATE: 1}))
+    with CameraServer(device) as served, socket.create_connection((served.host, served.port), timeout=5) as client:
+        client.sendall(b"isCapturing\r")
+        while not device.commands:
+            SYSTEM_CLOCK.sleep(0.01)
+        served.close()
+        assert not any(thread.is_alive() for thread in served._threads)

@@ -15,11 +15,10 @@ from pipeline.rig.line_positions import (
     LinePositions,
     MirrorTrack,
     PlayedPath,
-    index_steps,
+    line_edges,
     lines_by_commands,
     lines_by_log,
     lines_by_trigger,
-    tie_lines,
 )
 
 CAMERA = LineCamera(exposure_ms=8.0)
@@ -219,24 +218,15 @@ def test_without_stamps() -> None:
     assert "no line has a time stamp: frames are taken to follow their period" in found.notes
 
 
-def test_choice() -> None:
-    """A log with edges is taken before a trigger, that before a log without, and the commands last."""
-    path = PlayedPath(sweep(np.arange(6000) / 1000), 1000.0)
-    bare = track(with_edges=False)
-    assert tie_lines(frames(), CAMERA, path, triggered=True, track=track(), commands=COMMANDS).method == "log"
-    assert tie_lines(frames(), CAMERA, path, triggered=True, track=bare, commands=COMMANDS).method == "trigger"
-    assert tie_lines(frames(), CAMERA, path, track=bare, commands=COMMANDS).method == "log"
-    assert tie_lines(frames(), CAMERA, path, commands=COMMANDS).method == "command"
-    with pytest.raises(RigError, match="nothing ties lines to positions"):
-        tie_lines(frames(), CAMERA, path)
-
-
 def test_tracks_that_do_not_fit() -> None:
     """Times and positions of two lengths are refused."""
     with pytest.raises(ShapeError, match="expected logged times"):
         lines_by_log(frames(), CAMERA, replace(track(), time_s=np.arange(3.0)))
 
 
-def test_index_steps() -> None:
-    """An index that changes between two samples changed half way between them."""
-    assert index_steps(np.array([0, 0, 1, 1, 0]), np.arange(5.0)).tolist() == [1.5, 3.5]
+def test_line_edges() -> None:
+    """An edge is half a sample before its cell was seen, or a later one where two came between samples."""
+    index = np.array([0, 0, 1, 2, 4, 5, 5])
+    assert line_edges(index, np.arange(7.0), 1, 1).tolist() == [1.5, 2.5, 3.5, 3.5, 4.5]
+    assert line_edges(index, np.arange(7.0), 1, 2).tolist() == [1.5, 3.5, 4.5]
+    assert line_edges(np.zeros(3, np.int64), np.arange(3.0), 1, 2).tolist() == []

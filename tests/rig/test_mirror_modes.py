@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import pytest
 
 from pipeline.errors import RigError
@@ -19,6 +21,28 @@ def test_a_controller_in_pro_mode_is_brought_to_simple_mode_first(complaint: byt
     leave = (LEAVE[0], [complaint, LEAVE[1]])
     with scripted([SILENT, SILENT, SILENT, leave, GREET, *WHO, ENTER, WELL]) as transport:
         assert connected(transport).identity().device == "MR-E-2"
+
+
+def test_a_usual_reconnect_warns_of_nothing(caplog: pytest.LogCaptureFixture):
+    """In pro mode as drivers leave it, with bytes of another program before: noted, no cause to look."""
+    leave = (LEAVE[0], [DAMAGED, LEAVE[1]])
+    with (
+        caplog.at_level(logging.INFO),
+        scripted([SILENT, SILENT, SILENT, leave, GREET, *WHO, ENTER, WELL]) as transport,
+    ):
+        assert connected(transport).found_in_pro
+    with caplog.at_level(logging.INFO), scripted(CONNECT, stale=b"NO", drained=b"NO") as transport:
+        assert not connected(transport).found_in_pro
+    assert "it may be in pro mode" in caplog.text
+    assert "dropped 2 stale bytes" in caplog.text
+    assert {record.levelno for record in caplog.records} == {logging.INFO}
+
+
+def test_damage_at_a_reconnect_is_warned_of(caplog: pytest.LogCaptureFixture):
+    """Half of an answer to the greeting is nothing that another mode explains."""
+    with caplog.at_level(logging.INFO), scripted([(b"START\r\n", b"O"), *CONNECT]) as transport:
+        connected(transport)
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
 
 
 def test_a_line_that_somebody_began_is_ended_by_the_greeting():

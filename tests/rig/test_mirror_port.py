@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
+from pipeline.errors import RigError
 from pipeline.rig import mirror_port
 from pipeline.rig.mirror_port import open_mirror
 from pipeline.rig.mirror_settings import MirrorSettings
@@ -41,6 +44,15 @@ def test_a_port_without_a_controller_is_let_go_of(monkeypatch: pytest.MonkeyPatc
         give(monkeypatch, transport)
         with pytest.raises(DeadlinePassed):
             open_mirror(SETTINGS, transport.clock)
+        assert transport.closed
+
+
+def test_another_device_is_not_parked(monkeypatch: pytest.MonkeyPatch):
+    """Whoever parks at the end parks the mirror that was asked for: another controller is let go of as it was."""
+    with scripted(CONNECT) as transport:
+        give(monkeypatch, transport)
+        with pytest.raises(RigError, match="expected a controller whose id holds 'MR-9'"):
+            open_mirror(replace(SETTINGS, expected_id="MR-9", park_at_close=True), transport.clock)
         assert transport.closed
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.refusals import DeviceRefused
-from tests.rig.mirror_bytes import CONNECT, SET_LOG, START_LOG, STOP_LOG, connected, pair
+from tests.rig.mirror_bytes import CONNECT, DONE, SET_LOG, START_LOG, STOP_LOG, connected, pair
 from tests.rig.scripted import Late, Pair, scripted
 
 START: list[Pair] = [STOP_LOG, SET_LOG, START_LOG]
@@ -27,6 +27,20 @@ def test_a_log_is_started_stopped_and_fetched():
     np.testing.assert_array_equal(log.position, np.array([[0.5, -0.25], [1, 0], [0, -0.25]], np.float32))
     np.testing.assert_allclose(log.time_s, [0, 0.001, 0.002])
     assert (log.started_s, log.start_error_s) == (pytest.approx(0.002), pytest.approx(0.002))
+
+
+def test_cells_that_are_played_are_logged_beside_positions():
+    """The index of X's vector unit in slot 2, read as whole numbers."""
+    slots = "24 00 24 01 24 02 24 11 00 00 23 02 00 00 23 03 00 00 68 0A 44 7A 00 00"
+    set_three = pair(f"7E 00 12 1A 00 04 {slots} 60 DF 7E", DONE)
+    index = pair("7E 00 15 05 24 02 00 00 0C 35 2E 7E", "7E 00 15 0C 00 00 00 00 00 00 00 01 00 00 00 07 79 1B 7E")
+    with scripted([*CONNECT, STOP_LOG, set_three, START_LOG, STOP_LOG, X3, Y3, index]) as transport:
+        mirror = connected(transport)
+        mirror.start_log(1000.0, with_index=True)
+        log = mirror.read_log(3)
+    assert log.index is not None
+    assert log.index.tolist() == [0, 1, 7]
+    assert log.position.tolist() == [[0.5, -0.25], [1, 0], [0, -0.25]]
 
 
 @pytest.mark.parametrize("samples", [3, 5000])

@@ -100,6 +100,25 @@ def test_one_pulse_a_frame_steps_fine_sweeps_only():
         assert [told["method"] for told in source.record["captures"]] == ["trigger", "log"]
 
 
+@pytest.mark.parametrize(("sweep", "pulses"), [(FINE, "frame"), (FINE, "position"), (COARSE, "position")])
+def test_edges_in_the_log_tie_lines_to_where_the_mirror_was(sweep: Sweep, pulses: str):
+    """With pulses and the log, positions are measured ones at mid exposure, by a fit of both clocks to the edges."""
+    with small_rig(pulses=pulses, log_pulses=True, log_samples=16000) as rig:
+        source = rig.source()
+        found = list(source.lines(sweep))
+        middle_s = [capture.middle_s(np.arange(sweep.lines)) for capture in rig.emulated.camera.captures]
+        true = rig.emulated.mirror.positions(middle_s[0])
+    expected = list(small_source().lines(sweep))
+    np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
+    assert all(line.valid for line in found)
+    off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - true
+    assert np.hypot(*off.T).max() * 11275 < 0.2  # px
+    (told,) = source.record["captures"]
+    assert told["method"] == "log"
+    assert abs(told["drift_ppm"]) < 1000
+    assert told["residual_us"] < 2000
+
+
 def test_devices_are_let_go_of_whatever_ends_a_look():
     """A consumer that stops early, or an error, leaves no device held; a session holds them over several calls."""
     with small_rig() as rig:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -147,6 +147,56 @@ def test_capture_that_the_camera_lost_is_taken_again():
         rig.emulated.camera.captures[-1].folder = "/captured/elsewhere"
         assert_same(list(rig.source(kept).lines(FINE, first=1)), 1)
         assert len(rig.captures) == 2
+
+
+@dataclass
+class SlowEye:
+    """Has the camera look at frames only once a clock stands later than that."""
+
+    rig: SmallRig
+    after_s: float
+
+    def __post_init__(self) -> None:
+        camera = self.rig.emulated.camera
+        camera.aside, command = True, camera.command
+
+        def later(line: str) -> object:
+            while self.rig.line.clock.now() > self.after_s and camera.look_on():
+                pass
+            return command(line)
+
+        camera.command = later  # type: ignore[method-assign, assignment]
+
+
+def test_camera_that_writes_for_long_is_waited_for():
+    """Frames that are still being written after the capture's time are not given up and taken again."""
+    with small_rig() as rig:
+        SlowEye(rig, rig.line.clock.now() + 60)
+        assert_same(list(rig.source().lines(FINE)))
+        assert len(rig.captures) == 1
+
+
+def test_camera_that_never_ends_is_told_and_gone_on_with():
+    """Two minutes after it was told to stop that is an error; what it has by the next time is fetched then."""
+    with small_rig() as rig:
+        kept, eye = KeptInMemory(), SlowEye(rig, np.inf)
+        with pytest.raises(RigError, match=r"still captures /captured/fine-3\S+, 120 s after it was told to stop"):
+            list(rig.source(kept).lines(FINE))
+        eye.after_s = 0.0
+        assert_same(list(rig.source(kept).lines(FINE)))
+        assert len(rig.captures) == 1
+
+
+def test_wrong_password_costs_no_capture():
+    """Files that are not given to this user stay where they are: with another password the capture is used."""
+    with small_rig() as rig:
+        kept, right = KeptInMemory(), type(rig.line).files
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(type(rig.line), "files", property(lambda line: replace(right.fget(line), password="x")))
+            with pytest.raises(DeviceRefused, match="look at user and password"):
+                list(rig.source(kept).lines(FINE))
+        assert_same(list(rig.source(kept).lines(FINE)))
+        assert len(rig.captures) == 1
 
 
 def test_full_camera_ends_the_sweep_at_once():

@@ -76,6 +76,13 @@ def test_nonsense_is_asked_again():
         ask(make(transport))
 
 
+def test_answer_behind_nonsense_is_not_the_next_ones():
+    """What is no answer leaves one owed: it is waited for, and not taken for the answer to what is asked then."""
+    behind = [b"bad\n", Late(0.05, b"a\n")]
+    with scripted([(b"q\n", behind), (b"q\n", b"b\n")]) as transport:
+        assert ask(make(transport)) == b"b\n"
+
+
 def test_writes_are_sent_once():
     """A write without an answer is not sent again, and freezes nothing."""
     with scripted([(b"w\n", b"")]) as transport:

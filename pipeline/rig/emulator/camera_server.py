@@ -93,7 +93,7 @@ class CameraServer:
             chunks, goes_on = self.device.greet(), True
             while goes_on and not self._ended.is_set():
                 for chunk in chunks:
-                    self.device.clock.sleep(chunk.delay_s)
+                    self._wait(chunk.delay_s)
                     connection.sendall(chunk.data)
                 chunks = []
                 with suppress(TimeoutError):
@@ -103,6 +103,13 @@ class CameraServer:
                     chunks, goes_on = talk.feed(data)
             for chunk in chunks:
                 connection.sendall(chunk.data)
+
+    def _wait(self, seconds: float) -> None:
+        """Let the device's time pass, unless the server closes."""
+        clock = self.device.clock
+        until = clock.now() + seconds
+        while not self._ended.is_set() and (left := until - clock.now()) > 0:
+            clock.sleep(min(left, _SLICE_S * getattr(clock, "speed", 1.0)))
 
     def _serve_files(self) -> None:
         while not self._ended.is_set():

@@ -1,0 +1,68 @@
+"""The mirror's whole vector memory through a real pty whose bytes are paced: wall time over the bytes' own.
+
+2 x 1500 positions by the driver at two speeds, with each way of reading back. The time on the wire is that of the bytes
+really sent and received, at 10 bits each, one after the other: a request waits for the reply before it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from measure import Row
+
+from pipeline.rig.clock import SYSTEM_CLOCK
+from pipeline.rig.emulator.mirror_device import MirrorDevice
+from pipeline.rig.emulator.pty_port import EmulatedPort
+from pipeline.rig.mirror_port import open_mirror
+from pipeline.rig.mirror_settings import MirrorSettings
+from pipeline.rig.steering import ReadBack
+
+PAIRS = 1500
+BAUDS = (115200, 256000)
+READ_BACKS: tuple[ReadBack, ...] = ("none", "sampled", "all")
+GOAL = 1.2
+ROUNDS = 3
+
+
+def rows() -> Sequence[Row]:
+    """Time uploads, the least of three each."""
+    return [_row(baud, read_back) for baud in BAUDS for read_back in READ_BACKS]
+
+
+def _row(baud: int, read_back: ReadBack) -> Row:
+    taken = [_upload(baud, read_back) for _ in range(ROUNDS)]
+    wall_s, wire_s, cpu_s, told = min(taken)
+    ratio = wall_s / wire_s
+    return Row(
+        f"upload of 2 x {PAIRS} positions at {baud} baud, read back: {read_back}",
+        f"{ratio:.3f}x the wire time",
+        f"<= {GOAL}x" if read_back == "none" else "",
+        ratio <= GOAL if read_back == "none" else None,
+        f"{wall_s:.2f} s for {wire_s:.2f} s of bytes; {cpu_s:.2f} s of processor, the emulator's included; progress "
+        f"told {told} times",
+    )
+
+
+def _upload(baud: int, read_back: ReadBack) -> tuple[float, float, float, int]:
+    """Wall time, time on the wire, processor time [s] of one upload, and how often its progress was told."""
+    turn = np.linspace(0, 2 * np.pi, PAIRS)
+    positions = 0.9 * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    told: list[tuple[int, int]] = []
+    device = MirrorDevice(SYSTEM_CLOCK)
+    with (
+        EmulatedPort(device, baud=baud) as port,
+        open_mirror(MirrorSettings(port=port.path, baud=baud, vector_pairs=PAIRS)) as mirror,
+    ):
+        mirror.is_playing()  # as the upload asks first: everything is loaded
+        before_s, began_s, began_cpu_s = mirror.wire.wire_seconds, time.perf_counter(), time.process_time()
+        mirror.load_path(positions, read_back, lambda done, total: told.append((done, total)))
+        wall_s, cpu_s = time.perf_counter() - began_s, time.process_time() - began_cpu_s
+        wire_s = mirror.wire.wire_seconds - before_s
+    if not np.array_equal(device.state.memory, positions.T.ravel().astype(np.float32)):
+        raise AssertionError("the memory holds something else")
+    if told[-1][0] != told[-1][1] or any(one[0] >= other[0] for one, other in pairwise(told)):
+        raise AssertionError("the progress does not go on to its end")
+    return wall_s, wire_s, cpu_s, len(told)
