@@ -176,6 +176,17 @@ def test_old_captures_make_room() -> None:
         assert "/captured/000000" in rig.camera.folders()
 
 
+def test_references_outlast_the_captures_after_them() -> None:
+    """They are asked for again with every sweep of a survey, however many captures that takes."""
+    with connected(kept=2) as (pair, rig):
+        folder = pair.camera.capture(1, prefix=REFERENCES).folder
+        pair.camera.wait(MOST_S)
+        for _ in range(4):
+            pair.camera.capture(1)
+            pair.camera.wait(MOST_S)
+        assert set(pair.camera.references(folder, KeptInMemory())) == {"dark", "white"}
+
+
 def test_frames_that_wait_to_be_looked_at_keep_the_camera_busy() -> None:
     """Behind ports a thread looks; until it has, the capture is not over and its files are not whole."""
     with connected() as (pair, rig):

@@ -39,7 +39,7 @@ class SceneCamera(CameraDevice):
     aside
         Frames are looked at by calls of :meth:`look_on` alone, from a thread; until then the camera is capturing.
     kept
-        So many finished captures keep their files; 0 is all.
+        So many finished captures keep their files, and references always; 0 is all.
     """
 
     def __init__(
@@ -96,7 +96,8 @@ class SceneCamera(CameraDevice):
 
     def _begun(self, folder: str, frames: int, cubes: int) -> EmulatedCapture:
         for capture in self.captures[: -self.kept or None] if self.kept else ():
-            capture.drop()
+            if _prefix(capture) != REFERENCES:  # these are asked for again with every sweep
+                capture.drop()
         capture = super()._begun(folder, frames, cubes)
         if _prefix(capture) == REFERENCES:
             capture.references = self.view.references((self.exposure_ms, self.period_ms), REFERENCE_FRAMES)
