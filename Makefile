@@ -1,4 +1,4 @@
-# SpectralZoom: setup, survey, test, lint, bench, faults, lock.
+# SpectralZoom: setup, survey, survey-rig, test, lint, bench, faults, soak, lock.
 #   make survey ARCHIVE=/data/field7    make test PY=python3.12 VENV=/tmp/venv    make test PYTEST_ARGS="-x tests/pipeline"
 PY ?= python3
 VENV ?= .venv
@@ -11,7 +11,7 @@ BIN := $(VENV)/bin
 # The tools beneath are asked to send no analytics.
 export DO_NOT_TRACK = 1
 
-.PHONY: setup survey test lint bench faults lock
+.PHONY: setup survey survey-rig test lint bench faults soak lock
 .DEFAULT_GOAL := setup
 
 setup: $(BIN)/.ok
@@ -25,6 +25,10 @@ $(BIN)/.ok: pyproject.toml constraints.txt
 
 survey: $(BIN)/.ok
 	$(BIN)/spectralzoom survey --scene $(SCENE) --out $(ARCHIVE)
+
+# A rig emulated behind a pty and sockets, a whole survey through it, and the simulated one beside it. About a minute.
+survey-rig: $(BIN)/.ok
+	OMP_NUM_THREADS=1 $(BIN)/python tests/soak survey-rig
 
 test: $(BIN)/.ok
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q $(PYTEST_ARGS)
@@ -45,6 +49,12 @@ FAULTS ?=
 # the tests hold a quick part of each.
 faults: $(BIN)/.ok
 	OMP_NUM_THREADS=1 $(BIN)/python tests/faults $(FAULTS)
+
+SOAK ?=
+
+# Under half an hour: a day of 72 surveys with kills, cables and full disks, and Prefect's scheduler (SOAK="day --quick").
+soak: $(BIN)/.ok
+	OMP_NUM_THREADS=1 $(BIN)/python tests/soak $(SOAK)
 
 # Names and versions only. A machine that is offered a CPU wheel of torch does not resolve the accelerator's packages:
 # their lines are kept as they are.

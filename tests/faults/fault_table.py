@@ -45,18 +45,18 @@ class Clock:
 Rows = Callable[[bool], Sequence[Row]]  # quick or in full
 
 
-def plain_table(rows: Sequence[Row]) -> str:
+def plain_table(rows: Sequence[Row], headings: Sequence[str] = HEADINGS) -> str:
     """Rows in aligned columns, long texts folded inside their own."""
-    cells = [HEADINGS, *(row.cells for row in rows)]
+    cells = [headings, *(row.cells for row in rows)]
     widths = [min(width, max(len(line[column]) for line in cells)) for column, width in enumerate(WIDTHS)]
     lines = [line for cell in cells for line in _folded(cell, widths)]
     lines.insert(1, "  ".join("-" * width for width in widths))
     return "\n".join(line.rstrip() for line in lines)
 
 
-def markdown_table(rows: Sequence[Row]) -> str:
+def markdown_table(rows: Sequence[Row], headings: Sequence[str] = HEADINGS) -> str:
     """Rows as a table of Markdown."""
-    lines = [f"| {' | '.join(HEADINGS)} |", "|" + "---|" * len(HEADINGS)]
+    lines = [f"| {' | '.join(headings)} |", "|" + "---|" * len(headings)]
     lines += [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row.cells)} |" for row in rows]
     return "\n".join([*lines, ""])
 

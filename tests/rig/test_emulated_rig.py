@@ -178,7 +178,7 @@ def test_old_captures_make_room() -> None:
 
 def test_references_outlast_the_captures_after_them() -> None:
     """They are asked for again with every sweep of a survey, however many captures that takes."""
-    with connected(kept=2) as (pair, rig):
+    with connected(kept=2) as (pair, _):
         folder = pair.camera.capture(1, prefix=REFERENCES).folder
         pair.camera.wait(MOST_S)
         for _ in range(4):

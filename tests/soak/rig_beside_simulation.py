@@ -1,0 +1,189 @@
+"""A whole survey through an emulated rig in processes of their own, and the simulated one of the same scene beside it.
+
+The rig is `spectralzoom rig emulate` behind a pty and sockets, checked by `rig check` first. The surveys share scene,
+seed, effects and budget: their raw lines are to be equal, bit for bit. Positions and references are not quite: the wire
+rounds positions to float32, and a camera's white frames hold whole numbers. So the map is compared twice: with that of
+the simulated survey as it is, and with that of one which is rounded in these two places, where it is to be equal.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+import zarr
+
+from flows.figures import format_bytes, format_count, format_seconds
+from flows.receipt_table import COST_LABELS
+from tests.faults.fault_table import Clock, Row
+from tests.faults.nursery import ROOT
+
+SIZE, QUICK_SIZE = "256x256", "128x128"
+QUICK_BANDS = ",".join(map(str, range(8, 264, 16)))
+SPEED, BUDGET, SEED = 10, "0.8", "7"
+MOST_OTHER = 1e-3  # share of the map's pixels that rounding may decide
+BEGUN_WITHIN_S, ENDED_WITHIN_S = 120.0, 30.0
+SURVEY = ("survey", "--budget", BUDGET, "--no-controls", "--engine", "plain", "--json")
+
+
+@dataclass(frozen=True)
+class Surveyed:
+    """One survey: its archive, its receipt, and how long its process took. [s]"""
+
+    archive: Path
+    receipt: dict[str, Any]
+    wall_s: float
+
+    def wall_of(self, stage: str) -> float:
+        """Wall seconds of a stage; 0 where it had nothing to do."""
+        return next((one["wall_s"] or 0.0 for one in self.receipt["stages"] if one["name"] == stage), 0.0)
+
+    def sweeps(self, product: str) -> dict[str, zarr.Array[Any]]:
+        """Raw numbers (line, sample, band) of a capture's sweeps, opened with zarr alone."""
+        folder = self.archive / self.receipt["products"][product]
+        return {path.stem: zarr.open_array(path / "dn", mode="r") for path in sorted(folder.glob("*.zarr"))}
+
+    def class_map(self) -> np.ndarray[Any, Any]:
+        """The map (y, x), opened with xarray alone."""
+        with xr.open_zarr(self.archive / self.receipt["products"]["class_map"], consolidated=False) as opened:
+            return np.asarray(opened["classes"].values)
+
+
+def rows(quick: bool) -> list[Row]:
+    """Both surveys, their receipts side by side on stdout, and whether they are equal."""
+    clock = Clock()
+    scene = ["--scene", "farm", "--size", QUICK_SIZE if quick else SIZE, "--seed", SEED]
+    scene += ["--bands", QUICK_BANDS] if quick else []
+    with tempfile.TemporaryDirectory(prefix="survey-rig-") as name:
+        folder = Path(name)
+        with emulated(folder / "emulated.toml", scene) as (rig, process):
+            checked = command("rig", "check", str(rig))
+            print(checked.stdout, flush=True)
+            looked = survey(folder / "rig", str(rig), "--visit", "first")
+        simulated = survey(folder / "simulated", *scene)
+        print(side_by_side(looked, simulated), flush=True)
+        rounded = survey(folder / "rounded", *scene, program="tests.soak.simulated_as_wired")
+        found = [_of_check(checked), _of_lines(looked, simulated, clock.seconds)]
+        found += [_of_maps(looked, simulated, "as it is", MOST_OTHER), _of_maps(looked, rounded, "rounded alike", 0.0)]
+        return [*found, _of_end(process.returncode)]
+
+
+@contextmanager
+def emulated(file: Path, scene: Sequence[str]) -> Iterator[tuple[Path, subprocess.Popen[bytes]]]:
+    """Have a rig, and the settings of a survey of it, while the block runs; then it is told to end, as by Ctrl-C."""
+    words = [sys.executable, "-m", "flows.cli", "rig", "emulate", *scene, "--speed", str(SPEED), "--out", str(file)]
+    process = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL)
+    try:
+        end = time.monotonic() + BEGUN_WITHIN_S
+        while not file.exists() or "[rig]" not in file.read_text():
+            if process.poll() is not None or time.monotonic() > end:
+                raise RuntimeError(f"the emulated rig did not begin (exit code {process.poll()})")
+            time.sleep(0.05)
+        yield file, process
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(ENDED_WITHIN_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def command(*words: str, program: str = "flows.cli") -> subprocess.CompletedProcess[str]:
+    """Run a command to its end; progress goes on to stderr."""
+    print(f"  {program} {' '.join(words)}", file=sys.stderr, flush=True)
+    return subprocess.run(
+        [sys.executable, "-m", program, *words], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False
+    )
+
+
+def survey(archive: Path, *words: str, program: str = "flows.cli") -> Surveyed:
+    """Survey into an archive."""
+    clock = Clock()
+    done = command(SURVEY[0], *words, *SURVEY[1:], "--out", str(archive), program=program)
+    if done.returncode != 0:
+        raise RuntimeError(f"the survey ended with {done.returncode}: {done.stdout}")
+    return Surveyed(archive, json.loads(done.stdout), clock.seconds)
+
+
+def side_by_side(one: Surveyed, other: Surveyed) -> str:
+    """What both receipts say, a line each."""
+    lines = [("", "through the rig", "simulated")]
+
+    def add(label: str, show: Callable[[Surveyed], str]) -> None:
+        lines.append((label, show(one), show(other)))
+
+    for name, (label, show) in COST_LABELS.items():
+        add(label, lambda found, name=name, show=show: show(found.receipt["savings"][name]["done"]))  # type: ignore[misc]
+    add("fine sweeps", lambda found: format_count(len(found.sweeps("raw_fine"))))
+    add("seats seen twice", _seats)
+    add("mIoU", lambda found: f"{100 * found.receipt['accuracy']['miou']:.2f} %")
+    for stage in one.receipt["stages"]:
+        if any(found.wall_of(stage["name"]) for found in (one, other)):
+            add(f"{stage['name']}, wall", lambda found, name=stage["name"]: format_seconds(found.wall_of(name)))  # type: ignore[misc]
+    add("the process, wall", lambda found: format_seconds(found.wall_s))
+    add("archive", lambda found: format_bytes(_size(found.archive)))
+    widths = [max(len(line[column]) for line in lines) for column in range(3)]
+    return "\n".join(f"{a:<{widths[0]}}  {b:>{widths[1]}}  {c:>{widths[2]}}" for a, b, c in lines)
+
+
+def _seats(surveyed: Surveyed) -> str:
+    plan = json.loads((surveyed.archive / surveyed.receipt["products"]["plan"]).read_text())
+    return format_count(len(plan["seats"]))
+
+
+def _size(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def _of_check(checked: subprocess.CompletedProcess[str]) -> Row:
+    mended = "nothing to mend" in checked.stdout
+    return Row(
+        "rig check", "on the emulated rig, by the file that it wrote", 1, "exit code 0, nothing to mend",
+        f"exit code {checked.returncode}{', nothing to mend' if mended else ''}", checked.returncode == 0 and mended,
+        0.0,
+    )  # fmt: skip
+
+
+def _of_lines(one: Surveyed, other: Surveyed, seconds: float) -> Row:
+    lines, odd = 0, 0
+    for product in ("raw_coarse", "raw_fine"):
+        seen, wanted = one.sweeps(product), other.sweeps(product)
+        for name in seen.keys() | wanted.keys():
+            there = name in seen and name in wanted and seen[name].shape == wanted[name].shape
+            count = max(found[name].shape[0] for found in (seen, wanted) if name in found)
+            lines += count
+            odd += _odd_lines(seen[name], wanted[name]) if there else count
+    return Row(
+        "raw lines", "coarse and fine, rig beside simulated", lines, "equal bit for bit",
+        f"{odd} of {lines} lines differ", odd == 0, seconds,
+    )  # fmt: skip
+
+
+def _odd_lines(one: zarr.Array[Any], other: zarr.Array[Any]) -> int:
+    return int((np.asarray(one[:]) != np.asarray(other[:])).any(axis=(1, 2)).sum())
+
+
+def _of_maps(one: Surveyed, other: Surveyed, how: str, most: float) -> Row:
+    seen, wanted = one.class_map(), other.class_map()
+    odd = int((seen != wanted).sum()) if seen.shape == wanted.shape else seen.size
+    demanded = f"at most {100 * most:g} % of the pixels differ" if most else "equal bit for bit"
+    return Row(
+        "class map", f"{seen.shape[1]} x {seen.shape[0]} px, rig beside simulated {how}", 1, demanded,
+        f"{odd} of {seen.size} pixels differ ({100 * odd / seen.size:.2g} %)", odd <= most * seen.size, 0.0,
+    )  # fmt: skip
+
+
+def _of_end(code: int) -> Row:
+    return Row("the emulated rig", "told to end as by Ctrl-C", 1, "exit code 0", f"exit code {code}", code == 0, 0.0)
