@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.tree import Tree
 
-from flows.figures import DASH, format_bytes, format_points, format_seconds
+from flows.figures import DASH, counted, format_bytes, format_points, format_seconds
 from storage.addresses import in_text
 
 SHORT_KEY = 12
@@ -45,7 +45,9 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
     for uri in content["lost"]:
         console.print(f"[bold red]{escape(uri)} has lost its manifest; run verify[/]", highlight=False, soft_wrap=True)
     count = sum(map(len, content["stages"].values()))
-    _say(console, f"{len(content['runs'])} runs, {count} stores, {format_bytes(content['bytes'])}")
+    _say(
+        console, f"{counted(len(content['runs']), 'run')}, {counted(count, 'store')}, {format_bytes(content['bytes'])}"
+    )
 
 
 def show_clearance(content: dict[str, Any], console: Console) -> None:
@@ -57,7 +59,7 @@ def show_clearance(content: dict[str, Any], console: Console) -> None:
         _say(console, f"and {len(content['removals']) - MOST_ROWS} more")
     for reason in dict.fromkeys(content["kept"].values()):
         count = sum(why == reason for why in content["kept"].values())
-        _say(console, f"{count} stores that no run names stay: {reason}")
+        _say(console, f"{counted(count, 'store')} that no run names {'stays' if count == 1 else 'stay'}: {reason}")
     if content["obstacle"] is not None:
         console.print(f"[bold yellow]{escape(content['obstacle'])}[/]", highlight=False, soft_wrap=True)
     _say(console, f"{len(content['removals'])} things {verb}, {format_bytes(content['bytes'])}")

@@ -10,7 +10,7 @@ from typing import Any
 from flows.schedule_state import ENDINGS, read_moment
 from pipeline.errors import ArchiveError
 from storage.archive import Archive
-from storage.class_maps import load_class_map
+from storage.class_maps import load_class_map, load_class_names
 from storage.ledger import Ledger, ledgers
 from storage.lineage import Catalogue
 from storage.records import Run
@@ -89,6 +89,7 @@ def _row(archive: Archive, catalogue: Catalogue, run: Run, line: Mapping[str, An
         "miou": _number(accuracy.get("miou")) if isinstance(accuracy, Mapping) else None,
         "savings": {name: _ratio(savings, name) for name in ("capture_s", "lines", "bytes_stored", "multiply_adds")},
         "areas": shares,
+        "colours": _colours(archive, run),
         "unit": unit,
         "problem": run.problem,
     }
@@ -110,6 +111,18 @@ def _areas(archive: Archive, catalogue: Catalogue, run: Run) -> tuple[dict[str, 
     counts = {name: int((found.classes == number).sum()) for number, name in enumerate(found.names)}
     total = sum(counts.values()) or 1
     return {name: count / total for name, count in counts.items()}, "share"
+
+
+def _colours(archive: Archive, run: Run) -> dict[str, str]:
+    """The colours in which the run's map shows its classes, as CSS writes them; none where there is no map."""
+    address = run.products.get("class_map")
+    try:
+        found = None if address is None else load_class_names(archive.locate(address))
+    except (OSError, LookupError, ValueError):
+        found = None
+    if found is None:
+        return {}
+    return {name: f"#{bytes(map(int, rgb)).hex()}" for name, rgb in zip(found.names, found.colours, strict=False)}
 
 
 def _ratio(savings: object, name: str) -> float | None:

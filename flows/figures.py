@@ -54,5 +54,10 @@ def format_points(score: float | None) -> str:
     return f"{100 * score:.1f}" if _known(score) else DASH
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things: 1 run, 2 runs, no run counted as 0 runs."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def _known(value: float | None) -> TypeGuard[float]:
     return value is not None and math.isfinite(value)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flows.figures import format_percent
+from flows.figures import counted, format_percent
 
 LEAST_HECTARES = 0.1  # smaller areas are told in square metres
 
@@ -40,7 +40,11 @@ def _plan_words(plan: Mapping[str, Any]) -> list[str]:
     rounds = plan.get("rounds", [])
     if rounds:
         words.append(_round_words(rounds, plan["second_move_s"]))
-    words.append(("In the first round: " if rounds else "") + _sentence(plan["orientation"]["sentence"]))
+    turned = plan["orientation"]["sentence"]
+    if rounds and rounds[0]["lines"]:
+        words.append(_sentence(f"in the first round, {turned}"))
+    elif plan["lines"]:
+        words.append(_sentence(turned))
     return words
 
 
@@ -54,13 +58,14 @@ def _spared_words(plan: Mapping[str, Any]) -> str:
 
 def _round_words(rounds: Sequence[Mapping[str, Any]], move_s: float) -> str:
     parts = [
-        f"{one['seats']} seats in {one['sweeps']} runs of {one['lines']} lines for {one['seconds']:.1f} s"
+        f"{counted(one['seats'], 'seat')} in {counted(one['sweeps'], 'run')} of {counted(one['lines'], 'line')} for "
+        f"{one['seconds']:.1f} s"
+        if one["lines"]
+        else "nothing"
         for one in rounds
     ]
-    return (
-        f"The first round showed {parts[0]}, the second {parts[1]}; to go back a second time took {move_s:.1f} s of "
-        f"them."
-    )
+    again = f"; to go back a second time took {move_s:.1f} s of them" if all(one["lines"] for one in rounds) else ""
+    return f"The first round showed {parts[0]}, the second {parts[1]}{again}."
 
 
 def _sentence(text: str) -> str:

@@ -54,18 +54,19 @@ def render_index(histories: Sequence[FieldHistory], archive: str, pages: Mapping
 
 def _areas(runs: Sequence[Mapping[str, Any]]) -> str:
     units = {str(row["unit"]) for row in runs if row["areas"]}
-    drawn = [_area_chart(_by_class(runs, unit), unit) for unit in sorted(units)]
+    colours = {name.replace("_", " "): rgb for row in runs for name, rgb in row["colours"].items()}
+    drawn = [_area_chart(_by_class(runs, unit), unit, colours) for unit in sorted(units)]
     return "".join(drawn) or "<p>No run has left a map yet.</p>"
 
 
-def _area_chart(series: dict[str, list[tuple[float, float]]], unit: str) -> str:
-    """Areas on the ground in hectares, small ones in square metres; else shares of the map."""
+def _area_chart(series: dict[str, list[tuple[float, float]]], unit: str, colours: Mapping[str, str]) -> str:
+    """Areas on the ground in hectares, small ones in square metres; else shares of the map. Colours are the map's."""
     if unit == "share":
-        return line_chart(series, "Share of the map of each class", "%")
+        return line_chart(series, "Share of the map of each class", "%", colours)
     if max((value for points in series.values() for _, value in points), default=1.0) >= LEAST_HECTARES:
-        return line_chart(series, "Hectares of each class", "ha")
+        return line_chart(series, "Hectares of each class", "ha", colours)
     small = {name: [(moment, value * 1e4) for moment, value in points] for name, points in series.items()}
-    return line_chart(small, "Square metres of each class", "m²")
+    return line_chart(small, "Square metres of each class", "m²", colours)
 
 
 def _by_class(runs: Sequence[Mapping[str, Any]], unit: str) -> dict[str, list[tuple[float, float]]]:

@@ -15,8 +15,13 @@ COLOURS = ("#2f7d4f", "#c2571a", "#3465a4", "#8e6bb0", "#b58900", "#5b8a8a", "#a
 Points = Sequence[tuple[float, float]]  # seconds since 1970, value
 
 
-def line_chart(series: Mapping[str, Points], title: str, unit: str = "") -> str:
-    """A chart with its legend; words of what cannot be drawn where there is no point at all."""
+def line_chart(
+    series: Mapping[str, Points], title: str, unit: str = "", colours: Mapping[str, str] | None = None
+) -> str:
+    """A chart with its legend; words of what cannot be drawn where there is no point at all.
+
+    ``colours`` of series by their names; others take `COLOURS` in turn.
+    """
     every = [point for points in series.values() for point in points]
     if not every:
         return f"<p class=note>{escape(title)}: nothing to draw yet.</p>"
@@ -24,11 +29,11 @@ def line_chart(series: Mapping[str, Points], title: str, unit: str = "") -> str:
     low, high = float(times.min()), float(times.max())
     top = float(values.max()) or 1.0
     parts = [*_axis(top, unit), *_dates(low, high)]
-    for number, (name, points) in enumerate(series.items()):
-        parts += _line(name, points, COLOURS[number % len(COLOURS)], (low, high, top))
+    drawn_in = {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(series)} | dict(colours or {})
+    for name, points in series.items():
+        parts += _line(name, points, drawn_in[name], (low, high, top))
     legend = " ".join(
-        f'<span class="key"><i style="background:{COLOURS[number % len(COLOURS)]}"></i>{escape(name)}</span>'
-        for number, name in enumerate(series)
+        f'<span class="key"><i style="background:{escape(drawn_in[name])}"></i>{escape(name)}</span>' for name in series
     )
     drawing = f'<svg viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img" aria-label="{escape(title)}">{"".join(parts)}</svg>'
     return f"<h3>{escape(title)}</h3>{drawing}<p class=note>{legend}</p>"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flows.rectify_ahead import begin_mosaic, drop_ahead, mosaic_picture, take_mosaic
 from flows.run import SurveyRun
-from flows.stages import SEATS_AT_ONCE, Produce, captured, load_plan, write_json
+from flows.stages import SEATS_AT_ONCE, VERSIONS, Produce, captured, load_plan, write_json
 from pipeline.errors import ShapeError
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.placed import PixelGrid
@@ -81,7 +81,7 @@ def rectify(run: SurveyRun, produce: Produce, raw: StageRef, lookup: StageRef, *
             lookup=lookup.path / "lookup.zarr", registration=_record(_only(registration)),
         )  # fmt: skip
         out, settings, picture = path / "mosaic.zarr", run.settings, mosaic_picture(run)
-        there = take_mosaic(run, raw, out, recipe.sweeps(), picture)
+        there = take_mosaic(run, VERSIONS["rectify"], raw, out, recipe.sweeps(), picture)
         writer = MosaicWriter.reopen(out) if there else begin_mosaic(run, out, captured(raw)[0].simulation)
         write_mosaic(
             recipe, writer, memory=settings.memory, crew=settings.crew, seen=picture, there=there, report=run.report

@@ -8,9 +8,22 @@ from types import TracebackType
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, Task, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Column
+from rich.text import Text
 
 LINE_EVERY_S = 30.0
+TITLE, NARROW = 34, 110  # columns of a title; a console of fewer is narrow
+BARS = (8, 24)  # columns of a bar: narrow, wide
+TIME = 7
+
+
+class _WordsOrLeft(TimeRemainingColumn):
+    """Words where there are some, else how long it will take still: they never share a narrow line."""
+
+    def render(self, task: Task) -> Text:
+        words = task.fields["words"]
+        return Text(words) if words else Text("left ") + super().render(task)
 
 
 class StageProgress:
@@ -21,9 +34,17 @@ class StageProgress:
         self._tasks: dict[str, TaskID] = {}
         self._said: dict[str, float] = {}
         self._now: tuple[str, float] | None = None  # the stage that runs, and how far it is
+        bar = BARS[console.width >= NARROW]
+        room = max(console.width - TITLE - bar - TIME - 3, TIME)
         self._bars = Progress(
-            TextColumn("{task.description:<34}"), BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("left"),
-            TimeRemainingColumn(), TextColumn("{task.fields[words]}"), console=console, disable=not console.is_terminal,
+            TextColumn(
+                "{task.description}", markup=False,
+                table_column=Column(width=TITLE, no_wrap=True, overflow="ellipsis"),
+            ),
+            BarColumn(bar, table_column=Column(width=bar)),
+            TimeElapsedColumn(table_column=Column(width=TIME)),
+            _WordsOrLeft(table_column=Column(max_width=room, no_wrap=True, overflow="ellipsis")),
+            console=console, disable=not console.is_terminal,
         )  # fmt: skip
 
     def __enter__(self) -> StageProgress:
@@ -42,7 +63,7 @@ class StageProgress:
         if stage not in self._tasks:
             self._tasks[stage] = self._bars.add_task(title, total=1.0, words="")
             self._said[stage] = time.monotonic()
-        self._bars.update(self._tasks[stage], completed=done, words=escape(words))
+        self._bars.update(self._tasks[stage], completed=done, words=words)
         due = time.monotonic() - self._said[stage] > LINE_EVERY_S
         if not self.console.is_terminal and (ended or due):
             self._said[stage] = time.monotonic()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 
 from flows.run import SurveyRun
 from flows.tones import choose_bands
+from pipeline.errors import PipelineError
 from pipeline.rectify.placed import PixelGrid
 from pipeline.source import Source
 from storage.addresses import ahead_of
@@ -22,6 +24,7 @@ from storage.mosaics import MosaicWriter
 from storage.sightings import Sighted
 from storage.tile_work import Thumbnail
 
+LOG = logging.getLogger(__name__)
 QUICKLOOK_PX = 512
 
 Arrived = Callable[[str, int], None]  # a sweep's name, and how many of its lines are in the spool
@@ -42,11 +45,12 @@ def mosaic_picture(run: SurveyRun) -> Thumbnail:
 
 
 @contextmanager
-def rectifying_ahead(run: SurveyRun, source: Source, key: str) -> Iterator[Arrived]:
+def rectifying_ahead(run: SurveyRun, version: int, source: Source, key: str) -> Iterator[Arrived]:
     """Make tiles of the mosaic while the block captures the coarse sweeps under ``key``; gives what is to be told.
 
     Nothing is made ahead of a simulated capture, which uses the processor itself, nor where lines lie elsewhere than
     planned for all one knows: seams to be registered, or a mirror that no pulse steps or whose log says where it was.
+    Trouble with it is no trouble of the capture: then the mosaic is made in its turn, by ``version`` of that stage.
     """
     from pipeline.rig.capture_paths import can_trigger, planned_positions  # loads scipy, which a plan does without
 
@@ -55,28 +59,36 @@ def rectifying_ahead(run: SurveyRun, source: Source, key: str) -> Iterator[Arriv
     if run.rig is None or run.settings.pointing_px or not steady:
         yield lambda name, count: None
         return
-    grid = PixelGrid.of_scene(run.grid, run.grid.factor)
-    spool = run.archive.spool_folder(key)
-    lines = (
-        PlannedLines(spool, sweep, source.references(sweep), planned_positions(sweep, run.camera).astype(np.float64))
+    planned = [
+        (sweep, source.references(sweep), planned_positions(sweep, run.camera).astype(np.float64))
         for sweep in sorted(run.plan.coarse, key=lambda sweep: sweep.name)
-    )
-    placed = [place_as_planned(one, run.camera, grid) for one in lines]
-    work = MosaicWork(placed, run.camera, grid, run.settings.kernel)
-    folder = run.archive.spool_folder(ahead_of(key))
-    with MosaicAhead(
-        folder, work, lambda path: begin_mosaic(run, path), mosaic_picture(run), memory=run.settings.memory
-    ) as ahead:
+    ]
+    try:
+        ahead = _begin_ahead(run, version, key, [PlannedLines(run.archive.spool_folder(key), *one) for one in planned])
+    except (PipelineError, OSError) as error:
+        LOG.info("the mosaic is made after its lines: %s", error)
+        yield lambda name, count: None
+        return
+    with ahead:
         yield ahead.arrived
 
 
+def _begin_ahead(run: SurveyRun, version: int, key: str, lines: Sequence[PlannedLines]) -> MosaicAhead:
+    grid = PixelGrid.of_scene(run.grid, run.grid.factor)
+    placed = [place_as_planned(one, run.camera, grid) for one in lines]
+    return MosaicAhead(
+        run.archive.spool_folder(ahead_of(key)), MosaicWork(placed, run.camera, grid, run.settings.kernel),
+        lambda path: begin_mosaic(run, path), mosaic_picture(run), memory=run.settings.memory, version=version,
+    )  # fmt: skip
+
+
 def take_mosaic(
-    run: SurveyRun, raw: StageRef, out: Path, sweeps: Sequence[Sighted], seen: Thumbnail
+    run: SurveyRun, version: int, raw: StageRef, out: Path, sweeps: Sequence[Sighted], seen: Thumbnail
 ) -> Sequence[tuple[int, int]]:
     """Move what was made of the mosaic while its lines arrived to ``out``; first row and column of its tiles."""
     if run.rig is None:
         return []
-    wanted = AheadOf(run.camera, PixelGrid.of_scene(run.grid, run.grid.factor), run.settings.kernel)
+    wanted = AheadOf(run.camera, PixelGrid.of_scene(run.grid, run.grid.factor), run.settings.kernel, version)
     paths = {one.cube.sweep.name: path_digest(one.cube.position, one.usable, one.shift_px) for one in sweeps}
     return take_over(run.archive.spool_folder(ahead_of(raw.key)), out, wanted, paths, seen)
 

@@ -74,6 +74,7 @@ class CaptureRun:
             "camera": asdict(self.camera),
             "pointing_px": self.settings.pointing_px,
             **({} if self.settings.visit is None else {"visit": self.settings.visit}),
+            **({} if self.rig is None else {"field": self.name}),
         }
 
 

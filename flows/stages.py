@@ -52,8 +52,9 @@ Produce = Callable[[str, Build, dict[str, Any], Sequence[StageRef]], StageRef]
 
 
 def capture_coarse(run: SurveyRun, produce: Produce, effects: StageRef) -> StageRef:
-    """Sweep the whole field once, fast."""
-    return capture_sweeps(run, produce, run.plan.coarse, [effects], follow=partial(rectifying_ahead, run))
+    """Sweep the whole field once, fast; its mosaic is begun meanwhile."""
+    ahead = partial(rectifying_ahead, run, VERSIONS["rectify"])
+    return capture_sweeps(run, produce, run.plan.coarse, [effects], follow=ahead)
 
 
 def capture_fine(run: SurveyRun, produce: Produce, attention: StageRef, effects: StageRef) -> StageRef:

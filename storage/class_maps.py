@@ -133,6 +133,13 @@ def class_flags(names: Sequence[str], colours: NDArray[np.uint8]) -> dict[str, A
     }
 
 
+def load_class_names(path: Path) -> ClassNames:
+    """Read what the classes of a map are called, and their colours. Raises IncompleteStoreError where there is none."""
+    attributes: dict[str, Any] = dict(open_group(path).attrs)
+    colours = np.array(attributes.get("class_colours", ()), np.uint8).reshape(-1, 3)
+    return ClassNames(tuple(attributes.get("class_names", ())), colours)
+
+
 def load_class_map(path: Path) -> ClassMap:
     """Read a class map. Raises IncompleteStoreError where it is missing or damaged."""
     group = open_group(path)

@@ -9,12 +9,15 @@ with it leaves the mosaic to be made in its turn.
     <folder>/mosaic.zarr    tiles that are ready
     <folder>/seen.npy       what the thumbnail shows of them
     <folder>/ahead.json     which they are and what they were made of; written last
+
+No disk is waited for, so what a machine that was switched off in between left behind is not taken over.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -74,10 +77,11 @@ class AheadOf:
     camera: LineCamera
     grid: PixelGrid
     kernel: str
+    version: int  # of the stage that it is made for
 
     def facts(self, paths: Mapping[str, str]) -> dict[str, Any]:
-        """The same in plain values, with the digest of each sweep's path."""
-        told = {"camera": asdict(self.camera), "grid": asdict(self.grid), "kernel": self.kernel, "paths": dict(paths)}
+        """The same in plain values, with the digest of each sweep's path and since when this machine is up."""
+        told = {**asdict(self), "paths": dict(paths), "up": _boot()}
         plain: dict[str, Any] = json.loads(json.dumps(told))
         return plain
 
@@ -94,14 +98,16 @@ class MosaicAhead:
     """
 
     def __init__(
-        self, folder: Path, work: MosaicWork, begin: Callable[[Path], MosaicWriter], seen: Thumbnail, *, memory: int
-    ) -> None:
+        self, folder: Path, work: MosaicWork, begin: Callable[[Path], MosaicWriter], seen: Thumbnail, *,
+        memory: int, version: int = 0,
+    ) -> None:  # fmt: skip
         remove_tree(folder)
         folder.mkdir(parents=True)
         writer = begin(folder / MOSAIC)
         tiles = plan_tiles(work.placed, work.camera, work.grid, writer.tile_shape)
         budget = tile_budget(work, tiles, writer.tile_shape, memory=memory, crew=Crew(workers=1))
         self._folder, self._work, self._seen = folder, work, seen
+        self._wanted = AheadOf(work.camera, work.grid, work.kernel, version)
         self._opened = OpenMosaic(work, writer, LineCache(budget.cache), seen.cut)
         self._waiting = [(tile, lines_needed(work.placed, tile)) for tile in tiles]
         self._here = {one.lines.sweep.name: 0 for one in work.placed}
@@ -114,7 +120,8 @@ class MosaicAhead:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._thread.shutdown(cancel_futures=True)
-        failed = next((one.exception() for one in self._begun if one.done() and not one.cancelled()), None)
+        ended = [one.exception() for one in self._begun if one.done() and not one.cancelled()]
+        failed = next((error for error in ended if error is not None), None)
         if kind is not None or failed is not None:
             LOG.info("the mosaic is made after its lines: %s", failed or "their capture broke off")
             remove_tree(self._folder)
@@ -144,10 +151,8 @@ class MosaicAhead:
 
     def _keep(self) -> None:
         np.save(self._folder / SEEN, self._seen.image)
-        work = self._work
-        paths = {one.lines.sweep.name: path_digest(one.lines.position) for one in work.placed}
-        facts = AheadOf(work.camera, work.grid, work.kernel).facts(paths)
-        (self._folder / RECORD).write_text(json.dumps({**facts, "tiles": self._made}))
+        paths = {one.lines.sweep.name: path_digest(one.lines.position) for one in self._work.placed}
+        (self._folder / RECORD).write_text(json.dumps({**self._wanted.facts(paths), "tiles": self._made}))
 
 
 def place_as_planned(lines: PlannedLines, camera: LineCamera, grid: PixelGrid) -> Placed:
@@ -170,12 +175,20 @@ def take_over(
     try:
         record = json.loads((folder / RECORD).read_text())
         image = np.load(folder / SEEN)
-    except (OSError, ValueError):
+        tiles = [(int(row), int(column)) for row, column in record.pop("tiles")]
+        if record != wanted.facts(paths) or image.shape != seen.image.shape or not tiles:
+            return []
+        (folder / MOSAIC).rename(out)
+    except (OSError, ValueError, TypeError, LookupError, AttributeError) as error:
+        LOG.debug("no mosaic was made ahead: %s", error)
         return []
-    tiles = [(int(row), int(column)) for row, column in record.pop("tiles")]
-    if record != wanted.facts(paths) or image.shape != seen.image.shape or not tiles:
-        return []
-    (folder / RECORD).unlink()
-    (folder / MOSAIC).rename(out)
     seen.image[...] = image
     return tiles
+
+
+def _boot() -> str:
+    """What differs once this machine was switched off; where it does not say, once this process has ended."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return f"process {os.getpid()}"

@@ -83,7 +83,7 @@ def measure(px: int, *, ahead: bool) -> Moments:
 
 
 @contextmanager
-def _nothing_ahead(run: SurveyRun, source: Any, key: str) -> Iterator[Any]:
+def _nothing_ahead(run: SurveyRun, version: int, source: Any, key: str) -> Iterator[Any]:
     yield lambda name, count: None
 
 

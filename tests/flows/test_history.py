@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -13,6 +14,7 @@ from flows.field_history import FieldHistory, read_histories
 from flows.history_page import render_history, render_index, way_to
 from flows.line_chart import line_chart
 from storage.archive import Archive
+from storage.class_maps import load_class_map
 from storage.ledger import Ledger
 
 BAD = '<script>alert("1")</script>&'
@@ -135,6 +137,19 @@ def test_a_chart_has_a_line_for_each_series() -> None:
     assert chart.count("<circle") == 3
     assert "soil &lt;b&gt;" in chart
     assert "100 %" in chart
+
+
+def test_classes_have_the_colours_of_the_map(archive: Path) -> None:
+    """What is brown on the map is brown on the page; series without a colour of their own take one in turn."""
+    (north, _) = read_histories(Archive.open(archive))
+    receipt = json.loads((archive / north.runs[0]["run"] / "receipt.json").read_text())
+    shown = load_class_map(archive / receipt["products"]["class_map"])
+    wanted = {name: "#" + bytes(map(int, rgb)).hex() for name, rgb in zip(shown.names, shown.colours, strict=True)}
+    assert north.runs[0]["colours"] == wanted
+    page = render_history(north, "runs")
+    seen = [name for name, share in north.runs[0]["areas"].items() if share]
+    assert all(f'<i style="background:{wanted[name]}"></i>{name.replace("_", " ")}' in page for name in seen)
+    assert line_chart({"a": [(0.0, 1.0)], "b": [(0.0, 1.0)]}, "x", colours={"b": "#123456"}).count("#123456") == 3
 
 
 def test_the_way_to_an_archive(tmp_path: Path) -> None:

@@ -59,3 +59,14 @@ def test_a_log_says_what_a_long_stage_is_at(monkeypatch: pytest.MonkeyPatch) -> 
         progress.show("capture", 0.0)
         progress.say("fetching 3 of 55 MB")
     assert out.getvalue().splitlines()[-1] == "coarse sweep: 0% fetching 3 of 55 MB"
+
+
+def test_a_narrow_terminal_keeps_bars_and_times() -> None:
+    """In 80 columns words stand where the time left would, cut off at the end of the line; nothing else gives way."""
+    out = io.StringIO()
+    with StageProgress(Console(file=out, force_terminal=True, width=80, color_system=None)) as progress:
+        progress.show("what lines turned by 90 degrees would show", 0.5)
+        progress.say("fetching a file of a long name: 12.3 of 129.0 MB")
+    lines = out.getvalue().splitlines()
+    assert any("━" in line and "0:00:00 fetching a file" in line and "…" in line for line in lines)
+    assert any("0:00:00 left" in line for line in lines)

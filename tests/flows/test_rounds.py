@@ -117,6 +117,17 @@ def test_rounds_are_priced_apart_and_within_the_budget(two: tuple[Published, Pat
     assert len({sweep.name for sweeps in passes for sweep in sweeps}) == sum(map(len, passes))
 
 
+def test_a_round_of_nothing_is_told_as_such(two: tuple[Published, Path]) -> None:
+    """No seat in no run of no line is nothing; what a turned line would show is not told of nothing."""
+    plan = dict(two[0].receipt["plan"])
+    first, second = ({**one, "lines": 0, "seats": 0, "sweeps": 0} for one in plan["rounds"])
+    told = " ".join(sentences({"plan": {**plan, "rounds": [first, plan["rounds"][1]]}}))
+    assert "The first round showed nothing, the second" in told
+    assert "to go back" not in told
+    none = " ".join(sentences({"plan": {**plan, "lines": 0, "rounds": [first, second]}}))
+    assert none.endswith("The first round showed nothing, the second nothing.")
+
+
 def test_the_receipt_tells_of_both_rounds(two: tuple[Published, Path], one: tuple[Published, Path]) -> None:
     """What each showed and what the second move took is said in words; the second look's own work is counted."""
     told = " ".join(sentences(two[0].receipt))

@@ -232,6 +232,15 @@ def test_visits_are_captured_and_broken_ones_gone_on_with(tmp_path: Path, monkey
     assert {finding.kind for finding in Archive.open(tmp_path).verify_all()} == {"whole"}
 
 
+def test_fields_that_differ_in_name_alone_are_captured_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """What a rig saw of one field is not taken for another of the same settings, nor captured twice for the same."""
+    settings = small_settings(tmp_path, source="rig", visit="first", budget=0.5, name="east")
+    with emulated(settings, {}, monkeypatch) as rig:
+        for name in ("east", "west", "east"):
+            run_survey(replace(settings, name=name), QUIET)
+        assert coarse_captures(rig) == 2
+
+
 def test_field_without_a_picture_is_surveyed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path):
     """A field of which only size and bands are known: what the rig sees of it is mapped, and nothing judged."""
     told = {"scene": "field", "bands": None, "wavelengths": "640,550,460", "weights": str(weights), "effects": None}

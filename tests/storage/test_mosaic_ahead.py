@@ -6,6 +6,8 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Event, Timer
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +30,7 @@ BANDS = np.array([500.0, 600.0, 700.0])
 GRID = PixelGrid((-95.5, -79.5), 1, (192, 160))
 PLENTY = 4 * 2**30
 SWEEPS = [Sweep(f"coarse-{n}", "fine", "x", strip, -110.0, 220) for n, strip in enumerate((-40.0, 40.0))]
-WANTED = AheadOf(CAMERA, GRID, "catmull-rom")
+WANTED = AheadOf(CAMERA, GRID, "catmull-rom", 0)
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,9 @@ def make_ahead(captured: Captured, folder: Path, until: int = 220) -> None:
 
 
 @pytest.mark.parametrize("until", [140, 200, 220])
-def test_bytes_are_those_made_afterwards(captured: Captured, tmp_path: Path, until: int) -> None:
+def test_bytes_are_those_made_afterwards(
+    captured: Captured, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, until: int
+) -> None:
     """However many lines had arrived: tiles made ahead and the rest after them are one mosaic, and one picture."""
     plain, seen = begin(tmp_path / "plain.zarr"), picture()
     write_mosaic(captured.work, plain, memory=PLENTY, seen=seen)
@@ -99,7 +103,11 @@ def test_bytes_are_those_made_afterwards(captured: Captured, tmp_path: Path, unt
     other, out = picture(), tmp_path / "out.zarr"
     there = take_over(tmp_path / "ahead", out, WANTED, captured.paths, other)
     assert 0 < len(there) < 3 if until < 220 else len(there) == 3
+    written: list[int] = []
+    real = MosaicWriter.write_tile
+    monkeypatch.setattr(MosaicWriter, "write_tile", lambda *given: (written.append(given[1]), real(*given))[1])
     write_mosaic(captured.work, MosaicWriter.reopen(out), memory=PLENTY, seen=other, there=there)
+    assert len(written) == 3 - len(there)  # what is there is not made again
     assert contents(out) == contents(tmp_path / "plain.zarr")
     np.testing.assert_array_equal(other.image, seen.image)
 
@@ -140,11 +148,49 @@ def test_lines_that_are_not_as_planned_take_nothing_over(captured: Captured, tmp
     assert not (tmp_path / "out.zarr").exists()
 
 
-def test_another_kernel_takes_nothing_over(captured: Captured, tmp_path: Path) -> None:
-    """What was made with other settings is not what is wanted now."""
+OTHERS = {
+    "kernel": replace(WANTED, kernel="nearest"),
+    "version": replace(WANTED, version=1),
+    "camera": replace(WANTED, camera=replace(CAMERA, pitch_um=7.5)),
+}
+
+
+@pytest.mark.parametrize("wanted", OTHERS.values(), ids=OTHERS)
+def test_what_was_made_of_other_settings_is_not_taken_over(captured: Captured, tmp_path: Path, wanted: AheadOf) -> None:
+    """Nor what an earlier version of the stage made."""
     make_ahead(captured, tmp_path / "ahead")
-    other = replace(WANTED, kernel="nearest")
-    assert take_over(tmp_path / "ahead", tmp_path / "out.zarr", other, captured.paths, picture()) == []
+    assert take_over(tmp_path / "ahead", tmp_path / "out.zarr", wanted, captured.paths, picture()) == []
+
+
+def test_what_a_power_cut_left_is_not_taken_over(
+    captured: Captured, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk was waited for by nobody: once the machine has started anew a tile may be a hole."""
+    make_ahead(captured, tmp_path / "ahead")
+    monkeypatch.setattr(mosaic_ahead, "_boot", lambda: "another")
+    assert take_over(tmp_path / "ahead", tmp_path / "out.zarr", WANTED, captured.paths, picture()) == []
+
+
+@pytest.mark.parametrize("record", ["{}", "[]", '{"tiles": 3}', '{"tiles": [[1]]}', "null"])
+def test_a_record_of_something_else_takes_nothing_over(captured: Captured, tmp_path: Path, record: str) -> None:
+    """A file that is no record of ours is no reason to fail."""
+    make_ahead(captured, tmp_path / "ahead")
+    (tmp_path / "ahead" / "ahead.json").write_text(record)
+    assert take_over(tmp_path / "ahead", tmp_path / "out.zarr", WANTED, captured.paths, picture()) == []
+
+
+def test_a_mosaic_is_taken_over_once(captured: Captured, tmp_path: Path) -> None:
+    """Whoever fails after that makes all of it: the record is gone with the mosaic."""
+    make_ahead(captured, tmp_path / "ahead")
+    assert take_over(tmp_path / "ahead", tmp_path / "out.zarr", WANTED, captured.paths, picture())
+    assert take_over(tmp_path / "ahead", tmp_path / "again.zarr", WANTED, captured.paths, picture()) == []
+
+
+def test_a_picture_of_another_size_takes_nothing_over(captured: Captured, tmp_path: Path) -> None:
+    """Its pixels would be others."""
+    make_ahead(captured, tmp_path / "ahead")
+    seen = Thumbnail(GRID.shape, (2, 1, 0), 32)
+    assert take_over(tmp_path / "ahead", tmp_path / "out.zarr", WANTED, captured.paths, seen) == []
 
 
 def test_capture_that_breaks_off_leaves_nothing_ahead(captured: Captured, tmp_path: Path) -> None:
@@ -155,11 +201,40 @@ def test_capture_that_breaks_off_leaves_nothing_ahead(captured: Captured, tmp_pa
     assert not (tmp_path / "ahead").exists()
 
 
+def test_the_end_of_a_capture_waits_for_one_tile_at_most(
+    captured: Captured, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tiles that wait for their turn are left to whoever makes the rest, with more hands."""
+    free, made = Event(), list[int]()
+    real = MosaicWriter.write_tile
+
+    def slow(writer: MosaicWriter, row: int, *rest: Any) -> None:
+        assert free.wait(30)
+        made.append(row)
+        real(writer, row, *rest)
+
+    monkeypatch.setattr(MosaicWriter, "write_tile", slow)
+    with MosaicAhead(tmp_path / "ahead", captured.work, begin, picture(), memory=PLENTY) as ahead:
+        for name in ("coarse-0", "coarse-1"):
+            ahead.arrived(name, 220)
+        Timer(0.2, free.set).start()  # the block has ended by then
+    assert len(made) == 1
+
+
+@pytest.mark.parametrize("failing", [1, 2])
 def test_tile_that_fails_harms_nobody(
-    captured: Captured, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    captured: Captured, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, failing: int
 ) -> None:
     """A full disk behind the capture's back is told to the log, and the mosaic is made in its turn."""
-    monkeypatch.setattr(MosaicWriter, "write_tile", lambda *_: (_ for _ in ()).throw(OSError("No space left")))
+    real, calls = MosaicWriter.write_tile, list[int]()
+
+    def full(writer: MosaicWriter, row: int, *rest: Any) -> None:
+        calls.append(row)
+        if len(calls) == failing:
+            raise OSError("No space left")
+        real(writer, row, *rest)
+
+    monkeypatch.setattr(MosaicWriter, "write_tile", full)
     with caplog.at_level("INFO", mosaic_ahead.__name__):
         make_ahead(captured, tmp_path / "ahead")
     assert "made after its lines: No space left" in caplog.text
