@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.scan import Sweep
 
+AT_REST = Sweep("references", "fine", "x", 0.0, 0.0, 1)  # a line for references: the mirror at 0; 0, nothing summed
+
 
 @dataclass(frozen=True)
 class Line:

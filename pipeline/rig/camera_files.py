@@ -70,7 +70,7 @@ def _fetch(server: FileServer, file: RemoteFile, kept: Kept, progress: Progress 
             with _session(server) as session:
                 _fetch_once(session, server, file, kept, progress)
             return
-        except (DeviceRefused, RigError) as error:
+        except RigError as error:
             if not isinstance(error, DeadlinePassed | DeviceGone):
                 raise
             failed = 0 if kept.size(file.name) > held else failed

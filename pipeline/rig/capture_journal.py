@@ -117,6 +117,8 @@ class CaptureJournal:
     def _follow(self, record: dict[str, Any]) -> None:
         match record["what"]:
             case "capture":
+                self._taken.pop(record["folder"], None)  # a camera that was emptied gives its folders' names again
+                self._ties.pop(record["folder"], None)
                 self._taken[record["folder"]] = _taken(record)
             case "end":
                 log = None if record["log"] is None else LoggedPath(**record["log"])

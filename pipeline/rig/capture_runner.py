@@ -21,10 +21,9 @@ from pipeline.rig.line_positions import MirrorTrack, line_edges
 from pipeline.rig.registers import Trigger
 from pipeline.rig.steering import MotionLog, Steering
 from pipeline.rig.survey_rig import SurveyRig
-from pipeline.scan import Sweep
+from pipeline.source import AT_REST
 
 LOG = logging.getLogger(__name__)
-REST = Sweep("references", "fine", "x", 0.0, 0.0, 1)
 SLACK_S = 5.0  # by which a capture may take longer than its frames
 WRITING_S = 120.0  # that a camera may go on writing what it has, once it was told to stop
 POLL_S = 0.05
@@ -137,7 +136,7 @@ class CaptureRunner:
         with self._stopped_on_error():
             capture = self.devices.camera.capture(1, prefix=prefix)
             at = (capture.sent_s, capture.acknowledged_s)
-            self.wait(Taken(REST, 0, 1, capture.folder, False, at, at))
+            self.wait(Taken(AT_REST, 0, 1, capture.folder, False, at, at))
         return capture.folder
 
     def log_of(self, taken: Taken) -> MirrorTrack | None:

@@ -61,19 +61,6 @@ class HeadwallCamera:
         """End a capture; False where none ran."""
         return self.control.stop_capture()
 
-    def wait(self, at_most_s: float, *, every_s: float = 0.2) -> None:
-        """Wait until no capture runs.
-
-        Raises
-        ------
-        RigError : one still runs after ``at_most_s``.
-        """
-        until = self.clock.now() + at_most_s
-        while self.is_capturing():
-            if self.clock.now() >= until:
-                raise RigError(f"the capture still runs after {at_most_s:g} s; wait longer, or stop it")
-            self.clock.sleep(every_s)
-
     def fetch(self, folder: str, kept: Kept, progress: Progress | None = None) -> CapturedLines:
         """Get a finished capture's files, small ones first, and give its lines; a later call continues.
 
@@ -97,10 +84,6 @@ class HeadwallCamera:
         fetch_files(self.server, files, kept, clock=self.clock)
         cubes = read_references([file.name for file in files], _reader(kept))
         return {kind: mean_frame(cube.values) for kind, cube in cubes.items()}
-
-    def acknowledge_state(self, reason: str) -> None:
-        """Allow captures again after one whose reply was lost."""
-        self.control.acknowledge_state(reason)
 
     def close(self) -> None:
         """Hang up; a capture goes on."""

@@ -86,7 +86,7 @@ class HeadwallControl:
         """Begin a capture of ``cubes`` files (0: until stopped) of ``frames`` lines (0: the camera's own number).
 
         Sent once. Where no reply comes the camera is asked whether it captures and which folders are new, and that is
-        said in the error; captures and settings are then refused until ``acknowledge_state``.
+        said in the error; captures and settings are refused from then on: a person looks, and connects anew.
 
         Raises
         ------
@@ -147,13 +147,6 @@ class HeadwallControl:
         if not folder:
             raise SettingsError("expected a folder of the camera to list, such as /captured, got an empty name")
         return self._ask("listFiles", folder, as_listing)
-
-    def acknowledge_state(self, reason: str) -> None:
-        """Allow captures again: someone has looked, and ``reason`` says what was found."""
-        with self._lock:
-            if self.unknown:
-                LOG.warning("captures are allowed again: %s (refused since: %s)", reason, self.unknown)
-            self.unknown = ""
 
     def close(self) -> None:
         """Say exit and hang up. A capture goes on; nothing is raised."""
@@ -248,8 +241,8 @@ class HeadwallControl:
     def _check_known(self, name: str) -> None:
         if self.unknown:
             raise StateUnknown(
-                f"{name} is refused: {self.unknown}, so whether the camera captures is not known. Look at what it does "
-                "(isCapturing, listFiles), then call acknowledge_state"
+                f"{name} is refused: {self.unknown}, so whether the camera captures is not known. Look at the "
+                "camera, stop what runs there, then run again, which connects anew"
             )
 
     def _folders(self) -> set[str] | None:
@@ -273,8 +266,8 @@ class HeadwallControl:
         except RigError as other:
             found = f"asked again it does not answer: {other}"
         return CaptureUnknown(
-            f"capture (prefix {prefix!r}) was sent and its reply is lost: {error}. It is not sent again; {found}. Keep "
-            "or stop what runs, then call acknowledge_state",
+            f"capture (prefix {prefix!r}) was sent and its reply is lost: {error}. It is not sent again; {found}. "
+            "Look at the camera, stop what runs there, then run again, which connects anew",
             capturing=capturing,
             folders=folders,
         )

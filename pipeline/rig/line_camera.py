@@ -52,8 +52,5 @@ class LineCameraDevice(Protocol):
     def references(self, folder: str, kept: Kept) -> dict[str, MeanFrame]:
         """Mean frames of the reference cubes that lie in a capture's folder, by ``dark`` and ``white``."""
 
-    def acknowledge_state(self, reason: str) -> None:
-        """Allow captures again after one whose reply was lost."""
-
     def close(self) -> None:
         """Let go of the camera; a capture goes on."""

@@ -26,8 +26,7 @@ class MirrorTrack:
 
     time_s: Floats  # (sample,) in order
     position: Floats  # (sample, 2) device X and Y
-    edge_s: Floats | None = None  # (edge,) in order: index steps under an external trigger, or a frame pulse
-    edge_at: StampAt = "start"  # of the exposure
+    edge_s: Floats | None = None  # (edge,) in order, as exposures begin: the index stepped, under an external trigger
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,6 @@ class PlayedPath:
 
     position: Floats  # (held, 2)
     rate_hz: float
-    first: int = 0  # position that the first frame sees, under an external trigger
 
 
 @dataclass(frozen=True)
@@ -77,19 +75,18 @@ def lines_by_trigger(
     number, notes = whole_numbers(frames.number)
     if not (number >= 0).any():
         raise RigError("no line has a frame number, so which trigger each belongs to is not known; fetch frameIndex")
-    if index_at_end is not None and index_at_end - path.first != number.max():
+    if index_at_end is not None and index_at_end != number.max():
         raise RigError(
-            f"the mirror counted {index_at_end - path.first + 1} triggers, the camera's last frame is number "
+            f"the mirror counted {index_at_end + 1} triggers, the camera's last frame is number "
             f"{number.max()}: a frame or an edge was lost, and lines after it would be off; tie them by the log"
         )
-    place = path.first + number
-    valid = (number >= 0) & (place < len(positions))
-    if beyond := int(np.count_nonzero(place >= len(positions))):
+    valid = (number >= 0) & (number < len(positions))
+    if beyond := int(np.count_nonzero(number >= len(positions))):
         notes.append(f"{beyond} lines are beyond the {len(positions)} positions of the path")
     counted = index_at_end is not None
     notes.append("positions are those sent, not measured" + ("" if counted else "; triggers were not counted"))
     found = np.full((len(number), 2), np.nan)
-    found[valid] = positions[place[valid]]
+    found[valid] = positions[number[valid]]
     middle_s = np.where(valid, number * frames.period_ms + frames.exposure_ms / 2, np.nan) * 1e-3
     residual = 0.0 if counted else None
     return LinePositions(found, middle_s, valid, "trigger", residual, residual, notes=tuple(notes))
@@ -135,7 +132,7 @@ def lines_by_log(
     notes += [f"{np.count_nonzero(tied)} of {len(tied)} frames have an edge in the log"]
     notes += [f"{np.count_nonzero(odd)} frames are stamped off their edge, which counts"] if odd.any() else []
     notes += [f"a drift cannot be told from {np.count_nonzero(tied)} frame"] if np.count_nonzero(tied) == 1 else []
-    placed = _placed(frames, track, began_s, track.edge_at, notes)
+    placed = _placed(frames, track, began_s, "start", notes)
     px = _apart_px(track, camera, (began_s[tied & ~odd], own[tied & ~odd]))
     return replace(placed, residual_us=fit.residual_us, residual_px=px, offset_s=fit.offset_s, drift_ppm=fit.drift_ppm)
 

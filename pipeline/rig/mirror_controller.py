@@ -20,7 +20,6 @@ from pipeline.rig.motion_log import Logger
 from pipeline.rig.path_player import PathPlayer, Play, hold_values, run_values
 from pipeline.rig.pro_payloads import Value, ask_status, cell_int, set_values
 from pipeline.rig.registers import Status, Trigger
-from pipeline.rig.simple_mode import ACKNOWLEDGE
 from pipeline.rig.steering import Identity, MotionLog, Progress, ReadBack, as_cells, wire_positions
 from pipeline.rig.transport import Transport
 from pipeline.rig.vector_upload import upload
@@ -34,15 +33,15 @@ class MirrorController:
     """A mirror controller on a port. :meth:`connect` first; use it as a context, or close it.
 
     Motions (goto, run, park) are sent once. One that is not acknowledged raises StateUnknown, and so does every later
-    one until :meth:`acknowledge_state`; what only reads, and :meth:`halt`, still work. Every method that speaks to the
-    device raises DeviceRefused, DeadlinePassed or DeviceGone besides what it says itself, and RigError before connect.
+    one of this object; what only reads, and :meth:`halt`, still work. Every method that speaks to the device raises
+    DeviceRefused, DeadlinePassed or DeviceGone besides what it says itself, and RigError before connect.
     """
 
     def __init__(
         self, transport: Transport, settings: MirrorSettings | None = None, clock: Clock = SYSTEM_CLOCK
     ) -> None:
         self.settings = settings or MirrorSettings()
-        self.wire = Wire(transport, clock, self.settings.patience, self.settings.baud)
+        self.wire = Wire(transport, clock, self.settings.patience)
         self._link = ProLink(self.wire, self.settings.with_crc, self.settings.strict_crc)
         self._modes = Modes(self._link)
         self._player = PathPlayer(self._link, self.settings.ends)
@@ -105,11 +104,6 @@ class MirrorController:
         """
         with self._simple_mode("ask for its temperature") as lines:
             return lines.temperature()
-
-    def forget_history(self) -> None:
-        """Clear the status bits of what was the case and no longer is. RigError while a path plays."""
-        with self._simple_mode("clear its status") as lines:
-            lines.tell(ACKNOWLEDGE)
 
     def goto(self, x: float, y: float) -> None:
         """Send the mirror to a position and hold it there; comes back once that is acknowledged, not at rest.
@@ -222,14 +216,10 @@ class MirrorController:
         """Send the mirror to 0; 0, as :meth:`goto` does."""
         self.goto(0.0, 0.0)
 
-    def acknowledge_state(self, reason: str) -> None:
-        """Allow motions again: a person has looked at the mirror, and ``reason`` says what was found."""
-        self.wire.acknowledge_state(reason)
-
     def close(self) -> None:
         """Let go of the port; park before, where the settings say so and motions are not frozen."""
         try:
-            if self.settings.park_at_close and self._identity is not None and not self.wire.unknown:
+            if self.settings.park_at_close and self._identity is not None:
                 self.park()
         except RigError as error:
             LOG.warning("not parked: %s", error)

@@ -6,8 +6,8 @@ error               when
 DeviceGone          the port is not there, is in use, may not be opened, or went away
 DeadlinePassed      no whole answer before the deadline, and nothing can have moved
 DeviceRefused       the device answered that it did not do it; ``code`` is its number where it gave one
-StateUnknown        a motion was sent and not acknowledged: it may have happened. Motions stay frozen until a
-                    person has looked and says so
+StateUnknown        a motion was sent and not acknowledged: it may have happened. Motions stay frozen: a person
+                    has to look, and to connect anew
 NotKept             the disk here did not take what a device sent; the device still has it
 RigError            everything else: an answer that is not one, a wrong device, a path that was not kept
 ==================  =======================================================================================
@@ -43,7 +43,7 @@ class DeviceRefused(RigError):  # noqa: N818 - the name says what is the case
 
 
 class StateUnknown(RigError):  # noqa: N818 - the name says what is the case
-    """A device may or may not have moved; motions are frozen until a person says otherwise."""
+    """A device may or may not have moved; motions are frozen until somebody connects anew."""
 
 
 class NotKept(RigError):  # noqa: N818 - the name says what is the case

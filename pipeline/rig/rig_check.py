@@ -19,10 +19,7 @@ Verdict = Literal["ok", "warn", "fail"]
 Device = Literal["mirror", "camera"]
 
 SQUARE = ((0.03, 0.03), (0.03, -0.03), (-0.03, -0.03), (-0.03, 0.03))  # within 0.05 of the middle
-NEAR, FAR = (
-    0.002,
-    0.02,
-)  # of the disk's radius: a position read back is right within one, and elsewhere beyond the other
+NEAR, FAR = 0.002, 0.02  # of the disk's radius: a position read back is right within NEAR, and lost beyond FAR
 SETTLE_S = 2.0
 LOG_HZ, LOGGED = 1000.0, 8
 MOST_NAMED = 5  # entries of a listing, warnings

@@ -82,7 +82,7 @@ class RigSource:
         self._journal = CaptureJournal(kept)
         self._unknown: list[str] = []  # why nobody knows what the rig does; shared by all that are made from this one
         self._runner: CaptureRunner | None = None
-        self._panel_notes: tuple[str, ...] = ()
+        self._whole: dict[str, tuple[References, tuple[str, ...]]] = {}  # of all samples, and notes, by folder
 
     @property
     def camera(self) -> LineCamera:
@@ -106,7 +106,8 @@ class RigSource:
             name: getattr(self.rig, name)
             for name in ("pulses", "log_pulses", "ends", "read_back", "strict_crc", "provenance")
         }
-        return {"rig": told, "references": list(self._panel_notes), "captures": self._journal.captures}
+        _, notes = self._whole.get(self._journal.references, (None, ()))
+        return {"rig": told, "references": list(notes), "captures": self._journal.captures}
 
     def keeping(self, kept: Kept) -> RigSource:
         """Give the same source with its files elsewhere."""
@@ -119,6 +120,8 @@ class RigSource:
     def _like(self, kept: Kept, say: Say) -> RigSource:
         other = RigSource(self.view, self._open, kept, rig=self.rig, vector_pairs=self.vector_pairs, say=say)
         other._unknown = self._unknown
+        if kept is self._kept:
+            other._whole = self._whole
         return other
 
     @contextmanager
@@ -178,17 +181,25 @@ class RigSource:
                     self._give_up(taken, line, why, last=barren >= BARREN)
 
     def references(self, sweep: Sweep) -> References:
-        """Dark and white frames with the sweep's binning, from a capture of their own, once for all sweeps.
+        """Dark and white frames with the sweep's binning, captured and fetched once for all sweeps.
 
         Raises
         ------
         RigError : the camera has none beside its captures, they do not fit, or a device failed.
         """
-        with self.session() as runner:
-            if not self._journal.references:
-                self._journal.refer(runner.look_at_rest(REFERENCES))
-            folder = self._journal.references
-            frames = runner.devices.camera.references(folder, self._kept)
+        if self._journal.references not in self._whole:
+            with self.session() as runner:
+                if not self._journal.references:
+                    self._journal.refer(runner.look_at_rest(REFERENCES))
+                self._whole[self._journal.references] = self._whole_references(runner, self._journal.references)
+        whole, _ = self._whole[self._journal.references]
+        bad = None if whole.bad is None or not whole.bad.any() else _sums(whole.bad, sweep.binning) > 0
+        dark, white = (_sums(frame, sweep.binning) for frame in (whole.dark, whole.white))
+        return References(dark, white, whole.panel, bad, by_mirror=self.rig.white_at_rest)
+
+    def _whole_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]]:
+        """Dark and white frames of all samples, and what was found of them."""
+        frames = runner.devices.camera.references(folder, self._kept)
         missing = [kind for kind in ("dark", "white") if kind not in frames]
         if missing:
             raise RigError(
@@ -196,11 +207,8 @@ class RigSource:
                 "own program, then run again"
             )
         whole, notes = as_references(frames["dark"], frames["white"], panel=self.rig.panel)
-        self._panel_notes = notes
         self._check_size(whole.dark.shape, folder)
-        bad = None if whole.bad is None or not whole.bad.any() else _sums(whole.bad, sweep.binning) > 0
-        dark, white = (_sums(frame, sweep.binning) for frame in (whole.dark, whole.white))
-        return References(dark, white, whole.panel, bad, by_mirror=self.rig.white_at_rest)
+        return whole, notes
 
     def _next(self, sweep: Sweep, line: int) -> CapturePath:
         triggered = can_trigger(self.rig.pulses, sweep)

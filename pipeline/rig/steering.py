@@ -93,9 +93,6 @@ class Steering(Protocol):
     def park(self) -> None:
         """Send the mirror to 0; 0."""
 
-    def acknowledge_state(self, reason: str) -> None:
-        """Allow motions again after one that was not acknowledged: a person has looked."""
-
     def close(self) -> None:
         """Let go of the mirror."""
 

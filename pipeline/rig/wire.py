@@ -38,14 +38,13 @@ class Wire:
     """One device behind a transport. Only one transaction runs at a time, and each begins with an empty line.
 
     A read is asked again, within the deadline of the first; a write never is; a motion never is, and one that is not
-    acknowledged freezes all motions until :meth:`acknowledge_state`.
+    acknowledged freezes all motions: where the mirror is is for a person to see, who connects anew then.
     """
 
-    def __init__(self, transport: Transport, clock: Clock, patience: Patience, baud: int) -> None:
+    def __init__(self, transport: Transport, clock: Clock, patience: Patience) -> None:
         self.transport = transport
         self.clock = clock
         self.patience = patience
-        self.baud = baud
         self.lock = threading.RLock()
         self.bytes_sent = self.bytes_received = 0
         self.unknown = ""  # why the state is unknown; empty where it is known
@@ -55,11 +54,6 @@ class Wire:
     def port(self) -> str:
         """Name of the port."""
         return self.transport.port
-
-    @property
-    def wire_seconds(self) -> float:
-        """Time that the bytes sent and received so far take at the set speed, one after the other. [s]"""
-        return (self.bytes_sent + self.bytes_received) * BITS_PER_BYTE / self.baud
 
     def exchange(self, data: bytes, name: str, kind: Kind, receiver: Callable[[], Receiver[Answer]]) -> Answer:
         """Send a request and wait for its answer.
@@ -93,7 +87,7 @@ class Wire:
                     if kind == "motion" and not refused:
                         raise self._freeze(name, error) from error
                     left -= 1
-                    if kind not in _READS or left == 0 or not _may_ask_again(error):
+                    if left == 0 or not _may_ask_again(error):
                         raise
                     usual = kind == "greeting" and isinstance(error, DeadlinePassed) and error.silent
                     LOG.log(logging.INFO if usual else logging.WARNING, "%s; asking again", error)
@@ -104,19 +98,11 @@ class Wire:
                     self.unknown = f"{name} was interrupted" if kind == "motion" else self.unknown
                     raise
 
-    def acknowledge_state(self, reason: str) -> None:
-        """Allow motions again: a person has looked at the mirror, and ``reason`` says what was found."""
-        with self.lock:
-            self._empty_line("after the state was acknowledged")
-            if self.unknown:
-                LOG.warning("motions of %s are allowed again: %s (frozen since: %s)", self.port, reason, self.unknown)
-            self.unknown = ""
-
     def _freeze(self, name: str, error: RigError) -> StateUnknown:
         self.unknown = f"{name} was sent and not acknowledged"
         return StateUnknown(
             f"{name} was sent to {self.port} and may have happened or not: {error}. It is not sent again, and all "
-            f"motions are refused. Look at the mirror, then call acknowledge_state"
+            f"motions are refused. Look at the mirror, then run again, which connects anew"
         )
 
     def _once(self, data: bytes, name: str, receiver: Receiver[Answer], silence_s: float, deadline: float) -> Answer:
@@ -173,7 +159,7 @@ class Wire:
         if self.unknown:
             raise StateUnknown(
                 f"{name} is refused on {self.port}: {self.unknown}, so where the mirror is is not known. Look at it, "
-                f"then call acknowledge_state"
+                f"then run again, which connects anew"
             )
 
 

@@ -22,7 +22,7 @@ from pipeline.simulator.readout import dark_frame
 from pipeline.simulator.render import Choice
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import Scene
-from pipeline.source import References
+from pipeline.source import AT_REST, References
 
 Frame = NDArray[np.float32]
 SEEN = frozenset({RESPONSE.name, SMILE.name, PRNU.name, STRIPING.name})  # by light of the panel
@@ -38,8 +38,7 @@ def take_references(scene: Scene, rig: Rig, choice: Choice, sweep: Sweep) -> Ref
     -------
     Frames (sample, band) [DN]; the panel's values are those of the rig's bands.
     """
-    rest = Sweep("references", "fine", "x", 0.0, 0.0, 1)
-    block = sweep_block(scene, rig, rest, range(1))
+    block = sweep_block(scene, rig, AT_REST, range(1))
     dark = dark_frame(block, choice)
     white = dark + _panel_light(block, choice) / np.float32(rig.camera.electrons_per_dn)
     panel = scene.panel.astype(np.float32)

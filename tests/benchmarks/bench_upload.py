@@ -19,6 +19,7 @@ from pipeline.rig.emulator.pty_port import EmulatedPort
 from pipeline.rig.mirror_port import open_mirror
 from pipeline.rig.mirror_settings import MirrorSettings
 from pipeline.rig.steering import ReadBack
+from pipeline.rig.wire import BITS_PER_BYTE
 
 PAIRS = 1500
 BAUDS = (115200, 256000)
@@ -57,10 +58,11 @@ def _upload(baud: int, read_back: ReadBack) -> tuple[float, float, float, int]:
         open_mirror(MirrorSettings(port=port.path, baud=baud, vector_pairs=PAIRS)) as mirror,
     ):
         mirror.is_playing()  # as the upload asks first: everything is loaded
-        before_s, began_s, began_cpu_s = mirror.wire.wire_seconds, time.perf_counter(), time.process_time()
+        wire, began_s, began_cpu_s = mirror.wire, time.perf_counter(), time.process_time()
+        before = wire.bytes_sent + wire.bytes_received
         mirror.load_path(positions, read_back, lambda done, total: told.append((done, total)))
         wall_s, cpu_s = time.perf_counter() - began_s, time.process_time() - began_cpu_s
-        wire_s = mirror.wire.wire_seconds - before_s
+        wire_s = (wire.bytes_sent + wire.bytes_received - before) * BITS_PER_BYTE / baud
     if not np.array_equal(device.state.memory, positions.T.ravel().astype(np.float32)):
         raise AssertionError("the memory holds something else")
     if told[-1][0] != told[-1][1] or any(one[0] >= other[0] for one, other in pairwise(told)):

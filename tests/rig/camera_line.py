@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.rig.clock import ManualClock
 from pipeline.rig.emulator.camera_device import CameraDevice
+from pipeline.rig.headwall_camera import HeadwallCamera
 from pipeline.rig.headwall_control import ControlPatience, HeadwallControl
 from pipeline.rig.refusals import DeviceGone
 
@@ -69,6 +70,14 @@ def control_of(device: CameraDevice, clock: ManualClock, retries: int = 2) -> He
     return HeadwallControl(
         lambda: CameraLine(device, clock), clock=clock, patience=ControlPatience(5.0, retries), capture_root="/captured"
     )
+
+
+def wait_for(camera: HeadwallCamera, at_most_s: float) -> None:
+    """Let time pass until no capture runs."""
+    until = camera.clock.now() + at_most_s
+    while camera.is_capturing():
+        assert camera.clock.now() < until, f"the capture still runs after {at_most_s:g} s"
+        camera.clock.sleep(0.2)
 
 
 def scene_lines(samples: int = 6, bands: int = 4) -> LinesOf:

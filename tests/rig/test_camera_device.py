@@ -218,7 +218,6 @@ def test_fault_suite(fault: CameraFault) -> None:
             folder = control.capture(40).folder
         except CaptureUnknown as error:
             folder, told = "/captured/000000", str(error)
-            control.acknowledge_state("it captures")
         except DeviceRefused as error:
             told = str(error)
         words = "refused capture" if fault in (CameraFault.FULL, CameraFault.BUSY) else "It is not sent again; asked"

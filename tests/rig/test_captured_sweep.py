@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from pipeline.rig.camera_cubes import CapturedLines
-from pipeline.rig.capture_journal import Taken
+from pipeline.rig.capture_journal import LoggedPath, Taken
 from pipeline.rig.capture_paths import next_path
 from pipeline.rig.captured_sweep import UntiedError, place_lines
 from pipeline.rig.frame_index import LineTimes
+from pipeline.rig.line_positions import MirrorTrack
 from tests.rig.small_rig import CAMERA, COARSE, FINE
 
 PATH = next_path(FINE, 3, CAMERA, vector_pairs=7, triggered=True)  # lines 3 to 9
@@ -62,6 +63,28 @@ def test_mirror_that_stepped_otherwise_is_not_believed(index: int):
     """One edge too few or too many: which lines are off is not known."""
     with pytest.raises(UntiedError, match=rf"stands at cell {index} of its path, after 6 frames cell 6 was expected"):
         place_lines(frames(list(range(6))), PATH, replace(TAKEN, index_at_end=index), CAMERA, None)
+
+
+@pytest.mark.parametrize("index", [5, 6, 7, 9])
+def test_mirror_that_stands_within_a_line_is_not_believed(index: int):
+    """Coarse lines hold four cells each: two of them end at cell 8, and whoever stands beside it lost an edge."""
+    path = next_path(COARSE, 2, CAMERA, vector_pairs=12, triggered=True)
+    taken = Taken(COARSE, 2, 4, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=8)
+    assert place_lines(frames([0, 1]), path, taken, CAMERA, None).row.tolist() == [0, 1]
+    with pytest.raises(UntiedError, match=rf"stands at cell {index} of its path, after 2 frames cell 8 was expected"):
+        place_lines(frames([0, 1]), path, replace(taken, index_at_end=index), CAMERA, None)
+
+
+def test_log_began_before_its_acknowledgement():
+    """Between the request for the log and its acknowledgement: the middle counts, and the span is not known."""
+    path = next_path(FINE, 3, CAMERA, vector_pairs=6, triggered=False)
+    log = LoggedPath("/captured/x/mirror_log", 1000.0, started_s=0.06, start_error_s=0.04)
+    taken = Taken(FINE, 3, 9, "/captured/x", False, (5.0, 5.1), (0.1, 0.2), log=log)
+    track = MirrorTrack(np.arange(1000) / 1000, np.zeros((1000, 2)))
+    tied = place_lines(frames(list(range(6))), path, taken, CAMERA, track).tied
+    assert tied.method == "log"
+    assert tied.offset_s == pytest.approx(0.15 - 0.04)
+    assert tied.residual_us == pytest.approx((0.1 + 0.04) / 2 * 1e6)
 
 
 def test_paths_take_whole_lines():

@@ -28,6 +28,7 @@ from pipeline.rig.socket_transport import SocketTransport
 from pipeline.scan import Sweep, sweep_positions
 from pipeline.simulator.instrument import QUIET
 from pipeline.simulator.simulated import SimulatedSource
+from tests.rig.camera_line import wait_for
 from tests.rig.small_rig import CAMERA, COARSE, FINE, small_source
 
 ODD = Sweep("fine-7", "fine", "x", 10 / 3, -11.1, 23)
@@ -52,7 +53,7 @@ class Pair:
         self.mirror.run(0, len(cells), rate_hz, trigger=Trigger.RISING_EDGE if edges else Trigger.OFF)
         prefix = capture_prefix(sweep if told is None else told, first)
         folder = self.camera.capture(sweep.lines - first, prefix=prefix).folder
-        self.camera.wait(MOST_S)
+        wait_for(self.camera, MOST_S)
         return folder
 
     def lines(self, folder: str) -> np.ndarray[Any, Any]:
@@ -135,7 +136,7 @@ def test_captures_that_announce_nothing_have_streams_of_their_own() -> None:
         looks = []
         for _ in range(2):
             folder = pair.camera.capture(3).folder
-            pair.camera.wait(MOST_S)
+            wait_for(pair.camera, MOST_S)
             looks.append(pair.lines(folder).astype(int))
     rest = planned(Sweep("rest", "fine", "x", 0.0, 0.0, 1), range(1), small_source(chosen=QUIET))
     every = np.concatenate(looks)
@@ -158,7 +159,7 @@ def test_reference_capture_has_dark_and_white() -> None:
     """Their means are those of the simulated source, to the steps of so many frames of whole numbers."""
     with connected() as (pair, _):
         folder = pair.camera.capture(1, prefix=REFERENCES).folder
-        pair.camera.wait(MOST_S)
+        wait_for(pair.camera, MOST_S)
         found = pair.camera.references(folder, KeptInMemory())
     wanted = small_source().references(FINE)
     for name, mean in (("dark", wanted.dark), ("white", wanted.white)):
@@ -170,7 +171,7 @@ def test_old_captures_make_room() -> None:
     with connected(kept=2) as (pair, rig):
         for _ in range(4):
             pair.camera.capture(1)
-            pair.camera.wait(MOST_S)
+            wait_for(pair.camera, MOST_S)
         names = {name.rsplit("/", 1)[0] for name in rig.camera.files()}
         assert names == {"/captured/000001", "/captured/000002", "/captured/000003"}
         assert "/captured/000000" in rig.camera.folders()
@@ -180,10 +181,10 @@ def test_references_outlast_the_captures_after_them() -> None:
     """They are asked for again with every sweep of a survey, however many captures that takes."""
     with connected(kept=2) as (pair, _):
         folder = pair.camera.capture(1, prefix=REFERENCES).folder
-        pair.camera.wait(MOST_S)
+        wait_for(pair.camera, MOST_S)
         for _ in range(4):
             pair.camera.capture(1)
-            pair.camera.wait(MOST_S)
+            wait_for(pair.camera, MOST_S)
         assert set(pair.camera.references(folder, KeptInMemory())) == {"dark", "white"}
 
 

@@ -131,7 +131,7 @@ class Session:
         """An unknown state stays frozen, and the port is let go in any state."""
         if self.errors and isinstance(self.errors[0], StateUnknown):
             sent = len(self.transport.sent)
-            with pytest.raises(StateUnknown, match="acknowledge_state"):
+            with pytest.raises(StateUnknown, match="then run again, which connects anew"):
                 self.driver.goto(0.0, 0.0)
             assert not any(map(moves, self.transport.sent[sent:]))
         self.driver.close()

@@ -131,25 +131,37 @@ def test_refusals(why: bytes, remedy: str) -> None:
 
 
 def test_capture_without_a_reply() -> None:
-    """It is sent once; the camera is asked what it does, that is told, and motions are refused until acknowledged."""
+    """It is sent once; the camera is asked what it does, that is told, and captures are refused from then."""
     listed = b'[{"name": "/captured/f1_0", "isDirectory": true}]'
     with talk(
         [(LIST_ROOT, said(LIST_ROOT, b"[]")), (CAPTURE, b"")],
         [
             (IS_CAPTURING, said(IS_CAPTURING, b"true")), (LIST_ROOT, said(LIST_ROOT, listed)),
-            (b"stopCapture\r", said(b"stopCapture\r", b"true")), (LIST_ROOT, said(LIST_ROOT, listed)),
-            (CAPTURE, said(CAPTURE, b'{"folder": "/captured/f1_1"}')),
+            (b"stopCapture\r", said(b"stopCapture\r", b"true")),
         ],
     ) as control:  # fmt: skip
         with pytest.raises(CaptureUnknown, match=r"asked again it captures, .*/captured/f1_0") as caught:
             control.capture(500, prefix="f1")
         assert (caught.value.capturing, caught.value.folders) == (True, ("/captured/f1_0",))
         for refused_now in (lambda: control.capture(500, prefix="f1"), lambda: control.configure(10, 10)):
-            with pytest.raises(StateUnknown, match="acknowledge_state"):
+            with pytest.raises(StateUnknown, match="stop what runs there, then run again, which connects anew"):
                 refused_now()
         assert control.stop_capture()
-        control.acknowledge_state("stopped")
-        assert control.capture(500, prefix="f1").folder == "/captured/f1_1"
+
+
+def test_folders_that_were_there_are_not_the_lost_captures() -> None:
+    """Only what is new since before the capture may be its folder."""
+    old, new = (b'{"name": "/captured/%s", "isDirectory": true}' % name for name in (b"f0_0", b"f1_1"))
+    pairs = [(LIST_ROOT, said(LIST_ROOT, b"[" + old + b"]")), (CAPTURE, b"")]
+    after = [
+        (IS_CAPTURING, said(IS_CAPTURING, b"false")), (LIST_ROOT, said(LIST_ROOT, b"[" + old + b", " + new + b"]")),
+    ]  # fmt: skip
+    with (
+        talk(pairs, after) as control,
+        pytest.raises(CaptureUnknown, match=r"does not capture, and new are the folders /captured/f1_1\.") as caught,
+    ):
+        control.capture(500, prefix="f1")
+    assert caught.value.folders == ("/captured/f1_1",)
 
 
 def test_capture_and_then_nobody() -> None:
@@ -188,13 +200,14 @@ class Interrupting:
         self._sleep(seconds)
 
 
-def test_stale_bytes_are_dropped() -> None:
+def test_stale_bytes_are_dropped(caplog: pytest.LogCaptureFixture) -> None:
     """What lies on the line before a command is thrown away, not taken for its reply."""
     extra = said(IS_CAPTURING, b"true")
     torn = said(IS_CAPTURING, b"false") + extra[:20]
     with talk([(IS_CAPTURING, torn), (IS_CAPTURING, said(IS_CAPTURING, b"false"))]) as control:
         assert not control.is_capturing()
         assert not control.is_capturing()
+    assert "scripted: dropped 20 stale bytes" in caplog.text
     with talk(
         [(IS_CAPTURING, [said(IS_CAPTURING, b"false"), Late(0.0, extra)]), (IS_CAPTURING, said(IS_CAPTURING, b"false"))]
     ) as control:

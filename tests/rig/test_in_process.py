@@ -11,6 +11,7 @@ from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.mirror_controller import MirrorController
 from pipeline.rig.mirror_settings import MirrorSettings
 from pipeline.rig.refusals import DeadlinePassed, DeviceGone
+from pipeline.rig.wire import BITS_PER_BYTE
 
 
 def line(*faults: str, baud: int = 0) -> InProcessTransport:
@@ -101,8 +102,10 @@ def test_an_upload_takes_little_more_than_the_line_needs(baud: int) -> None:
     transport = line(baud=baud)
     driver = MirrorController(transport, MirrorSettings(baud=baud), transport.clock)
     driver.connect()
-    began, wire, told = transport.clock.now(), driver.wire.wire_seconds, []
+    began, told, wire = transport.clock.now(), [], driver.wire
+    before = wire.bytes_sent + wire.bytes_received
     driver.load_path([(0.1, 0.2)] * 1500, "none", lambda done, total: told.append((done, total)))
-    assert transport.clock.now() - began <= 1.2 * (driver.wire.wire_seconds - wire)
+    wire_s = (wire.bytes_sent + wire.bytes_received - before) * BITS_PER_BYTE / baud
+    assert transport.clock.now() - began <= 1.2 * wire_s
     assert told[-1] == (3000, 3000)
     assert len(told) == 300

@@ -170,18 +170,51 @@ def test_log_without_edges() -> None:
         lines_by_log(frames(), CAMERA, track(with_edges=False))
 
 
+def test_moments_of_stamps_count_without_edges() -> None:
+    """A stamp of the start lies half an exposure before the middle, one of the end as much behind it."""
+    log, path = track(with_edges=False), PlayedPath(sweep(np.arange(6000) / 1000), 1000.0)
+    for stamp_at, late_s in (("start", 0.004), ("middle", 0.0), ("end", -0.004)):
+        told = replace(frames(), stamp_at=stamp_at)
+        by_log = lines_by_log(told, CAMERA, log, commands=COMMANDS)
+        assert by_log.time_s[0] == pytest.approx(0.736 + late_s, abs=1e-9)
+        np.testing.assert_allclose(by_log.position[0], sweep(by_log.time_s[:1])[0], atol=1e-6)
+        by_commands = lines_by_commands(told, CAMERA, path, COMMANDS)
+        assert by_commands.time_s[0] == pytest.approx(late_s, abs=1e-9)
+        np.testing.assert_allclose(by_commands.position[0], sweep(np.array([0.7365 + late_s]))[0], atol=1e-4)
+
+
+def test_first_frames_that_were_dropped_without_edges() -> None:
+    """Lines that begin with frame 50 lie half a second behind the capture's start, by the log and by commands."""
+    whole = frames()
+    late = replace(whole, number=whole.number[50:], stamp_us=whole.stamp_us[50:])
+    lines = np.arange(50, LINES)
+    check_truth(lines_by_log(late, CAMERA, track(with_edges=False), commands=COMMANDS), lines, atol_s=2e-3)
+    path = PlayedPath(sweep(np.arange(6000) / 1000), 1000.0)
+    check_truth(lines_by_commands(late, CAMERA, path, COMMANDS), lines, atol_s=3e-3)
+
+
+def test_commands_count_from_the_logs_own_start() -> None:
+    """A log begins with its first sample, at 0 or not: without edges, and where edges do not tell the frame."""
+    late = replace(COMMANDS, run_s=(10.3, 10.302))
+    check_truth(lines_by_log(frames(), CAMERA, track(from_s=0.3, with_edges=False), commands=late), atol_s=2e-3)
+    amid = replace(COMMANDS, run_s=(10.9, 10.902))
+    found = lines_by_log(frames(), CAMERA, track(3.0, from_s=0.9), commands=amid)
+    check_truth(found)
+    assert np.count_nonzero(found.valid) > 200
+
+
 def test_by_trigger() -> None:
     """One vector index a frame: numbers count, missing ones too, and the mirror's count must agree."""
-    path = PlayedPath(sweep(np.arange(LINES + 1) / 100), 100.0, first=1)
+    path = PlayedPath(sweep(np.arange(LINES) / 100), 100.0)
     whole = frames()
     kept = np.concatenate([np.arange(10), np.arange(12, LINES)])
     told = replace(whole, number=whole.number[kept], stamp_us=whole.stamp_us[kept])
-    found = lines_by_trigger(told, CAMERA, path, index_at_end=LINES)
-    np.testing.assert_array_equal(found.position, path.position[kept + 1])
+    found = lines_by_trigger(told, CAMERA, path, index_at_end=LINES - 1)
+    np.testing.assert_array_equal(found.position, path.position[kept])
     assert (found.method, found.residual_us, found.residual_px) == ("trigger", 0.0, 0.0)
     assert "2 frames are missing between the lines" in found.notes
     with pytest.raises(RigError, match=r"counted 399 triggers, the camera's last frame is number 399"):
-        lines_by_trigger(told, CAMERA, path, index_at_end=LINES - 1)
+        lines_by_trigger(told, CAMERA, path, index_at_end=LINES - 2)
     unchecked = lines_by_trigger(told, CAMERA, path)
     assert unchecked.residual_us is None
     assert "positions are those sent, not measured; triggers were not counted" in unchecked.notes

@@ -37,7 +37,7 @@ HALF, MINUS_QUARTER = bytes.fromhex("3F 00 00 00"), bytes.fromhex("BE 80 00 00")
 
 def wire(transport: ScriptedTransport) -> Wire:
     """A wire that waits a second, asks twice again, and takes 0.1 s for silence."""
-    return Wire(transport, transport.clock, Patience(1.0, 2, 0.1), 115200)
+    return Wire(transport, transport.clock, Patience(1.0, 2, 0.1))
 
 
 def pro(transport: ScriptedTransport, **settings: bool) -> ProLink:

@@ -7,7 +7,7 @@ import pytest
 from pipeline.errors import PoseError, RigError, SettingsError, ShapeError
 from pipeline.rig.clock import ManualClock
 from pipeline.rig.mirror_controller import MirrorController
-from pipeline.rig.refusals import DeviceGone, StateUnknown
+from pipeline.rig.refusals import DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
 from pipeline.rig.registers import Status, Trigger
 from pipeline.rig.steering import Identity, Steering
 from tests.rig.mirror_bytes import (
@@ -136,9 +136,9 @@ def test_a_path_that_is_too_long_sends_no_byte():
 
 def test_nothing_is_loaded_under_a_playing_path():
     """The memory that plays is not written, and modes are not changed under it."""
-    with scripted([*CONNECT, PLAYING, PLAYING, PLAYING]) as transport:
+    with scripted([*CONNECT, PLAYING, PLAYING]) as transport:
         mirror = connected(transport)
-        for call in (lambda: mirror.load_path(PATH), mirror.temperature, mirror.forget_history):
+        for call in (lambda: mirror.load_path(PATH), mirror.temperature):
             with pytest.raises(RigError, match=r"plays a path; .* when that is over, or halt it"):
                 call()
 
@@ -157,10 +157,21 @@ def test_a_path_that_was_not_kept_is_not_played():
             mirror.run(0, 3, 10.0)
 
 
-def test_an_unacknowledged_motion_freezes_until_somebody_looked():
-    """The motion goes once, later ones send no byte, looking and halting still work, then motions do again."""
+def test_path_whose_upload_failed_is_not_played():
+    """Neither it nor the one before: the memory holds some of both, however many cells were written."""
+    with scripted([*CONNECT, IDLE, LOAD, IDLE, (LOAD[0], b"")]) as transport:
+        mirror = connected(transport, read_back="none")
+        mirror.load_path(PATH)
+        with pytest.raises(DeadlinePassed, match="writing cells 0 to 6"):
+            mirror.load_path(PATH)
+        with pytest.raises(SettingsError, match="0:3 is no range of the 0 positions loaded"):
+            mirror.run(0, 3, 10.0)
+
+
+def test_an_unacknowledged_motion_freezes():
+    """The motion goes once, later ones send no byte; looking and halting still work."""
     late = Late(1.02, bytes.fromhex(DONE))
-    script = [*CONNECT, WELL, (bytes.fromhex(GOTO), [late]), WELL, HALT, WELL, pair(PARK, DONE)]
+    script = [*CONNECT, WELL, (bytes.fromhex(GOTO), [late]), WELL, HALT]
     with scripted(script) as transport:
         mirror = connected(transport)
         with pytest.raises(StateUnknown, match=r"going to 0.5; -0.25 was sent to scripted and may have happened"):
@@ -170,8 +181,6 @@ def test_an_unacknowledged_motion_freezes_until_somebody_looked():
                 call()
         assert mirror.status() == Status(0)
         mirror.halt()
-        mirror.acknowledge_state("it points at 0.5; -0.25")
-        mirror.park()
 
 
 def test_a_frozen_mirror_plays_no_path():
@@ -228,11 +237,14 @@ def test_temperature_is_asked_in_simple_mode_and_back():
         assert connected(transport).temperature() == 31.5
 
 
-def test_latched_bits_are_cleared_in_simple_mode():
-    """ACKNOWLEDGE clears what was and is no longer."""
-    script = [*CONNECT, IDLE, LEAVE, GREET, (b"ACKNOWLEDGE\r\n", b"OK\r\n"), ENTER, WELL]
+def test_pro_mode_is_entered_again_after_a_refusal():
+    """Firmware that does not tell its temperature leaves the mode as it was."""
+    script = [*CONNECT, IDLE, LEAVE, GREET, (b"GETTEMP\r\n", b"NO\r\n"), ENTER, WELL, WELL]
     with scripted(script) as transport:
-        connected(transport).forget_history()
+        mirror = connected(transport)
+        with pytest.raises(DeviceRefused, match="answered NO to GETTEMP"):
+            mirror.temperature()
+        assert mirror.status() == Status(0)
 
 
 def test_the_place_in_the_path_is_the_cell_of_x():

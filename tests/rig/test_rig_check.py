@@ -23,6 +23,7 @@ from pipeline.rig.mirror_settings import MirrorSettings
 from pipeline.rig.pro_mode import Command
 from pipeline.rig.refusals import DeviceGone, DeviceRefused
 from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, works
+from pipeline.rig.steering import MotionLog
 from tests.rig.small_rig import FINE, small_source
 
 SETS = {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
@@ -148,6 +149,14 @@ def test_mirror_elsewhere_fails() -> None:
     """A motion that the device took for a trimmed one is not walked on from."""
     with rig("trimmed") as line:
         assert told(mirror_rows(line, move=True), "fail") == ["go to 0.03; 0.03"]
+
+
+def test_position_that_is_no_number_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mirror that measures nothing is not where it was sent."""
+    log = MotionLog(np.full((8, 2), np.nan, np.float32), 1000.0, 0.0, 0.0)
+    monkeypatch.setattr(MirrorController, "read_log", lambda *_: log)
+    with rig() as line:
+        assert "go to 0.03; 0.03" in told(mirror_rows(line, move=True), "fail")
 
 
 def test_path_that_plays_is_left_alone() -> None:

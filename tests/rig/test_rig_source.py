@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from ftplib import FTP
 from itertools import islice
 
 import numpy as np
 import pytest
 
 from pipeline.errors import RigError
+from pipeline.rig.capture_journal import CaptureJournal
+from pipeline.rig.kept_files import KeptInMemory
+from pipeline.rig.pro_mode import Command
 from pipeline.rig.steering import wire_positions
 from pipeline.scan import Sweep, line_positions
 from pipeline.source import Line
@@ -74,6 +79,48 @@ def test_references_are_the_mean_of_the_cameras_frames():
             assert found.by_mirror
             assert found.bad is None
         assert sum("references" in said for said in rig.emulated.camera.commands if "capture(" in said) == 1
+
+
+def test_references_are_fetched_once(monkeypatch: pytest.MonkeyPatch):
+    """By all sweeps, and by whoever shares the files; one that keeps its files elsewhere fetches its own."""
+    log_ins: list[object] = []
+    monkeypatch.setattr(FTP, "login", counted(FTP.login, log_ins))
+    with small_rig() as rig:
+        kept = KeptInMemory()
+        source = rig.source(kept)
+        source.references(FINE)
+        once, opened = len(log_ins), rig.opened
+        assert once > 0
+        again = source.saying(lambda words: None)
+        for sharing in (source, again):
+            np.testing.assert_allclose(
+                sharing.references(COARSE).dark, small_source().references(COARSE).dark, atol=0.1
+            )
+            assert sharing.record["references"]
+        assert (len(log_ins), rig.opened) == (once, opened)
+        elsewhere = KeptInMemory()
+        CaptureJournal(elsewhere).refer(CaptureJournal(kept).references)
+        source.keeping(elsewhere).references(FINE)
+        assert (len(log_ins), rig.opened) == (2 * once, opened + 1)
+        assert elsewhere.files.keys() == kept.files.keys()
+
+
+def counted(call: Callable[..., object], calls: list[object]) -> Callable[..., object]:
+    """The same call, noted each time."""
+
+    def counting(*given: object) -> object:
+        calls.append(given)
+        return call(*given)
+
+    return counting
+
+
+def test_mirror_is_left_alone_where_the_settings_say_so():
+    """Where white is not taken at rest, looking for references moves nothing; else it goes to 0; 0 and rests."""
+    for white_at_rest in (False, True):
+        with small_rig(white_at_rest=white_at_rest) as rig:
+            assert rig.source().references(FINE).by_mirror == white_at_rest
+            assert any(act.request.command == Command.SET_VALUES for act in rig.emulated.mirror.acts) == white_at_rest
 
 
 def test_without_pulses_lines_lie_where_the_log_measured():

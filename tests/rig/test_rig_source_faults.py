@@ -58,6 +58,13 @@ def test_cubes_that_are_always_cut_end_the_sweep():
         assert len(rig.captures) == 2
 
 
+def test_captures_that_are_cut_one_after_the_other_go_on():
+    """Each gave lines, so none of them is in vain, however many are cut."""
+    with small_rig(faults={CameraFault.CUT_CUBE: 3}, vector_pairs=6) as rig:
+        assert_same(list(rig.source().lines(FINE)))
+        assert [said.split("_")[-1].split('"')[0] for said in rig.captures] == ["0", "3", "6", "9", "14"]
+
+
 def test_broken_transfer_goes_on_in_the_next_process():
     """The camera goes away in the midst of a file: what has come is kept, and nothing is captured again."""
     with small_rig() as rig:

@@ -17,10 +17,9 @@ from pipeline.rig.emulator.scene_camera import REFERENCE_FRAMES
 from pipeline.rig.emulator.scene_view import SceneView
 from pipeline.scan import Sweep
 from pipeline.simulator.simulated import SimulatedSource
-from pipeline.source import Line, References
+from pipeline.source import AT_REST, Line, References
 
 _EXACT_LINES, _EXACT_REFERENCES = SimulatedSource.lines_of, SimulatedSource.references
-FINE = Sweep("references", "fine", "x", 0.0, 0.0, 1)
 
 
 def lines_of(self: SimulatedSource, sweep: Sweep, numbers: range) -> list[Line]:
@@ -34,7 +33,7 @@ def lines_of(self: SimulatedSource, sweep: Sweep, numbers: range) -> list[Line]:
 def references(self: SimulatedSource, sweep: Sweep) -> References:
     """The references, as means of whole frames."""
     exact = _EXACT_REFERENCES(self, sweep)
-    if sweep == FINE:  # what the frames are made of
+    if sweep == AT_REST:  # what the frames are made of
         return exact
     frames = SceneView(self).references((self.camera.exposure_ms, self.camera.frame_ms), REFERENCE_FRAMES)
     dark, white = (mean_frame(frames[f"{name}Reference"]) for name in ("dark", "white"))

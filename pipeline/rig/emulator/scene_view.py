@@ -30,6 +30,7 @@ from pipeline.simulator.probe import Probe
 from pipeline.simulator.render import Choice
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource
+from pipeline.source import AT_REST
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -103,8 +104,7 @@ class SceneView:
 
     def references(self, times_ms: tuple[float, float], frames: int) -> dict[str, Raw]:
         """Dark and white frames (frame, sample, band) whose means are the source's, to half of 1 / ``frames`` DN."""
-        rest = Sweep("references", "fine", "x", 0.0, 0.0, 1)
-        taken = replace(self.source, rig=self._rig(times_ms)).references(rest)
+        taken = replace(self.source, rig=self._rig(times_ms)).references(AT_REST)
         dither = ((np.arange(frames) + 0.5) / frames)[:, None, None]
         return {
             name: np.clip(np.floor(mean[None] + dither), 0, 65535).astype(np.uint16)

@@ -1,0 +1,68 @@
+"""What is taken down of captures: the latest one that has a line counts, and nothing is told twice."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.rig.capture_journal import JOURNAL, CaptureJournal, Taken
+from pipeline.rig.kept_files import KeptInMemory
+from pipeline.rig.line_positions import LinePositions
+from tests.rig.small_rig import COARSE, FINE
+
+ONE = Taken(FINE, 0, 5, "/captured/a", True, (0.0, 0.1), (0.1, 0.2))
+OTHER = replace(ONE, folder="/captured/b", first=3, stop=9)
+
+
+def folders(journal: CaptureJournal) -> list[str]:
+    """Which capture has each line of the sweep; empty where none has."""
+    held = [journal.holding(FINE, line) for line in range(10)]
+    return [taken.folder[-1:] if taken else "" for taken in held]
+
+
+def test_latest_capture_of_a_line_counts() -> None:
+    """Of two that have a line the later one is read, and the earlier one once that is spent; so by another process."""
+    kept = KeptInMemory()
+    journal = CaptureJournal(kept)
+    journal.began(ONE)
+    journal.began(OTHER)
+    assert folders(journal) == folders(CaptureJournal(kept)) == [*"aaabbbbbb", ""]
+    journal.spend(OTHER, "cut off")
+    assert folders(journal) == folders(CaptureJournal(kept)) == [*"aaaaa", "", "", "", "", ""]
+    assert journal.holding(COARSE, 0) is None
+
+
+def test_folder_whose_name_comes_again_is_the_latest() -> None:
+    """A camera that was emptied counts its folders anew: the new capture counts, is not spent, and is tied anew."""
+    kept = KeptInMemory()
+    journal = CaptureJournal(kept)
+    again = replace(ONE, run_s=(7.0, 7.1))
+    journal.began(ONE)
+    journal.tied(ONE, tied(1.0), ())
+    journal.spend(ONE, "gone")
+    journal.began(replace(OTHER, first=0))
+    journal.began(again)
+    journal.tied(again, tied(2.0), ())
+    for told in (journal, CaptureJournal(kept)):
+        assert told.holding(FINE, 0) == again
+        assert [one["folder"] for one in told.captures] == ["/captured/b", "/captured/a"]
+        assert told.captures[-1]["residual_us"] == 2.0
+        assert "spent" not in told.captures[-1]
+
+
+def tied(residual_us: float) -> LinePositions:
+    """How lines were tied, with a residual that tells one from another."""
+    nothing = np.zeros(0)
+    return LinePositions(np.zeros((0, 2)), nothing, np.zeros(0, np.bool_), "log", residual_us, 0.1)
+
+
+def test_sweep_keeps_its_first_origin() -> None:
+    """Stamps of a line 0 that is captured again change no time of lines given before, and write nothing."""
+    kept = KeptInMemory()
+    journal = CaptureJournal(kept)
+    assert journal.origin_us(FINE) is None
+    assert journal.origin_us(FINE, 500) == 500
+    assert journal.origin_us(FINE, 700) == 500
+    assert journal.origin_us(FINE) == CaptureJournal(kept).origin_us(FINE) == 500
+    assert bytes(kept.files[JOURNAL]).count(b"\n") == 1

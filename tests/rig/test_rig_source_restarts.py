@@ -1,0 +1,86 @@
+"""What is left of a capture that was broken off, by error or kill: stopped, counted, used where it is there."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipeline.errors import RigError
+from pipeline.rig.capture_journal import JOURNAL
+from pipeline.rig.emulator.faults import make_fault
+from pipeline.rig.headwall_control import HeadwallControl
+from pipeline.rig.kept_files import KeptInMemory
+from tests.rig.small_rig import COARSE, FINE, SmallRig, small_rig
+from tests.rig.test_rig_source_faults import KeptUntil, KilledError, SlowEye, assert_same
+
+
+def killed_amid(rig: SmallRig, kept: KeptInMemory, patch: pytest.MonkeyPatch | None = None) -> None:
+    """Begin to capture the sweep, and die while it is waited for; with ``patch`` before the camera can be stopped."""
+
+    def die(*_: object) -> None:
+        raise KilledError
+
+    if patch is not None:
+        patch.setattr(HeadwallControl, "stop_capture", die)
+    with pytest.raises(KilledError):
+        list(rig.source(kept).saying(lambda words: die() if words.startswith("capturing") else None).lines(FINE))
+
+
+def test_capture_that_still_runs_is_waited_for():
+    """Killed while the camera captures: the next process waits for its end and has all of it, counted and tied."""
+    with small_rig() as rig:
+        kept = KeptInMemory()
+        SlowEye(rig, rig.line.clock.now() + 60)
+        with pytest.MonkeyPatch.context() as patch:
+            killed_amid(rig, kept, patch)
+        assert rig.emulated.camera.is_capturing()
+        source = rig.source(kept)
+        assert_same(list(source.lines(FINE)))
+        assert len(rig.captures) == 1
+        (told,) = source.record["captures"]
+        assert (told["method"], told["residual_us"]) == ("trigger", 0.0)
+
+
+def test_error_while_it_captures_stops_both():
+    """Whoever is interrupted leaves neither a camera that captures nor a mirror that waits for edges."""
+    with small_rig() as rig:
+        killed_amid(rig, KeptInMemory())
+        assert not rig.emulated.camera.is_capturing()
+        assert rig.emulated.camera.captures[0].due(1e9) < FINE.lines
+        assert not any(player.running for player in rig.emulated.mirror.state.players)
+
+
+def test_capture_that_was_ended_is_not_asked_for_its_end_again():
+    """The mirror has played another path since; what it stood at after this one is in the journal."""
+    with small_rig() as rig:
+        kept = KeptInMemory()
+        assert_same(list(rig.source(kept).lines(FINE)))
+        list(rig.source().lines(COARSE))
+        assert_same(list(rig.source(kept).lines(FINE)))
+        assert len(rig.captures) == 2
+
+
+def test_capture_by_its_own_clock_is_not_counted():
+    """Killed before its log is read: lines are tied by the commands' times, and no index is taken for a count."""
+    with small_rig(pulses="none", log_samples=16000) as rig:
+        kept = KeptUntil(acts={b"mirror_log": killed})
+        with pytest.raises(KilledError):
+            list(rig.source(kept).lines(FINE))
+        source = rig.source(kept)
+        assert len(list(source.lines(FINE))) == FINE.lines
+        assert [one["method"] for one in source.record["captures"]] == ["command"]
+        assert b'"what": "end"' not in kept.files[JOURNAL]
+
+
+def killed() -> None:
+    """The process ends here."""
+    raise KilledError
+
+
+@pytest.mark.parametrize("look", ["lines", "references"])
+def test_mirror_that_never_rests_is_not_captured_with(look: str):
+    """Neither a path nor a look at rest is begun while the mirror is not there yet."""
+    with small_rig(mirror_faults=[make_fault("never-stable", at=0)]) as rig:
+        source = rig.source()
+        with pytest.raises(RigError, match="is not at rest after"):
+            list(source.lines(FINE)) if look == "lines" else source.references(FINE)
+        assert not any(said.startswith("capture(") for said in rig.emulated.camera.commands)
