@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from flows.process_guard import end_with_us
 from flows.survey import Products, StageRunner, Step, survey
 from pipeline.errors import PipelineError
 from storage.archive import StageRef
@@ -28,7 +29,7 @@ QUIET = {
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
     "PREFECT_SERVER_EPHEMERAL_ENABLED": "true",
     "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "120",
-    "PREFECT_LOGGING_LEVEL": "ERROR",
+    "PREFECT_LOGGING_LEVEL": "CRITICAL",  # what fails is told once, in our words
     "PREFECT_SERVER_LOGGING_LEVEL": "ERROR",
     "PREFECT_LOGGING_TO_API_ENABLED": "false",
     "PREFECT_CLI_PROMPT": "false",
@@ -144,7 +145,7 @@ def _guarded_server() -> Iterator[None]:
 
     def guarded(self: SubprocessASGIServer) -> subprocess.Popen[Any]:
         process: subprocess.Popen[Any] = start(self)
-        end_with_us(process.pid)
+        atexit.register(end_with_us(process.pid))  # asked before Prefect asks for its server's end, so called after it
         return process
 
     SubprocessASGIServer._run_uvicorn_command = guarded  # type: ignore[method-assign]
@@ -152,15 +153,6 @@ def _guarded_server() -> Iterator[None]:
         yield
     finally:
         SubprocessASGIServer._run_uvicorn_command = start  # type: ignore[method-assign]
-
-
-def end_with_us(process: int) -> None:
-    """Have a process ended (SIGTERM) when this one is gone, however it went."""
-    reading, writing = os.pipe()  # the system closes the end held here, and the shell's read returns
-    words = ["sh", "-c", 'read -r nothing; kill "$0" 2>/dev/null', str(process)]
-    os.posix_spawn("/bin/sh", words, os.environ, file_actions=[(os.POSIX_SPAWN_DUP2, reading, 0)], setpgroup=0)
-    os.close(reading)
-    os.set_inheritable(writing, False)
 
 
 @contextmanager

@@ -7,47 +7,24 @@ from __future__ import annotations
 
 import os
 import platform
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any
 
 from flows.schedule_state import Ending, ScheduleState, moment_words, read_state
 from flows.schedule_times import Timetable
+from flows.wall_clock import WallClock
 from storage.ledger import Ledger
 
 SET_BACK = timedelta(minutes=1)  # a clock that goes back by less is being put right
 MOST_LINES = 100  # due times that passed and have a line each; more have one together
 MOST_COUNTED = 100_000
 MOST_ATTEMPTS = 3
-NOT_SERVED = "nothing was serving the schedule when it was due"
+NOT_SERVED = "nothing was serving the schedule when it was due, or was killed before it could begin"
 TOO_LATE = "it could not begin in time"
-
-
-class WallClock(Protocol):
-    """The time of day, which may jump."""
-
-    def now(self) -> datetime:
-        """The moment, with its zone."""
-
-    def sleep(self, seconds: float) -> None:
-        """Let time pass. [s]"""
-
-
-@dataclass(frozen=True)
-class SystemWallClock:
-    """The machine's clock."""
-
-    def now(self) -> datetime:
-        """The moment in UTC."""
-        return datetime.now(UTC)
-
-    def sleep(self, seconds: float) -> None:
-        """Wait; nothing for a time that is not above 0. [s]"""
-        if seconds > 0:
-            time.sleep(seconds)
+OVERTAKEN = "a later one came first"
 
 
 @dataclass(frozen=True)
@@ -84,21 +61,25 @@ class FieldSchedule:
                 known = {} if first is None else {"first": moment_words(first)}
                 self._write("opened", now, **facts, **known, pid=os.getpid())
 
-    def join(self, due: datetime) -> None:
+    def join(self, due: datetime) -> bool:
         """Serve a due time as part of what serves the field; open the schedule where nothing does, or by another one.
 
-        What started the run for that time was scheduling before it, with or without a line in the ledger.
+        What started the run for that time was scheduling before it, with or without a line in the ledger. False where
+        that is not so any more: another schedule was opened after that time, and this run is left over from before.
         """
         state = self.state()
         if not state.serving or state.timetable != self.timetable or state.late != self.late:
+            if state.serving and state.opened is not None and due < state.opened:
+                return False
             self.open(due)
+        return True
 
-    def close(self) -> None:
-        """Stop serving: nothing is due from now on."""
+    def close(self, at: datetime | None = None) -> None:
+        """Stop serving: nothing is due from now on, or from ``at`` on, when it was told to stop."""
         with self.ledger.held():
             state, now = self._state_now()
             if state.serving:
-                self._pass_over(state, now, "the schedule was stopped", keep=False)
+                self._pass_over(state, now, "the schedule was stopped", keep=False, until=at)
                 self._write("closed", now)
 
     def pending(self, why: str | None = None) -> list[datetime]:
@@ -118,6 +99,8 @@ class FieldSchedule:
             attempts = len(state.begun.get(due, ()))
             if due in state.ended or (not attempts and due not in waiting):
                 return None
+            if not attempts:
+                self._overtake(state, now, due)
             self._write("begun", now, due=moment_words(due), attempt=attempts + 1, pid=os.getpid(), **facts)
             return attempts + 1
 
@@ -128,6 +111,8 @@ class FieldSchedule:
             if due in state.ended:
                 return False
             began = state.begun.get(due)
+            if began is None:
+                self._overtake(state, now, due)
             attempts = {} if began is None else {"attempts": len(began)}
             self._write(ending, now, due=moment_words(due), reason=reason, **attempts, **facts)
             return True
@@ -154,6 +139,11 @@ class FieldSchedule:
         if self.clock.now() >= due + self.timetable.interval(due):
             return f"{gone}, and the next one was due before it could be resumed; what it captured is kept"
         return None
+
+    def _overtake(self, state: ScheduleState, now: datetime, due: datetime) -> None:
+        """Skip what is due before a due time that is about to be accounted for: later looks begin after that."""
+        if state.serving:
+            self._pass_over(state, now, OVERTAKEN, keep=False, until=due - timedelta.resolution)
 
     def _pass_over(
         self, state: ScheduleState, now: datetime, why: str, *, keep: bool, until: datetime | None = None
@@ -190,11 +180,13 @@ class FieldSchedule:
             looked, last, before = looked + 1, due, last
         if looked == MOST_COUNTED:  # counting them all would take too long
             self._write("passed", now, after=moment_words(since), until=moment_words(end), count=None, reason=why)
+            state.since = end
             return []
         fresh = last not in state.ended and last not in state.begun
         spared = keep and fresh and now <= timetable.latest_start(last, state.late)
         until, number = (before, count - 1) if spared else (last, count)
         self._write("passed", now, after=moment_words(since), until=moment_words(until), count=number, reason=why)
+        state.since = until
         return [last] if spared else []
 
     def _state_now(self) -> tuple[ScheduleState, datetime]:

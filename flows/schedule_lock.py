@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from flows.field_schedule import SystemWallClock, WallClock
 from flows.settings import Settings
+from flows.wall_clock import SystemWallClock, WallClock
 from pipeline.errors import RigError
 from storage.staging import take_lock
 

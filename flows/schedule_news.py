@@ -2,14 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
 from flows.field_schedule import FieldSchedule
 from flows.schedule_runs import Outcome
+from flows.schedule_state import read_moment, read_state
 from pipeline.errors import PipelineError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Several(Outcome):
+    """Due runs of a field that ended alike. ``due`` is the last one's, ``since`` the first one's or shortly before it.
+
+    ``count`` is None where there are too many to count.
+    """
+
+    since: datetime
+    count: int | None
+
+    def words(self) -> str:
+        """In one line."""
+        number = "very many" if self.count is None else self.count
+        span = f"{self.since:%Y-%m-%d %H:%M:%S} and {self.due:%Y-%m-%d %H:%M:%S} UTC"
+        return f"{self.field}, {number} due between {span}, {self.ending}: {self.reason}"
 
 
 @dataclass
@@ -19,6 +37,7 @@ class ScheduleNews:
     schedules: Mapping[str, FieldSchedule]
     refused: Callable[[str, PipelineError], None]  # told of a field whose ledger cannot be read
     _known: dict[str, set[datetime]] = field(default_factory=dict)
+    _passed: dict[str, int] = field(default_factory=dict)  # lines for very many due times
 
     def __post_init__(self) -> None:
         self.fresh()
@@ -29,15 +48,48 @@ class ScheduleNews:
 
     def _of(self, name: str, schedule: FieldSchedule) -> list[Outcome]:
         try:
-            ended = schedule.state().ended
+            lines = schedule.ledger.lines()
         except PipelineError as error:
             self.refused(name, error)
             return []
-        known = self._known.get(name)
-        self._known[name] = set(ended)
-        return [] if known is None else [_outcome(name, due, ended[due]) for due in sorted(set(ended) - known)]
+        ended, passed = read_state(lines).ended, [line for line in lines if line.get("event") == "passed"]
+        known, told = self._known.get(name), self._passed.get(name, 0)
+        self._known[name], self._passed[name] = set(ended), len(passed)
+        if known is None:
+            return []
+        many = [found for line in passed[told:] if (found := _several(name, line)) is not None]
+        return [*many, *(_outcome(name, due, ended[due]) for due in sorted(set(ended) - known))]
+
+
+def together(outcomes: Iterable[Outcome]) -> list[Outcome]:
+    """The same with one for all runs of a field that ended alike: after an outage there are very many."""
+    alike: dict[tuple[str, str | None], list[Outcome]] = {}
+    for outcome in outcomes:
+        alike.setdefault((outcome.field, outcome.ending), []).append(outcome)
+    return [_as_one(same) for same in alike.values()]
+
+
+def _as_one(outcomes: Sequence[Outcome]) -> Outcome:
+    if len(outcomes) == 1:
+        return outcomes[0]
+    last = max(outcomes, key=lambda one: one.due)
+    counts = [one.count if isinstance(one, Several) else 1 for one in outcomes]
+    return Several(
+        last.field, last.due, last.ending, f"the last one: {last.reason}",
+        since=min(one.since if isinstance(one, Several) else one.due for one in outcomes),
+        count=None if None in counts else sum(filter(None, counts)),
+    )  # fmt: skip
 
 
 def _outcome(name: str, due: datetime, line: Mapping[str, Any]) -> Outcome:
     reason, run = line.get("reason"), line.get("run")
     return Outcome(name, due, line["event"], None if reason is None else str(reason), None if run is None else str(run))
+
+
+def _several(name: str, line: Mapping[str, Any]) -> Several | None:
+    """What a line for very many due times says; None where none was left to be accounted for."""
+    after, until, count = read_moment(line.get("after")), read_moment(line.get("until")), line.get("count")
+    if after is None or until is None or count == 0:
+        return None
+    number = count if isinstance(count, int) else None
+    return Several(name, until, "skipped", str(line.get("reason")), since=after, count=number)

@@ -18,7 +18,7 @@ Tell = Callable[[str], None]  # one line for the operator
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a due run; ``ending`` is None where it was accounted for before."""
+    """What became of a due run; ``ending`` is None where it has none of its own in the ledger."""
 
     field: str
     due: datetime
@@ -29,7 +29,7 @@ class Outcome:
 
     def words(self) -> str:
         """In one line."""
-        told = self.ending or "was accounted for before"
+        told = self.ending or "was not begun here"
         more = f": {self.reason}" if self.reason else f": {self.run}" if self.run else ""
         return f"{self.field}, due {self.due:%Y-%m-%d %H:%M:%S} UTC, {told}{more}"
 
@@ -53,12 +53,12 @@ def run_due(
     words = f"{schedule.field}, due {due:%H:%M:%S} UTC"
     if not lock.wait(latest, schedule.clock, words):
         if resumed:
-            return Outcome(schedule.field, due, None)
+            return _as_noted(schedule, due)
         reason = f"the rig was in use by {lock.holder()} until it was too late to begin"
         return _end(schedule, due, "skipped", reason)
     try:
         if schedule.begin(due, **(facts or {})) is None:
-            return Outcome(schedule.field, due, None)
+            return _as_noted(schedule, due)
         return _survey(schedule, due, survey)
     finally:
         lock.release()
@@ -89,8 +89,15 @@ def _end(
     seconds: float | None = None,
     error: BaseException | None = None,
 ) -> Outcome:
-    noted = schedule.end(due, ending, reason, run=run, seconds=seconds)
-    return Outcome(schedule.field, due, ending if noted else None, reason, run, error)
+    if not schedule.end(due, ending, reason, run=run, seconds=seconds):
+        return _as_noted(schedule, due)
+    return Outcome(schedule.field, due, ending, reason, run, error)
+
+
+def _as_noted(schedule: FieldSchedule, due: datetime) -> Outcome:
+    """What the ledger says of a run that ended otherwise than here."""
+    line = schedule.state().ended.get(due, {})
+    return Outcome(schedule.field, due, line.get("event"), line.get("reason"), line.get("run"))
 
 
 def run_all(

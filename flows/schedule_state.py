@@ -50,8 +50,9 @@ def read_state(lines: Iterable[Mapping[str, Any]]) -> ScheduleState:
         elif event == "passed" and (until := read_moment(line.get("until"))) is not None:
             _reach(state, until)
         elif event == "begun" and due is not None:
+            if due not in state.begun:
+                _reach(state, due)
             state.begun.setdefault(due, []).append(line)
-            _reach(state, due)
         elif event in ENDINGS and due is not None and due not in state.ended:
             state.ended[due] = line
             if due not in state.begun:
@@ -90,5 +91,6 @@ def _reach(state: ScheduleState, moment: datetime) -> None:
 
 def _set_back(state: ScheduleState, at: datetime) -> None:
     """The clock was set back: what was skipped in a future that did not come is due again; what ran has run."""
-    state.seen = state.since = at
+    state.seen = at
+    state.since = at if state.since is None else min(state.since, at)  # what waits to be begun waits still
     state.ended = {due: line for due, line in state.ended.items() if due <= at or line.get("event") != "skipped"}

@@ -129,9 +129,11 @@ def parse_every(text: str) -> timedelta:
 
 def every_words(span: timedelta) -> str:
     """A span in the largest unit that it is a whole number of."""
-    seconds = span.total_seconds()
-    unit = next((unit for unit in ("d", "h", "m") if seconds % UNITS_S[unit] == 0), "s")
-    return f"{seconds / UNITS_S[unit]:g}{unit}"
+    for unit in ("d", "h", "m"):
+        number, rest = divmod(span, timedelta(seconds=UNITS_S[unit]))
+        if not rest:
+            return f"{number}{unit}"
+    return exact_words(span)
 
 
 def exact_words(span: timedelta) -> str:

@@ -6,7 +6,7 @@ import math
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -88,7 +88,7 @@ def _stopped_cleanly(tell: Tell) -> Iterator[None]:
 
 
 def _serve_plain(request: ServeRequest, console: Console, tell: Tell) -> None:
-    by_name = {one.name: one for one in request.fields}
+    by_name = {one.name: replace(one, settings=replace(one.settings, engine="plain")) for one in request.fields}
 
     def note(outcome: Outcome) -> None:
         send_notice(request.notify, outcome, by_name[outcome.field].settings.out)

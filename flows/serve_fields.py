@@ -12,11 +12,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from flows.field_schedule import FieldSchedule, SystemWallClock, WallClock
+from flows.field_schedule import FieldSchedule
 from flows.schedule_lock import RigLock, rig_lock
 from flows.schedule_state import moment_words
 from flows.schedule_times import Timetable
 from flows.settings import Settings, load_settings
+from flows.wall_clock import SystemWallClock, WallClock
 from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
 from pipeline.simulator.farm_laws import has_days
 from storage.archive import Archive
@@ -46,9 +47,12 @@ class ServedField:
         return rig_lock(self.settings, self.archive)
 
     def settings_of(self, due: datetime, timetable: Timetable) -> Settings:
-        """What the survey of a due time is asked for: a visit of its own; a farm that grows is as on that day."""
+        """What the survey of a due time is asked for: a visit of its own; a simulated farm is as on that day.
+
+        What stands before a rig, an emulated one too, is as it is.
+        """
         asked = replace(self.settings, name=self.name, visit=moment_words(due))
-        if has_days(asked.scene) and asked.day is None:
+        if asked.source == "sim" and has_days(asked.scene) and asked.day is None:
             asked = replace(asked, day=due.astimezone(timetable.zone).timetuple().tm_yday)
         return asked
 

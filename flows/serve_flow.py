@@ -16,17 +16,18 @@ from prefect.states import Completed, Failed
 from rich.console import Console
 
 from flows.archive_commands import FAILED, PARTLY
-from flows.field_schedule import FieldSchedule, WallClock
+from flows.field_schedule import FieldSchedule
 from flows.notices import send_notice
 from flows.publish import Published
 from flows.reprocess_command import ReprocessRequest, run_reprocess
-from flows.schedule_news import ScheduleNews
+from flows.schedule_news import ScheduleNews, together
 from flows.schedule_runs import Outcome, run_due
 from flows.schedule_state import read_moment
 from flows.schedule_times import parse_timetable
 from flows.serve_fields import ServedField, load_field
 from flows.survey_artifacts import publish_artifacts
 from flows.survey_command import run_survey
+from flows.wall_clock import WallClock
 from pipeline.errors import PipelineError, RigError, SettingsError
 from storage.archive import Archive
 from storage.staging import take_lock
@@ -59,11 +60,12 @@ def survey_scheduled(
         if moment is None or not _wait_for(moment, schedule.clock):
             return _by_hand(one, schedule)
         news = ScheduleNews({field: schedule}, lambda name, error: None)
-        schedule.join(moment)
+        if not schedule.join(moment):
+            return Completed(name="Skipped", message="it is of a schedule that is not served any more")
         outcome = _run(one, schedule, moment)
     except PipelineError as error:
         return Failed(message=str(error))
-    for known in news.fresh():
+    for known in together(news.fresh()):
         send_notice(notify, known, one.settings.out)
     return _state(outcome)
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
 from datetime import datetime, timedelta
 
-from flows.field_schedule import FieldSchedule, SystemWallClock, WallClock
+from flows.field_schedule import FieldSchedule
 from flows.schedule_lock import RigLock
-from flows.schedule_news import ScheduleNews
+from flows.schedule_news import ScheduleNews, together
 from flows.schedule_runs import Outcome, Survey, Tell, run_all
+from flows.wall_clock import SystemWallClock, WallClock
+from pipeline.errors import PipelineError
 
 LOOK_AGAIN = timedelta(seconds=30)  # a clock that jumps, or a run that died, is seen after this at the latest
 
@@ -23,23 +26,36 @@ def serve_plain(
     note: Callable[[Outcome], None] = lambda outcome: None,
     until: datetime | None = None,
 ) -> None:
-    """Serve schedules until ``until``, or until interrupted; then they are closed, and what began is resumed later."""
+    """Serve schedules until ``until``, or until interrupted; then they are closed, and what began is resumed later.
+
+    Raises
+    ------
+    PipelineError : a ledger cannot be written at the start; what was opened until then is closed.
+    """
     watch, news = clock or SystemWallClock(), ScheduleNews(schedules, lambda name, error: tell(f"{name}: {error}"))
-    for schedule in schedules.values():
-        schedule.open()
-    try:
+    with ExitStack() as opened:
+        for name, schedule in schedules.items():
+            opened.callback(_close, name, schedule, tell)
+            schedule.open()
         while until is None or watch.now() < until:
             outcomes = run_all(schedules, lambda name: locks[name], survey, tell)
-            ran = {(outcome.field, outcome.due) for outcome in outcomes}
-            for outcome in news.fresh():  # also what was skipped, or found dead
+            ran = {(outcome.field, outcome.due) for outcome in outcomes if outcome.ending}
+            fresh = news.fresh()
+            for outcome in fresh:  # also what was skipped, or found dead
                 if (outcome.field, outcome.due) not in ran:
                     tell(outcome.words())
+            for outcome in together(fresh):
                 note(outcome)
             if not any(outcome.ending for outcome in outcomes):  # else others may have become due meanwhile
                 watch.sleep(_pause(schedules.values(), watch.now()).total_seconds())
-    finally:
-        for schedule in schedules.values():
-            schedule.close()
+
+
+def _close(name: str, schedule: FieldSchedule, tell: Tell) -> None:
+    """Close a schedule; one that cannot be closed keeps the others from nothing."""
+    try:
+        schedule.close()
+    except PipelineError as error:
+        tell(f"{name}: {error}")
 
 
 def _pause(schedules: Iterable[FieldSchedule], now: datetime) -> timedelta:

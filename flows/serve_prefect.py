@@ -8,11 +8,13 @@ from __future__ import annotations
 import time
 from contextlib import suppress
 
+from flows.field_schedule import FieldSchedule
 from flows.schedule_runs import Tell
 from flows.serve_request import ServeRequest
 from flows.serve_runner import RunnerProcess
 from flows.serve_server import LocalServer, pages_of, server_for
 from flows.serve_watcher import Watcher
+from flows.wall_clock import SystemWallClock
 from pipeline.errors import PipelineError
 
 WATCH_S = 15.0
@@ -23,15 +25,17 @@ def serve_prefect(request: ServeRequest, tell: Tell) -> None:
 
     Raises
     ------
-    PipelineError : no server, or a ledger cannot be written at the start.
+    PipelineError : no server, or a ledger cannot be written at the start; what was opened until then is closed.
     """
     schedules, home = request.schedules(), request.fields[0].archive / ".prefect"
     log = home / "surveys.log"
     with server_for(home, request.port) as server:
         watcher, runner = Watcher(request, schedules, tell), RunnerProcess(request.words(), log)
-        for schedule in schedules.values():
-            schedule.open()
+        opened: list[FieldSchedule] = []
         try:
+            for schedule in schedules.values():
+                opened.append(schedule)
+                schedule.open()
             tell(request.headline)
             tell(f"Prefect's pages: {pages_of(server)}; what surveys say: {log}")
             watcher.prepare()
@@ -45,11 +49,13 @@ def serve_prefect(request: ServeRequest, tell: Tell) -> None:
                     tell("runs that were asked for do not begin: Prefect's runner is started again")
                     runner.restart()
         finally:
+            stopped = SystemWallClock().now()
+            tell("stopping; what is under way is interrupted, and resumed when it is served again")
             runner.stop()
-            watcher.tell_news()
-            for schedule in schedules.values():
+            for schedule in opened:
                 with suppress(PipelineError):
-                    schedule.close()
+                    schedule.close(stopped)
+            watcher.tell_news()
 
 
 def _keep_up(server: LocalServer | None, runner: RunnerProcess, tell: Tell) -> None:

@@ -6,55 +6,25 @@ By itself Prefect's runner does not come back once its server has been away.
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from flows.engine import end_with_us
+from flows.process_guard import KeptProcess
 
 PATIENCE_S = 15.0
-LARGEST_LOG = 10_000_000  # bytes; a larger one is begun anew
 
 
-@dataclass
-class RunnerProcess:
-    """Prefect's runner, in a process of its own; ``words`` are what `main` reads."""
+class RunnerProcess(KeptProcess):
+    """Prefect's runner, in a process of its own; ``words`` are what `main` reads, ``log`` has what it and surveys say.
 
-    words: dict[str, Any]
-    log: Path  # what it and the surveys say
-    _process: subprocess.Popen[bytes] | None = field(default=None, repr=False)
+    A survey that it has started goes on by itself when it ends, or is resumed.
+    """
 
-    def keep_up(self) -> bool:
-        """Start it where it does not run; whether it was started."""
-        if self._process is not None and self._process.poll() is None:
-            return False
-        command = [sys.executable, "-m", "flows.serve_runner", json.dumps(self.words)]
-        self.log.parent.mkdir(parents=True, exist_ok=True)
-        grown = self.log.exists() and self.log.stat().st_size > LARGEST_LOG
-        with self.log.open("wb" if grown else "ab") as log:
-            self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-        end_with_us(self._process.pid)
-        return True
-
-    def restart(self) -> None:
-        """End it and start it again; a survey that it has started goes on by itself, or is resumed."""
-        self.stop()
-        self.keep_up()
-
-    def stop(self) -> None:
-        """End it."""
-        process, self._process = self._process, None
-        if process is None or process.poll() is not None:
-            return
-        process.terminate()
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(PATIENCE_S)
-            return
-        process.kill()
-        process.wait()
+    def __init__(self, words: Mapping[str, Any], log: Path) -> None:
+        super().__init__([sys.executable, "-m", "flows.serve_runner", json.dumps(words)], log, PATIENCE_S)
 
 
 def main(text: str) -> None:

@@ -4,63 +4,46 @@ from __future__ import annotations
 
 import os
 import socket
-import subprocess
 import sys
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from http.client import HTTPException
 from pathlib import Path
 
-from flows.engine import QUIET, end_with_us
+from flows.engine import QUIET
+from flows.process_guard import KeptProcess
 from pipeline.errors import SettingsError
 
 HOST = "127.0.0.1"
 STARTED_WITHIN_S = 120.0
+ENDS_WITHIN_S = 10.0
 PATIENCE_S = 10.0  # with a server that is named
+NO_ANSWER = (OSError, ValueError, HTTPException)  # also of what speaks another protocol
 POLL_S = "2"  # how often Prefect looks for due runs; by its own default the next field waits up to 10 s
 
 
-class LocalServer:
+class LocalServer(KeptProcess):
     """A server process with its files in a folder; started again where it has died."""
 
     def __init__(self, home: Path, port: int) -> None:
-        self.url, self._home, self._port = f"http://{HOST}:{port}/api", home, port
-        self._process: subprocess.Popen[bytes] | None = None
-
-    def keep_up(self) -> bool:
-        """Start it where it does not run; whether it was started."""
-        if self._process is not None and self._process.poll() is None:
-            return False
-        self._home.mkdir(parents=True, exist_ok=True)
-        words = [sys.executable, "-m", "prefect", "server", "start", "--host", HOST, "--port", str(self._port)]
-        with (self._home / "server.log").open("ab") as log:
-            self._process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-        end_with_us(self._process.pid)
-        return True
+        self.url = f"http://{HOST}:{port}/api"
+        command = [sys.executable, "-m", "prefect", "server", "start", "--host", HOST, "--port", str(port)]
+        super().__init__(command, home / "server.log", ENDS_WITHIN_S)
 
     def wait(self) -> bool:
         """Wait until it answers; False where it has not within two minutes, or has ended."""
         end = time.monotonic() + STARTED_WITHIN_S
         while time.monotonic() < end:
-            with suppress(OSError), urllib.request.urlopen(f"{self.url}/health", timeout=2) as answer:
+            with suppress(*NO_ANSWER), urllib.request.urlopen(f"{self.url}/health", timeout=2) as answer:
                 if answer.status == 200:
                     return True
-            if self._process is None or self._process.poll() is not None:
+            if not self.runs():
                 return False
             time.sleep(0.2)
         return False
-
-    def stop(self) -> None:
-        """End it."""
-        if self._process is not None and self._process.poll() is None:
-            self._process.terminate()
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(10)
-                return
-            self._process.kill()
-            self._process.wait()
 
 
 def pages_of(server: LocalServer | None) -> str:
@@ -94,7 +77,7 @@ def server_for(home: Path, port: int) -> Iterator[LocalServer | None]:
         server.keep_up()
         if not server.wait():
             raise SettingsError(
-                f"the Prefect server did not start; see {home / 'server.log'}, or go without one: --engine plain"
+                f"the Prefect server did not start; see {server.log}, or go without one: --engine plain"
             )
         yield server
     finally:
@@ -109,7 +92,7 @@ def _check_answers(url: str) -> None:
             return
     except urllib.error.HTTPError:  # it is there, and wants to know who asks
         return
-    except (OSError, ValueError) as error:
+    except NO_ANSWER as error:
         raise SettingsError(
             f"no Prefect server answers at {url}, which PREFECT_API_URL names ({error}): start it, or unset the "
             f"variable and have one started here"

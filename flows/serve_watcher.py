@@ -10,22 +10,28 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from flows.field_schedule import FieldSchedule
 from flows.notices import send_notice
 from flows.schedule_lock import RigLock
-from flows.schedule_news import ScheduleNews
+from flows.schedule_news import ScheduleNews, together
 from flows.schedule_runs import Tell
 from flows.schedule_state import moment_words
-from flows.schedule_times import EPOCH
 from flows.serve_fields import ServedField
 from flows.serve_request import ServeRequest
 from storage.staging import take_lock
 
-GRACE = timedelta(seconds=45)  # after a due time Prefect's own scheduler is given so long
+GRACE = timedelta(seconds=45)  # after a due time Prefect's own scheduler is given so long, or less: see `_grace`
 ASK_AGAIN = timedelta(minutes=3)
 UNHEARD = timedelta(minutes=1)
+
+
+class Asked(NamedTuple):
+    """When a run was asked for, and how often it had begun by then."""
+
+    at: datetime
+    attempts: int
 
 
 @dataclass
@@ -36,8 +42,7 @@ class Watcher:
     schedules: Mapping[str, FieldSchedule]
     tell: Tell
     client_of: Callable[[], Any] = field(default=lambda: _client())
-    asked: dict[tuple[str, datetime], datetime] = field(default_factory=dict)
-    attempts: dict[tuple[str, datetime], int] = field(default_factory=dict)
+    asked: dict[tuple[str, datetime], Asked] = field(default_factory=dict)  # and not begun since, as far as is known
     news: ScheduleNews = field(init=False)
 
     def __post_init__(self) -> None:
@@ -50,40 +55,64 @@ class Watcher:
         with self._errors("Prefect"), self.client_of() as client:
             client.upsert_global_concurrency_limit_by_name(LIMIT, 1)
         for one in self.request.fields:
-            self._alone(one, lambda one=one: self._reap_prefect(one))  # type: ignore[misc]
+            with self._errors(one.name):
+                self._alone(one, lambda one=one: self._reap_prefect(one))  # type: ignore[misc]
 
     def tell_news(self) -> None:
-        """Tell how runs ended since the last time, a line each, and give notice where an address was given."""
-        archives = {one.name: one.settings.out for one in self.request.fields}
-        for outcome in self.news.fresh():
+        """Tell how runs ended since the last time, a line each, and give notice where an address was given.
+
+        Of all that ended alike in a field there is one notice.
+        """
+        archives, fresh = {one.name: one.settings.out for one in self.request.fields}, self.news.fresh()
+        for outcome in fresh:
             self.tell(outcome.words())
+        for outcome in together(fresh):
             send_notice(self.request.notify, outcome, archives[outcome.field])
 
     def unheard(self) -> bool:
         """Whether a run that was asked for has not begun in time though nothing else runs: told once for each."""
-        late: list[tuple[str, datetime]] = []
         if self.busy():  # they wait for their turn, and the runner has a survey under way
             return False
-        for (name, due), asked in self.asked.items():
-            state, now = self.schedules[name].state(), self.schedules[name].clock.now()
-            began = due in state.ended or len(state.begun.get(due, ())) > self.attempts.get((name, due), 0)
-            if not began and now - asked > UNHEARD:
-                late.append((name, due))
+        late: list[tuple[str, datetime]] = []
+        for name in {name for name, _ in self.asked}:
+            with self._errors(name):
+                late += self._late_ones(name)
         for one in late:
             del self.asked[one]
         return bool(late)
 
+    def _late_ones(self, name: str) -> list[tuple[str, datetime]]:
+        """What of a field was asked for a while ago and has not begun; what has is forgotten."""
+        state, now = self.schedules[name].state(), self.schedules[name].clock.now()
+        late: list[tuple[str, datetime]] = []
+        for (field_name, due), asked in list(self.asked.items()):
+            if field_name != name:
+                continue
+            if due in state.ended or len(state.begun.get(due, ())) > asked.attempts:
+                del self.asked[name, due]
+            elif now - asked.at > UNHEARD:
+                late.append((name, due))
+        return late
+
     def busy(self) -> bool:
         """Whether another survey would have to wait: all rigs are in use, or as much runs as may run at a time."""
-        rigs = {lock.path: lock for lock in (one.lock() for one in self.request.fields)}
-        archives = {one.archive for one in self.request.fields}
-        looking = 0
-        for lock in rigs.values():
-            with self._errors("the rig"):
-                looking += not lock.take("a look at the schedule")
-            lock.release()
+        rigs: dict[Path, RigLock] = {}
+        archives: set[Path] = set()
+        for one in self.request.fields:
+            with self._errors(one.name):
+                lock = one.lock()
+                rigs[lock.path] = lock
+                archives.add(one.archive)
+        looking = sum(self._is_in_use(lock) for lock in rigs.values())
         reprocessing = sum(self._is_reprocessed(archive) for archive in archives)
         return looking == len(rigs) or looking + reprocessing >= self.request.limit
+
+    def _is_in_use(self, lock: RigLock) -> bool:
+        with self._errors("the rig"):
+            if not lock.take("a look at the schedule"):
+                return True
+            lock.release()
+        return False
 
     def _is_reprocessed(self, archive: Path) -> bool:
         from flows.serve_flow import REPROCESS_LOCK
@@ -106,29 +135,29 @@ class Watcher:
                 free = self._alone(one, lambda r=resumed, s=schedule: r.extend(s.reap(self._why)))  # type: ignore[misc]
                 why = None if free else f"the rig was in use by {one.lock().holder()}"
                 now = schedule.clock.now()
-                waiting = [due for due in schedule.pending(why) if now - due >= GRACE]
+                waiting = [due for due in schedule.pending(why) if now - due >= _grace(schedule, due)]
                 missed += [(one.name, due) for due in (*resumed, *(waiting if free else ()))]
-        asked = [(name, due) for name, due in missed if not full and self._is_to_be_asked(name, due)]
-        for name, due in asked:
-            with self._errors("Prefect"):
-                self._ask(name, due)
+        asked: list[tuple[str, datetime]] = []
+        for name, due in missed:
+            if not full and self._may_be_asked(name, due):
+                with self._errors("Prefect"):
+                    self._ask(name, due)
+                    asked.append((name, due))
         return asked
 
-    def _is_to_be_asked(self, name: str, due: datetime) -> bool:
-        now = self.schedules[name].clock.now()
-        if now - self.asked.get((name, due), EPOCH) < ASK_AGAIN:
-            return False
-        self.asked[name, due] = now
-        self.attempts[name, due] = len(self.schedules[name].state().begun.get(due, ()))
-        return True
+    def _may_be_asked(self, name: str, due: datetime) -> bool:
+        known = self.asked.get((name, due))
+        return known is None or self.schedules[name].clock.now() - known.at >= ASK_AGAIN
 
     def _ask(self, name: str, due: datetime) -> None:
         """Have a run that crashed, or that Prefect did not start, run now."""
-        one = next(one for one in self.request.fields if one.name == name)
+        one, schedule = next(one for one in self.request.fields if one.name == name), self.schedules[name]
+        attempts = len(schedule.state().begun.get(due, ()))
         with self.client_of() as client:
             deployment = client.read_deployment_by_name(f"survey/{name}")
             parameters = {**self.request.parameters(one), "due": moment_words(due)}
             client.create_flow_run_from_deployment(deployment.id, parameters=parameters)
+        self.asked[name, due] = Asked(schedule.clock.now(), attempts)
         self.tell(f"{name}: the run due {due:%H:%M:%S} UTC is asked for again")
 
     def _alone(self, one: ServedField, work: Callable[[], object]) -> bool:
@@ -188,6 +217,11 @@ class _Told:
             return False
         self.tell(f"{self.what}: {error}")
         return True
+
+
+def _grace(schedule: FieldSchedule, due: datetime) -> timedelta:
+    """How long Prefect is waited for: it makes runs of a new deployment late, so a third of what a run may wait."""
+    return min(GRACE, (schedule.timetable.latest_start(due, schedule.late) - due) / 3)
 
 
 def reap_flow_runs(client: Any, field: str | None, what: str) -> list[str]:

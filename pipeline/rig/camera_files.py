@@ -79,7 +79,7 @@ def _fetch(server: FileServer, file: RemoteFile, kept: Kept, progress: Progress 
                 raise type(error)(
                     f"{error}; {kept.size(file.name)} bytes of {file.name} are kept, and fetching again goes on there"
                 ) from error
-            LOG.warning("%s; going on at byte %d of %s", error, kept.size(file.name), file.name)
+            LOG.info("%s; going on at byte %d of %s", error, kept.size(file.name), file.name)
             clock.sleep(server.pause_s)
 
 
@@ -169,7 +169,8 @@ def _session(server: FileServer) -> Iterator[ftplib.FTP]:
     except (RigError, GeneratorExit):
         raise
     except (OSError, EOFError) as error:
-        raise DeviceGone(f"{where} is not there or went away ({error or 'connection closed'}); is it on?") from error
+        why = str(error) or "connection closed"
+        raise DeviceGone(f"{where} is not there or went away ({why}); is it on?") from error
     finally:
         session.close()
 

@@ -77,9 +77,7 @@ class CaptureRunner:
         """
         steering, prefix = self.devices.steering, capture_prefix(path.sweep, path.first)
         self._configure()
-        steering.load_path(
-            path.cells, progress=lambda done, total: self._say(f"path to the mirror: {done} of {total} cells")
-        )
+        steering.load_path(path.cells, progress=lambda done, total: self._say(f"path: {done} of {total} cells"))
         steering.goto(*(float(place) for place in path.cells[0]))
         steering.settle(self._rig.settle_s)
         with self._stopped_on_error():
@@ -108,7 +106,7 @@ class CaptureRunner:
         began, wanted = clock.now(), self._seconds(taken.stop - taken.first)
         until, stopped = began + wanted + SLACK_S, False
         while camera.is_capturing():
-            self._say(f"capturing {taken.stop - taken.first} lines: {clock.now() - began:.0f} of {wanted:.0f} s")
+            self._say(f"capturing: {clock.now() - began:.0f} of {wanted:.0f} s")
             if clock.now() >= until:
                 if stopped:
                     raise RigError(

@@ -171,7 +171,7 @@ class HeadwallControl:
                     self._hang_up()
                     if not left:
                         raise
-                    LOG.warning("%s; asking again", error)
+                    LOG.info("%s; asking again", error)
                     self.clock.sleep(self.patience.pause_s)
             raise AssertionError("unreachable")
 
@@ -184,7 +184,7 @@ class HeadwallControl:
                 self._reader = ReplyReader()
                 return
             except RigError as error:
-                LOG.warning("%s; connecting again", error)
+                LOG.info("%s; connecting again", error)
                 self._hang_up()
         self._line, self._reader = self._connect(), ReplyReader()
         try:

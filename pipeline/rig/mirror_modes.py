@@ -66,7 +66,7 @@ class Modes:
         try:
             self.pro.tell(go_simple(), "changing to simple mode")
         except DeadlinePassed as error:  # it may have changed all the same; the greeting tells
-            LOG.warning("%s; greeting it all the same", error)
+            LOG.info("%s; greeting it all the same", error)
         self._greet()
 
     def _greet(self) -> None:
@@ -81,7 +81,7 @@ class Modes:
         try:
             self._lines.tell(words)
         except DeadlinePassed as error:  # it may have changed all the same; the status tells
-            LOG.warning("%s; asking for the status all the same", error)
+            LOG.info("%s; asking for the status all the same", error)
         except DeviceRefused as error:
             raise DeviceRefused(f"{error}. Firmware without {words}? Turn mirror.with_crc over") from error
         self.pro.ask(ask_status(), "the status", cell_int)

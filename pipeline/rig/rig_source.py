@@ -189,13 +189,26 @@ class RigSource:
         """
         if self._journal.references not in self._whole:
             with self.session() as runner:
-                if not self._journal.references:
+                known = self._journal.references and self._known_references(runner)
+                if not known:
                     self._journal.refer(runner.look_at_rest(REFERENCES))
-                self._whole[self._journal.references] = self._whole_references(runner, self._journal.references)
+                    known = self._whole_references(runner, self._journal.references)
+                self._whole[self._journal.references] = known
         whole, _ = self._whole[self._journal.references]
         bad = None if whole.bad is None or not whole.bad.any() else _sums(whole.bad, sweep.binning) > 0
         dark, white = (_sums(frame, sweep.binning) for frame in (whole.dark, whole.white))
         return References(dark, white, whole.panel, bad, by_mirror=self.rig.white_at_rest)
+
+    def _known_references(self, runner: CaptureRunner) -> tuple[References, tuple[str, ...]] | None:
+        """The frames of an earlier session; None where the camera has them no more: it was emptied, or is another."""
+        folder = self._journal.references
+        try:
+            return self._whole_references(runner, folder)
+        except RigError as error:
+            if type(error) not in (RigError, DeviceRefused) or getattr(error, "code", None) == NOT_LOGGED_IN:
+                raise
+            LOG.warning("dark and white frames are taken again; %s: %s", folder, error)
+            return None
 
     def _whole_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]]:
         """Dark and white frames of all samples, and what was found of them."""
@@ -228,8 +241,8 @@ class RigSource:
         self._journal.tied(taken, placed.tied, captured.notes)
         yield from self._given(captured.values, placed, path, line)
 
-    def _fetched(self, name: str, held: int, size: int) -> None:
-        self._say(f"fetching {name.rpartition('/')[2]}: {held / 1e6:.1f} of {size / 1e6:.1f} MB")
+    def _fetched(self, _: str, held: int, size: int) -> None:
+        self._say(f"fetching: {held / 1e6:.1f} of {size / 1e6:.1f} MB")
 
     def _given(self, values: NDArray[np.uint16], placed: PlacedLines, path: CapturePath, line: int) -> Iterator[Line]:
         """Lines from ``line`` on; one that the camera dropped, or that nothing places, is there and not valid."""

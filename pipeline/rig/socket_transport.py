@@ -30,8 +30,8 @@ class SocketTransport:
             self._socket = socket.create_connection((host, port), timeout=connect_s)
         except (OSError, UnicodeError) as error:
             raise DeviceGone(
-                f"no connection to {self.port} within {connect_s:g} s ({error}); is the camera on, its network cable "
-                "in, and this machine's address in its network?"
+                f"no connection to {self.port}: {_why_not(error, connect_s)}; is the camera on, its network cable in, "
+                "and this machine's address in its network?"
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
@@ -105,3 +105,9 @@ class SocketTransport:
 
     def _gone(self, why: str) -> DeviceGone:
         return DeviceGone(f"the connection to {self.port} was lost ({why}); look at the cable and the power")
+
+
+def _why_not(error: OSError | UnicodeError, connect_s: float) -> str:
+    if isinstance(error, TimeoutError):
+        return f"nothing answered within {connect_s:g} s"
+    return str(getattr(error, "strerror", None) or error).lower()

@@ -6,11 +6,11 @@ import json
 import tempfile
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from flows.field_schedule import FieldSchedule
@@ -70,7 +70,15 @@ def do(schedule: FieldSchedule, clock: HandClock, step: tuple[str, object], lock
     cron=st.sampled_from(CRONS), zone=st.sampled_from(ZONES), start=st.sampled_from(CHANGES), steps=steps,
     late=st.sampled_from([0.1, 0.5, 1.0]),
 )  # fmt: skip
-@settings(max_examples=30, deadline=None)
+@example(  # set back while a due time waits to be begun
+    cron="30 2 * * *", zone="UTC", start=CHANGES[0], late=0.1,
+    steps=[*[("wait", 1)] * 3, ("jump", 109_858), ("start", 0), ("jump", -61), ("start", 0)],
+)  # fmt: skip
+@example(  # a run that died is resumed in what is its past by a clock that was set back
+    cron="*/20 * * * *", zone="UTC", start=CHANGES[0], late=0.1,
+    steps=[("wait", 2400), ("run", "killed"), ("jump", -1231), ("run", "well")],
+)  # fmt: skip
+@settings(max_examples=120, deadline=None)
 def test_every_due_time_is_accounted_for_exactly_once(
     cron: str, zone: str, start: datetime, steps: list[tuple[str, object]], late: float
 ) -> None:
@@ -79,10 +87,11 @@ def test_every_due_time_is_accounted_for_exactly_once(
         clock, lock = HandClock(start), RigLock(Path(folder) / "rig.lock")
         schedule = FieldSchedule(Ledger(Path(folder), "north"), parse_timetable(cron, None, zone), late, clock)
         schedule.open()
+        latest = start
         for step in steps:
             do(schedule, clock, step, lock)
-        latest = max(clock.moment, start)
-        clock.moment = latest + timedelta(days=40)  # when nothing can be pending, and nothing be resumed
+            latest = max(latest, clock.moment)
+        *_, clock.moment = islice(schedule.timetable.due_after(latest), 3)  # nothing is pending then, nor to be resumed
         schedule.reap()
         schedule.close()
         assert not schedule.state().open
@@ -156,6 +165,20 @@ def test_long_spans_keep_every_second(every: str) -> None:
     assert given.every is not None
     assert parse_every(exact_words(given.every)) == given.every
     assert read_timetable(json.loads(json.dumps(given.to_dict()))) == given
+
+
+@pytest.mark.parametrize(
+    ("every", "words"),
+    [
+        ("30m", "30m"), ("1.5h", "90m"), ("48h", "2d"), ("90.5s", "90.5s"), ("1234567s", "1234567s"),
+        ("100000.5s", "100000.5s"), ("0.1d", "144m"), ("366d", "366d"), ("10.000001s", "10.000001s"),
+    ],
+)  # fmt: skip
+def test_a_span_is_told_exactly(every: str, words: str) -> None:
+    """In its largest unit, with every digit: what is told can be given again."""
+    table = parse_timetable(None, every, "UTC")
+    assert table.words() == f"every {words}"
+    assert parse_every(words) == table.every
 
 
 @pytest.mark.parametrize("before", ["never served", "closed", "served by another schedule", "served less patiently"])

@@ -218,6 +218,10 @@ def test_very_many_missed_due_times_have_one_line(tmp_path: Path) -> None:
     lines = schedule.ledger.lines()
     assert [line["event"] for line in lines] == ["opened", "passed"]
     assert lines[-1]["count"] == 30 * 72 - 1
+    assert schedule.pending() == [NOON + timedelta(days=30)]
+    assert schedule.ledger.lines() == lines
+    assert schedule.begin(NOON + timedelta(days=30)) == 1
+    assert [line["event"] for line in schedule.ledger.lines()] == ["opened", "passed", "begun"]
 
 
 def test_a_clock_from_the_far_future_and_back(tmp_path: Path) -> None:

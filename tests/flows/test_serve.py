@@ -1,4 +1,4 @@
-"""Serving: what is refused before anything runs, plain serving, artifacts and notices."""
+"""Serving: what is refused before anything runs, plain serving and artifacts."""
 
 from __future__ import annotations
 
@@ -6,27 +6,26 @@ import base64
 import io
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from datetime import UTC, datetime, timedelta
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from flows import schedule_lock
-from flows.notices import send_notice
-from flows.schedule_runs import Outcome
+from flows import schedule_lock, serve_command, serve_prefect
 from flows.schedule_times import parse_timetable
 from flows.serve_fields import ServedField, alone_on, load_fields
 from flows.serve_plain import serve_plain
+from flows.serve_request import ServeRequest
 from flows.settings import Settings
 from flows.survey_artifacts import MOST_BYTES, artifact_key, savings_rows, small_jpeg, survey_markdown
 from pipeline.errors import ArchiveError
 from storage.archive import Archive
+from storage.ledger import Ledger
 from tests.flows.schedule_days import NOON, HandClock
 
 EVERY = parse_timetable(None, "20m", "UTC")
@@ -48,6 +47,7 @@ BAD = {
     "limit": (("north",), "--every 30m --limit 0", 2, "--limit 0: expected 1 or more"),
     "zone": (("north",), "--cron '0_6_*_*_*' --timezone Mars/Olympus", 2, "'Mars/Olympus' is no time zone"),
     "address": (("north",), "--every 30m --notify ftp://x", 2, "expected https://HOST/PATH"),
+    "address of no port": (("north",), "--every 30m --notify http://host:port/x", 2, "'http://host:port/x' is no addr"),
     "name": (("named",), "--every 30m", 2, "'name' in .*named.toml must be a name of letters, digits"),
 }
 
@@ -119,6 +119,25 @@ def test_a_server_that_cannot_be_had(
     assert load_fields([file])[0].schedule(EVERY, 0.5).ledger.lines() == []
 
 
+def test_a_ledger_that_cannot_be_written_at_the_start(
+    field_file: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is served on Prefect, and no field is left as if it were."""
+    request = ServeRequest(fields=load_fields([field_file("north"), field_file("south")]), timetable=EVERY, late=0.5)
+    append = Ledger.append
+
+    def refuse(self: Ledger, line: Mapping[str, Any]) -> None:
+        if self.field == "south":
+            raise ArchiveError("the disk is full")
+        append(self, line)
+
+    monkeypatch.setattr(Ledger, "append", refuse)
+    monkeypatch.setattr(serve_prefect, "server_for", lambda home, port: nullcontext())
+    with pytest.raises(ArchiveError, match="the disk is full"):
+        serve_prefect.serve_prefect(request, lambda words: None)
+    assert [line["event"] for line in request.schedules()["north"].ledger.lines()] == ["opened", "closed"]
+
+
 def test_the_flag_for_the_archive_wins(field_file: Callable[..., Path], tmp_path: Path) -> None:
     """Fields keep their own archives, unless one is given for all."""
     files = [field_file("north"), field_file("south", out=str(tmp_path / "other"))]
@@ -135,6 +154,27 @@ def test_a_farm_that_grows_is_seen_on_its_day() -> None:
     assert (asked.name, asked.visit, asked.day) == ("farm", "2026-02-01T23:30:00Z", 33)
     fixed = ServedField("farm", Path("farm.toml"), Settings(scene="farm@2", day=172))
     assert fixed.settings_of(due, berlin).day == 172
+    rig = ServedField("farm", Path("farm.toml"), Settings(scene="farm@2", source="rig"))
+    assert rig.settings_of(due, berlin).day is None  # what stands before a rig is as it is
+
+
+def test_plain_serving_needs_no_server(
+    field_file: Callable[..., Path], command_line: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Its surveys run without one too, whatever the fields' files say or leave out."""
+    engines: list[str] = []
+
+    def served(schedules: Any, locks: Any, survey: Callable[..., Path], *_: Any, **named: Any) -> None:
+        survey("north", NOON)
+
+    def surveyed(one: ServedField, *_: Any) -> Path:
+        engines.append(one.settings.engine)
+        return tmp_path
+
+    monkeypatch.setattr(serve_command, "serve_plain", served)
+    monkeypatch.setattr(serve_command, "survey_field", surveyed)
+    ended = command_line("serve", field_file("north", engine="prefect"), "--every", "30m", "--engine", "plain")
+    assert (ended.code, engines) == (0, ["plain"])
 
 
 def test_plain_serving_surveys_fields_in_turn_and_each_visit_anew(
@@ -178,40 +218,6 @@ def test_the_picture_of_an_artifact_is_small(survey_png: Any, tmp_path: Path) ->
     assert "archive/runs/x/report.html" in text
     assert all(row["cost"] in text for row in savings_rows(published.receipt))
     assert artifact_key("North_field 7") == "north-field-7"
-
-
-@pytest.fixture
-def listener() -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """An address on this machine, and what was posted to it."""
-    posted: list[dict[str, Any]] = []
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            posted.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
-            self.send_response(204)
-            self.end_headers()
-
-        def log_message(self, *words: object) -> None:
-            pass
-
-    server = HTTPServer(("127.0.0.1", 0), Handler)
-    thread = Thread(target=server.serve_forever)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_port}/", posted
-    server.shutdown()
-    server.server_close()
-    thread.join()
-
-
-def test_notices_are_of_trouble_only_and_never_needed(listener: tuple[str, list[dict[str, Any]]]) -> None:
-    """Failed and skipped runs are posted where an address was given; one that does not answer is nothing."""
-    address, posted = listener
-    failed, done = Outcome("north", NOON, "failed", "no reply"), Outcome("north", NOON, "done")
-    assert send_notice(address, failed, "archive")
-    assert not send_notice(address, done, "archive")
-    assert not send_notice(None, failed, "archive")
-    assert not send_notice("http://127.0.0.1:9/", failed, "archive")
-    assert [(one["field"], one["ending"], one["reason"]) for one in posted] == [("north", "failed", "no reply")]
 
 
 def test_alone_means_alone(field_file: Callable[..., Path]) -> None:

@@ -4,11 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -112,29 +107,3 @@ def test_without_a_server_the_survey_runs_plain(
     found = survey_png(tmp_path, Console(file=console, width=200), engine="prefect").receipt
     assert "did not start (no port); going on with --engine plain" in console.getvalue()
     assert {stage["state"] for stage in found["stages"]} == {"ran", "skipped"}
-
-
-ENDS = """
-import os, signal, subprocess, sys
-from flows.engine import end_with_us
-child = subprocess.Popen(["sleep", "60"], stdout=subprocess.DEVNULL)
-end_with_us(child.pid)
-print(child.pid, flush=True)
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def test_a_killed_survey_leaves_no_server() -> None:
-    """What was bound to end with a process does so when it is killed."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    ended = subprocess.run([sys.executable, "-c", ENDS], env=environment, capture_output=True, text=True, check=False)
-    assert ended.returncode == -signal.SIGKILL
-    for _ in range(100):
-        try:
-            os.kill(int(ended.stdout), 0)
-        except ProcessLookupError:
-            return
-        if "Z" in Path(f"/proc/{int(ended.stdout)}/stat").read_text().split(")")[1][:3]:
-            return  # ended; whoever adopted it has not asked yet
-        time.sleep(0.05)
-    pytest.fail("the process still runs")

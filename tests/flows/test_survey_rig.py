@@ -7,6 +7,8 @@ import io
 import json
 import re
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -203,10 +205,10 @@ def test_what_the_rig_is_at_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyP
         run_survey(settings, Console(file=out, width=200))
     told = [line.removeprefix("coarse sweep: 0% ") for line in out.getvalue().splitlines() if "sweep: 0% " in line]
     kinds = [re.sub(r"\d[\d.]*", "N", words) for words in told]
-    wanted = ["path to the mirror: N of N cells", "capturing N lines: N of N s", "fetching raw_N: N of N MB"]
+    wanted = ["path: N of N cells", "capturing: N of N s", "fetching: N of N MB"]
     coarse = kinds[kinds.index(wanted[0]) :]  # behind the references
     assert [kind for kind in dict.fromkeys(coarse) if kind in wanted] == wanted
-    assert any(re.fullmatch(r"fetching raw_0: (\d+\.\d) of \1 MB", words) for words in told)
+    assert any(re.fullmatch(r"fetching: (\d+\.\d) of \1 MB", words) for words in told)
 
 
 def test_visits_are_captured_and_broken_ones_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -366,6 +368,18 @@ def test_another_device_is_not_moved(command_line: CommandLine, tmp_path: Path, 
     asked = {act.request.command for act in rig.mirror.acts}
     assert not asked & {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
     assert not any("=" in act.request.line for act in rig.mirror.acts)
+
+
+def test_default_engine_says_it_once_as_well(tmp_path: Path):
+    """Through Prefect, which tries again, a port that is not there is one message too, and no traceback."""
+    file = tmp_path / "rig.toml"
+    file.write_text('source = "rig"\nscene = "farm"\nsize = "96x96"\nbands = [40, 90]\n[rig]\nport = "/dev/ttyNONE"\n')
+    words = [sys.executable, "-m", "flows.cli", "survey", str(file), "--out", str(tmp_path / "archive")]
+    ended = subprocess.run(words, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
+    assert ended.returncode == 1
+    assert ended.stderr.count("/dev/ttyNONE") == 1
+    assert ended.stderr.splitlines()[-1].startswith("error: there is no port /dev/ttyNONE")
+    assert not {"Traceback", "ERROR", "Task run"} & set(re.findall(r"Traceback|ERROR|Task run", ended.stderr))
 
 
 def test_port_in_use_and_camera_unreachable(command_line: CommandLine, tmp_path: Path):

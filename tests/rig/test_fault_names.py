@@ -29,3 +29,9 @@ def test_words_that_name_no_fault_are_refused(word: str) -> None:
     """With the word that was wrong."""
     with pytest.raises(SettingsError, match=word.partition(":")[0]):
         read_faults([word])
+
+
+def test_a_name_that_is_nearly_right_is_told() -> None:
+    """As keys of the settings are."""
+    with pytest.raises(SettingsError, match=r"no fault 'camera-ful'; did you mean camera-full\?"):
+        read_faults(["camera-ful"])

@@ -116,7 +116,7 @@ def test_wrong_device() -> None:
 @pytest.mark.parametrize(
     ("why", "remedy"),
     [
-        (b"disk full", "copy the folders"), (b"busy capturing", "stopCapture"),
+        (b"disk full", "copy the folders"), (b"busy capturing", "stop it with its own program"),
         (b"exposure longer than frame period", "not longer than the frame period"), (b"oh", "manual"),
     ],
 )  # fmt: skip

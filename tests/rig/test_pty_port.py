@@ -134,7 +134,7 @@ def test_emulated_time_may_run_faster() -> None:
     began = clock.now()
     clock.sleep(10.0)
     assert clock.now() - began >= 10.0
-    with pytest.raises(SettingsError, match="speed above 0"):
+    with pytest.raises(SettingsError, match=r"above 0 .--speed"):
         FastClock(0.0)
     device = MirrorDevice(clock)
     with EmulatedPort(device) as port, serial.Serial(port.path, timeout=2.0) as user:

@@ -9,7 +9,7 @@ from pipeline.rig.capture_journal import JOURNAL
 from pipeline.rig.emulator.faults import make_fault
 from pipeline.rig.headwall_control import HeadwallControl
 from pipeline.rig.kept_files import KeptInMemory
-from tests.rig.small_rig import COARSE, FINE, SmallRig, small_rig
+from tests.rig.small_rig import COARSE, FINE, SmallRig, small_rig, small_source
 from tests.rig.test_rig_source_faults import KeptUntil, KilledError, SlowEye, assert_same
 
 
@@ -74,6 +74,27 @@ def test_capture_by_its_own_clock_is_not_counted():
 def killed() -> None:
     """The process ends here."""
     raise KilledError
+
+
+@pytest.mark.parametrize("earlier", [0, 3], ids=["fewer folders than before", "folders of the same names"])
+def test_camera_that_was_emptied_in_between_is_gone_on_with(earlier: int):
+    """Its disk was cleared, or it is another: frames and lines that it has no more are taken again."""
+    kept = KeptInMemory()
+    with small_rig() as rig:
+        source = rig.source(kept)
+        source.references(FINE)
+        for _ in range(earlier):
+            list(rig.source().lines(COARSE))
+        killed_amid(rig, kept)
+    with small_rig() as rig:
+        for _ in range(3 - earlier):
+            list(rig.source().lines(COARSE))
+        source = rig.source(kept)
+        found = source.references(FINE)
+        assert_same(list(source.lines(FINE)))
+    wanted = small_source().references(FINE)
+    assert abs(found.white - wanted.white).max() <= 1 / 64
+    assert source.record["captures"][0]["spent"]
 
 
 @pytest.mark.parametrize("look", ["lines", "references"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
@@ -13,6 +13,7 @@ from storage.archive import Archive
 from storage.garbage import clear_up
 from storage.lineage import Catalogue
 
+GONE = "process was gone"  # in the reason of a run that was killed and not begun again
 Line = Mapping[str, Any]
 Look = tuple[int, str]  # the seed of a field's scene, and the visit, as the settings have them
 
@@ -23,8 +24,9 @@ class Account:
 
     due: int = 0
     endings: Counter[str] = field(default_factory=Counter)
-    wrong: list[str] = field(default_factory=list)  # due times without an ending, with several, or without a reason
+    wrong: list[str] = field(default_factory=list)  # not one ending, one without a reason, or of no due time
     resumed: int = 0  # done after more than one attempt
+    attempts: dict[tuple[str, str], int] = field(default_factory=dict)  # field and due time -> how often it began
     failed: dict[tuple[str, str], str] = field(default_factory=dict)  # field and due time -> reason
 
     def add(self, name: str, lines: Iterable[Line], due_times: Iterable[datetime]) -> None:
@@ -35,17 +37,20 @@ class Account:
                 by_due.setdefault(read_moment(line.get("due")), []).append(line)
         for due in due_times:
             self.due += 1
-            found = by_due.get(due, [])
+            found = by_due.pop(due, [])
             if len(found) != 1:
                 self.wrong.append(f"{name} {due:%H:%M:%S} has {len(found)} endings")
                 continue
             (ending,) = found
             self.endings[ending["event"]] += 1
+            self.attempts[name, moment_words(due)] = ending.get("attempts", 0)
             self.resumed += ending["event"] == "done" and ending.get("attempts", 1) > 1
             if ending["event"] != "done" and not ending.get("reason"):
                 self.wrong.append(f"{name} {due:%H:%M:%S} {ending['event']} without a reason")
             if ending["event"] == "failed":
                 self.failed[name, moment_words(due)] = str(ending.get("reason"))
+        for lines_of in by_due.values():
+            self.wrong += [f"{name} {line.get('due')} {line['event']}, which was never due" for line in lines_of]
 
     def words(self) -> str:
         """The counts."""
@@ -56,6 +61,20 @@ class Account:
     def failed_by(self, *words: str) -> int:
         """How many failed with one of these words in the reason."""
         return sum(any(word in reason for word in words) for reason in self.failed.values())
+
+    def begun_again(self, name: str, due: datetime) -> bool:
+        """Whether a run began more than once under its due time."""
+        return self.attempts.get((name, moment_words(due)), 0) > 1
+
+    def after_kills(self, killed: Sequence[tuple[str, datetime]]) -> tuple[int, int]:
+        """Of runs that were killed: how many were begun again, and how many of the others failed because of it."""
+        others = [run for run in killed if not self.begun_again(*run)]
+        return len(killed) - len(others), sum(self.names(*run, "", [GONE]) for run in others)
+
+    def names(self, name: str, due: datetime, device: str, words: Iterable[str]) -> bool:
+        """Whether a run failed by a device: its reason has the device's name, and one of the words."""
+        reason = self.failed.get((name, moment_words(due)), "")
+        return device in reason and any(word in reason for word in words)
 
 
 @dataclass
@@ -95,6 +114,11 @@ def clear(archive: Archive, failed: Iterable[Look], spools: Mapping[str, Look]) 
             found.unexplained.append(f"spool/{spool.name} of {spools.get(spool.name)}")
     found.unexplained += [str(path.relative_to(archive.root)) for path in archive.root.glob("*/*/*.part")]
     return found
+
+
+def problems_of(archive: Archive) -> list[str]:
+    """What `verify` finds."""
+    return [f"{found.uri}: {found.problem}" for found in archive.verify_all() if found.problem is not None]
 
 
 def _look_at_stores(archive: Archive, looks: set[Look], kept: Mapping[str, str], found: Leftovers) -> None:

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timedelta
@@ -28,8 +28,8 @@ from tests.faults.disk_full import can_mount, small_disk
 from tests.faults.fault_table import Clock, Row
 from tests.faults.nursery import ROOT
 from tests.flows.schedule_days import NOON, HandClock
-from tests.soak.accounts import Account, Leftovers, Look, clear
-from tests.soak.pulled_rig import RigProcess
+from tests.soak.accounts import Account, Leftovers, Look, clear, problems_of
+from tests.soak.pulled_rig import LINK, RigProcess
 from tests.soak.resident_memory import Growth, resident_bytes
 from tests.soak.serving import FIELDS, Serving, scene_settings, write_fields
 
@@ -42,6 +42,7 @@ SPEED = 4.0  # of the rig's clock, at 100 lines a second
 AGAIN_S = (5.0, 300.0, 900.0, 4000.0)  # after a kill, until somebody serves again
 LOOK_S = 300.0
 LONGEST_LIFE_S = 4.0  # of a survey that is killed
+DEVICES = {"mirror": f"/{LINK}", "camera": "127.0.0.1:"}  # as a reason names them
 CABLE = ("went away", "no connection to", "no answer", "hung up")
 FULL = ("disk is full", "No space left")
 
@@ -54,7 +55,7 @@ class Day:
     disk: Path
     chance: random.Random
     plan: dict[int, str]
-    struck: Counter[str] = field(default_factory=Counter)
+    struck: dict[str, list[tuple[str, datetime]]] = field(default_factory=lambda: defaultdict(list))  # trouble -> runs
     samples: list[int] = field(default_factory=list)  # resident memory of this process after each of its surveys
     told: list[str] = field(default_factory=list)
     spools: dict[str, Look] = field(default_factory=dict)  # name -> the look that it appeared in
@@ -88,8 +89,8 @@ class Day:
         if trouble in ("mirror", "camera"):
             self.serving.rig.ask("pull", trouble, self.chance.randint(1, 8))
         elif trouble == "disk":
-            self._fill(LEFT_BYTES[self.struck["disk"] % len(LEFT_BYTES)])
-            self._strikes("disk")
+            self._fill(LEFT_BYTES[len(self.struck["disk"]) % len(LEFT_BYTES)])
+            self.struck["disk"].append(self.look)
         elif trouble == "kill":  # for a process that may be killed
             self._later("kill")
         self.armed = trouble
@@ -100,7 +101,7 @@ class Day:
         self._look_at_spools(*self.look)
         if self.armed in ("mirror", "camera"):
             if self.serving.rig.ask("plug"):
-                self._strikes(self.armed)
+                self.struck[self.armed].append(self.look)
             else:  # the survey had no line to take any more: another one will
                 self._later(self.armed)
         self.armed = None
@@ -123,7 +124,7 @@ class Day:
         for look in broken:
             self._look_at_spools(*look)
         if code == -signal.SIGKILL and broken:
-            self._strikes("kill")
+            self.struck["kill"].append(broken[0])
             self.tell(f"the process that serves is killed {life_s:.2f} s into a run of {broken[0][0]}")
         else:
             self.tell(f"the process that was to be killed was between runs, or had ended ({code})")
@@ -150,9 +151,6 @@ class Day:
     def _look_at_spools(self, name: str, due: datetime) -> None:
         for path in (self.serving.archive / "spool").glob("*"):
             self.spools.setdefault(path.name, (FIELDS[name], moment_words(due)))
-
-    def _strikes(self, trouble: str) -> None:
-        self.struck[trouble] += 1
 
     def _put_off(self) -> None:
         """Have what was planned for runs that a process to be killed got through meanwhile happen later."""
@@ -189,7 +187,7 @@ def _rows(quick: bool) -> list[Row]:
         archive = Archive.open(day.serving.archive)
         before = problems_of(archive)
         left = clear(archive, {(FIELDS[name], visit) for name, visit in account.failed}, day.spools)
-        return _found(day, account, left, (before, problems_of(archive)), clock.seconds, quick=quick)
+        return judged(day, account, left, (before, problems_of(archive)), clock.seconds, quick=quick)
 
 
 def _live(folder: Path, disk: Path, quick: bool) -> tuple[Day, Account]:
@@ -212,32 +210,31 @@ def _live(folder: Path, disk: Path, quick: bool) -> tuple[Day, Account]:
     return day, account
 
 
-def problems_of(archive: Archive) -> list[str]:
-    """What `verify` finds."""
-    return [f"{found.uri}: {found.problem}" for found in archive.verify_all() if found.problem is not None]
-
-
-def _found(
+def judged(
     day: Day, account: Account, left: Leftovers, problems: tuple[list[str], list[str]], seconds: float, *, quick: bool
 ) -> list[Row]:
+    """A row for each demand, and whether it was met."""
     wanted, grown, struck = Counter(day.planned), Growth.of(day.samples), day.struck
-    cables, disks = account.failed_by(*CABLE), account.failed_by(*FULL)
-    pulls, refused = struck["mirror"] + struck["camera"], sum(any(one in words for one in FULL) for words in day.told)
+    disks, refused = account.failed_by(*FULL), sum(any(one in words for one in FULL) for words in day.told)
+    again, gone = account.after_kills(struck["kill"])
+    named = {which: sum(account.names(*run, name, CABLE) for run in struck[which]) for which, name in DEVICES.items()}
+    pulls = {which: len(struck[which]) for which in DEVICES}
     first = next((one for part in problems for one in part), "")
     whole = f"{len(problems[0])} problems before gc, {len(problems[1])} after{': ' + first if first else ''}"
     return [
         Row("a day of surveys", "three fields in turn through an emulated rig, by a clock turned by hand", account.due,
             "each due run done, skipped by rule, or failed with a reason", account.words(), not account.wrong, seconds),
-        Row("kills", "SIGKILL of the process that serves, within a survey", struck["kill"],
+        Row("kills", "SIGKILL of the process that serves, within a survey", len(struck["kill"]),
             "begun again under the same due time, or failed once the next was due",
-            f"{account.resumed} done after being resumed, {account.failed_by('process was gone')} failed",
-            struck["kill"] == wanted["kill"], 0.0),
-        Row("pulled cables", "pty, or the camera's sockets, closed within a capture", pulls,
-            "failed, and the reason names the device", f"{cables} failed by it",
-            pulls == wanted["mirror"] + wanted["camera"] and cables >= pulls, 0.0),
-        Row("full disks", "the archive's disk (a tmpfs) filled up as a survey begins", struck["disk"],
+            f"of the runs that were killed {again} begun again, {gone} failed for it",
+            again + gone == len(struck["kill"]) == wanted["kill"], 0.0),
+        Row("pulled cables", "pty, or the camera's sockets, closed within a capture", sum(pulls.values()),
+            "failed, and the reason names that device",
+            ", ".join(f"{which}: {named[which]} of {pulls[which]} runs" for which in DEVICES),
+            all(named[which] == pulls[which] == wanted[which] for which in DEVICES), 0.0),
+        Row("full disks", "the archive's disk (a tmpfs) filled up as a survey begins", len(struck["disk"]),
             "failed, or told and resumed, in words that say so", f"{disks} failed by it, told {refused} times",
-            struck["disk"] == wanted["disk"] and refused >= struck["disk"], 0.0),
+            refused >= len(struck["disk"]) == wanted["disk"], 0.0),
         Row("the archive", "verify_all, before and after gc", 2, "whole", whole, not first, 0.0),
         Row("clearing up", "gc --keep-days 0", 1, "what stays is named by a run, or is of a failed one", left.words(),
             not left.unexplained, 0.0),

@@ -12,12 +12,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 from flows.field_schedule import FieldSchedule
 from flows.schedule_state import read_moment
@@ -27,18 +28,18 @@ from storage.ledger import Ledger, ledgers
 from tests.faults.fault_table import Clock, Row
 from tests.faults.nursery import ROOT
 from tests.flows.schedule_days import HandClock
-from tests.soak.accounts import Account
-from tests.soak.day_of_surveys import problems_of
+from tests.soak.accounts import Account, problems_of
 from tests.soak.processes import children_of, is_alive, listener_at, words_of
 from tests.soak.resident_memory import MB, Growth, resident_bytes
 
 EVERY_S = 30
 TIMETABLE = parse_timetable(None, f"{EVERY_S}s", "UTC")
 FIELDS = ("north", "south")
-SERVED_S, QUICK_S = 600.0, 120.0
+SERVED_S, QUICK_S = 600.0, 180.0
 KILLED_AT = 0.4  # of the time
 EARLY = 0.2  # of the time: when memory is looked at first
 LOOK_S = 5.0
+LONGEST_GAP_S = 180.0  # without a done run: the server's death, the watcher's look, the start of server and runner
 BEGUN_WITHIN_S, ENDED_WITHIN_S = 180.0, 60.0
 SETTINGS = """name = "{name}"
 scene = "farm"
@@ -60,6 +61,7 @@ class Watched:
     others: set[int] = field(default_factory=set)  # every process seen below serve
     killed: int | None = None
     away_s: float | None = None  # until another server listened
+    back: datetime | None = None  # when it did
     code: int | None = None  # of serve
 
 
@@ -73,8 +75,8 @@ def rows(quick: bool) -> list[Row]:
         time.sleep(1.0)
         left = sorted(filter(None, (words_of(pid) for pid in watched.others if is_alive(pid))))
         archive = Archive.open(folder / "archive")
-        account, under_way, gap_s = account_of(archive.root)
-        return _found(watched, account, (under_way, gap_s, left, problems_of(archive)), clock.seconds, quick=quick)
+        served = account_of(archive.root, watched.back)
+        return judged(watched, served, (left, problems_of(archive)), clock.seconds, quick=quick)
 
 
 def free_port() -> int:
@@ -126,19 +128,30 @@ def watch(process: subprocess.Popen[bytes], port: int, archive: Path, served_s: 
             seen.killed, died = server, now_s
             print(f"  {now_s:.0f} s: the server, process {server}, is killed", file=sys.stderr, flush=True)
         elif seen.killed is not None and seen.away_s is None and server not in (None, seen.killed):
-            seen.away_s = now_s - died
+            seen.away_s, seen.back = now_s - died, datetime.now(UTC)
         time.sleep(LOOK_S)
     process.terminate()
     seen.code = process.wait(ENDED_WITHIN_S)
     return seen
 
 
-def account_of(root: Path) -> tuple[Account, int, float]:
-    """Endings of all due times, how many runs were under way at the stop, and the longest time without a done one. [s]
+@dataclass
+class Served:
+    """What the ledgers say of the time that was served."""
+
+    account: Account = field(default_factory=Account)
+    under_way: int = 0  # runs at the stop
+    gap_s: float = 0.0  # the longest time without a done run of a field
+    after: dict[str, int] = field(default_factory=dict)  # done runs of each field that began with the other server
+
+
+def account_of(root: Path, back: datetime | None) -> Served:
+    """Look at the ledgers; ``back`` is when another server listened, None where none did.
 
     A run that was under way is ended as the next `serve` would end it that comes after its next due time.
     """
-    account, under_way, gaps = Account(), 0, [0.0]
+    found = Served()
+    account = found.account
     for ledger in ledgers(root):
         lines = ledger.lines()
         opened = next(moment for line in lines if line["event"] == "opened" and (moment := read_moment(line["at"])))
@@ -146,12 +159,22 @@ def account_of(root: Path) -> tuple[Account, int, float]:
         if not closed:
             account.wrong.append(f"{ledger.field} was not closed")
             continue
-        under_way += _reap(root, ledger.field, closed[-1])
+        found.under_way += _reap(root, ledger.field, closed[-1])
         lines = ledger.lines()
         account.add(ledger.field, lines, TIMETABLE.due_between(opened, closed[-1]))
         done = [moment for line in lines if line["event"] == "done" and (moment := read_moment(line["at"]))]
-        gaps += [(later - one).total_seconds() for one, later in pairwise([opened, *done, closed[-1]])]
-    return account, under_way, max(gaps)
+        gaps = [(later - one).total_seconds() for one, later in pairwise([opened, *done, closed[-1]])]
+        found.gap_s = max(found.gap_s, *gaps)
+        found.after[ledger.field] = done_since(lines, back)
+    return found
+
+
+def done_since(lines: Sequence[Mapping[str, Any]], back: datetime | None) -> int:
+    """How many of the runs of a ledger that began after a moment are done; none where there is no such moment."""
+    if back is None:
+        return 0
+    begun = {line["due"] for line in lines if line["event"] == "begun" and (read_moment(line["at"]) or back) > back}
+    return sum(line["event"] == "done" and line["due"] in begun for line in lines)
 
 
 def _reap(root: Path, name: str, closed: datetime) -> int:
@@ -162,10 +185,11 @@ def _reap(root: Path, name: str, closed: datetime) -> int:
     return count
 
 
-def _found(
-    seen: Watched, account: Account, after: tuple[int, float, list[str], list[str]], seconds: float, *, quick: bool
+def judged(
+    seen: Watched, served: Served, after: tuple[list[str], list[str]], seconds: float, *, quick: bool
 ) -> list[Row]:
-    under_way, gap_s, left, problems = after
+    """A row for each demand, and whether it was met."""
+    account, (left, problems) = served.account, after
     grown = Growth.of(list(seen.serve.values()))
     early = max(seen.serve) * EARLY
     memory = "; ".join(
@@ -175,11 +199,15 @@ def _found(
     away = "none came" if seen.away_s is None else f"another listens after {seen.away_s:.0f} s"
     return [
         Row("Prefect's scheduler", f"{len(FIELDS)} fields every {EVERY_S} s for {max(seen.serve) / 60:.0f} min",
-            account.due, "each due run done, skipped by rule, or failed with a reason",
-            f"{account.words()}; {under_way} under way at the stop; longest time without a done one {gap_s:.0f} s",
-            not account.wrong and account.endings["done"] > 0, seconds),
-        Row("server killed", "SIGKILL of the Prefect server", int(seen.killed is not None), "started again", away,
-            seen.away_s is not None, 0.0),
+            account.due, "each due run done, skipped by rule, or failed with a reason; of each field one done at the "
+            f"latest {LONGEST_GAP_S:.0f} s after the last",
+            f"{account.words()}; {served.under_way} under way at the stop; longest time without a done one "
+            f"{served.gap_s:.0f} s",
+            not account.wrong and account.endings["done"] > 0 and served.gap_s <= LONGEST_GAP_S, seconds),
+        Row("server killed", "SIGKILL of the Prefect server", int(seen.killed is not None),
+            "started again, and runs that begin then are done",
+            f"{away}; done since: {', '.join(f'{count} {name}' for name, count in served.after.items())}",
+            seen.away_s is not None and sum(served.after.values()) > 0, 0.0),
         Row("stopped", "SIGTERM", 1, "exit code 0, no process left",
             f"exit code {seen.code}, {len(left)} processes left{': ' + left[0][:80] if left else ''}",
             seen.code == 0 and not left, 0.0),

@@ -11,7 +11,7 @@ class FastClock:
 
     def __init__(self, speed: float = 1.0) -> None:
         if not 0 < speed < float("inf"):
-            raise SettingsError(f"expected a clock's speed above 0, got {speed}")
+            raise SettingsError(f"a speed of {speed:g}: expected how many times as fast time goes, above 0 (--speed)")
         self.speed = speed
         self._began = SYSTEM_CLOCK.now()
 

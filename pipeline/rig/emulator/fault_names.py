@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from difflib import get_close_matches
 
 from pipeline.errors import SettingsError
 from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
@@ -54,7 +55,9 @@ def read_faults(words: Sequence[str]) -> tuple[list[Fault], CameraFaults]:
         elif name in KINDS:
             mirror.append(read_fault(word))
         else:
-            raise SettingsError(f"there is no fault {name!r}; rig emulate --faults list shows all")
+            near = get_close_matches(name, [*KINDS, *_CAMERA], 1)
+            hint = f"did you mean {near[0]}?" if near else "rig emulate --faults list shows all"
+            raise SettingsError(f"there is no fault {name!r}; {hint}")
     return mirror, CameraFaults.of(camera, seeds)
 
 
