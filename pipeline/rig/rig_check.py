@@ -14,6 +14,7 @@ from pipeline.rig.camera_files import FileServer, log_in
 from pipeline.rig.headwall_camera import HeadwallCamera
 from pipeline.rig.mirror_controller import MirrorController
 from pipeline.rig.mirror_modes import check_model
+from pipeline.rig.registers import Status
 
 Verdict = Literal["ok", "warn", "fail"]
 Device = Literal["mirror", "camera"]
@@ -24,6 +25,7 @@ SETTLE_S = 2.0
 LOG_HZ, LOGGED = 1000.0, 8
 MOST_NAMED = 5  # entries of a listing, warnings
 CONNECT = "connect"
+RESTLESS = "look for wind, a loose mount or a drive that hunts; a survey waits for rest in vain"
 LOOK_AT_LINE = "look at cable, plugs and earth if this comes again"
 
 
@@ -93,8 +95,8 @@ def _ask_mirror(mirror: MirrorController, rows: list[CheckRow], *, move: bool) -
     if mirror.found_in_pro:
         rows.append(CheckRow("mirror", "mode", "it was in pro mode, as drivers leave it"))
     try:
-        rows.append(_status(mirror))
         playing = mirror.is_playing()
+        rows.append(_status(mirror, playing=playing))
         rows.append(_playing(playing))
         if not playing:
             rows.append(CheckRow("mirror", "temperature", f"{mirror.temperature():.1f} deg C"))
@@ -117,8 +119,15 @@ def _identity(mirror: MirrorController) -> CheckRow:
     return CheckRow("mirror", "identity", found.words)
 
 
-def _status(mirror: MirrorController) -> CheckRow:
+def _status(mirror: MirrorController, *, playing: bool) -> CheckRow:
+    """What a survey would meet: one waits as long for the mirror to come to rest."""
     status = mirror.status()
+    until = mirror.wire.clock.now() + SETTLE_S
+    while Status.NOT_STABLE in status and not playing and mirror.wire.clock.now() < until:
+        mirror.wire.clock.sleep(SETTLE_S / 10)
+        status = mirror.status()
+    if Status.NOT_STABLE in status and not playing:
+        return CheckRow("mirror", "status", status.sentence, "fail", f"it has been so for {SETTLE_S:g} s: {RESTLESS}")
     if status.stops_motion:
         return CheckRow("mirror", "status", status.sentence, "fail", "mend that first: motions are refused with it")
     if status:

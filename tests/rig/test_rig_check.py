@@ -22,6 +22,7 @@ from pipeline.rig.mirror_controller import MirrorController
 from pipeline.rig.mirror_settings import MirrorSettings
 from pipeline.rig.pro_mode import Command
 from pipeline.rig.refusals import DeviceGone, DeviceRefused
+from pipeline.rig.registers import Status
 from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, works
 from pipeline.rig.steering import MotionLog
 from tests.rig.small_rig import FINE, small_source
@@ -138,11 +139,26 @@ def test_damaged_answers_are_told() -> None:
 
 
 def test_mirror_that_never_rests() -> None:
-    """The square ends at its first corner, with what is wrong."""
+    """A survey would wait for it in vain: it is told as failing, and nothing is moved."""
     with rig("never-stable") as line:
         rows = mirror_rows(line, move=True)
-        assert told(rows, "fail") == ["go to 0.03; 0.03"]
-        assert "not at rest" in rows[-1].came
+        assert told(rows, "fail") == ["status"]
+        (status,) = [row for row in rows if row.asked == "status"]
+        assert "not at rest" in status.came
+        assert "waits for rest in vain" in status.mend
+        assert rows[-1].came == "nothing was moved"
+
+
+def test_mirror_that_comes_to_rest_in_time() -> None:
+    """One that still moves as it is asked is asked again, as a survey would."""
+    with rig() as line:
+        left = [Status.NOT_STABLE, Status.NOT_STABLE]
+        real = MirrorController.status
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(MirrorController, "status", lambda mirror: left.pop() if left else real(mirror))
+            rows = mirror_rows(line)
+        assert told(rows, "fail") == told(rows, "warn") == []
+        assert left == []
 
 
 def test_mirror_elsewhere_fails() -> None:
