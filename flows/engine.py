@@ -82,6 +82,7 @@ def _task_step(runner: StageRunner) -> Step:
         return None if ref is None else {"uri": ref.uri, "key": ref.key}
 
     def step(name: str, /, *inputs: StageRef) -> StageRef | None:
+        """Run a stage as a task that comes after the last one."""
         one = task(
             name=name, task_run_name=f"{name}-{runner.run.name}", cache_policy=NO_CACHE, persist_result=False,
             retries=RETRIES.get(name, 0), retry_delay_seconds=RETRY_DELAY_S, retry_condition_fn=_may_help,

@@ -58,6 +58,7 @@ def evaluate(
     labels = _moved(run, off)
 
     def build(path: Path) -> None:
+        """Judge the map, the coarse look alone, and with controls other placements."""
         classes = load_class_map(class_map.path / "class_map.zarr").classes
         seen = glance_at(run, mosaic)
         counts = confusion(labels, classes, run.weights.config.classes)

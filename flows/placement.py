@@ -75,6 +75,7 @@ def rectify(run: SurveyRun, produce: Produce, raw: StageRef, lookup: StageRef, *
     """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
 
     def build(path: Path) -> None:
+        """Make the tiles that were not made while lines arrived, and the picture."""
         grid = PixelGrid.of_scene(run.grid, run.grid.factor)
         recipe = MosaicRecipe(
             raw.path, run.camera, grid, run.settings.kernel,
@@ -101,6 +102,7 @@ def cut_patches(
     """Bring every chosen seat onto the scene grid, one patch a seat; NaN where a mirror off the plan did not look."""
 
     def build(path: Path) -> None:
+        """Read the seats in the order in which lines show them."""
         ordered = _along_scan(run, load_plan(attention).seats)
         writer = PatchWriter(
             path / "patches.zarr", ordered, run.grid.seat_origin(ordered), run.grid.patch,
@@ -126,6 +128,7 @@ def cut_again(
     """
 
     def build(path: Path) -> None:
+        """Read the seats of this round, and put those of the first beside them."""
         kept, wanted = _Kept.of(patches), load_plan(attention).seats
         ordered = _along_scan(run, np.union1d(kept.store.seats, wanted))
         bands, patch = run.scene.wavelength_nm, run.grid.patch

@@ -90,6 +90,7 @@ def register_fine(run: SurveyRun, produce: Produce, raw: StageRef, mosaic: Stage
         return None
 
     def build(path: Path) -> None:
+        """Find each fine sweep by what the mosaic shows under it."""
         sweeps = sighted(run, raw, None)
         anchors: list[Anchor] = []
         values = load_mosaic(mosaic.path / "mosaic.zarr").values if sweeps else np.empty((0, 0, 0), np.float32)

@@ -82,6 +82,7 @@ def capture_sweeps(
     total = sum(sweep.lines for sweep in sweeps) or 1
 
     def build(path: Path) -> None:
+        """Take the sweeps one after the other, each into a cube of its own."""
         before, manifest = 0, load_manifest(inputs[-1])
         lit = replace(run, source=source_with(run.source, inputs[-1], clock))
         with capture_source(lit, key) as source, follow(source, key) as arrived:
@@ -150,6 +151,7 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
     budget_s = run.plan.fine_s / settings.rounds
 
     def build(path: Path) -> None:
+        """Score the seats, and refuse a plan whose map would not fit the memory."""
         work = FieldWork.of(run)
         scores = _scores(run, work, mosaic)
         plan = plan_fine(

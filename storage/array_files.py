@@ -112,6 +112,7 @@ def _npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 def _npz_loader(path: Path, member: zipfile.ZipInfo) -> Callable[[], NDArray[Any]]:
     def load() -> NDArray[Any]:
+        """Read the array, once its claims of size are found to be possible."""
         where = f"{path}:{member.filename}"
         packed = member.compress_type != zipfile.ZIP_STORED
         check_claim(where, member.file_size, member.compress_size, DEFLATE_RATIO if packed else 1)

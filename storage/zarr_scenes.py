@@ -191,6 +191,7 @@ def _fill(array: zarr.Array[Any]) -> float | None:
 
 def _reader(path: Path, array: zarr.Array[Any], order: tuple[int, ...], packing: _Packing) -> ReadLines:
     def read(start: int, stop: int) -> NDArray[Any]:
+        """Read lines start to stop, unpacked, NaN where there is none."""
         selection = tuple(slice(start, stop) if axis == order[0] else slice(None) for axis in range(array.ndim))
         with _named(path):
             block = np.transpose(np.asarray(array[selection]), order)
