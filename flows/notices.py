@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import urllib.request
 from contextlib import suppress
 from http.client import HTTPException
+from pathlib import Path
 from urllib.parse import urlsplit
 
 from flows.schedule_news import Several
@@ -15,12 +17,42 @@ from pipeline.errors import SettingsError
 
 PATIENCE_S = 5.0
 TOLD = ("failed", "skipped")
+NAMED_BY = "SPECTRALZOOM_NOTIFY"  # the environment variable that may hold the address
 
 
-def check_address(address: str | None) -> str | None:
-    """The address itself, if a notice can be posted to it (SettingsError)."""
-    if address is not None and not _can_be_asked(address):
-        raise SettingsError(f"--notify {address!r} is no address; expected https://HOST/PATH")
+class _NoRedirects(urllib.request.HTTPRedirectHandler):
+    """A notice goes where it was sent, and nowhere else: not to a port of this machine that the answer names."""
+
+    def redirect_request(self, *answer: object) -> None:
+        """Follow none: the answer is an error."""
+
+
+def notice_address(given: str | None) -> str | None:
+    """Where notices go: an address, or one in the file that was given, or in SPECTRALZOOM_NOTIFY; None without any.
+
+    What stands on a command line can be read in the process list: an address that holds a token belongs in a file.
+
+    Raises
+    ------
+    SettingsError : it is no address that can be posted to, or there is no such file.
+    """
+    named = os.environ.get(NAMED_BY) or None
+    if given is None:
+        return None if named is None else _checked(named, f"{NAMED_BY} is no address")
+    if "://" in given or not given:
+        return _checked(given, f"--notify {given!r} is no address")
+    try:
+        text = Path(given).read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise SettingsError(
+            f"--notify {given!r} is no address and no file that holds one ({error}); expected https://HOST/PATH"
+        ) from error
+    return _checked(text.strip(), f"--notify: what stands in {given} is no address")
+
+
+def _checked(address: str, otherwise: str) -> str:
+    if not _can_be_asked(address):
+        raise SettingsError(f"{otherwise}; expected https://HOST/PATH")
     return address
 
 
@@ -40,7 +72,8 @@ def send_notice(address: str | None, outcome: Outcome, archive: str) -> bool:
     request = urllib.request.Request(
         address, json.dumps(content).encode(), {"Content-Type": "application/json"}, method="POST"
     )
-    with suppress(OSError, ValueError, HTTPException), urllib.request.urlopen(request, timeout=PATIENCE_S):
+    opener = urllib.request.build_opener(_NoRedirects)
+    with suppress(OSError, ValueError, HTTPException), opener.open(request, timeout=PATIENCE_S):
         return True
     return False
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -42,12 +42,14 @@ def end_with_us(process: int) -> Callable[[], None]:
 class KeptProcess:
     """A process that ends with this one and is started again where it has died; what it says goes to ``log``.
 
-    ``patience_s`` is how long it may take to end when it is told to. [s]
+    ``patience_s`` is how long it may take to end when it is told to [s]; ``environment`` is added to that of this one.
     """
 
-    def __init__(self, command: Sequence[str], log: Path, patience_s: float) -> None:
+    def __init__(
+        self, command: Sequence[str], log: Path, patience_s: float, environment: Mapping[str, str] | None = None
+    ) -> None:
         self.log = log
-        self._command, self._patience_s = list(command), patience_s
+        self._command, self._patience_s, self._environment = list(command), patience_s, dict(environment or {})
         self._process: subprocess.Popen[bytes] | None = None
         self._let_go: Callable[[], None] | None = None
 
@@ -58,7 +60,9 @@ class KeptProcess:
         self.log.parent.mkdir(parents=True, exist_ok=True)
         grown = self.log.exists() and self.log.stat().st_size > LARGEST_LOG
         with self.log.open("wb" if grown else "ab") as log:
-            self._process = subprocess.Popen(self._command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+            self._process = subprocess.Popen(
+                self._command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env={**os.environ, **self._environment}
+            )
         self._let_go = end_with_us(self._process.pid)
         return True
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from flows.notices import check_address, send_notice
+from flows.notices import notice_address, send_notice
 from flows.schedule_runs import Outcome, Tell
 from flows.schedule_times import parse_timetable
 from flows.serve_fields import alone_on, load_fields, survey_field
@@ -51,7 +51,7 @@ def run_serve(choice: ServeChoice, console: Console) -> int:
         raise SettingsError(f"--late {choice.late}: expected a share of the interval, above 0 and at most 1")
     if choice.limit < 1:
         raise SettingsError(f"--limit {choice.limit}: expected 1 or more surveys at a time")
-    notify = check_address(choice.notify)
+    notify = notice_address(choice.notify)
     out = choice.out if choice.out is None or is_remote(choice.out) else str(Path(choice.out).absolute())
     fields = load_fields(choice.files, out)
 

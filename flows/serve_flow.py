@@ -1,5 +1,8 @@
 """The flows that Prefect runs on a schedule or on request: a field's survey, and the reprocessing of an archive.
 
+Their parameters can only name what is served; all else stands in the file of `flows.served`. What a survey needs is
+imported when it has begun: on a busy machine that takes longer than a run may be late.
+
 No ``from __future__ import annotations`` here: Prefect reads the signatures. What is done is in plain functions.
 """
 
@@ -12,23 +15,20 @@ from pathlib import Path
 from prefect import State, flow
 from prefect.concurrency.sync import concurrency
 from prefect.context import FlowRunContext
-from prefect.states import Completed, Failed
+from prefect.states import Cancelled, Completed, Failed
 from rich.console import Console
 
-from flows.archive_commands import FAILED, PARTLY
 from flows.field_schedule import FieldSchedule
 from flows.notices import send_notice
-from flows.publish import Published
-from flows.reprocess_command import ReprocessRequest, run_reprocess
 from flows.schedule_news import ScheduleNews, together
 from flows.schedule_runs import Outcome, run_due
 from flows.schedule_state import read_moment
-from flows.schedule_times import parse_timetable
-from flows.serve_fields import ServedField, load_field
-from flows.survey_artifacts import publish_artifacts
-from flows.survey_command import run_survey
+from flows.serve_fields import ServedField
+from flows.serve_queue import SKIPPED
+from flows.serve_request import ServeRequest
+from flows.served import read_served, served_archive, served_field, served_weights
 from flows.wall_clock import WallClock
-from pipeline.errors import PipelineError, RigError, SettingsError
+from pipeline.errors import PipelineError, RigError
 from storage.archive import Archive
 from storage.staging import take_lock
 
@@ -39,65 +39,53 @@ AHEAD = timedelta(minutes=2)  # a run that is begun earlier than this was begun 
 
 
 @flow(name="survey", flow_run_name="survey-{field}", persist_result=False)
-def survey_scheduled(
-    field: str,
-    settings: str,
-    out: str | None = None,
-    cron: str | None = None,
-    every: str | None = None,
-    timezone: str = "UTC",
-    late: float = 0.5,
-    notify: str | None = None,
-    due: str | None = None,
-) -> State:
-    """Survey one field: for the due time that this run was scheduled for, or at once where it was asked for by hand."""
+def survey_scheduled(field: str, due: str | None = None) -> State:
+    """Survey one served field: for the due time that this run was made for, or at once where it was asked by hand."""
     try:
-        one = load_field(Path(settings), out)
-        if one.name != field:
-            raise SettingsError(f"{settings} is of the field {one.name}, not {field}; give the deployment its name")
-        schedule = one.schedule(parse_timetable(cron, every, timezone), late)
+        request = read_served()
+        one = served_field(request, field)
+        schedule = one.schedule(request.timetable, request.late)
         moment = read_moment(due) or _scheduled()
         if moment is None or not _wait_for(moment, schedule.clock):
-            return _by_hand(one, schedule)
+            return _by_hand(one, request)
         news = ScheduleNews({field: schedule}, lambda name, error: None)
         if not schedule.join(moment):
-            return Completed(name="Skipped", message="it is of a schedule that is not served any more")
-        outcome = _run(one, schedule, moment)
+            return _skipped("it is of a schedule that is not served any more")
+        outcome = _run(one, schedule, moment, request)
     except PipelineError as error:
         return Failed(message=str(error))
     for known in together(news.fresh()):
-        send_notice(notify, known, one.settings.out)
+        send_notice(request.notify, known, one.settings.out)
     return _state(outcome)
 
 
-def _run(one: ServedField, schedule: FieldSchedule, moment: datetime) -> Outcome:
+def _run(one: ServedField, schedule: FieldSchedule, moment: datetime, request: ServeRequest) -> Outcome:
     waiting = [*schedule.state().open, *schedule.pending()]
     known = next((found for found in waiting if abs((found - moment).total_seconds()) < 1), None)
     if known is None:
         line = schedule.state().ended.get(moment, {})
         return Outcome(one.name, moment, None, str(line.get("reason") or "it is accounted for in the ledger already"))
     with _shown_in_queue():
-        return run_due(schedule, known, one.lock(), lambda field, due: _survey(one, schedule, due), facts=_flow_run())
+        return run_due(schedule, known, one.lock(), lambda field, due: _survey(one, due, request), facts=_flow_run())
 
 
-def _survey(one: ServedField, schedule: FieldSchedule, due: datetime) -> Path:
-    published = run_survey(one.settings_of(due, schedule.timetable), Console(stderr=True))
-    _show(published, one)
+def _survey(one: ServedField, due: datetime, request: ServeRequest) -> Path:
+    from flows.survey_artifacts import publish_artifacts
+    from flows.survey_command import run_survey
+
+    published = run_survey(one.settings_of(due, request.timetable), Console(stderr=True))
+    with suppress(Exception):  # a server that is gone: the archive has it all
+        publish_artifacts(published, one.name, one.settings.out)
     return published.folder
 
 
-def _show(published: Published, one: ServedField) -> None:
-    with suppress(Exception):  # a server that is gone: the archive has it all
-        publish_artifacts(published, one.name, one.settings.out)
-
-
-def _by_hand(one: ServedField, schedule: FieldSchedule) -> State:
+def _by_hand(one: ServedField, request: ServeRequest) -> State:
     """A survey that somebody asked for on Prefect's pages: it has no due time, and waits for nobody."""
     lock = one.lock()
     if not lock.take_soon(f"{one.name}, by hand"):
         raise RigError(f"the rig is in use by {lock.holder()}; run again when that survey has ended")
     try:
-        folder = _survey(one, schedule, datetime.now(UTC).replace(microsecond=0))
+        folder = _survey(one, datetime.now(UTC).replace(microsecond=0), request)
     finally:
         lock.release()
     return Completed(message=f"runs/{folder.name}")
@@ -145,7 +133,12 @@ def _state(outcome: Outcome) -> State:
         return Failed(message=outcome.reason)
     if outcome.ending == "done":
         return Completed(message=outcome.run)
-    return Completed(name="Skipped", message=outcome.reason or "it is accounted for already")
+    return _skipped(outcome.reason or "it is accounted for already")
+
+
+def _skipped(why: str) -> State:
+    """The end of a run that did nothing: not the green of one that surveyed."""
+    return Cancelled(name=SKIPPED, message=why)
 
 
 @flow(name="reprocess", flow_run_name="reprocess-{archive}", persist_result=False)
@@ -158,18 +151,24 @@ def reprocess_archive(
     weights: str | None = None,
     dry_run: bool = False,
 ) -> State:
-    """Survey every field of an archive again: light is found there, only what has changed is made anew."""
-    request = ReprocessRequest(
-        archive, since, stage, field, failed, None if weights is None else Path(weights), dry_run
-    )
+    """Survey every field of a served archive again: light is found there, only what has changed is made anew.
+
+    ``weights`` may be those that a served field's settings name.
+    """
+    from flows.archive_commands import FAILED, PARTLY
+    from flows.reprocess_command import ReprocessRequest, run_reprocess
+
     try:
+        served = read_served()
+        archive = served_archive(served, archive)
+        request = ReprocessRequest(archive, since, stage, field, failed, served_weights(served, weights), dry_run)
         lock = Archive.open(archive, create=False, write=False).root / ".locks" / REPROCESS_LOCK
         release = take_lock(lock, wait=False)
         if release is None:  # it may be but the watcher's look
             time.sleep(A_LOOK_S)
             release = take_lock(lock, wait=False)
         if release is None:
-            return Completed(name="Skipped", message="this archive is being reprocessed already")
+            return _skipped("this archive is being reprocessed already")
         try:
             code = run_reprocess(request, Console(stderr=True))
         finally:

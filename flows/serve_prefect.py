@@ -14,10 +14,11 @@ from flows.serve_request import ServeRequest
 from flows.serve_runner import RunnerProcess
 from flows.serve_server import LocalServer, pages_of, server_for
 from flows.serve_watcher import Watcher
+from flows.served import write_served
 from flows.wall_clock import SystemWallClock
 from pipeline.errors import PipelineError
 
-WATCH_S = 15.0
+WATCH_S, SOON_S = 15.0, 2.0
 
 
 def serve_prefect(request: ServeRequest, tell: Tell) -> None:
@@ -30,7 +31,9 @@ def serve_prefect(request: ServeRequest, tell: Tell) -> None:
     schedules, home = request.schedules(), request.fields[0].archive / ".prefect"
     log = home / "surveys.log"
     with server_for(home, request.port) as server:
-        watcher, runner = Watcher(request, schedules, tell), RunnerProcess(request.words(), log)
+        served = home / "served.json"
+        write_served(request, served)
+        watcher, runner = Watcher(request, schedules, tell), RunnerProcess(served, log)
         opened: list[FieldSchedule] = []
         try:
             for schedule in schedules.values():
@@ -41,17 +44,18 @@ def serve_prefect(request: ServeRequest, tell: Tell) -> None:
             watcher.prepare()
             runner.keep_up()
             while True:
-                time.sleep(WATCH_S)
                 _keep_up(server, runner, tell)
-                watcher.look()
+                ready = watcher.look()
                 watcher.tell_news()
                 if watcher.unheard():
                     tell("runs that were asked for do not begin: Prefect's runner is started again")
                     runner.restart()
+                time.sleep(WATCH_S if ready else SOON_S)
         finally:
             stopped = SystemWallClock().now()
             tell("stopping; what is under way is interrupted, and resumed when it is served again")
             runner.stop()
+            watcher.stop()
             for schedule in opened:
                 with suppress(PipelineError):
                     schedule.close(stopped)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flows.field_schedule import FieldSchedule
-from flows.schedule_times import EPOCH, Timetable, exact_words
+from flows.schedule_times import Timetable
 from flows.serve_fields import ServedField
 
 
@@ -29,45 +29,24 @@ class ServeRequest:
         names = ", ".join(one.name for one in self.fields)
         return f"serving {names}, {self.timetable.words()}; stop with Ctrl-C, the same command goes on"
 
-    def parameters(self, one: ServedField) -> dict[str, Any]:
-        """Parameters of a field's deployment."""
-        every = None if self.timetable.every is None else exact_words(self.timetable.every)
-        return {
-            "field": one.name, "settings": str(one.file), "out": one.settings.out if self.out else None,
-            "cron": self.timetable.cron, "every": every, "timezone": self.timetable.timezone, "late": self.late,
-            "notify": None,  # what serves sees the ledgers, which have more to tell than one run
-        }  # fmt: skip
-
-    def words(self) -> dict[str, Any]:
-        """All of it as plain values, for another process."""
-        given = self.parameters(self.fields[0])
-        return {
-            "files": [str(one.file) for one in self.fields], "out": self.out, "limit": self.limit,
-            **{name: given[name] for name in ("cron", "every", "timezone", "late")},
-        }  # fmt: skip
-
     def schedules(self) -> dict[str, FieldSchedule]:
         """The schedule of every field, by its name."""
         return {one.name: one.schedule(self.timetable, self.late) for one in self.fields}
 
 
 def deployments(request: ServeRequest) -> list[Any]:
-    """A deployment of the survey for each field, and of reprocessing for each archive, on request."""
-    from prefect.schedules import Cron, Interval
+    """A deployment of the survey for each field, and of reprocessing for each archive.
+
+    None has a schedule of Prefect's: the watcher plans each due time once, see `flows.serve_queue`.
+    """
     from prefect.types.entrypoint import EntrypointType
 
     from flows.serve_flow import reprocess_archive, survey_scheduled
 
-    timetable = request.timetable
-    when: Any = (
-        Interval(timetable.every, anchor_date=EPOCH, timezone="UTC")
-        if timetable.every is not None
-        else Cron(str(timetable.cron), timezone=timetable.timezone)
-    )
     made = [
         survey_scheduled.to_deployment(
-            one.name, schedules=[when], parameters=request.parameters(one), tags=[one.settings.source, one.name],
-            description=f"Surveys of {one.name} by {one.file}, {timetable.words()}.", version="1",
+            one.name, schedules=[], parameters={"field": one.name}, tags=[one.settings.source, one.name],
+            description=f"Surveys of {one.name} by {one.file}, {request.timetable.words()}.", version="1",
             entrypoint_type=EntrypointType.MODULE_PATH,
         )
         for one in request.fields

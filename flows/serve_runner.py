@@ -5,45 +5,36 @@ By itself Prefect's runner does not come back once its server has been away.
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from flows.process_guard import KeptProcess
+from flows.served import NAMED_BY, read_served
 
 PATIENCE_S = 15.0
 
 
 class RunnerProcess(KeptProcess):
-    """Prefect's runner, in a process of its own; ``words`` are what `main` reads, ``log`` has what it and surveys say.
+    """Prefect's runner, in a process of its own, and of the runs that it starts; ``log`` has what they say.
 
-    A survey that it has started goes on by itself when it ends, or is resumed.
+    What they may survey stands in ``served``. A survey goes on by itself when the runner ends, or is resumed.
     """
 
-    def __init__(self, words: Mapping[str, Any], log: Path) -> None:
-        super().__init__([sys.executable, "-m", "flows.serve_runner", json.dumps(words)], log, PATIENCE_S)
+    def __init__(self, served: Path, log: Path) -> None:
+        super().__init__([sys.executable, "-m", "flows.serve_runner"], log, PATIENCE_S, {NAMED_BY: str(served)})
 
 
-def main(text: str) -> None:
-    """Serve the deployments of a request until told to stop."""
+def main() -> None:
+    """Let the deployments of what is served run until told to stop."""
     from prefect import serve
 
-    from flows.schedule_times import parse_timetable
-    from flows.serve_fields import load_field
-    from flows.serve_request import ServeRequest, deployments
+    from flows.serve_request import deployments
 
-    words = json.loads(text)
-    request = ServeRequest(
-        fields=[load_field(Path(file), words["out"]) for file in words["files"]],
-        timetable=parse_timetable(words["cron"], words["every"], words["timezone"]),
-        late=words["late"], limit=words["limit"], out=words["out"],
-    )  # fmt: skip
+    request = read_served()
     with suppress(KeyboardInterrupt):
         serve(*deployments(request), limit=request.limit, print_starting_message=False)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main()

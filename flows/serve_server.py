@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import secrets
 import socket
+import stat
 import sys
 import time
 import urllib.error
@@ -15,9 +17,9 @@ from pathlib import Path
 
 from flows.engine import QUIET
 from flows.process_guard import KeptProcess
+from flows.serve_pages import HOST, own_origins
 from pipeline.errors import SettingsError
 
-HOST = "127.0.0.1"
 STARTED_WITHIN_S = 120.0
 ENDS_WITHIN_S = 10.0
 PATIENCE_S = 10.0  # with a server that is named
@@ -29,9 +31,8 @@ class LocalServer(KeptProcess):
     """A server process with its files in a folder; started again where it has died."""
 
     def __init__(self, home: Path, port: int) -> None:
-        self.url = f"http://{HOST}:{port}/api"
-        command = [sys.executable, "-m", "prefect", "server", "start", "--host", HOST, "--port", str(port)]
-        super().__init__(command, home / "server.log", ENDS_WITHIN_S)
+        self.url, self.password_file = f"http://{HOST}:{port}/api", home / "password"
+        super().__init__([sys.executable, "-m", "flows.serve_pages", str(port)], home / "server.log", ENDS_WITHIN_S)
 
     def wait(self) -> bool:
         """Wait until it answers; False where it has not within two minutes, or has ended."""
@@ -48,14 +49,17 @@ class LocalServer(KeptProcess):
 
 def pages_of(server: LocalServer | None) -> str:
     """Where the pages of a server are to be seen: one of our own, or the one that PREFECT_API_URL names."""
-    return (os.environ["PREFECT_API_URL"] if server is None else server.url).rstrip("/").removesuffix("/api")
+    pages = (os.environ["PREFECT_API_URL"] if server is None else server.url).rstrip("/").removesuffix("/api")
+    return pages if server is None else f"{pages}, the password is in {server.password_file}"
 
 
 @contextmanager
 def server_for(home: Path, port: int) -> Iterator[LocalServer | None]:
     """Have a server while the block runs, and name it to Prefect, here and in processes started from here.
 
-    None where PREFECT_API_URL names one, which is left as it is. Nothing outside this machine is asked.
+    None where PREFECT_API_URL names one, which is left as it is. One of our own wants a password: what the variable
+    PREFECT_SERVER_API_AUTH_STRING says, or one that is kept in ``home`` for this user. Nothing outside this machine is
+    asked.
 
     Raises
     ------
@@ -67,12 +71,15 @@ def server_for(home: Path, port: int) -> Iterator[LocalServer | None]:
         return
     server = LocalServer(home, port)
     _check_free(port)
+    password = os.environ.get("PREFECT_SERVER_API_AUTH_STRING") or _password_in(server.password_file)
+    ours = {"PREFECT_SERVER_API_AUTH_STRING": password, "PREFECT_API_AUTH_STRING": password}
     wanted = {
         **QUIET, "PREFECT_HOME": str(home), "PREFECT_API_URL": server.url, "PREFECT_SERVER_UI_V2_ENABLED": "false",
         "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false", "PREFECT_RUNNER_POLL_FREQUENCY": POLL_S,
+        "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": ",".join(own_origins(port)),
     }  # fmt: skip
-    added = {name: value for name, value in wanted.items() if name not in os.environ}
-    os.environ.update(added)
+    before = {name: os.environ.get(name) for name in (*wanted, *ours)}
+    os.environ.update({name: value for name, value in wanted.items() if name not in os.environ} | ours)
     try:
         server.keep_up()
         if not server.wait():
@@ -82,8 +89,40 @@ def server_for(home: Path, port: int) -> Iterator[LocalServer | None]:
         yield server
     finally:
         server.stop()
-        for name in added:
-            os.environ.pop(name, None)
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _password_in(path: Path) -> str:
+    """The password that a file keeps; made, for this user's eyes alone, where there is none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+        with os.fdopen(number, "w", encoding="ascii") as file:
+            file.write(f"spectralzoom:{secrets.token_urlsafe(24)}\n")
+    except FileExistsError:
+        pass
+    except OSError as error:
+        raise SettingsError(f"cannot keep the password of Prefect's pages in {path}: {error.strerror}") from error
+    return _read_password(path)
+
+
+def _read_password(path: Path) -> str:
+    """What stands in the file, where it is one that nobody else can read or write (SettingsError)."""
+    why = "is empty"
+    try:
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), encoding="utf-8") as file:
+            kept = os.fstat(file.fileno())
+            if not stat.S_ISREG(kept.st_mode) or kept.st_mode & 0o077 or kept.st_uid not in (os.geteuid(), 0):
+                why = "is not a plain file that only you can read"
+            elif text := file.read(1000).strip():
+                return text
+    except (OSError, ValueError) as error:
+        why = f"cannot be read ({error})"
+    raise SettingsError(f"{path}, the password of Prefect's pages, {why}: remove it, a new one is made")
 
 
 def _check_answers(url: str) -> None:

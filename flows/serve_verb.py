@@ -44,7 +44,8 @@ def serve(
     port
         Of Prefect's pages on this machine; a server that PREFECT_API_URL names is used instead.
     notify
-        Address that is told of failed and skipped runs, a POST of JSON; nobody is by default.
+        Address that is told of failed and skipped runs, a POST of JSON, or a file that holds it: what stands on the
+        command line is in the process list. SPECTRALZOOM_NOTIFY in the environment does as well. By default nobody.
     """
     from flows.serve_command import ServeChoice, run_serve
 

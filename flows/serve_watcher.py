@@ -1,4 +1,4 @@
-"""What looks after a schedule on Prefect: it skips and reaps by the ledgers, and asks for runs that did not come.
+"""What looks after a schedule on Prefect: it skips and reaps by the ledgers, and plans one flow run a due time.
 
 A server that is away is told of; what could not be done is done at the next look.
 """
@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,18 +18,19 @@ from flows.notices import send_notice
 from flows.schedule_lock import RigLock
 from flows.schedule_news import ScheduleNews, together
 from flows.schedule_runs import Tell
-from flows.schedule_state import moment_words
+from flows.schedule_times import Timetable
 from flows.serve_fields import ServedField
+from flows.serve_queue import FlowRuns
 from flows.serve_request import ServeRequest
 from storage.staging import take_lock
 
-GRACE = timedelta(seconds=45)  # after a due time Prefect's own scheduler is given so long, or less: see `_grace`
-ASK_AGAIN = timedelta(minutes=3)
-UNHEARD = timedelta(minutes=1)
+AHEAD, LEAST_AHEAD, MOST_AHEAD = timedelta(minutes=1), 2, 12  # due times to come that stand in Prefect
+UNHEARD = timedelta(minutes=2)
+CANCELLED = "it was cancelled in Prefect"
 
 
 class Asked(NamedTuple):
-    """When a run was asked for, and how often it had begun by then."""
+    """From when on a planned run could have begun, and how often it had by then."""
 
     at: datetime
     attempts: int
@@ -44,8 +46,10 @@ class Watcher:
     client_of: Callable[[], Any] = field(default=lambda: _client())
     asked: dict[tuple[str, datetime], Asked] = field(default_factory=dict)  # and not begun since, as far as is known
     news: ScheduleNews = field(init=False)
+    runs: dict[str, FlowRuns] = field(init=False)
 
     def __post_init__(self) -> None:
+        self.runs = {name: FlowRuns(name) for name in self.schedules}
         self.news = ScheduleNews(self.schedules, lambda name, error: self.tell(f"{name}: {error}"))
 
     def prepare(self) -> None:
@@ -77,8 +81,10 @@ class Watcher:
         for name in {name for name, _ in self.asked}:
             with self._errors(name):
                 late += self._late_ones(name)
-        for one in late:
-            del self.asked[one]
+        for name, due in late:
+            del self.asked[name, due]
+            with self._errors("Prefect"), self.client_of() as client:
+                self.runs[name].give_up(client, due)
         return bool(late)
 
     def _late_ones(self, name: str) -> list[tuple[str, datetime]]:
@@ -124,41 +130,47 @@ class Watcher:
             release()
         return False
 
-    def look(self) -> list[tuple[str, datetime]]:
-        """Once over all fields; gives the runs that were asked for."""
-        full = self.busy()
-        missed: list[tuple[str, datetime]] = []
+    def look(self) -> bool:
+        """Once over all fields: what is too late or dead is accounted for, and Prefect has a run of each due time.
+
+        False where Prefect does not know of a field yet.
+        """
         for one in self.request.fields:
-            schedule = self.schedules[one.name]
             with self._errors(one.name):
-                resumed: list[datetime] = []
-                free = self._alone(one, lambda r=resumed, s=schedule: r.extend(s.reap(self._why)))  # type: ignore[misc]
-                why = None if free else f"the rig was in use by {one.lock().holder()}"
-                now = schedule.clock.now()
-                waiting = [due for due in schedule.pending(why) if now - due >= _grace(schedule, due)]
-                missed += [(one.name, due) for due in (*resumed, *(waiting if free else ()))]
-        asked: list[tuple[str, datetime]] = []
-        for name, due in missed:
-            if not full and self._may_be_asked(name, due):
-                with self._errors("Prefect"):
-                    self._ask(name, due)
-                    asked.append((name, due))
-        return asked
+                self._look_at(one, self.schedules[one.name])
+        return all(runs.known for runs in self.runs.values())
 
-    def _may_be_asked(self, name: str, due: datetime) -> bool:
-        known = self.asked.get((name, due))
-        return known is None or self.schedules[name].clock.now() - known.at >= ASK_AGAIN
+    def _look_at(self, one: ServedField, schedule: FieldSchedule) -> None:
+        resumed: list[datetime] = []
+        free = self._alone(one, lambda: resumed.extend(schedule.reap(self._why)))
+        waiting = schedule.pending(None if free else f"the rig was in use by {one.lock().holder()}")
+        state, now = schedule.state(), schedule.clock.now()
+        wanted = dict.fromkeys((*waiting, *_ahead(schedule.timetable, now)), 0)
+        wanted |= {due: len(state.begun.get(due, ())) for due in resumed}
+        self._note(one.name, wanted, now)
+        cancelled: list[datetime] = []
+        with self._errors("Prefect"), self.client_of() as client:
+            cancelled = self.runs[one.name].settle(client, wanted, now, state.open.keys() - set(resumed))
+        for due in sorted(set(cancelled) & {*waiting, *resumed}):
+            schedule.end(due, "failed" if due in resumed else "skipped", CANCELLED)
 
-    def _ask(self, name: str, due: datetime) -> None:
-        """Have a run that crashed, or that Prefect did not start, run now."""
-        one, schedule = next(one for one in self.request.fields if one.name == name), self.schedules[name]
-        attempts = len(schedule.state().begun.get(due, ()))
-        with self.client_of() as client:
-            deployment = client.read_deployment_by_name(f"survey/{name}")
-            parameters = {**self.request.parameters(one), "due": moment_words(due)}
-            client.create_flow_run_from_deployment(deployment.id, parameters=parameters)
-        self.asked[name, due] = Asked(schedule.clock.now(), attempts)
-        self.tell(f"{name}: the run due {due:%H:%M:%S} UTC is asked for again")
+    def _note(self, name: str, wanted: Mapping[datetime, int], now: datetime) -> None:
+        """Which runs could begin from when on; one that was told of before is begun again."""
+        for due, attempts in wanted.items():
+            known = self.asked.get((name, due))
+            if known is None or known.attempts < attempts:
+                self.asked[name, due] = Asked(max(now, due), attempts)
+                if attempts:
+                    self.tell(f"{name}: the run due {due:%H:%M:%S} UTC is asked for again")
+        for field_name, due in list(self.asked):
+            if field_name == name and due not in wanted:
+                del self.asked[name, due]
+
+    def stop(self) -> None:
+        """Take back what Prefect was to begin: nothing is due any more."""
+        for name, runs in self.runs.items():
+            with suppress(Exception), self.client_of() as client:
+                runs.stop(client, self.schedules[name].clock.now())
 
     def _alone(self, one: ServedField, work: Callable[[], object]) -> bool:
         """Do it while no survey holds the field's rig; False where one does."""
@@ -178,12 +190,12 @@ class Watcher:
         with suppress(Exception), self.client_of() as client:
             state = client.read_flow_run(known).state if known else None
             if state is not None and state.type.value in ("CANCELLED", "CANCELLING"):
-                return "it was cancelled in Prefect"
+                return CANCELLED
         return None
 
     def _reap_prefect(self, one: ServedField) -> None:
         with self.client_of() as client:
-            for name in reap_flow_runs(client, one.name, str(one.file)):
+            for name in reap_flow_runs(client, one.name, None):
                 self.tell(f"{one.name}: the flow run {name} was told as running and is gone: crashed")
         self._reap_reprocess(one)
 
@@ -219,15 +231,16 @@ class _Told:
         return True
 
 
-def _grace(schedule: FieldSchedule, due: datetime) -> timedelta:
-    """How long Prefect is waited for: it makes runs of a new deployment late, so a third of what a run may wait."""
-    return min(GRACE, (schedule.timetable.latest_start(due, schedule.late) - due) / 3)
+def _ahead(timetable: Timetable, now: datetime) -> list[datetime]:
+    """The next due times: those of the next minute, and a few more for people to see."""
+    coming = islice(timetable.due_after(now), MOST_AHEAD)
+    return [due for number, due in enumerate(coming) if number < LEAST_AHEAD or due - now <= AHEAD]
 
 
-def reap_flow_runs(client: Any, field: str | None, what: str) -> list[str]:
+def reap_flow_runs(client: Any, field: str | None, archive: str | None) -> list[str]:
     """Set flow runs that Prefect believes alive to Crashed; only for whoever holds their lock. Gives their names.
 
-    Of the survey of ``field`` by the settings file ``what``, or of the reprocessing of the archive ``what``.
+    Of the survey of ``field``, or of the reprocessing of ``archive``.
     """
     from prefect.client.schemas.filters import FlowFilter, FlowFilterName, FlowRunFilter, FlowRunFilterState
     from prefect.client.schemas.filters import FlowRunFilterStateType as StateFilter
@@ -236,10 +249,9 @@ def reap_flow_runs(client: Any, field: str | None, what: str) -> list[str]:
 
     flow = FlowFilter(name=FlowFilterName(any_=["reprocess" if field is None else "survey"]))
     alive = FlowRunFilter(state=FlowRunFilterState(type=StateFilter(any_=[StateType.RUNNING, StateType.PENDING])))
-    key = "archive" if field is None else "settings"
     reaped: list[str] = []
     for run in client.read_flow_runs(flow_filter=flow, flow_run_filter=alive):
-        if run.parameters.get(key) == what and run.parameters.get("field") in (field, None):
+        if run.parameters.get("field" if field is not None else "archive") == (field if field is not None else archive):
             client.set_flow_run_state(run.id, Crashed(message="its process was gone: its lock is free"), force=True)
             reaped.append(run.name)
     return reaped

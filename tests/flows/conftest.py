@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 from flows.cli import main
 from flows.engine import QUIET
+from flows.served import NAMED_BY
 
 CommandLine = Callable[..., "Ended"]
 
@@ -66,3 +68,16 @@ def field_file(tmp_path: Path, scene_files: Path, weights: Path) -> Callable[...
         return path
 
     return write
+
+
+@pytest.fixture
+def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """Say what scheduled flows of this test may survey, as `serve` does."""
+
+    def say(*files: Path, **words: object) -> Path:
+        path = tmp_path / "served.json"
+        path.write_text(json.dumps({"files": [str(file) for file in files], "timezone": "UTC", **words}))
+        monkeypatch.setenv(NAMED_BY, str(path))
+        return path
+
+    return say

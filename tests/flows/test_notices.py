@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from flows.notices import check_address, send_notice
+from flows.notices import NAMED_BY, notice_address, send_notice
 from flows.schedule_lock import RigLock
 from flows.schedule_news import ScheduleNews, Several, together
 from flows.schedule_runs import Outcome
@@ -107,13 +107,57 @@ def test_a_named_server_that_speaks_another_protocol(stranger: str, monkeypatch:
 def test_an_address_that_cannot_be_asked_is_refused(address: str) -> None:
     """A port that is none, blanks, control characters, a password: notices to it would be lost without a word."""
     with pytest.raises(SettingsError, match="is no address; expected https://HOST/PATH"):
-        check_address(address)
+        notice_address(address)
 
 
 @pytest.mark.parametrize("address", [None, "http://127.0.0.1:8080/hook?key=1", "https://[::1]/", "https://a.example"])
 def test_an_address_that_can_be_asked(address: str | None) -> None:
     """None is an address, too: nobody's."""
-    assert check_address(address) == address
+    assert notice_address(address) == address
+
+
+def test_an_address_may_stand_in_a_file_or_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No process list shows it then, nor does the message that refuses it; the flag wins over the environment."""
+    file = tmp_path / "notify"
+    file.write_text("https://a.example/token\n")
+    assert notice_address(str(file)) == "https://a.example/token"
+    monkeypatch.setenv(NAMED_BY, "https://b.example/token")
+    assert (notice_address(None), notice_address(str(file))) == ("https://b.example/token", "https://a.example/token")
+    file.write_text("token, no address")
+    with pytest.raises(SettingsError, match=r"what stands in .*notify is no address") as refused:
+        notice_address(str(file))
+    assert "token" not in str(refused.value)
+    with pytest.raises(SettingsError, match="no file that holds one"):
+        notice_address(str(tmp_path / "none"))
+
+
+@pytest.mark.parametrize("code", [301, 302, 303, 307, 308])
+def test_a_notice_follows_no_redirect(listener: tuple[str, list[dict[str, Any]]], code: int) -> None:
+    """An answer that names another address, such as a port of this machine, has nothing posted or asked there."""
+    address, posted = listener
+    asked: list[str] = []
+
+    class Elsewhere(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            asked.append(self.path)
+            self.rfile.read(int(self.headers["Content-Length"]))
+            self.send_response(code)
+            self.send_header("Location", address)
+            self.end_headers()
+
+        def log_message(self, *words: object) -> None:
+            pass
+
+    server = HTTPServer(("127.0.0.1", 0), Elsewhere)
+    thread = Thread(target=server.serve_forever)
+    thread.start()
+    sent = send_notice(
+        f"http://127.0.0.1:{server.server_port}/hook", Outcome("north", NOON, "failed", "no reply"), "archive"
+    )
+    server.shutdown()
+    server.server_close()
+    thread.join()
+    assert (sent, asked, posted) == (False, ["/hook"], [])
 
 
 def test_what_ended_alike_is_one_notice() -> None:

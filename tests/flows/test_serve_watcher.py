@@ -11,10 +11,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from prefect.exceptions import ObjectNotFound
+from prefect.states import Cancelled, Completed, Pending, Running, State
 
 from flows import serve_watcher
 from flows.field_schedule import FieldSchedule
 from flows.schedule_runs import Outcome
+from flows.schedule_state import moment_words
 from flows.schedule_times import parse_timetable
 from flows.serve_fields import ServedField, load_fields
 from flows.serve_request import ServeRequest
@@ -29,23 +32,56 @@ EVERY = parse_timetable(None, "20m", "UTC")
 
 
 class AClient:
-    """Stands for a Prefect client: keeps what it was asked for."""
+    """Stands for a Prefect client and its server: keeps flow runs, one for each idempotency key."""
 
     def __init__(self, state: str = "CRASHED") -> None:
-        self.asked: list[dict[str, Any]] = []
+        self.runs: dict[str, SimpleNamespace] = {}
+        self.asked: list[str] = []  # due times for which a run was made, in turn
+        self.known = True
         self._state = state
 
     def read_deployment_by_name(self, name: str) -> SimpleNamespace:
-        """A deployment."""
+        """A deployment, once the runner has told of it."""
+        if not self.known:
+            raise ObjectNotFound(RuntimeError(name))
         return SimpleNamespace(id=name)
 
-    def create_flow_run_from_deployment(self, deployment: str, parameters: dict[str, Any]) -> None:
-        """Note it."""
-        self.asked.append({"deployment": deployment, **parameters})
+    def create_flow_run_from_deployment(
+        self, deployment: str, *, parameters: dict[str, Any], state: State, name: str, idempotency_key: str
+    ) -> SimpleNamespace:
+        """A new run, or the one that was made by that key."""
+        if idempotency_key not in self.runs:
+            known = {"id": idempotency_key, "deployment": deployment, "parameters": parameters, "state": state}
+            self.runs[idempotency_key] = SimpleNamespace(**known, auto_scheduled=False)
+            self.asked.append(parameters["due"])
+        return self.runs[idempotency_key]
+
+    def read_flow_runs(self, deployment_filter: Any, **filters: Any) -> list[SimpleNamespace]:
+        """Runs of a field that wait or are pending."""
+        (name,) = deployment_filter.name.any_
+        waiting = [run for run in self.runs.values() if run.deployment == f"survey/{name}"]
+        return [run for run in waiting if run.state.is_scheduled() or run.state.is_pending()]
+
+    def set_flow_run_state(self, run: str, state: State, force: bool = False) -> None:
+        """Set it."""
+        self.runs[run].state = state
+
+    def delete_flow_run(self, run: str) -> None:
+        """Forget it."""
+        del self.runs[run]
 
     def read_flow_run(self, known: str) -> SimpleNamespace:
         """A run in the state given."""
         return SimpleNamespace(state=SimpleNamespace(type=SimpleNamespace(value=self._state)))
+
+    def waits(self, name: str = "north") -> list[str]:
+        """Due times of the runs of a field that no process was started for, in order."""
+        found = [run for run in self.runs.values() if run.deployment == f"survey/{name}" and run.state.is_scheduled()]
+        return sorted(run.parameters["due"] for run in found)
+
+    def run_of(self, due: str) -> SimpleNamespace:
+        """The newest run of a due time."""
+        return [run for run in self.runs.values() if run.parameters["due"] == due][-1]
 
 
 def watcher(file: Path, clock: HandClock, client: AClient) -> tuple[Watcher, FieldSchedule, ServedField]:
@@ -71,17 +107,94 @@ def two_rigs(
     return Watcher(request, schedules, lambda words: None, lambda: nullcontext(client)), schedules
 
 
-def test_what_prefect_did_not_start_is_asked_for_once(field_file: Callable[..., Path]) -> None:
-    """After a grace a due run that nobody began is asked for by name and due time, and not again at every look."""
+def test_each_due_time_has_one_run_ahead_of_it(field_file: Callable[..., Path]) -> None:
+    """However often it is looked, and whoever looks: no due time is asked for twice, none is left out."""
+    clock, client = HandClock(), AClient()
+    watch, schedule, _ = watcher(field_file(), clock, client)
+    for _ in range(3 * 60 * 4):
+        clock.sleep(15)
+        watch.look()
+        due = clock.now().replace(second=0)
+        if due.minute % 20 == 0 and due > NOON:
+            schedule.begin(due)
+            schedule.end(due, "done")
+            client.run_of(moment_words(due)).state = Completed()
+        other = Watcher(watch.request, watch.schedules, watch.tell, watch.client_of)
+        other.look()
+    expected = [moment_words(NOON + timedelta(minutes=20 * number)) for number in range(1, 12)]
+    assert client.asked == expected
+    assert client.waits() == expected[-2:]
+
+
+def test_what_is_accounted_for_is_taken_back(field_file: Callable[..., Path]) -> None:
+    """A run that was skipped by rule has no process started for it any more, and says why; others stay."""
     clock, client = HandClock(), AClient()
     watch, _, _ = watcher(field_file(), clock, client)
-    clock.sleep(20 * 60 + 10)
-    assert watch.look() == []
+    watch.look()
+    clock.sleep(31 * 60)
+    watch.look()
+    skipped = client.run_of("2026-06-01T12:20:00Z")
+    assert (skipped.state.type.value, skipped.state.name) == ("CANCELLED", "Skipped")
+    assert client.waits() == ["2026-06-01T12:40:00Z", "2026-06-01T13:00:00Z"]
+    assert len(client.asked) == len(set(client.asked)) == 3
+
+
+def test_a_run_under_way_is_left_alone(field_file: Callable[..., Path]) -> None:
+    """While its rig is held, neither its own run nor one that waits for the rig is taken back or made again."""
+    clock, client = HandClock(), AClient()
+    watch, schedule, one = watcher(field_file(), clock, client)
+    watch.look()
+    clock.sleep(20 * 60)
+    lock = one.lock()
+    assert lock.take("a survey")
+    client.run_of("2026-06-01T12:20:00Z").state = Pending()
+    schedule.begin(clock.now(), flow_run="abc")
     clock.sleep(60)
-    assert watch.look() == [("north", NOON + timedelta(minutes=20))]
-    clock.sleep(30)
-    assert watch.look() == []
-    assert [(one["deployment"], one["due"]) for one in client.asked] == [("survey/north", "2026-06-01T12:20:00Z")]
+    watch.look()
+    assert client.run_of("2026-06-01T12:20:00Z").state.is_pending()
+    assert len(client.asked) == 3
+    lock.release()
+
+
+def test_a_run_that_somebody_cancelled_is_skipped(field_file: Callable[..., Path]) -> None:
+    """On Prefect's pages, before it began: the ledger says so when it is due, and it is not made again."""
+    clock, client = HandClock(), AClient()
+    watch, schedule, _ = watcher(field_file(), clock, client)
+    watch.look()
+    client.run_of("2026-06-01T12:20:00Z").state = Cancelled()
+    clock.sleep(10 * 60)
+    watch.look()
+    assert [line["event"] for line in schedule.ledger.lines()] == ["opened"]
+    clock.sleep(10 * 60)
+    watch.look()
+    line = schedule.ledger.lines()[-1]
+    assert (line["event"], line["due"], line["reason"]) == (
+        "skipped", "2026-06-01T12:20:00Z", "it was cancelled in Prefect",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("stopped", [1, 5])
+def test_a_schedule_that_is_stopped_leaves_nothing_to_begin(field_file: Callable[..., Path], stopped: int) -> None:
+    """However often it is stopped and served again, what is due next has a run."""
+    clock, client = HandClock(), AClient()
+    watch, _, _ = watcher(field_file(), clock, client)
+    for _ in range(stopped):
+        watch.look()
+        watch.stop()
+        assert client.waits() == []
+    watch.look()
+    assert client.waits() == ["2026-06-01T12:20:00Z", "2026-06-01T12:40:00Z"]
+
+
+def test_a_field_that_prefect_does_not_know_yet(field_file: Callable[..., Path]) -> None:
+    """The runner tells of it some seconds after its start: nothing is told, and the next look comes soon."""
+    clock, client, told = HandClock(), AClient(), list[str]()
+    watch, _, _ = watcher(field_file(), clock, client)
+    watch.tell, client.known = told.append, False
+    assert not watch.look()
+    client.known = True
+    assert watch.look()
+    assert (told, len(client.asked)) == ([], 2)
 
 
 @pytest.mark.parametrize(("state", "resumed"), [("CRASHED", True), ("CANCELLED", False)])
@@ -96,32 +209,25 @@ def test_a_crashed_run_is_resumed_a_cancelled_one_is_not(
     assert lock.take("a survey")
     schedule.begin(clock.now(), flow_run="abc")
     clock.sleep(60)
-    assert watch.look() == []
+    watch.look()
+    assert client.asked.count("2026-06-01T12:20:00Z") == 0
     lock.release()
-    assert bool(watch.look()) is resumed
+    watch.look()
+    assert bool(client.asked.count("2026-06-01T12:20:00Z")) is resumed
     assert bool(schedule.state().open) is resumed
     if not resumed:
         assert schedule.ledger.lines()[-1]["reason"] == "it was cancelled in Prefect"
 
 
-def test_nothing_is_asked_for_while_the_only_place_is_taken(field_file: Callable[..., Path], tmp_path: Path) -> None:
-    """With one survey at a time, another rig's survey or a reprocessing is waited for, and its runner is left alone."""
-    from flows.serve_flow import REPROCESS_LOCK
-
+def test_a_runner_that_has_something_to_do_is_left_alone(field_file: Callable[..., Path], tmp_path: Path) -> None:
+    """With one survey at a time, what waits for another rig's survey is not unheard."""
     clock, client = HandClock(), AClient()
     watch, _ = two_rigs(field_file, tmp_path, clock, client)
     fields, request = watch.request.fields, watch.request
-    clock.sleep(22 * 60)
+    watch.look()
+    clock.sleep(23 * 60)
+    watch.look()
     south = fields[1].lock()
-    assert south.take("a survey")
-    assert watch.look() == []
-    south.release()
-    reprocessing = take_lock(fields[1].archive / ".locks" / REPROCESS_LOCK, wait=False)
-    assert reprocessing is not None
-    assert watch.look() == []
-    reprocessing()
-    assert sorted(name for name, _ in watch.look()) == ["north", "south"]
-    clock.sleep(120)
     assert south.take("a survey")
     assert not watch.unheard()
     assert not replace(watch, request=replace(request, limit=2)).busy()
@@ -157,38 +263,9 @@ def test_notice_is_given_of_whatever_the_ledger_says(
     assert "it could not begin in time" in told[1]
 
 
-def test_prefect_is_given_a_grace_and_asked_again_after_a_while(field_file: Callable[..., Path]) -> None:
-    """45 s for its own scheduler; what it was asked for and did not begin it is asked for again after 3 min."""
-    clock, client = HandClock(), AClient()
-    watch, _, _ = watcher(field_file(), clock, client)
-    asked: list[float] = []
-    for after in (0, 44, 45, 46, 60, 200, 224, 225, 226, 404, 405, 420):  # seconds after it was due
-        clock.moment = NOON + timedelta(minutes=20, seconds=after)
-        asked += [after] * len(watch.look())
-    assert asked == [45, 225, 405]
-    assert len(client.asked) == 3
-
-
-def test_of_short_intervals_less_grace_is_given(field_file: Callable[..., Path]) -> None:
-    """Every minute a run may wait for 30 s: after 10 s it is asked for, and can still begin."""
-    clock, client = HandClock(), AClient()
-    (one,) = load_fields([field_file()])
-    minutely = parse_timetable(None, "1m", "UTC")
-    schedule = one.schedule(minutely, 0.5, clock)
-    schedule.open()
-    request = ServeRequest(fields=[one], timetable=minutely, late=0.5)
-    watch = Watcher(request, {one.name: schedule}, lambda words: None, lambda: nullcontext(client))
-    asked: list[float] = []
-    for after in (0, 5, 9, 10, 20):
-        clock.moment = NOON + timedelta(minutes=1, seconds=after)
-        asked += [after] * len(watch.look())
-    assert asked == [10]
-
-
-def test_a_server_that_is_away_was_not_asked(field_file: Callable[..., Path]) -> None:
-    """It is told of, asked at the next look, and the runner is not started again for what nobody was asked for."""
-    clock, client = HandClock(), AClient()
-    told: list[str] = []
+def test_a_server_that_is_away_is_told_of(field_file: Callable[..., Path]) -> None:
+    """What it could not be asked for it is asked for at the next look."""
+    clock, client, told = HandClock(), AClient(), list[str]()
     watch, _, _ = watcher(field_file(), clock, client)
     watch.tell, here = told.append, watch.client_of
 
@@ -197,52 +274,58 @@ def test_a_server_that_is_away_was_not_asked(field_file: Callable[..., Path]) ->
 
     watch.client_of = away
     clock.sleep(20 * 60 + 60)
-    assert watch.look() == []
+    watch.look()
     assert told == ["Prefect: connection refused"]
-    clock.sleep(90)
-    assert not watch.unheard()
     watch.client_of = here
-    assert watch.look() == [("north", NOON + timedelta(minutes=20))]
-    assert len(client.asked) == 1
+    watch.look()
+    assert client.waits()[0] == "2026-06-01T12:20:00Z"
 
 
 @pytest.mark.parametrize("begins", [True, False])
 def test_what_has_begun_is_not_unheard(field_file: Callable[..., Path], begins: bool) -> None:
-    """A minute after it was asked for, what has not begun is told of once; what has is forgotten."""
-    clock = HandClock()
-    watch, schedule, _ = watcher(field_file(), clock, AClient())
-    clock.sleep(20 * 60 + 60)
-    ((_, due),) = watch.look()
+    """Two minutes after it was due, what has not begun is told of once; a process that is gone is given up."""
+    clock, client = HandClock(), AClient()
+    watch, schedule, _ = watcher(field_file(), clock, client)
+    watch.look()
+    clock.sleep(20 * 60)
+    due = clock.now()
+    client.run_of(moment_words(due)).state = Pending()
     if begins:
         schedule.begin(due)
-    clock.sleep(60)
+    clock.sleep(120)
     assert not watch.unheard()
     clock.sleep(1)
     assert watch.unheard() is not begins
-    assert watch.asked == {}
     assert not watch.unheard()
+    if not begins:
+        assert client.run_of(moment_words(due)).state.is_crashed()
+        watch.look()
+        assert client.asked.count(moment_words(due)) == 2
+        assert client.waits()[0] == moment_words(due)
 
 
 def test_a_resumed_run_is_heard_when_it_begins_again(field_file: Callable[..., Path]) -> None:
     """That it had begun once, before it was asked for, is no sign of life; that it was skipped or failed is the end."""
-    clock = HandClock()
-    watch, schedule, _ = watcher(field_file(), clock, AClient())
+    clock, client, told = HandClock(), AClient(), list[str]()
+    watch, schedule, _ = watcher(field_file(), clock, client)
+    watch.tell = told.append
     clock.sleep(20 * 60)
     due = clock.now()
-    schedule.begin(due)
-    clock.sleep(60)
-    assert watch.look() == [("north", due)]
-    clock.sleep(61)
+    for _ in range(2):
+        schedule.begin(due)
+        watch.look()
+        client.run_of(moment_words(due)).state = Running()
+    assert told == ["north: the run due 12:20:00 UTC is asked for again"] * 2
+    assert client.asked.count(moment_words(due)) == 2
+    clock.sleep(121)
     assert watch.unheard()
-    assert watch.look() == [("north", due)]
+    watch.look()
     schedule.begin(due)
-    clock.sleep(61)
+    clock.sleep(121)
     assert not watch.unheard()
-    assert watch.look() == [("north", due)]
     schedule.end(due, "failed", "no reply")
-    clock.sleep(61)
-    assert not watch.unheard()
-    assert watch.asked == {}
+    watch.look()
+    assert due not in [known for _, known in watch.asked]
 
 
 def test_a_field_that_cannot_be_read_is_told_of_and_the_others_go_on(
@@ -253,8 +336,8 @@ def test_a_field_that_cannot_be_read_is_told_of_and_the_others_go_on(
     watch, schedules = two_rigs(field_file, tmp_path, clock, client)
     watch.tell = told.append
     clock.sleep(21 * 60)
-    assert [name for name, _ in watch.look()] == ["north", "south"]
-    clock.sleep(61)
+    watch.look()
+    clock.sleep(121)
     north = schedules["north"].ledger.path
     lines = Ledger.lines
 
@@ -265,13 +348,12 @@ def test_a_field_that_cannot_be_read_is_told_of_and_the_others_go_on(
 
     monkeypatch.setattr(Ledger, "lines", refuse)
     assert watch.unheard()
-    assert [name for name, _ in watch.look()] == ["south"]
+    clock.sleep(20 * 60)
+    watch.look()
     watch.tell_news()
-    assert set(told[2:]) == {
-        "north: cannot read the ledger", "south: the run due 12:20:00 UTC is asked for again",
-    }  # fmt: skip
+    assert {words for words in told if words.startswith("north")} == {"north: cannot read the ledger"}
+    assert (client.waits("north")[-1], client.waits("south")[-1]) == ("2026-06-01T13:00:00Z", "2026-06-01T13:20:00Z")
     monkeypatch.undo()
-    clock.sleep(181)
     opened = Archive.open
 
     def away(location: str, **options: Any) -> Archive:
@@ -282,7 +364,9 @@ def test_a_field_that_cannot_be_read_is_told_of_and_the_others_go_on(
     monkeypatch.setattr(Archive, "open", away)
     del told[:]
     assert not watch.busy()
-    assert [name for name, _ in watch.look()] == ["south"]
+    clock.sleep(20 * 60)
+    watch.look()
+    assert (client.waits("north")[-1], client.waits("south")[-1]) == ("2026-06-01T13:00:00Z", "2026-06-01T13:40:00Z")
     watch.prepare()
     assert "north: the archive is away" in told
 
@@ -311,18 +395,6 @@ def test_who_would_have_to_wait(
             assert release is not None
             held.callback(release)
         assert watch.busy() is busy
-
-
-def test_a_field_whose_rig_is_in_use_is_not_asked_for(field_file: Callable[..., Path], tmp_path: Path) -> None:
-    """It waits for its rig, though another field's may be surveyed beside it."""
-    clock = HandClock()
-    watch, _ = two_rigs(field_file, tmp_path, clock, AClient(), limit=2)
-    clock.sleep(21 * 60)
-    lock = watch.request.fields[0].lock()
-    assert lock.take("a survey by hand")
-    assert [name for name, _ in watch.look()] == ["south"]
-    lock.release()
-    assert [name for name, _ in watch.look()] == ["north"]
 
 
 def test_after_an_outage_there_is_one_notice(field_file: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:

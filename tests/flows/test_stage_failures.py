@@ -262,8 +262,9 @@ def test_a_stage_that_fails_by_prefect(
 
 
 def test_a_due_run_of_which_a_stage_fails(
-    server: None, scene_files: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    server: None, scene_files: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    served: Callable[..., Path],
+) -> None:  # fmt: skip
     """The scheduled flow ends Failed with the stage's words alone, the ledger has them, and no run is published."""
     from flows.serve_flow import survey_scheduled
 
@@ -275,10 +276,10 @@ def test_a_due_run_of_which_a_stage_fails(
     table, due = parse_timetable(cron["cron"], None, "UTC"), due.replace(second=0)
     told = {"event": "opened", "at": moment_words(due - timedelta(minutes=1)), "late": 0.5, "pid": 1}
     one.schedule(table, 0.5).ledger.append({**told, "schedule": table.to_dict()})
-    given = {"field": "north", "settings": str(file), "late": 0.5, **cron, "due": moment_words(due)}
+    served(file, late=0.5, cron=cron["cron"])
     with monkeypatch.context() as broken:
         broken.setitem(STAGES, "cut_patches", failing("cut_patches", refusal("cut_patches")))
-        state = survey_scheduled(**given, return_state=True)
+        state = survey_scheduled("north", moment_words(due), return_state=True)
     run, tasks = newest_run("survey")
     assert (state.is_failed(), state.message, run.name) == (True, FULL_DISK, "survey-north")
     assert tasks["cut_patches-north"].state.type.value == "FAILED"
@@ -288,12 +289,14 @@ def test_a_due_run_of_which_a_stage_fails(
 
 
 def test_a_reprocessing_of_which_a_stage_fails(
-    server: None, walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    server: None, walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, field_file: Callable[..., Path],
+    served: Callable[..., Path],
+) -> None:  # fmt: skip
     """It ends Failed and says where the reason stands; the next one makes what was missing, and completes."""
     from flows.serve_flow import reprocess_archive
 
     out = Path(shutil.copytree(walk.undisturbed, tmp_path / "archive"))
+    served(field_file(out=str(out)), every="1h")
     archive = Archive.open(out)
     (missing,) = archive.refs("segment")
     archive.discard(missing)
