@@ -5,6 +5,7 @@ No ``from __future__ import annotations`` here: Prefect reads the signatures.
 
 import atexit
 import os
+import secrets
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -24,6 +25,7 @@ RETRIES = {
     "capture_again": 2,
 }  # a device may answer the second time; the spool goes on
 RETRY_DELAY_S = 2.0
+PASSWORD = f"spectralzoom:{secrets.token_urlsafe(24)}"  # of the ephemeral server that this process starts
 QUIET = {
     "DO_NOT_TRACK": "1",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
@@ -56,8 +58,22 @@ def survey_with_prefect(runner: StageRunner) -> Products:
         except ImportError as error:
             raise EngineUnavailable(f"Prefect cannot be imported ({error})") from error
         # The heartbeat thread adds a second to every flow and tells nobody anything on an ephemeral server.
-        with temporary_settings(updates={PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}), _guarded_server():
+        with temporary_settings(updates={PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None, **_password()}), _guarded_server():
             return _run_flow(runner)
+
+
+def _password() -> dict[Any, str]:
+    """What an ephemeral server and its client need so that it answers this process alone, and no page of a browser."""
+    from prefect.settings import (
+        PREFECT_API_AUTH_STRING,
+        PREFECT_SERVER_API_AUTH_STRING,
+        PREFECT_SERVER_CORS_ALLOWED_ORIGINS,
+    )
+
+    if "PREFECT_API_URL" in os.environ or PREFECT_SERVER_API_AUTH_STRING.value() or PREFECT_API_AUTH_STRING.value():
+        return {}
+    known = {PREFECT_API_AUTH_STRING: PASSWORD, PREFECT_SERVER_API_AUTH_STRING: PASSWORD}
+    return {**known, PREFECT_SERVER_CORS_ALLOWED_ORIGINS: "http://127.0.0.1"}
 
 
 def inside_flow() -> bool:

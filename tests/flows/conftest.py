@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from flows.cli import main
-from flows.engine import QUIET
+from flows.engine import PASSWORD, QUIET
 from flows.served import NAMED_BY
 
 CommandLine = Callable[..., "Ended"]
@@ -48,7 +48,8 @@ def prefect_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Prefect's files in a folder of their own. Set before any test imports it, as it reads its settings only then."""
     home = tmp_path_factory.mktemp("prefect")
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in {**QUIET, "PREFECT_HOME": str(home)}.items():
+        known = {"PREFECT_API_AUTH_STRING": PASSWORD, "PREFECT_SERVER_API_AUTH_STRING": PASSWORD}
+        for name, value in {**QUIET, **known, "PREFECT_HOME": str(home)}.items():
             patch.setenv(name, value)
         yield home
 

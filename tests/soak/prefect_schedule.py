@@ -87,14 +87,16 @@ def free_port() -> int:
 
 
 @contextmanager
-def serving(folder: Path, port: int) -> Iterator[subprocess.Popen[bytes]]:
+def serving(
+    folder: Path, port: int, every_s: int = EVERY_S, fields: Sequence[str] = FIELDS
+) -> Iterator[subprocess.Popen[bytes]]:
     """Have `serve` run while the block does, with nothing of Prefect's from around it; killed where it still runs."""
     files = []
-    for seed, name in enumerate(FIELDS, 1):
+    for seed, name in enumerate(fields, 1):
         files.append(folder / f"{name}.toml")
         files[-1].write_text(SETTINGS.format(name=name, seed=seed))
-    words = [sys.executable, "-m", "flows.cli", "serve", *map(str, files), "--every", f"{EVERY_S}s"]
-    words += ["--limit", str(len(FIELDS)), "--out", str(folder / "archive"), "--port", str(port)]
+    words = [sys.executable, "-m", "flows.cli", "serve", *map(str, files), "--every", f"{every_s}s"]
+    words += ["--limit", str(len(fields)), "--out", str(folder / "archive"), "--port", str(port)]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
     process = subprocess.Popen(words, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, stdout=sys.stderr)
     try:
