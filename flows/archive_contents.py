@@ -8,6 +8,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 
+from flows.scores import score_of
 from storage.archive import Archive
 from storage.changes import changes_between, version_before
 from storage.lineage import Catalogue
@@ -36,7 +37,6 @@ def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
 
 def _run_row(catalogue: Catalogue, run: Run) -> dict[str, Any]:
     receipt, settings = run.receipt, run.settings
-    accuracy = receipt.get("accuracy")
     below = catalogue.named_and_below[run.uri]
     return {
         "id": run.folder.name,
@@ -45,7 +45,7 @@ def _run_row(catalogue: Catalogue, run: Run) -> dict[str, Any]:
         "scene": settings.get("scene"),
         "seed": settings.get("seed"),
         "budget": settings.get("budget"),
-        "miou": accuracy.get("miou") if isinstance(accuracy, dict) else None,
+        **score_of(receipt),
         "bytes": sum(catalogue.stores[uri].size for uri in below if uri in catalogue.stores),
         "state": _run_state(catalogue, run, below),
     }

@@ -8,7 +8,7 @@ from typing import Any
 from flows.benchmark_equal_time import plan_name
 from flows.benchmark_rig import BUDGETS, PLANNED, RANDOM, UNIFORM
 from flows.benchmark_series import Record, Row, Runs, by_seed, collect_row, difference, frame_names, mean_of
-from models.metrics import mean_iou
+from models.metrics import mean_iou, miou_of_shown_classes, overall_accuracy
 
 PLANS = (*PLANNED, UNIFORM, RANDOM)
 
@@ -70,11 +70,12 @@ def _first_draws(records: Sequence[Record]) -> list[Record]:
 
 
 def _figures(row: Row, name: str) -> dict[str, Any]:
-    each = row.over_runs(mean_iou)
     return {
         "policy": row.policy,
         name: row.share,
-        "miou": mean_of(each),
+        "miou": mean_of(row.over_runs(mean_iou)),
+        "miou_of_shown_classes": mean_of(row.over_runs(miou_of_shown_classes)),
+        "pixel_accuracy": mean_of(row.over_runs(overall_accuracy)),
         "frames": int(row.judged.sum()),
         **{part: _mean_part(row.parts, part) for part in ("seconds", "full_s", "lines", "full_lines", "seats")},
     }

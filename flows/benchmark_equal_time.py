@@ -15,9 +15,9 @@ import numpy as np
 from flows.benchmark_capture import plan_seconds
 from flows.benchmark_frames import Look, look_at
 from flows.benchmark_rig import BUDGETS, PLANNED
-from flows.benchmark_rows import Seats, Trial, known_or_none
+from flows.benchmark_rows import Seats, Trial
 from models.inference import segment
-from models.metrics import confusion, mean_iou
+from models.metrics import confusion
 from models.policies import score_seats
 from models.weights import Weights
 from pipeline.camera import LineCamera
@@ -88,7 +88,7 @@ def plan_name(policy: str) -> str:
 def _judged(look: Look, weights: Weights, seats: Seats) -> dict[str, Any]:
     drawn = segment(weights, look.seen, look.fine[seats], seats).classes
     counts = confusion(look.labels, drawn, weights.config.classes)
-    return {"draw": 0, "seats": len(seats), "counts": counts.tolist(), "miou": known_or_none(mean_iou(counts))}
+    return {"draw": 0, "seats": len(seats), "counts": counts.tolist()}
 
 
 def camera_of_equal_time(look: Look, camera: LineCamera, cost: CostModel, seats: Seats) -> LineCamera:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from flows.benchmark_jobs import Show, scene_of
 from flows.benchmark_rows import Trial
 from flows.benchmark_store import writing
 from flows.benchmark_work import Record, Work
 from flows.receipt import to_json
+from models.metrics import mean_iou
 
 SHOWN_SHARE = 0.10  # of the seats, or the nearest one tried: what the pictures show
 
@@ -55,8 +58,9 @@ def ends(runs: list[list[Record]], policy: str, share: float) -> list[tuple[str,
     for number, records in enumerate(runs):
         for record in records:
             row = next(row for row in record["rows"] if (row["policy"], row["share"]) == (policy, share))
-            if row["miou"] is not None:
-                judged.setdefault(record["frame"], (row["miou"], number))
+            own = mean_iou(np.array(row["counts"]))
+            if not np.isnan(own):
+                judged.setdefault(record["frame"], (own, number))
     if not judged:
         return []
     worst, best = (choose(judged, key=lambda name: judged[name][0]) for choose in (min, max))

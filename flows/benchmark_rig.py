@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from flows.benchmark_frames import Look
-from flows.benchmark_rows import Seats, known_or_none
+from flows.benchmark_rows import Seats
 from models.controls import RANDOM_DRAWS
 from models.inference import segment
-from models.metrics import confusion, mean_iou
+from models.metrics import confusion
 from models.policies import score_seats
 from models.weights import Weights
 from pipeline.camera import LineCamera
@@ -58,7 +58,7 @@ def judge_rig(
                 {
                     "policy": plan, "share": budget, "draw": draw, "seats": len(seats), "seconds": coarse_s + seconds,
                     "full_s": full_s, "lines": count_lines(coarse) + lines, "full_lines": count_lines(full),
-                    "counts": counts.tolist(), "miou": known_or_none(mean_iou(counts)),
+                    "counts": counts.tolist(),
                 }
             )  # fmt: skip
             report((number + (at + 1) / len(spends)) / len(BUDGETS))

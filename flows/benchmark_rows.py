@@ -14,7 +14,7 @@ from models.boundary import boundary_counts
 from models.controls import RANDOM_DRAWS
 from models.cost import MultiplyAdds, multiply_adds
 from models.inference import segment
-from models.metrics import confusion, iou_per_class, mean_iou
+from models.metrics import confusion
 from models.placement_metrics import average_precision, gain_sums, oracle_gain, rank_correlation, top_seats
 from models.policies import score_seats
 from models.weights import Weights
@@ -94,15 +94,12 @@ def wanted_rows(trial: Trial, placed: list[Placing], look: Look) -> Iterator[tup
 
 
 def judge_map(look: Sight, drawn: NDArray[np.uint8], seats: Seats, classes: int) -> dict[str, Any]:
-    """Counts of the whole map, of the captured seats alone, and near borders; and the frame's own mean IoU."""
+    """Counts of the whole map, of the captured seats alone, and near borders."""
     inside = np.where(captured_px(look, seats), look.labels, np.uint8(UNLABELLED))
-    whole = confusion(look.labels, drawn, classes)
     return {
-        "counts": whole.tolist(),
+        "counts": confusion(look.labels, drawn, classes).tolist(),
         "inside": confusion(inside, drawn, classes).tolist(),
         "boundary": boundary_counts(look.labels, drawn, classes).tolist(),
-        "miou": known_or_none(mean_iou(whole)),
-        "per_class_iou": [known_or_none(iou) for iou in iou_per_class(whole)],
     }
 
 

@@ -27,11 +27,14 @@ from flows.benchmark_series import (
 from models.boundary import boundary_iou, mean_boundary_iou
 from models.metrics import (
     average_accuracy,
+    false_pixels,
     frequency_weighted_iou,
     gap_closed,
     iou_per_class,
     kappa,
+    labelled_classes,
     mean_iou,
+    miou_of_shown_classes,
     miou_over_frame_classes,
     miou_over_frames,
     overall_accuracy,
@@ -127,10 +130,13 @@ def _accuracy(row: Row, class_names: Sequence[str]) -> dict[str, Any]:
     each = row.over_runs(mean_iou)
     seeds = np.array([mean_of(each[row.of_seed == number]) for number in np.unique(row.of_seed)])
     classes = row.over_runs(iou_per_class)
+    false = row.over_runs(false_pixels).mean(axis=0).tolist()  # of a run
+    near = list(zip(row.boundary.sum(axis=1), row.over_runs(labelled_classes).astype(bool), strict=True))
     judged = [run[run.any(axis=(1, 2))] for run in row.counts]
     outside = [mean_iou((whole - part).sum(axis=0)) for whole, part in zip(row.counts, row.inside, strict=True)]
     return {
         "miou": mean_of(each),
+        "miou_of_shown_classes": mean_of(row.over_runs(miou_of_shown_classes)),
         "spread": float(seeds.std(ddof=1)) if len(seeds) > 1 else None,
         "draws_spread": _draws_spread(row, each),
         "by_seed": seeds.tolist(),
@@ -142,9 +148,10 @@ def _accuracy(row: Row, class_names: Sequence[str]) -> dict[str, Any]:
         "average_accuracy": mean_of(row.over_runs(average_accuracy)),
         "kappa": mean_of(row.over_runs(kappa)),
         "per_class_iou": dict(zip(class_names, [mean_of(column) for column in classes.T], strict=True)),
-        "boundary_iou": mean_of(row.over_runs(mean_boundary_iou, "boundary")),
+        "false_classes": {name: pixels for name, pixels in zip(class_names, false, strict=True) if pixels},
+        "boundary_iou": mean_of([mean_boundary_iou(*run) for run in near]),
         "per_class_boundary_iou": dict(
-            zip(class_names, [mean_of(c) for c in row.over_runs(boundary_iou, "boundary").T], strict=True)
+            zip(class_names, [mean_of(c) for c in np.array([boundary_iou(*run) for run in near]).T], strict=True)
         ),
         "inside_miou": mean_of(row.over_runs(mean_iou, "inside")),
         "outside_miou": mean_of(outside),

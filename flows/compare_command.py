@@ -15,6 +15,7 @@ from flows.archive_commands import PIPED_WIDTH, check_outside
 from flows.comparison_table import SAVINGS, change_words, panel_words, show_comparison
 from flows.difference_picture import MapPair, draw_difference
 from flows.receipt import to_json
+from flows.scores import score_of
 from flows.setting_keys import BUILT_IN_SCENES
 from pipeline.errors import ArchiveError, SceneError, ShapeError
 from pipeline.grid import UNLABELLED
@@ -172,8 +173,7 @@ def _comparison(catalogue: Catalogue, runs: tuple[Run, Run], pair: _Pair) -> dic
 
 def _side(run: Run) -> dict[str, Any]:
     scene, seed = run.settings.get("scene"), run.settings.get("seed")
-    miou = _number(run.receipt, "accuracy", "miou")
-    return {"run": run.folder.name, "created": run.created, "scene": scene, "seed": seed, "miou": miou}
+    return {"run": run.folder.name, "created": run.created, "scene": scene, "seed": seed, **score_of(run.receipt)}
 
 
 def _classes(runs: tuple[Run, Run], pair: _Pair) -> list[dict[str, Any]]:

@@ -18,7 +18,8 @@ LABELS = {"lines": "lines", "capture_s": "time of capture", "tokens": "tokens"}
 
 def panel_words(side: Mapping[str, Any]) -> str:
     """A run and how good it is, in words."""
-    return str(side["run"]) + ("" if side["miou"] is None else f", mIoU {format_points(side['miou'])}")
+    scores = (("mIoU", side["miou"]), ("overall", side["overall_accuracy"]))
+    return ", ".join([str(side["run"]), *(f"{name} {format_points(one)}" for name, one in scores if one is not None)])
 
 
 def change_words(differing: Mapping[str, Any]) -> str:

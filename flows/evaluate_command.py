@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from flows.archive_commands import PIPED_WIDTH
@@ -18,6 +19,7 @@ from flows.benchmark_files import publish_evaluation
 from flows.benchmark_frames import Candidate, open_candidates, open_frames
 from flows.benchmark_jobs import Jobs, Show, sort_frames
 from flows.benchmark_request import COST, EvaluateRequest, checked_request
+from flows.benchmark_rows import known_or_none
 from flows.benchmark_series import Record, seeds_of
 from flows.benchmark_store import writing
 from flows.benchmark_summary import summarise
@@ -26,6 +28,7 @@ from flows.evaluation_table import print_evaluation
 from flows.progress import StageProgress
 from flows.receipt import to_json
 from models.bootstrap import LEVEL
+from models.metrics import agreement, false_pixels, iou_per_class
 from models.process import keep_freed_memory
 
 
@@ -127,15 +130,25 @@ NOTES = {
 
 
 def _per_frame(runs: list[list[Record]]) -> list[Record]:
-    kept = ("policy", "draw", "share", "seats", "miou", "per_class_iou")
     return [
         {
             "frame": record["frame"],
             "weights": number,
             "seats": record["seats"],
             "positive_seats": record["positive_seats"],
-            "rows": [{name: row[name] for name in kept} for row in record["rows"]],
+            "rows": [_of_frame(row) for row in record["rows"]],
         }
         for number, records in enumerate(runs)
         for record in records
     ]
+
+
+def _of_frame(row: Record) -> Record:
+    """The figures of a frame alone, over the classes of its own labels."""
+    counts = np.array(row["counts"])
+    return {
+        **{name: row[name] for name in ("policy", "draw", "share", "seats")},
+        **{name: known_or_none(figure) for name, figure in agreement(counts).items()},
+        "per_class_iou": [known_or_none(iou) for iou in iou_per_class(counts)],
+        "false_pixels": false_pixels(counts).tolist(),
+    }

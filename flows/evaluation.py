@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 from flows.effect_choice import source_with
 from flows.full_look import columns_of_all_seats
 from flows.pointing_stage import load_registration
+from flows.receipt import to_json
 from flows.run import SurveyRun
-from flows.stages import Produce, digest, glance_at, patch_columns, write_json
+from flows.stages import Produce, digest, glance_at, patch_columns
 from models.controls import CONTROL_SHARE, Controls, run_controls
 from models.inference import CoarseLook, Glance, glance_of_columns, segment
-from models.metrics import average_accuracy, confusion, gap_closed, iou_per_class, kappa, mean_iou, overall_accuracy
+from models.metrics import agreement, average_accuracy, confusion, false_pixels, gap_closed, iou_per_class, kappa
 from models.policies import score_seats
 from models.second_look import surprise
 from pipeline.grid import UNLABELLED
@@ -70,7 +71,7 @@ def evaluate(
         if run.settings.controls:
             source = source_with(_sure_source(run, off), effects)
             result |= _controls(replace(run, source=source), seen, patches, labels, result)
-        write_json(path / "accuracy.json", result)
+        (path / "accuracy.json").write_text(to_json(result), encoding="utf-8")  # no NaN, which JSON does not know
 
     params = {
         "weights": run.weights_key,
@@ -193,14 +194,16 @@ def _seconds(work: Callable[[], object]) -> float:
 
 
 def _figures(run: SurveyRun, counts: NDArray[np.int64]) -> dict[str, Any]:
+    """What is said of a map; every map of a run is judged by the same labels, and so over the same classes."""
     names = run.weights.class_names
+    false = zip(names, false_pixels(counts).tolist(), strict=True)
     return {
-        "miou": mean_iou(counts),
-        "per_class_iou": dict(zip(names, iou_per_class(counts).tolist(), strict=True)),
-        "overall_accuracy": overall_accuracy(counts),
+        **agreement(counts),
         "average_accuracy": average_accuracy(counts),
         "kappa": kappa(counts),
         "pixels": int(counts.sum()),
+        "per_class_iou": dict(zip(names, iou_per_class(counts).tolist(), strict=True)),
+        "false_classes": {name: pixels for name, pixels in false if pixels},
     }
 
 

@@ -60,14 +60,14 @@ def _pooled(content: dict[str, Any]) -> Table:
 
 def _rig(content: dict[str, Any]) -> Table:
     rig = content["rig"]
-    names = ("budget", "seconds", "of full", "lines", "of full", "seats", "mIoU", "to uniform", "to random")
+    names = ("budget", "seconds", "of full", "lines", "of full", "seats", "mIoU", "overall", "to uniform", "to random")
     table = _table("rig mode: mIoU at equal capture seconds", _left_out(rig["left_out"]), "plan", *names)
     for row in sorted(rig["rows"], key=lambda row: row["budget"]):
         table.add_row(
             row["policy"], format_percent(row["budget"]), _whole(row["seconds"]),
             _part(row["seconds"], row["full_s"]), _whole(row["lines"]), _part(row["lines"], row["full_lines"]),
-            _whole(row["seats"]), format_points(row["miou"]), format_difference(row["against_uniform"]),
-            format_difference(row["against_random"]),
+            _whole(row["seats"]), format_points(row["miou"]), format_points(row["pixel_accuracy"]),
+            format_difference(row["against_uniform"]), format_difference(row["against_random"]),
         )  # fmt: skip
     return table
 
@@ -85,15 +85,16 @@ def _left_out(missing: list[dict[str, Any]]) -> str:
 
 
 def _equal_time(content: dict[str, Any]) -> Table:
-    names = ("K", "exposure", "seconds", "of full", "mIoU", "to all", "equal exposure", "to equal exposure")
+    names = ("K", "exposure", "seconds", "of full", "mIoU", "overall", "to all", "equal exposure", "to equal exposure")
     table = _table(
         "equal time: as many capture seconds as all takes", content["notes"]["equal_time"], "placement", *names
     )
     for row in content["equal_time"]:
         table.add_row(
             row["policy"], format_percent(row["share"]), f"x {row['exposure']:.2f}", _whole(row["seconds"]),
-            _part(row["seconds"], row["full_s"]), format_points(row["miou"]), format_difference(row["against_all"]),
-            format_points(row["equal_exposure_miou"]), format_difference(row["against_equal_exposure"]),
+            _part(row["seconds"], row["full_s"]), format_points(row["miou"]), format_points(row["pixel_accuracy"]),
+            format_difference(row["against_all"]), format_points(row["equal_exposure_miou"]),
+            format_difference(row["against_equal_exposure"]),
         )  # fmt: skip
     return table
 

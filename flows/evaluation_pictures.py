@@ -18,7 +18,7 @@ from flows.figures import format_percent
 from flows.panels import INK, class_palette, class_rgb, outline
 from flows.tones import choose_bands, stretch
 from models.inference import segment
-from models.metrics import confusion, mean_iou
+from models.metrics import confusion, mean_iou, overall_accuracy
 from models.weights import Weights
 from pipeline.grid import UNLABELLED
 from pipeline.selection import frame_seats
@@ -37,7 +37,8 @@ def frame_figure(title: str, look: Look, weights: Weights, policy: str, share: f
     """Give the figure of four panels: image, labels, map, and where map and labels differ with the seats."""
     seats = chosen_seats(look, weights, policy, share)
     drawn = segment(weights, look.seen, look.fine[seats], seats).classes
-    miou = mean_iou(confusion(look.labels, drawn, weights.config.classes))
+    counts = confusion(look.labels, drawn, weights.config.classes)
+    scores = f"mIoU {100 * mean_iou(counts):.1f}, overall {100 * overall_accuracy(counts):.1f}"
     palette = class_palette(weights.config.classes, weights.class_colours)
     height, width = look.labels.shape
     step = max(1, max(height, width) // LONG_SIDE)
@@ -50,7 +51,7 @@ def frame_figure(title: str, look: Look, weights: Weights, policy: str, share: f
     pictures = {
         "image": _image(look, weights),
         "labels": class_rgb(look.labels, palette),
-        f"map: {policy}, K = {format_percent(share)}, mIoU {100 * miou:.1f}": class_rgb(drawn, palette),
+        f"map: {policy}, K = {format_percent(share)}, {scores}": class_rgb(drawn, palette),
         f"{len(seats)} of {len(look.seen.grid.valid_seats())} seats; red: not the label": error,
     }
     for axes, (name, picture) in zip(panels, pictures.items(), strict=True):

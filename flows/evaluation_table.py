@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -11,6 +12,7 @@ from rich.table import Table
 
 from flows.evaluation_budget_table import budget_tables, format_difference
 from flows.figures import DASH, format_count, format_percent, format_points
+from flows.scores import SHOWN, SHOWN_WORDS, definitions_differ
 
 SHOWN_SHARE = 0.10
 ENDS = ("none", "all")
@@ -20,7 +22,7 @@ def print_evaluation(content: dict[str, Any], console: Console) -> None:
     """Print what was judged, accuracy, costs, placement, budgets and classes, and what the figures mean."""
     for line in _head(content):
         console.print(escape(line), highlight=False, soft_wrap=True)
-    tables = (_accuracy(content), _costs(content), _compute(content), _placement(content))
+    tables = (_accuracy(content), *_both_definitions(content), _costs(content), _compute(content), _placement(content))
     for table in (*tables, *budget_tables(content), _classes(content)):
         console.print(table)
     console.print(escape(_caption(content)), highlight=False, soft_wrap=True, style="dim")
@@ -62,14 +64,24 @@ def _style(row: dict[str, Any]) -> str:
 
 
 def _accuracy(content: dict[str, Any]) -> Table:
-    """Of one frame alone, accuracies over its pixels take the place of the mean over frames."""
+    """Of one frame alone, more accuracies over its pixels take the place of the mean over frames."""
     alone = len(content["frames"]) == 1
-    of_frames = ("overall", "average", "kappa") if alone else ("per frame",)
-    names = ("K", "mIoU", *of_frames, "boundary", "in / out", "to baseline", "to random", "gap")
+    of_frames = ("average", "kappa") if alone else ("per\nframe",)
+    names = ("K", "mIoU", "overall", *of_frames, "bound-\nary", "in / out", "to baseline", "to random", "gap")
     table = new_table("placement", *names)
     for row in content["rows"]:
         table.add_row(*_accuracy_cells(row, alone=alone), style=_style(row))
     return table
+
+
+def _both_definitions(content: dict[str, Any]) -> Iterator[Table]:
+    """The mean over the classes that a map shows, where that is another: the figure of before."""
+    if definitions_differ(content["rows"]):
+        table = new_table("placement", "K", "mIoU", SHOWN)
+        for row in content["rows"]:
+            means = (format_points(row[name]) for name in ("miou", "miou_of_shown_classes"))
+            table.add_row(_name(row), format_percent(row["share"]), *means, style=_style(row))
+        yield table
 
 
 def _accuracy_cells(row: dict[str, Any], *, alone: bool) -> list[str]:
@@ -79,17 +91,14 @@ def _accuracy_cells(row: dict[str, Any], *, alone: bool) -> list[str]:
         _name(row),
         format_percent(row["share"]),
         format_points(row["miou"]) + ("" if spread is None else f" ±{100 * spread:.1f}"),
-        *(_pixel_cells(row) if alone else [format_points(row["miou_i"])]),
+        format_points(row["pixel_accuracy"]),
+        *([format_points(row["average_accuracy"]), _ratio(row["kappa"])] if alone else [format_points(row["miou_i"])]),
         format_points(row["boundary_iou"]),
         f"{format_points(row['inside_miou'])} / {format_points(row['outside_miou'])}",
         format_difference(row["against_baseline"]),
         format_difference(row["against_random"]),
         format_percent(gap),
     ]
-
-
-def _pixel_cells(row: dict[str, Any]) -> list[str]:
-    return [format_points(row["pixel_accuracy"]), format_points(row["average_accuracy"]), _ratio(row["kappa"])]
 
 
 def _costs(content: dict[str, Any]) -> Table:
@@ -174,20 +183,28 @@ def _classes(content: dict[str, Any]) -> Table:
     heads = [f"{row['policy']} {format_percent(row['share'])}\n{what}" for row in shown for what in ("IoU", "boundary")]
     table = new_table("class", "labelled px", *heads)
     for name, support in content["support"].items():
-        kinds = ("per_class_iou", "per_class_boundary_iou")
-        cells = [format_points(row[kind][name]) for row in shown for kind in kinds]
+        pairs = [(_iou_cell(row, name), format_points(row["per_class_boundary_iou"][name])) for row in shown]
+        cells = [cell for pair in pairs for cell in pair]
         table.add_row(escape(name), format_count(support), *cells)
     return table
+
+
+def _iou_cell(row: dict[str, Any], name: str) -> str:
+    """The IoU of a class that the labels have, or how often the map shows one that they lack."""
+    false = row["false_classes"].get(name)
+    return format_points(row["per_class_iou"][name]) if false is None else f"{format_count(false)} px false"
 
 
 def _caption(content: dict[str, Any]) -> str:
     averaged = {row["classes_averaged"] for row in content["rows"]}
     classes = " to ".join(str(number) for number in sorted({min(averaged), max(averaged)}))
     timed, notes = len(content["timed"]), content["notes"]
+    before = f"{SHOWN_WORDS} " if definitions_differ(content["rows"]) else ""
     return (
         "K: share of the valid seats, free of each other (frame mode). mIoU over the counts of all frames, mean over "
-        f"{classes} classes; ± the spread of seeds, else of random draws. [ ] 95 % of {content['settings']['draws']} "
-        f"draws: {notes['intervals']}. * uses labels.\n"
+        f"the {classes} classes of the labels (per frame, in / out: those they have there); overall: share of pixels "
+        f"that are right. {before}± the spread of seeds, else of random draws. [ ] 95 % of "
+        f"{content['settings']['draws']} draws: {notes['intervals']}. * uses labels.\n"
         "rank: Spearman of scores and gain; AP: average precision for seats with a gain, and for the oracle's own K; "
         "captured: the chosen seats' share of the gain that the oracle's seats have.\n"
         f"area of gap, hypervolume (points), least cost to reach 95 % of the mIoU of all: {notes['curves']}.\n"

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flows.schedule_state import ENDINGS, read_moment
+from flows.scores import score_of
 from pipeline.errors import ArchiveError
 from storage.archive import Archive
 from storage.class_maps import load_class_map, load_class_names
@@ -79,14 +80,14 @@ def _history(archive: Archive, catalogue: Catalogue, name: str, ledger: Ledger |
 
 def _row(archive: Archive, catalogue: Catalogue, run: Run, line: Mapping[str, Any]) -> dict[str, Any]:
     receipt = run.receipt
-    accuracy, savings = receipt.get("accuracy"), receipt.get("savings")
+    savings = receipt.get("savings")
     shares, unit = _areas(archive, catalogue, run)
     return {
         "run": run.uri,
         "created": run.created,
         "due": line.get("due"),
         "attempts": line.get("attempts"),
-        "miou": _number(accuracy.get("miou")) if isinstance(accuracy, Mapping) else None,
+        **score_of(receipt),
         "savings": {name: _ratio(savings, name) for name in ("capture_s", "lines", "bytes_stored", "multiply_adds")},
         "areas": shares,
         "colours": _colours(archive, run),

@@ -21,6 +21,7 @@ from flows.schedule_state import read_moment
 
 MOST_ROWS = 1000  # of each table; older ones are counted
 SAVINGS = {"capture_s": "time at the camera", "lines": "lines", "bytes_stored": "stored data", "multiply_adds": "model"}
+SCORES = {"miou": "mIoU", "overall_accuracy": "overall"}
 
 
 def render_history(history: FieldHistory, runs_at: str) -> str:
@@ -80,7 +81,7 @@ def _by_class(runs: Sequence[Mapping[str, Any]], unit: str) -> dict[str, list[tu
 
 def _savings(runs: Sequence[Mapping[str, Any]]) -> str:
     series: dict[str, list[tuple[float, float]]] = {label: [] for label in SAVINGS.values()}
-    scores: list[tuple[float, float]] = []
+    scores: dict[str, list[tuple[float, float]]] = {label: [] for label in SCORES.values()}
     for row in runs:
         moment = day_of(row)
         if moment is None:
@@ -88,10 +89,12 @@ def _savings(runs: Sequence[Mapping[str, Any]]) -> str:
         for name, label in SAVINGS.items():
             if row["savings"].get(name) is not None:
                 series[label].append((moment, row["savings"][name]))
-        if row["miou"] is not None:
-            scores.append((moment, row["miou"]))
+        for name, label in SCORES.items():
+            if row[name] is not None:
+                scores[label].append((moment, row[name]))
+    scored = {name: points for name, points in scores.items() if points}
     drawn = line_chart({name: points for name, points in series.items() if points}, "Share of everything", "%")
-    return drawn + (line_chart({"mIoU": scores}, "Score against the truth", "%") if scores else "")
+    return drawn + (line_chart(scored, "Score against the truth", "%") if scored else "")
 
 
 def _troubles(events: Sequence[Mapping[str, Any]]) -> str:
@@ -113,7 +116,7 @@ def _troubles(events: Sequence[Mapping[str, Any]]) -> str:
 def _runs(runs: Sequence[Mapping[str, Any]], runs_at: str) -> str:
     if not runs:
         return "<p>There are no runs yet.</p>"
-    head = page_row("th", ["published", "due", "time at the camera", "mIoU", "largest classes"])
+    head = page_row("th", ["published", "due", "time at the camera", *SCORES.values(), "largest classes"])
     rows = [_run_row(row, runs_at) for row in reversed(runs[-MOST_ROWS:])]
     return page_table([head, *rows]) + _rest(len(runs))
 
@@ -128,7 +131,7 @@ def _run_row(row: Mapping[str, Any], runs_at: str) -> str:
     due = _short(str(row["due"] or "")) or DASH
     again = f" (attempt {row['attempts']})" if (row["attempts"] or 1) > 1 else ""
     cells = [link, escape(due + again), format_percent(row["savings"]["capture_s"])]
-    cells += [format_points(row["miou"]), f'<span class="words">{escape(areas)}</span>']
+    cells += [*(format_points(row[name]) for name in SCORES), f'<span class="words">{escape(areas)}</span>']
     return page_row("td", cells)
 
 

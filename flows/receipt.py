@@ -48,10 +48,16 @@ class Savings(TypedDict):
 
 
 class Score(TypedDict):
-    """mIoU and IoU by class of one map, 0..1; null for a class that neither map nor truth holds."""
+    """What one map scores, 0..1, over the classes that the truth has (`models.metrics`); receipts of before lack some.
+
+    IoU is null for a class that the truth lacks; ``false_classes`` are those of them that the map shows, with pixels.
+    """
 
     miou: float | None
     per_class_iou: dict[str, float | None]
+    false_classes: NotRequired[dict[str, int]]
+    miou_of_shown_classes: NotRequired[float | None]  # by the definition of before
+    overall_accuracy: NotRequired[float | None]
 
 
 class Control(TypedDict):
@@ -59,6 +65,8 @@ class Control(TypedDict):
 
     miou: float | None
     spread: float | None
+    miou_of_shown_classes: NotRequired[float | None]
+    overall_accuracy: NotRequired[float | None]
 
 
 class Accuracy(Score):

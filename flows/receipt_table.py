@@ -12,10 +12,11 @@ from rich.table import Table
 
 from flows.figures import format_bytes, format_count, format_percent, format_points, format_seconds
 from flows.receipt import Accuracy, Receipt, Saving, Savings
+from flows.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words, worst_class_words
 
 
 def headline(receipt: Receipt, looked_twice: float | None = None) -> str:
-    """The run in one to three sentences that a farmer reads, plain text.
+    """The run in a few sentences that a farmer reads, plain text: how long, how good, and where it is worst.
 
     ``looked_twice`` is the share of the field that was captured in detail, 0..1; None leaves it out.
     """
@@ -35,10 +36,12 @@ def headline(receipt: Receipt, looked_twice: float | None = None) -> str:
         return text
     every = accuracy["all"]["miou"]
     detail = "" if every is None else f", detail everywhere {format_points(every)}"
+    right = accuracy.get("overall_accuracy")
+    pixels = "" if right is None else f" ({format_points(right)} % of its pixels are right)"
     return (
-        f"{text} The map scores {format_points(accuracy['miou'])} of 100 against the truth; the coarse look alone "
-        f"gives {format_points(accuracy['none']['miou'])}{detail}."
-    )
+        f"{text} The map scores {format_points(accuracy['miou'])} of 100 against the truth{pixels}; the coarse look "
+        f"alone gives {format_points(accuracy['none']['miou'])}{detail}. {worst_class_words(accuracy)}"
+    ).rstrip()
 
 
 COST_LABELS = {
@@ -81,15 +84,36 @@ def _savings_table(savings: Savings) -> Table:
 
 
 def _accuracy_table(accuracy: Accuracy) -> Table:
-    table = _table("Accuracy against the truth", "seats", "mIoU", "spread")
-    table.add_row("none: the coarse look alone", format_points(accuracy["none"]["miou"]), "")
-    table.add_row("[bold]this survey[/bold]", f"[bold]{format_points(accuracy['miou'])}[/bold]", "")
-    for policy, control in accuracy["controls"].items():
-        spread = "" if control["spread"] is None else f"± {format_points(control['spread'])}"
-        table.add_row(f"{control_seats(accuracy)} placed by {escape(policy)}", format_points(control["miou"]), spread)
-    table.add_row("all: detail everywhere", format_points(accuracy["all"]["miou"]), "")
-    table.add_row("gap from none to all closed", format_percent(accuracy["gap_closed"]), "")
+    rows = score_rows(accuracy)
+    before = definitions_differ([score for _, score in rows])
+    table = _table("Accuracy against the truth", "seats", "mIoU", "spread", "overall", *([SHOWN] if before else []))
+    for label, score in rows:
+        spread = "" if score.get("spread") is None else f"± {format_points(score['spread'])}"
+        cells = [format_points(score["miou"]), spread, format_points(score.get("overall_accuracy"))]
+        cells += [format_points(score.get("miou_of_shown_classes"))] if before else []
+        table.add_row(*([label, *cells] if score is not accuracy else (f"[bold]{cell}[/]" for cell in (label, *cells))))
+    table.add_row("gap from none to all closed", format_percent(accuracy["gap_closed"]))
+    words = [score_words(accuracy, before=before), false_class_words(accuracy)]
+    table.caption, table.caption_justify = escape("\n".join(filter(None, words))), "left"
     return table
+
+
+def score_rows(accuracy: Accuracy) -> list[tuple[str, Mapping[str, Any]]]:
+    """The maps that a receipt has scores of, and what a terminal calls them."""
+    seats = control_seats(accuracy)
+    return [
+        ("none: the coarse look alone", accuracy["none"]),
+        ("this survey", accuracy),
+        *((f"{seats} placed by {escape(policy)}", control) for policy, control in accuracy["controls"].items()),
+        ("all: detail everywhere", accuracy["all"]),
+    ]
+
+
+def score_words(accuracy: Accuracy, *, before: bool) -> str:
+    """What the scores are means of, for whoever reads the table; ``before``: it has the definition of before too."""
+    count = sum(iou is not None for iou in accuracy["per_class_iou"].values())
+    words = f"mIoU: mean over the {count} classes of the truth. Overall: share of pixels that are right."
+    return f"{words} {SHOWN_WORDS}" if before else words
 
 
 def control_seats(accuracy: Mapping[str, Any]) -> str:

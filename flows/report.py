@@ -20,6 +20,7 @@ from flows.finding_words import sentences
 from flows.page_parts import page_row, page_section, page_table
 from flows.receipt import Accuracy, Receipt, Saving, Savings
 from flows.receipt_table import COST_LABELS, control_seats, headline
+from flows.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words
 
 
 @dataclass(frozen=True)
@@ -131,21 +132,25 @@ def _bar(share: float | None, words: str | None = None) -> str:
 
 def _accuracy(accuracy: Accuracy) -> str:
     """The map against the truth, beside no detail, all detail and other placements; then class by class."""
-    rows = [_score_row("the coarse look alone (none)", accuracy["none"]["miou"])]
-    rows += [
-        _score_row(f"{control_seats(accuracy)} placed by {policy}", control["miou"], control["spread"])
-        for policy, control in accuracy["controls"].items()
+    seats = control_seats(accuracy)
+    scores: list[tuple[str, Mapping[str, Any]]] = [
+        ("the coarse look alone (none)", accuracy["none"]),
+        *((escape(f"{seats} placed by {policy}"), control) for policy, control in accuracy["controls"].items()),
+        ("<strong>this survey</strong>", accuracy),
+        ("detail everywhere (all)", accuracy["all"]),
     ]
-    rows += [
-        _score_row("<strong>this survey</strong>", accuracy["miou"], strong=True),
-        _score_row("detail everywhere (all)", accuracy["all"]["miou"]),
-    ]
+    before = definitions_differ([score for _, score in scores])
+    head = page_row("th", ["", "mIoU", "overall", *([SHOWN] if before else [])])
+    rows = [_score_row(label, score, before=before) for label, score in scores]
     gap = accuracy["gap_closed"]
-    words = "The score is the mean over classes of overlap / union of map and truth (mIoU), in points of 100."
-    closed = "" if gap is None else f" The detail captured closed {format_percent(gap)} of the gap from none to all."
-    return page_section(
-        "How good the map is", f"<p>{words}{closed}</p>{page_table(rows)}{_control_words(accuracy)}{_classes(accuracy)}"
+    words = (
+        "The score is the mean over the classes of the truth of overlap / union of map and truth (mIoU), in points "
+        "of 100, and beside it the share of all pixels that are right (overall)."
     )
+    words += f" {SHOWN_WORDS}" if before else ""
+    closed = "" if gap is None else f" The detail captured closed {format_percent(gap)} of the gap from none to all."
+    body = f"<p>{words}{closed}</p>{page_table([head, *rows])}{_control_words(accuracy)}{_classes(accuracy)}"
+    return page_section("How good the map is", body)
 
 
 def _control_words(accuracy: Mapping[str, Any]) -> str:
@@ -161,30 +166,26 @@ def _control_words(accuracy: Mapping[str, Any]) -> str:
     )
 
 
-def _score_row(label: str, miou: float | None, spread: float | None = None, *, strong: bool = False) -> str:
-    """``label`` may hold markup of ours when ``strong``; else it is escaped."""
+def _score_row(label: str, score: Mapping[str, Any], *, before: bool) -> str:
+    """The scores of one map; ``label`` is escaped, ``before`` adds the mean by the definition of before."""
+    miou, spread = score["miou"], score.get("spread")
     text = format_points(miou) + ("" if spread is None else f" ± {format_points(spread)}")
-    return page_row("td", [label if strong else escape(label), _bar(miou, text)])
+    more = ("overall_accuracy", *(["miou_of_shown_classes"] if before else []))
+    return page_row("td", [label, _bar(miou, text), *(format_points(score.get(name)) for name in more)])
 
 
 def _classes(accuracy: Accuracy) -> str:
     head = page_row("th", ["class", "this survey", "none", "all"])
-    none, full = accuracy["none"]["per_class_iou"], accuracy["all"]["per_class_iou"]
-    rows = [
-        page_row(
-            "td",
-            [
-                escape(name.replace("_", " ")),
-                _bar(value, format_points(value)),
-                format_points(none.get(name)),
-                format_points(full.get(name)),
-            ],
-        )
-        for name, value in accuracy["per_class_iou"].items()
-    ]
+    rows = [_class_row(name, accuracy) for name in accuracy["per_class_iou"]]
     counted = sum(value is not None for value in accuracy["per_class_iou"].values())
-    note = f"<p class=note>{counted} of {len(rows)} classes are in the map or the truth and count in the mean.</p>"
-    return f"<h3>Class by class</h3>{page_table([head, *rows])}{note}"
+    note = f"{counted} of {len(rows)} classes are in the truth and count in the mean. {false_class_words(accuracy)}"
+    return f"<h3>Class by class</h3>{page_table([head, *rows])}<p class=note>{escape(note.rstrip())}</p>"
+
+
+def _class_row(name: str, accuracy: Accuracy) -> str:
+    none, full, iou = accuracy["none"], accuracy["all"], accuracy["per_class_iou"][name]
+    others = [format_points(one["per_class_iou"].get(name)) for one in (none, full)]
+    return page_row("td", [escape(name.replace("_", " ")), _bar(iou, format_points(iou)), *others])
 
 
 def _stages(stages: Iterable[Mapping[str, Any]]) -> str:

@@ -30,6 +30,7 @@ from flows.generations import (
     would_remake,
 )
 from flows.receipt import to_json
+from flows.scores import score_of
 from flows.settings import Settings
 from pipeline.errors import PipelineError, SettingsError
 from storage.archive import Archive
@@ -163,20 +164,21 @@ def _again(
     run, begun = generation.run, time.perf_counter()
     row: dict[str, Any] = {
         "field": generation.field, "scene": run.settings.get("scene"), "old": run.folder.name, "new": None,
-        "state": "failed", "message": None, "miou_before": _miou(run.receipt), "miou_after": None, "seconds": None,
+        "state": "failed", "message": None, **_scores(run.receipt, "before"), **_scores({}, "after"), "seconds": None,
     }  # fmt: skip
     try:
         settings = asked_again(run, str(request.archive), request.weights)
         settings = replace(settings, scheduler=request.crew.scheduler, workers=request.crew.workers)
         if is_current(catalogue, run, settings):
-            return row | {"state": "skipped", "message": "is as it would become", "miou_after": row["miou_before"]}
+            same = {"state": "skipped", "message": "is as it would become"}
+            return row | same | _scores(run.receipt, "after")
         if request.dry_run:
             return row | {"state": "would run"}
         folder = survey(settings, console)
     except PipelineError as error:
         return row | {"message": str(error), "seconds": time.perf_counter() - begun}
-    after, seconds = _miou(read_run(folder, {}).receipt), time.perf_counter() - begun
-    return row | {"new": folder.name, "state": "ran", "miou_after": after, "seconds": seconds}
+    after, seconds = _scores(read_run(folder, {}).receipt, "after"), time.perf_counter() - begun
+    return row | {"new": folder.name, "state": "ran", **after, "seconds": seconds}
 
 
 def _survey(settings: Settings, console: Console) -> Path:
@@ -185,10 +187,8 @@ def _survey(settings: Settings, console: Console) -> Path:
     return run_survey(settings, console).folder
 
 
-def _miou(receipt: Mapping[str, Any]) -> float | None:
-    accuracy = receipt.get("accuracy")
-    found = accuracy.get("miou") if isinstance(accuracy, Mapping) else None
-    return float(found) if isinstance(found, int | float) else None
+def _scores(receipt: Mapping[str, Any], when: str) -> dict[str, float | None]:
+    return {f"{name}_{when}": score for name, score in score_of(receipt).items()}
 
 
 def _exit_code(states: Sequence[str]) -> int:
@@ -201,10 +201,14 @@ def _words(row: Mapping[str, Any]) -> str:
     """What became of one field, in one line."""
     words = f"{row['field']} ({row['old']}) {row['state']}"
     if row["state"] == "ran":
-        scores = [row["miou_before"], row["miou_after"]]
-        scored = f", mIoU {' to '.join(map(format_points, scores))}" if None not in scores else ""
-        return f"{words}: {row['new']}, {format_seconds(row['seconds'])}{scored}"
+        scored = [_change("mIoU", row, "miou"), _change("overall", row, "overall_accuracy")]
+        return f"{words}: {row['new']}, {format_seconds(row['seconds'])}{''.join(scored)}"
     return words + (f": {row['message']}" if row["message"] else "")
+
+
+def _change(label: str, row: Mapping[str, Any], name: str) -> str:
+    scores = [row[f"{name}_before"], row[f"{name}_after"]]
+    return "" if None in scores else f", {label} {' to '.join(map(format_points, scores))}"
 
 
 def _show(content: Mapping[str, Any], file: Path | None) -> None:

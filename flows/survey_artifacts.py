@@ -42,7 +42,7 @@ def survey_markdown(published: Published, where: str) -> str:
     rows = savings_rows(receipt)
     columns = list(rows[0])
     lines = [
-        f"# {_plain(receipt['survey'])}", "", headline(receipt, published.looked_twice), "",
+        f"# {_plain(receipt['survey'])}", "", _plain(headline(receipt, published.looked_twice)), "",
         f"![the survey at a glance](data:image/jpeg;base64,{data})", "",
         f"| {' | '.join(columns)} |", f"|{'---|' * len(columns)}",
         *(f"| {' | '.join(row[name] for name in columns)} |" for row in rows), "",

@@ -79,9 +79,8 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
         return
     title = f"{figures['scenes']} scene{'s' if figures['scenes'] > 1 else ''} kept for validation"
     caption = f"none: the coarse pass alone; all: fine everywhere; else fine at {figures['share_of_seats']:.0%}"
-    table = Table("placement", "mIoU", title=title, caption=caption)
+    table = Table("placement", "mIoU", "overall", title=title, caption=caption)
     for name in ("none", "random", "sobel", "entropy", "gain", "all"):
         if name in figures:  # a control has some of them
-            found = figures[name]
-            table.add_row(name, f"{found['miou'] if isinstance(found, dict) else found:.1%}")
+            table.add_row(name, *(f"{figures[name][figure]:.1%}" for figure in ("miou", "overall_accuracy")))
     console.print(table)

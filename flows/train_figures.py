@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.control_maps import draw_with_control
-from models.controls import CONTROL_SHARE, RANDOM_DRAWS, Controls, Counts, run_controls
+from models.controls import CONTROL_SHARE, RANDOM_DRAWS, Controls, Counts, agreement_of_draws, run_controls
 from models.examples import Example
 from models.holes import patches_of
 from models.inference import Glance, glance_of_columns
-from models.metrics import confusion, mean_iou
+from models.metrics import agreement, confusion
 from models.policies import score_seats
 from models.segmenter import Segmenter
 from models.weights import AnyWeights, Weights
@@ -25,7 +25,7 @@ Patches = NDArray[np.float32]  # (seat, p, p, column) of every seat of the padde
 
 
 def validate(weights: AnyWeights, examples: Iterable[Example], seed: int, show: Show) -> dict[str, Any] | None:
-    """mIoU over all scenes together, at one share of the seats; None without a scene.
+    """`agreement` over all scenes together, at one share of the seats; None without a scene.
 
     Of a control, those rows that it has: the paper's network is drawn with no seat, random ones, those with edges and
     all; `upsampled` sees none and stands as `none`; `dense` and `coarser` see all of the scene and stand as `all`.
@@ -66,8 +66,8 @@ def _summary(rows: list[Controls]) -> dict[str, Any] | None:
     return {
         "scenes": len(rows),
         "share_of_seats": whole.share,
-        "none": mean_iou(whole.none),
-        "all": mean_iou(whole.every),
+        "none": agreement(whole.none),
+        "all": agreement(whole.every),
         **whole.as_dict(),
     }
 
@@ -78,12 +78,8 @@ def _validate_control(weights: AnyWeights, examples: Iterable[Example], seed: in
         return None
     figures: dict[str, Any] = {"scenes": len(scenes), "share_of_seats": CONTROL_SHARE}
     for name in scenes[0]:
-        miou = [mean_iou(_added(list(draws))) for draws in zip(*(scene[name] for scene in scenes), strict=True)]
-        if name in ("none", "all"):
-            figures[name] = miou[0]
-        else:
-            spread = float(np.std(miou, ddof=1)) if len(miou) > 1 else None
-            figures[name] = {"miou": float(np.mean(miou)), "spread": spread}
+        draws = [_added(list(parts)) for parts in zip(*(scene[name] for scene in scenes), strict=True)]
+        figures[name] = agreement(draws[0]) if name in ("none", "all") else agreement_of_draws(draws)
     return figures
 
 

@@ -1,4 +1,7 @@
-"""How sure a difference of two rows is: frames and seeds drawn again and again, both rows judged on the same draw."""
+"""How sure a difference of two rows is: frames and seeds drawn again and again, both rows judged on the same draw.
+
+The classes of a draw's mean are those that the labels of its frames have: the same in both rows, whatever maps show.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from models.metrics import mean_iou_of_each
 from pipeline.errors import ShapeError
 
 DRAWS = 2000
@@ -26,19 +30,6 @@ class Interval:
     def as_dict(self) -> dict[str, float | None]:
         """Give the interval as the evaluation stores it."""
         return {"difference": self.difference, "low": self.low, "high": self.high}
-
-
-def mean_iou_of_sums(counts: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Mean IoU of each of many confusion counts, (..., class, class) -> (...); NaN where nothing is labelled."""
-    exact = counts.astype(np.float64)
-    hit = np.diagonal(exact, axis1=-2, axis2=-1)
-    union = exact.sum(axis=-1) + exact.sum(axis=-2) - hit
-    iou = np.divide(hit, union, out=np.zeros_like(hit), where=union > 0)
-    present = (union > 0).sum(axis=-1)
-    mean: NDArray[np.float64] = np.divide(
-        iou.sum(axis=-1), present, out=np.full(present.shape, np.nan), where=present > 0
-    )
-    return mean
 
 
 def paired_interval(
@@ -102,7 +93,7 @@ def _means(counts: Counts, times: Numbers, often: Numbers | None = None) -> NDAr
     ``often`` (draw, run) says how often each run counts; once, without it.
     """
     sums = np.einsum("df,rfij->drij", times, counts)
-    each = mean_iou_of_sums(sums)
+    each = mean_iou_of_each(sums)
     share = (~np.isnan(each)) * (1 if often is None else often)
     number = share.sum(axis=1)
     means: NDArray[np.float64] = np.divide(

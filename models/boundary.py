@@ -61,15 +61,14 @@ def near_border(region: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
     return border
 
 
-def boundary_iou(counts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Boundary IoU of each class from `boundary_counts`; NaN for a class in neither labels nor map."""
+def boundary_iou(counts: NDArray[np.int64], labelled: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Boundary IoU of each class from `boundary_counts`; NaN for a class that the labels lack (`labelled_classes`)."""
     both, either = counts[:, 0].astype(np.float64), counts[:, 1]
-    iou: NDArray[np.float64] = np.divide(both, either, out=np.full(len(both), np.nan), where=either > 0)
+    iou: NDArray[np.float64] = np.divide(both, either, out=np.full(len(both), np.nan), where=labelled)
     return iou
 
 
-def mean_boundary_iou(counts: NDArray[np.int64]) -> float:
-    """Mean over the classes that labels or map hold; NaN where there is none."""
-    iou = boundary_iou(counts)
-    known = iou[~np.isnan(iou)]
-    return float(known.mean()) if known.size else float("nan")
+def mean_boundary_iou(counts: NDArray[np.int64], labelled: NDArray[np.bool_]) -> float:
+    """Mean over the classes that the labels have; NaN where there is none."""
+    iou = boundary_iou(counts, labelled)
+    return float(iou[labelled].mean()) if labelled.any() else float("nan")

@@ -5,14 +5,15 @@ None of this belongs to a survey's own cost: it needs labels and the whole scene
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.inference import Glance, segment
-from models.metrics import confusion, gap_closed, mean_iou
+from models.metrics import agreement, confusion, gap_closed, mean_iou
 from models.policies import score_seats
 from models.weights import Weights
 from pipeline.selection import frame_seats
@@ -33,20 +34,23 @@ class Controls:
     policies: dict[str, Counts]
     random: list[Counts]
 
-    def as_dict(self) -> dict[str, object]:
-        """mIoU of every row, the share of the gap that it closes, and mean and spread of the random placements."""
+    def as_dict(self) -> dict[str, dict[str, Any]]:
+        """`agreement` of every row, the share of the gap that it closes, and mean and spread of the random placements.
+
+        All rows are judged by the same labels, and so over the same classes.
+        """
         none, every = mean_iou(self.none), mean_iou(self.every)
-        random = np.array([mean_iou(counts) for counts in self.random])
-        rows: dict[str, object] = {
-            policy: {"miou": mean_iou(counts), "spread": None, "gap_closed": gap_closed(mean_iou(counts), none, every)}
-            for policy, counts in self.policies.items()
-        }
-        rows["random"] = {
-            "miou": float(random.mean()),
-            "spread": float(random.std(ddof=1)) if len(random) > 1 else None,
-            "gap_closed": gap_closed(float(random.mean()), none, every),
-        }
-        return rows
+        placed = {name: [counts] for name, counts in self.policies.items()} | {"random": self.random}
+        rows = {policy: agreement_of_draws(draws) for policy, draws in placed.items()}
+        return {policy: {**row, "gap_closed": gap_closed(row["miou"], none, every)} for policy, row in rows.items()}
+
+
+def agreement_of_draws(draws: Sequence[Counts]) -> dict[str, Any]:
+    """Give the mean of `agreement` over the draws of a placement, and the spread of their mIoU; None of one alone."""
+    each = [agreement(counts) for counts in draws]
+    means = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
+    spread = float(np.std([one["miou"] for one in each], ddof=1)) if len(each) > 1 else None
+    return {**means, "spread": spread}
 
 
 def run_controls(

@@ -1,4 +1,13 @@
-"""Agreement of a class map with labels: confusion counts and what follows from them."""
+"""Agreement of a class map with labels: confusion counts and what follows from them.
+
+A mean over classes is over those that the labels have among the pixels judged (the mean IU of Long et al., arXiv
+1411.4038, with the classes of the truth for its n_cl), so that all maps judged by the same labels share one set of
+classes, whatever they show. A class that a map shows and the labels lack is a false class: it has no IoU of its own,
+`false_pixels` counts it, and each of its pixels is one that the class below it has missed.
+
+Before, the mean was over the classes that labels or map show (`miou_of_shown_classes`): a single stray pixel of a
+false class was another IoU of 0 in the mean of the map that has it, and none in the mean of the map beside it.
+"""
 
 from __future__ import annotations
 
@@ -29,21 +38,55 @@ def confusion(labels: NDArray[np.integer], predicted: NDArray[np.integer], class
     return np.bincount(truth * classes + guess, minlength=classes**2).reshape(classes, classes)
 
 
-def iou_per_class(counts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Intersection over union of each class; NaN for a class in neither labels nor predictions."""
-    hit = np.diag(counts).astype(np.float64)
-    union = counts.sum(axis=0) + counts.sum(axis=1) - np.diag(counts)
-    iou: NDArray[np.float64] = np.divide(hit, union, out=np.full(len(hit), np.nan), where=union > 0)
+def labelled_classes(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Which classes the labels have among the pixels judged, (..., class, class) -> (..., class)."""
+    held: NDArray[np.bool_] = counts.sum(axis=-1) > 0
+    return held
+
+
+def false_pixels(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Pixels of each class that the map shows although the labels have none of it; 0 for a class that they have."""
+    return np.where(labelled_classes(counts), 0, counts.sum(axis=0))
+
+
+def iou_per_class(counts: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Intersection over union of each class, (..., class, class) -> (..., class); NaN for one that the labels lack."""
+    hit = np.diagonal(counts, axis1=-2, axis2=-1).astype(np.float64)
+    union = counts.sum(axis=-2) + counts.sum(axis=-1) - hit
+    iou: NDArray[np.float64] = np.divide(hit, union, out=np.full(hit.shape, np.nan), where=labelled_classes(counts))
     return iou
 
 
-def mean_iou(counts: NDArray[np.int64]) -> float:
-    """Mean over the classes that labels or map hold; NaN when nothing is labelled.
+def mean_iou(counts: NDArray[np.integer]) -> float:
+    """Mean IoU over the classes that the labels have, whatever the map shows; NaN when nothing is labelled."""
+    return float(mean_iou_of_each(counts))
 
-    A class that is in neither is left out of the mean, not counted as 0 or 1.
+
+def mean_iou_of_each(counts: NDArray[np.integer]) -> NDArray[np.float64]:
+    """`mean_iou` of many confusion counts at once, (..., class, class) -> (...)."""
+    held = labelled_classes(counts)
+    total, number = np.where(held, iou_per_class(counts), 0).sum(axis=-1), held.sum(axis=-1)
+    mean: NDArray[np.float64] = np.divide(total, number, out=np.full(number.shape, np.nan), where=number > 0)
+    return mean
+
+
+def miou_of_shown_classes(counts: NDArray[np.int64]) -> float:
+    """Mean IoU over the classes that labels or map show, false ones as 0: the definition of before; NaN without any.
+
+    Of two maps the one whose every class is better may have the lower mean: not to be compared, kept for old figures.
     """
-    held = counts.sum(axis=0) + counts.sum(axis=1) > 0
-    return float(iou_per_class(counts)[held].mean()) if held.any() else float("nan")
+    held = labelled_classes(counts)
+    shown = held | (counts.sum(axis=0) > 0)
+    return mean_iou(counts) * float(held.sum() / shown.sum()) if shown.any() else float("nan")
+
+
+def agreement(counts: NDArray[np.int64]) -> dict[str, float]:
+    """Give the figures that stand side by side wherever a map is scored: mIoU, by both definitions, and the pixels'."""
+    return {
+        "miou": mean_iou(counts),
+        "miou_of_shown_classes": miou_of_shown_classes(counts),
+        "overall_accuracy": overall_accuracy(counts),
+    }
 
 
 def overall_accuracy(counts: NDArray[np.int64]) -> float:
@@ -88,7 +131,7 @@ def miou_over_frames(frames: NDArray[np.int64]) -> float:
 
 
 def miou_over_frame_classes(frames: NDArray[np.int64]) -> float:
-    """`miou_c`: each class's mean IoU over the frames that hold it, then the mean over classes; (frame, class, class).
+    """`miou_c`: each class's mean IoU over the frames whose labels have it, then over classes; (frame, class, class).
 
     A large object counts as much as a small one, which the counts of the whole data set do not allow for.
     """

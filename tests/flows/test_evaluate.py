@@ -13,6 +13,7 @@ from rich.console import Console
 
 from flows import benchmark_work
 from flows.benchmark_costs import Prices
+from flows.benchmark_files import ends
 from flows.benchmark_frames import open_candidates
 from flows.benchmark_request import EvaluateRequest
 from flows.benchmark_rows import ORACLE, Trial, captured_px, judge_frame, placings
@@ -22,6 +23,7 @@ from flows.benchmark_summary import summarise
 from flows.benchmark_timing import Rounds, cpu_seconds, row_seconds
 from flows.cli import main
 from flows.evaluate_command import evaluate_weights, run_evaluate
+from flows.evaluation_table import print_evaluation
 from flows.train import TrainRequest, train_weights
 from flows.training_data import farm_test_data, pack_mask
 from models.metrics import average_accuracy, kappa, mean_iou, overall_accuracy
@@ -302,6 +304,43 @@ def test_the_order_of_frames_does_not_matter():
     whole = collect_row([records], "none", 0.0)
     assert whole is not None
     assert there["rows"][0]["miou"] == mean_iou(whole.counts.sum(axis=(0, 1)))
+
+
+def test_a_class_that_no_label_has_is_told_apart(
+    drawn: tuple[Path, dict[str, Any]], capsys: pytest.CaptureFixture[str]
+):
+    """Rows are means over the classes of all frames' labels; a false class has pixels, and both means are told."""
+    counts = [[[8, 0, 2], [1, 9, 0], [0, 0, 0]], [[7, 3, 0], [0, 10, 0], [0, 0, 0]]]
+    records = [_record("001", np.random.default_rng(0)), _record("002", np.random.default_rng(0))]
+    for record, one in zip(records, counts, strict=True):
+        for row in record["rows"]:
+            row |= {"counts": one, "inside": np.zeros((3, 3), int).tolist(), "boundary": [[1, 2], [1, 2], [0, 2]]}
+    trial = {"shares": (0.5,), "policies": (), "seed": 0, "draws": 10}
+    found = summarise([records], ("soil", "crop", "weed"), trial, Prices())
+    row = found["rows"][0]
+    iou = [15 / 21, 19 / 23]
+    assert row["miou"] == pytest.approx(np.mean(iou))
+    assert row["miou_of_shown_classes"] == pytest.approx(sum(iou) / 3)
+    assert row["boundary_iou"] == pytest.approx(0.5)
+    assert row["false_classes"] == {"weed": 2}
+    assert np.isnan(row["per_class_iou"]["weed"])
+    shown = {**drawn[1], "rows": [*drawn[1]["rows"][:1], *found["rows"]], "support": found["support"]}
+    shown["rows"][0] = {**found["rows"][0], "policy": "none"}
+    print_evaluation({**shown, "curves": found["curves"]}, Console(width=200))
+    text = capsys.readouterr().out
+    assert "2 px false" in text
+    assert "of shown" in text
+    assert "the 2 classes of the labels" in text
+
+
+def test_the_ends_are_those_of_the_present_definition():
+    """Frames that were judged by an earlier version count by their pixels, not by the figure that was kept of them."""
+    good, bad = (_record(name, np.random.default_rng(0)) for name in ("001", "002"))
+    for row in good["rows"]:
+        row |= {"counts": [[9, 0], [0, 9]], "miou": 0.1}
+    for row in bad["rows"]:
+        row |= {"counts": [[5, 4], [4, 5]], "miou": 0.9}
+    assert ends([[good, bad]], "none", 0.0) == [("worst", "002", 0), ("best", "001", 0)]
 
 
 def _record(name: str, rng: np.random.Generator) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from flows.benchmark_rig import BUDGETS, judge_rig
 from flows.benchmark_rows import Trial, judge_frame
 from flows.evaluation_budget_table import budget_tables
 from flows.evaluation_rig_plot import rig_figure
+from models.metrics import mean_iou
 from models.weights import Weights
 from pipeline.camera import LineCamera
 from pipeline.scan import CostModel
@@ -113,7 +114,9 @@ def test_equal_time_stands_beside_equal_exposure(looked: tuple[Path, Look, Weigh
     rig = {**longer, "rows": [{**one, "policy": "entropy"} for one in longer["rows"]]}
     row, chance, *plans = summarise_equal_time([[longer]], [[usual]], [[rig]], {**TRIAL, "policies": trial.policies})
     first = next(one for one in usual["rows"] if (one["policy"], one["draw"]) == ("random", 0))
-    assert chance["equal_exposure_miou"] == pytest.approx(first["miou"])  # the draw that was exposed for longer
+    assert chance["equal_exposure_miou"] == pytest.approx(
+        mean_iou(np.array(first["counts"]))
+    )  # the draw that was exposed for longer
     assert row["exposure"] > 1
     assert row["seconds"] == pytest.approx(row["full_s"], rel=0.3)  # other seats than those the exposure was found for
     assert row["against_equal_exposure"]["difference"] == pytest.approx(row["miou"] - row["equal_exposure_miou"])

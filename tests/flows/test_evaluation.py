@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from flows import evaluation, placement, pointing_stage
+from models.metrics import confusion
 from pipeline.camera import LineCamera
 from pipeline.grid import UNLABELLED
 from pipeline.rectify.illumination import LightRatio
@@ -33,6 +34,17 @@ def test_labels_move_to_where_the_map_shows_them(along: str, down: int, right: i
         at = row + down, column + right
         known = 0 <= at[0] < 5 and 0 <= at[1] < 6
         assert moved[row, column] == (labels[at] if known else UNLABELLED)
+
+
+def test_a_false_class_is_listed_with_its_pixels() -> None:
+    """What a map shows and the labels lack has pixels and no IoU, and does not count in the mean."""
+    run: Any = SimpleNamespace(weights=SimpleNamespace(class_names=("soil", "crop", "tree")))
+    labels, drawn = np.array([0, 0, 0, 1, UNLABELLED], np.uint8), np.array([0, 0, 2, 1, 2], np.uint8)
+    found = evaluation._figures(run, confusion(labels, drawn, 3))
+    assert found["false_classes"] == {"tree": 1}
+    assert found["per_class_iou"] == pytest.approx({"soil": 2 / 3, "crop": 1.0, "tree": np.nan}, nan_ok=True)
+    assert found["miou"] == pytest.approx(5 / 6)
+    assert found["miou_of_shown_classes"] == pytest.approx(5 / 9)
 
 
 def _registration(archive: Path, record: dict[str, Any]) -> StageRef:

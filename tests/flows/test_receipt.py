@@ -32,14 +32,26 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
     savings["multiply_adds"] = {**saving, "glance": 20, "score": 1, "encode": 19, "decode": 10}
     savings["capture_s"] = {"done": 104.0, "full": 209.0, "ratio": 104 / 209, "full_is": "predicted"}
     savings["segment_wall_s"] = {"done": wall / 2, "full": wall}
-    accuracy = {
+    accuracy = {  # the map shows wheat, of which the truth has none
         "miou": np.float32(0.75),
-        "per_class_iou": {"soil": 0.9, "wheat": float("nan")},
-        "none": {"miou": 0.5, "per_class_iou": {"soil": 0.8, "wheat": None}},
-        "all": {"miou": 0.875, "per_class_iou": {"soil": 0.95, "wheat": None}},
+        "miou_of_shown_classes": 0.5,
+        "overall_accuracy": 0.934,
+        "per_class_iou": {"soil": 0.9, "bare_weed": 0.6, "wheat": float("nan")},
+        "false_classes": {"wheat": 2},
+        "none": {
+            "miou": 0.5, "miou_of_shown_classes": 0.5, "overall_accuracy": 0.812,
+            "per_class_iou": {"soil": 0.8, "bare_weed": 0.2, "wheat": None}, "false_classes": {},
+        },
+        "all": {
+            "miou": 0.875, "miou_of_shown_classes": 0.875, "overall_accuracy": 0.971,
+            "per_class_iou": {"soil": 0.95, "bare_weed": 0.8, "wheat": None}, "false_classes": {},
+        },
         "gap_closed": 2 / 3,
-        "controls": {"random": {"miou": 0.5625, "spread": 0.0125}, "sobel": {"miou": 0.6, "spread": None}},
-    }
+        "controls": {
+            "random": {"miou": 0.5625, "miou_of_shown_classes": 0.375, "overall_accuracy": 0.9, "spread": 0.0125},
+            "sobel": {"miou": 0.6, "miou_of_shown_classes": 0.6, "overall_accuracy": 0.91, "spread": None},
+        },
+    }  # fmt: skip
     row = {
         "name": "shot", "state": "on", "variant": "exact", "bound": 0.0, "measured": None, "cost_s": 1.5,
         "why": "asked for", "unit": "sigma",
@@ -91,7 +103,7 @@ def test_numbers_that_are_not_finite_become_null():
     """JSON has no NaN: it is null, and numpy scalars are plain numbers."""
     text = to_json({"nan": float("nan"), "list": [np.float64("inf"), np.int64(3)], "tuple": (1.5, None, True)})
     assert json.loads(text) == {"nan": None, "list": [None, 3], "tuple": [1.5, None, True]}
-    assert make_receipt()["accuracy"]["per_class_iou"] == {"soil": 0.9, "wheat": None}
+    assert make_receipt()["accuracy"]["per_class_iou"] == {"soil": 0.9, "bare_weed": 0.6, "wheat": None}
 
 
 def test_json_reads_back_to_the_same_receipt():
@@ -160,11 +172,39 @@ def test_comparable_leaves_times_out_and_nothing_else():
 
 def test_table_shows_savings_accuracy_and_stages():
     """The terminal block holds the figures with their units, 'predicted', the controls and every stage."""
-    console = Console(file=io.StringIO(), width=100)
-    print_table(make_receipt(), console)
-    text = console.file.getvalue()
-    for words in ("104 s", "209 s", "50 %", "predicted", "75.0", "± 1.2", "67 %", "capture", "cached"):
+    text = _printed(make_receipt())
+    for words in ("104 s", "209 s", "50 %", "predicted", "75.0", "93.4", "± 1.2", "67 %", "capture", "cached"):
         assert words in text, words
+
+
+def _printed(receipt: Receipt, width: int = 100) -> str:
+    console = Console(file=io.StringIO(), width=width)
+    print_table(receipt, console)
+    return console.file.getvalue()
+
+
+def test_table_lists_false_classes_with_their_pixels_and_both_definitions():
+    """What the truth lacks is told beside the mean over the classes that it has, and beside the mean of before."""
+    text = _printed(make_receipt(), 200)
+    assert "mean over the 2 classes of the truth" in text
+    assert "Shown although the truth has none: this survey wheat 2 px." in text
+    (row,) = [line.split() for line in text.splitlines() if "this survey " in line and "75.0" in line]
+    assert row[-3:] == ["75.0", "93.4", "50.0"]
+
+
+def test_a_table_in_which_both_definitions_agree_shows_one():
+    """Where no map shows a false class there is no second column, and nothing to say of one."""
+    receipt = make_receipt()
+    accuracy = receipt["accuracy"]
+    for one in (accuracy, *accuracy["controls"].values()):
+        one["miou_of_shown_classes"] = one["miou"]
+    accuracy["false_classes"] = {}
+    assert "shown" not in _printed(receipt).lower()
+
+
+def test_a_table_is_not_wider_than_a_terminal():
+    """80 columns, with both definitions and a control's long name."""
+    assert max(map(len, _printed(make_receipt(), 80).splitlines())) <= 80
 
 
 def test_headline_is_one_paragraph_with_the_figures():
@@ -172,12 +212,21 @@ def test_headline_is_one_paragraph_with_the_figures():
     text = headline(make_receipt(), 0.23)
     assert text.startswith("The camera looked twice at 23 % of the field. Capture took 104 s instead of 209 s")
     assert "75.0 of 100" in text
+    assert "93.4 % of its pixels are right" in text
     assert headline(make_receipt(), 0.0).startswith("The camera looked twice at nothing: no run of fine lines fits")
     assert "truth" not in headline(make_receipt(labels=False))
+
+
+def test_headline_names_the_worst_class_of_the_truth():
+    """The class of the truth with the lowest IoU, without detail, in this map and with all of it; no false class."""
+    words = "Its worst class is bare weed with 60.0: the coarse look alone gives 20.0, detail everywhere 80.0."
+    assert headline(make_receipt()).endswith(words)
 
 
 def test_headline_without_controls_says_nothing_of_detail_everywhere():
     """What was not judged is not mentioned."""
     receipt = make_receipt()
-    receipt["accuracy"]["all"]["miou"] = None
-    assert headline(receipt).endswith("the coarse look alone gives 50.0.")
+    receipt["accuracy"]["all"] = {"miou": None, "per_class_iou": {}}
+    text = headline(receipt)
+    assert "the coarse look alone gives 50.0. Its worst class" in text
+    assert text.endswith("bare weed with 60.0: the coarse look alone gives 20.0.")

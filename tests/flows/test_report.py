@@ -71,17 +71,22 @@ def test_words_are_escaped():
     receipt["survey"] = receipt["scene"] = receipt["settings"]["out"] = receipt["stages"][0]["name"] = bad
     receipt["versions"] = {bad: bad}
     receipt["accuracy"]["per_class_iou"] = {bad: 0.5}
+    receipt["accuracy"]["false_classes"] = {bad: 1}
     receipt["accuracy"]["controls"] = {bad: {"miou": 0.5, "spread": None}}
     receipt["effects"][0]["why"] = bad
     page = render_report(receipt, PNG, [Picture(PNG, bad + '" onload="x')])
     assert "script" not in read(page).seen
     assert '" onload="' not in page
-    assert page.count("&lt;script&gt;") >= 9
+    assert page.count("&lt;script&gt;") >= 11
 
 
 @pytest.mark.parametrize(
-    "words", ["104 s", "predicted", "50 %", "75.0", "56.2 ± 1.2", "67 %", "budget", "torch", "Class by class"]
-)
+    "words",
+    [
+        "104 s", "predicted", "50 %", "75.0", "93.4", "56.2 ± 1.2", "67 %", "budget", "torch", "Class by class",
+        "this survey wheat 2 px", "2 of 3 classes are in the truth",
+    ],
+)  # fmt: skip
 def test_page_has_the_figures(words):
     """Savings, accuracy with its controls, settings and versions are on the page."""
     assert words in render_report(make_receipt(), PNG, looked_twice=0.23)

@@ -19,6 +19,7 @@ from flows.publish import Published
 from flows.receipt import check_receipt, comparable
 from flows.settings import load_settings
 from flows.survey_command import run_survey
+from flows.survey_scene import open_scene
 from models.inference import glance
 from models.weights import load_weights
 from pipeline.camera import LineCamera
@@ -91,6 +92,20 @@ def test_receipt_has_every_field(farm: Done) -> None:
     assert {row["name"] for row in receipt["effects"]} == set(BY_NAME)
     assert receipt["effects_total"]["bound"] <= receipt["effects_total"]["tolerance"] == 0.1
     assert 0 < farm.published.looked_twice < 1
+
+
+def test_all_maps_of_a_receipt_are_judged_over_the_classes_of_the_truth(farm: Done) -> None:
+    """This map, none and all have an IoU for the same classes and null for the others, in the store as well."""
+    accuracy: Any = farm.receipt["accuracy"]
+    (stored,) = farm.archive.glob("stages/evaluate/*/accuracy.json")
+    assert "NaN" not in stored.read_text()
+    scene, _ = open_scene(load_settings(None, {"size": f"{FARM[1]}x{FARM[0]}", "seed": "1"}))
+    truth = {scene.class_names[number] for number in np.unique(scene.labels)}
+    for one in (accuracy, accuracy["none"], accuracy["all"]):
+        known = {name: iou for name, iou in one["per_class_iou"].items() if iou is not None}
+        assert set(known) == truth
+        assert one["miou"] == pytest.approx(np.mean(list(known.values())))
+        assert not truth & set(one["false_classes"])
 
 
 def test_savings_add_up(farm: Done) -> None:

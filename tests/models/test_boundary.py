@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from models.boundary import boundary_counts, boundary_iou, boundary_px, mean_boundary_iou, near_border
+from models.metrics import confusion, labelled_classes
 from pipeline.errors import ShapeError
 
 MAPS = arrays(np.uint8, (7, 9), elements=st.sampled_from([0, 1, 2, 255]))
@@ -29,8 +30,8 @@ def test_the_border_is_within_its_width(region: np.ndarray, width: int):
 @given(MAPS)
 def test_a_perfect_map_agrees_at_every_border(labels: np.ndarray):
     """The IoU of a class with itself is 1; a class that is not there has none."""
-    iou = boundary_iou(boundary_counts(labels, np.where(labels == 255, 0, labels), 3))
     present = np.array([(labels == number).any() for number in range(3)])
+    iou = boundary_iou(boundary_counts(labels, np.where(labels == 255, 0, labels), 3), present)
     assert (iou[present] == 1).all()
     assert np.isnan(iou[~present]).all()
 
@@ -41,7 +42,7 @@ def test_a_worked_case():
     labels[3:7, 3:7], drawn[3:7, 4:8] = 1, 1
     counts = boundary_counts(labels, drawn, 2, width=1)
     assert counts[1].tolist() == [6, 18]
-    assert boundary_iou(counts)[1] == pytest.approx(1 / 3)
+    assert boundary_iou(counts, counts[:, 1] > 0)[1] == pytest.approx(1 / 3)
 
 
 def test_only_borders_count():
@@ -61,13 +62,28 @@ def test_unlabelled_pixels_do_not_count():
     drawn = np.where(labels == 255, 2, 1).astype(np.uint8)
     counts = boundary_counts(labels, drawn, 3, width=1)
     assert counts[0].tolist() == counts[2].tolist() == [0, 0]
-    assert boundary_iou(counts)[1] == 1
+    assert boundary_iou(counts, counts[:, 1] > 0)[1] == 1
 
 
 def test_no_class_has_no_mean():
     """Nothing labelled: NaN, neither 0 nor 1."""
     empty = np.full((4, 4), 255, np.uint8)
-    assert np.isnan(mean_boundary_iou(boundary_counts(empty, np.zeros((4, 4), np.uint8), 2)))
+    assert np.isnan(mean_boundary_iou(boundary_counts(empty, np.zeros((4, 4), np.uint8), 2), np.zeros(2, bool)))
+
+
+@given(MAPS, MAPS, st.integers(1, 3))
+def test_a_false_class_adds_nothing_to_the_mean(labels: np.ndarray, drawn: np.ndarray, width: int):
+    """The mean is over the classes that the labels have: showing class 3, which they never have, is only a miss."""
+    known = np.minimum(drawn, 2)
+    labelled = labelled_classes(confusion(labels, known, 4))
+    means = [
+        mean_boundary_iou(boundary_counts(labels, np.where(known == 2, number, known), 4, width), labelled)
+        for number in (2, 3)
+    ]
+    if (labels == 2).any():
+        assert means[1] <= means[0] + 1e-12
+    else:
+        assert means[1] == pytest.approx(means[0], nan_ok=True)
 
 
 @pytest.mark.parametrize(("shape", "width"), [((3, 4), 1), ((300, 400), 10), ((966, 1296), 32)])

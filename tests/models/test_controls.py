@@ -9,7 +9,7 @@ import pytest
 
 from models.controls import RANDOM_DRAWS, Controls, run_controls
 from models.inference import Glance, glance_of_columns, segment
-from models.metrics import confusion, mean_iou
+from models.metrics import agreement, confusion, mean_iou
 from models.weights import Weights
 from pipeline.grid import SceneGrid
 
@@ -84,22 +84,34 @@ def _counts(right: int) -> np.ndarray:
 
 
 def test_figures_of_a_worked_case():
-    """mIoU, the share of the gap, and mean and spread of the random placements."""
+    """Both means and the pixels' accuracy, the share of the gap, and mean and spread of the random placements."""
     controls = Controls(
         0.35, 10, _counts(60), _counts(90), {"entropy": _counts(80)}, [_counts(62), _counts(66), _counts(64)]
     )
     rows = controls.as_dict()
     none, every, entropy = (mean_iou(_counts(right)) for right in (60, 90, 80))
-    assert rows["entropy"] == {"miou": entropy, "spread": None, "gap_closed": (entropy - none) / (every - none)}
+    closed = (entropy - none) / (every - none)
+    assert rows["entropy"] == {**agreement(_counts(80)), "spread": None, "gap_closed": closed}
     draws = [mean_iou(_counts(right)) for right in (62, 66, 64)]
+    figures = {"miou": np.mean(draws), "miou_of_shown_classes": np.mean(draws), "overall_accuracy": 0.64}
     closed = (np.mean(draws) - none) / (every - none)
-    assert rows["random"] == pytest.approx(
-        {"miou": np.mean(draws), "spread": np.std(draws, ddof=1), "gap_closed": closed}
-    )  # fmt: skip
+    assert rows["random"] == pytest.approx({**figures, "spread": np.std(draws, ddof=1), "gap_closed": closed})
 
 
 def test_one_draw_has_no_spread_and_a_small_gap_no_share():
     """What cannot be said is None."""
     rows = Controls(0.35, 10, _counts(60), _counts(60), {"sobel": _counts(61)}, [_counts(60)]).as_dict()
-    assert rows["random"] == {"miou": mean_iou(_counts(60)), "spread": None, "gap_closed": None}
-    assert rows["sobel"] == {"miou": mean_iou(_counts(61)), "spread": None, "gap_closed": None}
+    assert rows["random"] == {**agreement(_counts(60)), "spread": None, "gap_closed": None}
+    assert rows["sobel"] == {**agreement(_counts(61)), "spread": None, "gap_closed": None}
+
+
+def test_a_stray_class_does_not_move_the_gap():
+    """All rows are of one set of classes: a false class in one of the ends leaves the share of the gap as it is."""
+    stray, clean = np.zeros((3, 3), np.int64), np.zeros((3, 3), np.int64)
+    stray[:2, :2] = clean[:2, :2] = _counts(80)
+    stray[0, 1:] = [19, 1]  # a wrong pixel that shows what the labels lack
+    none, every = np.zeros((3, 3), np.int64), np.zeros((3, 3), np.int64)
+    none[:2, :2], every[:2, :2] = _counts(60), _counts(90)
+    shares = [Controls(0.35, 10, none, every, {"gain": one}, [none]).as_dict()["gain"] for one in (clean, stray)]
+    assert shares[0]["miou_of_shown_classes"] > shares[1]["miou_of_shown_classes"] + 0.2
+    assert shares[1]["gap_closed"] == pytest.approx(shares[0]["gap_closed"], abs=0.01)
