@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Annotated
 
 from cyclopts import App, Parameter
-from rich.console import Console
 from rich.markup import escape
 
+from flows.terminal import on_stderr
 from pipeline.errors import SettingsError
 
 
@@ -25,7 +25,7 @@ app = App(
     help="Survey a field: look coarsely at everything, finely where it changes the map.",
     suppress_keyboard_interrupt=False,  # main says what an interrupted survey leaves
 )
-stderr = Console(stderr=True)
+stderr = on_stderr()
 ArchiveName = Annotated[str, Parameter(help="The archive's folder, or s3://bucket/prefix.")]
 AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print one JSON object on stdout.")]
 Switch = Annotated[bool, Parameter(negative="")]  # off unless given

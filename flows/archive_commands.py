@@ -14,6 +14,7 @@ from flows.archive_contents import contents, explanation, verdict
 from flows.archive_tables import show_clearance, show_contents, show_explanation, show_repair, show_verdict
 from flows.progress import StageProgress
 from flows.receipt import to_json
+from flows.terminal import on_stdout
 from pipeline.errors import SettingsError
 from storage.archive import Archive
 from storage.garbage import Removal, clear_up
@@ -21,7 +22,6 @@ from storage.repair import Repaired, Rerun, put_back, repair
 from storage.verification import Finding
 
 DONE, FAILED, PARTLY = 0, 1, 3
-PIPED_WIDTH = 120
 
 
 def run_ls(archive: str | Path, *, as_json: bool = False) -> int:
@@ -140,4 +140,4 @@ def _put_out(content: dict[str, Any], show: Callable[[dict[str, Any], Console], 
     if as_json:
         sys.stdout.write(to_json(content))
     else:
-        show(content, Console(file=sys.stdout, width=None if sys.stdout.isatty() else PIPED_WIDTH))
+        show(content, on_stdout())

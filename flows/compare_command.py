@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
-from flows.archive_commands import PIPED_WIDTH, check_outside
+from flows.archive_commands import check_outside
 from flows.comparison_table import SAVINGS, change_words, panel_words, show_comparison
 from flows.difference_picture import MapPair, draw_difference
 from flows.receipt import to_json
 from flows.scores import score_of
 from flows.setting_keys import BUILT_IN_SCENES
+from flows.terminal import on_stdout
 from pipeline.errors import ArchiveError, SceneError, ShapeError
 from pipeline.grid import UNLABELLED
 from pipeline.simulator.farm_laws import law_of_key
@@ -57,7 +57,7 @@ def run_compare(archive: str | Path, old: str, new: str, out: Path | None = None
     if as_json:
         sys.stdout.write(to_json(content))
     else:
-        show_comparison(content, Console(file=sys.stdout, width=None if sys.stdout.isatty() else PIPED_WIDTH))
+        show_comparison(content, on_stdout())
     return 0
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from flows.archive_commands import PIPED_WIDTH
 from flows.benchmark_budgets import summarise_equal_time, summarise_rig
 from flows.benchmark_controls import design_of, open_controls
 from flows.benchmark_costs import Prices
@@ -27,6 +26,7 @@ from flows.benchmark_work import Judged, Work
 from flows.evaluation_table import print_evaluation
 from flows.progress import StageProgress
 from flows.receipt import to_json
+from flows.terminal import on_stdout
 from models.bootstrap import LEVEL
 from models.metrics import agreement, false_pixels, iou_per_class
 from models.process import keep_freed_memory
@@ -39,7 +39,7 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
     if as_json:
         sys.stdout.write(to_json(content))
     else:
-        print_evaluation(content, Console(file=sys.stdout, width=None if sys.stdout.isatty() else PIPED_WIDTH))
+        print_evaluation(content, on_stdout())
     for path in content["files"]:
         console.print(path, highlight=False, soft_wrap=True)
     return content

@@ -16,8 +16,8 @@ from flows.figures import format_bytes, format_seconds
 from flows.forecast import StageForecast, forecast
 from flows.receipt import to_json
 from flows.settings import Settings
+from flows.terminal import on_stdout
 
-PIPED_WIDTH = 120
 MOST_LETTERS = 250  # of a reason
 COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow", "skipped": "dim"}
 
@@ -28,7 +28,7 @@ def run_plan(settings: Settings, *, as_json: bool = False) -> int:
     if as_json:
         sys.stdout.write(to_json(content))
     else:
-        show_plan(content, Console(file=sys.stdout, width=None if sys.stdout.isatty() else PIPED_WIDTH))
+        show_plan(content, on_stdout())
     return 0
 
 

@@ -6,7 +6,6 @@ Styles and drawings are inline, nothing is loaded from anywhere. Links lead to r
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -16,7 +15,7 @@ from flows.field_history import FieldHistory, day_of
 from flows.figures import DASH, format_percent, format_points
 from flows.finding_words import LEAST_HECTARES, area_words
 from flows.line_chart import line_chart
-from flows.page_parts import page_row, page_section, page_table
+from flows.page_parts import escape, page_row, page_section, page_table
 from flows.schedule_state import read_moment
 
 MOST_ROWS = 1000  # of each table; older ones are counted

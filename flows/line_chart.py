@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from html import escape
 
 import numpy as np
+
+from flows.page_parts import escape
 
 WIDTH, HEIGHT, LEFT, BOTTOM, TOP, RIGHT = 760.0, 220.0, 64.0, 28.0, 12.0, 12.0
 _FORMS = ((1800, "%H:%M:%S"), (86_400, "%H:%M"), (300 * 86_400, "%d %b"))  # of dates, by seconds of the whole

@@ -16,11 +16,11 @@ from rich.table import Table
 from flows.figures import DASH, format_bytes
 from flows.progress import StageProgress
 from flows.receipt import to_json
+from flows.terminal import on_stdout
 from storage.archive import Archive
 from storage.repacking import Packed, Packing, pack, plan_packing
 
 DONE, PARTLY = 0, 3
-PIPED_WIDTH = 120
 STAGE = "pack"
 
 
@@ -49,7 +49,7 @@ def run_pack(
     if as_json:
         sys.stdout.write(to_json(content))
     else:
-        _show(done, Console(file=sys.stdout, width=None if sys.stdout.isatty() else PIPED_WIDTH), dry_run=dry_run)
+        _show(done, on_stdout(), dry_run=dry_run)
     partly = done.obstacle is not None or any(one.state == "failed" for one in done.stores)
     return PARTLY if partly else DONE
 

@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from html import escape
+from html import escape as escape_html
+
+from pipeline.visible_text import visible
+
+
+def escape(text: str) -> str:
+    """Words as a page may hold them: no markup, and nothing that turns the words beside them round."""
+    return escape_html(visible(text))
 
 
 def page_section(title: str, body: str) -> str:

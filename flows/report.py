@@ -9,7 +9,6 @@ import base64
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 from flows.effect_table import format_change, total_words
 from flows.figures import DASH, format_bytes, format_percent, format_points, format_seconds
 from flows.finding_words import sentences
-from flows.page_parts import page_row, page_section, page_table
+from flows.page_parts import escape, page_row, page_section, page_table
 from flows.receipt import Accuracy, Receipt, Saving, Savings
 from flows.receipt_table import COST_LABELS, control_seats, headline
 from flows.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words

@@ -33,6 +33,7 @@ from flows.receipt import to_json
 from flows.scores import score_of
 from flows.settings import Settings
 from pipeline.errors import PipelineError, SettingsError
+from pipeline.visible_text import visible
 from storage.archive import Archive
 from storage.block_work import THREADS, Crew
 from storage.lineage import Catalogue
@@ -219,4 +220,4 @@ def _show(content: Mapping[str, Any], file: Path | None) -> None:
     count = f"{len(rows)} field{'' if len(rows) == 1 else 's'}: {told}"
     lines = [*map(_words, rows), count if rows else "no field matches: nothing to do"]
     lines += [] if file is None else [f"  {file}"]
-    sys.stdout.write("\n".join(lines) + "\n")
+    sys.stdout.write(visible("\n".join(lines)) + "\n")

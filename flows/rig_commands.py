@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from rich.table import Table
 
 from flows.app import print_json
 from flows.settings import load_settings
+from flows.terminal import on_stdout
 from pipeline.errors import SettingsError
 from pipeline.rig.emulator.fault_names import fault_table
 from pipeline.rig.headwall_camera import HeadwallCamera
@@ -25,7 +25,6 @@ from pipeline.scan import CostModel
 
 DONE, FAILED, PARTLY = 0, 1, 3
 LIST = "list"
-PIPED_WIDTH = 120
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
 
@@ -38,7 +37,7 @@ def show_faults(*, as_json: bool = False) -> int:
     table = Table("fault", "strikes", "what happens", box=SIMPLE_HEAD)
     for row in fault_table():
         table.add_row(*map(escape, row))
-    _stdout().print(table)
+    on_stdout().print(table)
     return DONE
 
 
@@ -87,12 +86,8 @@ def run_check(request: CheckRequest, console: Console, *, as_json: bool = False)
     if as_json:
         print_json(_record(request, rows, code))
     else:
-        _print(rows, _stdout())
+        _print(rows, on_stdout())
     return code
-
-
-def _stdout() -> Console:
-    return Console() if sys.stdout.isatty() else Console(width=PIPED_WIDTH)
 
 
 def _record(request: CheckRequest, rows: Sequence[CheckRow], code: int) -> dict[str, Any]:

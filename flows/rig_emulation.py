@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import sys
 import threading
@@ -134,7 +135,7 @@ def _toml_table(name: str, values: dict[str, object]) -> str:
 
 def _toml_value(value: object) -> str:
     if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return f"[{', '.join(map(_toml_value, value))}]" if isinstance(value, tuple) else str(value)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -23,6 +22,7 @@ from pipeline.simulator.farm_laws import has_days
 from storage.archive import Archive
 from storage.ledger import Ledger
 from storage.staging import take_lock
+from storage.toml_files import read_toml
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def load_field(file: Path, out: str | None = None) -> ServedField:
     SettingsError : the file cannot be used, or says neither what to look at nor that a rig looks.
     """
     settings = load_settings(file, {"out": out})
-    said = tomllib.loads(file.read_text(encoding="utf-8"))
+    said = read_toml(file)
     if "scene" not in said and settings.source != "rig":
         raise SettingsError(
             f"{file} says neither scene nor source = 'rig': nothing to look at; give the field's scene, or its rig"

@@ -16,7 +16,6 @@ from prefect import State, flow
 from prefect.concurrency.sync import concurrency
 from prefect.context import FlowRunContext
 from prefect.states import Cancelled, Completed, Failed
-from rich.console import Console
 
 from flows.field_schedule import FieldSchedule
 from flows.notices import send_notice
@@ -27,6 +26,7 @@ from flows.serve_fields import ServedField
 from flows.serve_queue import SKIPPED
 from flows.serve_request import ServeRequest
 from flows.served import read_served, served_archive, served_field, served_weights
+from flows.terminal import on_stderr
 from flows.wall_clock import WallClock
 from pipeline.errors import PipelineError, RigError
 from storage.archive import Archive
@@ -73,7 +73,7 @@ def _survey(one: ServedField, due: datetime, request: ServeRequest) -> Path:
     from flows.survey_artifacts import publish_artifacts
     from flows.survey_command import run_survey
 
-    published = run_survey(one.settings_of(due, request.timetable), Console(stderr=True))
+    published = run_survey(one.settings_of(due, request.timetable), on_stderr())
     with suppress(Exception):  # a server that is gone: the archive has it all
         publish_artifacts(published, one.name, one.settings.out)
     return published.folder
@@ -170,7 +170,7 @@ def reprocess_archive(
         if release is None:
             return _skipped("this archive is being reprocessed already")
         try:
-            code = run_reprocess(request, Console(stderr=True))
+            code = run_reprocess(request, on_stderr())
         finally:
             release()
     except PipelineError as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, Field, asdict, dataclass, field, fields
 from datetime import datetime
@@ -21,6 +20,7 @@ from pipeline.scan import CostModel
 from pipeline.simulator.farm_laws import USUAL_DAY, USUAL_HOUR, has_days
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from storage.block_work import Crew
+from storage.toml_files import read_toml
 
 OF_THE_MACHINE = ("scheduler", "workers")  # no byte depends on them; a cluster of that day need not be there today
 _PATHS = ("scene", "labels", "out", "mask", "vgg", "weights")
@@ -198,15 +198,11 @@ def _refuse_key(full: str, known: Mapping[str, Parser], prefix: str, origin: str
 def _read_toml(path: Path) -> dict[str, object]:
     """The file's tables; a file that is not there or not TOML is an error with its place."""
     try:
-        text = path.read_text(encoding="utf-8")
+        return read_toml(path)
     except FileNotFoundError:
         raise SettingsError(f"no settings file {path}; give the path of a survey's TOML file, or none") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise SettingsError(f"cannot read the settings file {path}: {error}; expected TOML in UTF-8") from None
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise SettingsError(f"{path} is not valid TOML: {error}") from None
 
 
 def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:

@@ -13,10 +13,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.archive_commands import DONE, PIPED_WIDTH
+from flows.archive_commands import DONE
 from flows.figures import DASH, format_count
 from flows.progress import StageProgress
 from flows.receipt import to_json
+from flows.terminal import on_stdout
 from pipeline.errors import SettingsError
 from storage.archive import Archive
 from storage.band_statistics import BandTable, cube_stores, product_statistics
@@ -58,7 +59,7 @@ def run_statistics(
     if as_json:
         sys.stdout.write(to_json(content))
     else:
-        _show(content, Console(file=sys.stdout, width=None if sys.stdout.isatty() else PIPED_WIDTH), every_band)
+        _show(content, on_stdout(), every_band)
     return DONE
 
 

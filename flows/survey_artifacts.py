@@ -14,6 +14,7 @@ from flows.finding_words import sentences
 from flows.publish import Published
 from flows.receipt import Receipt, Saving
 from flows.receipt_table import COST_LABELS, headline
+from pipeline.visible_text import visible
 
 MOST_BYTES = 100 * 1024  # of the picture, as it stands in the text
 WIDTHS_PX = (1200, 1000, 800, 600, 400, 200)
@@ -88,7 +89,7 @@ def small_jpeg(png: bytes) -> bytes:
 
 def _plain(text: str) -> str:
     """Words in which nothing is markup."""
-    return "".join(f"\\{letter}" if letter in "\\`*_{}[]<>#|" else letter for letter in text)
+    return "".join(f"\\{letter}" if letter in "\\`*_{}[]<>#|" else letter for letter in visible(text))
 
 
 def progress_shown(field: str) -> Callable[[str, str, float], None]:

@@ -21,11 +21,19 @@ BoundError             a simulated effect changes more than its bound says      
 
 from __future__ import annotations
 
+from pipeline.visible_text import visible
+
 
 class PipelineError(Exception):
-    """Base of every error that the user is meant to read; ``exit_code`` is the process's."""
+    """Base of every error that the user is meant to read; ``exit_code`` is the process's.
+
+    Words of files and devices in it are shown as `visible_text` shows them.
+    """
 
     exit_code = 1
+
+    def __str__(self) -> str:
+        return visible(super().__str__())
 
 
 class SettingsError(PipelineError, ValueError):

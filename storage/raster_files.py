@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib
 import math
 import re
-import warnings
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from storage.wavelengths import BandWavelengths
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")
 SCENE_ENDINGS = (*IMAGE_ENDINGS, *TIFF_ENDINGS, ".npy", *NAMED_ENDINGS, ".hdr")
 
+_PILLOW_LIMIT = threading.RLock()  # it is the process's, not a call's
 _FORMATS = ("PNG", "JPEG", "BMP")  # whatever the ending says; Pillow's others may run programs
 _BYTES = {"I": 4, "F": 4, "I;16": 2, "I;16L": 2, "I;16B": 2}  # a number, by Pillow's mode; 1 in the others
 _WITH_VARIABLE = re.compile(r"^(?P<path>.+\.(?:mat|npz|zarr)):(?P<variable>[^/\\:]+)$", re.IGNORECASE)
@@ -97,14 +100,23 @@ def _check_numbers(values: NDArray[Any], path: Path) -> None:
 
 
 def _read_image(path: Path) -> Raster:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # mosaics are large on purpose
-        with Image.open(path, formats=_FORMATS) as image:
-            _check_image(path, image)
-            image.load()
-            if _is_deep_colour(path):
-                return _read_deep_colour(path)
-            return _from_pillow(image)
+    with _of_any_size(), Image.open(path, formats=_FORMATS) as image:
+        _check_image(path, image)
+        image.load()
+        if _is_deep_colour(path):
+            return _read_deep_colour(path)
+        return _from_pillow(image)
+
+
+@contextmanager
+def _of_any_size() -> Iterator[None]:
+    """Mosaics are large on purpose: what a file claims is judged by its bytes and the memory, not by Pillow's limit."""
+    with _PILLOW_LIMIT:
+        before, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            yield
+        finally:
+            Image.MAX_IMAGE_PIXELS = before
 
 
 def _check_image(path: Path, image: Image.Image) -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import SceneError
+from storage.toml_files import read_toml
 
 SETTINGS_NAME = "scene.toml"
 KNOWN_KEYS = ("bands", "wavelengths_nm", "wavelengths_file", "dropped_bands", "labels", "unlabelled", "classes")
@@ -48,8 +48,8 @@ def find_scene_settings(scene: Path) -> SceneSettings:
 def load_scene_settings(path: Path) -> SceneSettings:
     """Read one ``scene.toml``; errors as for :func:`find_scene_settings`."""
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        content = read_toml(path)
+    except (FileNotFoundError, ValueError) as error:
         raise SceneError(f"{path} cannot be read as TOML: {error}; correct it or take it away") from error
     unknown = sorted(set(content) - set(KNOWN_KEYS))
     if unknown:
