@@ -18,6 +18,7 @@ import flows.serve_verb
 import flows.simulate_verb  # noqa: F401 - each registers its verbs
 from flows.app import GOES_ON, AsJson, OutFile, app, parse_numbers, parse_wholes, print_json, say, split_list, stderr
 from flows.survey_flags import SurveyFlags
+from flows.system_refusals import refusal_words
 from pipeline.errors import PipelineError, SettingsError
 
 NO_FLAGS = SurveyFlags()
@@ -230,6 +231,9 @@ def main(arguments: list[str] | None = None) -> None:
     except BrokenPipeError:
         sys.exit(1)
     except Exception as error:
+        if (refused := refusal_words(error)) is not None:
+            say(refused)
+            sys.exit(1)
         say(f"{type(error).__name__}: {error}; this is a defect of SpectralZoom: please report {_keep_traceback()}")
         sys.exit(1)
     sys.exit(code if isinstance(code, int) else 0)

@@ -27,6 +27,7 @@ _ADVICE = {
     errno.EACCES: "permission is denied: change the folder's rights or choose another --out",
     errno.EPERM: "permission is denied: change the folder's rights or choose another --out",
     errno.EIO: "the disk reports an error: check the disk, then run again",
+    errno.EFBIG: "a file may not grow so large here: raise ulimit -f, or choose an --out on another file system",
     errno.EMFILE: "too many files are open: raise ulimit -n",
     errno.ENOLCK: "the file system has no locks: choose an --out on a local disk",
 }
@@ -53,12 +54,17 @@ def refusals(path: Path, doing: str) -> Iterator[None]:
     except ArchiveError:
         raise
     except OSError as error:
-        advice = _ADVICE.get(error.errno or 0)
+        advice = disk_advice(error)
         named = error.filename
         elsewhere = isinstance(named, str) and Path(named).is_absolute() and not Path(named).is_relative_to(path)
         if advice is None or elsewhere:
             raise
         raise ArchiveError(f"cannot {doing} {path}: {advice} (nothing published was changed)") from error
+
+
+def disk_advice(error: OSError) -> str | None:
+    """What to do about a disk's refusal; None where the error is another."""
+    return _ADVICE.get(error.errno or 0)
 
 
 def remove_tree(path: Path) -> None:

@@ -295,3 +295,12 @@ def test_envi_cut_off_at_every_byte(tmp_path: Path) -> None:
         assert (source.shape, source.lost_lines) == ((5, 3, 2), 5 - held)
         np.testing.assert_array_equal(source.read(0, held), values[:held])
         assert not source.read(held, 5).any()
+
+
+def test_a_large_picture_is_no_bomb(tmp_path: Path) -> None:
+    """14000 px a side is a mosaic as people make them: it is read, and Pillow's limit is as it was."""
+    Image.new("L", (14_000, 14_000), 7).save(tmp_path / "mosaic.png", compress_level=1)
+    before = Image.MAX_IMAGE_PIXELS
+    values = load_raster(tmp_path / "mosaic.png", dims=3).values
+    assert (values.shape, values.dtype, int(values[-1, -1])) == ((14_000, 14_000), np.uint8, 7)
+    assert Image.MAX_IMAGE_PIXELS == before
