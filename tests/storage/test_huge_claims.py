@@ -303,4 +303,4 @@ def test_a_large_picture_is_no_bomb(tmp_path: Path) -> None:
     before = Image.MAX_IMAGE_PIXELS
     values = load_raster(tmp_path / "mosaic.png", dims=3).values
     assert (values.shape, values.dtype, int(values[-1, -1])) == ((14_000, 14_000), np.uint8, 7)
-    assert Image.MAX_IMAGE_PIXELS == before
+    assert before == Image.MAX_IMAGE_PIXELS
