@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
-from contextlib import suppress
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,22 @@ class RunnerProcess(KeptProcess):
         super().__init__([sys.executable, "-m", "flows.serve_runner", json.dumps(words)], log, PATIENCE_S)
 
 
+@contextmanager
+def own_temporary_folder() -> Iterator[None]:
+    """Let this process have its temporary files in a folder that is this user's alone.
+
+    Prefect's runner keeps what it starts in /tmp/runner_storage, which belongs to the first user who ever ran one: that
+    one could exchange it, and no other can run one.
+    """
+    usual = tempfile.tempdir
+    with tempfile.TemporaryDirectory(prefix="spectralzoom-runner-", ignore_cleanup_errors=True) as own:
+        tempfile.tempdir = own
+        try:
+            yield
+        finally:
+            tempfile.tempdir = usual
+
+
 def main(text: str) -> None:
     """Serve the deployments of a request until told to stop."""
     from prefect import serve
@@ -41,7 +58,7 @@ def main(text: str) -> None:
         timetable=parse_timetable(words["cron"], words["every"], words["timezone"]),
         late=words["late"], limit=words["limit"], out=words["out"],
     )  # fmt: skip
-    with suppress(KeyboardInterrupt):
+    with suppress(KeyboardInterrupt), own_temporary_folder():
         serve(*deployments(request), limit=request.limit, print_starting_message=False)
 
 

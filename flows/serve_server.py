@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from http.client import HTTPException
 from pathlib import Path
 
+from flows.cache_places import place_pages
 from flows.engine import QUIET
 from flows.process_guard import KeptProcess
 from pipeline.errors import SettingsError
@@ -69,6 +70,7 @@ def server_for(home: Path, port: int) -> Iterator[LocalServer | None]:
     _check_free(port)
     wanted = {
         **QUIET, "PREFECT_HOME": str(home), "PREFECT_API_URL": server.url, "PREFECT_SERVER_UI_V2_ENABLED": "false",
+        **place_pages(),
         "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false", "PREFECT_RUNNER_POLL_FREQUENCY": POLL_S,
     }  # fmt: skip
     added = {name: value for name, value in wanted.items() if name not in os.environ}
