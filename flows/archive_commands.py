@@ -107,10 +107,10 @@ def check_outside(out: Path, archive: Archive) -> Path:
 
 def _survey_again(archive: Archive, console: Console) -> Rerun:
     def rerun(settings: dict[str, Any]) -> None:
-        from flows.settings import OF_THE_MACHINE, parse_settings
+        from flows.settings import OF_THE_MACHINE, of_this_version, parse_settings
         from flows.survey_command import run_survey
 
-        here = {**settings, "out": archive.name, **dict.fromkeys(OF_THE_MACHINE)}
+        here = {**of_this_version(settings), "out": archive.name, **dict.fromkeys(OF_THE_MACHINE)}
         run_survey(parse_settings(here), console)
 
     return rerun

@@ -17,6 +17,7 @@ import flows.rig_verbs
 import flows.serve_verb
 import flows.simulate_verb  # noqa: F401 - each registers its verbs
 from flows.app import GOES_ON, AsJson, OutFile, app, parse_numbers, parse_wholes, print_json, say, split_list, stderr
+from flows.cache_places import place_caches
 from flows.survey_flags import SurveyFlags
 from flows.system_refusals import refusal_words
 from pipeline.errors import PipelineError, SettingsError
@@ -216,6 +217,7 @@ def main(arguments: list[str] | None = None) -> None:
     # light behind one key, and so the receipt of one seed, would differ with the number of cores.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     try:
+        place_caches()  # read when numba and matplotlib are first imported
         code = app(arguments, result_action="return_value", exit_on_error=False, print_error=False)
     except CycloptsError as error:
         say(_usage(error))

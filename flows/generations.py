@@ -13,7 +13,7 @@ from typing import Any
 
 from flows.run import SHIPPED
 from flows.setting_keys import BUILT_IN_SCENES
-from flows.settings import OF_THE_MACHINE, Settings, parse_settings
+from flows.settings import OF_THE_MACHINE, Settings, of_this_version, parse_settings
 from flows.stages import VERSIONS
 from flows.survey import STAGES
 from pipeline.errors import SettingsError
@@ -85,8 +85,7 @@ def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
     """
     if not run.settings:
         raise SettingsError(f"the settings of {run.uri} cannot be read ({run.problem}); survey this field by hand")
-    here = {*Settings.__dataclass_fields__} - {*OF_THE_MACHINE}
-    known = {name: value for name, value in run.settings.items() if name in here} | {**_scene_of(run)}
+    known = of_this_version(run.settings) | dict.fromkeys(OF_THE_MACHINE) | {**_scene_of(run)}
     return parse_settings({**known, "out": str(out), **({} if weights is None else {"weights": str(weights)})})
 
 

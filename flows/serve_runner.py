@@ -6,7 +6,9 @@ By itself Prefect's runner does not come back once its server has been away.
 from __future__ import annotations
 
 import sys
-from contextlib import suppress
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from flows.process_guard import KeptProcess
@@ -25,6 +27,22 @@ class RunnerProcess(KeptProcess):
         super().__init__([sys.executable, "-m", "flows.serve_runner"], log, PATIENCE_S, {NAMED_BY: str(served)})
 
 
+@contextmanager
+def own_temporary_folder() -> Iterator[None]:
+    """Let this process have its temporary files in a folder that is this user's alone.
+
+    Prefect's runner keeps what it starts in /tmp/runner_storage, which belongs to the first user who ever ran one: that
+    one could exchange it, and no other can run one.
+    """
+    usual = tempfile.tempdir
+    with tempfile.TemporaryDirectory(prefix="spectralzoom-runner-", ignore_cleanup_errors=True) as own:
+        tempfile.tempdir = own
+        try:
+            yield
+        finally:
+            tempfile.tempdir = usual
+
+
 def main() -> None:
     """Let the deployments of what is served run until told to stop."""
     from prefect import serve
@@ -32,7 +50,7 @@ def main() -> None:
     from flows.serve_request import deployments
 
     request = read_served()
-    with suppress(KeyboardInterrupt):
+    with suppress(KeyboardInterrupt), own_temporary_folder():
         serve(*deployments(request), limit=request.limit, print_starting_message=False)
 
 

@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from http.client import HTTPException
 from pathlib import Path
 
+from flows.cache_places import place_pages
 from flows.engine import QUIET
 from flows.process_guard import KeptProcess
 from flows.serve_pages import HOST, own_origins
@@ -75,6 +76,7 @@ def server_for(home: Path, port: int) -> Iterator[LocalServer | None]:
     ours = {"PREFECT_SERVER_API_AUTH_STRING": password, "PREFECT_API_AUTH_STRING": password}
     wanted = {
         **QUIET, "PREFECT_HOME": str(home), "PREFECT_API_URL": server.url, "PREFECT_SERVER_UI_V2_ENABLED": "false",
+        **place_pages(),
         "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false", "PREFECT_RUNNER_POLL_FREQUENCY": POLL_S,
         "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": ",".join(own_origins(port)),
     }  # fmt: skip

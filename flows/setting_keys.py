@@ -41,6 +41,9 @@ KERNELS = ("catmull-rom", "bilinear", "nearest")
 BUILT_IN_SCENES = FARM_NAMES
 BUILT_IN_SOURCES = ("sim", "rig")
 RIG_FIELD = "field"  # the scene of which only the rig knows more than size and bands
+REPLACED = {
+    "optics.polarisation": 'the mirror\'s coating says it now: [mirror] coating = "aluminium"'
+}  # keys of before
 
 Parser = Callable[[object, str], object]
 

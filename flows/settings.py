@@ -9,7 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from flows.setting_keys import BUILT_IN_SCENES, RIG_FIELD, SURVEY, TABLES, MapChoice, Parser
+from flows.setting_keys import BUILT_IN_SCENES, REPLACED, RIG_FIELD, SURVEY, TABLES, MapChoice, Parser
 from flows.setting_rules import check_together, place_of
 from flows.setting_values import Tolerance
 from pipeline.camera import LineCamera
@@ -192,7 +192,19 @@ def _refuse_key(full: str, known: Mapping[str, Parser], prefix: str, origin: str
     near = [name for name in everywhere if name.split(".")[-1] == short]
     near = near or [prefix + key for key in difflib.get_close_matches(short, known, n=1, cutoff=0.5)]
     hint = f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(prefix + key for key in known)}"
+    hint = f"; {REPLACED[full]}" if full in REPLACED else hint
     raise SettingsError(f"unknown setting {place_of(full, origin)}{hint}")
+
+
+def of_this_version(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Give what a receipt says of settings that there are: keys of before are left out, in tables too."""
+    known = {key: value for key, value in stored.items() if key in SURVEY}
+    return {
+        key: {name: item for name, item in value.items() if name in TABLES[key][1]}
+        if key in TABLES and isinstance(value, Mapping)
+        else value
+        for key, value in known.items()
+    }
 
 
 def _read_toml(path: Path) -> dict[str, object]:

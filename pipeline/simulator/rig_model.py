@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
+from pipeline.simulator.coatings import Coating
 
 Source = Literal["measured", "data sheet", "assumed"]
 Relief = Literal["flat", "step", "plane"]
@@ -40,12 +41,11 @@ class Optics:
     stray_share: float = stated(1e-3, "", "assumed", 0.0, 0.5)  # of all light of a line, spread over its detector
     stray_even: float = stated(0.5, "", "assumed", 0.0, 1.0)  # of the stray light, falls evenly; the rest is a halo
     stray_halo_px: float = stated(64.0, "px", "assumed", 2.0, 1e6)  # sd of the halo, over samples and bands alike
-    polarisation: float = stated(0.02, "", "assumed", 0.0, 0.5)  # change of reflectance from 45 to 70 deg incidence
 
 
 @dataclass(frozen=True)
 class MirrorMotion:
-    """How the mirror follows its commands: a second-order system fed from a vector memory."""
+    """How the mirror follows its commands, a second-order system fed from a vector memory, and what coats it."""
 
     natural_hz: float = stated(20.0, "Hz", "data sheet", 0.1, 1e5)  # full-scale bandwidth
     damping: float = stated(0.7, "", "assumed", 0.01, 10.0)
@@ -54,6 +54,7 @@ class MirrorMotion:
     repeatability_urad: float = stated(0.0, "urad", "assumed", 0.0, 1e5)  # sd of the tilt, line by line; vendor: 40
     hysteresis_px: float = stated(0.0, "px", "assumed", 0.0, 1e4)  # systematic, sign by direction; vendor: 50
     drift_px_per_min: float = stated(0.0, "px/min", "assumed", 0.0, 1e4)  # as the unit warms up
+    coating: Coating = "aluminium"  # assumed; a bare metal: protecting layers are not modelled
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Detector:
     """What the sensor adds to the camera's own read noise, gain and well."""
 
     dark_e_per_s: float = stated(200.0, "e-/s", "assumed", 0.0, 1e9)  # at 25 deg C
-    temperature_deg_c: float = stated(25.0, "deg C", "assumed", -80.0, 80.0)
+    temperature_deg_c: float = stated(25.0, "deg C", "assumed", -80.0, 50.0)  # where dark current's law holds
     response_share: float = stated(0.01, "", "assumed", 0.0, 0.5)  # sd of a pixel's gain (PRNU)
     stripe_share: float = stated(0.002, "", "assumed", 0.0, 0.5)  # sd of the gain that a sample's whole column shares
     dead_share: float = stated(0.0, "", "assumed", 0.0, 0.5)

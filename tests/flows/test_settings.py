@@ -17,7 +17,7 @@ from flows import setting_keys
 from flows.receipt import to_json
 from flows.setting_keys import MapChoice
 from flows.setting_values import Tolerance
-from flows.settings import Settings, load_settings, parse_settings
+from flows.settings import Settings, load_settings, of_this_version, parse_settings
 from models import policies
 from pipeline.camera import LineCamera
 from pipeline.errors import BudgetError, SettingsError
@@ -203,7 +203,16 @@ def test_memory_reads_units(text, count):
         ({"optics": {"focus_m": 0}}, "of at least 0.01 m or inf, got 0"),
         ({"optics": {"fwhm_nm": float("inf")}}, "from 0 to 1000 nm, got inf"),
         ({"mirror": {"repeatability_urad": -40e-6}}, "from 0 to 100000 urad"),
+        (
+            {"mirror": {"coating": "brass"}},
+            "'mirror.coating' must be one of aluminium, gold, silver, ideal; got 'brass'",
+        ),
+        (
+            {"optics": {"polarisation": 0.02}},
+            r"unknown .*'optics\.polarisation'; the mirror's coating .* \[mirror\] coat",
+        ),
         ({"detector": {"noiseless": "maybe"}}, "true or false"),
+        ({"detector": {"temperature_deg_c": 60}}, "from -80 to 50 deg C, got 60"),
         ({"detector": {"unit": 1.5}}, "whole number from 0"),
         ({"air": {"distance_m": 0}}, "of at least 0.001 m, got 0"),
         ({"air": {"relief": "hills"}}, "one of flat, step, plane; got 'hills'"),
@@ -272,6 +281,14 @@ def test_a_rig_is_read_from_its_tables(toml):
     assert rig.air == Air(distance_m=30.0, relief="step", nearest_m=20.0)
     assert rig.sky.started == datetime(2026, 6, 1, 10, tzinfo=UTC)
     assert rig.camera == found.camera
+
+
+def test_receipts_of_before_are_read():
+    """Keys that there are no longer are left out of a receipt's settings, in its tables too; the others stay."""
+    now = Settings(seed=3, optics=Optics(smile_nm=1.0)).to_dict()
+    before = now | {"patch": 16, "optics": {**now["optics"], "polarisation": 0.02}, "rig": {**now["rig"], "old": 1}}
+    assert of_this_version(before) == now
+    assert parse_settings(of_this_version(before)) == Settings(seed=3, optics=Optics(smile_nm=1.0))
 
 
 @pytest.mark.parametrize(

@@ -3,9 +3,11 @@
 References
 ----------
 .. [1] Koschmieder, "Theorie der horizontalen Sichtweite", Beitraege zur Physik der freien Atmosphaere 12, 1924: a
-   contrast of 2 % is left at the visibility V, so that extinction is 3.912 / V.
+   contrast of 2 % is left at the visibility V, so that extinction is 3.912 / V: all of it, molecules included.
 .. [2] Bird and Riordan, "Simple solar spectral model for direct and diffuse irradiance on horizontal and tilted
    planes at the earth's surface for cloudless atmospheres", TR-215-2436, 1984. doi:10.2172/5986936
+.. [3] Kruse, McGlauchlin and McQuistan, "Elements of Infrared Technology", Wiley, 1962: Angstrom's exponent is 0.585
+   V^(1/3) below 6 km.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 
 from pipeline.simulator.block import Block
 from pipeline.simulator.daylight import relative_daylight
+from pipeline.simulator.effects.absorption import AIR_MASS_M
 from pipeline.simulator.effects.brdf import BRDF
 from pipeline.simulator.effects.cloud import CLOUD
 from pipeline.simulator.effects.drift import daylight_range
@@ -34,7 +37,7 @@ KOSCHMIEDER = 3.912  # -ln 0.02 [1]
 _LOOKS = 9  # distances at which the spectrum's course is taken for the bounds of others: it is smooth
 VISIBLE_NM = 550.0  # of the visibility
 ANGSTROM = 1.14  # exponent of a rural aerosol [2]
-RAYLEIGH_PER_KM = 0.043  # of air at sea level at 400 nm; as wavelength^-4
+KRUSE = 0.585  # of the root of 1 km [3]
 
 
 @dataclass(frozen=True)
@@ -119,12 +122,24 @@ PATH_RADIANCE = PathRadiance()
 
 
 def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
-    """Give the extinction of aerosol and molecules near the ground, (band,) [1/m]: 0.17 + 0.012 /km at 23 km, 550 nm.
+    """Give the extinction of aerosol and molecules near the ground, (band,) [1/m]: 0.17 /km in all at 23 km, 550 nm.
 
-    The aerosol is Koschmieder's for the visibility [1] at 550 nm, and falls by Angstrom's exponent [2].
+    At 550 nm it is Koschmieder's for the visibility [1] and no less than the molecules'; what these do not explain is
+    aerosol, which falls by Angstrom's exponent: 1.14 [2], below 7.4 km Kruse's 0.585 V^(1/3) [3], since fog is grey.
+    A visibility above 336 km, that of air without aerosol, is taken as that. Valid from 400 to 1000 nm beside the lines
+    of gases, which are absorption's, and down to some 0.5 km; in thicker fog Kruse's exponent is known to be too large.
     """
-    aerosol = KOSCHMIEDER / air.visibility_km * (wavelength_nm / VISIBLE_NM) ** -ANGSTROM
-    per_m: Floats = (aerosol + RAYLEIGH_PER_KM * (wavelength_nm / 400.0) ** -4) * 1e-3
+    molecules = rayleigh_per_m(np.array([VISIBLE_NM]))[0]
+    aerosol = max(KOSCHMIEDER / air.visibility_km * 1e-3 - molecules, 0.0)
+    exponent = min(ANGSTROM, KRUSE * air.visibility_km ** (1 / 3))
+    per_m: Floats = aerosol * (wavelength_nm / VISIBLE_NM) ** -exponent + rayleigh_per_m(wavelength_nm)
+    return per_m
+
+
+def rayleigh_per_m(wavelength_nm: Floats) -> Floats:
+    """Give what molecules scatter at sea level, (band,) [1/m]: the optical depth of [2], Eq. 2-4, over 8434 m."""
+    micron = wavelength_nm * 1e-3
+    per_m: Floats = 1 / (micron**4 * (115.6406 - 1.3366 / micron**2)) / AIR_MASS_M
     return per_m
 
 

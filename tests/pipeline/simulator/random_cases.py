@@ -18,6 +18,7 @@ from pipeline.camera import LineCamera
 from pipeline.once import Once
 from pipeline.scan import Sweep
 from pipeline.simulator.block import Block
+from pipeline.simulator.coatings import Coating
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Relief, Rig, Sky
@@ -150,12 +151,19 @@ def _optics(rng: np.random.Generator, distance_m: float | None) -> Optics:
         stray_share=_some(rng, 1e-4, 1e-2),
         stray_even=float(rng.uniform(0, 1)),
         stray_halo_px=float(rng.uniform(4, 100)),
-        polarisation=_some(rng, 0.005, 0.1),
     )
+
+
+def _coating(rng: np.random.Generator) -> Coating:
+    """A metal, or in half of the cases none."""
+    metals: tuple[Coating, ...] = ("aluminium", "gold", "silver")
+    metal = metals[int(rng.uniform(0, 3))]
+    return metal if rng.random() < 0.5 else "ideal"
 
 
 def _mirror(rng: np.random.Generator) -> MirrorMotion:
     return MirrorMotion(
+        coating=_coating(rng),
         natural_hz=float(rng.uniform(5, 100)),
         damping=float(rng.choice([0.3, 0.7, 1.0, 2.0])),
         settled_s=float(rng.uniform(0.05, 0.5)),

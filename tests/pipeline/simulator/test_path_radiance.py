@@ -7,9 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pipeline.once import Once
-from pipeline.simulator.effects.path_radiance import PATH_RADIANCE, extinction_per_m
+from pipeline.simulator.effects.path_radiance import PATH_RADIANCE, extinction_per_m, rayleigh_per_m
 from pipeline.simulator.gain_range import fixed_variance
 from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.render import expected_light
@@ -34,18 +36,51 @@ SLOPING = Air(30.0, relief="plane", nearest_m=10.0, farthest_m=100.0)
 
 
 def test_extinction_by_hand() -> None:
-    """At 23 km 0.17 /km of aerosol at 550 nm; Rayleigh's 0.043 /km at 400 nm is all that is left without haze."""
+    """At 23 km 3.912 / 23 = 0.1701 /km at 550 nm, molecules included: these are 0.0116 /km there and 0.0432 at 400."""
     at_550 = extinction_per_m(Air(visibility_km=23.0), np.array([550.0]))[0] * 1e3
-    assert at_550 == pytest.approx(0.170 + 0.043 * (400 / 550) ** 4, abs=5e-4)
-    clean = extinction_per_m(Air(visibility_km=math.inf), np.array([400.0, 800.0])) * 1e3
-    np.testing.assert_allclose(clean, [0.043, 0.043 / 16])
+    assert at_550 == pytest.approx(0.17009, abs=1e-5)
+    molecules = rayleigh_per_m(np.array([400.0, 550.0])) * 1e3
+    np.testing.assert_allclose(molecules, [0.0426, 0.0115], rtol=0.02)  # Bucholtz 1995, Applied Optics 34, table 3
+    at_400 = extinction_per_m(Air(visibility_km=23.0), np.array([400.0]))[0] * 1e3
+    assert at_400 == pytest.approx((0.17009 - 0.01165) * (550 / 400) ** 1.14 + 0.04317, abs=1e-4)
 
 
-@pytest.mark.parametrize(("metres", "percent"), [(30.0, 0.62), (300.0, 6.0)])
+@given(st.floats(0.05, 335.0))
+def test_an_object_at_the_visibility_keeps_2_percent_of_its_contrast(visibility_km: float) -> None:
+    """Koschmieder's definition, in any air that holds aerosol, at 550 nm."""
+    beta = extinction_per_m(Air(visibility_km=visibility_km), np.array([550.0]))[0]
+    assert math.exp(-beta * visibility_km * 1e3) == pytest.approx(0.02, rel=3e-4)
+
+
+@given(st.floats(0.05, 1e4), st.floats(1.0, 2.0))
+def test_clearer_air_takes_no_more(visibility_km: float, times: float) -> None:
+    """At any wavelength, and never less than its molecules; it falls with wavelength."""
+    hazy, clear = (extinction_per_m(Air(visibility_km=km), WAVELENGTH) for km in (visibility_km, visibility_km * times))
+    assert (clear <= hazy * (1 + 1e-12)).all()
+    assert (clear >= rayleigh_per_m(WAVELENGTH)).all()
+    assert (np.diff(hazy) < 0).all()
+
+
+@pytest.mark.parametrize("visibility_km", [336.0, 1e5, math.inf])
+def test_no_air_is_clearer_than_its_molecules(visibility_km: float) -> None:
+    """From 336 km on nothing but Rayleigh's scattering is left."""
+    found = extinction_per_m(Air(visibility_km=visibility_km), WAVELENGTH)
+    np.testing.assert_allclose(found, rayleigh_per_m(WAVELENGTH), rtol=1e-3)
+
+
+def test_fog_is_grey() -> None:
+    """Over 400 to 1000 nm aerosol falls by 2.8 times at 23 km, but by less than 1.4 times at 100 m."""
+    ends = np.array([400.0, 1000.0])
+    for km, least, most in ((23.0, 2.8, 2.9), (0.1, 1.2, 1.4)):
+        blue, red = extinction_per_m(Air(visibility_km=km), ends) - rayleigh_per_m(ends)
+        assert least < blue / red < most
+
+
+@pytest.mark.parametrize(("metres", "percent"), [(30.0, 0.58), (300.0, 5.65)])
 def test_share_by_hand(metres: float, percent: float) -> None:
-    """In clear air 0.6 % of the light is lost at 30 m and 6 % at 300 m, at 500 nm."""
+    """In clear air 0.58 % of the light is lost at 30 m and 5.7 % at 300 m, at 500 nm."""
     beta = extinction_per_m(Air(visibility_km=23.0), np.array([500.0]))[0]
-    assert -100 * math.expm1(-beta * metres) == pytest.approx(percent, abs=0.05)
+    assert -100 * math.expm1(-beta * metres) == pytest.approx(percent, abs=0.02)
 
 
 def test_endless_air_is_the_horizon() -> None:

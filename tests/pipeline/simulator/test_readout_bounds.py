@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pipeline.camera import LineCamera
-from pipeline.simulator.effects.dark_current import DARK_CURRENT, dark_electrons
+from pipeline.simulator.effects.dark_current import DARK_CURRENT
 from pipeline.simulator.effects.defects import DEFECTS, dead_elements, hot_electrons
 from pipeline.simulator.effects.quantisation import QUANTISATION
 from pipeline.simulator.effects.read_noise import READ_NOISE
@@ -72,7 +72,6 @@ def test_a_dim_scene_at_1_s_needs_dark_current() -> None:
     assert bound.value > 8
     assert bound.why == "200 e- in 1000 ms at 25 deg C, beside 24.5 e- of noise"
     assert DARK_CURRENT.bound(probe(200, 400), Rig(detector=Detector(temperature_deg_c=-30.0))).value < TOLERANCE
-    assert dark_electrons(Rig(detector=Detector(temperature_deg_c=32.0))) == pytest.approx(40)
 
 
 @pytest.mark.parametrize("unit", ["sigma", "dn"])

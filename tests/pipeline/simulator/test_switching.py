@@ -24,7 +24,7 @@ from pipeline.simulator.options import SAFETY
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.render import expected_light
-from pipeline.simulator.rig_model import Air, Detector, Optics, Rig, Sky
+from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.survey_probe import noise_electrons, probe_scene
 from pipeline.simulator.verification import verify
@@ -81,7 +81,7 @@ def rig_of(*, exposure_ms: float = 100.0, **parts: object) -> Rig:
 
 FLAT = Case()
 NOISELESS = Case(rig=rig_of(detector=Detector(noiseless=True)))
-BRIGHT_FLAT = Case(BRIGHT)
+BRIGHT_FLAT = Case(BRIGHT, rig=rig_of(mirror=MirrorMotion(coating="ideal")))  # which else takes the tolerance
 DIM_1_S = Case(DIM, rig=rig_of(exposure_ms=1000.0))
 FAST = Case(texture=0.01, rig=rig_of(exposure_ms=3.0))
 SLOW = Case(texture=0.01)
