@@ -21,7 +21,6 @@ from pipeline.rig.refusals import DeadlinePassed, DeviceGone, DeviceRefused
 
 LOG = logging.getLogger(__name__)
 NOT_LOGGED_IN = 530  # of FTP: user or password is not taken, whatever file is asked for
-MOST_DAMAGED = 8  # transfers of one file; more mean that the line, or the camera, is not to be used
 
 
 def fetch_files(
@@ -105,7 +104,7 @@ class _Fetch:
                 raise error
         elif isinstance(error, DamagedTransfer):
             self.damaged += 1
-            if failed >= self.server.tries or self.damaged >= MOST_DAMAGED or late:
+            if self.damaged >= 2 * self.server.tries or late:  # it may be dropped and begun anew meanwhile
                 self._drop(error)
                 raise RigError(str(error)) from error
         elif failed >= self.server.tries or late:
