@@ -71,7 +71,9 @@ class Hostile:
         came = b""
         while not self._ended.is_set():
             with suppress(TimeoutError):
+                line.settimeout(0.05)
                 data = line.recv(4096)
+                line.settimeout(2.0)
                 if not data:
                     return
                 came += data
@@ -90,7 +92,7 @@ class Hostile:
                 self._start(self._talk, line)
 
     def _talk(self, line: socket.socket) -> None:
-        line.settimeout(0.5)
+        line.settimeout(2.0)
         with line, suppress(OSError):
             self.talk(line)
 
@@ -119,7 +121,7 @@ class HostileFiles(Hostile):
                 self.say(line, self.says.get(name, [b"502 what?\r\n"]))
                 if name == "RETR":
                     with transfers.accept()[0] as transfer:
-                        transfer.settimeout(0.5)
+                        transfer.settimeout(2.0)
                         self.say(transfer, self.data)
                     self.say(line, self.end)
 
