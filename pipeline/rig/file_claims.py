@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pipeline.errors import RigError
 from pipeline.rig.kept_files import RemoteFile
 
-MOST_TEXT = 1 << 24  # bytes of a header, a frame index or another text: an index of half a million frames
+MOST_TEXT = 1 << 26  # bytes of a header, a frame index or another text: an index of two million frames
 MOST_OFFSET = 1 << 16  # bytes before the first frame of a cube; cameras write none
 MOST_REFERENCE_FRAMES = 2048
 MOST_FILES = 4096
