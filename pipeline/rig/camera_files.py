@@ -104,7 +104,7 @@ class _Fetch:
                 raise error
         elif isinstance(error, DamagedTransfer):
             self.damaged += 1
-            if self.damaged >= 2 * self.server.tries or late:  # it may be dropped and begun anew meanwhile
+            if self.damaged >= 2 * self.server.tries - 1 or late:  # it may be dropped and begun anew meanwhile
                 self._drop(error)
                 raise RigError(str(error)) from error
         elif failed >= self.server.tries or late:
