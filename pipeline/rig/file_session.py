@@ -64,7 +64,7 @@ class FileSession(ftplib.FTP):
 
     def log_in(self) -> None:
         """Connect, greet and log in, all within ``stall_s`` once the server is there."""
-        self._together, self._until = True, time.monotonic() + 2 * self.server.stall_s
+        self._together = True
         self.connect(self.server.host, self.server.port)
         self.login(self.server.user, self.server.password)
         self.voidcmd("TYPE I")
@@ -130,7 +130,7 @@ class FileSession(ftplib.FTP):
 
     def getresp(self) -> str:
         """Read a reply, within ``stall_s``."""
-        if not self._together:
+        if not (self._together and self._until):
             self._until = time.monotonic() + self.server.stall_s
         self._most = MOST_REPLY
         return super().getresp()

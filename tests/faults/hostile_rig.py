@@ -8,7 +8,6 @@ and no survey through a line that puts in, doubles or cuts out bytes ends with o
 from __future__ import annotations
 
 import argparse
-import itertools
 import logging
 import resource
 import socket
@@ -147,10 +146,7 @@ class HostileMirror(Hostile):
     def talk(self, line: socket.socket) -> None:
         """Answer, line by line or frame by frame."""
         self.say(line, random_pieces(self.rng, b"", 0.8))
-        for count in itertools.count():
-            line.settimeout(3.0)
-            if not line.recv(4096):
-                return
+        for count, _ in enumerate(self.words(line)):
             valid = SPEAKS[0] if count == 0 else SPEAKS[int(self.rng.integers(len(SPEAKS)))]
             self.say(line, random_pieces(self.rng, valid))
 

@@ -66,9 +66,8 @@ class Hostile:
             else:
                 self._ended.wait(piece)
 
-    def lines(self, line: socket.socket, end: bytes) -> Iterator[str]:
-        """What the client says, up to each line's end."""
-        came = b""
+    def words(self, line: socket.socket) -> Iterator[bytes]:
+        """What the client says, as it comes, until it hangs up or the test is over."""
         while not self._ended.is_set():
             with suppress(TimeoutError):
                 line.settimeout(0.05)
@@ -76,7 +75,13 @@ class Hostile:
                 line.settimeout(2.0)
                 if not data:
                     return
-                came += data
+                yield data
+
+    def lines(self, line: socket.socket, end: bytes) -> Iterator[str]:
+        """What the client says, up to each line's end."""
+        came = b""
+        for data in self.words(line):
+            came += data
             while end in came:
                 said, _, came = came.partition(end)
                 yield said.decode(errors="replace")
