@@ -37,6 +37,8 @@ RIG: dict[str, Parser] = {
     "password": parse_text,
     "connect_s": parse_number(Span(0.1, 60, "s")),
     "stall_s": parse_number(Span(0.1, 600, "s")),
+    "least_kb_s": parse_number(Span(0.001, 1e6, "kb_s")),
+    "read_twice": parse_switch,
     "pulses": parse_choice(("position", "frame", "none")),
     "log_pulses": parse_switch,
     "settle_s": parse_number(Span(0.01, 60, "s")),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -12,7 +13,7 @@ from pathlib import Path
 from rich.console import Console
 
 from flows.field_schedule import FieldSchedule
-from flows.schedule_lock import RigLock, rig_lock
+from flows.schedule_lock import RigLock, hold_place, rig_lock
 from flows.schedule_state import moment_words
 from flows.schedule_times import Timetable
 from flows.settings import Settings, load_settings
@@ -120,7 +121,7 @@ def alone_on(fields: Sequence[ServedField]) -> Iterator[None]:
     RigError : another serves one of the rigs.
     """
     roots: Mapping[Path, str] = {one.archive: str(one.settings.out) for one in fields}
-    rigs = {one.lock().path: one.settings.rig.port for one in fields if one.settings.source == "rig"}
+    rigs = {one.lock().of_servers(): one.settings.rig.port for one in fields if one.settings.source == "rig"}
     with ExitStack() as held:
         for root, name in roots.items():
             release = take_lock(root / ".locks" / "serve.lock", wait=False)
@@ -129,19 +130,13 @@ def alone_on(fields: Sequence[ServedField]) -> Iterator[None]:
                     f"another serve works on the archive {name}: give all its fields to that one, or end it first"
                 )
             held.callback(release)
-        for path, port in rigs.items():
-            held.callback(_alone_on_rig(path.with_suffix(".serve"), str(port)))
+        for place, port in rigs.items():
+            held.callback(_alone_on_rig(place, port))
         yield
 
 
-def _alone_on_rig(path: Path, port: str) -> Callable[[], None]:
-    try:
-        release = take_lock(path, wait=False)
-    except OSError as error:
-        raise RigError(
-            f"cannot use the lock {path}: {error.strerror}; it may belong to another user: end that user's serve, or "
-            f"remove the file when there is none"
-        ) from error
+def _alone_on_rig(place: Path | str, port: str) -> Callable[[], None]:
+    release = hold_place(place, f"a serve (process {os.getpid()})")
     if release is None:
         raise RigError(f"another serve uses the rig at {port}: give all its fields to that one, or end it first")
     return release

@@ -102,12 +102,12 @@ class Watcher:
 
     def busy(self) -> bool:
         """Whether another survey would have to wait: all rigs are in use, or as much runs as may run at a time."""
-        rigs: dict[Path, RigLock] = {}
+        rigs: dict[Path | str, RigLock] = {}
         archives: set[Path] = set()
         for one in self.request.fields:
             with self._errors(one.name):
                 lock = one.lock()
-                rigs[lock.path] = lock
+                rigs[lock.place] = lock
                 archives.add(one.archive)
         looking = sum(self._is_in_use(lock) for lock in rigs.values())
         reprocessing = sum(self._is_reprocessed(archive) for archive in archives)

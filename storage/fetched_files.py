@@ -1,8 +1,9 @@
 """Camera files on their way here, in a folder: what has come stays, whatever ends the transfer, and goes on there.
 
 A file of the camera is named by its whole path there, notes about the files by a name alone. Bytes are written at the
-end and nowhere else. Notes are on the disk when ``append`` returns; of files so is all but the last ``SYNC_BYTES``,
-since the camera still has them. The end of what is held is compared when a transfer goes on.
+end and nowhere else; a file that came damaged goes as a whole. Notes are on the disk when ``append`` returns; of files
+so is all but the last ``SYNC_BYTES``, since the camera still has them. What is held is compared when a transfer goes
+on.
 """
 
 from __future__ import annotations
@@ -79,6 +80,22 @@ class FetchedFiles:
                 f"rights and run again: the {before} bytes before it are kept, and the camera still has the file"
             ) from error
 
+    def drop(self, name: str) -> None:
+        """Hold no byte of a file any more.
+
+        Raises
+        ------
+        NotKept : the disk refuses.
+        """
+        path = self._path(name)
+        try:
+            path.unlink(missing_ok=True)
+            self._unsynced.pop(name, None)
+        except OSError as error:
+            raise NotKept(
+                f"cannot remove {path}: {error.strerror or error}; mend the disk and run again: the camera still has it"
+            ) from error
+
     def _path(self, name: str) -> Path:
         named = quote(name.strip("/"), safe="")
         if not named or len(named) > _LONGEST:
@@ -96,4 +113,4 @@ def _cut(path: Path, size: int) -> None:
     try:
         os.truncate(path, size)
     except OSError:
-        return  # the end is compared when the transfer goes on
+        return  # what is held is compared when the transfer goes on

@@ -60,7 +60,7 @@ class Ledger:
         with refusals(self._root, "write to the archive"):
             fresh = not self.path.exists()
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
+            descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
             try:
                 _write_at_end(descriptor, content)
             finally:

@@ -10,6 +10,7 @@ import os
 import re
 import secrets
 import shutil
+import stat
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -30,7 +31,9 @@ _ADVICE = {
     errno.EFBIG: "a file may not grow so large here: raise ulimit -f, or choose an --out on another file system",
     errno.EMFILE: "too many files are open: raise ulimit -n",
     errno.ENOLCK: "the file system has no locks: choose an --out on a local disk",
+    errno.ELOOP: "a link stands where a file of its own belongs: see where it leads, remove it and run again",
 }
+_OF_LOCKS = (".locks", ".in-use")  # folders of an archive that hold nothing else
 
 log = logging.getLogger(__name__)
 
@@ -122,23 +125,62 @@ def file_hash(path: Path) -> str:
     return digest.hexdigest()
 
 
-def take_lock(path: Path, *, wait: bool = True, shared: bool = False) -> Callable[[], None] | None:
+def take_lock(
+    path: Path, *, wait: bool = True, shared: bool = False, words: str = ""
+) -> Callable[[], None] | None:  # fmt: skip
     """Hold ``path`` against other processes and threads until the function returned is called, or the process dies.
 
     None where another holds it and ``wait`` is false. Holders of a ``shared`` lock keep out only those that want it
-    for themselves. The file goes away with a lock that is not shared; letting go twice is harmless.
+    for themselves. The file goes away with a lock that is not shared; letting go twice is harmless. ``words`` are
+    written into it for others to read, as far as the disk takes them.
+
+    Raises
+    ------
+    ArchiveError : a link, or something else than a file, is in its place: what it leads to is not touched.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     while True:
         with ExitStack() as held:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+            descriptor = _open_lock(path)
             held.callback(os.close, descriptor)
             if not _lock(descriptor, path, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, wait=wait):
                 return None
             if _is_still(descriptor, path):
                 if not shared:  # else another may hold it yet
                     held.callback(_drop_name, path)  # called before the lock is let go
+                if words:
+                    _write_words(descriptor, words)
                 return held.pop_all().close
+
+
+def _open_lock(path: Path) -> int:
+    """Open a lock's file, made where it is missing, and never through a link."""
+    if path.parent.name in _OF_LOCKS and path.parent.is_symlink():
+        raise _misplaced(path.parent, "a folder")
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise _misplaced(path, "a lock file") from error
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise ArchiveError(f"{path} is no file, expected a lock file; see what it is, remove it and run again")
+    return descriptor
+
+
+def _misplaced(path: Path, expected: str) -> ArchiveError:
+    return ArchiveError(
+        f"{path} is a link, expected {expected} of its own; see where it leads and who made it, remove it and run again"
+    )
+
+
+def _write_words(descriptor: int, words: str) -> None:
+    """Replace what a lock's file says; one that has another name too may be somebody's file, and is left as it is."""
+    with suppress(OSError):  # a full disk keeps nobody from holding a lock
+        if os.fstat(descriptor).st_nlink == 1:
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, words.encode(), 0)
 
 
 def _drop_name(path: Path) -> None:
@@ -150,7 +192,7 @@ def _drop_name(path: Path) -> None:
 def _is_still(descriptor: int, path: Path) -> bool:
     """Whether an open file has its name yet: whoever held the lock before may have taken it away."""
     try:
-        return os.path.samestat(path.stat(), os.fstat(descriptor))
+        return os.path.samestat(path.lstat(), os.fstat(descriptor))
     except FileNotFoundError:
         return False
 

@@ -21,6 +21,7 @@ _PART = re.compile(r"raw_(\d{1,12})", re.IGNORECASE)
 _INDEX = re.compile(r"frameindex_(\d{1,12})\.txt", re.IGNORECASE)
 _REFERENCE = re.compile(r"(dark|white)[A-Za-z_]*", re.IGNORECASE)
 MOST_MISSING = 100_000  # lines between two parts; more means that the names are wrong
+MOST_NUMBERS = 1 << 26  # of a line: a hundred times those of any such camera
 
 Read = Callable[[str], bytes]  # the content of a file by its name
 
@@ -81,6 +82,8 @@ def parse_cube_header(text: str, where: str) -> CubeHeader:
     samples, lines, bands = (_whole(fields, key, where) for key in ("samples", "lines", "bands"))
     if not samples or not bands:
         raise RigError(f"{where}: {samples} samples and {bands} bands; expected at least one of each")
+    if samples * bands > MOST_NUMBERS:
+        raise RigError(f"{where}: {samples} samples and {bands} bands; no camera has so many, fetch it again")
     order = _whole(fields | {"byte order": fields.get("byte order", "0")}, "byte order", where)
     if order > 1:
         raise RigError(f"{where}: byte order = {order}, expected 0 or 1")
@@ -108,7 +111,7 @@ def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
 
     Raises
     ------
-    RigError : there is no line, a header is missing or wrong, or the files do not belong together.
+    RigError : there is no line, a header is missing, wrong or promises less, or the files do not belong together.
     """
     by_name = {name.rsplit("/", 1)[-1]: name for name in names}
     firsts = sorted(int(match[1]) for name in by_name if (match := _PART.fullmatch(name)))
@@ -147,7 +150,7 @@ def read_references(names: Iterable[str], read: Read) -> dict[str, CubeLines]:
 
     Raises
     ------
-    RigError : one has no header, or a wrong one, or there are two of a kind.
+    RigError : one has no header, a wrong one, or frames less or more, or there are two of a kind.
     """
     by_name = {name.rsplit("/", 1)[-1]: name for name in names}
     found: dict[str, CubeLines] = {}
@@ -157,7 +160,12 @@ def read_references(names: Iterable[str], read: Read) -> dict[str, CubeLines]:
             continue
         if match[1].lower() in found:
             raise RigError(f"two {match[1].lower()} references among {', '.join(sorted(by_name))}; keep one of them")
-        found[match[1].lower()] = _read_cube(by_name, name, read)
+        found[match[1].lower()] = cube = _read_cube(by_name, name, read)
+        if cube.lost:
+            raise RigError(
+                f"{by_name[name]} holds {len(cube.values)} whole frames, its header says "
+                f"{len(cube.values) + cube.lost}; take both references again"
+            )
     return found
 
 
@@ -165,8 +173,12 @@ def _read_cube(by_name: Mapping[str, str], name: str, read: Read) -> CubeLines:
     header = next((found for found in by_name if found.lower() == name.lower() + ".hdr"), None)
     if header is None:
         raise RigError(f"{by_name[name]} has no header {name}.hdr beside it; fetch the folder again")
-    text = read(by_name[header]).decode("utf-8", errors="replace")
-    return cube_lines(parse_cube_header(text, by_name[header]), read(by_name[name]))
+    found = parse_cube_header(read(by_name[header]).decode("utf-8", errors="replace"), by_name[header])
+    data = read(by_name[name])
+    promised = found.offset + found.lines * found.line_bytes
+    if len(data) > promised:
+        raise RigError(f"{by_name[name]} has {len(data)} bytes, its header says {promised}; is it another file's?")
+    return cube_lines(found, data)
 
 
 def _named(by_name: Mapping[str, str], pattern: re.Pattern[str], number: int) -> str:

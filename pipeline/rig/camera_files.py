@@ -1,35 +1,26 @@
-"""Files of the camera over FTP: fetched in order, continued where an earlier try ended, their sizes checked."""
+"""Files of the camera over FTP: fetched in order, continued where an earlier try ended, and every byte read twice.
+
+FTP says nothing of what is in a file, so one that came with bytes lost, doubled or put in between can have the right
+size. What is held is therefore read again and compared before it counts, and dropped whole where it differs from two
+readings. What the camera itself gives alike twice cannot be doubted here.
+"""
 
 from __future__ import annotations
 
-import ftplib
 import logging
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import time
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 from pipeline.errors import RigError
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
-from pipeline.rig.kept_files import Kept, Progress, RemoteFile
+from pipeline.rig.file_session import DamagedTransfer, FileServer, FileSession, open_session
+from pipeline.rig.kept_files import Kept, Progress, RemoteFile, check_remote_name
 from pipeline.rig.refusals import DeadlinePassed, DeviceGone, DeviceRefused
 
 LOG = logging.getLogger(__name__)
 NOT_LOGGED_IN = 530  # of FTP: user or password is not taken, whatever file is asked for
-
-
-@dataclass(frozen=True)
-class FileServer:
-    """The camera's FTP server, and how long it is waited for. User and password as public programs use them."""
-
-    host: str = "10.0.65.50"
-    port: int = 21
-    user: str = "ftpuser"
-    password: str = "ftpuser"
-    stall_s: float = 10.0  # of silence, after which the server counts as gone
-    tries: int = 3  # without a byte gained in between
-    pause_s: float = 1.0
-    block: int = 1 << 16  # bytes handed over at a time
-    overlap: int = 4096  # last bytes held that are fetched again, to see that it is the same file
 
 
 def fetch_files(
@@ -38,17 +29,18 @@ def fetch_files(
 ) -> None:  # fmt: skip
     """Fetch files one after the other until ``kept`` holds them whole.
 
-    What is held already is continued after a look at its last bytes. A transfer that breaks off is taken up again;
-    what has come stays in ``kept`` however this ends, and a later call goes on from there.
+    What is held from an earlier call is compared before anything is added to it. A transfer that breaks off is taken
+    up again; what has come stays in ``kept`` however this ends, unless it is damaged, and a later call goes on there.
 
     Raises
     ------
-    RigError : a file is not the one of which a part is held, or its size is not that of the listing.
+    RigError : a file is not the one of which a part is held, is larger than it can be, or comes damaged each time.
     DeviceRefused : the server does not give a file, or takes another password.
-    DeadlinePassed, DeviceGone : ``server.tries`` tries in a row brought nothing.
+    DeadlinePassed, DeviceGone : ``server.tries`` tries in a row brought nothing, or all of them took too long.
     """
     for file in files:
-        _fetch(server, file, kept, progress, clock)
+        check_remote_name(file.name)
+        _Fetch(server, file, kept, progress, clock).run()
 
 
 def log_in(server: FileServer) -> str:
@@ -58,123 +50,148 @@ def log_in(server: FileServer) -> str:
     ------
     DeviceRefused : it takes another password. RigError : no FTP. DeadlinePassed, DeviceGone : it is not there.
     """
-    with _session(server) as session:
-        return session.getwelcome().removeprefix("220").strip() or "logged in"
-
-
-def _fetch(server: FileServer, file: RemoteFile, kept: Kept, progress: Progress | None, clock: Clock) -> None:
-    failed = 0
-    while True:
-        held = kept.size(file.name)
-        try:
-            with _session(server) as session:
-                _fetch_once(session, server, file, kept, progress)
-            return
-        except RigError as error:
-            if not isinstance(error, DeadlinePassed | DeviceGone):
-                raise
-            failed = 0 if kept.size(file.name) > held else failed
-            failed += 1
-            if failed >= server.tries:
-                raise type(error)(
-                    f"{error}; {kept.size(file.name)} bytes of {file.name} are kept, and fetching again goes on there"
-                ) from error
-            LOG.info("%s; going on at byte %d of %s", error, kept.size(file.name), file.name)
-            clock.sleep(server.pause_s)
-
-
-def _fetch_once(
-    session: ftplib.FTP, server: FileServer, file: RemoteFile, kept: Kept, progress: Progress | None
-) -> None:
-    """Bring one file from what is held to its whole size, in one transfer."""
-    size = _whole_size(session, file)
-    held = kept.size(file.name)
-    if held > size:
-        raise RigError(
-            f"{held} bytes of {file.name} are held, the camera's file has {size}: it is another one; take what is held "
-            "away and fetch again"
-        )
-    start = max(held - server.overlap, 0)
-    check = kept.read(file.name, start, held)
-    if progress is not None:
-        progress(file.name, held, size)
-    if size == 0:
-        kept.append(file.name, b"")
-    if held == size and not check:
-        return
-    for data in _transfer(session, file.name, start, size, server.block):
-        same = min(len(check), len(data))
-        if data[:same] != check[:same]:
-            raise RigError(
-                f"the bytes of {file.name} before byte {held} differ from those held: it is another file; take what is "
-                "held away and fetch again"
-            )
-        check = check[same:]
-        if same < len(data):
-            kept.append(file.name, data[same:])
-            if progress is not None:
-                progress(file.name, kept.size(file.name), size)
-
-
-def _whole_size(session: ftplib.FTP, file: RemoteFile) -> int:
-    """Size by the server; the listing must agree, or the file still grows."""
-    size = session.size(file.name)
-    if size is None:
-        size = file.size
-    if size is None:
-        raise RigError(f"neither the listing nor SIZE tells how long {file.name} is; fetch it by hand")
-    if file.size is not None and file.size != size:
-        raise RigError(
-            f"{file.name} has {size} bytes, {file.size} when it was listed; is the capture still running? "
-            "Fetch when it has ended"
-        )
-    return size
-
-
-def _transfer(session: ftplib.FTP, name: str, start: int, size: int, block: int) -> Iterator[bytes]:
-    """Bytes of a file from ``start`` to its end, and not one beyond ``size``."""
-    reached = start
-    with session.transfercmd(f"RETR {name}", start or None) as connection:
-        while data := connection.recv(block):
-            reached += len(data)
-            if reached > size:
-                raise RigError(f"{name} goes on after its {size} bytes; is the capture still running?")
-            yield data
-    session.voidresp()
-    if reached < size:
-        raise DeviceGone(f"the transfer of {name} ended at byte {reached} of {size}")
-
-
-@contextmanager
-def _session(server: FileServer) -> Iterator[ftplib.FTP]:
-    """A session that is logged in; what goes wrong inside is told in our words."""
-    where = f"the camera's file server {server.host}:{server.port}"
-    session = ftplib.FTP(timeout=server.stall_s, encoding="utf-8")
     try:
-        session.connect(server.host, server.port)
-        session.login(server.user, server.password)
-        session.voidcmd("TYPE I")
-        yield session
-        session.close()
-    except TimeoutError as error:
-        raise DeadlinePassed(f"{where} was silent for {server.stall_s:g} s; is it on?") from error
-    except ftplib.error_perm as error:
-        raise DeviceRefused(
-            f"{where} refused: {error}; look at user and password, and whether the file is there", _code(error)
-        ) from error
-    except ftplib.error_temp as error:
-        raise DeviceGone(f"{where} broke off: {error}") from error
-    except ftplib.Error as error:
-        raise RigError(f"{where} answered {str(error)!r:.200}, which is no FTP; check host and port") from error
-    except (RigError, GeneratorExit):
-        raise
-    except (OSError, EOFError) as error:
-        why = str(error) or "connection closed"
-        raise DeviceGone(f"{where} is not there or went away ({why}); is it on?") from error
-    finally:
-        session.close()
+        with open_session(server) as session:
+            return session.getwelcome().removeprefix("220").strip() or "logged in"
+    except DamagedTransfer as error:
+        raise RigError(str(error)) from error
 
 
-def _code(error: ftplib.Error) -> int | None:
-    digits = str(error)[:3]
-    return int(digits) if digits.isdigit() else None
+@dataclass
+class _Fetch:
+    """One file on its way. Of the bytes that are held the first ``sure`` ones came alike twice."""
+
+    server: FileServer
+    file: RemoteFile
+    kept: Kept
+    progress: Progress | None
+    clock: Clock
+    sure: int = 0
+    doubted: tuple[int, int] = (-1, 0)  # the first byte that came differently, and how often in a row
+    damaged: int = 0
+    refused: int = 0
+
+    def __post_init__(self) -> None:
+        self.earlier = self.held  # by another call, maybe of another file of that name
+        self.began = time.monotonic()
+
+    @property
+    def held(self) -> int:
+        """Bytes that are kept."""
+        return self.kept.size(self.file.name)
+
+    def run(self) -> None:
+        """Read until the file is whole and sure, again where a session breaks off."""
+        failed = 0
+        while True:
+            before = (self.held, self.sure)
+            try:
+                with open_session(self.server) as session:
+                    self._go_on(session)
+                return
+            except (DamagedTransfer, DeadlinePassed, DeviceGone, DeviceRefused) as error:
+                failed = 1 if (self.held, self.sure) > before else failed + 1
+                self._judge(error, failed)
+                LOG.info("%s; going on at byte %d of %s", error, self.held, self.file.name)
+                self.clock.sleep(self.server.pause_s)
+
+    def _judge(self, error: RigError, failed: int) -> None:
+        """Raise what ends the fetching; nothing where the file may be asked for again."""
+        late = time.monotonic() - self.began > self.server.most_s(self.file.size or self.held)
+        if isinstance(error, DeviceRefused):
+            self.refused += 1
+            if self.refused > 1 or late:  # once more: the words may have been damaged on their way there
+                raise error
+        elif isinstance(error, DamagedTransfer):
+            self.damaged += 1
+            if self.damaged >= 2 * self.server.tries - 1 or late:  # it may be dropped and begun anew meanwhile
+                self._drop(error)
+                raise RigError(str(error)) from error
+        elif failed >= self.server.tries or late:
+            raise type(error)(
+                f"{error}; {self.held} bytes of {self.file.name} are kept, and fetching again goes on there"
+            ) from error
+
+    def _go_on(self, session: FileSession) -> None:
+        size = self._whole_size(session)
+        if self.held > size:
+            self._drop(
+                RigError(
+                    f"{self.held} bytes of {self.file.name} are held, the camera's file has {size}: it is another one; "
+                    "take what is held away and fetch again"
+                )
+            )
+        if self.progress is not None:
+            self.progress(self.file.name, self.held, size)
+        if size == 0:
+            self.kept.append(self.file.name, b"")
+        while self.sure < size:
+            held = self.held
+            try:
+                self._read(session, held, size)
+            except DamagedTransfer as error:
+                if self.held > held:  # what this reading brought may lie beside its place
+                    self._drop(error)
+                raise
+            self.sure = held if self.server.read_twice else size
+
+    def _read(self, session: FileSession, held: int, size: int) -> None:
+        """Read once from where nothing is sure: compare with what is held, and add what is beyond it."""
+        at = self.sure if self.server.read_twice else max(held - self.server.overlap, 0)
+        with closing(session.pieces(self.file.name, at, size)) as pieces:
+            for data in pieces:
+                same = min(len(data), max(held - at, 0))
+                known = self.kept.read(self.file.name, at, at + same)
+                if data[:same] != known:
+                    self._differ(at + next(i for i in range(same) if data[i] != known[i]), held)
+                if self.server.read_twice:
+                    self.sure = max(self.sure, min(at + same, held))
+                at += len(data)
+                if same < len(data):
+                    self._keep(data[same:], size)
+
+    def _keep(self, data: bytes, size: int) -> None:
+        self.kept.append(self.file.name, data)
+        if self.progress is not None:
+            self.progress(self.file.name, self.held, size)
+
+    def _differ(self, at: int, held: int) -> None:
+        """Doubt this reading where it differs from what is held; where the next one does too, what is held goes."""
+        self.doubted = (at, self.doubted[1] + 1 if self.doubted[0] == at else 1)
+        if self.doubted[1] > 1 or not self.server.read_twice:
+            self._drop(
+                RigError(
+                    f"the bytes of {self.file.name} before byte {held} differ from those held: it is another file; "
+                    "take what is held away and fetch again"
+                )
+            )
+        raise DamagedTransfer(
+            f"byte {at} of {self.file.name} came differently each time; look at the network between here and the "
+            "camera, then run again"
+        )
+
+    def _drop(self, error: RigError) -> None:
+        """Hold nothing of the file any more, unless it is of an earlier call and may be of another file: then raise."""
+        if self.sure < self.earlier:
+            raise RigError(str(error)) from error
+        self.kept.drop(self.file.name)
+        self.sure = self.earlier = 0
+
+    def _whole_size(self, session: FileSession) -> int:
+        """Size by the server; the listing must agree, or the file still grows."""
+        listed, most = self.file.size, self.file.most
+        told = session.size_of(self.file.name)
+        size = listed if told is None else told
+        if size is None:
+            raise RigError(f"neither the listing nor SIZE tells how long {self.file.name} is; fetch it by hand")
+        if listed is not None and listed != size:
+            raise DamagedTransfer(
+                f"{self.file.name} has {size} bytes, {listed} when it was listed; is the capture still running? "
+                "Fetch when it has ended"
+            )
+        if most is not None and size > most:
+            raise RigError(
+                f"{self.file.name} is said to have {size} bytes, expected {most} at most; nothing of it is fetched: "
+                "look at what the camera wrote"
+            )
+        return size

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Any
 
 from pipeline.errors import RigError
 from pipeline.rig.headwall_replies import Said
-from pipeline.rig.kept_files import RemoteFile
+from pipeline.rig.kept_files import RemoteFile, check_remote_name
 from pipeline.rig.refusals import DeviceRefused
 
 # words of a refusal -> what to do about it
@@ -22,6 +23,11 @@ _REMEDIES = (
 )
 
 
+_UNFIT = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
+_LONGEST_REASON = 300
+TIMES_ALIKE = 0.01  # of a time: cameras round them to what their clock gives
+
+
 class MisfitError(Exception):
     """A response that is no answer to this command."""
 
@@ -29,6 +35,19 @@ class MisfitError(Exception):
 def other_command(said: Said, name: str) -> str:
     """Why this is no reply to the command; empty where it may be one."""
     return f"a reply to {said.command}" if said.command not in ("", name) else ""
+
+
+def check_repeated(said: Said, sent: str, port: str) -> None:
+    """Refuse a reply to other words than were sent: they, or those that came back, were damaged on their way.
+
+    Raises
+    ------
+    RigError : the camera repeats a command with its argument, and it is another one.
+    """
+    if "(" in said.echo and said.echo.split() != sent.split():
+        raise RigError(
+            f"{port} took {said.echo[:200]!r}, sent was {sent[:200]!r}; look at the network between here and the camera"
+        )
 
 
 def response_of(said: Said, name: str, port: str) -> Any:
@@ -46,7 +65,7 @@ def response_of(said: Said, name: str, port: str) -> Any:
     if not isinstance(success, bool):
         raise RigError(f"{port} answered {name} with {said.text[:200]!r}, expected success true or false")
     if not success:
-        words = str(said.reply.get("errorMessage") or "no reason given")
+        words = _UNFIT.sub("?", str(said.reply.get("errorMessage") or "no reason given"))[:_LONGEST_REASON]
         lower = words.lower()
         remedy = next(
             (what for keys, what in _REMEDIES if any(key in lower for key in keys)), "see the camera's manual"
@@ -65,7 +84,24 @@ def as_folder(response: Any) -> str:
     folder = response.get("folder") if isinstance(response, dict) else None
     if not isinstance(folder, str) or not folder:
         raise MisfitError("a reply without a folder")
+    check_remote_name(folder)
     return folder
+
+
+def check_times_set(response: Any, asked_ms: Mapping[str, float]) -> None:
+    """Compare the times that were set, as far as the response tells them, with those that were asked for. [ms]
+
+    Raises
+    ------
+    RigError : another time was set.
+    """
+    told = response if isinstance(response, dict) else {}
+    for name, wanted in asked_ms.items():
+        found = told.get(name, wanted)
+        if not isinstance(found, int | float) or not abs(found - wanted) <= TIMES_ALIKE * wanted:
+            raise RigError(
+                f"the camera set {name} to {found!r:.40} ms, asked was {wanted:g} ms; give a time that it takes"
+            )
 
 
 def as_truth(response: Any) -> bool:
@@ -91,7 +127,7 @@ def as_listing(response: Any) -> list[RemoteFile]:
 
     Raises
     ------
-    MisfitError : this answers another command.
+    MisfitError : this answers another command. RigError : a name cannot be asked for.
     """
     if not isinstance(response, list):
         raise MisfitError("a reply that is no list")
@@ -100,6 +136,7 @@ def as_listing(response: Any) -> list[RemoteFile]:
         name = entry.get("name") if isinstance(entry, dict) else None
         if not isinstance(name, str):
             raise MisfitError("a list of something else than files")
+        check_remote_name(name)
         found.append(RemoteFile(re.sub("/{2,}", "/", name), _size(entry.get("size")), bool(entry.get("isDirectory"))))
     return sorted(found, key=lambda entry: entry.name)
 
@@ -107,5 +144,5 @@ def as_listing(response: Any) -> list[RemoteFile]:
 def _size(value: Any) -> int | None:
     try:
         return max(int(value), 0)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 
 from pipeline.errors import RigError
 from pipeline.rig.camera_cubes import CapturedLines, Read, read_capture, read_references
-from pipeline.rig.camera_files import FileServer, fetch_files
+from pipeline.rig.camera_files import fetch_files
 from pipeline.rig.camera_limits import CameraLimits
 from pipeline.rig.camera_references import MeanFrame, mean_frame
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
+from pipeline.rig.file_claims import FrameClaim, bounded
+from pipeline.rig.file_session import FileServer
 from pipeline.rig.headwall_control import ControlPatience, HeadwallControl
 from pipeline.rig.kept_files import Kept, Progress, RemoteFile
 from pipeline.rig.line_camera import Capture
@@ -61,26 +63,28 @@ class HeadwallCamera:
         """End a capture; False where none ran."""
         return self.control.stop_capture()
 
-    def fetch(self, folder: str, kept: Kept, progress: Progress | None = None) -> CapturedLines:
+    def fetch(
+        self, folder: str, kept: Kept, progress: Progress | None = None, *, claim: FrameClaim | None = None
+    ) -> CapturedLines:
         """Get a finished capture's files, small ones first, and give its lines; a later call continues.
 
         Raises
         ------
-        RigError : the capture still runs, or its files do not belong together.
+        RigError : the capture still runs, its files do not belong together, or are larger than ``claim`` lets them be.
         DeviceRefused, DeadlinePassed, DeviceGone
         """
-        files = self._finished(folder)
+        files = self._finished(folder, claim)
         fetch_files(self.server, sorted(files, key=_rawness), kept, progress, clock=self.clock)
         return read_capture([file.name for file in files], _reader(kept))
 
-    def references(self, folder: str, kept: Kept) -> dict[str, MeanFrame]:
+    def references(self, folder: str, kept: Kept, *, claim: FrameClaim | None = None) -> dict[str, MeanFrame]:
         """Mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``; empty without any.
 
         Raises
         ------
         RigError, DeviceRefused, DeadlinePassed, DeviceGone
         """
-        files = [file for file in self._finished(folder) if _base(file).lower().startswith(("dark", "white"))]
+        files = [file for file in self._finished(folder, claim) if _base(file).lower().startswith(("dark", "white"))]
         fetch_files(self.server, files, kept, clock=self.clock)
         cubes = read_references([file.name for file in files], _reader(kept))
         return {kind: mean_frame(cube.values) for kind, cube in cubes.items()}
@@ -89,10 +93,17 @@ class HeadwallCamera:
         """Hang up; a capture goes on."""
         self.control.close()
 
-    def _finished(self, folder: str) -> list[RemoteFile]:
+    def _finished(self, folder: str, claim: FrameClaim | None) -> list[RemoteFile]:
+        """Files of a folder, as two listings in a row have them: one that lost an entry on its way looks whole."""
         if self.is_capturing():
             raise RigError(f"a capture still runs, so files of {folder} may grow; wait for its end, or stop it")
-        return [file for file in self.control.list_files(folder) if not file.folder]
+        listed = self.control.list_files(folder)
+        for _ in range(self.control.patience.retries + 1):
+            before, listed = listed, self.control.list_files(folder)
+            if listed == before:
+                files = [file for file in listed if not file.folder]
+                return files if claim is None else bounded(files, claim)
+        raise RigError(f"{folder} was listed differently each time; look at the camera's network, then run again")
 
 
 def _base(file: RemoteFile) -> str:

@@ -17,6 +17,8 @@ from pipeline.rig.headwall_answers import (
     as_listing,
     as_stopped,
     as_truth,
+    check_repeated,
+    check_times_set,
     other_command,
     response_of,
 )
@@ -27,6 +29,8 @@ from pipeline.rig.refusals import DeadlinePassed, DeviceRefused, StateUnknown
 from pipeline.rig.transport import Transport
 
 LOG = logging.getLogger(__name__)
+LONGEST_GREETING = 1 << 16  # bytes
+MOST_PASSED_OVER = 32  # replies to other commands, while one is waited for
 Answer = TypeVar("Answer")
 
 
@@ -73,6 +77,7 @@ class HeadwallControl:
         Raises
         ------
         SettingsError : a time is none, too short (given in seconds?), or the exposure is longer than the period.
+        RigError : the camera says that it set others.
         StateUnknown : a capture may be running, see ``capture``.
         DeviceRefused, DeadlinePassed, DeviceGone
         """
@@ -80,7 +85,7 @@ class HeadwallControl:
         with self._lock:
             self._check_known("configure")
             times = {"exposure": exposure_ms, "framePeriod": frame_period_ms}
-            self._ask("configure", times, lambda response: None)
+            self._ask("configure", times, lambda response: check_times_set(response, times))
 
     def capture(self, frames: int, *, cubes: int = 1, prefix: str = "") -> Capture:
         """Begin a capture of ``cubes`` files (0: until stopped) of ``frames`` lines (0: the camera's own number).
@@ -204,6 +209,8 @@ class HeadwallControl:
             if b"hpi> " in came:
                 self.greeting = came.decode("utf-8", errors="replace").split("hpi> ")[0].strip()
                 return
+            if len(came) > LONGEST_GREETING:
+                raise RigError(f"{line.port} greets without end ({_told(came)}); is this the camera's control port?")
         raise DeadlinePassed(
             f"{line.port} sent no prompt 'hpi> ' within {self.patience.deadline_s:g} s ({_told(came)}); "
             "is this the camera's control port (8100)?"
@@ -214,19 +221,26 @@ class HeadwallControl:
         line = self._line
         assert line is not None
         deadline = self.clock.now() + self.patience.deadline_s
-        line.write(to_request(name, argument), deadline)
+        request = to_request(name, argument)
+        line.write(request, deadline)
         passed_over: list[str] = []
         while self.clock.now() < deadline:
             for said in self._reader.feed(line.read(65536, deadline)):
                 why = other_command(said, name)
                 if not why:
+                    check_repeated(said, request.decode().rstrip("\r"), line.port)
                     response = response_of(said, name, line.port)
                     try:
                         return check(response)
                     except MisfitError as misfit:
                         why = str(misfit)
                 LOG.warning("%s, while waiting for %s: %s: %.200s", line.port, name, why, said.text)
-                passed_over.append(said.text)
+                passed_over.append(said.text[:80])
+                if len(passed_over) > MOST_PASSED_OVER:
+                    raise RigError(
+                        f"{line.port} answers {name} with {len(passed_over)} replies to others; does another program "
+                        "talk to the camera? End that first"
+                    )
         came = self._reader.held or " | ".join(passed_over).encode()
         raise DeadlinePassed(
             f"no reply to {name} from {line.port} within {self.patience.deadline_s:g} s ({_told(came)}); "

@@ -16,10 +16,10 @@ from pipeline.errors import RigError
 PROMPT = b"hpi> "
 COMMANDS = ("configure", "capture", "isCapturing", "stopCapture", "listFiles", "exit")
 LONGEST_REPLY = 1 << 24  # bytes: a listing of a hundred thousand files
+MOST_PROMPTS = 16  # in the texts of one reply
 
 # a telnet server's negotiations; JSON in UTF-8 never holds the byte FF
 _NEGOTIATION = re.compile(rb"\xff[\xfb-\xfe].", re.DOTALL)
-_AT_LINE_START = re.compile(rb"(?:^|[\r\n])" + re.escape(PROMPT))
 
 
 @dataclass(frozen=True)
@@ -44,15 +44,20 @@ def to_request(name: str, argument: Any = None) -> bytes:
 
 
 class ReplyReader:
-    """Takes bytes as they come and gives what stands before each prompt, once the prompt is whole."""
+    """Takes bytes as they come and gives what stands before each prompt, once the prompt is whole.
+
+    Each byte is looked at a bounded number of times, however few come at once and whatever they are.
+    """
 
     def __init__(self) -> None:
-        self._held = b""
+        self._held = bytearray()
+        self._looked = 0  # bytes in which no prompt begins that ends a reply
+        self._passed = 0  # prompts among them
 
     @property
     def held(self) -> bytes:
         """Bytes that no prompt has followed yet."""
-        return self._held
+        return bytes(self._held)
 
     def feed(self, data: bytes) -> list[Said]:
         """Take bytes; give what is complete, which may be nothing or several replies.
@@ -61,25 +66,32 @@ class ReplyReader:
         ------
         RigError : more came without a prompt than any reply has.
         """
-        self._held = _NEGOTIATION.sub(b"", self._held + data)
+        cut = max(len(self._held) - 2, 0)  # a negotiation may have come in part
+        self._held[cut:] = _NEGOTIATION.sub(b"", bytes(self._held[cut:]) + data)
         said: list[Said] = []
         while (end := self._prompt_at()) >= 0:
-            before, self._held = self._held[:end], self._held[end + len(PROMPT) :]
-            said += _parse(before)
+            said += _parse(bytes(self._held[:end]))
+            del self._held[: end + len(PROMPT)]
+            self._looked = self._passed = 0
         if len(self._held) > LONGEST_REPLY:
             raise RigError(f"{len(self._held)} bytes came without a prompt 'hpi> '; is this the camera's control port?")
         return said
 
     def _prompt_at(self) -> int:
         """Where the first prompt is: at a line's start, or right behind a reply (a text in a reply may hold one)."""
-        match = _AT_LINE_START.search(self._held)
-        first = -1 if match is None else match.end() - len(PROMPT)
-        at = self._held.find(PROMPT)
-        while 0 <= at != first:
-            if any(said.reply is not None for said in _parse(self._held[:at])):
+        while (at := self._held.find(PROMPT, self._looked)) >= 0:
+            if at == 0 or self._held[at - 1] in b"\r\n":
                 return at
-            at = self._held.find(PROMPT, at + 1)
-        return first
+            if any(said.reply is not None for said in _parse(bytes(self._held[:at]))):
+                return at
+            self._looked, self._passed = at + 1, self._passed + 1
+            if self._passed > MOST_PROMPTS:
+                raise RigError(
+                    f"{self._passed} prompts 'hpi> ' came within one reply, {self.held[:80]!r} and on; is this the "
+                    "camera's control port?"
+                )
+        self._looked = max(len(self._held) - len(PROMPT) + 1, self._looked)
+        return -1
 
 
 def _parse(data: bytes) -> list[Said]:

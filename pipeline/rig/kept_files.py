@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from pipeline.errors import RigError
+
+_UNFIT = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 Progress = Callable[[str, int, int], None]  # file, bytes held, bytes in all
 
 
@@ -16,6 +20,16 @@ class RemoteFile:
     name: str  # whole path
     size: int | None  # bytes; None where the camera does not say
     folder: bool
+    most: int | None = None  # bytes that it can have; None where nothing is known
+
+
+def check_remote_name(name: str) -> None:
+    """Refuse a name that cannot stand in a line of text, as files are asked for (RigError)."""
+    if _UNFIT.search(name):
+        raise RigError(
+            f"the camera names a file {name!r:.200}, expected no line ends or control characters in a name; give it "
+            "another name there"
+        )
 
 
 class Kept(Protocol):
@@ -29,6 +43,9 @@ class Kept(Protocol):
 
     def append(self, name: str, data: bytes) -> None:
         """Add bytes at the end."""
+
+    def drop(self, name: str) -> None:
+        """Hold no byte of a file any more."""
 
 
 @dataclass
@@ -48,3 +65,7 @@ class KeptInMemory:
     def append(self, name: str, data: bytes) -> None:
         """Add bytes at the end."""
         self.files.setdefault(name, bytearray()).extend(data)
+
+    def drop(self, name: str) -> None:
+        """Hold no byte of a file any more."""
+        self.files.pop(name, None)

@@ -7,6 +7,7 @@ from typing import Protocol
 
 from pipeline.rig.camera_cubes import CapturedLines
 from pipeline.rig.camera_references import MeanFrame
+from pipeline.rig.file_claims import FrameClaim
 from pipeline.rig.kept_files import Kept, Progress
 from pipeline.rig.refusals import StateUnknown
 
@@ -46,10 +47,12 @@ class LineCameraDevice(Protocol):
     def stop(self) -> bool:
         """End a capture; False where none ran."""
 
-    def fetch(self, folder: str, kept: Kept, progress: Progress | None = None) -> CapturedLines:
-        """Get a finished capture's files, from where an earlier try ended, and give its lines."""
+    def fetch(
+        self, folder: str, kept: Kept, progress: Progress | None = None, *, claim: FrameClaim | None = None
+    ) -> CapturedLines:
+        """Get a finished capture's files, from where an earlier try ended, and give its lines; none beyond a claim."""
 
-    def references(self, folder: str, kept: Kept) -> dict[str, MeanFrame]:
+    def references(self, folder: str, kept: Kept, *, claim: FrameClaim | None = None) -> dict[str, MeanFrame]:
         """Mean frames of the reference cubes that lie in a capture's folder, by ``dark`` and ``white``."""
 
     def close(self) -> None:

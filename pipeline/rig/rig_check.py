@@ -10,7 +10,8 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 from pipeline.errors import PipelineError, RigError
-from pipeline.rig.camera_files import FileServer, log_in
+from pipeline.rig.camera_files import log_in
+from pipeline.rig.file_session import FileServer
 from pipeline.rig.headwall_camera import HeadwallCamera
 from pipeline.rig.mirror_controller import MirrorController
 from pipeline.rig.mirror_modes import check_model

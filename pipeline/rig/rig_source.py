@@ -33,6 +33,7 @@ from pipeline.rig.capture_names import REFERENCES
 from pipeline.rig.capture_paths import CapturePath, can_trigger, next_path, path_of
 from pipeline.rig.capture_runner import CaptureRunner, RigDevices, Say, say_nothing
 from pipeline.rig.captured_sweep import PlacedLines, UntiedError, place_lines
+from pipeline.rig.file_claims import FrameClaim
 from pipeline.rig.kept_files import Kept
 from pipeline.rig.refusals import DeviceRefused, StateUnknown
 from pipeline.rig.survey_rig import SurveyRig
@@ -212,7 +213,7 @@ class RigSource:
 
     def _whole_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]]:
         """Dark and white frames of all samples, and what was found of them."""
-        frames = runner.devices.camera.references(folder, self._kept)
+        frames = runner.devices.camera.references(folder, self._kept, claim=self._claim(1))
         missing = [kind for kind in ("dark", "white") if kind not in frames]
         if missing:
             raise RigError(
@@ -230,7 +231,9 @@ class RigSource:
     def _read(self, runner: CaptureRunner, taken: Taken, line: int) -> Iterator[Line]:
         """Fetch a capture and give its lines from ``line`` on."""
         try:
-            captured = runner.devices.camera.fetch(taken.folder, self._kept, self._fetched)
+            captured = runner.devices.camera.fetch(
+                taken.folder, self._kept, self._fetched, claim=self._claim(taken.stop - taken.first)
+            )
         except RigError as error:
             if type(error) is not RigError:  # a device that is gone, or a disk that is full: nothing is wrong with it
                 raise
@@ -279,6 +282,9 @@ class RigSource:
                 f"{why}. The {line} lines before it are kept; mend that and run again"
             )
         LOG.warning("%s: line %d is captured again; %s: %s", taken.sweep.name, line, taken.folder, why)
+
+    def _claim(self, frames: int) -> FrameClaim:
+        return FrameClaim(frames, self.camera.samples, len(self.wavelength_nm))
 
     def _check_size(self, found: tuple[int, ...], folder: str) -> None:
         wanted = (self.camera.samples, len(self.wavelength_nm))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from pipeline.rig.camera_files import FileServer
+from pipeline.rig.file_session import FileServer
 from pipeline.rig.mirror_settings import MirrorSettings
 from pipeline.rig.steering import ReadBack
 from pipeline.vector_memory import Ends
@@ -45,6 +45,8 @@ class SurveyRig:
     password: str = "ftpuser"
     connect_s: float = 3.0
     stall_s: float = 10.0
+    least_kb_s: float = 100.0  # of the camera's files; slower counts as stalled
+    read_twice: bool = True  # the camera's files: FTP has no checksums, so two readings have to agree
     pulses: Pulses = "position"  # at the mirror's trigger input: one a held position, one a frame, or none
     log_pulses: bool = False  # with pulses read the mirror's log too: lines lie where it measured, tied by its edges
     settle_s: float = 2.0  # most that the mirror may take to come to rest
@@ -70,4 +72,7 @@ class SurveyRig:
     @property
     def files(self) -> FileServer:
         """Where the camera's files are."""
-        return FileServer(self.host, self.file_port, self.user, self.password, self.stall_s)
+        return FileServer(
+            self.host, self.file_port, self.user, self.password, self.stall_s, least_kb_s=self.least_kb_s,
+            read_twice=self.read_twice,
+        )  # fmt: skip

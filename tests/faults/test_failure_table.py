@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from random import Random
 
 import pytest
 
-from tests.faults import clocks, disk_full, lost_lines, many_writers, refused_writes, small_survey, spool_rate
+from tests.faults import (
+    clocks,
+    disk_full,
+    hostile_rig,
+    lost_lines,
+    many_writers,
+    refused_writes,
+    small_survey,
+    spool_rate,
+)
 from tests.faults.fault_table import Row, markdown_table, plain_table
 from tests.faults.nursery import Nursery
 from tests.faults.small_survey import Subject, changing_calls, prepare, stored, words
@@ -79,6 +88,14 @@ def test_spool_at_a_cameras_pace(tmp_path: Path) -> None:
     pace = spool_rate.keep_pace(tmp_path, 2.0)
     assert pace.lines == 200
     assert pace.kept == pace.lines - pace.dropped
+
+
+@pytest.mark.parametrize("meet", [hostile_rig.meet_camera, hostile_rig.meet_mirror])
+def test_devices_that_mean_harm(meet: Callable[..., None]) -> None:
+    """Whatever a camera or a mirror says, whoever asks is done by the deadline, in one message."""
+    found = hostile_rig.meet_for(2.0, 1, meet)
+    assert found.wrong == []
+    assert found.count > 0
 
 
 def test_a_fault_that_is_not_survived_is_seen(subject: Subject) -> None:

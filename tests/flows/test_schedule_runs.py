@@ -300,5 +300,5 @@ def test_a_survey_by_hand_outlasts_a_look(tmp_path: Path) -> None:
 def test_each_rig_has_one_lock(tmp_path: Path) -> None:
     """The rig's is the same for every archive; that of the simulated one is the archive's own."""
     rig = replace(Settings(), source="rig")
-    assert rig_lock(rig, tmp_path / "a").path == rig_lock(rig, tmp_path / "b").path
-    assert rig_lock(Settings(), tmp_path / "a").path != rig_lock(Settings(), tmp_path / "b").path
+    assert rig_lock(rig, tmp_path / "a").place == rig_lock(rig, tmp_path / "b").place
+    assert rig_lock(Settings(), tmp_path / "a").place != rig_lock(Settings(), tmp_path / "b").place

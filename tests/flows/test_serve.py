@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows import schedule_lock, serve_command, serve_prefect
+from flows import serve_command, serve_prefect
 from flows.schedule_times import parse_timetable
 from flows.serve_fields import ServedField, alone_on, load_fields
 from flows.serve_plain import serve_plain
@@ -79,19 +80,17 @@ def test_two_serves_on_one_archive(field_file: Callable[..., Path], command_line
     assert "another serve works on the archive" in ended.errors[0]
 
 
-def test_two_serves_of_one_rig(
-    field_file: Callable[..., Path], tmp_path: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_serves_of_one_rig(field_file: Callable[..., Path], tmp_path: Path, command_line: Any) -> None:
     """Also with archives of their own the second is refused: a rig is served once."""
-    monkeypatch.setattr(schedule_lock, "MACHINE_WIDE", tmp_path)
-    rig = '[rig]\nport = "/dev/ttyNONE"\nhost = "192.0.2.1"\n'
+    port = f"/dev/ttyNONE{os.getpid()}"  # these tests may run twice on one machine
+    rig = f'[rig]\nport = "{port}"\nhost = "192.0.2.1"\n'
     files = [field_file(name, out=str(tmp_path / name), source="rig") for name in ("north", "south")]
     for file in files:
         file.write_text(file.read_text() + rig)
     with alone_on(load_fields(files[:1])):
         ended = command_line("serve", files[1], "--every", "30m", "--engine", "plain")
     assert (ended.code, len(ended.errors)) == (1, 1), ended.err
-    assert "another serve uses the rig at /dev/ttyNONE: give all its fields to that one" in ended.errors[0]
+    assert f"another serve uses the rig at {port}: give all its fields to that one" in ended.errors[0]
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.camera_files import FileServer, log_in
+from pipeline.rig.camera_files import log_in
 from pipeline.rig.capture_names import capture_prefix
 from pipeline.rig.clock import ManualClock
 from pipeline.rig.emulator.camera_device import CameraUnit
@@ -18,6 +18,7 @@ from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, InProcessRig
 from pipeline.rig.emulator.exchange import Mode
 from pipeline.rig.emulator.faults import make_fault
+from pipeline.rig.file_session import FileServer
 from pipeline.rig.mirror_controller import MirrorController
 from pipeline.rig.mirror_settings import MirrorSettings
 from pipeline.rig.pro_mode import Command

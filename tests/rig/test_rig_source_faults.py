@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.capture_journal import JOURNAL
-from pipeline.rig.emulator.camera_faults import CameraFault
+from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
 from pipeline.rig.kept_files import KeptInMemory
 from pipeline.rig.refusals import DeviceGone, DeviceRefused, StateUnknown
 from pipeline.source import Line
@@ -65,13 +65,18 @@ def test_captures_that_are_cut_one_after_the_other_go_on():
         assert [said.split("_")[-1].split('"')[0] for said in rig.captures] == ["0", "3", "6", "9", "14"]
 
 
+def breaks_off(faults: CameraFaults) -> None:
+    """Have the next transfer but one break off: the header, which just came, is read once more."""
+    faults.left, faults.passes = {CameraFault.BREAKS_OFF: 1}, 1
+
+
 def test_broken_transfer_goes_on_in_the_next_process():
     """The camera goes away in the midst of a file: what has come is kept, and nothing is captured again."""
     with small_rig() as rig:
         faults = rig.emulated.camera.faults
         kept = KeptUntil(
             acts={
-                b"raw_0.hdr": lambda: faults.left.update({CameraFault.BREAKS_OFF: 1}),
+                b"raw_0.hdr": lambda: breaks_off(faults),
                 b"raw_0": lambda: faults.left.update({CameraFault.REFUSES_FILES: 9}),
             }
         )

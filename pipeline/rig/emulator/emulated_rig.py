@@ -21,7 +21,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 
-from pipeline.rig.camera_files import FileServer
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock, ManualClock
 from pipeline.rig.emulator.camera_device import CameraUnit
 from pipeline.rig.emulator.camera_faults import CameraFaults
@@ -34,6 +33,7 @@ from pipeline.rig.emulator.pty_port import EmulatedPort
 from pipeline.rig.emulator.scene_camera import Look, SceneCamera
 from pipeline.rig.emulator.scene_view import SceneView
 from pipeline.rig.emulator.triggered_mirror import TriggeredMirror
+from pipeline.rig.file_session import FileServer
 from pipeline.rig.headwall_camera import HeadwallCamera
 from pipeline.rig.headwall_control import HeadwallControl
 from pipeline.rig.survey_rig import Pulses
