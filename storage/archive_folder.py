@@ -35,10 +35,10 @@ def open_folder(path: Path, *, create: bool, write: bool) -> None:
 
 def _refuse_links(path: Path) -> None:
     """Links within an archive are not followed, so its own folders cannot be any; the archive's name may be one."""
-    for name in PARTS:
-        if (path / name).is_symlink():
+    for part in (*(path / name for name in PARTS), *(path / "stages").glob("*")):
+        if part.is_symlink():
             raise ArchiveError(
-                f"{path / name} is a link, which is not followed; put the folder that it leads to in its place, or "
+                f"{part} is a link, which is not followed; put the folder that it leads to in its place, or "
                 f"mount it there"
             )
 

@@ -95,9 +95,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
     """Content of a published folder's manifest and None, or nothing and what is wrong with it."""
-    link = next((one for one in (folder, _stage_of(folder)) if one.is_symlink()), None)
-    if link is not None:
-        return {}, f"{link.name} is a link, which is not followed: put there what it leads to"
+    if folder.is_symlink():
+        return {}, f"{folder.name} is a link, which is not followed: put there what it leads to"
     try:
         text = read_plain(folder / MANIFEST_NAME).decode()
         content = json.loads(text)
@@ -113,11 +112,6 @@ def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
     except (OSError, ValueError, TypeError) as error:
         return {}, (isinstance(error, OSError) and error.strerror) or str(error)
     return content, None
-
-
-def _stage_of(folder: Path) -> Path:
-    """The folder of the stage that a store is of; of what is no store itself."""
-    return folder.parent if folder.parent.parent.name == "stages" else folder
 
 
 def is_sealed(manifest: Mapping[str, Any]) -> bool:

@@ -172,7 +172,7 @@ def test_a_spool_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
     content = (tmp_path / "lines.index").read_bytes()
     earlier = re.sub(rb', "check": "[0-9a-f]{8}"', b"", content).replace(b"line spool 2", b"line spool 1")
     (tmp_path / "lines.index").write_bytes(earlier)
-    with pytest.raises(RigError, match="another version.*finish that capture with the version that began it, or remove"):
+    with pytest.raises(RigError, match=r"another version.*finish that capture with the version that began it"):
         Spool.open(tmp_path, 6, 4, header=HEADER)
     assert (tmp_path / "lines.index").read_bytes() == earlier
 
