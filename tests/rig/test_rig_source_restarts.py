@@ -166,4 +166,5 @@ def test_end_that_the_journal_has_lost_is_not_read_from_another_path():
         source = rig.source(kept)
         assert_same(list(source.lines(FINE)))
         assert len(rig.captures) == 3
+        assert "what the journal has lost" in source.record["captures"][0]["spent"]
         assert "counts for nothing: it has changed" in source.record["journal"][0]

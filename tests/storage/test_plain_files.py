@@ -40,8 +40,9 @@ def test_what_is_no_file_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert "expected a file" in str(told.value.strerror) or kind == "a folder"
 
 
-def test_a_device_is_no_file() -> None:
-    """It may give bytes without end."""
+def test_a_device_is_not_even_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some act on that, and it may give bytes without end."""
+    monkeypatch.setattr(os, "open", lambda *given: pytest.fail("it was opened"))
     with pytest.raises(NotPlainError, match="it is a device, expected a file"):
         read_plain(Path("/dev/zero"))
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipeline.checked_lines import with_check
 from pipeline.errors import RigError
 from pipeline.source import Line
 from storage.spool import Spool, read_spooled
@@ -164,6 +167,21 @@ def test_a_damaged_header_costs_no_line_of_this_sweep(tmp_path: Path) -> None:
     flip(tmp_path / "lines.index", 30)
     with Spool.open(tmp_path, 6, 4, header={**HEADER, "seed": 4}) as spool:
         assert spool.count == 0
+
+
+@pytest.mark.parametrize(
+    "change", [{"line": -1}, {"line": 2.0}, {"valid": 1}, {"time_s": None}, {"crc32": "0"}, {"x": 0}]
+)
+def test_an_entry_of_other_facts_is_a_lost_line(tmp_path: Path, change: dict[str, object]) -> None:
+    """Whatever its checksum says: facts that are missing, too many or of another kind are no line's."""
+    _fill(tmp_path, 5)
+    path = tmp_path / "lines.index"
+    head, *entries = path.read_bytes().splitlines(keepends=True)
+    facts = {name: value for name, value in json.loads(entries[2]).items() if name != "check"}
+    entries[2] = with_check(json.dumps(facts | change).encode(), zlib.crc32(head))
+    path.write_bytes(head + b"".join(entries))
+    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        assert (spool.count, spool.lost) == (5, [2])
 
 
 def test_a_spool_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
