@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -17,9 +17,10 @@ from pipeline.once import Once
 from pipeline.rig.camera_limits import CameraLimits, check_times
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
 from pipeline.rig.kept_files import KeptInMemory
+from pipeline.scan import Sweep
 from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.scene import RasterScene
-from pipeline.source import Source
+from pipeline.source import Line, Source
 from storage.fetched_files import FetchedFiles
 
 if TYPE_CHECKING:
@@ -87,6 +88,11 @@ def capture_source(run: CaptureRun, key: str) -> Iterator[Source]:
     run.report(0.0)  # a rig is at work long before its first line is here
     with source.session():
         yield source
+
+
+def held_lines(source: Source, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
+    """Give single lines that a rig gave before, from the files of their captures; not valid where these are gone."""
+    return cast("RigSource", source).lines_again(sweep, numbers)
 
 
 def rig_record(source: Source) -> dict[str, Any]:

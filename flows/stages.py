@@ -22,8 +22,8 @@ from flows.effect_choice import load_manifest, source_with
 from flows.field_work import FieldWork, region_params
 from flows.rectify_ahead import Arrived, rectifying_ahead
 from flows.region_work import look_at, seat_columns
-from flows.rendered_lines import take_lines
-from flows.rig_run import RIG_RECORD, capture_source, rig_record
+from flows.rendered_lines import lines_again, take_lines
+from flows.rig_run import RIG_RECORD, capture_source, held_lines, rig_record
 from flows.run import CaptureRun, SurveyRun
 from models.inference import CoarseLook, Glance, read_glance
 from models.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_seats
@@ -107,7 +107,10 @@ def _capture_sweep(
     run: CaptureRun, source: Source, sweep: Sweep, path: Path, *, key: str, report: Callable[[int], None],
     effects: Mapping[str, Any],
 ) -> None:  # fmt: skip
-    """Lines into the spool and then the cube, one by one, from where a broken capture stopped."""
+    """Lines into the spool and then the cube, one by one, from where a broken capture stopped.
+
+    Lines that were lost since are asked for again; a rig captures nothing for them, and what it cannot give is invalid.
+    """
     references = source.references(sweep)
     simulation = None if run.rig else effects
     header = SweepHeader(
@@ -126,6 +129,8 @@ def _capture_sweep(
             cube.write([line])
             report(spool.count)
 
+        again = lines_again if run.rig is None else held_lines
+        spool.mend(again(source, sweep, spool.lost))
         for block in spool.blocks():
             cube.write(block)
         report(spool.count)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,29 +42,27 @@ def ahead_of(key: str) -> str:
 
 def published_stores(root: Path, stage: str | None = None) -> list[StageRef]:
     """Every published store (of one stage), by stage and key."""
-    folders = sorted((root / "stages").glob(f"{stage or '*'}/*/{MANIFEST_NAME}"))
-    found = [folder.parent for folder in folders if not folder.parent.name.endswith(PART_SUFFIX)]
-    return [StageRef(path.parent.name, path.name, path) for path in found]
+    folders = sorted((root / "stages").glob(f"{stage or '*'}/*"))
+    return [StageRef(path.parent.name, path.name, path) for path in folders if _is_published(path)]
 
 
 def published_runs(root: Path) -> list[Path]:
     """Folders of the published runs, oldest first: by the second in their names, then by when they were written."""
-    manifests = [
-        path for path in (root / "runs").glob(f"*/{MANIFEST_NAME}") if not path.parent.name.endswith(PART_SUFFIX)
-    ]
-    ages = {path.parent: path.stat().st_mtime_ns for path in manifests}
+    folders = [path for path in (root / "runs").glob("*") if _is_published(path)]
+    ages = {path: (path / MANIFEST_NAME).lstat().st_mtime_ns for path in folders}
     return sorted(ages, key=lambda folder: (folder.name[:SECOND], ages[folder], folder.name))
+
+
+def _is_published(folder: Path) -> bool:
+    """Whether a folder has a manifest, be it a damaged one, or a link."""
+    return not folder.name.endswith(PART_SUFFIX) and os.path.lexists(folder / MANIFEST_NAME)
 
 
 def without_manifest(root: Path) -> list[Path]:
     """What lies among stores and runs and is neither: folders that lost their manifest, and other people's files."""
     inside = [*root.glob("stages/*/*"), *root.glob("runs/*")]
     loose = [path for path in root.glob("stages/*") if not path.is_dir()]
-    return sorted(
-        path
-        for path in (*inside, *loose)
-        if not path.name.endswith(PART_SUFFIX) and not (path / MANIFEST_NAME).is_file()
-    )
+    return sorted(path for path in (*inside, *loose) if not path.name.endswith(PART_SUFFIX) and not _is_published(path))
 
 
 def in_text(text: str) -> str | None:

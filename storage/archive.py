@@ -16,6 +16,7 @@ bucket (`storage.object_archive`) has the same addresses.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,7 +25,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from storage.addresses import StageRef, published_runs, published_stores, store_at, without_manifest
+from storage.addresses import StageRef, in_text, published_runs, published_stores, store_at, without_manifest
 from storage.archive_folder import is_folder_archive, open_folder
 from storage.keys import plain, stage_key
 from storage.lineage import rests_on
@@ -117,7 +118,15 @@ class Archive:
         return store_at(self.root, stage, key)
 
     def locate(self, address: str) -> Path:
-        """Where on this machine a product lies by its address relative to the archive, as a receipt gives it."""
+        """Where on this machine a product lies by its address relative to the archive, as a receipt gives it.
+
+        Raises
+        ------
+        IncompleteStoreError : its store is not there, or a file of it is missing, cut short, a link or no file at all.
+        """
+        uri = in_text(address)
+        if uri is not None:
+            check_files(self.root / uri, hashes=False)
         return self.root / address
 
     def find(self, stage: str, key: str) -> StageRef | None:
@@ -128,7 +137,7 @@ class Archive:
         IncompleteStoreError : it is there, but its manifest or a file is missing, or has another size.
         """
         ref = store_at(self.root, stage, key)
-        if not ref.path.exists():
+        if not os.path.lexists(ref.path):
             return None
         check_files(ref.path, hashes=False)
         return ref

@@ -11,6 +11,8 @@ from pathlib import Path
 from pipeline.errors import ArchiveError
 from storage.staging import refusals, sync_path
 
+PARTS = ("stages", "runs", "spool", "schedule", ".aside", ".locks")
+
 
 def open_folder(path: Path, *, create: bool, write: bool) -> None:
     """Make an archive's folder where ``create``, and see whether it can be used.
@@ -25,9 +27,20 @@ def open_folder(path: Path, *, create: bool, write: bool) -> None:
         if not create and not (path / "stages").is_dir():
             state = "is a folder but no archive (it has no folder stages)" if path.is_dir() else "is not there"
             raise ArchiveError(f"{path} {state}; check the name, or make an archive with survey --out")
+        _refuse_links(path)
         _make_and_probe(path, create=create, write=write)
         if not os.access(path, os.R_OK | os.X_OK):
             raise ArchiveError(f"cannot read the archive {path}: permission is denied; change the folder's rights")
+
+
+def _refuse_links(path: Path) -> None:
+    """Links within an archive are not followed, so its own folders cannot be any; the archive's name may be one."""
+    for part in (*(path / name for name in PARTS), *(path / "stages").glob("*")):
+        if part.is_symlink():
+            raise ArchiveError(
+                f"{part} is a link, which is not followed; put the folder that it leads to in its place, or "
+                f"mount it there"
+            )
 
 
 def is_folder_archive(path: Path) -> bool:

@@ -135,7 +135,7 @@ def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bo
 
 def _age_days(store: Store, now: datetime) -> float:
     """Days since a store was made or copied, by whichever clock is the later; negative where one runs ahead."""
-    made = (store.ref.path / MANIFEST_NAME).stat().st_mtime
+    made = (store.ref.path / MANIFEST_NAME).lstat().st_mtime
     try:
         created = datetime.fromisoformat(store.created)
         made = max(made, (created if created.tzinfo else created.replace(tzinfo=UTC)).timestamp())

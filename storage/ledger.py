@@ -5,7 +5,9 @@
     schedule/<field>.jsonl
 
 A line is on the disk before the call that wrote it returns. A line that a power cut tore is passed over, and the next
-one begins below it. In an archive on S3 the ledgers lie in its working copy, on the machine that surveys.
+one begins below it. Each line has a checksum: one that has changed is passed over too, and `verify` tells its number.
+Lines of earlier versions have none, and are read as they are. In an archive on S3 the ledgers lie in its working copy,
+on the machine that surveys.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from pipeline.checked_lines import read_checked, with_check
 from pipeline.errors import ArchiveError
+from storage.plain_files import open_plain, read_plain
 from storage.staging import is_name, refusals, sync_path
 
 FOLDER = "schedule"
@@ -35,19 +39,19 @@ class Ledger:
         self._root = root
 
     def lines(self) -> list[dict[str, Any]]:
-        """Every whole line, oldest first; none of a field that was never scheduled.
+        """Every line that can be believed, oldest first; none of a field that was never scheduled.
 
         Raises
         ------
         ArchiveError : the file is there and cannot be read.
         """
         try:
-            content = self.path.read_bytes()
+            content = read_plain(self.path)
         except FileNotFoundError:
             return []
         except OSError as error:
             raise ArchiveError(f"cannot read the ledger {self.path}: {error.strerror}; check its rights") from error
-        return [line for text in content.split(b"\n") if (line := _line(text)) is not None]
+        return [line.content for line in read_checked(content) if line.content is not None]
 
     def append(self, line: Mapping[str, Any]) -> None:
         """Add one line, for good.
@@ -56,11 +60,11 @@ class Ledger:
         ------
         ArchiveError : the disk refuses; what was there stays.
         """
-        content = (json.dumps(line, ensure_ascii=False, allow_nan=False) + "\n").encode()
+        content = with_check(json.dumps(line, ensure_ascii=False, allow_nan=False).encode())
         with refusals(self._root, "write to the archive"):
             fresh = not self.path.exists()
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+            descriptor = open_plain(self.path, os.O_RDWR | os.O_CREAT)
             try:
                 _write_at_end(descriptor, content)
             finally:
@@ -86,14 +90,6 @@ def ledgers(root: Path) -> list[Ledger]:
     """The ledgers of an archive, by the names of their fields."""
     found = sorted((root / FOLDER).glob(f"*{SUFFIX}"))
     return [Ledger(root, path.name.removesuffix(SUFFIX)) for path in found if is_name(path.name.removesuffix(SUFFIX))]
-
-
-def _line(text: bytes) -> dict[str, Any] | None:
-    try:
-        found = json.loads(text)
-    except (ValueError, RecursionError):
-        return None
-    return found if isinstance(found, dict) else None
 
 
 def _write_at_end(descriptor: int, content: bytes) -> None:

@@ -10,8 +10,9 @@ import hashlib
 import importlib.metadata
 import json
 import math
+import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -19,6 +20,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
+from storage.plain_files import NotPlainError, kind_of, plain_size, read_plain
 from storage.staging import MANIFEST_NAME, file_hash, files_below, sync_path
 
 FORMAT = 2
@@ -93,8 +95,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
     """Content of a published folder's manifest and None, or nothing and what is wrong with it."""
+    if folder.is_symlink():
+        return {}, f"{folder.name} is a link, which is not followed: put there what it leads to"
     try:
-        text = (folder / MANIFEST_NAME).read_bytes().decode()
+        text = read_plain(folder / MANIFEST_NAME).decode()
         content = json.loads(text)
         if not isinstance(content, dict) or not isinstance(content.get("files"), dict):
             raise TypeError("it lists no files")
@@ -106,7 +110,7 @@ def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
     except RecursionError:
         return {}, "it is nested too deeply"
     except (OSError, ValueError, TypeError) as error:
-        return {}, str(error)
+        return {}, (isinstance(error, OSError) and error.strerror) or str(error)
     return content, None
 
 
@@ -200,32 +204,49 @@ def check_files(folder: Path, *, hashes: bool) -> None:
 def broken_files(folder: Path, manifest: Mapping[str, Any], *, hashes: bool) -> Iterator[tuple[str, str]]:
     """Give name and problem of every file that is not as the manifest lists it; with ``hashes`` also extra ones."""
     listed = manifest["files"]
+    links = _linked_folders(folder, listed)
     for name, entry in listed.items():
-        problem = file_problem(folder / name, entry, hashes=hashes)
+        link = next((one for one in links if one in PurePosixPath(name).parents), None)
+        problem = file_problem(folder / name, entry, hashes=hashes) if link is None else _below_link(link)
         if problem is not None:
             yield name, problem
     if hashes:
-        found = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if _is_file(path)}
-        for name in sorted(found - set(listed) - {MANIFEST_NAME}):
-            yield name, "is not in the manifest: take it out of the archive"
+        for name in sorted(_no_folders(folder) - set(listed) - {MANIFEST_NAME}):
+            kind = kind_of(folder / name)
+            yield name, f"is {kind if kind != 'a file' else 'not in the manifest'}: take it out of the archive"
 
 
-def _is_file(path: Path) -> bool:
-    return path.is_symlink() or path.is_file()
+def _linked_folders(folder: Path, names: Iterable[str]) -> list[PurePosixPath]:
+    """Which of the folders that files lie in are links, the outer ones first."""
+    inner = {parent for name in names for parent in PurePosixPath(name).parents}
+    return sorted(one for one in inner if (folder / one).is_symlink())
+
+
+def _below_link(link: PurePosixPath) -> str:
+    return f"cannot be read: {link if link.parts else 'its store'} is a link, which is not followed"
+
+
+def _no_folders(folder: Path) -> set[str]:
+    """Names of all that lies in a folder, however deep, and is no folder; no link is followed."""
+    found = set[str]()
+    for place, folders, files in os.walk(folder):
+        links = [name for name in folders if Path(place, name).is_symlink()]
+        found.update(Path(place, name).relative_to(folder).as_posix() for name in (*links, *files))
+    return found
 
 
 def file_problem(path: Path, entry: Mapping[str, Any], *, hashes: bool) -> str | None:
     """What is not as the manifest's ``entry`` says of a file, in words that follow its name; None where it is whole."""
     try:
-        if hashes and path.is_symlink():
-            return "is a link, expected a file"
-        size = path.stat().st_size
+        size = plain_size(path)
         if size != entry["size"]:
             return f"has {size} bytes, expected {entry['size']}"
         if hashes and file_hash(path) != entry["sha256"]:
             return "has changed since it was published (its SHA-256 differs)"
     except FileNotFoundError:
         return "cannot be read: it is missing"
+    except NotPlainError as error:
+        return str(error.strerror).removeprefix("it ")
     except OSError as error:
         return f"cannot be read: {error.strerror}"
     return None

@@ -15,9 +15,11 @@ No disk is waited for, so what a machine that was switched off in between left b
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import os
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -29,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
+from pipeline.checked_lines import read_checked, with_check
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.placed import PixelGrid, Placed, place
 from pipeline.rectify.tiles import Tile, lines_needed, plan_tiles
@@ -38,6 +41,7 @@ from storage.block_work import Crew
 from storage.lookups import path_digest
 from storage.mosaic_work import MosaicWork
 from storage.mosaics import MosaicWriter
+from storage.plain_files import read_plain
 from storage.spool import read_spooled
 from storage.staging import remove_tree
 from storage.tile_work import OpenMosaic, Thumbnail, tile_budget
@@ -152,7 +156,8 @@ class MosaicAhead:
     def _keep(self) -> None:
         np.save(self._folder / SEEN, self._seen.image)
         paths = {one.lines.sweep.name: path_digest(one.lines.position) for one in self._work.placed}
-        (self._folder / RECORD).write_text(json.dumps({**self._wanted.facts(paths), "tiles": self._made}))
+        record = {**self._wanted.facts(paths), "tiles": self._made, "seen": zlib.crc32(read_plain(self._folder / SEEN))}
+        (self._folder / RECORD).write_bytes(with_check(json.dumps(record).encode()))
 
 
 def place_as_planned(lines: PlannedLines, camera: LineCamera, grid: PixelGrid) -> Placed:
@@ -173,8 +178,13 @@ def take_over(
     lie elsewhere than it was made of.
     """
     try:
-        record = json.loads((folder / RECORD).read_text())
-        image = np.load(folder / SEEN)
+        (line,) = read_checked(read_plain(folder / RECORD))
+        if line.content is None or line.state != "whole":
+            raise ValueError(f"{RECORD} has changed")
+        record, picture = line.content, read_plain(folder / SEEN)
+        if record.pop("seen") != zlib.crc32(picture):
+            raise ValueError(f"{SEEN} has changed")
+        image = np.load(io.BytesIO(picture))
         tiles = [(int(row), int(column)) for row, column in record.pop("tiles")]
         if record != wanted.facts(paths) or image.shape != seen.image.shape or not tiles:
             return []

@@ -30,7 +30,7 @@ from storage.object_stores import Objects
 from storage.object_transfers import BEGUN
 from storage.run_folders import RunDraft
 from storage.staging import refusals
-from storage.verification import Finding, Progress
+from storage.verification import Finding, Progress, verify_growing
 
 MARK = "archive.json"  # at the prefix: here is an archive
 MARK_TEXT = b'{"archive": "spectralzoom", "layout": 1}\n'
@@ -204,10 +204,10 @@ class ObjectArchive(Archive):
     # --- verification and clearing up ---------------------------------------------------------------------------------
 
     def verify_all(self, progress: Progress | None = None) -> list[Finding]:
-        """Read every object of the archive again; findings are named as in a folder."""
+        """Read every object of the archive again, and what grows here; findings are named as in a folder."""
         from storage.object_checks import verify_objects
 
-        return verify_objects(self.objects, progress)
+        return [*verify_objects(self.objects, progress), *verify_growing(self.root)]
 
     def size_of(self, uri: str) -> int:
         """Bytes of all objects of a store."""

@@ -13,6 +13,7 @@ from typing import Any
 
 from storage.addresses import StageRef, in_text
 from storage.manifests import Cost, cost_of, listed_bytes, try_manifest
+from storage.plain_files import read_plain
 from storage.staging import MANIFEST_NAME, file_hash
 
 RECEIPT = "receipt.json"
@@ -146,7 +147,7 @@ def _receipt(folder: Path, facts: Mapping[str, Any]) -> tuple[dict[str, Any], st
     try:
         if file_hash(path) != entry["sha256"]:
             return {}, f"{RECEIPT} has changed since it was published (its SHA-256 differs)"
-        return _table(json.loads(path.read_bytes())), None
+        return _table(json.loads(read_plain(path))), None
     except (OSError, ValueError, RecursionError) as error:
         words = error.strerror if isinstance(error, OSError) else error
         return {}, f"{RECEIPT} cannot be read: {words}"

@@ -7,6 +7,7 @@ a version of a stage that is no longer made, cannot be remade: they stay, and wi
 
 from __future__ import annotations
 
+import os
 import secrets
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -180,7 +181,7 @@ def _settle(archive: Archive, done: Repaired) -> None:
         else:
             why = "; ".join(done.failed.values()) or "its survey ran again and did not make it"
             done.put_back[uri] = why
-            if aside.exists():
+            if os.path.lexists(aside):
                 _move(aside, archive.root / uri)
         remove_tree(aside)
     remove_tree(archive.root / ASIDE)
@@ -201,7 +202,7 @@ def _set_aside(root: Path, uri: str) -> None:
     _, stage, key = uri.split("/")
     release = take_lock(root / ".locks" / f"{stage}-{key}.lock")
     try:
-        if (root / uri).exists():
+        if os.path.lexists(root / uri):
             _move(root / uri, root / ASIDE / stage / key)
     finally:
         if release is not None:

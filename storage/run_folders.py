@@ -22,7 +22,7 @@ def date_of_store(root: Path, uri: str) -> str:
     """
     now = datetime.now(UTC)
     folders = published_runs(root)
-    if any((folder / MANIFEST_NAME).stat().st_mtime >= now.timestamp() for folder in folders):
+    if any((folder / MANIFEST_NAME).lstat().st_mtime >= now.timestamp() for folder in folders):
         runs = (read_run(folder, {}) for folder in folders)
         for known in (run.created for run in runs if uri in run.recorded):
             try:

@@ -13,6 +13,7 @@ from typing import Any
 import zarr
 
 from storage.archive_codec import allow_pcodec
+from storage.plain_files import kind_of, read_plain
 
 WORDS = {"y": "rows", "x": "columns", "line": "lines", "sample": "samples", "band": "bands", "patch": "patches"}
 MOST_NAMED = 3
@@ -58,12 +59,14 @@ def name_damage(store: Path, name: str) -> str:
 
     For example ``(values: rows 0 to 63, columns 0 to 639; unreadable: rows 32 to 63, columns 0 to 31)``.
     """
+    if any(path.is_symlink() for path in (store / name).parents if path.is_relative_to(store)):
+        return ""
     try:
         shard = find_shard(store, name)
         if shard is None:
             return ""
         where = f"{shard.array.relative_to(store).as_posix()}: {shard.words(shard.box)}"
-        return f" ({where}{_damage_words(shard) if (store / name).is_file() else ''})"
+        return f" ({where}{_damage_words(shard) if kind_of(store / name) == 'a file' else ''})"
     except _NO_ARRAY:
         return ""
 
@@ -92,9 +95,9 @@ def find_shard(store: Path, name: str) -> Shard | None:
     for array in file.parents:
         if array == store or not array.is_relative_to(store):
             return None
-        if (array / "zarr.json").is_file():
+        if kind_of(array / "zarr.json") == "a file":
             break
-    about = json.loads((array / "zarr.json").read_text())
+    about = json.loads(read_plain(array / "zarr.json"))
     if about.get("node_type") != "array" or file == array / "zarr.json":
         return None
     shape = tuple(int(size) for size in about["shape"])

@@ -16,6 +16,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from pipeline.errors import ArchiveError
+from storage.plain_files import NotPlainError, plain_reader
 
 MANIFEST_NAME = "manifest.json"
 PART_SUFFIX = ".part"
@@ -56,6 +57,8 @@ def refusals(path: Path, doing: str) -> Iterator[None]:
         yield
     except ArchiveError:
         raise
+    except NotPlainError as error:
+        raise ArchiveError(f"cannot {doing} {path}: {error.filename}: {error.strerror}; take it out") from error
     except OSError as error:
         advice = disk_advice(error)
         named = error.filename
@@ -81,7 +84,7 @@ def remove_tree(path: Path) -> None:
 
 def retire(path: Path) -> None:
     """Take a published folder away in one step: first its name, then its files."""
-    if path.exists():
+    if os.path.lexists(path):
         away = path.with_name(f"{path.name}-{secrets.token_hex(4)}{PART_SUFFIX}")
         path.rename(away)
         sync_path(path.parent)  # or a power cut leaves the name, and not the files
@@ -110,16 +113,18 @@ def files_below(folder: Path) -> list[Path]:
 
 
 def bytes_below(folder: Path) -> int:
-    """Bytes of a folder's files, as far as they are there."""
+    """Bytes of a folder's files, as far as they are there; none of a link to one."""
+    if folder.is_symlink():
+        return 0
     sizes = [path.lstat().st_size for path in files_below(folder) if path.exists()]
     manifest = folder / MANIFEST_NAME
-    return sum(sizes) + (manifest.stat().st_size if manifest.is_file() else 0)
+    return sum(sizes) + (manifest.lstat().st_size if manifest.is_file() else 0)
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 of a file's content, in hex."""
+    """SHA-256 of a file's content, in hex (NotPlainError: it is a link, a pipe, or whatever else is no file)."""
     digest = hashlib.sha256()
-    with path.open("rb") as file:
+    with plain_reader(path) as file:
         while block := file.read(_BLOCK):
             digest.update(block)
     return digest.hexdigest()

@@ -8,6 +8,7 @@ from typing import Any
 
 from pipeline.errors import IncompleteStoreError
 from storage.manifests import CURE, file_problem, read_manifest
+from storage.plain_files import read_plain
 
 
 def read_table(path: Path) -> dict[str, Any]:
@@ -21,5 +22,5 @@ def read_table(path: Path) -> dict[str, Any]:
     problem = "is in no manifest" if entry is None else file_problem(path, entry, hashes=True)
     if problem is not None:
         raise IncompleteStoreError(f"{path} {problem}; {CURE}")
-    table: dict[str, Any] = json.loads(path.read_bytes())
+    table: dict[str, Any] = json.loads(read_plain(path))
     return table

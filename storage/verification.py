@@ -1,7 +1,11 @@
-"""Reading a whole archive again: every byte against its manifest, every manifest against its seal and its runs."""
+"""Reading a whole archive again: every byte against its manifest, every manifest against its seal and its runs.
+
+What is no file where one should be, such as a link or a pipe, is told and never opened.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +14,8 @@ from typing import Any, Literal
 from pipeline.errors import IncompleteStoreError
 from storage.addresses import without_manifest
 from storage.archive_codec import MissingCodecError
+from storage.growing_checks import SPOOLS, growing_problems
+from storage.ledger import FOLDER
 from storage.lineage import Catalogue
 from storage.manifests import (
     broken_files,
@@ -21,12 +27,13 @@ from storage.manifests import (
     try_manifest,
 )
 from storage.packed_arrays import values_hash
+from storage.plain_files import kind_of
 from storage.records import Run, Store
 from storage.shard_names import name_damage
 from storage.staging import MANIFEST_NAME
 
 ASIDE = ".aside"
-Kind = Literal["whole", "broken", "missing", "stray"]
+Kind = Literal["whole", "broken", "missing", "stray", "growing"]
 Progress = Callable[[str, float], None]  # address of what is being read, how far of all bytes, 0..1
 
 
@@ -35,6 +42,7 @@ class Finding:
     """What ``verify`` says of one store or run; ``problem`` is None where every byte is as published.
 
     ``missing``: something names or rests on a store that is not there. ``stray``: what is no part of the archive.
+    ``growing``: something of a spool or a ledger that cannot be believed; the rest of it is used.
     """
 
     uri: str
@@ -59,14 +67,28 @@ def verify_everything(
         if progress is not None:
             progress(uri, done / total)
         done += size
-        if not path.exists() and not catalogue.named_by(uri):
+        if not os.path.lexists(path) and not catalogue.named_by(uri):
             continue  # gc or a repair has cleared it away since
         problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
         if problems and _packed_since(catalogue, uri):  # its files and its manifest changed together
             catalogue = Catalogue.read(root)
             problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
         found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
-    return [*found, *_lost(root), *_missing(catalogue), *_left_aside(root)]
+    misplaced = _misplaced_runs(catalogue)
+    return [*found, *misplaced, *_lost(root), *_missing(catalogue), *_left_aside(root), *verify_growing(root)]
+
+
+def verify_growing(root: Path) -> Iterator[Finding]:
+    """Findings about spools, ledgers and what lies beside them; none where all is as it was written."""
+    yield from (Finding(uri, problem, "growing") for uri, problem in growing_problems(root))
+    for name in (SPOOLS, FOLDER):
+        if kind_of(root / name) not in (None, "a folder"):
+            yield Finding(name, f"is {kind_of(root / name)}, expected a folder; take it out of the archive", "stray")
+        for place, folders, files in os.walk(root / name):
+            for path in (Path(place, one) for one in (*folders, *files)):
+                if (kind := kind_of(path)) not in (None, "a file", "a folder"):
+                    uri = path.relative_to(root).as_posix()
+                    yield Finding(uri, f"is {kind}, expected a file; take it out of the archive", "stray")
 
 
 def _packed_since(catalogue: Catalogue, uri: str) -> bool:
@@ -109,7 +131,7 @@ def _number_problems(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]
 def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
     """Whether a store is the one that its place and the runs say."""
     store = catalogue.stores.get(uri)
-    if store is None or store.problem is not None or not (store.ref.path / MANIFEST_NAME).is_file():
+    if store is None or store.problem is not None or kind_of(store.ref.path / MANIFEST_NAME) != "a file":
         return  # which is told of already
     stated = f"stages/{store.facts.get('stage')}/{store.facts.get('key')}"
     if stated != uri:
@@ -134,12 +156,23 @@ def _doubter(catalogue: Catalogue, store: Store) -> Run | None:
     return None if anew else knowing[-1]
 
 
+def _misplaced_runs(catalogue: Catalogue) -> Iterator[Finding]:
+    """Folders of runs that say that they are another: copies, or renamed."""
+    there = {run.folder.name for run in catalogue.runs}
+    for run in catalogue.runs:
+        stated = run.facts.get("run", run.folder.name)
+        if stated != run.folder.name:
+            do = "it is a copy: take it out of the archive" if stated in there else "give it its name back"
+            yield Finding(run.uri, f"its {MANIFEST_NAME} is that of runs/{stated}; {do}", "stray")
+
+
 def _lost(root: Path) -> Iterator[Finding]:
     """What lies among stores and runs without a manifest."""
     for path in without_manifest(root):
         uri = path.relative_to(root).as_posix()
-        if not path.is_dir() or len(path.relative_to(root).parts) < 2:
-            yield Finding(uri, "is a file, expected a folder with a manifest; take it out of the archive", "stray")
+        kind = kind_of(path)
+        if kind != "a folder" or len(path.relative_to(root).parts) < 2:
+            yield Finding(uri, f"is {kind}, expected a folder with a manifest; take it out of the archive", "stray")
         else:
             yield Finding(uri, f"{MANIFEST_NAME} is missing", "broken")
 

@@ -1,21 +1,26 @@
 """What the rig has acknowledged of a stage's captures, one JSON object a line beside the files fetched from the camera.
 
 A process that is killed leaves it behind; the next one reads which folder on the camera holds which lines, so that
-nothing the rig acknowledged is captured twice. A torn last line counts as not written.
+nothing the rig acknowledged is captured twice. Each line has a checksum. A torn line counts as not written, and so does
+one that has changed since; but then a capture of which no end is told is not gone on with: what the mirror stands at
+now need not be what it stood at after that.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from pipeline.checked_lines import read_checked, with_check
 from pipeline.rig.kept_files import Kept
 from pipeline.rig.line_positions import CommandTimes, LinePositions
 from pipeline.scan import Sweep
 
 JOURNAL = "captures.jsonl"
+LOG = logging.getLogger(__name__)
 _TIES = ("method", "residual_us", "residual_px", "offset_s", "drift_ppm")
 
 
@@ -47,19 +52,29 @@ class LoggedPath:
     started_s: float
     start_error_s: float
     index_name: str = ""
+    crc32: int | None = None  # of both files, one after the other; None by an earlier version
 
 
 class CaptureJournal:
-    """Records in ``kept``, read once and added to."""
+    """Records in ``kept``, read once and added to.
+
+    Attributes
+    ----------
+    references
+        Folder that holds dark and white frames.
+    damage
+        What cannot be believed of the journal, in words.
+    """
 
     def __init__(self, kept: Kept) -> None:
         self._kept = kept
         self._taken: dict[str, Taken] = {}
         self._origins: dict[str, int] = {}  # stamp of line 0 [us], by the sweep's name
         self._ties: dict[str, dict[str, Any]] = {}
-        self.references = ""  # folder that holds dark and white frames
-        for record in _records(kept):
-            self._follow(record)
+        self._ended: set[str] = set()  # folders
+        self.references = ""
+        self.damage: list[str] = []
+        self._read()
 
     def holding(self, sweep: Sweep, line: int) -> Taken | None:
         """The latest capture that has a line of the sweep and is not spent."""
@@ -107,23 +122,44 @@ class CaptureJournal:
             self._write({"what": "origin", "sweep": sweep.name, "stamp_us": stamp_us})
         return self._origins.get(sweep.name)
 
+    def _read(self) -> None:
+        for line in read_checked(self._kept.read(JOURNAL, 0, self._kept.size(JOURNAL))):
+            if line.state == "torn":
+                continue
+            if line.content is None or not self._could_follow(line.content):
+                why = "it has changed since it was written" if line.content is None else "what it adds to is not there"
+                self.damage.append(f"line {line.number} of {JOURNAL} counts for nothing: {why}")
+        if self.damage:
+            LOG.warning("%s", "; ".join(self.damage))
+            for folder in self._taken.keys() - self._ended:
+                self._taken[folder] = replace(self._taken[folder], spent="its end may be what the journal has lost")
+
     def _write(self, record: dict[str, Any]) -> None:
-        text = json.dumps(record).encode() + b"\n"
+        text = json.dumps(record).encode()
         size = self._kept.size(JOURNAL)
         torn = size > 0 and self._kept.read(JOURNAL, size - 1, size) != b"\n"
-        self._kept.append(JOURNAL, b"\n" + text if torn else text)
+        self._kept.append(JOURNAL, (b"\n" if torn else b"") + with_check(text))
         self._follow(json.loads(text))
+
+    def _could_follow(self, record: dict[str, Any]) -> bool:
+        try:
+            self._follow(record)
+        except (LookupError, TypeError, ValueError):
+            return False
+        return True
 
     def _follow(self, record: dict[str, Any]) -> None:
         match record["what"]:
             case "capture":
                 self._taken.pop(record["folder"], None)  # a camera that was emptied gives its folders' names again
                 self._ties.pop(record["folder"], None)
+                self._ended.discard(record["folder"])
                 self._taken[record["folder"]] = _taken(record)
             case "end":
                 log = None if record["log"] is None else LoggedPath(**record["log"])
                 found = self._taken[record["folder"]]
                 self._taken[found.folder] = replace(found, index_at_end=record["index_at_end"], log=log)
+                self._ended.add(found.folder)
             case "spent":
                 self._taken[record["folder"]] = replace(self._taken[record["folder"]], spent=record["why"])
             case "tied":
@@ -137,18 +173,6 @@ class CaptureJournal:
 def commands_of(taken: Taken) -> CommandTimes:
     """When path and capture were begun."""
     return CommandTimes(taken.run_s, taken.capture_s)
-
-
-def _records(kept: Kept) -> list[dict[str, Any]]:
-    found = []
-    for line in kept.read(JOURNAL, 0, kept.size(JOURNAL)).split(b"\n"):
-        try:
-            record = json.loads(line)
-        except ValueError:
-            continue  # torn, or the empty end
-        if isinstance(record, dict) and "what" in record:
-            found.append(record)
-    return found
 
 
 def _taken(record: dict[str, Any]) -> Taken:

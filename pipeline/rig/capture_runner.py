@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -14,6 +16,7 @@ from pipeline.errors import RigError
 from pipeline.rig.capture_journal import CaptureJournal, LoggedPath, Taken
 from pipeline.rig.capture_names import capture_prefix
 from pipeline.rig.capture_paths import LEAD, CapturePath
+from pipeline.rig.captured_sweep import UntiedError
 from pipeline.rig.clock import Clock
 from pipeline.rig.kept_files import Kept
 from pipeline.rig.line_camera import Capture, LineCameraDevice
@@ -138,16 +141,23 @@ class CaptureRunner:
         return capture.folder
 
     def log_of(self, taken: Taken) -> MirrorTrack | None:
-        """Read the mirror's log of a capture; None where there is none."""
+        """Read the mirror's log of a capture; None where there is none.
+
+        Raises
+        ------
+        UntiedError : what is kept of it is not what the mirror gave.
+        """
         if taken.log is None:
             return None
-        data = self._kept.read(taken.log.name, 0, self._kept.size(taken.log.name))
-        position = np.frombuffer(data[: len(data) // 8 * 8], _CELL).reshape(-1, 2).astype(np.float64)
+        names = (taken.log.name, taken.log.index_name)
+        files = [self._kept.read(name, 0, self._kept.size(name)) if name else b"" for name in names]
+        if taken.log.crc32 not in (None, zlib.crc32(b"".join(files))):
+            raise UntiedError(f"the mirror's log that is kept as {taken.log.name} has changed (its CRC-32 differs)")
+        position = np.frombuffer(files[0][: len(files[0]) // 8 * 8], _CELL).reshape(-1, 2).astype(np.float64)
         time_s = np.arange(len(position)) / taken.log.rate_hz
         if not taken.log.index_name:
             return MirrorTrack(time_s, position)
-        data = self._kept.read(taken.log.index_name, 0, self._kept.size(taken.log.index_name))
-        index = np.frombuffer(data[: len(data) // 4 * 4], _INDEX).astype(np.int64)
+        index = np.frombuffer(files[1][: len(files[1]) // 4 * 4], _INDEX).astype(np.int64)
         return MirrorTrack(time_s, position, line_edges(index, time_s[: len(index)], LEAD, taken.sweep.step))
 
     def _configure(self) -> None:
@@ -171,12 +181,19 @@ class CaptureRunner:
         return self._journal.ended(taken)
 
     def _keep_log(self, folder: str, log: MotionLog) -> LoggedPath:
-        name = f"{folder}/mirror_log"
-        self._kept.append(name, log.position.astype(_CELL).tobytes())
-        index_name = "" if log.index is None else f"{folder}/mirror_index"
-        if log.index is not None:
-            self._kept.append(index_name, log.index.astype(_INDEX).tobytes())
-        return LoggedPath(name, log.rate_hz, log.started_s, log.start_error_s, index_name)
+        name, position = self._new_name(f"{folder}/mirror_log"), log.position.astype(_CELL).tobytes()
+        self._kept.append(name, position)
+        index_name = "" if log.index is None else self._new_name(f"{folder}/mirror_index")
+        index = b"" if log.index is None else log.index.astype(_INDEX).tobytes()
+        if index_name:
+            self._kept.append(index_name, index)
+        crc32 = zlib.crc32(position + index)
+        return LoggedPath(name, log.rate_hz, log.started_s, log.start_error_s, index_name, crc32)
+
+    def _new_name(self, name: str) -> str:
+        """A name of which nothing is kept: a camera that was emptied gives its folders' names again."""
+        names = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
+        return next(one for one in names if not self._kept.size(one))
 
     def _log_rate_hz(self, lines: int) -> float:
         """As fast as the logger goes, or so that it holds the whole capture."""

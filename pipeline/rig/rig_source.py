@@ -16,7 +16,7 @@ up a transfer where it broke off, and captures only what the camera does not hav
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -108,7 +108,8 @@ class RigSource:
             for name in ("pulses", "log_pulses", "ends", "read_back", "strict_crc", "provenance")
         }
         _, notes = self._whole.get(self._journal.references, (None, ()))
-        return {"rig": told, "references": list(notes), "captures": self._journal.captures}
+        damage = {"journal": self._journal.damage} if self._journal.damage else {}
+        return {"rig": told, "references": list(notes), "captures": self._journal.captures, **damage}
 
     def keeping(self, kept: Kept) -> RigSource:
         """Give the same source with its files elsewhere."""
@@ -180,6 +181,45 @@ class RigSource:
                 barren = 0 if line > before else barren + 1
                 if line < taken.stop:
                     self._give_up(taken, line, why, last=barren >= BARREN)
+
+    def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
+        """Give single lines of those given before, in order, from the files of the captures that hold them.
+
+        Nothing is captured for them. A line that no capture gives any more comes as one that the camera dropped: there,
+        and not valid.
+
+        Raises
+        ------
+        RigError : a device failed, or the password is not taken.
+        """
+        waiting = list(numbers)
+        with self.session() as runner:
+            while waiting:
+                held = self._journal.holding(sweep, waiting[0])
+                found = {} if held is None else self._found_again(runner, held, waiting)
+                given = [number for number in waiting if held is not None and number < held.stop] or waiting[:1]
+                yield from (found.get(number) or self._lost(sweep, number) for number in given)
+                waiting = waiting[len(given) :]
+
+    def _found_again(self, runner: CaptureRunner, held: Taken, wanted: Sequence[int]) -> dict[int, Line]:
+        """Those of the lines that a capture gives yet, by number."""
+        found: dict[int, Line] = {}
+        try:
+            for line in self._read(runner, runner.recovered(held), wanted[0]):
+                if line.number in wanted:
+                    found[line.number] = line
+        except (UntiedError, DeviceRefused) as error:
+            if getattr(error, "code", None) == NOT_LOGGED_IN:
+                raise
+            LOG.warning("%s, from line %d on: lost; %s: %s", held.sweep.name, wanted[0], held.folder, error)
+        return found
+
+    def _lost(self, sweep: Sweep, number: int) -> Line:
+        path = path_of(sweep, (number, number + 1), self.camera, triggered=can_trigger(self.rig.pulses, sweep))
+        frame = (self.camera.samples // sweep.binning, len(self.wavelength_nm))
+        nothing, (x, y) = np.zeros(frame, np.uint16), path.middle[0]
+        time_s = self._time_s(sweep, number, -1)
+        return Line(number, nothing, float(x), float(y), time_s, self.camera.exposure_ms, valid=False)
 
     def references(self, sweep: Sweep) -> References:
         """Dark and white frames with the sweep's binning, captured and fetched once for all sweeps.

@@ -161,9 +161,11 @@ def try_power(cuts: int, folder: Path, seed: int = 0) -> Losses:
 def _go_on(place: Path, appended: int, found: Losses) -> Iterator[str]:
     """Open what is left, compare each line, append the rest."""
     with Spool.open(place, SAMPLES, BANDS, header=HEADER) as spool:
-        found.lost[max(appended - spool.count, 0)] += 1
-        if appended - spool.count > SYNC_LINES:
-            yield f"{appended - spool.count} lines lost"
+        lost = max(appended - spool.count, 0) + len(spool.lost)
+        found.lost[lost] += 1
+        if lost > SYNC_LINES:
+            yield f"{lost} lines lost"
+        spool.mend(line(number) for number in spool.lost)
         kept = [one for block in spool.blocks() for one in block]
         yield from (f"line {one.number} is another" for one in kept if not _same(one, line(one.number)))
         fill(spool, LINES)

@@ -11,6 +11,7 @@ import pytest
 from tests.faults import (
     clocks,
     disk_full,
+    growing_files,
     hostile_rig,
     lost_lines,
     many_writers,
@@ -81,6 +82,19 @@ def test_capture_killed(tmp_path: Path) -> None:
     found = lost_lines.try_kills(2, tmp_path, seed=1)
     assert found.wrong == []
     assert set(found.lost) == {0}
+
+
+@pytest.mark.parametrize("name", ["lines.index", "lines.bil", "lines.hdr"])
+def test_bit_flips_in_a_spool(tmp_path: Path, name: str) -> None:
+    """Told by verify; one line at most is asked for again, none is another, the capture goes on to the same bytes."""
+    found = growing_files.flip_spool(name, 60, tmp_path, seed=2)
+    assert found.wrong == []
+    assert found.told >= found.flips - 1  # the end of the last line is no part of it
+
+
+def test_bit_flips_in_a_ledger(tmp_path: Path) -> None:
+    """Told by verify; one line at most counts for nothing, and none says anything else."""
+    assert growing_files.flip_ledger(150, tmp_path, seed=2).wrong == []
 
 
 def test_spool_at_a_cameras_pace(tmp_path: Path) -> None:

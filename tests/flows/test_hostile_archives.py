@@ -14,6 +14,7 @@ from storage.archive import Archive
 from storage.manifests import _seal, _text
 from storage.staging import file_hash
 from tests.storage.small_archive import Small, small_survey
+from tests.storage.test_no_files import CASES, Case
 
 SECRET = b"not of this archive"
 LEADS = ("../../../secret", "../secret", "/etc/passwd", "stages/../../secret", "./secret", "secret\0", "..", "")
@@ -81,3 +82,21 @@ def test_no_verb_leaves_the_archive(
         assert SECRET.decode() not in shown.err + shown.out
         assert secrets[0].read_bytes() == SECRET, verb
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["archive", "secret"]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_no_verb_waits_or_follows(case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Pipes and links where files and folders should be: each verb ends, verify with 1, and no defect is met."""
+    root, out = tmp_path / "archive", str(tmp_path / "out")
+    uri = case(small_survey(Archive.open(root)))
+    for verb, *more in (
+        ("ls",), ("explain", "class_map"), ("report", "--out", f"{out}.html"), ("export", "--out", out),
+        ("gc", "--dry-run"), ("verify",),
+    ):  # fmt: skip
+        with pytest.raises(SystemExit) as ended:
+            main([verb, str(root), *more])
+        shown = capsys.readouterr()
+        assert ended.value.code in (0, 1, 2, 3), (verb, shown.err)
+        assert "defect" not in shown.err + shown.out, (verb, shown.err)
+    assert ended.value.code == 1
+    assert uri in shown.out

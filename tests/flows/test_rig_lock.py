@@ -158,6 +158,6 @@ def test_locks_and_ledgers_of_an_archive_follow_no_link(tmp_path: Path) -> None:
         take_lock(tmp_path / "linked" / ".locks" / "use.lock")
     with pytest.raises(ArchiveError, match=r"use\.lock is no file, expected a lock file"):
         take_lock(tmp_path / "piped" / ".locks" / "use.lock")
-    with pytest.raises(ArchiveError, match="a link stands where a file of its own belongs"):
+    with pytest.raises(ArchiveError, match="it is a link, expected a file; take it out"):
         Ledger(tmp_path, "north").append({})
     assert list(elsewhere.iterdir()) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from pipeline.rig.capture_journal import JOURNAL, CaptureJournal, Taken
 from pipeline.rig.kept_files import KeptInMemory
 from pipeline.rig.line_positions import LinePositions
+from tests.faults.growing_files import flip_journal
 from tests.rig.small_rig import COARSE, FINE
 
 ONE = Taken(FINE, 0, 5, "/captured/a", True, (0.0, 0.1), (0.1, 0.2))
@@ -66,3 +68,22 @@ def test_sweep_keeps_its_first_origin() -> None:
     assert journal.origin_us(FINE, 700) == 500
     assert journal.origin_us(FINE) == CaptureJournal(kept).origin_us(FINE) == 500
     assert bytes(kept.files[JOURNAL]).count(b"\n") == 1
+
+
+def test_flipped_bit_of_the_journal_changes_no_capture():
+    """Whichever it is: each capture is held as it was or not at all, one is lost at most, and the journal says so."""
+    found = flip_journal(150, seed=3)
+    assert found.wrong == []
+    assert found.told >= found.flips - 1  # the end of the last line is no part of it
+
+
+def test_journal_without_checksums_is_read():
+    """As an earlier version wrote it; what is added to it has them."""
+    kept = KeptInMemory()
+    CaptureJournal(kept).began(ONE)
+    kept.files[JOURNAL] = bytearray(re.sub(rb', "check": "[0-9a-f]{8}"', b"", bytes(kept.files[JOURNAL])))
+    CaptureJournal(kept).began(OTHER)
+    journal = CaptureJournal(kept)
+    assert folders(journal) == [*"aaabbbbbb", ""]
+    assert journal.damage == []
+    assert bytes(kept.files[JOURNAL]).count(b'"check"') == 1

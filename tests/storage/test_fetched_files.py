@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import errno
 import os
+import random
+import shutil
 from pathlib import Path
 
 import pytest
 
 from pipeline.rig.refusals import NotKept
-from storage.fetched_files import FetchedFiles
+from storage.fetched_files import SUMS, FetchedFiles
+from tests.storage.small_archive import flip
 
 
 def test_what_was_appended_is_read_back(tmp_path: Path):
@@ -41,7 +44,7 @@ def test_no_name_leads_out_of_the_folder(tmp_path: Path, name: str):
     kept.append(name, b"x")
     kept.append("/a/b", b"yy")
     assert kept.size(name) == 1
-    assert len(list((tmp_path / "camera").iterdir())) == 2
+    assert len([path for path in (tmp_path / "camera").iterdir() if not path.name.endswith(SUMS)]) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["camera"]
 
 
@@ -67,3 +70,30 @@ def test_full_disk_keeps_what_there_was(tmp_path: Path, monkeypatch: pytest.Monk
     with pytest.raises(NotKept, match=r"cannot keep byte 5 of /a/raw_0 .*No space left.*the 5 bytes before"):
         kept.append("/a/raw_0", b"torn")
     assert kept.read("/a/raw_0", 0, 99) == b"whole"
+
+
+@pytest.mark.parametrize("rotten", ["bytes", "sums"])
+def test_flipped_bit_is_cut_off_and_nothing_before_it(tmp_path: Path, rotten: str):
+    """Of what an earlier process left only bytes that are as they came are held; the camera gives the rest again."""
+    chance, name = random.Random(7), "/captured/a/raw_0"
+    parts = [chance.randbytes(chance.randint(1, 40)) for _ in range(12)]
+    truth = b"".join(parts)
+    before = FetchedFiles(tmp_path / "whole")
+    for part in parts:
+        before.append(name, part)
+    for trial in range(40):
+        folder = shutil.copytree(tmp_path / "whole", tmp_path / str(trial))
+        path = next(path for path in folder.iterdir() if path.name.endswith(SUMS) == (rotten == "sums"))
+        flip(path, at=(place := chance.randrange(path.stat().st_size)), bit=chance.randrange(8))
+        kept = FetchedFiles(folder)
+        held = kept.size(name)
+        assert kept.read(name, 0, held) == truth[:held]
+        assert held > (place if rotten == "bytes" else len(truth)) - 80
+        kept.append(name, truth[held:])
+        assert FetchedFiles(folder).read(name, 0, 1000) == truth
+
+
+def test_file_without_sums_is_fetched_again(tmp_path: Path):
+    """As of an earlier version, or of a disk that did not keep them: nothing vouches for a byte of it."""
+    (tmp_path / "a%2Fraw_0").write_bytes(b"whatever")
+    assert FetchedFiles(tmp_path).size("/a/raw_0") == 0

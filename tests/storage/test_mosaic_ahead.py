@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from pipeline.camera import LineCamera
+from pipeline.checked_lines import with_check
 from pipeline.errors import SettingsError
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.scan import Sweep, line_positions
@@ -24,6 +25,7 @@ from storage.mosaic_work import MosaicWork
 from storage.mosaics import MosaicWriter
 from storage.spool import Spool
 from storage.tile_work import Thumbnail, write_mosaic
+from tests.storage.small_archive import flip
 
 CAMERA = LineCamera(samples=96)
 BANDS = np.array([500.0, 600.0, 700.0])
@@ -175,7 +177,18 @@ def test_what_a_power_cut_left_is_not_taken_over(
 def test_a_record_of_something_else_takes_nothing_over(captured: Captured, tmp_path: Path, record: str) -> None:
     """A file that is no record of ours is no reason to fail."""
     make_ahead(captured, tmp_path / "ahead")
-    (tmp_path / "ahead" / "ahead.json").write_text(record)
+    for text in (record.encode(), with_check(record.encode())):
+        (tmp_path / "ahead" / "ahead.json").write_bytes(text)
+        assert take_over(tmp_path / "ahead", tmp_path / "out.zarr", WANTED, captured.paths, picture()) == []
+
+
+@pytest.mark.parametrize("name", ["ahead.json", "seen.npy"])
+def test_what_has_changed_is_not_taken_over(captured: Captured, tmp_path: Path, name: str) -> None:
+    """A bit in the record, which could name a tile that is not ready, or in the picture."""
+    make_ahead(captured, tmp_path / "ahead")
+    path = tmp_path / "ahead" / name
+    at = path.read_bytes().index(b'"tiles": [[0') + 11 if name == "ahead.json" else -5
+    flip(path, at, bit=0)
     assert take_over(tmp_path / "ahead", tmp_path / "out.zarr", WANTED, captured.paths, picture()) == []
 
 

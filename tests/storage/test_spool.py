@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
+import re
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipeline.checked_lines import with_check
 from pipeline.errors import RigError
 from pipeline.source import Line
 from storage.spool import Spool, read_spooled
+from tests.storage.small_archive import flip
 
 HEADER = {"sweep": "fine-0", "seed": 3, "start_px": -40.25}
 
@@ -90,12 +95,16 @@ def test_the_spool_is_an_envi_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["lines.bil", "lines.index"])
 @pytest.mark.parametrize("cut", [1, 30, 47, 48, 49, 130])
 def test_a_torn_tail_is_cut_off(tmp_path: Path, name: str, cut: int) -> None:
-    """Whatever part of the last lines is lost, the whole lines before it are kept and the capture goes on."""
+    """Whatever part of the last lines is lost, the whole lines before it are kept and the capture goes on.
+
+    An entry that only lost its end is whole by its checksum.
+    """
     _fill(tmp_path, 8)
     size = (tmp_path / name).stat().st_size
     os.truncate(tmp_path / name, size - cut)
     with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
-        assert 4 < spool.count < 8
+        assert spool.count == 8 if (name, cut) == ("lines.index", 1) else 4 < spool.count < 8
+        assert spool.lost == []
         assert _same([line for block in spool.blocks() for line in block])
     _fill(tmp_path, 8)
     with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
@@ -104,7 +113,7 @@ def test_a_torn_tail_is_cut_off(tmp_path: Path, name: str, cut: int) -> None:
 
 
 def test_a_changed_line_is_named(tmp_path: Path) -> None:
-    """Reading compares each line's CRC; opening again goes on before the changed line."""
+    """Reading compares each line's CRC; opening again finds it lost, and the lines after it good."""
     _fill(tmp_path, 6)
     with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
         content = bytearray((tmp_path / "lines.bil").read_bytes())
@@ -112,7 +121,92 @@ def test_a_changed_line_is_named(tmp_path: Path) -> None:
         (tmp_path / "lines.bil").write_bytes(content)
         with pytest.raises(RigError, match="line 4 has changed"):
             list(spool.blocks())
-        assert spool.recover() == 4
+        assert spool.recover() == 6
+        assert spool.lost == [4]
+
+
+@pytest.mark.parametrize("lost", [[0], [3], [2, 3, 4], list(range(70))])
+def test_lost_lines_are_put_back(tmp_path: Path, lost: list[int]) -> None:
+    """The same bytes as had nothing been lost; until then the others are there and these are not given."""
+    _fill(tmp_path, 75)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    lines = before["lines.index"].split(b"\n")
+    for number in lost:
+        lines[1 + number] = lines[1 + number].replace(b"true", b"tree").replace(b"false", b"falls")
+    (tmp_path / "lines.index").write_bytes(b"\n".join(lines))
+    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        assert (spool.count, spool.lost) == (75, lost)
+        with pytest.raises(RigError, match=f"line {lost[0]} has changed since it was captured"):
+            list(spool.blocks(75))
+        spool.mend(_line(number) for number in lost)
+        assert spool.lost == []
+        assert _same(next(spool.blocks(75)))
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_lines_are_put_back_in_their_places_alone(tmp_path: Path) -> None:
+    """Another line than the one that is lost is refused, and nothing is overwritten with it."""
+    _fill(tmp_path, 6)
+    flip(tmp_path / "lines.bil", 48 * 4 + 5)
+    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        with pytest.raises(RigError, match="got line 3"):
+            spool.mend([_line(3)])
+        assert spool.lost == [4]
+        spool.append(_line(6))
+        spool.mend([_line(4)])
+        assert _same(next(spool.blocks()))
+
+
+def test_a_damaged_header_costs_no_line_of_this_sweep(tmp_path: Path) -> None:
+    """Entries go on from the header's checksum: those of this sweep are known without it, another's are not taken."""
+    _fill(tmp_path, 6)
+    flip(tmp_path / "lines.index", 30)
+    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        assert (spool.count, spool.lost) == (6, [])
+        assert _same(next(spool.blocks()))
+    flip(tmp_path / "lines.index", 30)
+    with Spool.open(tmp_path, 6, 4, header={**HEADER, "seed": 4}) as spool:
+        assert spool.count == 0
+
+
+@pytest.mark.parametrize(
+    "change", [{"line": -1}, {"line": 2.0}, {"valid": 1}, {"time_s": None}, {"crc32": "0"}, {"x": 0}]
+)
+def test_an_entry_of_other_facts_is_a_lost_line(tmp_path: Path, change: dict[str, object]) -> None:
+    """Whatever its checksum says: facts that are missing, too many or of another kind are no line's."""
+    _fill(tmp_path, 5)
+    path = tmp_path / "lines.index"
+    head, *entries = path.read_bytes().splitlines(keepends=True)
+    facts = {name: value for name, value in json.loads(entries[2]).items() if name != "check"}
+    entries[2] = with_check(json.dumps(facts | change).encode(), zlib.crc32(head))
+    path.write_bytes(head + b"".join(entries))
+    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        assert (spool.count, spool.lost) == (5, [2])
+
+
+def test_a_spool_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
+    """Its entries have no checksum: one message says so and what to do, and nothing of it is touched."""
+    _fill(tmp_path, 3)
+    content = (tmp_path / "lines.index").read_bytes()
+    earlier = re.sub(rb', "check": "[0-9a-f]{8}"', b"", content).replace(b"line spool 2", b"line spool 1")
+    (tmp_path / "lines.index").write_bytes(earlier)
+    with pytest.raises(RigError, match=r"another version.*finish that capture with the version that began it"):
+        Spool.open(tmp_path, 6, 4, header=HEADER)
+    assert (tmp_path / "lines.index").read_bytes() == earlier
+
+
+@pytest.mark.parametrize("name", ["lines.bil", "lines.index"])
+@pytest.mark.parametrize("kind", ["link", "pipe"])
+def test_a_link_or_a_pipe_is_no_spool(tmp_path: Path, name: str, kind: str) -> None:
+    """Neither followed nor waited for, and what a link leads to stays as it was."""
+    _fill(tmp_path / "spool", 3)
+    path, away = tmp_path / "spool" / name, tmp_path / "away"
+    path.rename(away)
+    before = away.read_bytes()
+    os.mkfifo(path) if kind == "pipe" else path.symlink_to(away)
+    with pytest.raises(RigError, match=f"it is a {kind}, expected a file"):
+        Spool.open(tmp_path / "spool", 6, 4, header=HEADER)
+    assert away.read_bytes() == before
 
 
 def test_lines_of_another_sweep_are_not_continued(tmp_path: Path) -> None:

@@ -1,0 +1,95 @@
+"""Lines of JSON that vouch for themselves, for files that only grow and of which any byte may change.
+
+The last member of each object, ``check``, is the CRC-32 of the text before it, so that every bit of a line counts. It
+may go on from a seed, another text's CRC, without which the line is none: so lines are bound to what they belong to.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+_CHECK = re.compile(rb', "check": "([0-9a-f]{8})"\}')
+_OPENS, _CLOSES = b', "check": "', b'"}'
+_LENGTH = len(_OPENS) + 8 + len(_CLOSES)
+
+State = Literal["whole", "unchecked", "torn", "changed"]
+
+
+@dataclass(frozen=True)
+class CheckedLine:
+    """One line as it was found; ``content`` is None where it cannot be believed.
+
+    ``unchecked``: an object without a checksum, as earlier versions wrote them. ``torn``: what a power cut leaves of a
+    line, or of others' bytes. ``changed``: it was whole once.
+    """
+
+    number: int  # from 1
+    text: bytes
+    content: dict[str, Any] | None
+    state: State
+
+
+def with_check(text: bytes, seed: int = 0) -> bytes:
+    """Make the line of an object, given as JSON on one line and not empty."""
+    body = text[: -len(b"}")]
+    return body + b"%s%08x%s\n" % (_OPENS, zlib.crc32(body, seed), _CLOSES)
+
+
+def read_checked(content: bytes, seed: int = 0) -> Iterator[CheckedLine]:
+    """Give every line of a file. Two that only lost the end between them are both whole, and one more is ``changed``.
+
+    No single bit that flips makes a line with a checksum ``unchecked`` or ``torn``, or gives it another content.
+    """
+    for number, text in enumerate(content.split(b"\n"), 1):
+        if text:
+            yield from _line(number, text, seed)
+
+
+def _line(number: int, text: bytes, seed: int) -> Iterator[CheckedLine]:
+    found = _whole(text, seed)
+    if found is not None:
+        yield CheckedLine(number, text, found, "whole")
+        return
+    ends = [match.end() for match in _CHECK.finditer(text)]
+    for start, end in zip([0, *ends], ends, strict=False):
+        for part in (text[start:end], text[start + 1 : end]):  # or behind what the end of a line became
+            found = _whole(part, seed)
+            if found is not None:
+                yield CheckedLine(number, part, found, "whole")
+                break
+    yield _unchecked(number, text) if not ends else CheckedLine(number, text, None, "changed")
+
+
+def _whole(text: bytes, seed: int) -> dict[str, Any] | None:
+    """The object of a line whose checksum is that of its text."""
+    body, check = text[:-_LENGTH], _CHECK.fullmatch(text[-_LENGTH:])
+    if check is None or int(check[1], 16) != zlib.crc32(body, seed):
+        return None
+    return _object(body + b"}")
+
+
+def _unchecked(number: int, text: bytes) -> CheckedLine:
+    content = None if _had_check(text) else _object(text)
+    if content is not None:
+        return CheckedLine(number, text, content, "unchecked")
+    return CheckedLine(number, text, None, "changed" if _had_check(text) or text.endswith(b"}") else "torn")
+
+
+def _had_check(text: bytes) -> bool:
+    """Whether a line ends as one with a checksum does, but for one byte at most."""
+    tail = text[-_LENGTH:]
+    fixed = tail[: len(_OPENS)] + tail[-len(_CLOSES) :]
+    return len(tail) == _LENGTH and sum(a != b for a, b in zip(fixed, _OPENS + _CLOSES, strict=True)) <= 1
+
+
+def _object(text: bytes) -> dict[str, Any] | None:
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) else None

@@ -1,0 +1,186 @@
+"""Bits that flip in files that only grow: ``python tests/faults/growing_files.py 2000``.
+
+A spool's index, numbers and ENVI header, a field's ledger, a rig's journal. Each is opened again as a capture, a
+schedule or a rig would, and gone on with. Demanded: no other number without a word, no defect, every other line kept.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import random
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from pipeline.errors import PipelineError
+from pipeline.rig.capture_journal import JOURNAL, CaptureJournal, Taken
+from pipeline.rig.kept_files import KeptInMemory
+from pipeline.scan import Sweep
+from storage.growing_checks import growing_problems
+from storage.ledger import Ledger
+from storage.spool import Spool
+from tests.faults.fault_table import Clock, Row
+from tests.faults.lost_lines import BANDS, HEADER, SAMPLES, fill, line
+
+LINES = 40
+FLIPS = 2000
+SWEEP = Sweep("fine-0", "fine", "x", 0.0, -7.5, 40)
+
+
+@dataclass
+class Rot:
+    """What came of the flips of one kind of file. ``told`` counts those of which anything is said."""
+
+    flips: int = 0
+    told: int = 0
+    wrong: list[str] = field(default_factory=list)
+
+    def words(self) -> str:
+        """The figures."""
+        few = f": {'; '.join(self.wrong[:3])}" if self.wrong else ""
+        return f"{self.told} of {self.flips} told; {len(self.wrong)} wrong{few}"
+
+
+def flip_spool(name: str, flips: int, folder: Path, seed: int = 0) -> Rot:
+    """Flip bits of one of a spool's files, see what verify says, and go on with the capture."""
+    whole = folder / "spool" / "whole"
+    with Spool.open(whole, SAMPLES, BANDS, header=HEADER) as spool:
+        fill(spool, LINES)
+    truth = {path.name: path.read_bytes() for path in whole.iterdir()}
+    chance, found = random.Random(f"{seed} {name}"), Rot()
+    for _ in range(flips):
+        place = folder / "rotten" / "spool" / "key"
+        shutil.rmtree(folder / "rotten", ignore_errors=True)
+        place.mkdir(parents=True)
+        for each, content in truth.items():
+            (place / each).write_bytes(content)
+        where = _flip(place / name, chance)
+        found.told += bool(_told(folder / "rotten"))
+        found.wrong += [f"{where}: {one}" for one in _guarded(lambda at=place: _go_on(at, truth))]  # type: ignore[misc]
+        found.flips += 1
+    return found
+
+
+def _go_on(place: Path, truth: dict[str, bytes]) -> list[str]:
+    """Open a spool, have back what is lost, read every line."""
+    wrong = []
+    with Spool.open(place, SAMPLES, BANDS, header=HEADER) as spool:
+        if len(spool.lost) + LINES - spool.count > 1:
+            wrong.append(f"{len(spool.lost) + LINES - spool.count} lines lost")
+        spool.mend(line(number) for number in spool.lost)
+        fill(spool, LINES)
+        kept = [asdict(one) | {"data": one.data.tobytes()} for block in spool.blocks() for one in block]
+    if kept != [asdict(line(number)) | {"data": line(number).data.tobytes()} for number in range(LINES)]:
+        wrong.append("a line is another")
+    if {path.name: path.read_bytes() for path in place.iterdir()} != truth:
+        wrong.append("not the undisturbed bytes after going on")
+    return wrong
+
+
+def flip_ledger(flips: int, folder: Path, seed: int = 0) -> Rot:
+    """Flip bits of a ledger, see what verify says, and read it."""
+    ledger = Ledger(folder, "north")
+    lines = [{"event": "done", "at": f"2026-11-20T10:{number:02}:00Z", "words": "ä J *"} for number in range(LINES)]
+    for one in lines:
+        ledger.append(one)
+    content, chance, found = ledger.path.read_bytes(), random.Random(seed), Rot()
+    for _ in range(flips):
+        ledger.path.write_bytes(content)
+        where = _flip(ledger.path, chance)
+        told = _told(folder)
+        found.told += bool(told)
+        found.flips += 1
+        last_end = where.startswith(f"byte {len(content) - 1}:")  # a last line without its end is as good as whole
+        wrong = [] if told or last_end else ["not told"]
+        wrong += _guarded(lambda: _others(ledger.lines(), lines))
+        found.wrong += [f"{where}: {one}" for one in wrong]
+    return found
+
+
+def flip_journal(flips: int, seed: int = 0) -> Rot:
+    """Flip bits of a rig's journal: a capture is held as it was, or not at all; the loss is told."""
+    kept = KeptInMemory()
+    journal = CaptureJournal(kept)
+    truth = []
+    for number in range(8):
+        times = (float(number), number + 0.5)
+        taken = Taken(SWEEP, 5 * number, 5 * number + 5, f"/captured/a_{number}", True, times, times)
+        journal.began(taken)
+        truth.append(asdict(journal.ended(taken)))
+    content, chance, found = bytes(kept.files[JOURNAL]), random.Random(seed), Rot()
+    for _ in range(flips):
+        rotten = bytearray(content)
+        at, bit = chance.randrange(len(rotten)), chance.randrange(8)
+        rotten[at] ^= 1 << bit
+        found.flips += 1
+        for one in _guarded(lambda held=rotten: _held(held, truth, found)):  # type: ignore[misc]
+            found.wrong.append(f"byte {at}: bit {bit}: {one}")
+    return found
+
+
+def _held(rotten: bytearray, truth: list[dict[str, Any]], found: Rot) -> list[str]:
+    journal = CaptureJournal(KeptInMemory({JOURNAL: rotten}))
+    held = [taken for number in range(8) if (taken := journal.holding(SWEEP, 5 * number)) is not None]
+    found.told += bool(journal.damage)
+    return ["another capture"] * any(asdict(one) not in truth for one in held) + ["captures lost"] * (len(held) < 7)
+
+
+def _others(found: list[dict[str, Any]], lines: list[dict[str, Any]]) -> list[str]:
+    return ["another line"] * any(one not in lines for one in found) + ["lines lost"] * (len(found) < len(lines) - 1)
+
+
+def _flip(path: Path, chance: random.Random) -> str:
+    content = bytearray(path.read_bytes())
+    at, bit = chance.randrange(len(content)), chance.randrange(8)
+    content[at] ^= 1 << bit
+    path.write_bytes(content)
+    return f"byte {at}: bit {bit} of {path.name}"
+
+
+def _told(root: Path) -> list[str]:
+    return [problem for _, problem in growing_problems(root) if problem is not None]
+
+
+def _guarded(tried: Callable[[], list[str]]) -> list[str]:
+    """What is wrong, a defect among it."""
+    try:
+        return tried()
+    except PipelineError as error:
+        return [f"refused: {error}"]
+    except Exception as error:
+        return [f"defect: {error!r}"]
+
+
+def rot_everything(flips: int, folder: Path, seed: int = 0) -> dict[str, Rot]:
+    """So many flips in all, by the kind of file."""
+    share = -(-flips // 5)
+    found = {name: flip_spool(name, share, folder, seed) for name in ("lines.index", "lines.bil", "lines.hdr")}
+    return found | {"ledger": flip_ledger(share, folder / "schedules", seed), "journal": flip_journal(share, seed)}
+
+
+def rows(quick: bool = False) -> Sequence[Row]:
+    """One row for all kinds of files."""
+    clock = Clock()
+    with tempfile.TemporaryDirectory(prefix="growing-") as name:
+        found = rot_everything(200 if quick else FLIPS, Path(name))
+    met = not any(one.wrong for one in found.values())
+    return [Row(
+        "a bit flips in a file that grows", "one bit of a spool's index, numbers or ENVI header, of a ledger, of a "
+        "rig's journal", sum(one.flips for one in found.values()), "no other number, no defect, no other line lost",
+        "; ".join(f"{kind}: {one.words()}" for kind, one in found.items()), met, clock.seconds,
+    )]  # fmt: skip
+
+
+if __name__ == "__main__":
+    logging.disable(logging.WARNING)
+    FLIPS = int(sys.argv[1]) if len(sys.argv) > 1 else FLIPS
+    (row,) = rows()
+    print(json.dumps({"flips": row.count, "found": row.found}, indent=1))
+    sys.exit(0 if row.met else 1)
