@@ -27,6 +27,7 @@ from flows.progress import StageProgress
 from flows.receipt import to_json
 from models.bootstrap import LEVEL
 from models.process import keep_freed_memory
+from models.weights import describe_weights, unsealed_note
 
 
 def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = False) -> dict[str, Any]:
@@ -37,6 +38,9 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
         sys.stdout.write(to_json(content))
     else:
         print_evaluation(content, Console(file=sys.stdout, width=None if sys.stdout.isatty() else PIPED_WIDTH))
+    for path in (*request.weights, *request.controls):
+        if not describe_weights(path).sealed:
+            console.print(f"note: {unsealed_note(path)}", highlight=False, markup=False, soft_wrap=True)
     for path in content["files"]:
         console.print(path, highlight=False, soft_wrap=True)
     return content

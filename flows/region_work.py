@@ -5,7 +5,6 @@ A worker gets paths and numbers, opens what it needs, and keeps one region in me
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -18,7 +17,7 @@ from models.policies import IMAGE_POLICIES, NETWORK_POLICIES, score_seats
 from models.regions import Region
 from models.second_look import surprise
 from models.vgg_file import VggFile
-from models.weights import Weights, load_weights
+from models.weights import Weights, content_key, load_weights
 from pipeline.errors import WeightsError
 from storage.class_maps import write_class_tile
 from storage.mosaic_strips import mosaic_strips, mosaic_wavelengths
@@ -41,7 +40,7 @@ class WeightsFile:
 @lru_cache(maxsize=1)
 def _weights_at(file: WeightsFile) -> Weights:
     weights = load_weights(file.path)
-    if hashlib.sha256(file.path.read_bytes()).hexdigest()[:20] != file.key:
+    if content_key(file.path) != file.key:
         raise WeightsError(f"the weights {file.path} have changed since the survey began; start it again")
     return weights
 

@@ -101,6 +101,16 @@ def checked_wavelengths(wavelength_nm: NDArray[np.floating], bands: int) -> NDAr
     return wavelength
 
 
+def check_basis(basis: SpectralBasis, columns: int) -> None:
+    """Raise WavelengthError unless a basis has so many columns, between two wavelengths that there can be."""
+    checked_wavelengths(np.array([basis.low_nm, basis.high_nm]), 2)
+    if basis.columns != columns or basis.low_nm > basis.high_nm:
+        raise WavelengthError(
+            f"a basis of {basis.columns} columns from {basis.low_nm:g} to {basis.high_nm:g} nm, expected {columns} of"
+            " them between ascending wavelengths"
+        )
+
+
 def band_widths(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Stretch of spectrum that a band stands for [nm]: half the way to either neighbour; 1 for a single wavelength."""
     distinct, group, members = np.unique(wavelength_nm, return_inverse=True, return_counts=True)

@@ -123,6 +123,7 @@ FAULTS: dict[str, Callable[[bool], Sequence[Row]]] = {
     "clocks": _module("clocks"),
     "lost_lines": _module("lost_lines"),
     "spool_rate": _module("spool_rate"),
+    "sealed_flips": _module("sealed_flips"),
 }  # fmt: skip
 
 if __name__ == "__main__":

@@ -8,7 +8,16 @@ from random import Random
 
 import pytest
 
-from tests.faults import clocks, disk_full, lost_lines, many_writers, refused_writes, small_survey, spool_rate
+from tests.faults import (
+    clocks,
+    disk_full,
+    lost_lines,
+    many_writers,
+    refused_writes,
+    sealed_flips,
+    small_survey,
+    spool_rate,
+)
 from tests.faults.fault_table import Row, markdown_table, plain_table
 from tests.faults.nursery import Nursery
 from tests.faults.small_survey import Subject, changing_calls, prepare, stored, words
@@ -79,6 +88,14 @@ def test_spool_at_a_cameras_pace(tmp_path: Path) -> None:
     pace = spool_rate.keep_pace(tmp_path, 2.0)
     assert pace.lines == 200
     assert pace.kept == pace.lines - pace.dropped
+
+
+def test_bits_flipped_in_weights_and_checkpoints(tmp_path: Path) -> None:
+    """Each is refused in one message, or read as it was written."""
+    found = sealed_flips.flip_bits(150, tmp_path, seed=1)
+    assert found.wrong == []
+    assert found.tried == found.refused + found.same == 150
+    assert found.refused > 100
 
 
 def test_a_fault_that_is_not_survived_is_seen(subject: Subject) -> None:
