@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import WavelengthError
+from pipeline.readings import MOST_STEPS
 
 REACH = 1.5  # a column is reached by a band within this many column spacings of its centre
 LONGEST_NM, SHORTEST_NM = 3000.0, 200.0
@@ -177,6 +178,12 @@ class Normalisation:
         inverse = whitening @ whitening
         rest = ~reached
         return np.asarray(-np.linalg.solve(inverse[np.ix_(rest, rest)], inverse[np.ix_(rest, reached)]).T, np.float32)
+
+    @property
+    def most_value(self) -> float:
+        """Size up to which a value may be a reading: as many spreads from the centre as a camera tells steps apart."""
+        reach = np.abs(self.centre.astype(np.float64)) + MOST_STEPS * self.spread.astype(np.float64)
+        return float(min(reach.max(initial=0.0), np.finfo(np.float32).max))
 
     @property
     def gain_shift(self) -> NDArray[np.float32]:

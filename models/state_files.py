@@ -31,8 +31,8 @@ def read_state(path: Path) -> dict[str, Tensor]:
 
     Raises
     ------
-    WeightsError : missing, cut short, no tensors in it, a tensor larger than the file, or it holds Python objects, which
-        are refused unread.
+    WeightsError : missing, cut short, no tensors in it, one larger than the file, or it holds Python objects, which are
+        refused unread.
     """
     if not path.is_file():
         raise WeightsError(f"no file of weights at {path}; give the path of a .safetensors or .pth file")
@@ -47,8 +47,8 @@ def _check_extent(state: Mapping[str, Tensor], path: Path) -> None:
     for name, tensor in state.items():
         if tensor.numel() * tensor.element_size() > size:
             raise WeightsError(
-                f"{path} claims {tuple(tensor.shape)} numbers for the tensor {name}, more than its {size} bytes hold; save"
-                " the state dict again, every tensor contiguous"
+                f"{path} claims {tuple(tensor.shape)} numbers for the tensor {name}, more than its {size} bytes hold;"
+                " save the state dict again, every tensor contiguous"
             )
 
 

@@ -23,6 +23,7 @@ from models.sealed_files import (
 from models.sizes import SegmenterConfig
 from models.spectral import Normalisation, SpectralBasis, check_basis, project
 from pipeline.errors import WeightsError
+from pipeline.readings import readings_alone
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -72,8 +73,10 @@ class AnyWeights:
         """Normalised spectral columns of pixels, (..., band) -> (..., column) float32.
 
         Columns that no band reaches take what the others let expect, and so do those of which all bands are dead.
-        A pixel with more than half of its bands dead is NaN.
+        A value that is no reading by `Normalisation.most_value` is dead. A pixel with more than half of its bands dead
+        is NaN.
         """
+        values = readings_alone(values, self.normalisation.most_value)
         matrix, reached = self.basis.matrix(wavelength_nm)
         seen = project(values, matrix)
         columns = self.normalisation.apply(seen, reached)
