@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from flows.training_look import observe_scene
 from models.examples import normalised
 from models.holes import patches_of
 from models.inference import CoarseLook, Glance, glance_of_columns
-from models.weights import AnyWeights, Description, Weights, describe_weights, load_any_weights
+from models.weights import AnyWeights, Description, Weights, content_key, describe_weights, load_any_weights
 from pipeline.camera import LineCamera
 from pipeline.errors import PipelineError, SceneError, SettingsError, WeightsError
 from pipeline.grid import SceneGrid
@@ -135,11 +134,8 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
 
 
 def file_key(path: Path) -> str:
-    """Name a file by its bytes; WeightsError where it cannot be read."""
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-    except OSError as error:
-        raise WeightsError(f"cannot read {path}: {error.strerror}") from error
+    """Name weights by what they hold; WeightsError where they cannot be read."""
+    return content_key(path)[:16]
 
 
 def open_frames(

@@ -30,6 +30,7 @@ from flows.terminal import on_stdout
 from models.bootstrap import LEVEL
 from models.metrics import agreement, false_pixels, iou_per_class
 from models.process import keep_freed_memory
+from models.weights import describe_weights, unsealed_note
 
 
 def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = False) -> dict[str, Any]:
@@ -40,6 +41,9 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
         sys.stdout.write(to_json(content))
     else:
         print_evaluation(content, on_stdout())
+    for path in (*request.weights, *request.controls):
+        if not describe_weights(path).sealed:
+            console.print(f"note: {unsealed_note(path)}", highlight=False, markup=False, soft_wrap=True)
     for path in content["files"]:
         console.print(path, highlight=False, soft_wrap=True)
     return content

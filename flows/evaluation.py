@@ -61,16 +61,17 @@ def evaluate(
     def build(path: Path) -> None:
         """Judge the map, the coarse look alone, and with controls other placements."""
         classes = load_class_map(class_map.path / "class_map.zarr").classes
+        judged = np.where(classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # what has no class is not
         seen = glance_at(run, mosaic)
-        counts = confusion(labels, classes, run.weights.config.classes)
+        counts = confusion(judged, classes, run.weights.config.classes)
         result: dict[str, Any] = _figures(run, counts)
         empty = np.empty((0, run.grid.patch, run.grid.patch, run.weights.basis.columns), np.float32)
         none = segment(run.weights, seen, empty, np.empty(0, np.int64))
-        result["none"] = _figures(run, confusion(labels, none.classes, run.weights.config.classes))
+        result["none"] = _figures(run, confusion(judged, none.classes, run.weights.config.classes))
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
         if run.settings.controls:
             source = source_with(_sure_source(run, off), effects)
-            result |= _controls(replace(run, source=source), seen, patches, labels, result)
+            result |= _controls(replace(run, source=source), seen, patches, judged, result)
         (path / "accuracy.json").write_text(to_json(result), encoding="utf-8")  # no NaN, which JSON does not know
 
     params = {

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.region_work import Comparing, Drawing, Scoring, WeightsFile
+from flows.region_work import Comparing, Drawing, Scoring, Strange, WeightsFile
 from flows.run import SurveyRun, weights_path
 from models.policies import IMAGE_POLICIES
 from models.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field
@@ -103,8 +103,10 @@ class FieldWork:
             found[region.kept_seats.rows, region.kept_seats.columns] = part
         return found.ravel()
 
-    def draw(self, mosaic: Path, patches: Path, out: Path, report: Callable[[float], None]) -> None:
-        """Draw the class map into the store that was created at ``out``.
+    def draw(self, mosaic: Path, patches: Path, out: Path, report: Callable[[float], None]) -> Strange:
+        """Draw the class map into the store that was created at ``out``; count pixels that were left out.
+
+        These are the coarse pixels, and the fine ones, with a value that the weights take for no reading.
 
         Raises
         ------
@@ -113,7 +115,8 @@ class FieldWork:
         store = open_patches(patches)
         crew = self.crew_for(store.seats, len(store.wavelength_nm))
         paths = mosaic.resolve(), patches.resolve(), out.resolve()
-        run_blocks(Drawing(self.weights, *paths), self.regions, crew, keep=False, report=report, paths=paths)
+        parts = run_blocks(Drawing(self.weights, *paths), self.regions, crew, report=report, paths=paths)
+        return sum(coarse for coarse, _ in parts), sum(fine for _, fine in parts)
 
     def check_memory(self, seats: NDArray[np.integer], bands: int) -> None:
         """Refuse a memory in which no region with its part of these seats of the field can be read.

@@ -13,16 +13,21 @@ from flows.orientation_stage import load_orientation
 from flows.placement import line_facts, seen_shares
 from flows.pointing_stage import load_registration
 from flows.run import SurveyRun
-from flows.stages import load_plan
+from flows.stages import load_plan, strange_pixels
 from flows.survey import Products
+from pipeline.grid import UNLABELLED
 from pipeline.planning import FinePlan, joined_plan
 from storage.archive import StageRef
 from storage.attention import load_attention
+from storage.class_maps import load_class_map
 from storage.ground_maps import load_ground_map
 
 
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
-    """Gather ``plan`` and the parts of the receipt that not every survey has: ``pointing``, ``ground``, ``lines``."""
+    """Gather ``plan`` and the parts of the receipt that not every survey has.
+
+    These are ``pointing``, ``ground``, ``pixels`` and ``lines``.
+    """
     found: dict[str, Any] = {"plan": _plan(run, products)}
     passes = {
         "coarse": products.coarse_pointing, "fine": products.fine_pointing, "second fine": products.pointing_again,
@@ -34,10 +39,25 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
     if products.ground_map is not None:
         found["ground"] = _ground(products.ground_map)
+    pixels = _pixels(run, products.class_map)
+    if any(pixels.values()):
+        found["pixels"] = pixels
     troubled = {name: facts for name, facts in line_facts(products.mosaic).items() if any(facts.values())}
     if troubled:
         found["lines"] = troubled
     return found
+
+
+def _pixels(run: SurveyRun, class_map: StageRef) -> dict[str, int]:
+    """Pixels of which not all was known: of the scene, of what was captured, and of the map."""
+    classes = load_class_map(class_map.path / "class_map.zarr").classes
+    return {
+        "scene_without_a_value": run.scene.filled_px,
+        "coarse_px_no_reading": 0,
+        "fine_px_no_reading": 0,
+        **{f"{name}_no_reading": count for name, count in strange_pixels(class_map).items()},
+        "map_without_a_class": int(np.count_nonzero(classes == UNLABELLED)),
+    }
 
 
 def _plan(run: SurveyRun, products: Products) -> dict[str, Any]:

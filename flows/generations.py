@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -16,7 +15,8 @@ from flows.setting_keys import BUILT_IN_SCENES
 from flows.settings import OF_THE_MACHINE, Settings, of_this_version, parse_settings
 from flows.stages import VERSIONS
 from flows.survey import STAGES
-from pipeline.errors import SettingsError
+from models.weights import content_key
+from pipeline.errors import SettingsError, WeightsError
 from pipeline.simulator.farm_laws import USUAL_DAY, USUAL_HOUR, farm_law, has_days, law_of_key
 from storage.keys import canonical_json
 from storage.lineage import Catalogue
@@ -138,23 +138,23 @@ def check_stage(stage: str) -> None:
 
 
 def weights_key(settings: Settings) -> str | None:
-    """The beginning of the SHA-256 of the weights' file, as stages know it; None where it cannot be read."""
+    """What the weights are called by what they hold, as stages know it; None where they cannot be read."""
     shipped = Path(str(resources.files("models") / "shipped" / SHIPPED))
     return file_key(shipped if settings.weights is None else Path(settings.weights))
 
 
 def file_key(path: Path) -> str | None:
-    """The beginning of a file's SHA-256; None where it cannot be read."""
+    """What a file of weights is called by what it holds; None where it cannot be read."""
     try:
         return _file_key(path, path.stat().st_mtime_ns, path.stat().st_size)
-    except OSError:
+    except (OSError, WeightsError):
         return None
 
 
 @cache
 def _file_key(path: Path, changed_ns: int, size: int) -> str:
     """Read once for all fields, and again when the file has changed."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:20]
+    return content_key(path)
 
 
 def _called(run: Run, uri: str) -> set[str]:

@@ -8,6 +8,28 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from flows.app import AsJson, OutFolder, Switch, app, parse_numbers, parse_wholes, split_list, stderr
+from pipeline.errors import SettingsError
+
+
+@app.command
+def seal(*weights: Path) -> int:
+    """Give WEIGHTS of an earlier version the hashes by which damage is told; those that have them are checked.
+
+    Nothing else of a file changes, and nothing that was made with it counts as made with other weights.
+
+    Parameters
+    ----------
+    weights
+        Files of weights.
+    """
+    from models.weights import seal_weights
+
+    if not weights:
+        raise SettingsError("seal needs files of weights: spectralzoom seal FILE ...")
+    for path in weights:
+        done = "sealed" if seal_weights(path) else "sealed already, every tensor as it was written"
+        stderr.print(f"{path}: {done}", highlight=False, markup=False, soft_wrap=True)
+    return 0
 
 
 @app.command

@@ -5,7 +5,6 @@ A worker gets paths and numbers, opens what it needs, and keeps one region in me
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -18,12 +17,15 @@ from models.policies import IMAGE_POLICIES, NETWORK_POLICIES, score_seats
 from models.regions import Region
 from models.second_look import surprise
 from models.vgg_file import VggFile
-from models.weights import Weights, load_weights
+from models.weights import Weights, content_key, load_weights
 from pipeline.errors import WeightsError
+from pipeline.readings import beyond_range, readings_alone
 from storage.class_maps import write_class_tile
 from storage.mosaic_strips import mosaic_strips, mosaic_wavelengths
 from storage.patches import PATCHES_A_SHARD, PatchStore, open_patches
 from storage.tile_work import let_tiles_go
+
+Strange = tuple[int, int]  # coarse pixels, and fine ones, with a value that is no reading
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class WeightsFile:
 @lru_cache(maxsize=1)
 def _weights_at(file: WeightsFile) -> Weights:
     weights = load_weights(file.path)
-    if hashlib.sha256(file.path.read_bytes()).hexdigest()[:20] != file.key:
+    if content_key(file.path) != file.key:
         raise WeightsError(f"the weights {file.path} have changed since the survey began; start it again")
     return weights
 
@@ -74,15 +76,18 @@ class Drawing:
     patches: Path
     out: Path
 
-    def __call__(self, region: Region) -> None:
+    def __call__(self, region: Region) -> Strange:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
         let_tiles_go()
         weights, store = self.weights.load(), open_patches(self.patches)
         seen = look_at(weights, self.mosaic, region)
-        seats, columns = seat_columns(weights, store, store.wavelength_nm, seen, region)
+        strange = np.zeros(region.grid.seat_shape, np.int64)
+        seats, columns = seat_columns(weights, store, store.wavelength_nm, seen, region, strange=strange.ravel())
         drawn = segment(weights, seen, columns, seats)
         origin = region.kept.top, region.kept.left
         write_class_tile(self.out, origin, region.crop(drawn.classes), region.crop(drawn.confidence))
+        coarse = 0 if seen.strange is None else int(np.count_nonzero(region.crop_coarse(seen.strange)))
+        return coarse, int(region.crop_seats(strange).sum())
 
 
 @dataclass(frozen=True)
@@ -116,12 +121,19 @@ def look_at(weights: Weights, mosaic: Path, region: Region) -> CoarseLook:
 
 
 def seat_columns(
-    weights: Weights, store: PatchStore, wavelength_nm: NDArray[np.float64], seen: CoarseLook, region: Region
+    weights: Weights,
+    store: PatchStore,
+    wavelength_nm: NDArray[np.float64],
+    seen: CoarseLook,
+    region: Region,
+    *,
+    strange: NDArray[np.int64] | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Numbers and normalised spectral columns (seat, p, p, column) of a region's patches, some read at a time.
 
     A mirror that looks beside the plan leaves pixels of a seat unseen: they take the columns of the coarse pixel over
-    them. A seat of which nothing was seen is left out.
+    them, and so do those with a number that is no reading in every band. A seat of which nothing was seen is left out.
+    Pixels with such a number are counted in ``strange``, (seat,) of the region's scene.
     """
     numbers = region.numbers_here(store.seats)
     here = np.flatnonzero(numbers >= 0)
@@ -129,7 +141,10 @@ def seat_columns(
     seats, columns = np.empty(count, np.int64), np.empty((count, p, p, weights.basis.columns), np.float32)
     for first in range(0, count, PATCHES_A_SHARD):
         entries = here[first : first + PATCHES_A_SHARD]
-        values = store.pick(entries)
+        values, most = store.pick(entries), weights.normalisation.most_value
+        if (wild := beyond_range(values, most)) is not None and strange is not None:
+            strange[numbers[entries]] = wild.any(axis=-1).sum(axis=(1, 2))
+        values = readings_alone(values, most)
         reached = np.asarray(np.isfinite(values).any(axis=-1), np.bool_)
         some = np.asarray(reached.any(axis=(1, 2)), np.bool_)
         part = slice(kept, kept := kept + int(some.sum()))

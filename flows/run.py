@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -20,7 +19,15 @@ from flows.setting_keys import BUILT_IN_SCENES
 from flows.settings import Settings
 from flows.survey_scene import check_labels, check_mask, farm_refusal, judged_labels, open_scene
 from models.vgg_file import VggFile
-from models.weights import Description, Weights, check_two_scale, describe_weights, load_weights
+from models.weights import (
+    Description,
+    Weights,
+    check_two_scale,
+    content_key,
+    describe_weights,
+    load_weights,
+    unsealed_note,
+)
 from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.grid import SceneGrid
@@ -143,16 +150,17 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     band_notes = _check_bands(scene, described, path)
     if settings.mask is not None:
         check_mask(settings.mask, scene.shape)
+    sealing = () if described.sealed else (unsealed_note(path),)
     vgg_notes = _check_vgg(settings, None if planning else load)
     source = make_source(scene, settings)
     rig = rig_source(scene, settings) if settings.source == "rig" else None
     check_memory(settings, source, grid, plan)
     _check_pose(settings, scene.shape)
-    key = hashlib.sha256(path.read_bytes()).hexdigest()[:20]
+    key = content_key(path)
     return SurveyRun(
         settings=settings, archive=Archive.open(settings.out), source=source, rig=rig, scene=scene,
         planned=(*plan.coarse, *plan.full), described=described, load=load, weights_key=key, grid=grid, plan=plan,
-        notes=(*notes, *band_notes, *vgg_notes, *label_notes), refused=refused,
+        notes=(*notes, *sealing, *band_notes, *vgg_notes, *label_notes), refused=refused,
     )  # fmt: skip
 
 

@@ -34,17 +34,18 @@ from pipeline.simulator.survey_clock import sweep_starts
 from pipeline.source import Line, Source
 from storage.archive import StageRef, stage_key
 from storage.attention import Attention, write_attention
-from storage.class_maps import ClassNames, create_class_map
+from storage.class_maps import ClassNames, clear_classes, create_class_map
 from storage.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from storage.patches import open_patches
 from storage.spool import Spool
 from storage.stored_tables import read_table
 
 VERSIONS = {
-    "effects": 2, "capture": 4, "register": 2, "locate": 2, "rectify": 3, "attend": 6, "patches": 3, "segment": 4,
+    "effects": 2, "capture": 4, "register": 2, "locate": 2, "rectify": 3, "attend": 7, "patches": 3, "segment": 5,
     "turned": 1, "ground": 2, "evaluate": 7,
 }  # fmt: skip
 SEATS_AT_ONCE = 64
+STRANGE = "strange.json"  # beside a map, where values were no readings
 
 Build = Callable[[Path], None]
 Follow = Callable[[Source, str], AbstractContextManager[Arrived]]  # of the source of a capture, and its key
@@ -220,15 +221,33 @@ def patch_columns(run: SurveyRun, patches: StageRef, seen: CoarseLook) -> tuple[
 
 
 def draw_map(run: SurveyRun, produce: Produce, mosaic: StageRef, patches: StageRef) -> StageRef:
-    """Read coarse and fine patches together and draw the class map, one region of the field after the other."""
+    """Read coarse and fine patches together and draw the class map, one region of the field after the other.
+
+    Where the scene has no value the map has no class.
+    """
 
     def build(path: Path) -> None:
         out, legend = path / "class_map.zarr", ClassNames(run.weights.class_names, run.weights.class_colours)
         create_class_map(out, (run.grid.height, run.grid.width), legend, grid=run.angular_grid())
-        FieldWork.of(run).draw(mosaic.path / "mosaic.zarr", patches.path / "patches.zarr", out, run.report)
+        strange = FieldWork.of(run).draw(mosaic.path / "mosaic.zarr", patches.path / "patches.zarr", out, run.report)
+        if any(strange):
+            write_json(path / STRANGE, dict(zip(("coarse_px", "fine_px"), strange, strict=True)))
+        if run.scene.missing is not None:
+            clear_classes(out, run.scene.missing)
 
-    params = {"weights": run.weights_key, "grid": asdict(run.grid), **region_params(run.grid)}
+    params = {
+        "weights": run.weights_key,
+        "grid": asdict(run.grid),
+        **region_params(run.grid),
+        **({} if run.scene.missing is None else {"missing": digest(run.scene.missing)}),
+    }
     return produce("segment", build, params, [mosaic, patches])
+
+
+def strange_pixels(class_map: StageRef) -> dict[str, int]:
+    """Coarse and fine pixels that were left out of a map, as no sensor gives their values; empty without any."""
+    path = class_map.path / STRANGE
+    return dict(read_table(path)) if path.is_file() else {}
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

@@ -44,8 +44,16 @@ def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
         settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths
     )
     scene = scene_of_file(file, settings.camera)
-    filled = (f"{scene.filled_px} pixels without a value were given their band's median",) if scene.filled_px else ()
-    return scene, (*file.provenance, *filled)
+    return scene, (*file.provenance, *_gap_note(scene))
+
+
+def _gap_note(scene: RasterScene) -> tuple[str, ...]:
+    """What became of pixels that came without a value."""
+    if not scene.filled_px:
+        return ()
+    void = 0 if scene.missing is None else int(np.count_nonzero(scene.missing))
+    unclassed = f"; {void} without most of their bands have no class in the map" if void else ""
+    return (f"{scene.filled_px} pixels without a value were given their band's median{unclassed}",)
 
 
 def _open_farm(settings: Settings) -> RasterScene:

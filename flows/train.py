@@ -14,6 +14,7 @@ from flows.train_figures import validate
 from flows.train_start import joined_split, open_start, refuse_seen
 from flows.training_data import TrainingData, open_training_data, pack_mask, trained_pixels
 from flows.training_look import observe_scene
+from models.checkpoint import read_checkpoint
 from models.examples import Observation, measured_normalisation, normalised
 from models.sizes import PRESETS, Positions, Preset, SegmenterConfig
 from models.spectral import SpectralBasis
@@ -65,6 +66,7 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
     """
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
     _check_places(request.out, checkpoint)
+    read_checkpoint(checkpoint)  # refuses a damaged one before minutes are spent
     start = open_start(request.init, request.tokens, request.preset)
     data = open_training_data(
         request.dataset, request.validation, request.scenes, request.camera,

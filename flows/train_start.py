@@ -74,5 +74,7 @@ def print_start(begun: Mapping[str, Any], console: Console) -> None:
     for why, names in skipped.items():
         shown = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else names[0]
         console.print(f"  skipped {shown}: {why}")
+    if "unsealed" in begun:
+        console.print(f"  note: {begun['unsealed']}", highlight=False, markup=False, soft_wrap=True)
     if begun["licence"]:
         console.print(f"  its licence: {begun['licence']}")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.cost import control_multiply_adds as control_multiply_adds
-from models.inference import PATCHES_AT_ONCE, ClassMap, CoarseLook, check_seats, draw_coarse, origin_of
+from models.inference import PATCHES_AT_ONCE, ClassMap, CoarseLook, check_seats, decide, draw_coarse, origin_of
 from models.weights import AnyWeights
 from pipeline.errors import ShapeError
 from pipeline.grid import SceneGrid, pad_by_reflection
@@ -96,8 +96,8 @@ def _draw_dense(
         chunks = _in_chunks(fine, _places_of(valid, seats))
     corners = iter(grid.seat_origin(valid))
     for logits in _read(network, chunks, -(-grid.width // p), look):
-        confidence, classes = logits.softmax(dim=1).max(dim=1)
-        for values, sure in zip(classes.numpy().astype(np.uint8), confidence.numpy(), strict=True):
+        confidence, classes = decide(logits, dim=1)
+        for values, sure in zip(classes.numpy(), confidence.numpy(), strict=True):
             top, left = next(corners)
             drawn.classes[top : top + p, left : left + p] = values
             drawn.confidence[top : top + p, left : left + p] = sure

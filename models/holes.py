@@ -1,4 +1,4 @@
-"""Pixels without a value: filled from the rest of their patch, and what of a patch is too little to be read."""
+"""Pixels without a reading: filled from the rest of their patch, and what of a patch is too little to be read."""
 
 from __future__ import annotations
 
@@ -10,11 +10,21 @@ from numpy.typing import NDArray
 Kind = TypeVar("Kind", bound=np.generic)
 
 MOST_DEAD = 0.5  # a token with more dead pixels than this share is not read
+MOST_COLUMN = 1e12  # of normalised columns: no reading gives more, and squares of more would end the range of float32
+
+
+def all_alive(columns: NDArray[np.floating]) -> bool:
+    """Whether no pixel is dead, without a copy of the columns."""
+    return not columns.size or bool(columns.min() >= -MOST_COLUMN and columns.max() <= MOST_COLUMN)
 
 
 def dead_pixels(columns: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Pixels with a column that is not finite, (..., column) -> (...)."""
-    return np.asarray(~np.isfinite(columns).all(axis=-1), np.bool_)
+    """Pixels with a column that is not finite, or larger than any reading gives, (..., column) -> (...)."""
+    if all_alive(columns):
+        return np.zeros(columns.shape[:-1], np.bool_)
+    alive = columns <= MOST_COLUMN  # no copy of the columns: their size would be one
+    alive &= columns >= -MOST_COLUMN
+    return np.asarray(~alive.all(axis=-1), np.bool_)
 
 
 def fill_dead(patches: NDArray[np.floating], dead: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from models.holes import dead_pixels, fill_dead, patches_of, readable
+from models.holes import all_alive, dead_pixels, fill_dead, patches_of, readable
 from models.self_attention import TokenReading, queries_kept, token_reading
 from models.sizes import PATCHES_AT_ONCE as PATCHES_AT_ONCE
 from models.sizes import SegmenterConfig
 from models.weights import AnyWeights, Weights
 from pipeline.errors import ShapeError
-from pipeline.grid import SceneGrid, pad_by_reflection
+from pipeline.grid import UNLABELLED, SceneGrid, pad_by_reflection
+from pipeline.readings import beyond_range
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -35,6 +36,7 @@ class CoarseLook:
     columns: NDArray[np.float32]  # (y, x, column) normalised
     origin: tuple[int, int] = field(default=(0, 0), kw_only=True)  # row and column of the field's seat it begins at
     living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) which are read; None: all
+    strange: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) of the scene: a value is no reading
 
 
 @dataclass(frozen=True)
@@ -68,8 +70,8 @@ class Glance(CoarseLook):
 class ClassMap:
     """The map of a scene: class of each pixel and the probability given to it."""
 
-    classes: NDArray[np.uint8]  # (y, x)
-    confidence: NDArray[np.float32]  # (y, x)
+    classes: NDArray[np.uint8]  # (y, x), 255 where nothing can be said
+    confidence: NDArray[np.float32]  # (y, x), NaN there
 
 
 def glance(
@@ -80,7 +82,8 @@ def glance(
     Parameters
     ----------
     coarse
-        (y, x, band) scene values of the coarse pass, shape ``grid.coarse_shape``; NaN where nothing was captured.
+        (y, x, band) scene values of the coarse pass, shape ``grid.coarse_shape``; NaN where nothing was captured. What
+        is no reading by the weights' `most_value` counts as NaN.
 
     Raises
     ------
@@ -112,6 +115,7 @@ def look_coarsely(
     """
     _check_grid(weights, grid)
     columns, filled = np.empty((*grid.coarse_shape, weights.config.columns), np.float32), 0
+    strange: NDArray[np.bool_] | None = None
     for strip in strips:
         last = filled + len(strip)
         if strip.shape[1] != grid.coarse_shape[1] or last > grid.coarse_shape[0]:
@@ -119,6 +123,9 @@ def look_coarsely(
                 f"the coarse mosaic is {(last, strip.shape[1])}, the scene grid expects {grid.coarse_shape}"
             )
         columns[filled:last] = weights.columns(strip, wavelength_nm)
+        if (wild := beyond_range(strip, weights.normalisation.most_value)) is not None:
+            strange = np.zeros(grid.coarse_shape, np.bool_) if strange is None else strange
+            strange[filled:last] = wild.any(axis=-1)
         filled = last
     if filled != grid.coarse_shape[0]:
         raise ShapeError(
@@ -128,7 +135,7 @@ def look_coarsely(
     padded = pad_by_reflection(columns, (y // grid.factor, x // grid.factor))
     columns = np.ascontiguousarray(padded, np.float32)
     living = _mend(columns, weights.config)
-    return CoarseLook(grid, columns, origin=origin, living=living)
+    return CoarseLook(grid, columns, origin=origin, living=living, strange=strange)
 
 
 def _mend(columns: NDArray[np.float32], config: SegmenterConfig) -> NDArray[np.bool_] | None:
@@ -144,8 +151,10 @@ def _mend(columns: NDArray[np.float32], config: SegmenterConfig) -> NDArray[np.b
 
 
 def glance_of_columns(weights: Weights, columns: NDArray[np.generic], grid: SceneGrid) -> Glance:
-    """Read normalised columns of the padded coarse grid, (y, x, column)."""
-    return read_glance(weights, CoarseLook(grid, np.ascontiguousarray(columns, np.float32)))
+    """Read normalised columns of the padded coarse grid, (y, x, column); dead ones count as in a mosaic."""
+    given = np.ascontiguousarray(columns, np.float32)
+    mended = given if all_alive(given) else given.copy()
+    return read_glance(weights, CoarseLook(grid, mended, living=_mend(mended, weights.config)))
 
 
 def read_glance(weights: Weights, look: CoarseLook, *, precision: Precision = "float32") -> Glance:
@@ -200,8 +209,8 @@ def segment(
     Parameters
     ----------
     patches
-        (seat, p, p, column) normalised columns of the fine pass. A dead pixel, not finite, counts as the mean of its
-        patch; a patch of which more than half is dead counts as not captured.
+        (seat, p, p, column) normalised columns of the fine pass. A dead pixel (see `models.holes`) counts as the mean
+        of its patch; a patch of which more than half is dead counts as not captured.
     seats
         (seat,) their numbers on the grid, each once.
     precision
@@ -263,7 +272,7 @@ def _draw_pack(
     ]
     p = weights.config.patch
     for logits in read_fine_packed(weights.segmenter.eval(), scenes):
-        confidence, classes = (part.numpy() for part in logits.float().softmax(dim=1).max(dim=1))
+        confidence, classes = (part.numpy() for part in decide(logits.float(), dim=1))
         for sure, values, (drawn, (y, x)) in zip(confidence, classes, places, strict=False):
             drawn.classes[y : y + p, x : x + p] = values
             drawn.confidence[y : y + p, x : x + p] = sure
@@ -274,9 +283,9 @@ def _draw_pack(
 
 def captured(patches: NDArray[np.floating], seats: NDArray[np.int64]) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
     """Keep the patches that show something of their seats, dead pixels filled, and these seats."""
-    if np.isfinite(patches).all():
-        return patches, seats
     dead = dead_pixels(patches)
+    if not dead.any():
+        return patches, seats
     shown = readable(dead)[:, 0]
     return fill_dead(patches[shown], dead[shown]), seats[shown]
 
@@ -365,7 +374,15 @@ def draw_coarse(logits: Tensor, grid: SceneGrid) -> ClassMap:
         strip = F.interpolate(
             padded[:, :, top : top + cell + 2], scale_factor=grid.factor, mode="bilinear", align_corners=False
         )[0, :, grid.factor : -grid.factor]
-        confidence, classes = strip.softmax(dim=0).max(dim=0)
+        confidence, classes = decide(strip, dim=0)
         rows = slice(top * grid.factor, (top + cell) * grid.factor)
-        drawn.classes[rows], drawn.confidence[rows] = classes.to(torch.uint8).numpy(), confidence.numpy()
+        drawn.classes[rows], drawn.confidence[rows] = classes.numpy(), confidence.numpy()
     return drawn
+
+
+def decide(logits: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    """The greatest probability and its class, uint8; NaN and 255 where a logit is not finite: that is no class."""
+    import torch
+
+    confidence, classes = logits.softmax(dim=dim).max(dim=dim)
+    return confidence, torch.where(confidence.isnan(), UNLABELLED, classes).to(torch.uint8)

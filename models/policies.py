@@ -24,6 +24,8 @@ POLICIES = (
     "mask", "vgg-static", "vgg-trained", "self-attention",
 )  # fmt: skip
 
+MOST_SUMMED = 1e280  # of a mask's values: larger ones are summed in a larger unit
+
 
 def score_seats(
     policy: str,
@@ -183,7 +185,8 @@ def _mask_scores(seen: Glance, mask: NDArray[np.generic] | None) -> Scores:
     full = np.zeros(grid.padded_shape)
     full[: grid.height, : grid.width] = np.where(np.isnan(flat), 0.0, flat)
     rows, columns = grid.seat_shape
-    total = full.reshape(rows, grid.patch, columns, grid.patch).sum(axis=(1, 3))
+    unit = 2.0**-100 if np.abs(full).max() > MOST_SUMMED else 1.0  # else sums would end the range of numbers
+    total = (full * unit).reshape(rows, grid.patch, columns, grid.patch).sum(axis=(1, 3))
     share = grid.valid_share() * grid.patch**2
-    means: Scores = np.divide(total, share, out=np.zeros((rows, columns)), where=share > 0)
+    means: Scores = np.divide(total, share, out=np.zeros((rows, columns)), where=share > 0) / unit
     return means

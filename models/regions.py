@@ -101,6 +101,11 @@ class Region:
         y, x = self.kept.shape
         return image[top : top + y, left : left + x]
 
+    def crop_coarse(self, image: NDArray[Scalar]) -> NDArray[Scalar]:
+        """Keep of a (y, x, ...) image of the scene in coarse pixels what belongs to the region."""
+        kept, read = self.kept.over(self.field.factor), self.coarse
+        return image[kept.top - read.top : kept.bottom - read.top, kept.left - read.left : kept.right - read.left]
+
     def crop_seats(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
         """Keep of (seat,) values of the scene's padded grid what belongs to the region, (y, x)."""
         (top, left), kept = self.origin, self.kept_seats

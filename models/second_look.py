@@ -24,6 +24,7 @@ Floats = NDArray[np.float64]
 REACH_SEATS = 1.0  # over which what was found at a seat speaks for its neighbours: sigma of a Gaussian
 NEAR_SEATS = 2.0  # looks at the seat itself that weigh as much as what holds for the whole field
 FIELD_SEATS = 8.0  # looks anywhere that weigh as much as the expectation before them
+MOST_SCORE = 1e100  # larger ones are compared in a larger unit
 MOST_TIMES = 8.0  # that a score is raised or lowered
 
 
@@ -88,6 +89,8 @@ def _ratio(
 ) -> Floats:
     """By what to multiply the score of every seat, (seat,)."""
     found = np.maximum(found, 0.0)
+    if (most := float(expected.max(initial=0.0))) > MOST_SCORE:  # in a larger unit: sums would end the range of numbers
+        expected, found = expected / most, found / most
     if not expected.sum() > 0 or (relative and not found.sum() > 0):
         return np.ones(shape[0] * shape[1])  # nothing was expected, or nothing found: nothing to compare
     if relative:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from numbers import Integral
 from typing import Any, Literal, get_args
 
 from pipeline.errors import ShapeError
@@ -22,6 +23,11 @@ PRESETS: dict[Preset, dict[str, Any]] = {
 }
 
 MOST_CLASSES = 255  # maps are uint8 and 255 stands for unlabelled
+# What nobody builds: sizes beyond these are damage, or an attempt to have memory filled.
+MOST = {
+    "columns": 4096, "patch": 1024, "factor": 1024, "width": 4096, "coarse_width": 4096, "dim": 16384, "layers": 256,
+    "heads": 1024, "mlp_ratio": 64,
+}  # fmt: skip
 BOTTOM = 4  # pixels a side at the lowest level of a patch
 PATCHES_AT_ONCE = 64  # their features fit the caches; larger chunks go to memory and back at every layer
 TOKEN_PX = 16  # a token stands for at most so many pixels a side
@@ -57,11 +63,15 @@ class SegmenterConfig:
     sight: Sight = "fine"  # what a dense network reads: the fine image, the coarse one brought up, or 2 x 2 means
 
     def __post_init__(self) -> None:
+        for name in ("classes", *MOST):
+            if isinstance(getattr(self, name), bool) or not isinstance(getattr(self, name), Integral):
+                raise ShapeError(f"{name} of a segmenter must be a whole number, got {getattr(self, name)!r}")
         if not 2 <= self.classes <= MOST_CLASSES:
             raise ShapeError(f"a segmenter needs 2 to {MOST_CLASSES} classes, got {self.classes}")
-        for name in ("columns", "patch", "factor", "width", "coarse_width", "dim", "layers", "heads", "mlp_ratio"):
-            if getattr(self, name) < 1:
-                raise ShapeError(f"{name} of a segmenter must be at least 1, got {getattr(self, name)}")
+        for name, most in MOST.items():
+            if not 1 <= getattr(self, name) <= most:
+                least = f"{name} of a segmenter must be at least 1"
+                raise ShapeError(f"{least} and at most {most}, got {getattr(self, name)}")
         level_widths(self.width, self.patch)  # refuses a patch that cannot be halved down to the lowest level
         if self.patch % self.factor:
             raise ShapeError(f"patch {self.patch} must divide by the factor {self.factor}")

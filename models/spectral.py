@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import WavelengthError
+from pipeline.readings import MOST_STEPS
 
 REACH = 1.5  # a column is reached by a band within this many column spacings of its centre
 LONGEST_NM, SHORTEST_NM = 3000.0, 200.0
@@ -101,6 +102,16 @@ def checked_wavelengths(wavelength_nm: NDArray[np.floating], bands: int) -> NDAr
     return wavelength
 
 
+def check_basis(basis: SpectralBasis, columns: int) -> None:
+    """Raise WavelengthError unless a basis has so many columns, between two wavelengths that there can be."""
+    checked_wavelengths(np.array([basis.low_nm, basis.high_nm]), 2)
+    if basis.columns != columns or basis.low_nm > basis.high_nm:
+        raise WavelengthError(
+            f"a basis of {basis.columns} columns from {basis.low_nm:g} to {basis.high_nm:g} nm, expected {columns} of"
+            " them between ascending wavelengths"
+        )
+
+
 def band_widths(wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Stretch of spectrum that a band stands for [nm]: half the way to either neighbour; 1 for a single wavelength."""
     distinct, group, members = np.unique(wavelength_nm, return_inverse=True, return_counts=True)
@@ -167,6 +178,12 @@ class Normalisation:
         inverse = whitening @ whitening
         rest = ~reached
         return np.asarray(-np.linalg.solve(inverse[np.ix_(rest, rest)], inverse[np.ix_(rest, reached)]).T, np.float32)
+
+    @property
+    def most_value(self) -> float:
+        """Size up to which a value may be a reading: as many spreads from the centre as a camera tells steps apart."""
+        reach = np.abs(self.centre.astype(np.float64)) + MOST_STEPS * self.spread.astype(np.float64)
+        return float(min(reach.max(initial=0.0), np.finfo(np.float32).max))
 
     @property
     def gain_shift(self) -> NDArray[np.float32]:

@@ -24,7 +24,7 @@ from models.segmenter import Segmenter, SegmenterConfig
 from models.spectral import Normalisation, SpectralBasis
 from models.start_columns import STEMS, column_change, for_columns, of_colours, with_patch_kernels
 from models.state_files import read_notes, read_state, read_variant
-from models.weights import FORMAT, NORMALISATION, Description, describe_weights
+from models.weights import FORMAT, NORMALISATION, Description, describe_weights, read_tensors, unsealed_note
 from pipeline.errors import SettingsError, WeightsError
 
 Kind = Literal["vision transformer", "Segmenter", "spectralzoom"]
@@ -78,7 +78,7 @@ class StartFile:
             raise SettingsError(f"no file {path}; --init takes {START_FROM}")
         self.path = path
         self.described = _described(path)
-        self.state = read_state(path)
+        self.state = read_state(path) if self.described is None else read_tensors(path, self.described)
         self.kind: Kind = _kind(self.state, self.described, path)
 
     @cached_property
@@ -152,6 +152,7 @@ class StartFile:
             "resized": dict(report.resized),
             "skipped": by_reason(report.skipped),
             "licence": self._licence(),
+            **({} if self.described is None or self.described.sealed else {"unsealed": unsealed_note(self.path)}),
         }
 
     def _licence(self) -> str | None:

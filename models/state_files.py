@@ -31,11 +31,25 @@ def read_state(path: Path) -> dict[str, Tensor]:
 
     Raises
     ------
-    WeightsError : missing, cut short, no tensors in it, or it holds Python objects, which are refused unread.
+    WeightsError : missing, cut short, no tensors in it, one larger than the file, or it holds Python objects, which are
+        refused unread.
     """
     if not path.is_file():
         raise WeightsError(f"no file of weights at {path}; give the path of a .safetensors or .pth file")
-    return unwrap_state(_read(path), str(path))
+    found = unwrap_state(_read(path), str(path))
+    _check_extent(found, path)
+    return found
+
+
+def _check_extent(state: Mapping[str, Tensor], path: Path) -> None:
+    """Refuse a tensor of more numbers than its file can hold: one number repeated would fill the memory."""
+    size = path.stat().st_size
+    for name, tensor in state.items():
+        if tensor.numel() * tensor.element_size() > size:
+            raise WeightsError(
+                f"{path} claims {tuple(tensor.shape)} numbers for the tensor {name}, more than its {size} bytes hold;"
+                " save the state dict again, every tensor contiguous"
+            )
 
 
 def read_notes(path: Path) -> dict[str, str]:

@@ -1,30 +1,39 @@
-"""Weights on disk: one safetensors file with the tensors, the spectral basis, the classes and how they were made."""
+"""Weights on disk: one sealed file with the tensors, the spectral basis, the classes and how they were made."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 
+from models.sealed_files import (
+    DAMAGED,
+    broken_seal,
+    changed_tensor,
+    hash_without_seal,
+    read_about,
+    write_sealed,
+)
 from models.sizes import SegmenterConfig
-from models.spectral import Normalisation, SpectralBasis, project
+from models.spectral import Normalisation, SpectralBasis, check_basis, project
 from pipeline.errors import WeightsError
+from pipeline.readings import readings_alone
 
 if TYPE_CHECKING:
-    import torch
+    from torch import Tensor
 
     from models.designs import Network
     from models.segmenter import Segmenter
 
 NORMALISATION = ("centre", "spread", "whitening")
-FORMAT = "spectralzoom-weights/1"
+FORMAT, UNSEALED = "spectralzoom-weights/2", "spectralzoom-weights/1"  # the earlier one has no hashes
+KEY_DIGITS = 20
 Learned = TypeVar("Learned", bound="AnyWeights")
 
 
@@ -36,6 +45,12 @@ class Description:
     basis: SpectralBasis
     class_names: tuple[str, ...]
     record: dict[str, Any]
+    about: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)  # all of it, hashes too
+
+    @property
+    def sealed(self) -> bool:
+        """Whether the file tells the hash of every tensor."""
+        return self.about.get("format") == FORMAT
 
 
 @dataclass(frozen=True)
@@ -58,8 +73,10 @@ class AnyWeights:
         """Normalised spectral columns of pixels, (..., band) -> (..., column) float32.
 
         Columns that no band reaches take what the others let expect, and so do those of which all bands are dead.
-        A pixel with more than half of its bands dead is NaN.
+        A value that is no reading by `Normalisation.most_value` is dead. A pixel with more than half of its bands dead
+        is NaN.
         """
+        values = readings_alone(values, self.normalisation.most_value)
         matrix, reached = self.basis.matrix(wavelength_nm)
         seen = project(values, matrix)
         columns = self.normalisation.apply(seen, reached)
@@ -80,11 +97,15 @@ class Weights(AnyWeights):
 
 
 def save_weights(weights: AnyWeights, path: Path) -> None:
-    """Write the file by a temporary name and a rename, so that it is whole or absent."""
-    import torch
-    from safetensors.torch import save
+    """Write the file, sealed, by a temporary name and a rename, so that it is whole or absent.
 
-    tensors = {name: value.detach().cpu().contiguous() for name, value in weights.network.state_dict().items()}
+    Raises
+    ------
+    WeightsError : the disk refuses.
+    """
+    import torch
+
+    tensors = dict(weights.network.state_dict())
     for name in NORMALISATION:
         tensors[f"normalisation.{name}"] = torch.from_numpy(getattr(weights.normalisation, name).copy())
     tensors["class_colours"] = torch.from_numpy(weights.class_colours.copy())
@@ -99,14 +120,44 @@ def save_weights(weights: AnyWeights, path: Path) -> None:
         "class_names": list(weights.class_names),
         "record": weights.record,
     }
-    temporary = path.with_name(path.name + ".part")
     try:
-        temporary.write_bytes(save(tensors, {"about": json.dumps(about, sort_keys=True)}))
-        temporary.replace(path)
+        write_sealed(path, about, tensors)
     except OSError as error:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
         raise WeightsError(f"cannot write weights to {path}: {error.strerror}; choose another -o") from error
+
+
+def content_key(path: Path) -> str:
+    """Name weights by what they hold, 20 hexadecimal digits: the same with hashes and without.
+
+    It is the beginning of the SHA-256 of the file as it was before files had hashes, so that sealing weights makes
+    nothing anew that was made with them. Raises WeightsError where the file cannot be read.
+    """
+    try:
+        return hash_without_seal(path, {"format": UNSEALED})[:KEY_DIGITS]
+    except (*DAMAGED, KeyError, TypeError, ValueError) as error:
+        raise _unreadable(path, error) from error
+
+
+def seal_weights(path: Path) -> bool:
+    """Give a file of an earlier version the hashes that it lacks, in place; False where it has them and they fit.
+
+    Raises
+    ------
+    WeightsError : as in ``load_weights``, or the disk refuses.
+    """
+    described = describe_weights(path)
+    weights = _read(path, described)
+    if not described.sealed:
+        save_weights(weights, path)
+    return not described.sealed
+
+
+def unsealed_note(path: Path) -> str:
+    """What to say of weights without hashes."""
+    return (
+        f"{path.name} was made before weights had hashes: damage to its numbers cannot be told; to add them now:"
+        f" spectralzoom seal {path}"
+    )
 
 
 def load_weights(path: Path) -> Weights:
@@ -114,7 +165,8 @@ def load_weights(path: Path) -> Weights:
 
     Raises
     ------
-    WeightsError : missing, damaged, of another format, a control, or a tensor that does not fit its config (named).
+    WeightsError : missing, of another format, a control; a tensor is not the one that was written, does not fit its
+        config, or holds what is no finite number (named).
     """
     described = describe_weights(path)
     check_two_scale(described.config, path)
@@ -143,54 +195,11 @@ def check_two_scale(config: SegmenterConfig, path: Path) -> None:
 
 
 def _read(path: Path, described: Description) -> AnyWeights:
-    with _opened(path, "pt") as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-    return _assemble(path, described, tensors)
-
-
-def describe_weights(path: Path) -> Description:
-    """Read what a file of weights says of itself, in milliseconds.
-
-    Raises
-    ------
-    WeightsError : missing, cut short, of another format, or a description that is damaged.
-    """
-    if not path.is_file():
-        raise WeightsError(f"no weights at {path}; train some with: spectralzoom train DATASET -o {path.name}")
-    with _opened(path, "np") as file:
-        about = json.loads((file.metadata() or {}).get("about", "{}"))
-    if about.get("format") != FORMAT:
-        raise WeightsError(f"{path} holds {about.get('format', 'no format mark')}, expected {FORMAT}; train it again")
-    try:
-        config, basis = SegmenterConfig(**about["config"]), SpectralBasis(**about["basis"])
-        names, record = tuple(about["class_names"]), dict(about["record"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise WeightsError(f"{path}: its description is damaged ({error}); copy or train the file again") from error
-    if len(names) != config.classes:
-        raise WeightsError(f"{path} names {len(names)} classes, its segmenter has {config.classes}")
-    return Description(config, basis, names, record)
-
-
-@contextmanager
-def _opened(path: Path, framework: str) -> Iterator[Any]:
-    try:
-        with safe_open(path, framework=framework) as file:
-            yield file
-    except (SafetensorError, OSError, json.JSONDecodeError) as error:
-        raise WeightsError(f"{path} is not a readable safetensors file ({error}); train or copy it again") from error
-
-
-def _assemble(path: Path, described: Description, tensors: dict[str, torch.Tensor]) -> AnyWeights:
     from models.designs import build_network
 
+    tensors = read_tensors(path, described)
     network = build_network(described.config)
-    parameters = network.state_dict()
-    expected = {name: tuple(value.shape) for name, value in parameters.items()} | _shapes_beside(network.config)
-    for name, shape in expected.items():
-        came = tuple(tensors[name].shape) if name in tensors else "nothing"
-        if came != shape:
-            raise WeightsError(f"{path}: tensor {name} should be {shape}, the file has {came}; train it again")
-    network.load_state_dict({name: tensors[name] for name in parameters})
+    network.load_state_dict({name: tensors[name] for name in network.state_dict()})
     normalisation = Normalisation(*(tensors[f"normalisation.{name}"].numpy() for name in NORMALISATION))
     return AnyWeights(
         network.eval(), described.basis, normalisation, described.class_names, tensors["class_colours"].numpy(),
@@ -198,15 +207,64 @@ def _assemble(path: Path, described: Description, tensors: dict[str, torch.Tenso
     )  # fmt: skip
 
 
-def _shapes_beside(config: SegmenterConfig) -> dict[str, tuple[int, ...]]:
-    """Shapes of the tensors that are not the network's own."""
-    one, all_pairs = (config.columns,), (config.columns, config.columns)
-    return {
-        "normalisation.centre": one,
-        "normalisation.spread": one,
-        "normalisation.whitening": all_pairs,
-        "class_colours": (config.classes, 3),
-    }
+def read_tensors(path: Path, described: Description) -> dict[str, Tensor]:
+    """Read every tensor of a file of weights, after its header was held against what the description asks for.
+
+    Raises
+    ------
+    WeightsError : as in ``load_weights``.
+    """
+    from models.weights_checks import misfit, unusable
+
+    with _opened(path, "pt") as file:
+        claimed = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        if wrong := misfit(described.config, claimed):
+            raise WeightsError(f"{path}: {wrong}; train it again")
+        tensors = {name: file.get_tensor(name) for name in claimed}
+    if wrong := changed_tensor(described.about, tensors) if described.sealed else "":
+        raise WeightsError(f"{path} is damaged: {wrong}; copy or train the file again")
+    if wrong := unusable(tensors):
+        raise WeightsError(f"{path}: {wrong}; copy or train the file again")
+    return tensors
+
+
+def describe_weights(path: Path) -> Description:
+    """Read what a file of weights says of itself, in milliseconds.
+
+    Raises
+    ------
+    WeightsError : missing, cut short, of another format, or a description that is damaged or asks for what cannot be.
+    """
+    if not path.is_file():
+        raise WeightsError(f"no weights at {path}; train some with: spectralzoom train DATASET -o {path.name}")
+    with _opened(path, "np") as file:
+        about = read_about(file)
+    if about.get("format") not in (FORMAT, UNSEALED):
+        raise WeightsError(f"{path} holds {about.get('format', 'no format mark')}, expected {FORMAT}; train it again")
+    if wrong := broken_seal(about) if about["format"] == FORMAT else "":
+        raise WeightsError(f"{path} is damaged: {wrong}; copy or train the file again")
+    try:
+        config, basis = SegmenterConfig(**about["config"]), SpectralBasis(**about["basis"])
+        names, record = tuple(map(str, about["class_names"])), dict(about["record"])
+        check_basis(basis, config.columns)
+    except (KeyError, TypeError, ValueError) as error:
+        raise WeightsError(f"{path}: its description is damaged ({error}); copy or train the file again") from error
+    if len(names) != config.classes:
+        raise WeightsError(f"{path} names {len(names)} classes, its segmenter has {config.classes}")
+    return Description(config, basis, names, record, about)
+
+
+@contextmanager
+def _opened(path: Path, framework: str) -> Iterator[Any]:
+    try:
+        with safe_open(path, framework=framework) as file:
+            yield file
+    except DAMAGED as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> WeightsError:
+    return WeightsError(f"{path} is not a readable safetensors file ({error}); train or copy it again")
 
 
 def with_record(weights: Learned, **entries: Any) -> Learned:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import ceil, isfinite
+from math import ceil, frexp, isfinite
 from typing import Literal
 
 import numpy as np
@@ -23,6 +23,8 @@ from pipeline.strips import covered_seats, look_from, strips_at_seats
 
 LEAST_DIGITS = 4  # of the least budget that a refusal names
 ROUNDING = 1e-9
+MOST_WORTH = 1e100  # of one seat: larger scores are planned in a larger unit
+MOST_FLOAT = float(np.finfo(np.float64).max)
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,8 @@ class FinePlan:
 
     ``worth`` is the score that was bought. Seats that a sweep shows besides are in ``seats``; what they add may not be
     in ``worth``. ``kind`` says whether the sweeps are runs of lines, whose seats lie wholly in one of them, or those of
-    the full scan, taken because it is cheaper or as cheap; ``reason`` says so in a sentence.
+    the full scan, taken because it is cheaper or as cheap; ``reason`` says so in a sentence. ``worth`` and
+    ``wanted_worth`` are in a larger unit where a score is infinite, or the sum of all would be beyond float64.
     """
 
     sweeps: list[Sweep]
@@ -144,7 +147,8 @@ def plan_fine(
     Parameters
     ----------
     scores
-        (seat,) gain of each seat of ``grid``; NaN, -inf and negative ones are worth nothing, +inf more than all others.
+        (seat,) gain of each seat of ``grid``, of any size; NaN, -inf and negative ones are worth nothing, +inf more
+        than all others.
     budget_s
         Seconds for the fine pass, 0 or more.
     margin_px
@@ -166,9 +170,11 @@ def plan_fine(
     if not isfinite(budget_s) or budget_s < 0:
         raise BudgetError(f"the fine pass needs a finite number of seconds, 0 or more, got {budget_s}")
     limit = 0.0 if threshold is None else check_threshold(threshold)
-    worth, unit = _worth(grid, scores, limit * budget_s)
-    floor = limit / unit
+    scale = _scale(scores)
+    worth, unit = _worth(grid, np.asarray(scores, np.float64) / scale, min(limit / scale * budget_s, MOST_WORTH))
+    floor = limit / scale / unit
     field = _field(grid, camera, cost, along, worth, margin_px)
+    told = scale if scale <= 1 or field.total <= MOST_FLOAT / scale else 1.0
     missed = int(np.count_nonzero(worth)) - len(np.unique(field.views.seat))
     whole = _full(grid, camera, cost, along) if full is None else (list(full), cost.seconds(list(full), camera))
     full_s = None if whole is None else whole[1]
@@ -179,16 +185,18 @@ def plan_fine(
             f"to show every place worth a second look takes no less time than to scan everything in detail, "
             f"{whole[1]:.1f} s; the full scan is taken, which shows all of the field"
         )
+        total = field.total * told
         return FinePlan(
-            whole[0], grid.valid_seats(), whole[1], field.total, "full", reason, field.total, full_s, missed, threshold
+            whole[0], grid.valid_seats(), whole[1], total, "full", reason, total, full_s, missed, threshold
         )  # fmt: skip
     sweeps = _sweeps(field, plan)
     check_reach(sweeps, camera)
     seconds = cost.seconds(sweeps, camera)
     seats = covered_seats(grid, camera, sweeps, margin_px=margin_px)
     return FinePlan(
-        sweeps, seats, seconds, plan.worth, "lines", _lines_reason(seconds, full_s), field.total, full_s, missed,
-        threshold, budget_s - seconds if floor and not everything else None,
+        sweeps, seats, seconds, plan.worth * told, "lines", _lines_reason(seconds, full_s),
+        field.total * told, full_s, missed, threshold,
+        budget_s - seconds if floor and not everything else None,
     )  # fmt: skip
 
 
@@ -258,6 +266,17 @@ def joined_plan(plans: Sequence[FinePlan]) -> FinePlan:
         seconds=sum(plan.seconds for plan in plans),
         spared_s=plans[-1].spared_s,
     )
+
+
+def _scale(scores: NDArray[np.floating]) -> float:
+    """What very large and very small scores are divided by, a power of two: their plan is that of usual ones, exactly.
+
+    1 for scores of any usual size. Products of two worths and sums over seats then stay within float64.
+    """
+    given = np.asarray(scores, np.float64)
+    peak = float(given.max(initial=0.0, where=np.isfinite(given) & (given > 0)))
+    usual = not peak or 1 / MOST_WORTH <= peak <= MOST_WORTH
+    return 1.0 if usual else 2.0 ** (frexp(peak)[1] - 1)
 
 
 def _worth(grid: SceneGrid, scores: NDArray[np.floating], most: float) -> tuple[NDArray[np.float64], float]:

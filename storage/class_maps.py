@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +107,24 @@ def write_class_tile(
         )
     for array, values in zip(arrays, (classes, confidence), strict=True):
         array[place] = np.asarray(values, array.dtype)
+
+
+def clear_classes(path: Path, where: NDArray[np.bool_]) -> None:
+    """Take the class from some pixels of a stored map: 255, and a confidence of NaN.
+
+    ``where`` is (y, x), True for those pixels. Raises IncompleteStoreError where there is no map.
+    """
+    group = open_group(path)
+    array = group["classes"]
+    assert isinstance(array, zarr.Array)
+    steps = array.shards or array.shape
+    rows, columns = (range(0, size, step) for size, step in zip(array.shape, steps, strict=True))
+    for top, left in product(rows, columns):
+        place = np.s_[top : top + steps[0], left : left + steps[1]]
+        if where[place].any():
+            classes = np.where(where[place], UNLABELLED, read_array(group, "classes", place))
+            confidence = np.where(where[place], np.nan, read_array(group, "confidence", place))
+            write_class_tile(path, (top, left), classes, confidence)
 
 
 def _place_of(origin: tuple[int, int], shape: tuple[int, ...], array: zarr.Array[Any]) -> tuple[slice, ...]:

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
+from pipeline.readings import MOST_STEPS, MOST_VALUE, beyond_range, find_beyond
+from pipeline.simulator.scene import BRIGHT_PERCENTILE
 from storage.cube_sources import BLOCK_LINES, scene_lines
 from storage.dataset_layouts import find_layout
 from storage.declared_sizes import machine_bytes
@@ -22,9 +24,11 @@ from storage.labels import Labels, load_labels
 from storage.raster_files import load_raster, split_variable
 from storage.rasters import Raster
 from storage.scan_files import is_scan, known_bands, open_cube_source
-from storage.scene_toml import ClassValue, SceneSettings, find_scene_settings
+from storage.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
 from storage.staging import file_hash
 from storage.wavelengths import settle_wavelengths
+
+_LOOKED_AT = 1 << 20  # values, evenly spread, by which the range of a scene is told
 
 
 @dataclass(frozen=True)
@@ -88,12 +92,14 @@ def load_scene_file(
         file, chosen, cube.shape[2], stated=wavelengths, settings=settings, assumed_nm=raster.assumed_nm,
         known=raster.known,
     )  # fmt: skip
-    values, notes = _as_float(cube, chosen, raster.nodata, file)
+    nodata = raster.nodata if settings.nodata is None else settings.nodata
+    values, notes = _as_float(cube, chosen, nodata, file)
     found, label_note = _labels(file, (cube.shape[0], cube.shape[1]), labels, settings)
     if layout is not None and labels is None and settings.labels is None:
         found, label_note = layout.labels, (layout.label_note,)
+    stated = () if settings.nodata is None else (f"nodata {settings.nodata!r}",)
     light_hash = _digest(
-        _content_hash(file, raster), variable, chosen, light.centre_nm.tolist(), _listed(light.fwhm_nm)
+        _content_hash(file, raster), variable, chosen, light.centre_nm.tolist(), _listed(light.fwhm_nm), *stated
     )
     return SceneFile(
         name=file.stem,
@@ -179,28 +185,57 @@ def _band_note(chosen: list[int], count: int) -> tuple[str, ...]:
 def _as_float(
     cube: NDArray[Any], chosen: list[int], nodata: float | None, path: Path
 ) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-    """Chosen bands as float32; the file's no-data value and infinities become NaN, and are counted."""
+    """Chosen bands as float32; the no-data value and infinities become NaN, and are counted.
+
+    Raises SceneError where another value is no reading, or no value is finite.
+    """
     every = chosen == list(range(cube.shape[2]))
     picked = cube if every else cube[..., chosen]
     notes: list[str] = []
     with np.errstate(over="ignore"):
         values = np.array(picked, np.float32, order="C")
+    strange = beyond_range(picked)
     if nodata is not None:
         # Compared as numbers: -9999 in the numbers of the file would wrap to 55537 where they are uint16.
         with np.errstate(over="ignore"):
             void = picked == nodata if np.isfinite(nodata) else np.isnan(values)
         values[void] = np.nan
         notes.append(f"{int(void.sum())} samples have the file's no-data value {nodata:g}")
+        picked = picked if strange is None else np.where(void, picked.dtype.type(0), picked)
+    if strange is not None and (found := find_beyond(picked)) is not None:
+        raise SceneError(
+            f"{path} has {found.words(np.array(chosen))}, beyond the {MOST_VALUE:g} that readings reach; if it stands"
+            f" for no data, write nodata = {found.value!s} into a {SETTINGS_NAME} beside the file, else leave the band"
+            " out with --bands, or give the values in a larger unit"
+        )
     infinite = np.isinf(values)
     if infinite.any():
         values[infinite] = np.nan
-        notes.append(f"{int(infinite.sum())} infinite samples count as missing")
+        y, x, band = np.unravel_index(int(infinite.argmax()), infinite.shape)
+        place = f"y {y}, x {x}, band {chosen[int(band)]}"
+        notes.append(f"{int(infinite.sum())} infinite samples count as missing, the first at {place}")
     missing = int(np.isnan(values).sum())
     if missing == values.size:
         raise SceneError(f"{path} holds no finite number in the bands used; choose others")
     if missing:
         notes.append(f"{missing} of {values.size} samples are missing")
-    return values, tuple(notes)
+    return values, (*notes, *_dark_note(values))
+
+
+def _dark_note(values: NDArray[np.float32]) -> tuple[str, ...]:
+    """Say where the bright end is so far above all else that hardly any light is left for it."""
+    some = values.reshape(-1)[:: max(1, values.size // _LOOKED_AT)]
+    lit = some[some > 0]  # no NaN
+    if not lit.size:
+        return ()
+    middle, bright = (float(value) for value in np.percentile(lit, (50, BRIGHT_PERCENTILE)))
+    if bright <= MOST_STEPS * middle:
+        return ()
+    return (
+        f"the brightest values, {bright:.3g}, are more than {MOST_STEPS} times the middle one, {middle:.3g}, and all"
+        f" else is dark beside them; if they stand for no data, write nodata = {float(lit.max())!r} into a"
+        f" {SETTINGS_NAME}",
+    )
 
 
 def _labels(

@@ -11,7 +11,9 @@ from pipeline.errors import SceneError
 from storage.toml_files import read_toml
 
 SETTINGS_NAME = "scene.toml"
-KNOWN_KEYS = ("bands", "wavelengths_nm", "wavelengths_file", "dropped_bands", "labels", "unlabelled", "classes")
+KNOWN_KEYS = (
+    "bands", "wavelengths_nm", "wavelengths_file", "dropped_bands", "nodata", "labels", "unlabelled", "classes",
+)  # fmt: skip
 
 Colour = tuple[int, int, int]
 ClassValue = int | Colour
@@ -26,6 +28,7 @@ class SceneSettings:
     wavelengths_nm: tuple[float, ...] | None = None  # of ``bands``, or of all bands of the file
     wavelengths_file: Path | None = None  # rows of nm and FWHM, all bands of the file and the dropped ones
     dropped_bands: tuple[int, ...] = ()  # rows of wavelengths_file that the file leaves out, counted from 1
+    nodata: float | None = None  # the number that stands for no value
     labels: str | None = None  # relative to the folder of scene.toml; may hold {number}
     unlabelled: ClassValue | None = None
     classes: Mapping[str, ClassValue] = field(default_factory=dict)
@@ -63,6 +66,7 @@ def load_scene_settings(path: Path) -> SceneSettings:
         wavelengths_nm=_numbers(path, content, "wavelengths_nm"),
         wavelengths_file=None if file_name is None else path.parent / file_name,
         dropped_bands=_whole_numbers(path, content, "dropped_bands") or (),
+        nodata=_number(path, content, "nodata"),
         labels=_text(path, content, "labels"),
         unlabelled=None if "unlabelled" not in content else _class_value(path, "unlabelled", content["unlabelled"]),
         classes=_classes(path, content.get("classes", {})),
@@ -83,6 +87,13 @@ def _numbers(path: Path, content: Mapping[str, Any], key: str) -> tuple[float, .
     if not isinstance(value, list) or any(isinstance(v, bool) or not isinstance(v, int | float) for v in value):
         raise SceneError(f"{path}: {key} must be a list of numbers such as [660.0, 800.0], got {value!r}")
     return tuple(float(v) for v in value)
+
+
+def _number(path: Path, content: Mapping[str, Any], key: str) -> float | None:
+    value = content.get(key)
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
+        raise SceneError(f"{path}: {key} must be a number such as -9999 or 1e30, got {value!r}")
+    return None if value is None else float(value)
 
 
 def _whole_numbers(path: Path, content: Mapping[str, Any], key: str) -> tuple[int, ...] | None:

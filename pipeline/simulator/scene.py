@@ -11,13 +11,16 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, ShapeError
+from pipeline.grid import UNLABELLED
 from pipeline.once import Once
+from pipeline.readings import MOST_VALUE, find_beyond
 from pipeline.rectify.resample import gather
 from pipeline.simulator.raster import Light, Raster
 
 DEFAULT_EXPOSURE_MS = 100.0  # the exposure at which Scene.electrons is stated
 WELL_SHARE = 0.6  # of the full well, filled by the bright end of a scene without a radiance law
 BRIGHT_PERCENTILE = 99.9
+LEAST_BRIGHT = 1e-30  # electrons per unit of less would end the range of float32
 
 
 class Scene(Protocol):
@@ -64,7 +67,8 @@ class RasterScene:
     """A scene of pixels, interpolated by Catmull-Rom; outside, the edge pixel is repeated.
 
     ``planes`` is (y, x, component) float32 and ``electrons`` (component, band), or (band,) where each band has its own
-    plane. Labels are (y, x) uint8 with 255 for unlabelled. ``filled_px`` counts pixels that came without a value.
+    plane. Labels are (y, x) uint8 with 255 for unlabelled. ``filled_px`` counts pixels that came without a value in a
+    band; ``missing`` (y, x) are those without one in most bands, of which nothing is known (None: no such pixel).
     Planes, labels and electrons may be made when they are first asked for; all else is known at once.
     """
 
@@ -78,6 +82,7 @@ class RasterScene:
     class_names: tuple[str, ...] = ()
     class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
     filled_px: int = 0
+    missing: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         if self.light.is_made():
@@ -165,7 +170,8 @@ def raster_from_values(
 
     The 99.9th percentile of the finite values fills 60 % of the full well at the default exposure; a scene without
     positive light takes 1 in its place. Pixels with a value that is not finite get the band's median and are counted
-    in ``filled_px``. Negative values give no electrons.
+    in ``filled_px``; where that is so in more than half of the bands, the pixel is ``missing`` and loses its label.
+    Negative values give no electrons.
 
     Parameters
     ----------
@@ -176,14 +182,19 @@ def raster_from_values(
 
     Raises
     ------
-    SceneError : not three axes, nothing in it, no finite value, or the labels do not fit.
+    SceneError : not three axes, nothing in it, no finite value, one that is no reading (see `pipeline.readings`), or
+        the labels do not fit.
     """
     if values.ndim != 3 or 0 in values.shape:
         raise SceneError(f"scene {name} must be (y, x, band) and not empty, got {values.shape}")
     if labels is not None and labels.shape != values.shape[:2]:
         raise SceneError(f"scene {name} is {values.shape[:2]} px, its labels {labels.shape}; crop or pad one")
+    _refuse_strange(values, name)
     planes = np.ascontiguousarray(values, dtype=np.float32)
     bright = _bright_value(planes, name)
+    missing = _missing_pixels(planes)
+    if missing is not None and labels is not None:
+        labels = np.where(missing, np.uint8(UNLABELLED), labels)
     planes, filled = _fill_by_median(planes)
     bands = planes.shape[2]
     return RasterScene(
@@ -202,7 +213,26 @@ def raster_from_values(
         class_names=class_names,
         class_colours=np.zeros((0, 3), np.uint8) if class_colours is None else class_colours,
         filled_px=filled,
+        missing=missing,
     )
+
+
+def _refuse_strange(values: NDArray[np.generic], name: str) -> None:
+    """Raise SceneError where a finite value is no reading: light for all others is measured by the brightest."""
+    if (found := find_beyond(values)) is not None:
+        raise SceneError(
+            f"scene {name} has {found.words()}, beyond the {MOST_VALUE:g} that readings reach; put NaN where there is"
+            " no data, or give the values in a larger unit"
+        )
+
+
+def _missing_pixels(planes: NDArray[np.float32]) -> NDArray[np.bool_] | None:
+    """(y, x) pixels with no finite value in more than half of their bands; None without any."""
+    known = np.isfinite(planes)
+    if known.all():
+        return None
+    missing: NDArray[np.bool_] = 2 * known.sum(axis=2) < planes.shape[2]
+    return missing if missing.any() else None
 
 
 def content_key(planes: NDArray[np.float32]) -> str:
@@ -222,6 +252,11 @@ def _bright_value(planes: NDArray[np.float32], name: str) -> float:
     if not finite.size:
         raise SceneError(f"scene {name} holds no finite value; check its fill value and its bands")
     bright = float(np.percentile(finite, BRIGHT_PERCENTILE))
+    if 0 < bright < LEAST_BRIGHT:
+        raise SceneError(
+            f"the brightest values of scene {name} are {bright:.3g}, too small to be told from nothing; give them in a"
+            " smaller unit"
+        )
     return bright if bright > 0 else 1.0
 
 

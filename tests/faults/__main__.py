@@ -127,6 +127,7 @@ FAULTS: dict[str, Callable[[bool], Sequence[Row]]] = {
     "growing_files": _module("growing_files"),
     "spool_rate": _module("spool_rate"),
     "hostile_rig": _module("hostile_rig"),
+    "sealed_flips": _module("sealed_flips"),
 }  # fmt: skip
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from tests.faults import (
     lost_lines,
     many_writers,
     refused_writes,
+    sealed_flips,
     small_survey,
     spool_rate,
 )
@@ -110,6 +111,14 @@ def test_devices_that_mean_harm(meet: Callable[..., None]) -> None:
     found = hostile_rig.meet_for(2.0, 1, meet)
     assert found.wrong == []
     assert found.count > 0
+
+
+def test_bits_flipped_in_weights_and_checkpoints(tmp_path: Path) -> None:
+    """Each is refused in one message, or read as it was written."""
+    found = sealed_flips.flip_bits(150, tmp_path, seed=1)
+    assert found.wrong == []
+    assert found.tried == found.refused + found.same == 150
+    assert found.refused > 100
 
 
 def test_a_fault_that_is_not_survived_is_seen(subject: Subject) -> None:

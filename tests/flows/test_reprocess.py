@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import io
 import json
 import shutil
@@ -21,6 +20,7 @@ from flows import generations
 from flows.archive_commands import DONE, FAILED, PARTLY, run_verify
 from flows.reprocess_command import ReprocessRequest, _survey, run_reprocess
 from flows.settings import Settings
+from models.weights import content_key
 from pipeline.errors import ArchiveError, SettingsError, WeightsError
 from pipeline.simulator.farm import CLASSES
 from storage.archive import Archive
@@ -247,7 +247,7 @@ def test_the_summary_tells_what_was_asked_and_what_became_of_it(
     asked = told["asked"]
     assert (asked["field"], asked["since"], asked["stage"], asked["failed"]) == ("*n*", None, None, False)
     assert asked["weights"] == str(other)
-    assert asked["weights_key"] == hashlib.sha256(other.read_bytes()).hexdigest()[:20]
+    assert asked["weights_key"] == content_key(other)
     for _ in range(3):
         assert len(reprocess(archive, out=tmp_path / "told")) == 2
     assert len(list((tmp_path / "told").iterdir())) == 3

@@ -13,7 +13,7 @@ from flows.run import SHIPPED
 from models.controls import Controls, run_controls
 from models.inference import glance
 from models.metrics import mean_iou
-from models.weights import Weights, load_weights
+from models.weights import Weights, content_key, describe_weights, load_weights
 from pipeline.camera import LineCamera
 from pipeline.coverage import coarse_sweeps, full_sweeps
 from pipeline.grid import SceneGrid
@@ -46,6 +46,12 @@ def controls(weights: Weights) -> Controls:
     )
     seen = glance(weights, mosaic, scene.wavelength_nm, grid)
     return run_controls(weights, seen, columns, np.asarray(scene.labels), share=0.35, seed=41)
+
+
+def test_file_is_sealed_and_its_key_is_that_of_before() -> None:
+    """Every tensor has its hash; what was made with these weights before they had is still theirs."""
+    assert describe_weights(PATH).sealed
+    assert content_key(PATH) == "8ea1bd282d34bea7e1a8"
 
 
 def test_file_is_small_and_tells_its_making(weights: Weights) -> None:

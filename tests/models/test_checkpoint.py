@@ -83,12 +83,43 @@ def test_time_spent_counts_after_a_restart(tmp_path: Path) -> None:
     assert summary["steps"] == 3
 
 
-def test_a_damaged_checkpoint_is_no_checkpoint(tmp_path: Path) -> None:
-    """A file cut short or of another kind counts as none; one that cannot be written is an error with its place."""
+@pytest.mark.parametrize("damage", ["cut", "tensor", "description", "other", "empty", "earlier"])
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path, damage: str) -> None:
+    """Neither gone on from nor written over: one message says where it lies, and that deleting it begins anew."""
     file = tmp_path / "c"
-    save_checkpoint(file, "x", {}, {"a": torch.ones(100)})
-    file.write_bytes(file.read_bytes()[:60])
-    assert load_checkpoint(file, "x") is None
+    save_checkpoint(file, "x", {"course": {"step": 4}}, {"a": torch.ones(100)})
+    raw = file.read_bytes()
+    changed = {
+        "cut": raw[:60],
+        "tensor": raw[:-1] + bytes([raw[-1] ^ 1]),
+        "description": raw.replace(b'"step\\": 4', b'"step\\": 5'),
+        "other": b"hello",
+        "empty": b"",
+        "earlier": raw.replace(b"checkpoint/2", b"checkpoint/1"),
+    }[damage]
+    assert changed != raw
+    file.write_bytes(changed)
+    for identity in ("x", "another"):
+        with pytest.raises(WeightsError, match=r"the state of training in .*/c cannot .*; bring back .* or del"):
+            load_checkpoint(file, identity)
+    assert file.read_bytes() == changed
+
+
+def test_training_beside_a_damaged_checkpoint_ends_with_its_name(tmp_path: Path) -> None:
+    """It does not begin anew in silence, and the file stays for whoever can mend it."""
+    file = tmp_path / "c"
+    with pytest.raises(KeyboardInterrupt):
+        train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(4), checkpoint=file, keep_every_s=0)
+    raw = bytearray(file.read_bytes())
+    raw[-9] ^= 4
+    file.write_bytes(raw)
+    with pytest.raises(WeightsError, match="is not what was written; bring back a copy of it, or delete it to begin"):
+        train(CONFIG, [example()], SHIFT, SETTINGS, checkpoint=file)
+    assert file.read_bytes() == raw
+
+
+def test_a_checkpoint_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    """The message says where."""
     with pytest.raises(WeightsError, match="cannot keep the state of training"):
         save_checkpoint(tmp_path / "none" / "c", "x", {}, {"a": torch.ones(1)})
 

@@ -35,10 +35,12 @@ def _scene(model: Segmenter, rows: int = 2, columns: int = 3, batch: int = 1) ->
         ({"classes": 256}, "2 to 255 classes, got 256"),
         ({"patch": 24}, "power of two, got 24"),
         ({"patch": 8, "factor": 16}, "patch 8 must divide by the factor 16"),
-        ({"factor": 0}, "factor of a segmenter must be at least 1, got 0"),
+        ({"factor": 0}, "factor of a segmenter must be at least 1 and at most 1024, got 0"),
         ({"dim": 18, "heads": 2}, "width 18 must divide by 4"),
         ({"dim": 16, "heads": 3}, "by its 3 heads"),
-        ({"layers": -1}, "layers of a segmenter must be at least 1, got -1"),
+        ({"layers": 257}, "layers of a segmenter must be at least 1 and at most 256, got 257"),
+        ({"heads": 2.0}, "heads of a segmenter must be a whole number, got 2.0"),
+        ({"layers": -1}, "layers of a segmenter must be at least 1 and at most 256, got -1"),
     ],
 )
 def test_sizes_that_do_not_fit_are_refused(sizes: dict[str, Any], words: str):

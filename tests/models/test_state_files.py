@@ -127,3 +127,12 @@ def test_a_variant_that_cannot_be_used_is_named(tmp_path: Path, text: str | None
         (tmp_path / "variant.yml").write_text(text)
     with pytest.raises(WeightsError, match=said):
         read_variant(tmp_path / "checkpoint.pth")
+
+
+def test_one_number_that_is_called_many_is_refused(tmp_path: Path):
+    """Petabytes by a stride of 0: a file of a kilobyte that any use of its tensor would fill the memory for."""
+    torch.save({"weight": torch.ones(1).expand(900 * 10**12)}, tmp_path / "w.pth")
+    with pytest.raises(
+        WeightsError, match=r"w.pth claims \(900000000000000,\) numbers for the tensor weight, more than"
+    ):
+        read_state(tmp_path / "w.pth")

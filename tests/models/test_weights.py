@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import struct
 from collections.abc import Callable
@@ -12,10 +13,23 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from models.inference import glance
-from models.weights import FORMAT, Weights, describe_weights, load_weights, save_weights, with_record
+from models.sealed_files import SEAL, TENSORS
+from models.weights import (
+    FORMAT,
+    UNSEALED,
+    Weights,
+    content_key,
+    describe_weights,
+    load_any_weights,
+    load_weights,
+    save_weights,
+    seal_weights,
+    with_record,
+)
 from pipeline.errors import WeightsError
 from pipeline.grid import SceneGrid
 
@@ -23,14 +37,16 @@ Maker = Callable[..., Weights]
 
 
 def _about(path: Path) -> dict[str, Any]:
+    """What a file says of itself, without its hashes: as files of an earlier version did."""
     raw = path.read_bytes()
     (size,) = struct.unpack("<Q", raw[:8])
     about: dict[str, Any] = json.loads(json.loads(raw[8 : 8 + size])["__metadata__"]["about"])
-    return about
+    return {name: value for name, value in about.items() if name not in (TENSORS, SEAL)} | {"format": UNSEALED}
 
 
 def _rewritten(path: Path, about: dict[str, Any], tensors: dict[str, torch.Tensor] | None = None) -> Path:
-    save_file(load_file(path) if tensors is None else tensors, path, {"about": json.dumps(about)})
+    tensors = load_file(path) if tensors is None else tensors
+    save_file(tensors, path, {"about": json.dumps(about, sort_keys=True)})
     return path
 
 
@@ -135,7 +151,12 @@ def test_another_format_is_named(saved: Path):
         ({"classes": 1}, "description is damaged.*2 to 255 classes, got 1"),
         ({"depth": 3}, "description is damaged.*depth"),
         ({"dim": 32}, r"tensor scale_code should be \(2, 32\), the file has \(2, 16\)"),
-        ({"columns": 7}, r"tensor coarse_stem.enter.weight should be \(8, 7, 1, 1\)"),
+        ({"width": 16}, r"tensor fine_stem.enter.weight should be \(16, 4, 1, 1\)"),
+        ({"columns": 7}, "description is damaged.*a basis of 4 columns from 400 to 1000 nm, expected 7"),
+        ({"layers": 10_000_000}, "description is damaged.*layers of a segmenter must be at least 1 and at most 256"),
+        ({"dim": 2**40}, "description is damaged.*dim of a segmenter must be at least 1 and at most 16384"),
+        ({"dim": 16384, "layers": 256}, r"tensor scale_code should be \(2, 16384\), the file has \(2, 16\)"),
+        ({"layers": 1.0}, "description is damaged.*layers of a segmenter must be a whole number, got 1.0"),
     ],
 )
 def test_sizes_that_do_not_fit_are_named(saved: Path, changes: dict[str, int], words: str):
@@ -197,3 +218,108 @@ def test_a_description_is_what_the_weights_say(saved: Path):
     assert described.config == weights.config
     assert (described.basis, described.class_names) == (weights.basis, weights.class_names)
     assert described.record == weights.record
+
+
+def _flipped(path: Path, place: int, bit: int) -> None:
+    raw = bytearray(path.read_bytes())
+    raw[place] ^= 1 << bit
+    path.write_bytes(raw)
+
+
+def test_a_flipped_bit_of_a_tensor_is_named(saved: Path):
+    """Any number of any tensor, to its lowest bit."""
+    _flipped(saved, saved.stat().st_size - 4, 0)
+    with pytest.raises(WeightsError, match=r"is damaged: tensor \S+ is not what was written; copy or train"):
+        load_weights(saved)
+
+
+def test_a_description_that_was_changed_is_refused(saved: Path):
+    """A class renamed by one bit, which no tensor would tell."""
+    raw = saved.read_bytes()
+    saved.write_bytes(raw.replace(b"class 1", b"class 3"))
+    with pytest.raises(WeightsError, match="is damaged: its description is not what was written"):
+        describe_weights(saved)
+
+
+def test_tensors_of_other_weights_are_refused(tiny: Maker, saved: Path, tmp_path: Path):
+    """Tensors of the right shapes that the hashes are not of."""
+    save_weights(tiny(1), tmp_path / "other.safetensors")
+    about = json.loads((_metadata(saved))["about"])
+    save_file(load_file(tmp_path / "other.safetensors"), saved, {"about": json.dumps(about)})
+    with pytest.raises(WeightsError, match=r"is damaged: tensor \S+ is not what was written"):
+        load_weights(saved)
+
+
+def _metadata(path: Path) -> dict[str, str]:
+    with safe_open(path, framework="np") as file:
+        found: dict[str, str] = file.metadata()
+    return found
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("sealed", [True, False])
+def test_numbers_that_are_not_finite_are_refused(tiny: Maker, tmp_path: Path, value: float, sealed: bool):
+    """A network of NaN would draw a map of nothing; the tensor is named, whether the file has hashes or not."""
+    weights, path = tiny(), tmp_path / "w.safetensors"
+    with torch.no_grad():
+        weights.segmenter.fine_classes.bias[1] = value
+    save_weights(weights, path)
+    if not sealed:
+        _rewritten(path, _about(path))
+    with pytest.raises(WeightsError, match=r"1 of 3 numbers of tensor fine_classes.bias are not finite; copy or train"):
+        load_any_weights(path)
+
+
+def test_a_spread_of_nothing_is_refused(tiny: Maker, tmp_path: Path):
+    """Columns would be divided by 0."""
+    weights, path = tiny(), tmp_path / "w.safetensors"
+    flat = replace(weights.normalisation, spread=np.zeros(4, np.float32))
+    save_weights(replace(weights, normalisation=flat), path)
+    with pytest.raises(WeightsError, match=r"normalisation.spread holds a spread that is not above 0"):
+        load_weights(path)
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.float64, torch.int32])
+def test_numbers_of_another_kind_are_refused(saved: Path, kind: torch.dtype):
+    """Nothing is brought to float32 unsaid."""
+    tensors = {name: value.to(kind) for name, value in load_file(saved).items()}
+    _rewritten(saved, _about(saved), tensors)
+    with pytest.raises(WeightsError, match=r"should be of torch.float32, the file has"):
+        load_weights(saved)
+
+
+def test_a_header_of_petabytes_is_refused_unread(saved: Path):
+    """A tensor of 3.6 PB that the file has not: refused before memory is asked for."""
+    about = json.dumps(_about(saved))
+    size = 900 * 10**12
+    header = {"__metadata__": {"about": about}, "a": {"dtype": "F32", "shape": [size], "data_offsets": [0, 4 * size]}}
+    text = json.dumps(header).encode()
+    saved.write_bytes(len(text).to_bytes(8, "little") + text + bytes(64))
+    with pytest.raises(WeightsError, match="not a readable safetensors file"):
+        load_weights(saved)
+
+
+def test_weights_of_an_earlier_version_are_sealed_in_place(saved: Path):
+    """They load, say that they have no hashes, and have them after sealing, under the same key; then damage is told."""
+    written = saved.read_bytes()
+    _rewritten(saved, _about(saved))
+    key = content_key(saved)
+    assert key == hashlib.sha256(saved.read_bytes()).hexdigest()[:20]  # as before there were hashes
+    assert not describe_weights(saved).sealed
+    load_weights(saved)
+    assert seal_weights(saved)
+    assert saved.read_bytes() == written
+    assert content_key(saved) == key
+    assert describe_weights(saved).sealed
+    assert not seal_weights(saved)
+
+
+def test_what_is_damaged_is_not_sealed(saved: Path):
+    """A file of an earlier version with a NaN stays as it is."""
+    tensors = load_file(saved)
+    tensors["fine_classes.bias"][0] = float("nan")
+    _rewritten(saved, _about(saved), tensors)
+    before = saved.read_bytes()
+    with pytest.raises(WeightsError, match="not finite"):
+        seal_weights(saved)
+    assert saved.read_bytes() == before

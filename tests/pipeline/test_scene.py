@@ -111,3 +111,32 @@ def test_a_raster_is_drawn_when_it_is_looked_at() -> None:
             other.drawn()
     with pytest.raises(SceneError, match="not empty"):
         Raster((0, 5, 2), labelled=False, draw=draw)
+
+
+@pytest.mark.parametrize("value", [1e30, -1e20, 2e9, 1e300])
+def test_values_that_no_sensor_gives_are_refused(value: float) -> None:
+    """All light is measured by the brightest: one message with the first place, the value and what to do."""
+    values = np.ones((4, 5, 2))
+    values[1, 3, 0], values[2, 0, 1], values[0, 0, 0], values[0, 1, 0] = value, value, np.nan, np.inf
+    with pytest.raises(SceneError, match=r"scene p has 2 values, the first \S+ at y 1, x 3, band 0, .*; put NaN"):
+        raster_from_values(values, CAMERA, name="p", wavelength_nm=WAVELENGTH)
+
+
+def test_light_too_small_for_numbers_is_refused() -> None:
+    """Electrons per unit would be infinite."""
+    with pytest.raises(SceneError, match="brightest values of scene p are 1e-38, too small to be told from nothing"):
+        raster_from_values(np.full((4, 5, 2), 1e-38), CAMERA, name="p", wavelength_nm=WAVELENGTH)
+
+
+def test_pixels_without_most_bands_are_missing_and_unlabelled() -> None:
+    """Half of the bands is enough to be known by; a scene with every value misses nothing."""
+    values, labels = np.ones((4, 5, 2)), np.zeros((4, 5), np.uint8)
+    values[0, 0], values[1, 1, 0], values[2, 2] = np.nan, np.nan, np.inf
+    scene = raster_from_values(values, CAMERA, name="p", wavelength_nm=WAVELENGTH, labels=labels)
+    assert scene.missing is not None
+    assert np.argwhere(scene.missing).tolist() == [[0, 0], [2, 2]]
+    assert scene.labels is not None
+    assert np.argwhere(scene.labels == 255).tolist() == [[0, 0], [2, 2]]
+    assert scene.filled_px == 3
+    assert not labels.any()
+    assert raster_from_values(np.ones((4, 5, 2)), CAMERA, name="p", wavelength_nm=WAVELENGTH).missing is None

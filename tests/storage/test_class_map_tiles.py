@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
-from storage.class_maps import ClassMap, ClassNames, create_class_map, load_class_map, write_class_map, write_class_tile
+from storage.class_maps import (
+    ClassMap,
+    ClassNames,
+    clear_classes,
+    create_class_map,
+    load_class_map,
+    write_class_map,
+    write_class_tile,
+)
 from storage.layout import AngularGrid
 
 LEGEND = ClassNames(("crop", "weed"), np.array([[0, 255, 0], [255, 0, 0]], np.uint8))
@@ -74,3 +82,17 @@ def test_what_a_tile_lacks_is_told(tmp_path: Path) -> None:
         create_class_map(tmp_path / "d.zarr", (20, 30), ClassNames(LEGEND.names, LEGEND.colours[:1]))
     with pytest.raises(IncompleteStoreError, match=r"none\.zarr cannot be read"):
         write_class_tile(tmp_path / "none.zarr", (0, 0), ones, ones.astype(np.float32))
+
+
+def test_classes_are_taken_from_pixels_and_from_no_other(tmp_path: Path) -> None:
+    """In whichever shards they lie; a map of which none is taken keeps its bytes."""
+    classes, confidence = _drawn()
+    write_class_map(tmp_path / "m.zarr", ClassMap(classes, confidence, LEGEND.names, LEGEND.colours))
+    before, where = _contents(tmp_path / "m.zarr"), np.zeros(SHAPE, np.bool_)
+    clear_classes(tmp_path / "m.zarr", where)
+    assert _contents(tmp_path / "m.zarr") == before
+    where[60:70, 630:650], where[149, 699] = True, True
+    clear_classes(tmp_path / "m.zarr", where)
+    found = load_class_map(tmp_path / "m.zarr")
+    np.testing.assert_array_equal(found.classes, np.where(where, 255, classes))
+    np.testing.assert_array_equal(found.confidence, np.where(where, np.nan, confidence))

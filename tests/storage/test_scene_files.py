@@ -75,7 +75,7 @@ def test_missing_values_stay_missing(tmp_path: Path) -> None:
     values[0, 0, 0], values[1, 1, 1] = np.nan, np.inf
     scene = load_scene_file(_save(tmp_path / "a.npy", values), wavelengths=[500, 600])
     assert np.isnan(scene.values).sum() == 2
-    assert "1 infinite samples count as missing" in scene.provenance
+    assert "1 infinite samples count as missing, the first at y 1, x 1, band 1" in scene.provenance
 
 
 @pytest.mark.parametrize(
@@ -362,3 +362,56 @@ def test_npy_that_claims_more_than_it_holds(tmp_path: Path) -> None:
     (tmp_path / "a.npy").write_bytes(claim)
     with pytest.raises(SceneError, match="cannot be read as"):
         load_scene_file(tmp_path / "a.npy", wavelengths=NM)
+
+
+@pytest.mark.parametrize(
+    "value", ["1e+30", "-1e+30", "3.4028235e+38", "-3.4028235e+38", "9.96921e+36", "1e+20", "2e+09"]
+)
+def test_a_fill_value_that_nobody_stated_is_refused_with_its_place(tmp_path: Path, value: str) -> None:
+    """The first of them in the file's own bands; what the message says to write makes them missing, and no other."""
+    values = np.random.default_rng(0).uniform(0.1, 0.5, (6, 7, 4)).astype(np.float32)
+    holes = values.copy()
+    values[2, 3:5, 1], values[4, 0, 3] = np.float32(value), np.float32(value)
+    holes[2, 3:5, 1], holes[4, 0, 3] = np.nan, np.nan
+    path = _save(tmp_path / "a.npy", values)
+    with pytest.raises(SceneError) as refused:
+        load_scene_file(path, bands=[1, 3], wavelengths=[500, 600])
+    told = str(refused.value)
+    assert f"a.npy has 3 values, the first {np.float32(value)!s} at y 2, x 3, band 1, beyond" in told
+    (tmp_path / "scene.toml").write_text(told[told.index("nodata =") : told.index(" into a scene.toml")] + "\n")
+    found = load_scene_file(path, wavelengths=NM[:4])
+    np.testing.assert_array_equal(found.values, holes)
+    assert any(note.startswith("3 samples have the file's no-data value") for note in found.provenance)
+    (tmp_path / "scene.toml").unlink()
+    load_scene_file(path, bands=[0, 2], wavelengths=[500, 600])
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.int64, np.uint32])
+def test_fill_values_of_any_type_are_refused(tmp_path: Path, kind: Any) -> None:
+    """Also those that float32 would make infinite, and the ends of whole numbers; infinities themselves are missing."""
+    values = np.ones((3, 3, 1), kind)
+    values[1, 2, 0] = 1e300 if kind is np.float64 else np.iinfo(kind).max
+    with pytest.raises(SceneError, match=r"has 1 value, the first \S+ at y 1, x 2, band 0, beyond"):
+        load_scene_file(_save(tmp_path / "a.npy", values), wavelengths=[500])
+
+
+def test_another_no_data_value_is_another_scene(tmp_path: Path) -> None:
+    """What counts as light changes with it, so that nothing stored of one is taken for the other."""
+    path = _save(tmp_path / "a.npy", np.arange(12.0).reshape(2, 3, 2))
+    found = [load_scene_file(path, wavelengths=[500, 600]).light_hash]
+    for number in ("0", "5", "5.0"):
+        (tmp_path / "scene.toml").write_text(f"nodata = {number}\n")
+        found.append(load_scene_file(path, wavelengths=[500, 600]).light_hash)
+    assert len(set(found)) == 3
+    assert found[2] == found[3]
+
+
+def test_values_that_leave_all_else_in_the_dark_are_told(tmp_path: Path) -> None:
+    """A fill value that could be a reading: one note with the number to write; a bright scene has none."""
+    values = np.random.default_rng(0).uniform(0.1, 0.5, (40, 50, 2))
+    plain = load_scene_file(_save(tmp_path / "a.npy", values), wavelengths=[500, 600])
+    assert not any("all else is dark" in note for note in plain.provenance)
+    values[:2] = 1e6
+    dark = load_scene_file(_save(tmp_path / "a.npy", values), wavelengths=[500, 600])
+    (note,) = (note for note in dark.provenance if "all else is dark" in note)
+    assert note.endswith("if they stand for no data, write nodata = 1000000.0 into a scene.toml")

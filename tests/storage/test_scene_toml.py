@@ -51,6 +51,8 @@ def test_wavelengths_file_less_dropped_rows(tmp_path: Path, cube: NDArray[np.uin
         ("bands = [1.5]", "list of whole numbers"),
         ("wavelengths_nm = 5", "list of numbers"),
         ("labels = 3", "file name in quotes"),
+        ('nodata = "none"', "nodata must be a number such as -9999 or 1e30, got 'none'"),
+        ("nodata = true", "nodata must be a number"),
         ("[classes]\na = 1\nb = [1, 2, 3]", "one kind"),
         ("[classes]\na = 1\nb = 1", "same number or colour"),
         ("[classes]\na = [1, 2, 300]", r"colour \[r, g, b\]"),
@@ -73,3 +75,12 @@ def test_dropped_rows_must_leave_one_a_band(tmp_path: Path, cube: NDArray[np.uin
     ):
         with pytest.raises(WavelengthError, match=words):
             load_scene_file(_scene(tmp_path, cube, f'wavelengths_file = "w.txt"\ndropped_bands = {dropped}'))
+
+
+def test_no_data_as_stated(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
+    """The number of scene.toml becomes NaN; one that whole numbers cannot hold is in no pixel."""
+    cube[1, 2, 3] = 7
+    nm = "wavelengths_nm = [400, 500, 600, 700, 800]\n"
+    scene = load_scene_file(_scene(tmp_path, cube, nm + "nodata = 7"))
+    np.testing.assert_array_equal(np.isnan(scene.values), cube == 7)
+    assert not np.isnan(load_scene_file(_scene(tmp_path, cube, nm + "nodata = -9999")).values).any()

@@ -10,13 +10,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.camera import LineCamera
+from pipeline.coverage import full_sweeps
+from pipeline.grid import SceneGrid
 from pipeline.once import Once
+from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.path_radiance import PATH_RADIANCE, extinction_per_m, rayleigh_per_m
 from pipeline.simulator.gain_range import fixed_variance
 from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.render import expected_light
-from pipeline.simulator.rig_model import Air
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.rig_model import Air, Rig, Sky
+from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.survey_probe import probe_scene
 from tests.pipeline.simulator.outdoors import (
     BANDS,
     MORNING,
@@ -206,3 +211,17 @@ def test_rendered() -> None:
     light = expected_light(scene, block, {PATH_RADIANCE: "range"})
     lost = -np.expm1(-300 * extinction_per_m(HAZY_300_M, WAVELENGTH))
     np.testing.assert_allclose(light, np.broadcast_to(0.3 * white_e() * lost, light.shape), rtol=1e-5)
+
+
+@pytest.mark.parametrize("air", [CLEAR_30_M, HAZY_300_M, Air(math.inf), SLOPING])
+@pytest.mark.parametrize("black", [slice(1, 2), slice(None)], ids=["one band", "all bands"])
+def test_bands_without_light_have_a_finite_bound(air: Air, black: slice) -> None:
+    """What air adds to them is all that there is; nothing overflows, with any effect of the view."""
+    values = np.random.default_rng(0).uniform(0, 1, (24, 32, 3))
+    values[..., black] = 0
+    scene = raster_from_values(values, LineCamera(samples=32), name="t", wavelength_nm=np.array([640.0, 550.0, 460.0]))
+    rig = Rig(LineCamera(samples=32), air=air, sky=Sky(brdf_per_rad=0.3, hot_spot=0.2))
+    probe = probe_scene(scene, rig, full_sweeps(SceneGrid(24, 32, 8, 4), rig.camera, "x"))
+    found = [PATH_RADIANCE.bound(probe, rig, variant).value for variant in (OFF, *PATH_RADIANCE.variants)]
+    assert np.isfinite(found).all()
+    assert found[0] > 0

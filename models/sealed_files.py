@@ -1,0 +1,104 @@
+"""Files of tensors that say what they hold: safetensors with the hash of every tensor and of the description itself.
+
+The hashes lie in the description, the one text beside the tensors. They tell damage, not forgery: whoever can write the
+file can seal it anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from safetensors import SafetensorError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+ABOUT = "about"  # the text's name in the file
+TENSORS, SEAL = "tensors", "seal"  # entries of the description: hashes of the tensors by name, and its own
+# what reading a description may raise over bytes that are not what they should be
+DAMAGED = (SafetensorError, OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError)
+
+
+def write_sealed(path: Path, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+    """Write the file by a temporary name and a rename, so that it is whole or absent. Raises OSError."""
+    from safetensors.torch import save
+
+    whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    hashed = {**about, TENSORS: {name: hash_of(tensor) for name, tensor in whole.items()}}
+    text = json.dumps({**hashed, SEAL: _seal(hashed)}, sort_keys=True)
+    temporary = path.with_name(path.name + ".part")
+    try:
+        temporary.write_bytes(save(whole, {ABOUT: text}))
+        temporary.replace(path)
+    except OSError:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+
+
+def read_about(file: Any) -> dict[str, Any]:
+    """Give the description of a file that `safetensors.safe_open` opened; empty where there is none."""
+    about = json.loads((file.metadata() or {}).get(ABOUT, "{}"))
+    return about if isinstance(about, dict) else {}
+
+
+def broken_seal(about: Mapping[str, Any]) -> str:
+    """Why a description is not what was written, in words; nothing where it is."""
+    told = about.get(SEAL)
+    if told is None or not isinstance(about.get(TENSORS), dict):
+        return "its hashes are missing"
+    return "" if told == _seal(about) else "its description is not what was written"
+
+
+def changed_tensor(about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> str:
+    """Which tensor is not the one that was written, in words; nothing where all are."""
+    told: Mapping[str, str] = about[TENSORS]
+    if other := sorted(set(told) ^ set(tensors)):
+        return f"tensor {other[0]} is {'missing' if other[0] in told else 'none of those that were written'}"
+    changed = next((name for name, tensor in tensors.items() if hash_of(tensor) != told[name]), None)
+    return "" if changed is None else f"tensor {changed} is not what was written"
+
+
+def hash_of(tensor: Tensor) -> str:
+    """SHA-256 of a tensor's kind, shape and numbers, in hexadecimal digits."""
+    import torch
+
+    digest = hashlib.sha256(f"{tensor.dtype} {tuple(tensor.shape)}\n".encode())
+    digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _seal(about: Mapping[str, Any]) -> str:
+    """Hash of a description without its seal, whatever the order and the spaces of its text."""
+    plain = {name: value for name, value in about.items() if name != SEAL}
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+def hash_without_seal(path: Path, spared: Mapping[str, Any]) -> str:
+    """SHA-256 of the bytes that a file would have without its hashes: sealing a file does not change it.
+
+    Parameters
+    ----------
+    spared
+        Entries that the description had before, such as its format.
+
+    Raises
+    ------
+    One of `DAMAGED`, KeyError or ValueError : no such file.
+    """
+    raw = path.read_bytes()
+    size = int.from_bytes(raw[:8], "little")
+    header = json.loads(raw[8 : 8 + size])
+    about = {**json.loads(header["__metadata__"][ABOUT]), **spared}
+    plain = {name: value for name, value in about.items() if name not in (TENSORS, SEAL)}
+    header["__metadata__"] = {ABOUT: json.dumps(plain, sort_keys=True)}
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)  # safetensors: tensors begin at a multiple of 8
+    digest = hashlib.sha256(len(text).to_bytes(8, "little") + text)
+    digest.update(memoryview(raw)[8 + size :])
+    return digest.hexdigest()

@@ -1,0 +1,64 @@
+"""What counts as a reading: the range of numbers that a sensor, or a product made of its lines, can give.
+
+Fill values of common formats lie outside: 1e20, 9.97e36, 1e30, 3.4e38. So do the ends of 32-bit whole numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+MOST_VALUE = 1e9  # in any unit that scenes come in; what is larger is to be given in a larger unit
+MOST_STEPS = 65535  # that a camera tells apart: raw lines hold 16 bits
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """Values of a cube that are no readings: how many, and the first of them."""
+
+    count: int
+    place: tuple[int, ...]  # (y, x, band)
+    value: np.number[Any]
+
+    def words(self, bands: NDArray[np.integer] | None = None) -> str:
+        """Count, place and value; ``bands`` are the numbers of the cube's bands in their file."""
+        y, x, band = self.place
+        number = band if bands is None else int(bands[band])
+        return f"{self.count} value{'s' * (self.count > 1)}, the first {self.value!s} at y {y}, x {x}, band {number}"
+
+
+def beyond_range(values: NDArray[Any], most: float = MOST_VALUE) -> NDArray[np.bool_] | None:
+    """Which values are larger than ``most`` by size, infinite ones too; None where none is. NaN is no value at all."""
+    if not values.size or values.dtype.kind not in "fiu" or _too_short(values.dtype, most):
+        return None
+    low, high = values.min(), values.max()
+    if -most <= low and high <= most:
+        return None
+    found: NDArray[np.bool_] = (values > most) | (values < -most)
+    return found if found.any() else None
+
+
+def _too_short(kind: np.dtype[Any], most: float) -> bool:
+    """Whether numbers of a kind cannot be larger."""
+    return bool(kind.kind in "iu" and np.iinfo(kind).max <= most)
+
+
+def find_beyond(values: NDArray[Any], most: float = MOST_VALUE) -> Beyond | None:
+    """Count the finite values of a (y, x, band) cube that are no readings, and name the first; None where all are.
+
+    Infinite ones are missing values, as NaN is.
+    """
+    found = beyond_range(values, most)
+    if found is None or not (found := found & np.isfinite(values)).any():
+        return None
+    place = tuple(int(at) for at in np.unravel_index(int(found.argmax()), found.shape))
+    return Beyond(int(np.count_nonzero(found)), place, values[place])
+
+
+def readings_alone(values: NDArray[np.floating], most: float) -> NDArray[np.floating]:
+    """Give values with NaN for those that are no readings; the same array where all are."""
+    found = beyond_range(values, most)
+    return values if found is None else np.where(found, values.dtype.type(np.nan), values)

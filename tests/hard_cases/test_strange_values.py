@@ -1,0 +1,221 @@
+"""Hard cases of values: numbers that no sensor gives, from the bound to the end of float32, infinite or none."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from flows.region_work import seat_columns
+from models.holes import MOST_COLUMN
+from models.inference import ClassMap, Glance, decide, glance, glance_of_columns, look_coarsely, segment
+from models.policies import score_seats
+from models.regions import whole_field
+from models.second_look import rescore
+from models.weights import Weights
+from pipeline.camera import LineCamera
+from pipeline.grid import UNLABELLED, SceneGrid
+from pipeline.planning import FinePlan, plan_fine
+from pipeline.readings import MOST_VALUE, beyond_range, find_beyond, readings_alone
+from pipeline.scan import CostModel
+from tests.models.conftest import make_weights
+
+WEIGHTS = make_weights(0)
+GRID, NM = SceneGrid(48, 64, 8, 2), np.linspace(420, 980, 7)
+MOST = WEIGHTS.normalisation.most_value
+COARSE = np.random.default_rng(0).uniform(0.1, 0.5, (*GRID.coarse_shape, 7)).astype(np.float32)
+SEATS = np.array([3, 9, 20, 21])
+FINE = np.random.default_rng(1).uniform(0.1, 0.5, (len(SEATS), 8, 8, 7)).astype(np.float32)
+FAR = np.float32(np.finfo(np.float32).max)
+
+sizes = st.floats(float(np.log10(MOST * 1.001)), 38.5).map(lambda power: np.float32(min(10.0**power, float(FAR))))
+STRANGE = st.one_of(
+    sizes, sizes.map(lambda size: -size), st.sampled_from([np.inf, -np.inf, np.nan, 1e9, 1e18, 1e30, FAR])
+)
+
+
+def _drawn(coarse: NDArray[np.float32], fine: NDArray[np.float32]) -> tuple[Glance, ClassMap]:
+    """Glance and map as a survey makes them of stored values."""
+    seen = glance(WEIGHTS, coarse, NM, GRID)
+    store: Any = SimpleNamespace(seats=SEATS, pick=lambda entries: fine[entries])
+    seats, columns = seat_columns(WEIGHTS, store, NM, seen, whole_field(GRID))
+    return seen, segment(WEIGHTS, seen, columns, seats)
+
+
+def _alike(one: tuple[Glance, ClassMap], other: tuple[Glance, ClassMap]) -> bool:
+    parts = [
+        (a.columns, a.probability, a.gain, score_seats("entropy", a), b.classes, b.confidence) for a, b in (one, other)
+    ]
+    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in zip(*parts, strict=True))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    value=STRANGE,
+    y=st.integers(0, 23),
+    x=st.integers(0, 31),
+    bands=st.sets(st.integers(0, 6), min_size=1),
+    at=st.booleans(),
+)
+@example(value=np.float32(1e30), y=3, x=3, bands=set(range(7)), at=True)
+@example(value=np.float32(1e18), y=3, x=3, bands=set(range(7)), at=True)
+@example(value=np.float32(1e30), y=3, x=3, bands=set(range(7)), at=False)
+def test_a_strange_value_is_as_if_it_had_not_been_captured(
+    value: float, y: int, x: int, bands: set[int], at: bool
+) -> None:
+    """A pixel of the coarse or of the fine pass, in some bands or all: every bit is as with NaN in its place."""
+    strange, hole = (COARSE if at else FINE).copy(), (COARSE if at else FINE).copy()
+    place = (y, x, sorted(bands)) if at else (y % len(SEATS), y % 8, x % 8, sorted(bands))
+    strange[place], hole[place] = value, np.nan
+    with np.errstate(all="raise", under="ignore"):
+        one, other = (_drawn(*((cube, FINE) if at else (COARSE, cube))) for cube in (strange, hole))
+    assert _alike(one, other)
+    assert np.isfinite(one[0].probability).all()
+    assert (one[1].classes < len(WEIGHTS.class_names)).all()
+
+
+def test_strange_pixels_are_counted() -> None:
+    """By the pixel, whatever the number of bands; NaN is none of them."""
+    coarse, fine = COARSE.copy(), FINE.copy()
+    coarse[2, 5], coarse[7, 1, 3], coarse[0, 0] = 1e30, -1e20, np.nan
+    fine[1, 2, 3], fine[1, 2, 4, 0], fine[3, 0, 0], fine[0, 0, 0] = 1e18, np.inf, FAR, np.nan
+    look = look_coarsely(WEIGHTS, [coarse[:10], coarse[10:]], NM, GRID)
+    assert look.strange is not None
+    assert np.argwhere(look.strange).tolist() == [[2, 5], [7, 1]]
+    store: Any = SimpleNamespace(seats=SEATS, pick=lambda entries: fine[entries])
+    counts = np.zeros(GRID.seat_shape, np.int64).ravel()
+    seat_columns(WEIGHTS, store, NM, look, whole_field(GRID), strange=counts)
+    assert counts[SEATS].tolist() == [0, 2, 0, 1]
+    assert look_coarsely(WEIGHTS, [COARSE], NM, GRID).strange is None
+
+
+@pytest.mark.parametrize("share", [0.2, 1.0])
+def test_a_field_of_strange_values_still_ends(share: float) -> None:
+    """A fifth of the pixels, and all of them: as with NaN there, without a warning."""
+    where = np.random.default_rng(2).random(GRID.coarse_shape) < share
+    strange, hole = COARSE.copy(), COARSE.copy()
+    strange[where], hole[where] = 1e30, np.nan
+    assert _alike(_drawn(strange, FINE), _drawn(hole, FINE))
+
+
+@pytest.mark.parametrize("value", [10 * MOST_COLUMN, 1e18, 1e30, FAR, np.inf, -np.inf])
+def test_columns_that_no_reading_gives_are_dead(value: float) -> None:
+    """Given normalised already, to the glance or to the map, they count as NaN does."""
+    columns = np.random.default_rng(3).normal(0, 1, (*GRID.coarse_shape, 4)).astype(np.float32)
+    patches = np.random.default_rng(4).normal(0, 1, (2, 8, 8, 4)).astype(np.float32)
+    found = []
+    for one in (value, np.nan):
+        coarse, fine = columns.copy(), patches.copy()
+        coarse[4, 6, 2], fine[1, 3, 5, 0] = one, one
+        seen = glance_of_columns(WEIGHTS, coarse, GRID)
+        found.append((seen, segment(WEIGHTS, seen, fine, np.array([4, 30]))))
+    assert _alike(*found)
+    assert np.isfinite(found[0][0].probability).all()
+
+
+def test_a_logit_that_is_no_number_is_no_class() -> None:
+    """NaN and +inf are 255 with a confidence of NaN, and nothing beside them changes; -inf is a class ruled out."""
+    logits = torch.tensor([[1.0, np.nan, np.inf, -np.inf, 3.0], [2.0, 0.0, 0.0, 1.0, 4.0]])
+    confidence, classes = decide(logits, dim=0)
+    assert classes.tolist() == [1, UNLABELLED, UNLABELLED, 1, 1]
+    assert torch.isnan(confidence).tolist() == [False, True, True, False, False]
+    assert classes.dtype == torch.uint8
+
+
+def test_weights_that_overflow_draw_no_class() -> None:
+    """Finite weights whose logits are not: the map says nothing there, instead of class 0."""
+    weights: Weights = make_weights(0)
+    with torch.no_grad():
+        weights.segmenter.coarse_classes.weight.fill_(3e38)
+        weights.segmenter.fine_classes.weight.fill_(3e38)
+    seen = glance(weights, COARSE, NM, GRID)
+    drawn = segment(weights, seen, weights.columns(FINE, NM), SEATS)
+    lost = np.isnan(drawn.confidence)
+    assert lost.mean() > 0.5
+    assert (drawn.classes[lost] == UNLABELLED).all()
+    assert (drawn.classes[~lost] != UNLABELLED).all()
+
+
+# --- scores -----------------------------------------------------------------------------------------------------------
+
+FIELD, CAMERA, COST = SceneGrid(200, 900, 32, 4), LineCamera(), CostModel()
+SCORES = np.random.default_rng(3).exponential(size=int(np.prod(FIELD.seat_shape))) ** 3
+
+
+def _plan(scores: NDArray[np.float64], threshold: float | None = None) -> FinePlan:
+    return plan_fine(FIELD, CAMERA, COST, "x", scores, budget_s=15.0, threshold=threshold)
+
+
+@settings(max_examples=20, deadline=None)
+@given(power=st.integers(-1000, 1010), limited=st.booleans())
+@example(power=1010, limited=True)
+@example(power=997, limited=False)  # about 1e300
+def test_the_unit_of_scores_does_not_matter(power: int, limited: bool) -> None:
+    """Scores times any power of two buy the same lines and share, with or without a threshold."""
+    usual = _plan(SCORES, 0.5 if limited else None)
+    scaled = _plan(np.ldexp(SCORES, power), float(np.ldexp(0.5, power)) if limited else None)
+    assert scaled.sweeps == usual.sweeps
+    assert scaled.worth == np.ldexp(usual.worth, power)
+    assert scaled.wanted_worth == np.ldexp(usual.wanted_worth, power)
+
+
+@pytest.mark.parametrize("value", [1e300, 1.7e308, np.finfo(np.float64).max])
+def test_sums_beyond_all_numbers_are_told_in_a_larger_unit(value: float) -> None:
+    """Every seat of nearly the largest score there is: the plan of equal ones, and its share of the score."""
+    plan, usual = _plan(np.full(SCORES.shape, value)), _plan(np.ones(SCORES.shape))
+    assert plan.sweeps == usual.sweeps
+    assert plan.seconds <= 15.0
+    assert plan.worth / plan.wanted_worth == pytest.approx(usual.worth / usual.wanted_worth)
+    assert np.isfinite([plan.worth, plan.wanted_worth]).all()
+
+
+def test_infinite_scores_lead_huge_ones() -> None:
+    """+inf is worth more than all of 1e300 together; NaN and below 0 are worth nothing beside them."""
+    scores = 1e300 * SCORES
+    scores[7], scores[40:60], scores[60:80] = np.inf, np.nan, -1e300
+    plan, bare = _plan(scores), _plan(np.where(np.arange(len(scores)) == 7, 1.0, 0.0))
+    assert set(bare.seats) & {7} <= set(plan.seats)
+    assert np.isfinite(plan.worth)
+    zeroed = np.where(np.isnan(scores) | (scores < 0), 0.0, scores)
+    assert _plan(zeroed).sweeps == plan.sweeps
+
+
+@pytest.mark.parametrize("power", [0, 300, 990, 1020])
+def test_a_second_look_at_huge_scores_is_that_at_usual_ones(power: int) -> None:
+    """What is found scales with what was expected: the order of the seats that are left stays."""
+    scores, seats = np.minimum(SCORES[:48], 1.0), np.arange(0, 48, 2)
+    scores[seats] = 1.0
+    found = np.linspace(0.2, 1.0, len(seats))
+    usual = rescore(scores, seats, found, (6, 8))
+    scaled = rescore(np.ldexp(scores, power), seats, np.ldexp(found, power), (6, 8))
+    np.testing.assert_allclose(np.ldexp(scaled, -power), usual, rtol=1e-12)
+
+
+# --- the rule itself --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int64, np.uint32, np.uint16, np.uint8, bool])
+def test_the_bound_is_inclusive_and_knows_every_kind(kind: Any) -> None:
+    """Values up to 1e9 are readings in any type; short whole numbers cannot be larger."""
+    values = np.ones((2, 3, 4), kind)
+    assert beyond_range(values) is None
+    if np.dtype(kind).itemsize > 2:
+        values[1, 2, 3] = MOST_VALUE
+        assert find_beyond(values) is None
+        values[1, 2, 3] = 2 * MOST_VALUE
+        found = find_beyond(values)
+        assert found is not None
+        assert (found.count, found.place, float(found.value)) == (1, (1, 2, 3), 2 * MOST_VALUE)
+
+
+def test_readings_stay_the_same_array() -> None:
+    """No copy is made where there is nothing to take out, and NaN stays NaN where there is."""
+    values = np.array([[1.0, np.nan, -5.0]], np.float32)
+    assert readings_alone(values, 10.0) is values
+    np.testing.assert_array_equal(readings_alone(values, 2.0), [[1.0, np.nan, np.nan]])
