@@ -99,7 +99,7 @@ def test_without_a_server_the_survey_runs_plain(
 ) -> None:
     """A server that cannot start is told of in one line, and the survey goes on without it."""
 
-    def refuse(runner: Any) -> None:
+    def refuse(*given: Any) -> None:
         raise engine.EngineUnavailable("the Prefect server did not start (no port)")
 
     monkeypatch.setattr(engine, "survey_with_prefect", refuse)
