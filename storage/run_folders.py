@@ -131,8 +131,13 @@ def _take_its_place(part: Path, final: Path) -> None:
     away = part
     if not try_exchange(part, final):
         away = final.with_name(f"{final.name}-{secrets.token_hex(4)}{PART_SUFFIX}")
-        final.rename(away)
-        part.rename(final)
+        try:
+            final.rename(away)
+            part.rename(final)
+        except BaseException:
+            if not final.exists():
+                away.rename(final)
+            raise
         sync_path(final.parent)
     remove_tree(away)
 
