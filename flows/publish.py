@@ -86,10 +86,12 @@ def add_accuracy(run: SurveyRun, draft: RunDraft, products: Products, stage: Sta
     itself stays as it is.
     """
     assert products.accuracy is not None
-    asked = asked_settings(run)
+    before, asked = load_receipt(draft.published), asked_settings(run)
+    other_labels = asked["labels"] != before["settings"].get("labels")
+    names = ("accuracy", "controls", *(("labels", "notes") if other_labels else ()))
     receipt = with_accuracy(
-        load_receipt(draft.published), load_accuracy(products.accuracy), stage, accuracy_address(products.accuracy),
-        settings={name: asked[name] for name in ("accuracy", "controls", "labels", "notes")}, judged=now(),
+        before, load_accuracy(products.accuracy), stage, accuracy_address(products.accuracy),
+        settings={name: asked[name] for name in names}, judged=now(),
     )  # fmt: skip
     return _publish(run, draft, products, _whole_plan(products), receipt)
 

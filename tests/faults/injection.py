@@ -9,6 +9,7 @@ import _pyio  # type: ignore[import-not-found]
 import builtins
 import datetime
 import errno
+import functools
 import importlib
 import io
 import os
@@ -61,9 +62,10 @@ def end_at(root: str, at: int, number: int, log: str | None = None) -> None:
 
 
 def end_before(place: str, number: int, call: int = 1) -> None:
-    """Send this process signal ``number`` just before the ``call``-th call of a function, ``module:name``."""
-    module, _, name = place.partition(":")
-    inside = importlib.import_module(module)
+    """Send this process a signal before the ``call``-th call of a function: ``module:name``, ``module:Class.name``."""
+    module, _, path = place.partition(":")
+    *outer, name = path.split(".")
+    inside = functools.reduce(getattr, outer, importlib.import_module(module))
     real, calls = getattr(inside, name), count(1)
 
     def ended(*given: Any, **named: Any) -> Any:
