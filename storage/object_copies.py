@@ -168,7 +168,7 @@ class WorkingCopy:
         folder = self.root / uri
         ours, standing = (folder / MANIFEST_NAME).read_bytes(), send_folder(self.objects, uri, folder)
         if _extends(ours, standing):
-            send_extension(self.objects, uri, folder)
+            send_extension(self.objects, uri, folder, standing)
         elif standing != ours:
             dated = self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")
             if dated is None or not _is_of_one_run(dated[0], ours):

@@ -78,10 +78,10 @@ def send_folder(objects: Objects, uri: str, folder: Path) -> bytes:
     return objects.claim(f"{uri}/{MANIFEST_NAME}", text)
 
 
-def send_extension(objects: Objects, uri: str, folder: Path) -> None:
-    """Upload a run that something was added to in the place of the one that stands: its files, its manifest last.
+def send_extension(objects: Objects, uri: str, folder: Path, standing: bytes) -> None:
+    """Upload a run that something was added to in the place of the one that stands: its files, then its manifest.
 
-    Whoever reads meanwhile has one of the two, whole; the files of the other one are cleared away later.
+    The files of the one of which ``standing`` is the manifest go last; killed before, `gc` clears them away.
 
     Raises
     ------
@@ -91,6 +91,7 @@ def send_extension(objects: Objects, uri: str, folder: Path) -> None:
     text = (folder / MANIFEST_NAME).read_bytes()
     _send_files(objects, uri, folder, text)
     objects.write(f"{uri}/{MANIFEST_NAME}", text)
+    objects.remove(objects.listing(files_at(uri, standing)))
 
 
 def _send_files(objects: Objects, uri: str, folder: Path, text: bytes) -> None:
