@@ -46,6 +46,7 @@ def _run_row(catalogue: Catalogue, run: Run) -> dict[str, Any]:
         "seed": settings.get("seed"),
         "budget": settings.get("budget"),
         **score_of(receipt),
+        "accuracy_is": receipt.get("accuracy_is"),
         "bytes": sum(catalogue.stores[uri].size for uri in below if uri in catalogue.stores),
         "state": _run_state(catalogue, run, below),
     }

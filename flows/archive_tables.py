@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.tree import Tree
 
 from flows.figures import DASH, counted, format_bytes, format_points, format_seconds
+from flows.receipt import is_pending
 from storage.addresses import in_text
 
 SHORT_KEY = 12
@@ -25,9 +26,11 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
     """Print what `ls` found."""
     runs = _table("Runs", "run", "scene", "seed", "budget", "mIoU", "size", "age", "state", left=2)
     for run in content["runs"]:
+        miou = run["miou"] if isinstance(run["miou"], int | float) else None
+        scored = "not yet" if is_pending(run) else format_points(miou)
         runs.add_row(
             escape(run["id"]), escape(_file_name(run["scene"])), _plain(run["seed"]), _plain(run["budget"]),
-            format_points(run["miou"]), format_bytes(run["bytes"]), _age(run["age_s"]), _state(run["state"]),
+            scored, format_bytes(run["bytes"]), _age(run["age_s"]), _state(run["state"]),
         )  # fmt: skip
     console.print(runs if content["runs"] else "no runs")
     stores = _table("Stores", "stage", "key", "version", "size", "age", "runs that name it")

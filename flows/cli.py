@@ -20,9 +20,12 @@ from flows.app import GOES_ON, AsJson, OutFile, app, parse_numbers, parse_wholes
 from flows.cache_places import place_caches
 from flows.survey_flags import SurveyFlags
 from flows.system_refusals import refusal_words
+from flows.termination import EXIT_CODE as TERMINATED
+from flows.termination import Terminated, terminable
 from pipeline.errors import PipelineError, SettingsError
 
 NO_FLAGS = SurveyFlags()
+INTERRUPTED = 130
 
 
 @app.command
@@ -216,29 +219,35 @@ def main(arguments: list[str] | None = None) -> None:
     # Read when numpy is first imported, which the verbs do. Split among threads, sums are rounded otherwise: the raw
     # light behind one key, and so the receipt of one seed, would differ with the number of cores.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    with terminable():
+        sys.exit(_run(sys.argv[1:] if arguments is None else arguments))
+
+
+def _run(arguments: list[str]) -> int:
+    """Run the verb; gives the exit code, once what went wrong has been said."""
     try:
         place_caches()  # read when numba and matplotlib are first imported
         code = app(arguments, result_action="return_value", exit_on_error=False, print_error=False)
     except CycloptsError as error:
         say(_usage(error))
-        sys.exit(SettingsError.exit_code)
+        return SettingsError.exit_code
     except PipelineError as error:
         say(str(error))
-        sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        verb = next(iter(sys.argv[1:] if arguments is None else arguments), "")
-        goes_on = "; the same command goes on from here" if verb in GOES_ON else ""
-        stderr.print(f"interrupted{goes_on}", highlight=False)
-        sys.exit(130)
+        return error.exit_code
+    except KeyboardInterrupt as error:
+        what, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", INTERRUPTED)
+        goes_on = "; the same command goes on from here" if next(iter(arguments), "") in GOES_ON else ""
+        stderr.print(f"{what}{goes_on}", highlight=False)
+        return code
     except BrokenPipeError:
-        sys.exit(1)
+        return 1
     except Exception as error:
         if (refused := refusal_words(error)) is not None:
             say(refused)
-            sys.exit(1)
+            return 1
         say(f"{type(error).__name__}: {error}; this is a defect of SpectralZoom: please report {_keep_traceback()}")
-        sys.exit(1)
-    sys.exit(code if isinstance(code, int) else 0)
+        return 1
+    return code if isinstance(code, int) else 0
 
 
 def _usage(error: CycloptsError) -> str:

@@ -8,10 +8,10 @@ import os
 import secrets
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from flows.process_guard import end_with_us
 from flows.survey import Products, StageRunner, Step, survey
@@ -38,12 +38,17 @@ QUIET = {
 }
 
 
+Left = TypeVar("Left")
+
+
 class EngineUnavailable(RuntimeError):  # noqa: N818 - a state of affairs: the survey goes on without it
     """No Prefect server could be started or reached."""
 
 
-def survey_with_prefect(runner: StageRunner) -> Products:
+def survey_with_prefect(runner: StageRunner, finish: Callable[[Step, Products], Left]) -> Left:
     """Run the survey as a Prefect flow on an ephemeral server, or on the one that PREFECT_API_URL names.
+
+    ``finish`` is called in the flow once the map is drawn, with what runs a stage as a task; what it gives is given.
 
     Raises
     ------
@@ -51,7 +56,7 @@ def survey_with_prefect(runner: StageRunner) -> Products:
     PipelineError : from a stage, as with the plain engine.
     """
     if inside_flow():
-        return survey(_task_step(runner), runner.run.settings.rounds)
+        return _survey(runner, finish)
     with _prefect_home(runner.run.archive.root):
         try:
             from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
@@ -59,7 +64,7 @@ def survey_with_prefect(runner: StageRunner) -> Products:
             raise EngineUnavailable(f"Prefect cannot be imported ({error})") from error
         # The heartbeat thread adds a second to every flow and tells nobody anything on an ephemeral server.
         with temporary_settings(updates={PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None, **_password()}), _guarded_server():
-            return _run_flow(runner)
+            return _run_flow(runner, finish)
 
 
 def _password() -> dict[Any, str]:
@@ -112,17 +117,23 @@ def _task_step(runner: StageRunner) -> Step:
     return step
 
 
-def _run_flow(runner: StageRunner) -> Products:
+def _survey(runner: StageRunner, finish: Callable[[Step, Products], Left]) -> Left:
+    """Run the stages as tasks of the flow that this is called in."""
+    step = _task_step(runner)
+    return finish(step, survey(step, runner.run.settings.rounds))
+
+
+def _run_flow(runner: StageRunner, finish: Callable[[Step, Products], Left]) -> Left:
     from prefect import flow
 
     started: list[bool] = []
-    left: list[Products] = []
+    left: list[Left] = []
 
     @flow(name="survey", flow_run_name=f"survey-{runner.run.name}", persist_result=False, validate_parameters=False)
     def survey_flow(scene: str, seed: int, budget: float) -> None:
         """Sweep coarsely, look again where it changes the map, draw the map."""
         started.append(True)
-        left.append(survey(_task_step(runner), runner.run.settings.rounds))
+        left.append(_survey(runner, finish))
 
     settings = runner.run.settings
     try:

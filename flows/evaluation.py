@@ -51,7 +51,7 @@ def evaluate(
 
     What controls see has the effects of the survey.
     """
-    if not run.scene.labelled:
+    if not run.scene.labelled or not run.settings.accuracy:
         return None
     inputs = [mosaic, patches, class_map, effects, *pointing]
     _wait_for(inputs)

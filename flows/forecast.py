@@ -13,7 +13,7 @@ from flows.run import SurveyRun, open_run
 from flows.settings import Settings
 from flows.stage_costs import PARTS, PastCosts
 from flows.stages import VERSIONS
-from flows.survey import STAGES, survey
+from flows.survey import STAGES, judge, survey
 from pipeline.errors import IncompleteStoreError, PipelineError
 from storage.addresses import store_at
 from storage.archive import Archive, StageRef, stage_key
@@ -73,7 +73,7 @@ def forecast(settings: Settings) -> Forecast:
     """
     with _opened(settings) as run:
         planner = Planner(run, Catalogue.read(run.archive.root))
-        survey(planner, settings.rounds)
+        judge(planner, survey(planner, settings.rounds))
     return Forecast(planner.rows, run.refused)
 
 

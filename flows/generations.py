@@ -10,6 +10,7 @@ from importlib import resources
 from pathlib import Path, PurePath
 from typing import Any
 
+from flows.receipt import is_pending
 from flows.run import SHIPPED
 from flows.setting_keys import BUILT_IN_SCENES
 from flows.settings import OF_THE_MACHINE, Settings, of_this_version, parse_settings
@@ -111,12 +112,13 @@ def is_whole(catalogue: Catalogue, run: Run) -> bool:
 def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
     """Whether its survey with these settings would find all that this run names or rests on, by versions and weights.
 
+    A run whose accuracy is not there yet is not: the survey adds it.
     What lies in a scene's file is not looked at.
     """
     drawn_by = law_of_key(str(run.receipt.get("scene")))
     of_this_law = settings.scene not in BUILT_IN_SCENES or drawn_by == farm_law(settings.scene)
     stale = stale_stores(catalogue, catalogue.named_and_below[run.uri], weights_key(settings))
-    return of_this_law and not stale and is_whole(catalogue, run)
+    return of_this_law and not stale and is_whole(catalogue, run) and not is_pending(run.receipt)
 
 
 def would_remake(catalogue: Catalogue, run: Run, stage: str, settings: Settings) -> bool:

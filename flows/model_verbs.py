@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
-from flows.app import AsJson, OutFolder, Switch, app, parse_numbers, parse_wholes, split_list, stderr
+from flows.app import AsJson, OutFolder, Switch, app, parse_numbers, parse_wholes, print_json, split_list, stderr
 from pipeline.errors import SettingsError
 
 
@@ -35,8 +37,9 @@ def seal(*weights: Path) -> int:
 @app.command
 def evaluate(
     dataset: str,
+    run: str | None = None,
     *,
-    weights: Annotated[tuple[Path, ...], Parameter(negative="")],
+    weights: Annotated[tuple[Path, ...], Parameter(negative="")] = (),
     out: OutFolder = None,
     shares: str | None = None,
     policies: str | None = None,
@@ -53,16 +56,22 @@ def evaluate(
     labels: str | None = None,
     bands: str | None = None,
     wavelengths: str | None = None,
+    controls: bool | None = None,
     as_json: AsJson = False,
 ) -> int:
     """Judge WEIGHTS on the frames of DATASET that they were not trained on: accuracy, intervals, placement, costs.
 
     With --out, frames that were judged are kept there: the same command goes on where it was stopped.
 
+    `evaluate ARCHIVE RUN`, without weights, adds its accuracy to a run that was published without; of the flags below
+    it takes --labels, --controls and --json.
+
     Parameters
     ----------
     dataset
-        `farm` (or `farm@1`, `farm@2`), a folder of labelled scenes, or one scene file.
+        `farm` (or `farm@1`, `farm@2`), a folder of labelled scenes, or one scene file; with RUN, an archive.
+    run
+        A run of the archive: its name, `latest` or `previous`. `evaluate archive/runs/NAME` is the same.
     weights
         A file of weights. Several are seeds of one training, or of frames left out in turn: each frame is judged by
         those that never saw it.
@@ -97,12 +106,24 @@ def evaluate(
         Of several frames, also judge gain and entropy with one threshold for the scores of all frames, which buys the
         share of the seats of all of them together: bare frames then get fewer, rich ones more.
     labels
-        For one scene: the file of its labels.
+        For one scene, or a run: the file of its labels.
     bands
         For one scene: numbers of the bands to use, from 0, with commas.
     wavelengths
         For one scene: wavelengths of its bands [nm], with commas.
+    controls
+        For a run: also judge other placements of the same number of seats; as its survey was asked for by default.
     """
+    address = _run_address(dataset, run, given=bool(weights))
+    if address is not None:
+        for_weights = {
+            "weights": weights, "out": out, "shares": shares, "policies": policies, "frames": frames, "scenes": scenes,
+            "seed": seed, "draws": draws, "timed-frames": timed_frames, "timed-runs": timed_runs, "control": control,
+            "rig": rig, "equal-time": equal_time, "pooled": pooled, "bands": bands, "wavelengths": wavelengths,
+        }  # fmt: skip
+        return _evaluate_run(*address, for_weights, controls=controls, labels=labels, as_json=as_json)
+    if controls is not None:
+        raise SettingsError("--controls is for a run of an archive; weights are judged beside others by --control FILE")
     from flows.benchmark_request import SHARES, USUAL, EvaluateRequest
     from flows.evaluate_command import run_evaluate
 
@@ -118,4 +139,45 @@ def evaluate(
         pooled, choices,
     )  # fmt: skip
     run_evaluate(request, stderr, as_json=as_json)
+    return 0
+
+
+def _run_address(dataset: str, run: str | None, *, given: bool) -> tuple[str, str] | None:
+    """Archive and run, where a run is to be judged; None where weights are, on a data set.
+
+    Raises
+    ------
+    SettingsError : neither can be meant.
+    """
+    from flows.judge_command import split_address
+
+    if run is not None:
+        return dataset, run
+    if given:
+        return None
+    address = split_address(dataset)
+    if address is None:
+        raise SettingsError(
+            f"evaluate {dataset}: give --weights FILE to judge weights on this data set, or a run of this archive, such"
+            f" as evaluate {dataset} latest, to judge its map"
+        )
+    return address
+
+
+def _evaluate_run(
+    archive: str, run: str, for_weights: Mapping[str, object], *, controls: bool | None, labels: str | None,
+    as_json: bool,
+) -> int:  # fmt: skip
+    from flows.judge_command import JudgeRequest, run_judge
+
+    usual = inspect.signature(evaluate).parameters
+    named = [flag for flag, value in for_weights.items() if value != usual[flag.replace("-", "_")].default]
+    if named:
+        raise SettingsError(
+            f"--{named[0]} is for weights that are judged on a data set; the run {run} is judged as it was surveyed:"
+            " leave it out"
+        )
+    receipt = run_judge(JudgeRequest(archive, run, controls, labels), stderr)
+    if as_json:
+        print_json(receipt)
     return 0

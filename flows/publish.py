@@ -1,4 +1,7 @@
-"""The end of a survey: receipt, quicklook and report from what the stages left, published as one run folder."""
+"""The end of a survey: receipt, quicklook and report from what the stages left, published as one run folder.
+
+Once the map is judged they are made again with its accuracy, and take the place of those that were published.
+"""
 
 from __future__ import annotations
 
@@ -24,22 +27,35 @@ from flows.panels import choose_bands
 from flows.placement import seen_shares
 from flows.pointing_stage import RECORD
 from flows.quicklook import QuicklookData, draw_quicklook
-from flows.receipt import Header, Receipt, build_receipt, to_json
+from flows.receipt import (
+    AccuracyIs,
+    Header,
+    Receipt,
+    StageRecord,
+    build_receipt,
+    check_receipt,
+    to_json,
+    with_accuracy,
+)
 from flows.report import Picture, write_report
 from flows.run import SurveyRun, now
 from flows.settings import anchor_paths
 from flows.stages import SEATS_AT_ONCE, captured, load_plan
 from flows.survey import Products, StageRunner
 from pipeline.coverage import on_scene
+from pipeline.errors import IncompleteStoreError
 from pipeline.planning import FinePlan, joined_plan
 from pipeline.rectify.calibrate import of_bands, reflectance
 from pipeline.savings import Entry, capture_savings
 from pipeline.scan import Sweep
+from storage.archive import StageRef
 from storage.attention import load_attention
 from storage.class_maps import ClassMap, load_class_map
 from storage.cubes import RawCube
 from storage.ground_maps import load_ground_map
 from storage.patches import open_patches
+from storage.records import read_run
+from storage.run_folders import RunDraft
 from storage.stored_images import open_image
 
 LIBRARIES = ("spectralzoom", "numpy", "torch", "zarr", "xarray", "prefect")
@@ -57,20 +73,59 @@ class Published:
 def publish_run(runner: StageRunner, products: Products, started: str) -> Published:
     """Write receipt.json, quicklook.png and report.html into a run folder and publish it as a whole."""
     run = runner.run
-    plan = joined_plan([load_plan(attention) for attention in products.attentions])
-    looked_twice = float(seen_shares(run, products.patches).sum()) / len(run.grid.valid_seats())
+    plan = _whole_plan(products)
     with run.archive.new_run(run.name) as draft:
         receipt = make_receipt(runner, products, plan, started, f"runs/{draft.id}")
-        panels = quicklook_data(run, products, plan, receipt)
-        draw_quicklook(draft.folder / "quicklook.png", panels)
-        draft.write_file("receipt.json", to_json(receipt))
-        picture = (draft.folder / "quicklook.png").read_bytes()
-        write_report(draft.folder / "report.html", receipt, picture, _pictures(products), looked_twice=looked_twice)
-        named = [ref for ref in vars(products).values() if ref is not None]
-        folder = draft.publish(
-            survey=receipt["survey"], settings=receipt["settings"], rests_on=run.archive.manifest_hashes(named)
-        )
+        return _publish(run, draft, products, plan, receipt)
+
+
+def add_accuracy(run: SurveyRun, draft: RunDraft, products: Products, stage: StageRecord) -> Published:
+    """Publish a run again with its accuracy, in the place of what was published before.
+
+    ``draft`` is of `Archive.extend_run`, ``stage`` the record of the judging. All that the receipt says of the survey
+    itself stays as it is.
+    """
+    assert products.accuracy is not None
+    before, asked = load_receipt(draft.published), asked_settings(run)
+    other_labels = asked["labels"] != before["settings"].get("labels")
+    names = ("accuracy", "controls", *(("labels", "notes") if other_labels else ()))
+    receipt = with_accuracy(
+        before, load_accuracy(products.accuracy), stage, accuracy_address(products.accuracy),
+        settings={name: asked[name] for name in names}, judged=now(),
+    )  # fmt: skip
+    return _publish(run, draft, products, _whole_plan(products), receipt)
+
+
+def load_receipt(folder: Path) -> Receipt:
+    """Read the receipt of a published run.
+
+    Raises
+    ------
+    IncompleteStoreError : it is not as it was published.
+    ShapeError : it lacks what a receipt has.
+    """
+    found = read_run(folder, {})
+    if found.problem is not None:
+        raise IncompleteStoreError(f"{found.uri}: {found.problem}; run verify --repair on the archive")
+    return check_receipt(found.receipt)
+
+
+def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan, receipt: Receipt) -> Published:
+    """Draw and write what a run's folder holds, and publish it."""
+    looked_twice = float(seen_shares(run, products.patches).sum()) / len(run.grid.valid_seats())
+    draw_quicklook(draft.folder / "quicklook.png", quicklook_data(run, products, plan, receipt))
+    draft.write_file("receipt.json", to_json(receipt))
+    picture = (draft.folder / "quicklook.png").read_bytes()
+    write_report(draft.folder / "report.html", receipt, picture, _pictures(products), looked_twice=looked_twice)
+    named = [ref for ref in vars(products).values() if ref is not None]
+    folder = draft.publish(
+        survey=receipt["survey"], settings=receipt["settings"], rests_on=run.archive.manifest_hashes(named)
+    )
     return Published(receipt, folder, looked_twice)
+
+
+def _whole_plan(products: Products) -> FinePlan:
+    return joined_plan([load_plan(attention) for attention in products.attentions])
 
 
 def _pictures(products: Products) -> list[Picture]:
@@ -92,12 +147,29 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
     header = Header(
         run.name, run.source.name, run.scene.key, run.settings.seed, started, now(),
         _versions(),
-        {**anchor_paths(run.settings.to_dict(), Path.cwd()), "notes": list(run.notes)},  # to be asked for from anywhere
+        asked_settings(run),
     )  # fmt: skip
     return build_receipt(
         header, runner.records.values(), savings, _addresses(products, folder),
-        accuracy=accuracy, simulation=simulation, findings=find_out(run, products),
+        accuracy=accuracy, accuracy_is=_accuracy_is(run, products), judged=None if accuracy is None else now(),
+        simulation=simulation, findings=find_out(run, products),
     )  # fmt: skip
+
+
+def _accuracy_is(run: SurveyRun, products: Products) -> AccuracyIs:
+    if products.accuracy is not None:
+        return "judged"
+    return "without labels" if not run.scene.labelled else "pending" if run.settings.accuracy else "left out"
+
+
+def accuracy_address(accuracy: StageRef) -> str:
+    """Where a receipt says that a run's accuracy lies."""
+    return f"{accuracy.uri}/accuracy.json"
+
+
+def asked_settings(run: SurveyRun) -> dict[str, object]:
+    """The settings, so that they can be asked for from anywhere, and what was assumed beside them."""
+    return {**anchor_paths(run.settings.to_dict(), Path.cwd()), "notes": list(run.notes)}
 
 
 def _versions() -> dict[str, str]:
@@ -129,7 +201,7 @@ def _addresses(products: Products, folder: str) -> dict[str, str]:
     if products.ground_map is not None:
         named["ground_map"] = f"{products.ground_map.uri}/{STORE}"
     if products.accuracy is not None:
-        named["accuracy"] = f"{products.accuracy.uri}/accuracy.json"
+        named["accuracy"] = accuracy_address(products.accuracy)
     return named | {name: f"{folder}/{name}" for name in ("receipt.json", "quicklook.png", "report.html")}
 
 

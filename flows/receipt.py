@@ -9,12 +9,13 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, NotRequired, TypedDict, cast
+from typing import Any, Literal, NotRequired, TypedDict, cast, get_args
 
 from pipeline.errors import ShapeError
 from pipeline.visible_text import is_visible
 
 State = Literal["ran", "cached", "skipped", "failed"]
+AccuracyIs = Literal["judged", "pending", "left out", "without labels"]  # pending: it is worked out after the map
 
 
 class Saving(TypedDict):
@@ -93,6 +94,8 @@ class Receipt(TypedDict):
     settings: dict[str, Any]
     stages: list[dict[str, Any]]
     savings: Savings
+    accuracy_is: NotRequired[AccuracyIs]  # receipts of before have none
+    judged: NotRequired[str]  # when accuracy was added, ISO 8601
     accuracy: NotRequired[Accuracy]
     effects: NotRequired[list[dict[str, Any]]]
     effects_total: NotRequired[dict[str, Any]]  # sum of the bounds beside the tolerance, and seconds saved
@@ -144,6 +147,7 @@ _HEADER_FIELDS = ("survey", "source", "scene", "seed", "started", "finished", "v
 # what another run of the same seed has otherwise
 _OF_ONE_RUN = ("wall_s", "cpu_s", "peak_rss_bytes", "state", "manifest_sha256")
 _STATES = ("ran", "cached", "skipped", "failed")
+JUDGING = "evaluate"  # the stage that judges the map
 
 
 def build_receipt(
@@ -153,6 +157,8 @@ def build_receipt(
     products: Mapping[str, str],
     *,
     accuracy: Mapping[str, object] | None = None,
+    accuracy_is: AccuracyIs | None = None,
+    judged: str | None = None,
     simulation: Mapping[str, Any] | None = None,
     findings: Mapping[str, object] | None = None,
 ) -> Receipt:
@@ -163,7 +169,8 @@ def build_receipt(
     savings
         `COSTS` and, where measured, ``segment_wall_s``; each a mapping with the fields of `Saving`.
     accuracy
-        Fields of `Accuracy`; None without labels.
+        Fields of `Accuracy`, and ``judged``, when they were worked out; None where the map is not judged, or not yet:
+        ``accuracy_is`` says which.
     simulation
         ``effects``, rows with name, state, variant, bound, measured, cost_s, why, unit, and ``total``, their sums; None
         for a source that is not simulated.
@@ -176,13 +183,52 @@ def build_receipt(
     """
     receipt: dict[str, object] = {**asdict(header), "stages": [asdict(stage) for stage in stages]}
     receipt["savings"] = {name: savings[name] for name in (*COSTS, "segment_wall_s") if name in savings}
-    if accuracy is not None:
-        receipt["accuracy"] = accuracy
+    told = {"accuracy_is": accuracy_is, "judged": judged, "accuracy": accuracy}
+    receipt |= {name: value for name, value in told.items() if value is not None}
     if simulation is not None:
         receipt |= {"effects": list(simulation["effects"]), "effects_total": simulation["total"]}
     receipt |= {name: found for name in FINDINGS if (found := (findings or {}).get(name))}
     receipt["products"] = dict(products)
     return check_receipt(json.loads(to_json(receipt)))
+
+
+def with_accuracy(
+    receipt: Receipt, accuracy: Mapping[str, Any], stage: StageRecord, address: str, *,
+    settings: Mapping[str, object], judged: str,
+) -> Receipt:  # fmt: skip
+    """The receipt of a run once its map is judged; nothing that was spent on the survey itself changes.
+
+    Parameters
+    ----------
+    accuracy
+        Fields of `Accuracy` and, where measured, ``segment_wall_s``, which belongs to the savings.
+    stage
+        Of the judging; it takes the place of an earlier one.
+    address
+        Of the product ``accuracy``.
+    settings
+        By which the map was judged; ``judged`` is when, ISO 8601.
+
+    Raises
+    ------
+    ShapeError : a field is missing or not of the design; names it.
+    """
+    figures = {name: value for name, value in accuracy.items() if name != "segment_wall_s"}
+    walls = {name: accuracy[name] for name in ("segment_wall_s",) if name in accuracy}
+    added = {"accuracy_is": "judged", "judged": judged, "accuracy": figures}
+    found: dict[str, object] = {}
+    for name, value in receipt.items():
+        if name not in added:
+            found[name] = value
+        if name == "savings":  # accuracy follows it
+            found |= added
+    found["settings"] = {**receipt["settings"], **settings}
+    found["stages"] = [*(row for row in receipt["stages"] if row["name"] != stage.name), asdict(stage)]
+    found["savings"] = {**receipt["savings"], **walls}
+    files = {name: place for name, place in receipt["products"].items() if place.startswith("runs/")}
+    stores = {name: place for name, place in receipt["products"].items() if name not in (*files, "accuracy")}
+    found["products"] = {**stores, "accuracy": address, **files}
+    return check_receipt(json.loads(to_json(found)))
 
 
 def check_receipt(receipt: Mapping[str, Any]) -> Receipt:
@@ -194,6 +240,11 @@ def check_receipt(receipt: Mapping[str, Any]) -> Receipt:
             place = f"receipt.stages[{number}].state"
             raise ShapeError(f"{place} must be one of {', '.join(_STATES)}; got {stage['state']!r}")
     _check_savings(receipt["savings"])
+    if receipt.get("accuracy_is", "judged") not in get_args(AccuracyIs):
+        known = ", ".join(get_args(AccuracyIs))
+        raise ShapeError(f"receipt.accuracy_is must be one of {known}; got {receipt['accuracy_is']!r}")
+    if receipt.get("accuracy_is") == "judged":
+        _need(receipt, ("judged", "accuracy"), "receipt")
     if "accuracy" in receipt:
         _check_accuracy(receipt["accuracy"])
     for number, effect in enumerate(receipt.get("effects", ())):
@@ -201,6 +252,11 @@ def check_receipt(receipt: Mapping[str, Any]) -> Receipt:
     if "effects_total" in receipt:
         _need(receipt["effects_total"], _TOTAL_FIELDS, "receipt.effects_total")
     return cast("Receipt", receipt)
+
+
+def is_pending(receipt: Mapping[str, Any]) -> bool:
+    """Whether a run was published before its map was judged, and has not been judged since."""
+    return receipt.get("accuracy_is") == "pending"
 
 
 def _check_savings(savings: Mapping[str, Any]) -> None:
@@ -262,10 +318,11 @@ def comparable(receipt: Receipt) -> dict[str, Any]:
     times), the size of the evaluation (which holds times, in more digits or fewer), and the addresses of the products
     (their names stay).
     """
-    same: dict[str, Any] = {key: value for key, value in receipt.items() if key not in ("started", "finished")}
+    times = ("started", "finished", "judged")
+    same: dict[str, Any] = {key: value for key, value in receipt.items() if key not in times}
     same["settings"] = {key: value for key, value in receipt["settings"].items() if key != "out"}
     same["stages"] = [
-        _without(stage, (*_OF_ONE_RUN, *(("bytes_out",) if stage["name"] == "evaluate" else ())))
+        _without(stage, (*_OF_ONE_RUN, *(("bytes_out",) if stage["name"] == JUDGING else ())))
         for stage in receipt["stages"]
     ]
     same["savings"] = _without(receipt["savings"], ("segment_wall_s",))

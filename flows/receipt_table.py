@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flows.figures import format_bytes, format_count, format_percent, format_points, format_seconds
-from flows.receipt import Accuracy, Receipt, Saving, Savings
+from flows.receipt import Accuracy, Receipt, Saving, Savings, is_pending
 from flows.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words, worst_class_words
 
 
@@ -33,7 +33,7 @@ def headline(receipt: Receipt, looked_twice: float | None = None) -> str:
     )
     accuracy = receipt.get("accuracy")
     if accuracy is None:
-        return text
+        return f"{text} The map is not judged yet: its accuracy is added once it is." if is_pending(receipt) else text
     every = accuracy["all"]["miou"]
     detail = "" if every is None else f", detail everywhere {format_points(every)}"
     right = accuracy.get("overall_accuracy")

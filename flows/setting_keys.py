@@ -114,6 +114,7 @@ SURVEY: dict[str, Parser] = {
     "seed": parse_whole(0, 2**63 - 1),
     "effects": parse_effects,
     "tol": parse_tolerance,
+    "accuracy": parse_switch,
     "controls": parse_switch,
     "engine": parse_choice(ENGINES),
     "memory": parse_memory,

@@ -48,6 +48,7 @@ class Settings:
     seed: int = 0
     effects: str = "auto"  # of the simulated rig: auto, all, none, or names with commas
     tol: Tolerance = field(default_factory=Tolerance)  # what leaving effects out may change any number by
+    accuracy: bool = True  # whether a map with labels is judged by them
     controls: bool = True
     engine: Literal["prefect", "plain"] = "prefect"
     memory: int = 4 * 1024**3  # [bytes]

@@ -16,7 +16,7 @@ from flows.evaluation import evaluate
 from flows.ground_stage import ground
 from flows.orientation_stage import compare_turned
 from flows.pointing_stage import register_coarse, register_fine
-from flows.receipt import StageRecord, State
+from flows.receipt import JUDGING, StageRecord, State
 from flows.run import SurveyRun
 from flows.second_round import attend_again
 from storage.archive import StageRef
@@ -38,7 +38,7 @@ STAGES: dict[str, Callable[..., StageRef | None]] = {
     "draw_map": stages.draw_map,
     "compare_turned": compare_turned,
     "ground": ground,
-    "evaluate": evaluate,
+    JUDGING: evaluate,
 }
 OF_ROUND_TWO = ("attend_again", "capture_again", "register_again", "cut_again")
 TITLES = {
@@ -58,7 +58,8 @@ TITLES = {
     "draw_map": "class map",
     "compare_turned": "what lines turned by 90° would show",
     "ground": "map on the ground",
-    "evaluate": "accuracy (not part of the survey)",
+    JUDGING: "accuracy (not part of the survey)",
+    "publish": "pictures and report",
 }
 
 
@@ -88,7 +89,7 @@ class Products:
     class_map: StageRef
     turned: StageRef
     ground_map: StageRef | None
-    accuracy: StageRef | None
+    accuracy: StageRef | None = None  # once the map is judged
     first_patches: StageRef | None = None  # these and those below: only with two rounds
     attention_again: StageRef | None = None
     raw_again: StageRef | None = None
@@ -108,7 +109,7 @@ class Products:
 def survey(step: Step, rounds: int = 1) -> Products:
     """Sweep the field coarsely, decide where detail changes the map, look there again, and draw the map.
 
-    With two rounds the second goes where the first showed that more is to be found.
+    With two rounds the second goes where the first showed that more is to be found. How good the map is `judge` tells.
     """
     effects = _needed(step("choose_effects"))
     raw = _needed(step("capture_coarse", effects))
@@ -130,12 +131,17 @@ def survey(step: Step, rounds: int = 1) -> Products:
     class_map = _needed(step("draw_map", mosaic, patches))
     turned = _needed(step("compare_turned", mosaic, attention))
     ground_map = step("ground", class_map, mosaic)
-    accuracy = step("evaluate", mosaic, patches, class_map, effects, *_there(coarse_pointing))
     return Products(
         effects, raw, coarse_pointing, lookup, mosaic, attention, fine, fine_pointing, patches, class_map, turned,
-        ground_map, accuracy,
+        ground_map,
         **second,
     )  # fmt: skip
+
+
+def judge(step: Step, products: Products) -> Products:
+    """Judge the map of a survey by the labels, where there are any; none of it is part of the survey's own cost."""
+    given = (products.mosaic, products.patches, products.class_map, products.effects, *_there(products.coarse_pointing))
+    return replace(products, accuracy=step(JUDGING, *given))
 
 
 def _there(ref: StageRef | None) -> tuple[StageRef, ...]:

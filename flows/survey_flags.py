@@ -55,6 +55,8 @@ class SurveyFlags:
     tol: str | None = None
     """What leaving effects out may change any number by: in sigmas of its noise, 0.1 by default, or in DN, 0.5dn. With
     0 everything is computed exactly, with inf all is left out that can be."""
+    accuracy: bool | None = None
+    """Judge the map by the labels once it is published; without it, `evaluate ARCHIVE RUN` does so later."""
     controls: bool | None = None
     """Also judge other placements of the same number of seats (needs labels)."""
     engine: str | None = None

@@ -25,6 +25,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from pipeline.errors import ArchiveError
 from storage.addresses import StageRef, in_text, published_runs, published_stores, store_at, without_manifest
 from storage.archive_folder import is_folder_archive, open_folder
 from storage.keys import plain, stage_key
@@ -40,7 +41,7 @@ from storage.manifests import (
     write_manifest,
 )
 from storage.object_places import is_remote, need_obstore
-from storage.run_folders import RunDraft, date_of_store
+from storage.run_folders import RunDraft, date_of_store, finish_extensions
 from storage.staging import (
     PART_SUFFIX,
     bytes_below,
@@ -89,6 +90,9 @@ class Archive:
             return open_object_archive(root, create=create, write=write)
         path = Path(root).absolute()
         open_folder(path, create=create, write=write)
+        if write:
+            with refusals(path, "write to the archive"):
+                finish_extensions(path)
         return cls(path, writes=write)
 
     @staticmethod
@@ -280,6 +284,7 @@ class Archive:
         """Remove unfinished folders that no living process works on; gives their addresses."""
         removed: list[str] = []
         with refusals(self.root, "clear up the archive"):
+            finish_extensions(self.root)
             for part in sorted((*self.root.glob(f"stages/*/*{PART_SUFFIX}"), *self.root.glob(f"runs/*{PART_SUFFIX}"))):
                 release = take_lock(self._lock_path(f"{part.parent.name}-{part.stem}"), wait=False)
                 if release is not None:
@@ -338,6 +343,31 @@ class Archive:
             release()
             raise
         return RunDraft(run_id, folder, self.root, release)
+
+    def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
+        """Begin to add to a published run; it stays as it is until :meth:`RunDraft.publish` of what is given.
+
+        One process at a time does so; None where another does and ``wait`` is false.
+
+        Raises
+        ------
+        ArchiveError : there is no run of this name.
+        """
+        check_name(run_id)
+        folder = self.root / "runs" / (run_id + PART_SUFFIX)
+        with refusals(self.root, "write to the archive"):
+            release = take_lock(self._lock_path(f"runs-{run_id}"), wait=wait)
+            if release is None:
+                return None
+            try:
+                if not folder.with_name(run_id).is_dir():
+                    raise ArchiveError(f"there is no run {run_id} in {self.name}; see ls")
+                remove_tree(folder)  # of a process that was killed
+                folder.mkdir()
+            except BaseException:
+                release()
+                raise
+        return RunDraft(run_id, folder, self.root, release, extends=True)
 
     def runs(self) -> list[Path]:
         """Folders of the published runs, oldest first."""

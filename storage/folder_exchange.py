@@ -25,16 +25,23 @@ def exchange(one: Path, other: Path) -> None:
     ------
     ArchiveError : the file system cannot do that; both are as they were.
     """
-    error = _renameat2(one, other)
-    if error in _UNSUPPORTED:
+    if not try_exchange(one, other):
         raise ArchiveError(
             f"the file system of {one.parent} cannot exchange two folders in one step (renameat2), so a store could "
             "be lost half-way: nothing was changed; pack a copy of the archive on a local disk"
         )
+
+
+def try_exchange(one: Path, other: Path) -> bool:
+    """Exchange two folders' names as `exchange` does; False, with nothing changed, where the file system cannot."""
+    error = _renameat2(one, other)
+    if error in _UNSUPPORTED:
+        return False
     if error:
         raise OSError(error, os.strerror(error), str(one))
     for parent in {one.parent, other.parent}:
         sync_path(parent)
+    return True
 
 
 def _renameat2(one: Path, other: Path) -> int:

@@ -17,6 +17,7 @@ from storage.addresses import AHEAD_SUFFIX, StageRef
 from storage.archive import Archive
 from storage.lineage import Catalogue
 from storage.records import Store
+from storage.run_folders import unfinished_extensions
 from storage.staging import MANIFEST_NAME, PART_SUFFIX, bytes_below, check_name, refusals, remove_tree, take_lock
 
 DAY_S = 86400.0
@@ -174,7 +175,7 @@ def _unfinished(root: Path) -> list[Removal]:
     parts = [*root.glob(f"stages/*/*{PART_SUFFIX}"), *root.glob(f"runs/*{PART_SUFFIX}")]
     return [
         Removal(path.relative_to(root).as_posix(), "unfinished", bytes_below(path), "whoever made it is gone")
-        for path in sorted(parts)
+        for path in sorted(set(parts) - set(unfinished_extensions(root)))
         if _is_free(root, path)
     ]
 

@@ -25,6 +25,7 @@ from storage.staging import MANIFEST_NAME, file_hash, files_below, sync_path
 
 FORMAT = 2
 PACKED = "packed"  # what a store was before its numbers went into a smaller codec
+EXTENDED = "extended"  # what a run was before something was added to it
 CURE = "restore it from a copy, or run verify --repair on the archive"
 _DISTRIBUTIONS = ("spectralzoom", "numpy", "torch", "xarray", "zarr", "numcodecs")
 
@@ -98,19 +99,27 @@ def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
     if folder.is_symlink():
         return {}, f"{folder.name} is a link, which is not followed: put there what it leads to"
     try:
-        text = read_plain(folder / MANIFEST_NAME).decode()
+        return parse_manifest(read_plain(folder / MANIFEST_NAME))
+    except FileNotFoundError:
+        return {}, "it is missing"
+    except OSError as error:
+        return {}, error.strerror or str(error)
+
+
+def parse_manifest(written: bytes) -> tuple[dict[str, Any], str | None]:
+    """Content of a manifest as it was written and None, or nothing and what is wrong with it."""
+    try:
+        text = written.decode()
         content = json.loads(text)
         if not isinstance(content, dict) or not isinstance(content.get("files"), dict):
             raise TypeError("it lists no files")
         _check_seal(text, content)
         for name, entry in content["files"].items():
             _check_entry(name, entry)
-    except FileNotFoundError:
-        return {}, "it is missing"
     except RecursionError:
         return {}, "it is nested too deeply"
-    except (OSError, ValueError, TypeError) as error:
-        return {}, (isinstance(error, OSError) and error.strerror) or str(error)
+    except (ValueError, TypeError) as error:
+        return {}, str(error)
     return content, None
 
 
@@ -186,8 +195,33 @@ def packed_values(manifest: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _packed(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
-    found = manifest.get(PACKED)
-    return found if isinstance(found, Mapping) else {}
+    return _table(manifest.get(PACKED))
+
+
+def _table(value: object) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def extended_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
+    """Facts for the manifest of a run that something is added to; it stays a run of the time at which it was published.
+
+    ``before`` and ``sha256`` are the manifest that it has until then, and the SHA-256 of its file.
+    """
+    at = datetime.now(UTC).isoformat(timespec="milliseconds")
+    created = {} if "created" not in before else {"created": before["created"]}
+    return created | {EXTENDED: {"at": at, "manifests": [*extended_from(before), sha256]}}
+
+
+def extended_from(manifest: Mapping[str, Any]) -> list[str]:
+    """SHA-256 of the manifests that a run had before something was added to it, oldest first."""
+    found = _table(manifest.get(EXTENDED)).get("manifests")
+    return [one for one in found if isinstance(one, str)] if isinstance(found, list) else []
+
+
+def extended_at(manifest: Mapping[str, Any]) -> str:
+    """When something was last added to a run, ISO 8601 in UTC; empty where nothing was."""
+    found = _table(manifest.get(EXTENDED)).get("at")
+    return found if isinstance(found, str) else ""
 
 
 def check_files(folder: Path, *, hashes: bool) -> None:

@@ -194,7 +194,15 @@ class ObjectArchive(Archive):
         draft = super()._begin_run(run_id)
         if draft is None:
             return None
-        run = RemoteRun(run_id, draft.folder, self.root, draft.abandon)
+        return self._sending(draft)
+
+    def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
+        """Begin to add to a run that is published here or in the bucket; see `Archive.extend_run`."""
+        draft = super().extend_run(run_id, wait=wait)
+        return None if draft is None else self._sending(draft)
+
+    def _sending(self, draft: RunDraft) -> RunDraft:
+        run = RemoteRun(draft.id, draft.folder, self.root, draft.abandon, extends=draft.extends)
         run.send = self._send_run
         return run
 

@@ -6,6 +6,7 @@ asked for, and a file of another size than its manifest says is fetched again.
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import secrets
 import shutil
@@ -18,9 +19,26 @@ from typing import NoReturn
 from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.addresses import published_runs, published_stores
 from storage.lineage import Catalogue
-from storage.manifests import manifest_sha256, read_manifest, try_manifest, write_manifest
+from storage.manifests import (
+    extended_from,
+    manifest_sha256,
+    parse_manifest,
+    read_manifest,
+    try_manifest,
+    write_manifest,
+)
 from storage.object_stores import Objects, some_at_a_time
-from storage.object_transfers import aside_in, fetch_folder, is_address, is_here, lay_manifest, send_folder
+from storage.object_transfers import (
+    aside_in,
+    attempt_of,
+    attempts_in,
+    fetch_folder,
+    is_address,
+    is_here,
+    lay_manifest,
+    send_extension,
+    send_folder,
+)
 from storage.records import RECEIPT, RESTS_ON, read_run
 from storage.staging import (
     MANIFEST_NAME,
@@ -139,14 +157,26 @@ class WorkingCopy:
     # --- all of it ----------------------------------------------------------------------------------------------------
 
     def send_run(self, uri: str) -> None:
-        """Upload a run, whose stores are in the bucket.
+        """Upload a run, whose stores are in the bucket; where it stands there without what was added here, with that.
+
+        What another machine has added before is taken instead.
 
         Raises
         ------
         ArchiveError : another run of this name is there.
         """
-        if send_folder(self.objects, uri, self.root / uri) != (self.root / uri / MANIFEST_NAME).read_bytes():
-            raise ArchiveError(f"{self.objects.place.url}/{uri} is another run than {self.root / uri}: move yours away")
+        folder = self.root / uri
+        ours, standing = (folder / MANIFEST_NAME).read_bytes(), send_folder(self.objects, uri, folder)
+        if _extends(ours, standing):
+            send_extension(self.objects, uri, folder, standing)
+        elif standing != ours:
+            dated = self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")
+            if dated is None or not _is_of_one_run(dated[0], ours):
+                raise ArchiveError(f"{self.objects.place.url}/{uri} is another run than {folder}: move yours away")
+            with self._alone(uri):
+                self._take(uri, *dated)
+                fetch_folder(self.objects, self.root, uri)
+            return
         self._note(uri)
 
     def waiting(self) -> list[str]:
@@ -185,9 +215,13 @@ class WorkingCopy:
     def mirror(self) -> set[str]:
         """Bring the manifests of all stores and runs, and the receipts; gives what there is in the bucket."""
         stages = [f"stages/{stage}" for stage in self.objects.children("stages")]
-        found = {f"{folder}/{name}" for folder in (*stages, "runs") for name in self.objects.children(folder)}
+        found = {f"{folder}/{name}" for folder in stages for name in self.objects.children(folder)}
+        runs = attempts_in(self.objects.listing("runs"))
+        found |= set(runs)
         with refusals(self.root, "write to the working copy"):
-            some_at_a_time(self._mirror_one, filter(is_address, sorted(found)))
+            some_at_a_time(
+                lambda uri: self._mirror_one(uri, runs.get(uri, frozenset())), filter(is_address, sorted(found))
+            )
         return found
 
     def forget_all_but(self, found: Container[str]) -> None:
@@ -200,13 +234,16 @@ class WorkingCopy:
             if uri not in found and self.is_known(uri) and not here.named_by(uri) and not here.is_only_copy(uri):
                 self._forget(uri)
 
-    def _mirror_one(self, uri: str) -> None:
-        if not self.is_known(uri):
+    def _mirror_one(self, uri: str, attempts: frozenset[str]) -> None:
+        """Bring one manifest; of a run ``attempts`` are those that have left files, of which the last one may count."""
+        known = self.is_known(uri)
+        if not known or attempts - {attempt_of((self.root / uri / MANIFEST_NAME).read_bytes())}:
             dated = self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")
             if dated is None:  # an upload under way, or what was left of one
                 return
-            waits = try_manifest(self.root / uri)[1] is None  # another of the same key, for its upload
-            if not waits or (self.root / uri / MANIFEST_NAME).read_bytes() == dated[0]:
+            waits = not known and try_manifest(self.root / uri)[1] is None  # another of the same key, for its upload
+            ours = (self.root / uri / MANIFEST_NAME).read_bytes() if known or waits else b""
+            if not (known or waits) or dated[0] == ours or _extends(dated[0], ours):
                 with self._alone(uri):
                     self._take(uri, *dated)
         if uri.startswith("runs/"):
@@ -265,3 +302,14 @@ class WorkingCopy:
             finally:
                 if release is not None:
                     release()
+
+
+def _extends(later: bytes, earlier: bytes) -> bool:
+    """Whether the manifest ``later`` is of the run of ``earlier`` once something was added to it."""
+    return hashlib.sha256(earlier).hexdigest() in extended_from(parse_manifest(later)[0])
+
+
+def _is_of_one_run(standing: bytes, ours: bytes) -> bool:
+    """Whether both manifests come of one: another machine has added to the same run."""
+    theirs, mine = (extended_from(parse_manifest(text)[0]) for text in (standing, ours))
+    return _extends(standing, ours) or not set(theirs).isdisjoint(mine)

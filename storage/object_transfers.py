@@ -35,6 +35,16 @@ def attempt_of(manifest: bytes) -> str:
     return hashlib.sha256(manifest).hexdigest()[:ATTEMPT_LETTERS]
 
 
+def attempts_in(listed: Iterable[str]) -> dict[str, frozenset[str]]:
+    """Runs among the names of objects by their addresses, and the attempts of which files are there."""
+    found: dict[str, set[str]] = {}
+    for parts in (name.split("/") for name in listed):
+        if len(parts) > 2:
+            attempts = found.setdefault("/".join(parts[:2]), set())
+            attempts.update([parts[2]] if ATTEMPT.fullmatch(parts[2]) else [])
+    return {uri: frozenset(attempts) for uri, attempts in found.items()}
+
+
 def is_address(uri: str) -> bool:
     """Whether an object's name can be an address in an archive: what a bucket lists is not trusted."""
     try:
@@ -64,12 +74,32 @@ def send_folder(objects: Objects, uri: str, folder: Path) -> bytes:
     standing = objects.read(f"{uri}/{MANIFEST_NAME}")
     if standing is not None:
         return standing
+    _send_files(objects, uri, folder, text)
+    return objects.claim(f"{uri}/{MANIFEST_NAME}", text)
+
+
+def send_extension(objects: Objects, uri: str, folder: Path, standing: bytes) -> None:
+    """Upload a run that something was added to in the place of the one that stands: its files, then its manifest.
+
+    The files of the one of which ``standing`` is the manifest go last; killed before, `gc` clears them away.
+
+    Raises
+    ------
+    IncompleteStoreError : a file of the folder is not as published any more; nothing is changed then.
+    UnreachableError : the bucket refuses or does not answer.
+    """
+    text = (folder / MANIFEST_NAME).read_bytes()
+    _send_files(objects, uri, folder, text)
+    objects.write(f"{uri}/{MANIFEST_NAME}", text)
+    objects.remove(objects.listing(files_at(uri, standing)))
+
+
+def _send_files(objects: Objects, uri: str, folder: Path, text: bytes) -> None:
     check_files(folder, hashes=True)
     place, files = files_at(uri, text), read_manifest(folder)["files"]
     there = {name: found.size for name, found in objects.listing(place).items()}
     waiting = [name for name, entry in files.items() if there.get(f"{place}/{name}") != entry["size"]]
     some_at_a_time(lambda name: objects.write(f"{place}/{name}", folder / name), waiting)
-    return objects.claim(f"{uri}/{MANIFEST_NAME}", text)
 
 
 def fetch_folder(objects: Objects, root: Path, uri: str, only: Iterable[str] | None = None) -> None:

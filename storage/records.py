@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from storage.addresses import StageRef, in_text
-from storage.manifests import Cost, cost_of, listed_bytes, try_manifest
+from storage.manifests import Cost, cost_of, extended_at, listed_bytes, try_manifest
 from storage.plain_files import read_plain
 from storage.staging import MANIFEST_NAME, file_hash
 
@@ -112,6 +112,11 @@ class Run:
         return _text(self.facts.get("created")) or _text(self.receipt.get("finished"))
 
     @property
+    def sealed(self) -> str:
+        """When its manifest was written: at its publication, or when something was last added to it; ISO 8601."""
+        return extended_at(self.facts) or self.created
+
+    @property
     def simulated(self) -> bool:
         """Whether its light came from the simulator, and so can be had again."""
         return self.settings.get("source") == "sim"
@@ -130,6 +135,8 @@ def read_run(folder: Path, by_key: Mapping[str, list[str]]) -> Run:
     receipt: dict[str, Any] = {}
     if broken is None:
         receipt, problem = _receipt(folder, facts)
+        if problem is not None and try_manifest(folder)[0] not in ({}, facts):  # something was added to it meanwhile
+            return read_run(folder, by_key)
     texts = list(_texts([receipt, {name: facts[name] for name in facts if name != "files"}]))
     names = {uri for text in texts if (uri := in_text(text)) is not None}
     stages = receipt.get("stages")

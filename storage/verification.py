@@ -19,6 +19,7 @@ from storage.ledger import FOLDER
 from storage.lineage import Catalogue
 from storage.manifests import (
     broken_files,
+    extended_from,
     is_sealed,
     listed_bytes,
     manifest_sha256,
@@ -29,6 +30,7 @@ from storage.manifests import (
 from storage.packed_arrays import values_hash
 from storage.plain_files import kind_of
 from storage.records import Run, Store
+from storage.run_folders import unfinished_extensions
 from storage.shard_names import name_damage
 from storage.staging import MANIFEST_NAME
 
@@ -70,12 +72,12 @@ def verify_everything(
         if not os.path.lexists(path) and not catalogue.named_by(uri):
             continue  # gc or a repair has cleared it away since
         problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
-        if problems and _packed_since(catalogue, uri):  # its files and its manifest changed together
+        if problems and _changed_since(catalogue, uri):  # its files and its manifest changed together
             catalogue = Catalogue.read(root)
             problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
         found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
-    misplaced = _misplaced_runs(catalogue)
-    return [*found, *misplaced, *_lost(root), *_missing(catalogue), *_left_aside(root), *verify_growing(root)]
+    misplaced, growing = _misplaced_runs(catalogue), verify_growing(root)
+    return [*found, *misplaced, *_lost(root), *_missing(catalogue), *_left_aside(root), *_half_extended(root), *growing]
 
 
 def verify_growing(root: Path) -> Iterator[Finding]:
@@ -91,10 +93,13 @@ def verify_growing(root: Path) -> Iterator[Finding]:
                     yield Finding(uri, f"is {kind}, expected a file; take it out of the archive", "stray")
 
 
-def _packed_since(catalogue: Catalogue, uri: str) -> bool:
-    """Whether a store was packed after the catalogue was read."""
+def _changed_since(catalogue: Catalogue, uri: str) -> bool:
+    """Whether a store was packed, or something added to a run, after the catalogue was read."""
     store = catalogue.stores.get(uri)
-    return store is not None and packed_from(try_manifest(store.ref.path)[0]) != packed_from(store.facts)
+    if store is not None:
+        return packed_from(try_manifest(store.ref.path)[0]) != packed_from(store.facts)
+    run = next((run for run in catalogue.runs if run.uri == uri), None)
+    return run is not None and extended_from(try_manifest(run.folder)[0]) != extended_from(run.facts)
 
 
 def _bytes(run: Run) -> int:
@@ -152,7 +157,7 @@ def _doubter(catalogue: Catalogue, store: Store) -> Run | None:
     own = {manifest_sha256(store.ref.path), *packed_from(store.facts)}
     if any(run.recorded[store.ref.uri] in own for run in knowing):
         return None
-    anew = is_sealed(store.facts) and all(store.created > run.created for run in knowing)
+    anew = is_sealed(store.facts) and all(store.created > run.sealed for run in knowing)
     return None if anew else knowing[-1]
 
 
@@ -189,6 +194,12 @@ def _missing(catalogue: Catalogue) -> Iterator[Finding]:
             if given not in there | told:
                 told.add(given)
                 yield Finding(given, f"is not there, but {uri} was made of it", "missing")
+
+
+def _half_extended(root: Path) -> Iterator[Finding]:
+    for part in unfinished_extensions(root):
+        words = "what was added to it lacks its last step, a name; any command that writes into the archive gives it"
+        yield Finding(f"runs/{part.stem}", words, "stray")
 
 
 def _left_aside(root: Path) -> Iterator[Finding]:

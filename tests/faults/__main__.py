@@ -106,6 +106,7 @@ FAULTS: dict[str, Callable[[bool], Sequence[Row]]] = {
          "archive verifies, nothing published is lost, rerun bit-identical"),
         (100, 3),
     ),
+    "terminations": _module("terminations"),
     "flips": _flips,
     "headers": _script(
         "mutated_headers",

@@ -9,6 +9,8 @@ import _pyio  # type: ignore[import-not-found]
 import builtins
 import datetime
 import errno
+import functools
+import importlib
 import io
 import os
 import random
@@ -16,6 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +51,31 @@ def fill_disk(root: str, at: int, kind: str) -> None:
     _install(watch)
 
 
+def end_at(root: str, at: int, number: int, log: str | None = None) -> None:
+    """Send this process a signal just before the ``at``-th call (from 1) that changes something below ``root``.
+
+    ``log`` is as of `refuse`.
+    """
+    watch = _Watch(Path(root).absolute(), at, 0, False, log)
+    watch.ending = number
+    _install(watch)
+
+
+def end_before(place: str, number: int, call: int = 1) -> None:
+    """Send this process a signal before the ``call``-th call of a function: ``module:name``, ``module:Class.name``."""
+    module, _, path = place.partition(":")
+    *outer, name = path.split(".")
+    inside = functools.reduce(getattr, outer, importlib.import_module(module))
+    real, calls = getattr(inside, name), count(1)
+
+    def ended(*given: Any, **named: Any) -> Any:
+        if next(calls) == call:
+            os.kill(os.getpid(), number)
+        return real(*given, **named)
+
+    setattr(inside, name, ended)
+
+
 def label(path: Path) -> str | None:
     """What a file of an archive belongs to: a stage's store or manifest, the spool, the run; None for locks."""
     first, *rest = path.parts or ("",)
@@ -70,6 +98,7 @@ class _Watch:
     """Counts calls, from any thread."""
 
     fill: Path | None = None  # file to fill the disk with, instead of refusing
+    ending: int | None = None  # signal to send this process, instead of refusing
     kind: str | None = None  # of the files whose opening counts; None counts every call
 
     def __init__(self, root: Path, at: int, number: int, lasting: bool, log: str | None) -> None:
@@ -86,6 +115,8 @@ class _Watch:
             due = path is not None and self._due(name, path)
             if due and self.fill is not None:
                 _fill(self.fill)
+            elif due and self.ending is not None:
+                os.kill(os.getpid(), self.ending)
             elif due:
                 if name == "write" and len(given[1]) > 1:
                     call(given[0], memoryview(given[1])[: len(given[1]) // 2])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from functools import reduce
@@ -13,7 +14,7 @@ from typing import Any
 import pytest
 
 from flows import cli
-from flows.app import app, print_json
+from flows.app import GOES_ON, app, print_json
 from flows.setting_keys import SURVEY, TABLES
 from flows.survey_flags import IN_TABLES
 
@@ -80,3 +81,23 @@ def test_printed_json_is_json(capsys: pytest.CaptureFixture[str]) -> None:
     content: dict[str, Any] = {"a": float("nan"), "b": [1.5, float("inf")], "name": "ü"}
     print_json(content)
     assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail) == {"a": None, "b": [1.5, None], "name": "ü"}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_sigterm_ends_every_verb(
+    verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """143 and one sentence, which says whether the same command goes on; afterwards SIGTERM is what it was before."""
+    named = reduce(lambda found, word: found[word], verb.split(), app)
+
+    def terminated() -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        pytest.fail("SIGTERM was not heard")
+
+    monkeypatch.setattr(named, "default_command", terminated)
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as left:
+        cli.main(verb.split())
+    goes_on = "; the same command goes on from here" if verb in GOES_ON else ""
+    assert (left.value.code, capsys.readouterr().err.strip()) == (143, f"terminated{goes_on}")
+    assert signal.getsignal(signal.SIGTERM) is before

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import signal
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from datetime import UTC, datetime, timedelta
@@ -135,6 +136,21 @@ def test_a_ledger_that_cannot_be_written_at_the_start(
     with pytest.raises(ArchiveError, match="the disk is full"):
         serve_prefect.serve_prefect(request, lambda words: None)
     assert [line["event"] for line in request.schedules()["north"].ledger.lines()] == ["opened", "closed"]
+
+
+def test_sigterm_stops_a_schedule(
+    field_file: Callable[..., Path], command_line: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That is the way to stop it, and no error: it says how to go on, and ends with 0."""
+
+    def terminated(*given: Any) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        pytest.fail("SIGTERM was not heard")
+
+    monkeypatch.setattr(serve_command, "_serve_plain", terminated)
+    ended = command_line("serve", field_file(), "--every", "30m", "--engine", "plain")
+    assert (ended.code, ended.errors) == (0, [])
+    assert ended.err.splitlines()[-1].startswith("stopped: nothing is due any more; the same command serves again")
 
 
 def test_the_flag_for_the_archive_wins(field_file: Callable[..., Path], tmp_path: Path) -> None:

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import signal
 from pathlib import Path
 from typing import Any
 
 import pytest
 from rich.console import Console
 
-from flows import engine
+from flows import engine, evaluation
 from flows.survey import STAGES
 from pipeline.errors import RigError, SceneError
+from storage.archive import Archive
+from tests.flows.conftest import CommandLine
 
 
 @pytest.fixture
@@ -99,7 +103,7 @@ def test_without_a_server_the_survey_runs_plain(
 ) -> None:
     """A server that cannot start is told of in one line, and the survey goes on without it."""
 
-    def refuse(runner: Any) -> None:
+    def refuse(*given: Any) -> None:
         raise engine.EngineUnavailable("the Prefect server did not start (no port)")
 
     monkeypatch.setattr(engine, "survey_with_prefect", refuse)
@@ -107,3 +111,44 @@ def test_without_a_server_the_survey_runs_plain(
     found = survey_png(tmp_path, Console(file=console, width=200), engine="prefect").receipt
     assert "did not start (no port); going on with --engine plain" in console.getvalue()
     assert {stage["state"] for stage in found["stages"]} == {"ran", "skipped"}
+
+
+def test_the_run_is_published_before_its_map_is_judged(
+    survey_png: Any, tmp_path: Path, prefect_home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the same flow; a stop while it is judged leaves the run, and the same command adds its accuracy to it."""
+
+    def interrupt(*given: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluation, "load_class_map", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            survey_png(tmp_path, engine="prefect")
+    (run,) = Archive.open(tmp_path).runs()
+    assert json.loads((run / "receipt.json").read_text())["accuracy_is"] == "pending"
+    published = survey_png(tmp_path, engine="prefect")
+    assert published.folder == run
+    assert published.receipt["accuracy_is"] == "judged"
+    assert [finding.problem for finding in Archive.open(tmp_path).verify_all() if finding.problem] == []
+
+
+def test_sigterm_in_a_stage(
+    scene_files: Path, weights: Path, tmp_path: Path, prefect_home: Path, monkeypatch: pytest.MonkeyPatch,
+    command_line: CommandLine,
+) -> None:  # fmt: skip
+    """143 and one sentence, whatever Prefect makes of it; the same command goes on."""
+    real = STAGES["rectify"]
+
+    def terminated(*given: Any) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        pytest.fail("SIGTERM was not heard")
+
+    words = ("survey", "--scene", scene_files / "scene.png", "--weights", weights, "--out", tmp_path / "archive")
+    monkeypatch.setitem(STAGES, "rectify", terminated)
+    ended = command_line(*words)
+    assert (ended.code, ended.out, ended.errors) == (143, "", [])
+    assert ended.err.splitlines()[-1] == "terminated; the same command goes on from here"
+    monkeypatch.setitem(STAGES, "rectify", real)
+    assert command_line(*words).code == 0
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL

@@ -1,0 +1,364 @@
+"""When a map is judged: after its run is published, later by `evaluate ARCHIVE RUN`, or not at all."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from flows import evaluation, publish, stages
+from flows.judge_command import split_address
+from flows.receipt import check_receipt, comparable, is_pending
+from flows.reprocess_command import ReprocessRequest, run_reprocess
+from flows.survey import STAGES
+from storage.archive import Archive
+from tests.conftest import WeightsMaker
+from tests.flows.conftest import CommandLine
+from tests.storage.small_archive import flip
+
+QUIET = Console(quiet=True)
+Refuse = Callable[[Path, Path, pytest.MonkeyPatch], None]
+
+
+def tells(pattern: str, lines: list[str]) -> bool:
+    """Whether the one error that was told matches."""
+    (line,) = lines
+    return re.search(pattern, line) is not None
+
+
+def problems(out: Path) -> list[str]:
+    """What verify finds."""
+    return [f"{one.uri} {one.problem}" for one in Archive.open(out).verify_all() if one.problem]
+
+
+def receipts(out: Path) -> list[Any]:
+    """What the runs of an archive say, oldest first."""
+    return [check_receipt(json.loads((run / "receipt.json").read_text())) for run in Archive.open(out).runs()]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where scene, labels and weights lie, as receipts name them."""
+    return tmp_path_factory.mktemp("files")
+
+
+@pytest.fixture
+def scene(folder: Path, scene_files: Path, weights: Path) -> Path:
+    """The folder, with its files as they were."""
+    return lay_files(folder, scene_files, weights)
+
+
+def lay_files(folder: Path, scene_files: Path, weights: Path) -> Path:
+    """Put scene, labels and weights into a folder, whatever is there."""
+    for path in (scene_files / "scene.png", scene_files / "labels.png"):
+        shutil.copy(path, folder)
+    shutil.copy(weights, folder / "w.safetensors")
+    return folder
+
+
+def words_of(folder: Path) -> dict[str, str]:
+    """What a survey is asked for."""
+    files = {"scene": "scene.png", "labels": "labels.png", "weights": "w.safetensors"}
+    return {name: str(folder / file) for name, file in files.items()}
+
+
+@pytest.fixture
+def survey(survey_png: Any, scene: Path, out: Path) -> Callable[..., Any]:
+    """Survey the scene of the folder into the archive of the test."""
+
+    def run(**flags: Any) -> Any:
+        return survey_png(out, **{**words_of(scene), **flags})
+
+    return run
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """The archive of the test."""
+    return tmp_path / "archive"
+
+
+@pytest.fixture(scope="module")
+def surveyed(survey_png: Any, folder: Path, scene_files: Path, weights: Path) -> Path:
+    """The archive of a survey that was asked to leave accuracy out, not to be changed."""
+    survey_png(folder / "archive", **words_of(lay_files(folder, scene_files, weights)), accuracy=False)
+    return folder / "archive"
+
+
+@pytest.fixture
+def unjudged(surveyed: Path, scene: Path, out: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(surveyed, out))
+
+
+def break_off(survey: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, **flags: Any) -> None:
+    """Survey, and break off when the map is about to be judged."""
+
+    def interrupt(*given: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluation, "load_class_map", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            survey(**flags)
+
+
+def test_the_run_is_published_before_its_map_is_judged(
+    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the map is looked at the run is there and says so; then it is the same run, and has its accuracy."""
+    real, seen = STAGES["evaluate"], list[Any]()
+
+    def looking(run: Any, produce: Any, *inputs: Any) -> Any:
+        def made(name: str, build: Any, params: Any, refs: Any) -> Any:
+            def building(path: Path) -> None:
+                seen.append((Archive.open(out).runs(), *receipts(out)))
+                assert problems(out) == []
+                build(path)
+
+            return produce(name, building, params, refs)
+
+        return real(run, made, *inputs)
+
+    monkeypatch.setitem(STAGES, "evaluate", looking)
+    published = survey()
+    ((folders, receipt),) = seen
+    assert folders == [published.folder]
+    assert is_pending(receipt)
+    assert receipt["savings"] == published.receipt["savings"]
+    assert receipt["finished"] == published.receipt["finished"] <= published.receipt["judged"]
+    assert published.receipt["accuracy_is"] == "judged"
+    assert receipts(out) == [published.receipt]
+
+
+def test_where_accuracy_is_stored_the_run_is_published_once(
+    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing takes time then: it is drawn once, and the manifest tells of nothing that it was before."""
+    survey()
+    draw, drawn = publish.draw_quicklook, list[Path]()
+    monkeypatch.setattr(publish, "draw_quicklook", lambda path, data: (drawn.append(path), draw(path, data)))
+    folder = survey().folder
+    assert len(drawn) == 1
+    assert "extended" not in json.loads((folder / "manifest.json").read_text())
+    first, second = receipts(out)
+    assert comparable(first) == comparable(second)
+
+
+def test_a_survey_of_other_words_leaves_the_run_of_another(
+    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It publishes one of its own; the stopped one is judged by its own words."""
+    break_off(survey, monkeypatch, name="north")
+    survey(name="south")
+    assert {one["survey"]: is_pending(one) for one in receipts(out)} == {"north": True, "south": False}
+    survey(name="north")
+    assert {one["survey"]: is_pending(one) for one in receipts(out)} == {"north": False, "south": False}
+    assert len(receipts(out)) == 2
+
+
+def test_a_run_that_is_being_judged_is_left_alone(
+    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch, command_line: CommandLine
+) -> None:
+    """The same survey publishes a run of its own meanwhile, and `evaluate` says who is at it."""
+    break_off(survey, monkeypatch)
+    archive = Archive.open(out)
+    (run,) = archive.runs()
+    draft = archive.extend_run(run.name)
+    assert draft is not None
+    with draft:
+        ended = command_line("evaluate", out, run.name)
+        assert ended.errors == [f"runs/{run.name} is being judged by another process; it adds the accuracy"]
+        survey()
+    assert [is_pending(one) for one in receipts(out)] == [True, False]
+
+
+def test_reprocess_adds_what_a_stopped_survey_lacks(
+    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The field is not as it would become: its run is judged, and no other is made."""
+    break_off(survey, monkeypatch)
+    for _ in range(2):
+        assert run_reprocess(ReprocessRequest(out), QUIET) == 0
+        (receipt,) = receipts(out)
+        assert receipt["accuracy_is"] == "judged"
+    assert problems(out) == []
+
+
+def test_ls_and_the_receipt_say_that_a_map_is_not_judged_yet(
+    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch, command_line: CommandLine
+) -> None:
+    """Of one that was stopped; of one that was not to be judged they say nothing of a time to come."""
+    break_off(survey, monkeypatch, name="north")
+    survey(name="south", accuracy=False)
+    north, south = (line for line in command_line("ls", out).out.splitlines() if "scene.png" in line)
+    assert "not yet" in north
+    assert "not yet" not in south
+    listed = json.loads(command_line("ls", out, "--json").out)["runs"]
+    assert [(row["accuracy_is"], row["miou"]) for row in listed] == [("pending", None), ("left out", None)]
+    pages = [(run / "report.html").read_text() for run in Archive.open(out).runs()]
+    assert ["The map is not judged yet" in page for page in pages] == [True, False]
+
+
+def test_accuracy_that_is_left_out(surveyed: Path) -> None:
+    """The receipt says so, and the stage that judges had nothing to do."""
+    (receipt,) = receipts(surveyed)
+    assert receipt["accuracy_is"] == "left out"
+    assert (receipt["stages"][-1]["name"], receipt["stages"][-1]["state"]) == ("evaluate", "skipped")
+    assert "accuracy" not in receipt
+    assert problems(surveyed) == []
+
+
+def test_what_was_left_out_is_added_later(
+    unjudged: Path, survey: Callable[..., Any], command_line: CommandLine
+) -> None:
+    """Accuracy first, then controls, each to the same run: its receipt is that of a survey that was asked for both."""
+    (run,) = Archive.open(unjudged).runs()
+    ended = command_line("evaluate", unjudged, run.name, "--json")
+    assert (ended.code, ended.errors) == (0, [])
+    (receipt,) = receipts(unjudged)
+    assert json.loads(ended.out) == receipt
+    assert (receipt["accuracy"]["controls"], receipt["settings"]["accuracy"]) == ({}, True)
+    assert command_line("evaluate", run, "--controls").code == 0
+    (receipt,) = receipts(unjudged)
+    assert set(receipt["accuracy"]["controls"]) == {"gain", "entropy", "sobel", "random"}
+    assert "segment_wall_s" in receipt["savings"]
+    assert Archive.open(unjudged).runs() == [run]
+    assert problems(unjudged) == []
+    asked = survey(controls=True).receipt
+    assert comparable(receipt) == comparable(asked)
+
+
+def test_labels_may_come_later(
+    survey: Callable[..., Any], scene: Path, out: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run without any is judged by those that are given, with a path that can be read from anywhere."""
+    survey(labels=None)
+    monkeypatch.chdir(scene)
+    ended = command_line("evaluate", out, "latest")
+    assert tells("there are no labels to judge runs/.* by; give --labels FILE", ended.errors)
+    assert command_line("evaluate", out, "latest", "--labels", "labels.png").code == 0
+    (receipt,) = receipts(out)
+    assert receipt["accuracy_is"] == "judged"
+    assert receipt["settings"]["labels"] == str(scene / "labels.png")
+    assert comparable(receipt)["accuracy"] == survey().receipt["accuracy"]
+
+
+def test_a_second_round_is_judged_too(survey: Callable[..., Any], out: Path, command_line: CommandLine) -> None:
+    """All patches of both rounds count."""
+    survey(rounds="2", accuracy=False)
+    assert command_line("evaluate", out, "latest").code == 0
+    (receipt,) = receipts(out)
+    assert receipt["accuracy"] == survey(rounds="2").receipt["accuracy"]
+    assert problems(out) == []
+
+
+def _other_scene(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
+    with Image.open(scene / "scene.png") as image:
+        image.transpose(Image.Transpose.ROTATE_180).save(scene / "scene.png")
+
+
+def _no_scene(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
+    (scene / "scene.png").unlink()
+
+
+def _damaged_receipt(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
+    flip(Archive.open(out).runs()[0] / "receipt.json")
+
+
+def _mosaic_gone(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
+    archive = Archive.open(out)
+    archive.discard(archive.refs("rectify")[0])
+
+
+def _newer_stage(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
+    patch.setitem(stages.VERSIONS, "segment", 99)
+
+
+REFUSED: dict[str, tuple[Refuse, int, str]] = {
+    "another scene": (_other_scene, 1, "is another than runs/.* looked at; put that one back"),
+    "no scene": (_no_scene, 1, "there is no file .*scene.png"),
+    "a damaged receipt": (_damaged_receipt, 1, "receipt.json has changed .*; run verify --repair"),
+    "a store that is gone": (_mosaic_gone, 1, "the mosaic of runs/.* is missing or damaged; run verify --repair"),
+    "an older version": (_newer_stage, 1, "version 4 of the stage segment, which is now 99: reprocess makes a new run"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_judged_is_refused(
+    case: str, unjudged: Path, scene: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One message, and the run stays as it was."""
+    spoil, code, message = REFUSED[case]
+    spoil(scene, unjudged, monkeypatch)
+    (run,) = Archive.open(unjudged).runs()
+    before = (run / "manifest.json").read_bytes()
+    ended = command_line("evaluate", unjudged, run.name)
+    assert (ended.code, len(ended.errors)) == (code, 1), ended.err
+    assert tells(message, ended.errors)
+    assert (run / "manifest.json").read_bytes() == before
+    assert Archive.open(unjudged).runs() == [run]
+
+
+def test_other_weights_are_refused(
+    unjudged: Path, scene: Path, make_weights: WeightsMaker, command_line: CommandLine
+) -> None:
+    """They stand where those lay that the map was drawn with."""
+    shutil.copy(make_weights(dim=32), scene / "w.safetensors")
+    ended = command_line("evaluate", unjudged, "latest")
+    assert tells("w.safetensors are others than the map of runs/.* was drawn with; put those back", ended.errors)
+
+
+WORDS = {
+    "a data set without weights": ("evaluate farm", "give --weights FILE to judge weights on this data set, or a run"),
+    "an archive without a run": ("evaluate ARCHIVE", "such as evaluate .*archive latest, to judge its map"),
+    "a run with weights": (
+        "evaluate ARCHIVE latest --weights w.safetensors",
+        "--weights is for weights that are judged",
+    ),
+    "a run with shares": (
+        "evaluate ARCHIVE latest --shares 0.1",
+        "--shares is for weights that are judged on a data set",
+    ),
+    "a run with a folder": ("evaluate ARCHIVE latest -o out", "--out is for weights"),
+    "weights with controls": ("evaluate farm --weights w --controls", "--controls is for a run of an archive"),
+}
+
+
+@pytest.mark.parametrize("case", WORDS)
+def test_words_that_mean_neither_are_refused(case: str, surveyed: Path, command_line: CommandLine) -> None:
+    """Wrong use: one message that says which of the two wants what."""
+    words, message = WORDS[case]
+    ended = command_line(*words.replace("ARCHIVE", str(surveyed)).split())
+    assert (ended.code, len(ended.errors)) == (2, 1), ended.err
+    assert tells(message, ended.errors)
+
+
+def test_a_run_that_is_not_there_is_refused(surveyed: Path, command_line: CommandLine) -> None:
+    """With those that are."""
+    ended = command_line("evaluate", surveyed, "20200101T000000-gone")
+    assert (ended.code, len(ended.errors)) == (1, 1)
+    assert tells("there is no run 20200101T000000-gone in this archive; there is runs/", ended.errors)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("archive/runs/20261120T101701-farm", ("archive", "20261120T101701-farm")),
+        ("/a/runs/b/runs/c/", ("/a/runs/b", "c")),
+        ("s3://bucket/prefix/runs/c", ("s3://bucket/prefix", "c")),
+        ("archive/stages/segment/c", None),
+        ("runs/c", None),
+        ("farm", None),
+    ],
+)
+def test_addresses_of_runs(text: str, found: tuple[str, str] | None) -> None:
+    """Archive and name, as `survey` prints them."""
+    assert split_address(text) == found
