@@ -18,7 +18,7 @@ FAR = Sweep("far", "fine", "y", -400.0, -900.0, 50)
 WHOLE = Block(RIG, FAR, range(50), np.array([500.0]), (1000, 2000))
 
 
-def ones(light: Light) -> Light:
+def ones(light: Light, binning: int) -> Light:
     """Electrons are the unit."""
     return np.ones_like(light)
 

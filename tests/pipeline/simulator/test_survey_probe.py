@@ -25,8 +25,9 @@ from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Detector, Rig
 from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.stored_light import noise_electrons
 from pipeline.simulator.survey_looks import views_of_places
-from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+from pipeline.simulator.survey_probe import probe_scene
 
 RIG = Rig(camera=LineCamera(samples=96))
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-30.0, lines=61)

@@ -30,7 +30,7 @@ def render(block: Block, chosen: Mapping[Effect, str]) -> Light:
     return light
 
 
-def units(light: Light) -> Floats:
+def units(light: Light, binning: int) -> Floats:
     """100 e- are one unit."""
     return np.full(light.shape, 100.0)
 
