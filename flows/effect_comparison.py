@@ -6,9 +6,11 @@ over the scan; what is looked at closely is where the two differ most.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from flows.tones import choose_bands
 from pipeline.camera import bin_samples
 from pipeline.errors import BoundError
 from pipeline.scan import Sweep
+from pipeline.simulator.arithmetic import contrast_about, misplaced_electrons, misplaced_share
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.effects.registry import BY_NAME
@@ -31,7 +34,6 @@ from pipeline.simulator.render import expected_light
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.simulator.stored_light import stored_mean, unit_at
 from pipeline.simulator.survey_clock import sweep_starts
-from pipeline.simulator.verification import arithmetic_electrons
 from storage.archive import StageRef
 
 MOST_S = 60.0  # of processor time for both ways together; beyond, not all lines are compared
@@ -146,7 +148,9 @@ def compare_with_everything(
     """
     clock = sweep_starts(sweeps, run.camera, run.settings.cost)
     chosen = source_with(run.source, effects, clock)
-    ways = _Ways(replace(chosen, chosen=everything(effects)), chosen, load_manifest(effects)["total"]["unit"])
+    total = load_manifest(effects)["total"]
+    bound = math.inf if total["bound"] is None else total["bound"]
+    ways = _Ways(replace(chosen, chosen=everything(effects)), chosen, total["unit"], bound)
     blocks = _blocks(sweeps)
     taken = _affordable(ways, blocks, say)
     sums = _Sums()
@@ -218,6 +222,7 @@ class _Ways:
     exact: SimulatedSource
     chosen: SimulatedSource
     unit: Unit
+    bound: float
 
     def take(self, sweep: Sweep, lines: range) -> _Both:
         """Render some lines both ways."""
@@ -231,6 +236,12 @@ class _Ways:
         """By how much the stored light differs, in the unit of the tolerance, (line, binned sample, band)."""
         difference: NDArray[np.float64] = (both.chosen.astype(np.float64) - both.exact) / self._unit(both, sweep)
         return difference
+
+    def _arithmetic(self, both: _Both, sweep: Sweep, lines: range) -> NDArray[np.float64]:
+        """What of a difference arithmetic may have made, (line or 1, binned sample, band). [e-]"""
+        share = misplaced_share(dict(self.exact.choice.effects), dict(self.chosen.choice.effects))
+        contrast = contrast_about(self.exact.block(sweep, lines), partial(expected_light, self.exact.scene))
+        return misplaced_electrons(both.exact, stored_mean(contrast, sweep.binning), share)
 
     def _unit(self, both: _Both, sweep: Sweep) -> NDArray[np.floating]:
         return unit_at(both.exact, self.exact.rig, self.unit, sweep.binning)
@@ -248,8 +259,9 @@ class _Ways:
         if change[line, sample, band] > sums.greatest:
             sums.greatest = float(change[line, sample, band])
             sums.place = Place(sweep.name, lines[line], sample * sweep.binning, band)
-        arithmetic = arithmetic_electrons(both.exact, sweep.binning) / self._unit(both, sweep)
-        sums.unexplained = max(sums.unexplained, float((change - arithmetic).max()))
+        if change.max() > self.bound:
+            change -= self._arithmetic(both, sweep, lines) / self._unit(both, sweep)
+        sums.unexplained = max(sums.unexplained, float(change.max()))
         apart = np.abs(both.chosen_raw.astype(np.int32) - both.alike_raw)
         sums.unequal += int(np.count_nonzero(apart))
         sums.raw_numbers += apart.size

@@ -5,25 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import BoundError
+from pipeline.simulator.arithmetic import contrast_about, misplaced_electrons, misplaced_share
 from pipeline.simulator.block import Block
 from pipeline.simulator.chips import Units
 from pipeline.simulator.choice import Decision, Taken
 from pipeline.simulator.effects.effect import OFF, Effect, Light
-from pipeline.simulator.footprint import NEGLIGIBLE
 from pipeline.simulator.manifest import TOTAL, UNIT_WORDS
 from pipeline.simulator.options import acts_on_light
 from pipeline.simulator.stored_light import stored_mean
-from pipeline.simulator.tap_tables import TABULATED
 
 Floats = NDArray[np.float64]
 Render = Callable[[Block, Mapping[Effect, str]], Light]
-
-REACH_PX = 8  # of a footprint's weights, along the line
 
 
 @dataclass(frozen=True)
@@ -34,6 +32,12 @@ class _Chip:
     block: Block
     light: NDArray[np.floating]
     unit: NDArray[np.floating]
+    render: Render
+
+    @cached_property
+    def contrast(self) -> NDArray[np.floating]:
+        """Range of the scene's light about each number, (1, number, band) [e-]; only asked for where it matters."""
+        return stored_mean(contrast_about(self.block, self.render), self.block.sweep.binning)
 
 
 @dataclass(frozen=True)
@@ -76,16 +80,14 @@ def verify(decision: Decision, render: Render, chips: Mapping[str, Block], units
     ------
     BoundError : a change exceeds the bound that the decision counted on; names effect, bound, change and place.
     """
-    full = []
-    for name, block in _once_each(chips).items():
-        light = stored_mean(render(block, decision.exact), block.sweep.binning)
-        full.append(_Chip(name, block, light, np.broadcast_to(units(light, block.sweep.binning), light.shape)))
+    full = [_chip(name, block, render, decision, units) for name, block in _once_each(chips).items()]
     changed = [one for one in decision.taken if _changes_light(one)]
     trials = [(one.name, [one]) for one in changed] + [(TOTAL, changed)]
     measured: dict[str, float] = {}
     for name, inexact in trials:
         bound, chosen = math.fsum(one.option.error for one in inexact), _with(decision, inexact)
-        found = [_greatest_change(chip, render(chip.block, chosen)) for chip in full] if inexact else []
+        share = misplaced_share(decision.exact, chosen)
+        found = [_greatest_change(chip, render(chip.block, chosen), bound, share) for chip in full] if inexact else []
         worst = max(found, key=lambda one: one.unexplained, default=_Change(0.0))
         if not worst.unexplained <= bound:
             raise BoundError(_complaint(name, worst, bound, decision))
@@ -101,6 +103,12 @@ def _once_each(chips: Mapping[str, Block]) -> dict[str, Block]:
     return {" and ".join(said): chips[said[0]] for said in names.values()}
 
 
+def _chip(name: str, block: Block, render: Render, decision: Decision, units: Units) -> _Chip:
+    light = stored_mean(render(block, decision.exact), block.sweep.binning)
+    unit = np.broadcast_to(units(np.asarray(light, np.float32), block.sweep.binning), light.shape)
+    return _Chip(name, block, light, unit, render)
+
+
 def _changes_light(one: Taken) -> bool:
     return acts_on_light(one.menu.effect) and one.menu.present and one.option is not one.menu.exact
 
@@ -112,12 +120,14 @@ def _with(decision: Decision, inexact: Sequence[Taken]) -> dict[Effect, str]:
     return {effect: variant for effect, variant in variants.items() if variant != OFF}
 
 
-def _greatest_change(chip: _Chip, light: Light) -> _Change:
+def _greatest_change(chip: _Chip, light: Light, bound: float, share: float) -> _Change:
     binning = chip.block.sweep.binning
     change = np.abs(stored_mean(light, binning).astype(np.float64) - chip.light) / chip.unit
     if not change.size:
         return _Change(0.0)
-    rounding = arithmetic_electrons(chip.light, binning) / chip.unit
+    rounding = np.zeros(change.shape)
+    if not change.max() <= bound:
+        rounding = misplaced_electrons(chip.light, chip.contrast, share) / chip.unit
     worst = np.unravel_index(int(np.argmax(change - rounding)), change.shape)  # the first NaN, if there is one
     line, number, band = worst
     block, summed = chip.block, "" if binning == 1 else f" (of {binning} summed)"
@@ -126,32 +136,6 @@ def _greatest_change(chip: _Chip, light: Light) -> _Change:
     return _Change(
         float(change.max()), float(change[worst]), float(rounding[worst]), f"{place} of the {chip.name} chip"
     )
-
-
-def arithmetic_electrons(light: NDArray[np.floating], binning: int) -> Floats:
-    """Bound by how much two ways to compute the same light may differ, (line, number, band). [e-]
-
-    It follows the light itself and not its noise, of which the one grows faster than the other: beyond a full well, and
-    in a dark sample beside bright ones, it is what a small change is lost in. Tables of weights, one along either axis,
-    misplace up to `TABULATED` of all light, with which goes the rounding of float32. A few kernels that stand for those
-    of all bands misplace up to `NEGLIGIBLE` of it by size, either way its own; as weights sum to 1 that counts half of
-    the range within a footprint.
-
-    Parameters
-    ----------
-    light
-        Lines of one block as they are stored. [e-]
-    binning
-        Samples that a stored number sums.
-    """
-    from scipy.ndimage import maximum_filter1d
-
-    most, least = (maximum_filter1d(
-        one.max(axis=0), 2 * math.ceil(REACH_PX / binning) + 1, axis=0, mode="nearest"
-    ) for one in (light, -light))  # fmt: skip
-    near = np.asarray(most + least, np.float64)
-    allowed: Floats = np.broadcast_to(TABULATED * float(np.abs(light).max()) + NEGLIGIBLE * near, light.shape)
-    return allowed
 
 
 def _complaint(name: str, worst: _Change, bound: float, decision: Decision) -> str:

@@ -139,7 +139,7 @@ def _contrast(probe: Probe, rig: Rig) -> Floats:
     horizon, (low, high) = rig.air.airlight_share * probe.white_e, lights_within(probe, rig)
     cloud, view = CLOUD.gain_range(probe, rig), BRDF.gain_range(probe, rig)
     lit, shaded = np.maximum(cloud.greatest * view.greatest, 1.0), cloud.least * view.least
-    above = probe.level * np.clip(1 - horizon / np.maximum(lit * high, np.finfo(float).tiny), 0.0, 1.0)
+    above = probe.level * (1 - horizon / np.maximum(np.maximum(lit * high, horizon), np.finfo(float).tiny))
     sun = daylight_range(probe, rig)
     below = np.maximum(horizon - shaded * low, 0.0) * np.maximum(sun.greatest, 1.0)
     worst: Floats = np.maximum(above, below / unit_electrons(shaded * np.minimum(sun.least, 1.0) * low, probe, rig))
