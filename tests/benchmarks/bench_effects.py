@@ -63,13 +63,13 @@ def _bounds(numbers: Sequence[int]) -> list[Row]:
 
 
 def _of_effect(name: str, variant: str, cases: list[tuple[int, Trial]]) -> Row:
-    loose = {number: trial.looseness for number, trial in cases if np.isfinite(trial.looseness)}
-    broken = [number for number, trial in cases if trial.is_broken]
+    loose = {(number, trial.binning): trial.looseness for number, trial in cases if np.isfinite(trial.looseness)}
+    broken = [(number, trial.binning) for number, trial in cases if trial.is_broken]
     said = "nothing seen"
     if loose:
         worst = max(loose, key=loose.__getitem__)
         said = f"median {statistics.median(loose.values()):.2g}, {min(loose.values()):.2g} to {loose[worst]:.3g}"
-        said += f" (case {worst})"
+        said += f" (case {worst[0]}, sums of {worst[1]})"
     chance = "; 1 survey of 1000 may" if name in DRAWN else ""
     return Row(
         f"bound / measured: {name}, {variant}",
