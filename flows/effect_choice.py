@@ -6,19 +6,17 @@ and nothing of the scene is drawn to read it. The coarse pass and the scan of ev
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from flows.receipt import to_json
 from flows.run import CaptureRun
 from flows.settings import plain_value
 from pipeline.errors import IncompleteStoreError
 from pipeline.simulator.block import Block
-from pipeline.simulator.chips import Floats, candidate_chips, worst_chips
+from pipeline.simulator.chips import candidate_chips, worst_chips
 from pipeline.simulator.choice import Decision, decide
 from pipeline.simulator.effects.effect import Effect, Light
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
@@ -26,11 +24,13 @@ from pipeline.simulator.effects.rotation import ROTATION
 from pipeline.simulator.effects.slit import SLIT
 from pipeline.simulator.instrument import sweep_block
 from pipeline.simulator.manifest import list_effects, sum_up
+from pipeline.simulator.probe import Probe
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource
+from pipeline.simulator.stored_light import unit_at
 from pipeline.simulator.survey_clock import sweep_starts
-from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+from pipeline.simulator.survey_probe import probe_survey
 from pipeline.simulator.verification import verify
 from storage.archive import StageRef
 from storage.stored_tables import read_table
@@ -63,10 +63,10 @@ def choose_effects(run: CaptureRun, produce: Produce) -> StageRef:
 
     def build(path: Path) -> None:
         rig = run.settings.simulated_rig
-        probe = probe_scene(run.scene, rig, run.planned, tolerance.unit)
-        decision = decide(probe, rig, EFFECTS, tolerance.value, asked)
+        probes = probe_survey(run.scene, rig, run.planned, tolerance.unit)
+        decision = decide(probes, rig, EFFECTS, tolerance.value, asked)
         run.report(DRAFT)
-        measured = _verified(run, decision, probe.places)
+        measured = _verified(run, decision, probes)
         manifest = {"effects": list_effects(decision, measured), "total": sum_up(decision, measured)}
         (path / RECORD).write_text(to_json(manifest), encoding="utf-8")
         run.report(VERIFIED)
@@ -126,14 +126,12 @@ def source_with(
     return replace(source, chosen=chosen_effects(effects), clock=clock)
 
 
-def _verified(run: CaptureRun, decision: Decision, places: Floats) -> dict[str, float]:
-    """Measure what is left out on the worst chips of the scene, about places of it, in the unit of the tolerance."""
+def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> dict[str, float]:
+    """Measure what is left out on the worst chips of the scene, in the unit of the tolerance."""
     scene, rig = run.scene, run.settings.simulated_rig
 
-    def units(light: Light) -> Light:
-        if decision.unit == "sigma":
-            return noise_electrons(light, rig)
-        return np.full_like(light, rig.camera.electrons_per_dn)
+    def units(light: Light, binning: int) -> Light:
+        return unit_at(light, rig, decision.unit, binning)
 
     renders = 0
 
@@ -143,7 +141,12 @@ def _verified(run: CaptureRun, decision: Decision, places: Floats) -> dict[str, 
         run.report(DRAFT + (VERIFIED - DRAFT) * renders / (renders + len(EFFECTS)))  # how many there will be is open
         return expected_light(scene, block, chosen)
 
-    candidates = candidate_chips(_whole_sweeps(run), places)
+    whole = _whole_sweeps(run)
+    candidates = [
+        chip
+        for probe in probes
+        for chip in candidate_chips([one for one in whole if one.sweep in probe.sweeps], probe.places)
+    ]
     worst = worst_chips(candidates, lambda block: expected_light(scene, block, LOOK), units)
     return verify(decision, render, worst, units)
 

@@ -6,9 +6,11 @@ over the scan; what is looked at closely is where the two differ most.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from flows.tones import choose_bands
 from pipeline.camera import bin_samples
 from pipeline.errors import BoundError
 from pipeline.scan import Sweep
+from pipeline.simulator.arithmetic import contrast_about, misplaced_electrons, misplaced_share
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.effects.registry import BY_NAME
@@ -29,9 +32,8 @@ from pipeline.simulator.probe import Unit
 from pipeline.simulator.readout import dark_frame, read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.simulated import SimulatedSource
+from pipeline.simulator.stored_light import stored_mean, unit_at
 from pipeline.simulator.survey_clock import sweep_starts
-from pipeline.simulator.survey_probe import noise_electrons
-from pipeline.simulator.verification import ROUNDING
 from storage.archive import StageRef
 
 MOST_S = 60.0  # of processor time for both ways together; beyond, not all lines are compared
@@ -43,11 +45,11 @@ Raw = NDArray[np.uint16]
 
 @dataclass(frozen=True)
 class Place:
-    """A sample and a band of it."""
+    """A stored number: a band of a sample, or of some that are summed."""
 
     sweep: str
     line: int
-    sample: int  # of the camera, before binning
+    sample: int  # of the camera: the first of those that are summed
     band: int
 
 
@@ -57,7 +59,7 @@ class View:
 
     exact: Light  # (line, binned sample, 3) over the white panel
     chosen: Light  # the same
-    change: NDArray[np.float64]  # (line, sample) of the band that differs most, in the unit of the tolerance
+    change: NDArray[np.float64]  # (line, binned sample), the band that differs most, in the unit of the tolerance
     bands: str  # which three, in words
     lines: range
     samples: range  # of the camera
@@ -104,7 +106,7 @@ class _Sums:
     exact_cpu_s: float = 0.0
     cpu_s: float = 0.0
     greatest: float = -1.0
-    rounding: float = 0.0
+    unexplained: float = -1.0  # of the greatest change, what arithmetic can not have made
     place: Place | None = None
     squares: float = 0.0
     numbers: int = 0
@@ -115,13 +117,13 @@ class _Sums:
 
 @dataclass(frozen=True)
 class _Both:
-    """A block both ways: expected electrons with those of the dark, and raw numbers.
+    """A block both ways: expected electrons with those of the dark, as means over the samples summed; raw numbers.
 
     ``alike_raw`` is exact light with the noise and the digits of the effects chosen.
     """
 
-    exact: Light
-    chosen: Light
+    exact: NDArray[np.floating]
+    chosen: NDArray[np.floating]
     exact_raw: Raw
     chosen_raw: Raw
     alike_raw: Raw
@@ -146,7 +148,9 @@ def compare_with_everything(
     """
     clock = sweep_starts(sweeps, run.camera, run.settings.cost)
     chosen = source_with(run.source, effects, clock)
-    ways = _Ways(replace(chosen, chosen=everything(effects)), chosen, load_manifest(effects)["total"]["unit"])
+    total = load_manifest(effects)["total"]
+    bound = math.inf if total["bound"] is None else total["bound"]
+    ways = _Ways(replace(chosen, chosen=everything(effects)), chosen, total["unit"], bound)
     blocks = _blocks(sweeps)
     taken = _affordable(ways, blocks, say)
     sums = _Sums()
@@ -218,23 +222,34 @@ class _Ways:
     exact: SimulatedSource
     chosen: SimulatedSource
     unit: Unit
+    bound: float
 
     def take(self, sweep: Sweep, lines: range) -> _Both:
         """Render some lines both ways."""
         exact, chosen = (_taken(source, source.block(sweep, lines)) for source in (self.exact, self.chosen))
         alike = read_out(exact.light, self.chosen.block(sweep, lines), self.chosen.choice)
         exact_raw, chosen_raw, alike_raw = (bin_samples(raw, sweep.binning) for raw in (exact.raw, chosen.raw, alike))
-        return _Both(exact.shown, chosen.shown, exact_raw, chosen_raw, alike_raw, exact.cpu_s, chosen.cpu_s)
+        shown, other = (stored_mean(one.shown, sweep.binning) for one in (exact, chosen))
+        return _Both(shown, other, exact_raw, chosen_raw, alike_raw, exact.cpu_s, chosen.cpu_s)
 
-    def change(self, both: _Both) -> NDArray[np.float64]:
-        """By how much the chosen light differs, in the unit of the tolerance, (line, sample, band)."""
-        difference: NDArray[np.float64] = (both.chosen.astype(np.float64) - both.exact) / self._scale(both.exact)
+    def change(self, both: _Both, sweep: Sweep) -> NDArray[np.float64]:
+        """By how much the stored light differs, in the unit of the tolerance, (line, binned sample, band)."""
+        difference: NDArray[np.float64] = (both.chosen.astype(np.float64) - both.exact) / self._unit(both, sweep)
         return difference
+
+    def _arithmetic(self, both: _Both, sweep: Sweep, lines: range) -> NDArray[np.float64]:
+        """What of a difference arithmetic may have made, (line or 1, binned sample, band). [e-]"""
+        share = misplaced_share(dict(self.exact.choice.effects), dict(self.chosen.choice.effects))
+        contrast = contrast_about(self.exact.block(sweep, lines), partial(expected_light, self.exact.scene))
+        return misplaced_electrons(both.exact, stored_mean(contrast, sweep.binning), share)
+
+    def _unit(self, both: _Both, sweep: Sweep) -> NDArray[np.floating]:
+        return unit_at(both.exact, self.exact.rig, self.unit, sweep.binning)
 
     def add(self, sweep: Sweep, lines: range, sums: _Sums) -> None:
         """Take some lines both ways and add up how they differ."""
         both = self.take(sweep, lines)
-        change = self.change(both)
+        change = self.change(both, sweep)
         sums.exact_cpu_s += both.exact_cpu_s
         sums.cpu_s += both.cpu_s
         sums.squares += float(np.square(change).sum())
@@ -243,18 +258,14 @@ class _Ways:
         line, sample, band = (int(one) for one in np.unravel_index(int(np.argmax(change)), change.shape))
         if change[line, sample, band] > sums.greatest:
             sums.greatest = float(change[line, sample, band])
-            sums.place = Place(sweep.name, lines[line], sample, band)
-            sums.rounding = ROUNDING * float(np.max(both.exact / self._scale(both.exact)))
+            sums.place = Place(sweep.name, lines[line], sample * sweep.binning, band)
+        if change.max() > self.bound:
+            change -= self._arithmetic(both, sweep, lines) / self._unit(both, sweep)
+        sums.unexplained = max(sums.unexplained, float(change.max()))
         apart = np.abs(both.chosen_raw.astype(np.int32) - both.alike_raw)
         sums.unequal += int(np.count_nonzero(apart))
         sums.raw_numbers += apart.size
         sums.most_dn = max(sums.most_dn, int(apart.max()))
-
-    def _scale(self, light: Light) -> Light:
-        rig = self.exact.rig
-        if self.unit == "sigma":
-            return noise_electrons(light, rig)
-        return np.full_like(light, rig.camera.electrons_per_dn)
 
 
 def _compared(
@@ -302,7 +313,7 @@ def _view(run: CaptureRun, ways: _Ways, sweep: Sweep, place: Place) -> View:
         both = ways.take(sweep, range(first, min(first + BLOCK_LINES, lines.stop)))
         for kept, raw in ((exact, both.exact_raw), (chosen, both.chosen_raw)):
             kept.append(raw[:, samples.start : samples.stop, list(bands)])
-        changes.append(_strongest(ways.change(both)[:, of_camera.start : of_camera.stop]))
+        changes.append(_strongest(ways.change(both, sweep)[:, samples.start : samples.stop]))
     white = np.maximum(run.scene.panel_electrons[list(bands)] / camera.electrons_per_dn, np.float32(1e-6))
     dark = np.float32(binning * camera.dark_dn)
     shown = [(np.concatenate(kept).astype(np.float32) - dark) / (binning * white) for kept in (exact, chosen)]
@@ -323,7 +334,7 @@ def _strongest(change: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _check(found: Comparison, sums: _Sums) -> None:
-    if found.bound is None or found.measured <= found.bound + sums.rounding:
+    if found.bound is None or sums.unexplained <= found.bound:
         return
     place = found.place
     raise BoundError(

@@ -16,8 +16,8 @@ from pipeline.simulator.manifest import UNIT_WORDS
 WIDE = 100  # characters, from which words fit into the table
 COLOURS = {"on": "green", "off": "dim"}
 _KEY = (
-    "left out: what any number would change by at most without the effect [{unit}]; error: by what is done instead of"
-    " the exact; measured: the same on the worst lines of the scene."
+    "left out: what any stored number would change by at most without the effect [{unit}]; error: by what is done"
+    " instead of the exact; measured: the same on the worst lines of the scene."
 )
 Row = Mapping[str, Any]
 
@@ -97,8 +97,10 @@ def total_words(total: Mapping[str, Any]) -> Sequence[str]:
         words.append("What is left out has no bound.")
     else:
         measured = "" if total["measured"] is None else f", measured on the worst chips {total['measured']:.2g}"
+        if total["measured"] is not None and total["measured"] > total["bound"]:
+            measured += ", more by what arithmetic makes of light with such contrasts"
         words.append(
-            f"What is left out or cheapened changes a number by at most {total['bound']:.2g} {unit}{measured}."
+            f"What is left out or cheapened changes a stored number by at most {total['bound']:.2g} {unit}{measured}."
         )
     exact, cheap = (format_seconds(max(total[name], 0.0)) for name in ("saved_s", "saved_cheap_s"))
     words.append(

@@ -22,7 +22,8 @@ from pipeline.simulator.probe import Probe
 from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import RasterScene
-from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+from pipeline.simulator.stored_light import noise_electrons
+from pipeline.simulator.survey_probe import probe_scene
 
 SHAPE = (512, 1280)
 LINES = 8  # at each end of a sweep and in its middle

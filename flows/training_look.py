@@ -29,7 +29,7 @@ from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from pipeline.simulator.survey_clock import sweep_starts
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.survey_probe import probe_survey
 from pipeline.source import References
 
 TOLERANCE_SIGMA = 0.1  # of a survey, unless it says otherwise
@@ -105,7 +105,7 @@ def observe_farm(
 
 def chosen_effects(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep]) -> Choice:
     """Choose effects as a survey does that takes these sweeps, without its look at the worst lines."""
-    return Choice.of(decide(probe_scene(scene, rig, sweeps, "sigma"), rig, EFFECTS, TOLERANCE_SIGMA).chosen)
+    return Choice.of(decide(probe_survey(scene, rig, sweeps, "sigma"), rig, EFFECTS, TOLERANCE_SIGMA).chosen)
 
 
 def _columns(source: SimulatedSource, sweeps: Sequence[Sweep], grid: SceneGrid, matrix: Columns) -> Columns:

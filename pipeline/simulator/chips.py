@@ -12,9 +12,10 @@ from pipeline.errors import ShapeError
 from pipeline.scan import scene_to_sweep
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import Light
+from pipeline.simulator.stored_light import stored_mean
 
 Floats = NDArray[np.float64]
-Units = Callable[[Light], NDArray[np.floating]]
+Units = Callable[[Light, int], NDArray[np.floating]]  # of the mean light of so many samples that a number sums
 
 CHIP_LINES = 3  # whole ones, for stray light comes from all of a line
 MOST_CANDIDATES = 40
@@ -43,12 +44,14 @@ def candidate_chips(whole: Sequence[Block], places: Floats, *, lines: int = CHIP
 def worst_chips(candidates: Sequence[Block], render: Callable[[Block], Light], units: Units) -> dict[str, Block]:
     """Choose where bounds are hardest to keep: the steepest, brightest, darkest and most oblique of some chips.
 
+    Of numbers as they are stored, and of each binning that the sweeps have its own.
+
     Parameters
     ----------
     render
         Expected electrons (line, sample, band); the footprint alone is enough.
     units
-        From expected electrons to one unit of the tolerance at each. [e-]
+        From expected electrons and their binning to one unit of the tolerance at each. [e-]
 
     Returns
     -------
@@ -59,13 +62,16 @@ def worst_chips(candidates: Sequence[Block], render: Callable[[Block], Light], u
     ShapeError : there is nothing to choose from.
     """
     best: dict[str, tuple[float, Block]] = {}
+    least = min((chip.sweep.binning for chip in candidates), default=1)
     for chip in candidates:
-        light = render(chip)
+        binning = chip.sweep.binning
+        light = stored_mean(render(chip), binning)
         if not light.size:
             continue
-        for name, score in _scores(chip, light / units(light)).items():
-            if name not in best or score > best[name][0]:
-                best[name] = score, chip
+        for name, score in _scores(chip, light / units(light, binning)).items():
+            called = name if binning == least else f"{name} in sums of {binning}"
+            if called not in best or score > best[called][0]:
+                best[called] = score, chip
     if not best:
         raise ShapeError(
             f"no chip to verify effects on: {len(candidates)} candidates hold no sample; give lines of a sweep"

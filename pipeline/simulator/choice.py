@@ -1,5 +1,8 @@
 """The decision: which effects to compute, and how, so that what is left out stays within one tolerance.
 
+The tolerance is of the numbers that are stored, sums of samples where a sweep bins them: an effect counts by what it
+does at the binning where it does most.
+
 Greedy: start with everything exact; of all cheaper options that still fit, take the one that saves most per error that
 it adds; until none fits. Because one long step may be shut out by a short one, the same is tried after each single
 step, and the cheapest end counts: it saves at least half of what can be saved.
@@ -107,7 +110,9 @@ class Decision:
         return {one.menu.effect: one.menu.cheapest_within(within).variant for one in self.taken if one.menu.present}
 
 
-def decide(probe: Probe, rig: Rig, effects: Sequence[Effect], tolerance: float, asked: str = "auto") -> Decision:
+def decide(
+    probes: Probe | Sequence[Probe], rig: Rig, effects: Sequence[Effect], tolerance: float, asked: str = "auto"
+) -> Decision:
     """Choose off or a variant for every effect, so that the sum of their errors stays within the tolerance.
 
     Tolerance 0 is everything that the rig has, exact; an infinite one switches off all that may be off. Quantisation
@@ -115,10 +120,12 @@ def decide(probe: Probe, rig: Rig, effects: Sequence[Effect], tolerance: float, 
 
     Parameters
     ----------
+    probes
+        One for each binning of the survey; the worst counts.
     effects
         In the order of the chain; the order does not change what is chosen.
     tolerance
-        Greatest change of any number, in the unit of the probe.
+        Greatest change of any stored number, in the unit of the probes.
     asked
         ``auto``; ``all``: on and exact; ``none``; or names with commas: those on, in the variants that the tolerance
         lets them have, and the others off, whatever that changes.
@@ -130,15 +137,17 @@ def decide(probe: Probe, rig: Rig, effects: Sequence[Effect], tolerance: float, 
     if not tolerance >= 0:
         raise SettingsError(f"the tolerance must be 0 or more, got {tolerance}; 0 computes everything")
     named = named_effects(asked, [effect.name for effect in effects])
-    menus = list_options(probe, rig, effects)
+    menus = list_options(probes, rig, effects)
     taken = {one.name: one for one in _settled(menus, tolerance, named, exact=asked == "all")}
     open_menus = [menu for menu in menus if menu.name not in taken]
     options = _cheapened(open_menus, tolerance, forced=named is not None)
     for menu in open_menus:
         option = options[menu.name]
         taken[menu.name] = Taken(menu, option, _reason(menu, option, tolerance, named))
-    px_bands = sum(sweep.lines for sweep in probe.sweeps) * rig.camera.samples * len(probe.wavelength_nm)
-    return Decision(tuple(taken[menu.name] for menu in menus), tolerance, probe.unit, asked, px_bands)
+    every = [probes] if isinstance(probes, Probe) else probes
+    lines = sum(sweep.lines for probe in every for sweep in probe.sweeps)
+    px_bands = lines * rig.camera.samples * len(every[0].wavelength_nm)
+    return Decision(tuple(taken[menu.name] for menu in menus), tolerance, every[0].unit, asked, px_bands)
 
 
 def named_effects(asked: str, known: Sequence[str]) -> frozenset[str] | None:

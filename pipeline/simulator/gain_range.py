@@ -95,20 +95,21 @@ def fixed_variance(rig: Rig) -> float:
 def unit_electrons(light_e: Floats, probe: Probe, rig: Rig) -> Floats:
     """Give the unit of the probe at some light [e-]; what does not follow the light is the smallest unit met."""
     if probe.unit == "sigma" and not rig.detector.noiseless:
-        return np.sqrt(np.maximum(light_e, 0.0) + fixed_variance(rig))
+        return np.sqrt((np.maximum(light_e, 0.0) + fixed_variance(rig)) / probe.binning)
     return np.full_like(light_e, probe.unit_least_dn * rig.camera.electrons_per_dn)
 
 
 def lights_within(probe: Probe, rig: Rig) -> tuple[Floats, Floats]:
     """Give least and greatest light of every band, (band,) each [e-]: where level and span have their units from.
 
-    With U(S)^2 = S + n, the greatest S has level S / U(S), and the least a difference of span U to it, or a smaller.
+    With U(S)^2 = (S + n) / m for means of m samples, the greatest S has level S / U(S), and the least a difference of
+    span U to it, or a smaller.
     """
     if probe.unit != "sigma" or rig.detector.noiseless:
         unit = unit_electrons(probe.level, probe, rig)
         high, way = probe.level * unit, probe.span * unit
     else:
-        fixed, level, span = fixed_variance(rig), probe.level**2, probe.span**2
+        fixed, level, span = fixed_variance(rig), probe.level**2 / probe.binning, probe.span**2 / probe.binning
         high = (level + np.sqrt(level * (level + 4 * fixed))) / 2
         way = (np.sqrt(span * (span + 4 * (high + fixed))) - span) / 2
     return np.maximum(high - way, probe.darkest_e), high
@@ -141,7 +142,7 @@ def light_after(probe: Probe, ranges: Iterable[GainRange], rig: Rig) -> Probe:
     follows = probe.unit == "sigma" and not rig.detector.noiseless
     return replace(
         probe,
-        level=probe.level + added / (np.sqrt(added + fixed_variance(rig)) if follows else unit_e),
+        level=probe.level + added / (unit_electrons(added, probe, rig) if follows else unit_e),
         spectral_slope=probe.spectral_slope + ratio * probe.level * steep + added_steep / unit_e,
         spectral_curvature=probe.spectral_curvature
         + 2 * ratio * steep * probe.spectral_slope

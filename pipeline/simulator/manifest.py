@@ -16,11 +16,12 @@ TOTAL = "all effects"
 def list_effects(decision: Decision, measured: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
     """Give one plain row for every effect, in the order of the chain.
 
-    Each has ``name``; ``state`` (on or off); ``variant`` (None where off); ``bound`` on the change of any number by
-    treating the effect so, in ``unit``, with the factor of safety: 0 where it is exact or absent, None where there is
-    none; ``measured``, the same on chips of the scene (None where not verified); ``cost_s``, estimated CPU seconds of
-    all sweeps; ``why`` in a sentence, and its parts: ``reason`` (see `choice.Taken`), ``left_out``, the bound on what
-    leaving it out would change, and ``magnitude``, how large it is here, in the words of its own bound.
+    Each has ``name``; ``state`` (on or off); ``variant`` (None where off); ``bound`` on the change of any number that
+    is stored, at the worst binning, by treating the effect so, in ``unit``, with the factor of safety: 0 where it is
+    exact or absent, None where there is none; ``measured``, the same on chips of the scene (None where not verified);
+    ``cost_s``, estimated CPU seconds of all sweeps; ``why`` in a sentence, and its parts: ``reason`` (see
+    `choice.Taken`), ``left_out``, the bound on what leaving it out would change, and ``magnitude``, how large it is
+    here, in the words of its own bound.
 
     Parameters
     ----------
@@ -85,12 +86,12 @@ def explain(one: Taken, decision: Decision) -> str:
 
 def _reason(one: Taken, decision: Decision) -> str:
     unit, tolerance = UNIT_WORDS[decision.unit], _number(decision.tolerance)
-    left_out = f"left out it could change a sample by {_number(one.menu.off.error)} {unit}"
+    left_out = f"left out it could change a stored number by {_number(one.menu.off.error)} {unit}"
     asked = one.name in [word.strip() for word in decision.asked.split(",")]
     return {
         "absent": ("asked for, but " if asked else "") + "the rig has none of it",
         "unseen": "the scene shows nothing of it",
-        "small": f"left out it changes a sample by at most {_number(one.option.error)} {unit}",
+        "small": f"left out it changes a stored number by at most {_number(one.option.error)} {unit}",
         "needed": f"{left_out}, more than the tolerance of {tolerance}",
         "spent": f"{left_out}, and the tolerance of {tolerance} is spent where it saves more",
         "exact": "the tolerance is 0, so everything is computed",

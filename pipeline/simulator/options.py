@@ -1,12 +1,13 @@
 """What the decision chooses from: for every effect, off and each variant with its error and cost.
 
-One currency. A bound is the change of a sample in units of the noise at it (or in DN). Effects that draw enter the same
-sum in two ways. Where a drawn displacement or gain moves the light (jitter, turbulence, wind), the bound is on the
-change with the same draws: it is as certain as any other. Where the draw is the noise itself (shot, read, dark), a
-paired change says nothing about later decisions; what matters is the total variation between the distributions of a
-sample with and without. A change by ``d`` noise deviations has a total variation of at most ``d / 2``, so noise that
-changes it by ``t`` counts ``2 t`` deviations. Total variation is a metric and no later stage increases it: the sum of
-all bounds is then twice a bound on how much more often than not one sample could tell the image from the exact one.
+One currency. A bound is the change of a stored number in units of its noise (or in DN), at the worst binning of the
+survey. Effects that draw enter the same sum in two ways. Where a drawn displacement or gain moves the light (jitter,
+turbulence, wind), the bound is on the change with the same draws: it is as certain as any other. Where the draw is the
+noise itself (shot, read, dark), a paired change says nothing about later decisions; what matters is the total variation
+between the distributions of a number with and without. A change by ``d`` noise deviations has a total variation of at
+most ``d / 2``, so noise that changes it by ``t`` counts ``2 t`` deviations. Total variation is a metric and no later
+stage increases it: the sum of all bounds is then twice a bound on how much more often than not one number could tell
+the image from the exact one. Noise of samples that are summed grows as their sum's does: its deviations stay.
 
 Composition. Kernels that are not negative and sum to 1 have gain 1 at most, readout none. Gains of light (vignetting,
 drift, ...) multiply the errors of all other effects in the light, each by its own greatest factor, and change the unit:
@@ -83,14 +84,36 @@ def acts_on_light(effect: Effect) -> bool:
     return effect.name in LIGHT_EFFECTS or any(hasattr(effect, action) for action in LINEAR_ACTIONS)
 
 
-def list_options(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> tuple[Menu, ...]:
-    """Ask every effect for the bounds of its options; errors are in the unit of the probe.
+def list_options(probes: Probe | Sequence[Probe], rig: Rig, effects: Sequence[Effect]) -> tuple[Menu, ...]:
+    """Ask every effect for the bounds of its options; errors are in the unit of the probes.
+
+    Of several probes, one for each binning of a survey, every option has the error of the worst.
 
     Raises
     ------
     SettingsError : two effects have one name, or a bound is negative or not a number; names it.
     """
     _check_names(effects)
+    each = [_options_of(probe, rig, effects) for probe in ([probes] if isinstance(probes, Probe) else probes)]
+    return tuple(_worst_of(menus) for menus in zip(*each, strict=True))
+
+
+def _worst_of(menus: Sequence[Menu]) -> Menu:
+    """Join one effect's menus of several probes; what it costs they have in common."""
+
+    def worst(options: Iterable[Option]) -> Option:
+        return max(options, key=lambda option: option.error)
+
+    variants = zip(*(menu.variants for menu in menus), strict=True)
+    return replace(
+        menus[0],
+        variants=tuple(map(worst, variants)),
+        off=worst(menu.off for menu in menus),
+        present=any(menu.present for menu in menus),
+    )
+
+
+def _options_of(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> tuple[Menu, ...]:
     present = [_is_present(effect, probe, rig) for effect in effects]
     ranges = [_gain_range(one, probe, rig) if there else None for one, there in zip(effects, present, strict=True)]
     growth = Growth(probe, rig)
@@ -112,7 +135,8 @@ def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) ->
     def option(variant: str) -> Option:
         bound = _checked_bound(effect, probe, rig, variant)
         error = bound.value * gain * SAFETY if bound.value else 0.0
-        return Option(variant, error, _cost_ns(costs, variant), bound.why)
+        why = bound.why if probe.binning == 1 or not error else f"{bound.why}, in sums of {probe.binning} samples"
+        return Option(variant, error, _cost_ns(costs, variant), why)
 
     exact = Option(effect.variants[0], 0.0, _cost_ns(costs, effect.variants[0]), "exact")
     merged: Merged | None = effect.merged(rig) if hasattr(effect, "merged") else None

@@ -19,8 +19,10 @@ Unit = Literal["sigma", "dn"]
 class Probe:
     """Maxima over the samples of a few lines, band by band, as the footprint of slit and pixel alone shows the scene.
 
-    All but the electrons are over the unit of the tolerance: one standard deviation of the noise at the sample itself,
-    or one DN. Axis 0 of ``slope`` and ``curvature`` is (along the line, along the scan).
+    All but the electrons are over the unit of the tolerance: one standard deviation of the noise of the number that is
+    stored, or one DN of it. Where that sums ``binning`` samples, a maximum is of the mean of their sizes over the noise
+    of their mean: a change of whatever sign at each of them is bounded, and no more than needed where they differ.
+    Axis 0 of ``slope`` and ``curvature`` is (along the line, along the scan).
     """
 
     unit: Unit
@@ -36,13 +38,14 @@ class Probe:
     spectral_curvature: Floats  # (band,) greatest second one, twice, 0 at either end [1/nm^2]
     brightest_e: float  # expected electrons of the brightest sample
     darkest_e: float
-    unit_least_dn: float  # the smallest unit met, in DN: turns electrons into the unit, on the safe side
+    unit_least_dn: float  # the smallest unit met, in DN of a sample: turns electrons into the unit, on the safe side
     lines: int  # of all sweeps
     seconds: float  # from the first line to the last
     white_e: Floats | None = None  # (band,) electrons of the white panel in one exposure; None where not known
     slit_errors: Mapping[str, float] = field(default_factory=dict)  # measured change by variant of the slit, or off
     usual_e: Floats | None = None  # evenly spaced quantiles of the light along the lines; None where not known
     places: Floats = field(default_factory=lambda: np.zeros((0, 2)))  # the telling ones, rows and columns, worst first
+    binning: int = 1  # samples that a stored number sums, the same in all of the sweeps
 
     def moved(self, along_px: float, scan_px: float) -> float:
         """Bound what a shift of the image by at most so much changes: slope times way, never more than the span."""
@@ -63,7 +66,7 @@ class Probe:
         return float((self.level * np.abs(share)).max(initial=0.0))
 
     def added(self, electrons: float, electrons_per_dn: float) -> float:
-        """Bound what adding so many electrons changes."""
+        """Bound what adding so many electrons to every sample changes."""
         return abs(electrons) / electrons_per_dn / self.unit_least_dn
 
 

@@ -33,20 +33,31 @@ class _Optics:
     slit: NDArray[np.float32]
     pixel: NDArray[np.float32]
     fixed_noise: float
+    binning: int
 
     @property
     def halo(self) -> int:
-        """How far kernels and differences reach. [px]"""
-        return len(self.slit) // 2 + len(self.pixel) // 2 + 1
+        """How far kernels, differences and sums reach. [px]"""
+        return len(self.slit) // 2 + len(self.pixel) // 2 + 1 + self.binning // 2
 
     @staticmethod
-    def of(camera: LineCamera) -> _Optics:
-        """Those of a camera."""
+    def of(camera: LineCamera, binning: int) -> _Optics:
+        """Those of a camera whose stored numbers sum so many samples."""
         return _Optics(
             _short_kernel(camera.slit_px),
             _short_kernel(1.0),
             camera.read_noise_e**2 + camera.electrons_per_dn**2 / 12,
+            binning,
         )
+
+    def summed(self, values: Light, axis: int) -> Light:
+        """Mean over the samples of a stored number about each pixel, along an axis."""
+        if self.binning == 1:
+            return values
+        steps = np.arange(self.binning) - self.binning // 2
+        total: Light = sum((np.roll(values, -step, axis) for step in steps.tolist()), np.zeros_like(values))
+        total /= np.float32(self.binning)
+        return total
 
 
 def telling_places(scene: Scene, camera: LineCamera, sweeps: Sequence[Sweep], most: int = 200) -> NDArray[np.float64]:
@@ -55,7 +66,7 @@ def telling_places(scene: Scene, camera: LineCamera, sweeps: Sequence[Sweep], mo
     Parameters
     ----------
     sweeps
-        What will be looked at: other parts of the scene do not count.
+        What will be looked at: other parts of the scene do not count. All sum as many samples to a stored number.
     most
         How many places, each in a tile of its own for one measure and band; the worst of every measure first.
 
@@ -68,7 +79,7 @@ def telling_places(scene: Scene, camera: LineCamera, sweeps: Sequence[Sweep], mo
     SceneError : the scene holds a number that is not finite; the message says where.
     """
     spectra = scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-    bands, optics = telling_bands(spectra), _Optics.of(camera)
+    bands, optics = telling_bands(spectra), _Optics.of(camera, sweeps[0].binning)
     turned = tuple(sorted({sweep.along == "y" for sweep in sweeps}))
     reached, cell = _reached(scene.shape, camera, sweeps)
     tile = max(8, math.ceil(math.sqrt(scene.shape[0] * scene.shape[1] / _TILES)))
@@ -151,19 +162,24 @@ def _check_finite(scene: Scene, planes: Light, first: int) -> None:
 
 
 def _worths(light: Light, rig: _Optics, turned: tuple[bool, ...]) -> Iterator[Light]:
-    """Measures of the strip without its halo, (row, column, band) each: the higher, the more worth a look."""
+    """Measures of the strip without its halo, (row, column, band) each: the higher, the more worth a look.
+
+    Where samples are summed, sizes are averaged along the line, as the probe does.
+    """
     inner = (slice(rig.halo, -rig.halo), slice(rig.halo, -rig.halo))
     for along_y in turned:
-        seen = _blurred(_blurred(light, rig.slit, 1 if along_y else 0), rig.pixel, 0 if along_y else 1)
-        noise = np.sqrt(np.maximum(seen, 0) + np.float32(rig.fixed_noise))[inner]
-        yield seen[inner]
-        yield -seen[inner]
-        yield np.abs(light - seen)[inner] / noise
+        line = 0 if along_y else 1
+        seen = _blurred(_blurred(light, rig.slit, 1 - line), rig.pixel, line)
+        level = rig.summed(seen, line)[inner]
+        noise: Light = np.sqrt(np.maximum(level, 0) + np.float32(rig.fixed_noise))
+        yield level
+        yield -level
+        yield rig.summed(np.abs(light - seen), line)[inner] / noise
         for axis in (0, 1):
-            ahead, behind = np.roll(seen, -1, axis)[inner], np.roll(seen, 1, axis)[inner]
-            yield np.abs(ahead - behind) / noise
-            yield np.abs(ahead + behind - 2 * seen[inner]) / noise
-        yield np.divide(_mixed(seen)[inner], noise)  # what a box that does not lie turned misses
+            ahead, behind = np.roll(seen, -1, axis), np.roll(seen, 1, axis)
+            yield rig.summed(np.abs(ahead - behind), line)[inner] / noise
+            yield rig.summed(np.abs(ahead + behind - 2 * seen), line)[inner] / noise
+        yield np.divide(rig.summed(_mixed(seen), line)[inner], noise)  # what a box that does not lie turned misses
 
 
 def _mixed(seen: Light) -> Light:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,29 +21,47 @@ Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
 Way = tuple[float, float]
 
-LINE_SAMPLES = 64  # at most, of a line, evenly from end to end
-_PATCH = np.stack(np.meshgrid(np.arange(-2.0, 3.0), np.arange(-1.0, 2.0)), axis=-1).reshape(-1, 2)  # along, scan [px]
-PATCH_VIEWS = len(_PATCH)
+LINE_SAMPLES = 64  # of a line, evenly from end to end, in sums where samples are summed
+_LEAST_SUMS = 16  # of a line
+_BESIDE = 2  # samples to either side of a place; of sums, one
 
 
 @dataclass(frozen=True)
 class SampleViews:
-    """Samples at any place of any sweep, (view,) each: the line's centre and the camera's slope."""
+    """Samples at any place of any sweep, (view,) each: the line's centre and the camera's slope.
+
+    ``binning`` in a row are the samples of one stored number.
+    """
 
     strip_px: Floats
     scan_px: Floats
     slope: Floats
     along_y: NDArray[np.bool_]
     sweep: NDArray[np.intp]  # number of the sweep
+    binning: int = 1
+
+    @property
+    def sums(self) -> int:
+        """How many stored numbers the samples make."""
+        return len(self.slope) // self.binning
 
     def chosen(self, which: NDArray[np.intp]) -> SampleViews:
         """Some of the views."""
-        return SampleViews(*(getattr(self, one.name)[which] for one in fields(self)))
+        some: dict[str, Any] = {name: getattr(self, name)[which] for name in _OF_A_VIEW}
+        return replace(self, **some)
+
+    def chosen_sums(self, which: NDArray[np.intp]) -> SampleViews:
+        """All samples of some of the stored numbers."""
+        return self.chosen((which[:, None] * self.binning + np.arange(self.binning)).ravel())
+
+
+_OF_A_VIEW = tuple(one.name for one in fields(SampleViews) if one.name != "binning")
 
 
 def joined(parts: list[SampleViews]) -> SampleViews:
-    """Put views one after the other."""
-    return SampleViews(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(SampleViews)))
+    """Put views of one binning one after the other."""
+    every: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in parts]) for name in _OF_A_VIEW}
+    return replace(parts[0], **every)
 
 
 def light_seen(
@@ -78,35 +97,48 @@ def rays_of(views: SampleViews, camera: LineCamera, turned: Way = (0.0, 0.0)) ->
     return exact_views(normal, turned[1] * ifov, views.slope + turned[0] * ifov)
 
 
-def line_samples(camera: LineCamera) -> int:
-    """Give how many samples of a line stand for all of it."""
-    return min(camera.samples, LINE_SAMPLES)
+def line_sums(camera: LineCamera, binning: int) -> int:
+    """Give how many stored numbers of a line stand for all of it."""
+    return min(camera.samples // binning, max(LINE_SAMPLES // binning, _LEAST_SUMS))
+
+
+def patch_views(binning: int) -> int:
+    """Give how many samples a patch around a place has."""
+    return len(_patch(binning)) * binning
 
 
 def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> SampleViews:
-    """Lines spread over all sweeps, the most oblique among them, of samples evenly from end to end."""
+    """Lines spread over all sweeps, the most oblique among them, of samples evenly from end to end.
+
+    All sweeps sum as many samples to a number.
+    """
     order = {id(sweep): place for place, sweep in enumerate(sweeps)}
+    binning = sweeps[0].binning
     numbers = [(sweep, number) for sweep in sweeps for number in {0, sweep.lines // 2, sweep.lines - 1}]
     numbers.sort(key=lambda one: -float(np.hypot(one[0].strip_px, one[0].line_px()[one[1]])))
-    most = max(room // line_samples(camera), 1)
+    most = max(room // (line_sums(camera, binning) * binning), 1)
     kept = numbers[: most // 2 or 1]
     rest = [(sweep, round(share * (sweep.lines - 1))) for sweep in sweeps for share in (0.25, 0.75)]
     rest += numbers[len(kept) :]
     kept += [rest[round(at)] for at in np.linspace(0, len(rest) - 1, most - len(kept))] if most > len(kept) else []
-    samples = np.linspace(0, camera.samples - 1, line_samples(camera)).round().astype(np.intp)
-    slopes = camera.pixel_slopes()[samples]
-    count = len(samples)
+    sums = np.linspace(0, camera.samples // binning - 1, line_sums(camera, binning)).round().astype(np.intp)
+    slopes = camera.pixel_slopes()[_samples_of(sums, binning)]
+    count = len(slopes)
     return SampleViews(
         np.repeat([sweep.strip_px for sweep, _ in kept], count).astype(np.float64),
         np.repeat([sweep.line_px()[number] for sweep, number in kept], count),
         np.tile(slopes, len(kept)),
         np.repeat([sweep.along == "y" for sweep, _ in kept], count),
         np.repeat([order[id(sweep)] for sweep, _ in kept], count),
+        binning,
     )
 
 
 def views_of_places(places: Floats, scene: Scene, camera: LineCamera, sweeps: tuple[Sweep, ...]) -> SampleViews:
-    """Patches around places, each as the finest and the most oblique sweep of each orientation see it."""
+    """Patches around places, each as the finest and the most oblique sweep of each orientation see it.
+
+    All sweeps sum as many samples to a number.
+    """
     centred = places - (np.array(scene.shape) - 1) / 2
     found = []
     for along_y in (False, True):
@@ -116,10 +148,9 @@ def views_of_places(places: Floats, scene: Scene, camera: LineCamera, sweeps: tu
         along, scan = (centred if along_y else centred[:, ::-1]).T
         seen = [_first_seeing(order, sweeps, camera, along, scan) for order in (finest, oblique)]
         for number in numbers:
-            held = _held(sweeps[number])
             which = np.flatnonzero((seen[0] == number) | (seen[1] == number))
-            line, sample = scene_to_sweep(held, camera, along[which], scan[which]).T
-            found.append(_patches(held, number, camera, line, sample))
+            line, sample = scene_to_sweep(_held(sweeps[number]), camera, along[which], scan[which]).T
+            found.append(_patches(sweeps[number], number, camera, line, sample))
     return joined(found)
 
 
@@ -143,13 +174,30 @@ def _held(sweep: Sweep) -> Sweep:
     return replace(sweep, step=1, lines=sweep.lines * sweep.step, binning=1)
 
 
+def _patch(binning: int) -> Floats:
+    """Steps of a patch around a place: stored numbers along the line and lines along the scan, (number, 2)."""
+    beside = _BESIDE if binning == 1 else 1
+    return np.stack(np.meshgrid(np.arange(-beside, beside + 1.0), np.arange(-1.0, 2.0)), axis=-1).reshape(-1, 2)
+
+
 def _patches(sweep: Sweep, number: int, camera: LineCamera, line: Floats, sample: Floats) -> SampleViews:
     """Views around continuous lines and samples of a sweep, moved to what it has."""
-    samples = np.rint(sample[:, None] + _PATCH[:, 0]).clip(0, camera.samples - 1).astype(np.intp).ravel()
-    lines = (line[:, None] + _PATCH[:, 1]).clip(0, sweep.lines - 1).ravel()
-    count = len(samples)
-    slopes = camera.pixel_slopes()[samples]
-    turned = np.full(count, sweep.along == "y")
+    patch, binning = _patch(sweep.binning), sweep.binning
+    middle = sample if binning == 1 else (sample + 0.5) / binning - 0.5
+    sums = np.rint(middle[:, None] + patch[:, 0]).clip(0, camera.samples // binning - 1).astype(np.intp).ravel()
+    lines = (line[:, None] + patch[:, 1]).clip(0, _held(sweep).lines - 1).ravel()
+    slopes = camera.pixel_slopes()[_samples_of(sums, binning)]
+    count = len(slopes)
     return SampleViews(
-        np.full(count, sweep.strip_px), sweep.start_px + lines, slopes, turned, np.full(count, number, np.intp)
+        np.full(count, sweep.strip_px),
+        sweep.start_px + np.repeat(lines, binning),
+        slopes,
+        np.full(count, sweep.along == "y"),
+        np.full(count, number, np.intp),
+        binning,
     )
+
+
+def _samples_of(sums: NDArray[np.intp], binning: int) -> NDArray[np.intp]:
+    """Give the camera's samples that stored numbers sum, one number's after the other's."""
+    return (sums[:, None] * binning + np.arange(binning)).ravel()

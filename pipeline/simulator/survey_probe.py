@@ -26,12 +26,13 @@ from pipeline.simulator.render import views_all_over
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene, Scene
 from pipeline.simulator.scouting import telling_places
+from pipeline.simulator.stored_light import stored_mean, unit_at
 from pipeline.simulator.survey_looks import (
-    PATCH_VIEWS,
     SampleViews,
     joined,
     light_seen,
-    line_samples,
+    line_sums,
+    patch_views,
     views_of_lines,
     views_of_places,
 )
@@ -44,6 +45,7 @@ MOST_SAMPLES = 12_000
 USUAL_LIGHTS = 101  # quantiles of the light that are kept
 FINEST_SAMPLES = 1000  # at which variants of the slit are held against the finest
 _LEAST_OF_SWEEP = 50
+_LEAST_PLACES = 24  # that are looked at where samples are summed, however many samples that takes
 _LOOK, _CLOSE = (2, 1), (3, 1)  # boxes that are looked through, and that tell where variants differ
 _ROUNDING = 2e-6  # of the level: less is rounding of float32
 _ALIKE = 0.02  # share by which blurs may differ and count as one
@@ -52,41 +54,57 @@ _NEAR, _FAR = 0.25, 0.5  # px by which the footprint is shifted
 _PHASES = tuple(((along, scan), (0.0, 0.0)) for along in (0.0, 0.5) for scan in (0.0, 0.5))  # at which boxes differ
 
 
-def noise_electrons(signal: Light, rig: Rig) -> Light:
-    """Give one standard deviation of shot noise, read noise and quantisation at each signal; never 0. [e-]"""
-    camera, quantised = rig.camera, rig.camera.electrons_per_dn**2 / 12
-    if rig.detector.noiseless:
-        return np.full_like(signal, np.sqrt(quantised))
-    return np.sqrt(np.maximum(signal, 0) + np.float32(camera.read_noise_e**2 + quantised))
+def probe_survey(scene: Scene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> tuple[Probe, ...]:
+    """Probe the scene for sweeps of any binning: one probe for each binning that they have, the smallest first.
+
+    What a survey takes of time and lines, and how bright the light along its lines usually is, all have in common.
+
+    Raises
+    ------
+    SceneError, SettingsError, PoseError : as `probe_scene`.
+    """
+    taken = _taken(sweeps)
+    each = [tuple(one for one in taken if one.binning == binning) for binning in sorted({one.binning for one in taken})]
+    probes = [probe_scene(scene, rig, some, unit) for some in each]
+    lines, seconds = sum(one.lines for one in probes), CostModel().seconds(list(taken), rig.camera)
+    return tuple(replace(one, lines=lines, seconds=seconds, usual_e=probes[0].usual_e) for one in probes)
 
 
 def probe_scene(scene: Scene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> Probe:
     """Look at the scene through the footprint alone where it is steepest, brightest and darkest, and along some lines.
 
     Where to look is found on the scene's own pixels (`scouting`), so that the maxima hold for the whole image and not
-    for the looks alone.
+    for the looks alone. All sweeps sum as many samples to a stored number; see `probe_survey`.
 
     Raises
     ------
     SceneError : the scene holds a number that is not finite; the message says where.
-    SettingsError : there is no line to take.
+    SettingsError : there is no line to take, or sweeps differ in their binning.
     PoseError : a sweep is out of the mirror's reach.
     """
-    taken = tuple(sweep for sweep in sweeps if sweep.lines > 0)
-    if not taken:
-        raise SettingsError("a scene is summed up for the sweeps that look at it; expected lines to take, got none")
-    camera, bands = rig.camera, len(scene.wavelength_nm)
+    taken = _taken(sweeps)
+    binnings = {sweep.binning for sweep in taken}
+    if len(binnings) > 1:
+        raise SettingsError(f"expected sweeps of one binning, got {sorted(binnings)}; probe each of them")
+    binning, camera, bands = binnings.pop(), rig.camera, len(scene.wavelength_nm)
     room = max(min(MOST_VALUES // bands, MOST_SAMPLES), 64)
     lines = views_of_lines(taken, camera, room // 3)
-    most = (room - room // 3) // (PATCH_VIEWS * len({sweep.along for sweep in taken}))
-    places = telling_places(scene, camera, taken, max(most, 1))
+    most = (room - room // 3) // (patch_views(binning) * len({sweep.along for sweep in taken}))
+    places = telling_places(scene, camera, taken, max(most, 1 if binning == 1 else _LEAST_PLACES))
     views = joined([lines, views_of_places(places, scene, camera, taken)])
     seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _LOOK, None, scene), _shifts())
-    means = seen[0, : len(lines.slope)].reshape(-1, line_samples(camera) * bands).mean(axis=1)
+    means = seen[0, : len(lines.slope)].reshape(-1, line_sums(camera, binning) * binning * bands).mean(axis=1)
     errors = _slit_errors(scene, rig, views, taken, unit)
     usual = np.quantile(seen[0, : len(lines.slope)], np.linspace(0, 1, USUAL_LIGHTS)).astype(np.float64)
     summed = _summed_up(scene, rig, taken, unit, seen, means)
     return replace(summed, slit_errors=errors, usual_e=usual, places=places)
+
+
+def _taken(sweeps: Sequence[Sweep]) -> tuple[Sweep, ...]:
+    taken = tuple(sweep for sweep in sweeps if sweep.lines > 0)
+    if not taken:
+        raise SettingsError("a scene is summed up for the sweeps that look at it; expected lines to take, got none")
+    return taken
 
 
 def _slit_errors(scene: Scene, rig: Rig, views: SampleViews, sweeps: tuple[Sweep, ...], unit: Unit) -> dict[str, float]:
@@ -95,18 +113,19 @@ def _slit_errors(scene: Scene, rig: Rig, views: SampleViews, sweeps: tuple[Sweep
     Each sweep is seen through the boxes that a variant takes for it. Scenes without pixels know no boxes.
     """
     ladder = LADDER if isinstance(scene, RasterScene) else LADDER[-1:]
-    views = views.chosen(_roughest(scene, rig, views, unit))
+    views = views.chosen_sums(_roughest(scene, rig, views, unit))
+    sweep_of = views.sweep[:: views.binning]
     whole = [views_all_over(rig, sweep, exact=True) for sweep in sweeps]
     errors = dict.fromkeys((*SLIT.variants[1:], OFF), 0.0)
     for moments in _blurs(rig, scene.wavelength_nm, sweeps):
         boxes = {parts: _footprint(SLIT.variants[0], rig, parts, moments, scene) for parts in ladder}
         finest = light_seen(scene, rig.camera, views, boxes[LADDER[-1]], _PHASES)
-        scale = _unit(finest, rig, unit)
+        scale = unit_at(_stored(finest, views), rig, unit, views.binning)
         found = {parts: _changes(scene, rig, views, boxes[parts], finest, scale) for parts in ladder[:-1]}
-        found[LADDER[-1]] = np.zeros(len(views.slope))
+        found[LADDER[-1]] = np.zeros(views.sums)
         for variant in SLIT.variants[1:]:
             taken = [box_parts(variant, rig, one) for one in whole]
-            seen = [found.get(parts, found[LADDER[-1]])[views.sweep == number] for number, parts in enumerate(taken)]
+            seen = [found.get(parts, found[LADDER[-1]])[sweep_of == number] for number, parts in enumerate(taken)]
             errors[variant] = max(errors[variant], *(float(one.max(initial=0.0)) for one in seen))
         off = _changes(scene, rig, views, _footprint(OFF, rig, (1, 1), moments, scene), finest, scale)
         errors[OFF] = max(errors[OFF], float(off.max(initial=0.0)))
@@ -114,24 +133,26 @@ def _slit_errors(scene: Scene, rig: Rig, views: SampleViews, sweeps: tuple[Sweep
 
 
 def _roughest(scene: Scene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray[np.intp]:
-    """Views where a middle ray, and a box that does not lie turned, differ most: of all, and of every sweep's own."""
+    """Stored numbers where a middle ray, and a box that does not lie turned, differ most: of all, and of each sweep."""
     boxes = _footprint(SLIT.variants[0], rig, _CLOSE, None, scene)
     close = light_seen(scene, rig.camera, views, boxes, _PHASES)
-    scale, found = _unit(close, rig, unit), []
+    scale, found = unit_at(_stored(close, views), rig, unit, views.binning), []
+    sweep_of, count = views.sweep[:: views.binning], max(FINEST_SAMPLES // views.binning, 2 * _LEAST_OF_SWEEP)
     for variant in (OFF, UPRIGHT):
         other = _footprint(variant, rig, (1, 1), None, scene)
         order = np.argsort(-_changes(scene, rig, views, other, close, scale), kind="stable")
-        found.append(order[: FINEST_SAMPLES // 2])
-        numbers = np.unique(views.sweep)
-        each = max(FINEST_SAMPLES // 2 // len(numbers), _LEAST_OF_SWEEP)
-        found += [order[views.sweep[order] == number][:each] for number in numbers]
+        found.append(order[: count // 2])
+        numbers = np.unique(sweep_of)
+        each = max(count // 2 // len(numbers), _LEAST_OF_SWEEP)
+        found += [order[sweep_of[order] == number][:each] for number in numbers]
     return np.unique(np.concatenate(found))
 
 
 def _changes(scene: Scene, rig: Rig, views: SampleViews, footprint: Footprint, finest: Light, scale: Light) -> Floats:
-    """Greatest change of each view by another footprint, over the unit, (view,)."""
-    other = light_seen(scene, rig.camera, views, footprint, _PHASES)
-    greatest: Floats = (_above(np.abs(other - finest), finest) / scale).max(axis=(0, 2)).astype(np.float64)
+    """Greatest change of each stored number by another footprint, over the unit, (number,): measured, with its sign."""
+    change = light_seen(scene, rig.camera, views, footprint, _PHASES) - finest
+    change = np.abs(_stored(np.where(np.abs(change) > _ROUNDING * np.abs(finest), change, np.float32(0)), views))
+    greatest: Floats = (change / scale).max(axis=(0, 2)).astype(np.float64)
     return greatest
 
 
@@ -159,9 +180,9 @@ def _moments(rig: Rig, wavelength_nm: Floats, normal: Floats) -> Moments:
     return Moments(sum((one.shift for one in found), none), sum((one.variance for one in found), none))
 
 
-def _unit(light: Light, rig: Rig, unit: Unit) -> Light:
-    """One unit of the tolerance at each light [e-]."""
-    return noise_electrons(light, rig) if unit == "sigma" else np.full_like(light, rig.camera.electrons_per_dn)
+def _stored(values: Light, views: SampleViews) -> Light:
+    """Means over the samples of each stored number, (..., number, band)."""
+    return np.asarray(stored_mean(values, views.binning), np.float32)
 
 
 def _shifts() -> list[tuple[tuple[float, float], tuple[float, float]]]:
@@ -176,48 +197,55 @@ def _shifts() -> list[tuple[tuple[float, float], tuple[float, float]]]:
 
 def _summed_up(scene: Scene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit, seen: Light, means: Light) -> Probe:
     """Turn light (shift, view, band) and means of lines (line,) into the probe's maxima."""
-    camera, level, least, most = rig.camera, seen[0], seen.min(axis=0), seen.max(axis=0)
-    scale = _unit(least, rig, unit)
-    slope, curvature = _derivatives(seen, scale)
-    spectral = _spectral_derivatives(level, scene.wavelength_nm, scale)
+    camera, binning, least, most = rig.camera, sweeps[0].binning, seen.min(axis=0), seen.max(axis=0)
+    darkest, brightest = stored_mean(least, binning), stored_mean(most, binning)
+    scale = unit_at(darkest, rig, unit, binning)
+    slope, curvature = _derivatives(seen, scale, binning)
+    spectral = _spectral_derivatives(seen[0], scene.wavelength_nm, scale, binning)
     low, high = least.min(axis=0), most.max(axis=0)
+    level = np.maximum(np.abs(brightest) / unit_at(brightest, rig, unit, binning), np.abs(darkest) / scale)
     off_mean = np.maximum(most - means.min(), means.max() - least)
     off_other = np.maximum(most - low, high - least)
     return Probe(
         unit=unit, sweeps=sweeps, wavelength_nm=scene.wavelength_nm, fwhm_nm=scene.fwhm_nm,
-        level=_greatest(np.abs(most) / _unit(most, rig, unit)),
-        spread=_greatest(_above(off_mean, high) / scale),
-        span=_greatest(_above(off_other, high) / scale),
+        level=_greatest(level), spread=_greatest(stored_mean(_above(off_mean, high), binning) / scale),
+        span=_greatest(stored_mean(_above(off_other, high), binning) / scale),
         slope=slope, curvature=curvature, spectral_slope=spectral[0], spectral_curvature=spectral[1],
         brightest_e=float(most.max()), darkest_e=float(least.min()),
-        unit_least_dn=float(noise_electrons(least, rig).min()) / camera.electrons_per_dn if unit == "sigma" else 1.0,
+        unit_least_dn=float(scale.min()) / camera.electrons_per_dn,
         lines=sum(sweep.lines for sweep in sweeps), seconds=CostModel().seconds(list(sweeps), camera),
-        white_e=scene.panel_electrons.astype(np.float64) * (camera.exposure_ms / DEFAULT_EXPOSURE_MS),
+        white_e=scene.panel_electrons.astype(np.float64) * (camera.exposure_ms / DEFAULT_EXPOSURE_MS), binning=binning,
     )  # fmt: skip
 
 
-def _derivatives(seen: Light, scale: Light) -> tuple[Floats, Floats]:
-    """Greatest first and second derivatives, (2, band) each over the unit, by differences within half a px."""
+def _derivatives(seen: Light, scale: Light, binning: int) -> tuple[Floats, Floats]:
+    """Greatest first and second derivatives, (2, band) each over the unit, by differences within half a px.
+
+    Of a stored number the mean size over its samples: they may be moved one way or the other.
+    """
     level, high = seen[0], np.abs(seen[0]).max(axis=0)
+
+    def size(difference: Light) -> Floats:
+        return _greatest(stored_mean(_above(np.abs(difference), high), binning) / scale)
+
     slope, curvature = [], []
     for axis in (0, 1):
         behind, back, ahead, front, before, after = seen[1 + 6 * axis : 7 + 6 * axis]
         pairs = [(behind, back, _NEAR), (back, level, _NEAR), (level, ahead, _NEAR), (ahead, front, _NEAR),
                  (before, level, _FAR), (level, after, _FAR)]  # fmt: skip
         triples = [(back, ahead, _NEAR), (behind, front, _FAR), (before, after, _FAR)]
-        slope.append(np.max([_greatest(_above(np.abs(b - a), high) / scale) / way for a, b, way in pairs], axis=0))
-        bends = [_greatest(_above(np.abs(a + b - 2 * level), high) / scale) / way**2 for a, b, way in triples]
-        curvature.append(np.max(bends, axis=0))
+        slope.append(np.max([size(b - a) / way for a, b, way in pairs], axis=0))
+        curvature.append(np.max([size(a + b - 2 * level) / way**2 for a, b, way in triples], axis=0))
     return np.array(slope), np.array(curvature)
 
 
-def _spectral_derivatives(level: Light, wavelength_nm: Floats, scale: Light) -> tuple[Floats, Floats]:
+def _spectral_derivatives(level: Light, wavelength_nm: Floats, scale: Light, binning: int) -> tuple[Floats, Floats]:
     """Greatest divided differences over wavelength at each band, (band,) each over the unit; 0 where there is none."""
     nm = np.asarray(wavelength_nm, np.float64)
     if len(nm) < 2:
         return np.zeros(len(nm)), np.zeros(len(nm))
-    bend = np.abs(second_difference(level, nm)) / scale
-    return _greatest(steepest_difference(level, nm) / scale), _greatest(bend)
+    steep, bend = steepest_difference(level, nm), np.abs(second_difference(level, nm))
+    return _greatest(stored_mean(steep, binning) / scale), _greatest(stored_mean(bend, binning) / scale)
 
 
 def _above(difference: Light, high: Light) -> Light:

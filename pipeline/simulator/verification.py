@@ -5,45 +5,60 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import BoundError
+from pipeline.simulator.arithmetic import contrast_about, misplaced_electrons, misplaced_share
 from pipeline.simulator.block import Block
 from pipeline.simulator.chips import Units
 from pipeline.simulator.choice import Decision, Taken
 from pipeline.simulator.effects.effect import OFF, Effect, Light
 from pipeline.simulator.manifest import TOTAL, UNIT_WORDS
 from pipeline.simulator.options import acts_on_light
+from pipeline.simulator.stored_light import stored_mean
 
 Floats = NDArray[np.float64]
 Render = Callable[[Block, Mapping[Effect, str]], Light]
 
-ROUNDING = 4e-6  # of the light: float32 sums over the rays of a footprint
-
 
 @dataclass(frozen=True)
 class _Chip:
-    """A chip with everything on, and what a unit of the tolerance is at each of its samples [e-]."""
+    """A chip with everything on as it is stored, and what a unit of the tolerance is at each of its numbers [e-]."""
 
     name: str
     block: Block
-    light: Light
+    light: NDArray[np.floating]
     unit: NDArray[np.floating]
+    render: Render
+
+    @cached_property
+    def contrast(self) -> NDArray[np.floating]:
+        """Range of the scene's light about each number, (1, number, band) [e-]; only asked for where it matters."""
+        return stored_mean(contrast_about(self.block, self.render), self.block.sweep.binning)
 
 
 @dataclass(frozen=True)
 class _Change:
-    """The greatest change on a chip in units of the tolerance, what of it float32 may have made, and where it is."""
+    """The greatest change on a chip in units of the tolerance; the one that arithmetic least explains, and where."""
 
-    change: float
-    rounding: float = 0.0
+    greatest: float
+    change: float = 0.0
+    rounding: float = 0.0  # what of it arithmetic may have made
     place: str = ""
+
+    @property
+    def unexplained(self) -> float:
+        """What arithmetic can not have made; endless where light is no number."""
+        return math.inf if math.isnan(self.change) else self.change - self.rounding
 
 
 def verify(decision: Decision, render: Render, chips: Mapping[str, Block], units: Units) -> dict[str, float]:
     """Measure on chips what every effect that is off or cheapened changes, and all together, against everything on.
+
+    What changes are numbers as they are stored: sums of neighbouring samples where a sweep bins them.
 
     Draws are paired: streams are keyed by seed, sweep, line and effect, so that the difference is the effect's alone.
     Effects of the readout change distributions, not expected light, and are not measured here.
@@ -55,7 +70,7 @@ def verify(decision: Decision, render: Render, chips: Mapping[str, Block], units
     chips
         By name, as `chips.worst_chips` chooses them.
     units
-        From expected electrons with everything on to one unit of the tolerance at each. [e-]
+        From expected electrons with everything on, and their binning, to one unit of the tolerance at each. [e-]
 
     Returns
     -------
@@ -65,20 +80,18 @@ def verify(decision: Decision, render: Render, chips: Mapping[str, Block], units
     ------
     BoundError : a change exceeds the bound that the decision counted on; names effect, bound, change and place.
     """
-    full = []
-    for name, block in _once_each(chips).items():
-        light = render(block, decision.exact)
-        full.append(_Chip(name, block, light, np.broadcast_to(units(light), light.shape)))
+    full = [_chip(name, block, render, decision, units) for name, block in _once_each(chips).items()]
     changed = [one for one in decision.taken if _changes_light(one)]
     trials = [(one.name, [one]) for one in changed] + [(TOTAL, changed)]
     measured: dict[str, float] = {}
     for name, inexact in trials:
         bound, chosen = math.fsum(one.option.error for one in inexact), _with(decision, inexact)
-        found = [_greatest_change(chip, render(chip.block, chosen)) for chip in full] if inexact else []
-        worst = max(found, key=lambda one: math.inf if math.isnan(one.change) else one.change, default=_Change(0.0))
-        if not worst.change <= bound + worst.rounding:
+        share = misplaced_share(decision.exact, chosen)
+        found = [_greatest_change(chip, render(chip.block, chosen), bound, share) for chip in full] if inexact else []
+        worst = max(found, key=lambda one: one.unexplained, default=_Change(0.0))
+        if not worst.unexplained <= bound:
             raise BoundError(_complaint(name, worst, bound, decision))
-        measured[name] = worst.change
+        measured[name] = max((one.greatest for one in found), default=0.0)
     return measured
 
 
@@ -88,6 +101,12 @@ def _once_each(chips: Mapping[str, Block]) -> dict[str, Block]:
     for name, block in chips.items():
         names.setdefault((block.sweep.name, block.lines), []).append(name)
     return {" and ".join(said): chips[said[0]] for said in names.values()}
+
+
+def _chip(name: str, block: Block, render: Render, decision: Decision, units: Units) -> _Chip:
+    light = stored_mean(render(block, decision.exact), block.sweep.binning)
+    unit = np.broadcast_to(units(np.asarray(light, np.float32), block.sweep.binning), light.shape)
+    return _Chip(name, block, light, unit, render)
 
 
 def _changes_light(one: Taken) -> bool:
@@ -101,15 +120,22 @@ def _with(decision: Decision, inexact: Sequence[Taken]) -> dict[Effect, str]:
     return {effect: variant for effect, variant in variants.items() if variant != OFF}
 
 
-def _greatest_change(chip: _Chip, light: Light) -> _Change:
-    change = np.abs(light.astype(np.float64) - chip.light) / chip.unit
+def _greatest_change(chip: _Chip, light: Light, bound: float, share: float) -> _Change:
+    binning = chip.block.sweep.binning
+    change = np.abs(stored_mean(light, binning).astype(np.float64) - chip.light) / chip.unit
     if not change.size:
         return _Change(0.0)
-    line, sample, band = np.unravel_index(int(np.argmax(change)), change.shape)  # the first NaN, if there is one
-    block = chip.block
-    place = f"sweep {block.sweep.name}, line {block.numbers[line]}, sample {block.columns[sample]}, band {band}"
-    rounding = ROUNDING * float(np.max(np.abs(chip.light) / chip.unit))
-    return _Change(float(change[line, sample, band]), rounding, f"{place} of the {chip.name} chip")
+    rounding = np.zeros(change.shape)
+    if not change.max() <= bound:
+        rounding = misplaced_electrons(chip.light, chip.contrast, share) / chip.unit
+    worst = np.unravel_index(int(np.argmax(change - rounding)), change.shape)  # the first NaN, if there is one
+    line, number, band = worst
+    block, summed = chip.block, "" if binning == 1 else f" (of {binning} summed)"
+    count = number if binning > 1 else block.columns[number]
+    place = f"sweep {block.sweep.name}, line {block.numbers[line]}, sample {count}{summed}, band {band}"
+    return _Change(
+        float(change.max()), float(change[worst]), float(rounding[worst]), f"{place} of the {chip.name} chip"
+    )
 
 
 def _complaint(name: str, worst: _Change, bound: float, decision: Decision) -> str:

@@ -25,13 +25,15 @@ from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Rig
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+from pipeline.simulator.stored_light import noise_electrons
+from pipeline.simulator.survey_probe import probe_scene
 from pipeline.simulator.verification import verify
 from tests.pipeline.simulator.bound_trials import DRAWN, Trial, trials
 from tests.pipeline.simulator.random_cases import random_case
 
 CASES = 200
 MOST_LOOSE = 6.0  # median of bound over measured change
+MOST_BINNING = 8  # every case is stored as samples, and in sums of 2 to so many
 TOLERANCE = 0.1
 LEAST_SAVED = 3.0
 LOOK = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[1]}
@@ -48,26 +50,26 @@ def _bounds(numbers: Sequence[int]) -> list[Row]:
     found: dict[tuple[str, str], list[tuple[int, Trial]]] = defaultdict(list)
     began = time.process_time()
     for number in numbers:
-        for trial in trials(random_case(number)):
+        for trial in trials(random_case(number), (1, 2 + number % (MOST_BINNING - 1))):
             found[trial.effect, trial.variant].append((number, trial))
     spent = time.process_time() - began
     kept = [_of_effect(*key, cases) for key, cases in found.items()]
     broken = sum(trial.is_broken for cases in found.values() for _, trial in cases)
     count = sum(map(len, found.values()))
     return [*kept, Row(
-        f"bounds of effects and variants over {len(numbers)} random scenes and rigs",
+        f"bounds over {len(numbers)} random scenes and rigs, each as samples and in sums of 2 to {MOST_BINNING}",
         f"{broken} of {count} broken", "0", broken == 0, f"{spent:.0f} s of processor time",
     )]  # fmt: skip
 
 
 def _of_effect(name: str, variant: str, cases: list[tuple[int, Trial]]) -> Row:
-    loose = {number: trial.looseness for number, trial in cases if np.isfinite(trial.looseness)}
-    broken = [number for number, trial in cases if trial.is_broken]
+    loose = {(number, trial.binning): trial.looseness for number, trial in cases if np.isfinite(trial.looseness)}
+    broken = [(number, trial.binning) for number, trial in cases if trial.is_broken]
     said = "nothing seen"
     if loose:
         worst = max(loose, key=loose.__getitem__)
         said = f"median {statistics.median(loose.values()):.2g}, {min(loose.values()):.2g} to {loose[worst]:.3g}"
-        said += f" (case {worst})"
+        said += f" (case {worst[0]}, sums of {worst[1]})"
     chance = "; 1 survey of 1000 may" if name in DRAWN else ""
     return Row(
         f"bound / measured: {name}, {variant}",
@@ -145,7 +147,10 @@ def _cpu_row(name: str, against: str, clocks: Mapping[str, Clock], apart: float)
 
 def _verified(scene: RasterScene, name: str, decision: Decision, probe: Probe, before: str) -> Row:
     rig, clock = RIGS[name], time.process_time()
-    units = partial(noise_electrons, rig=rig)
+
+    def units(light: Light, binning: int) -> Light:
+        return noise_electrons(light, rig, binning)
+
     whole = [_block(scene, rig, sweep, range(sweep.lines)) for sweep in probe.sweeps]
     chips = worst_chips(candidate_chips(whole, probe.places), lambda chip: expected_light(scene, chip, LOOK), units)
     measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), chips, units)

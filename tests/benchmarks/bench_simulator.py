@@ -27,7 +27,8 @@ from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+from pipeline.simulator.stored_light import noise_electrons
+from pipeline.simulator.survey_probe import probe_scene
 
 SIZE = 2560  # px of the scene
 LINES, AT_ONCE = 256, 16

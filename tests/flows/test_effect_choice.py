@@ -91,7 +91,7 @@ def test_a_decision_that_is_there_draws_nothing(
 
     run = opened(scene_files, decided[0], budget="0.9", policy="random")
     monkeypatch.setattr(RasterScene, "sample", refuse)
-    monkeypatch.setattr(effect_choice, "probe_scene", refuse)
+    monkeypatch.setattr(effect_choice, "probe_survey", refuse)
     assert choose(run) == decided[1]
 
 

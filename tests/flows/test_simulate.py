@@ -185,3 +185,14 @@ def test_the_table_fits_the_terminal(width: int) -> None:
     assert ("0.3 nm" in row) == (width >= 100)
     assert "smile: smile" not in said.getvalue()
     assert "Not there: wind (the air is calm)." in said.getvalue()
+
+
+def test_rows_at_the_longest_exposure_are_scanned(command_line: Any, tmp_path: Path) -> None:
+    """Light of sixty full wells beside dark rows: what arithmetic loses of it is no broken bound."""
+    rows = np.zeros((128, 160, 3), np.float32)
+    rows[1::2] = 1
+    np.save(tmp_path / "rows.npy", rows)
+    flags = ["--wavelengths", "640,550,460", "--exposure-ms", "10000", "-o", str(tmp_path / "scan"), "--json"]
+    record = json.loads(command_line("simulate", str(tmp_path / "rows.npy"), *flags).out)
+    assert record["lines"] == 131
+    assert record["effects_total"]["within"]

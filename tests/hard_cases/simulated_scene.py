@@ -20,7 +20,8 @@ from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
 from pipeline.simulator.scene import RasterScene
-from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+from pipeline.simulator.stored_light import noise_electrons
+from pipeline.simulator.survey_probe import probe_scene
 
 ROUNDING = 4e-6  # of the light over its noise: sums of float32 in another order
 CAMERA = LineCamera(samples=64)

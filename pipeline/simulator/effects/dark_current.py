@@ -42,7 +42,8 @@ class DarkCurrent:
         sd = float(np.hypot(rig.camera.read_noise_e, np.sqrt(max(probe.darkest_e, 0.0))))
         spread = told_apart(float(np.hypot(sd, np.sqrt(electrons))), sd)
         if probe.unit == "dn":
-            spread *= float(np.hypot(sd, np.sqrt(electrons))) / rig.camera.electrons_per_dn
+            summed = float(np.sqrt(probe.binning))  # the spread of a sum over that of a sample
+            spread *= summed * float(np.hypot(sd, np.sqrt(electrons))) / rig.camera.electrons_per_dn
         warm = rig.detector.temperature_deg_c
         why = f"{electrons:.3g} e- in {rig.camera.exposure_ms:g} ms at {warm:g} deg C, beside {sd:.3g} e- of noise"
         return Bound(probe.added(electrons, rig.camera.electrons_per_dn) + spread, why)

@@ -46,7 +46,7 @@ class Jitter:
         exceeds m with probability exp(-m^2 / 2), so any of n lines' does with at most n exp(-m^2 / 2): m is
         sqrt(2 ln(n / 1e-3)), 5.4 for 2560 lines.
         """
-        sigma, lines = _sigma_px(rig), sum(sweep.lines for sweep in probe.sweeps)
+        sigma, lines = _sigma_px(rig), probe.lines
         if variant != OFF or sigma == 0 or lines == 0:
             return Bound(0.0, "the mirror comes back to the same tilt" if variant == OFF else "exact")
         along, scan, common = _spreads(probe, rig)

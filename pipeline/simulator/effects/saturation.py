@@ -41,7 +41,8 @@ class Saturation:
         why = f"{expected:.3g} e- and 6 x {sd:.3g} e- of noise reach {over:.3g} e- above the limit of {limit:.3g} e-"
         unit_dn = probe.unit_least_dn
         if probe.unit == "sigma" and sd > 0 and not rig.detector.hot_share:  # what is lost, is lost where it is bright
-            unit_dn = float(np.hypot(np.sqrt(brightest), camera.read_noise_e)) / camera.electrons_per_dn
+            of_sample = float(np.hypot(np.sqrt(brightest), camera.read_noise_e)) / camera.electrons_per_dn
+            unit_dn = of_sample / np.sqrt(probe.binning)
         return Bound(over / camera.electrons_per_dn / unit_dn, why)
 
 

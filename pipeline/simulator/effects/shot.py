@@ -71,7 +71,8 @@ class Shot:
     def _of_gaussian(self, probe: Probe, rig: Rig, total: float) -> Bound:
         read = rig.camera.read_noise_e
         worst = max(chip_variation(0.0), chip_variation(read))
-        apart = 2 * worst / np.sqrt(CHIP_SAMPLES)  # of one number: 2 TV <= sqrt(divergence)
+        apart = 2 * worst / np.sqrt(CHIP_SAMPLES)  # of one sample: 2 TV <= sqrt(divergence), which sums with samples
+        apart *= np.sqrt(probe.binning)
         why = (
             f"{CHIP_SAMPLES:.0e} numbers have a total variation of at most {worst:.2g} from exact ones"
             f" (limit {MOST_VARIATION:.2g}); exact below {least_expected(read):.3g} e-, without read noise"
@@ -84,5 +85,7 @@ SHOT = Shot()
 
 
 def in_unit(deviations: float, sd_e: float, probe: Probe, rig: Rig) -> float:
-    """Give deviations of a noise of ``sd_e`` [e-] in the unit of the probe."""
-    return deviations if probe.unit == "sigma" else deviations * sd_e / rig.camera.electrons_per_dn
+    """Give deviations of a noise of ``sd_e`` in each sample [e-] in the unit of the probe."""
+    if probe.unit == "sigma":
+        return deviations
+    return deviations * sd_e * float(np.sqrt(probe.binning)) / rig.camera.electrons_per_dn

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -36,7 +37,10 @@ class Smear:
     cost_ns = MappingProxyType({POSITIONS: 7.8, FOLDED: 5.2})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
-        """Bound what a blur of the positions' variance changes; 0 where every line has one position."""
+        """Bound what a blur of the positions' variance changes; 0 where every line has one position.
+
+        They vary as the mirror runs: without them its course within an exposure is left out as well.
+        """
         most = max((sweep.step for sweep in probe.sweeps), default=1)
         variance = held_variance(most)
         if variant == POSITIONS or variance == 0:
@@ -53,7 +57,7 @@ class Smear:
             step = PARALLAX.bound(probe, rig).value if rig.air.relief == "step" else 0.0
             return Bound(float(change.max(initial=0.0)) + step, f"lines of an exposure lie as one, {most} px")
         both = np.zeros(probe.slope.shape)
-        both[1] = variance
+        both[1] = max(variance, _greatest_variance(probe.sweeps, rig))
         return Bound(probe.blurred(both), f"the mirror moves {most} px in an exposure")
 
 
@@ -62,12 +66,21 @@ SMEAR = Smear()
 
 def _uneven_course(sweeps: tuple[Sweep, ...], rig: Rig) -> float:
     """Greatest mean way of held positions from where the mirror's mean in the exposure would have them. [px]"""
-    worst = 0.0
+    uneven = (np.abs(ways - ways.mean(axis=1, keepdims=True)).mean(axis=1) for ways in _courses(sweeps, rig))
+    return max((float(one.max()) for one in uneven), default=0.0)
+
+
+def _greatest_variance(sweeps: tuple[Sweep, ...], rig: Rig) -> float:
+    """Greatest variance of the positions of an exposure as the mirror runs, not as planned. [px^2]"""
+    held = ((ways + np.arange(ways.shape[1])).var(axis=1) for ways in _courses(sweeps, rig))
+    return max((float(one.max()) for one in held), default=0.0)
+
+
+def _courses(sweeps: tuple[Sweep, ...], rig: Rig) -> Iterator[Floats]:
+    """Ways of held positions beside their plan, (line, step), of each kind of sweep that has several. [px]"""
     for sweep in {(one.lines, one.step): one for one in sweeps if one.lines and one.step > 1}.values():
         numbers = np.arange(sweep.lines)
-        ways = transient(rig, sweep, numbers) + beside_plan(rig.mirror.positions_per_line, sweep.step, numbers)
-        worst = max(worst, float(np.abs(ways - ways.mean(axis=1, keepdims=True)).mean(axis=1).max()))
-    return worst
+        yield transient(rig, sweep, numbers) + beside_plan(rig.mirror.positions_per_line, sweep.step, numbers)
 
 
 def held_variance(positions: int) -> float:

@@ -84,7 +84,7 @@ def _most_halo(probe: Probe, rig: Rig, spread: float) -> float:
     elsewhere = _uneven_share(probe, rig)
     per_dn = rig.camera.electrons_per_dn
     range_e, least_e = max(probe.brightest_e - probe.darkest_e, 0.0), probe.unit_least_dn * per_dn
-    most = math.sqrt(1 + range_e / least_e**2) if probe.unit == "sigma" else 1.0
+    most = math.sqrt(1 + range_e / (probe.binning * least_e**2)) if probe.unit == "sigma" else 1.0
     return min(elsewhere * probe.added(range_e, per_dn), min(2 * elsewhere, 1) * spread * most)
 
 

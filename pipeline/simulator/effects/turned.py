@@ -19,7 +19,7 @@ def beside_plan_px(probe: Probe, rig: Rig) -> tuple[float, float]:
 
     Along the line and the scan. Lines lie turned by where the mirror looks: the farther from the middle, the more.
     """
-    mirror, lines = rig.mirror, max(sum(sweep.lines for sweep in probe.sweeps), 1)
+    mirror, lines = rig.mirror, max(probe.lines, 1)
     drift = mirror.drift_px_per_min / 60 * (probe.seconds + rig.camera.frame_ms * 1e-3)
     jitter = _RAY_PER_TILT * mirror.repeatability_urad * 1e-6 / rig.camera.ifov_rad
     drawn = (jitter + turbulence_px(rig)) * math.sqrt(2 * math.log(lines / 1e-3))

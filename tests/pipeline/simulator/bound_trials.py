@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ from pipeline.simulator.effects.effect import OFF, Effect, Light
 from pipeline.simulator.effects.registry import EFFECTS, READOUT
 from pipeline.simulator.options import SAFETY, Menu, list_options
 from pipeline.simulator.render import expected_light
-from pipeline.simulator.survey_probe import noise_electrons
+from pipeline.simulator.stored_light import noise_electrons
 from tests.pipeline.simulator.random_cases import Case
 
 ROUNDING = 4e-6  # of the light over the unit: sums of float32 in another order
@@ -22,10 +22,11 @@ IN_THE_LIGHT: tuple[Effect, ...] = tuple(effect for effect in EFFECTS if effect 
 
 @dataclass(frozen=True)
 class Trial:
-    """``bound`` is the composed one, with gains of other effects and without `SAFETY`; both in sigma."""
+    """``bound`` is the composed one, with gains of other effects and without `SAFETY`; both in sigma as stored."""
 
     effect: str
     variant: str
+    binning: int
     bound: float
     measured: float
     rounding: float
@@ -41,32 +42,60 @@ class Trial:
         return self.bound / self.measured if self.measured > 10 * self.rounding else np.nan
 
 
-def trials(case: Case) -> Iterator[Trial]:
+@dataclass(frozen=True)
+class _Stored:
+    """A case as it is stored in sums of so many samples: what is decided of it, and its noise."""
+
+    binning: int
+    menus: tuple[Menu, ...]
+    noise: list[Light]  # of each block with everything on, of the sums (line, number, band) [e-]
+    rounding: float
+
+    def change(self, light: list[Light], full: list[Light]) -> float:
+        """Greatest change of a stored number in its own sigmas."""
+        sums = (_summed(one - other, self.binning) for one, other in zip(light, full, strict=True))
+        return max(float((np.abs(one) / noise).max()) for one, noise in zip(sums, self.noise, strict=True))
+
+
+def trials(case: Case, binnings: Sequence[int] = (1,)) -> Iterator[Trial]:
     """Leave out every effect that the rig has, and take each variant, beside all others exact.
 
-    Changes are over the noise at every sample of all sweeps, with everything on; draws are paired.
+    Changes are over the noise of every stored number of all sweeps, with everything on; draws are paired. The same
+    light is stored in each of the ``binnings``.
     """
-    probe = case.probe()
-    menus = [menu for menu in list_options(probe, case.rig, IN_THE_LIGHT) if menu.present]
-    exact: dict[Effect, str] = {menu.effect: menu.exact.variant for menu in menus}
-    blocks = case.blocks(probe)
+    probes = [case.stored_in_sums_of(binning).probe() for binning in binnings]
+    menus = [list_options(probe, case.rig, IN_THE_LIGHT) for probe in probes]
+    present = [menu for menu in menus[0] if menu.present]
+    exact: dict[Effect, str] = {menu.effect: menu.exact.variant for menu in present}
+    blocks = case.blocks(probes[0])
     full = [expected_light(case.scene, block, exact) for block in blocks]
-    units = [noise_electrons(light, case.rig) for light in full]
-    rounding = ROUNDING * max(float((np.abs(light) / unit).max()) for light, unit in zip(full, units, strict=True))
-    for menu, variant, error in _options(menus):
-        chosen = {effect: variant if effect is menu.effect else way for effect, way in exact.items()}
-        changes = (
-            np.abs(_light(case, block, chosen) - light) / unit
-            for block, light, unit in zip(blocks, full, units, strict=True)
-        )
-        yield Trial(menu.name, variant, error / SAFETY, max(float(change.max()) for change in changes), rounding)
+    stored = [_stored(full, case, binning, found) for binning, found in zip(binnings, menus, strict=True)]
+    for menu in present:
+        for variant in (OFF, *(option.variant for option in menu.variants[1:])):
+            chosen = {effect: variant if effect is menu.effect else way for effect, way in exact.items()}
+            light = [_light(case, block, chosen) for block in blocks]
+            for one in stored:
+                bound = _error(one.menus, menu.name, variant) / SAFETY
+                yield Trial(menu.name, variant, one.binning, bound, one.change(light, full), one.rounding)
 
 
-def _options(menus: list[Menu]) -> Iterator[tuple[Menu, str, float]]:
-    for menu in menus:
-        yield menu, OFF, menu.off.error
-        for option in menu.variants[1:]:
-            yield menu, option.variant, option.error
+def _stored(full: list[Light], case: Case, binning: int, menus: tuple[Menu, ...]) -> _Stored:
+    noise = [np.sqrt(_summed(np.square(noise_electrons(light, case.rig)), binning)) for light in full]
+    sums = [_summed(np.abs(light), binning) for light in full]
+    level = max(float((light / one).max()) for light, one in zip(sums, noise, strict=True))
+    return _Stored(binning, menus, noise, ROUNDING * level)
+
+
+def _summed(values: Light, binning: int) -> Light:
+    """Sums of neighbouring samples, a remainder dropped."""
+    count = values.shape[1] // binning
+    sums: Light = values[:, : count * binning].reshape(len(values), count, binning, -1).sum(axis=2)
+    return sums
+
+
+def _error(menus: tuple[Menu, ...], name: str, variant: str) -> float:
+    menu = next(one for one in menus if one.name == name)
+    return next(option.error for option in (menu.off, *menu.variants) if option.variant == variant)
 
 
 def _light(case: Case, block: Block, chosen: dict[Effect, str]) -> Light:

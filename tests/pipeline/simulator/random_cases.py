@@ -44,6 +44,10 @@ class Case:
     seconds: float | None  # from the first line to the last; None is that of the sweeps
     seed: int
 
+    def stored_in_sums_of(self, binning: int) -> Case:
+        """The same, with so many neighbouring samples summed to one number."""
+        return replace(self, sweeps=tuple(replace(sweep, binning=binning) for sweep in self.sweeps))
+
     def probe(self) -> Probe:
         """What the decision sees of it."""
         probe = probe_scene(self.scene, self.rig, self.sweeps)

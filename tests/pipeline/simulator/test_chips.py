@@ -18,7 +18,7 @@ FAR = Sweep("far", "fine", "y", -400.0, -900.0, 50)
 WHOLE = Block(RIG, FAR, range(50), np.array([500.0]), (1000, 2000))
 
 
-def ones(light: Light) -> Light:
+def ones(light: Light, binning: int) -> Light:
     """Electrons are the unit."""
     return np.ones_like(light)
 
@@ -37,6 +37,22 @@ def test_worst_chips_are_about_the_worst_places():
     assert {name: chip.lines.start for name, chip in found.items() if name != "most oblique"} == {
         "steepest": 20, "brightest": 10, "darkest": 45}  # fmt: skip
     assert found["most oblique"].normals[:, 2].max() == WHOLE.normals[:, 2].max()
+
+
+def test_each_binning_has_worst_chips_of_its_own():
+    """Sums by sums: what is brightest as a sample need not be so in a sum of 4."""
+
+    def light(chip: Block) -> Light:
+        seen = np.full((50, 640, 1), 50.0, np.float32)
+        seen[10, 100], seen[30, 100:108] = 60.0, 58.0
+        return seen[chip.lines.start : chip.lines.stop]
+
+    coarse = replace(WHOLE, sweep=replace(FAR, binning=4))
+    chips = [replace(whole, lines=range(at, at + 5)) for whole in (WHOLE, coarse) for at in range(0, 50, 5)]
+    found = worst_chips(chips, light, ones)
+    assert found["brightest"].lines.start == 10
+    assert found["brightest in sums of 4"].lines.start == 30
+    assert found["brightest in sums of 4"].sweep.binning == 4
 
 
 def test_candidates_are_about_places_that_the_sweep_sees():

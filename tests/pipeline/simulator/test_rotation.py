@@ -14,7 +14,8 @@ from pipeline.simulator.effects.slit import SLIT
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import RasterScene, raster_from_values
-from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+from pipeline.simulator.stored_light import noise_electrons
+from pipeline.simulator.survey_probe import probe_scene
 
 RIG = Rig(camera=LineCamera(samples=80))
 

@@ -14,7 +14,8 @@ from pipeline.simulator.effects.smear import SMEAR, folded_positions, held_varia
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import raster_from_values
-from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+from pipeline.simulator.stored_light import noise_electrons
+from pipeline.simulator.survey_probe import probe_scene
 from tests.pipeline.simulator.bound_trials import trials
 from tests.pipeline.simulator.random_cases import random_case
 

@@ -25,8 +25,9 @@ from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Detector, Rig
 from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.stored_light import noise_electrons, stored_mean
 from pipeline.simulator.survey_looks import views_of_places
-from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+from pipeline.simulator.survey_probe import probe_scene, probe_survey
 
 RIG = Rig(camera=LineCamera(samples=96))
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-30.0, lines=61)
@@ -131,7 +132,7 @@ def test_places_are_seen_from_the_most_oblique_sweep_that_reaches_them() -> None
     """Of two sweeps that overlap, the finer one and the one whose lines are turned more."""
     scene = mixed(1, (80, 1000))
     fine = replace(SWEEP, name="a", strip_px=360.0)
-    coarse = replace(SWEEP, name="b", kind="coarse", strip_px=420.0, lines=15, step=4, binning=4)
+    coarse = replace(SWEEP, name="b", kind="coarse", strip_px=420.0, lines=15, step=4)
     found = views_of_places(np.array([[40.0, 890.0]]), scene, RIG.camera, (fine, coarse))
     assert set(found.sweep) == {0, 1}
     assert set(found.strip_px[found.sweep == 1]) == {420.0}
@@ -173,9 +174,48 @@ def test_coarse_sweeps_are_looked_at_where_they_hold() -> None:
     """A coarse sweep's probe is that of a fine one over the same path."""
     scene = mixed(3)
     fine = probe_scene(scene, RIG, [SWEEP])
-    coarse = probe_scene(scene, RIG, [replace(SWEEP, kind="coarse", lines=15, step=4, binning=4)])
+    coarse = probe_scene(scene, RIG, [replace(SWEEP, kind="coarse", lines=15, step=4)])
     np.testing.assert_allclose(coarse.slope, fine.slope, rtol=0.2)
     assert (coarse.lines, coarse.sweeps[0].step) == (15, 4)
+
+
+@pytest.mark.parametrize("binning", [2, 4, 7])
+@pytest.mark.parametrize("along", ["x", "y"])
+def test_no_stored_sum_exceeds_its_probe(binning: int, along: str) -> None:
+    """Sums' levels, and what a sample on either side changes of them, are within 1.05 of the probe for the binning."""
+    scene = mixed(binning, (96, 110))
+    sweep = replace(SWEEP, along=along, binning=binning, start_px=-20.0, lines=41)
+    probe = probe_scene(scene, RIG, [sweep])
+    light = seen(scene, sweep)
+    noise = noise_electrons(stored_mean(light, binning), RIG, binning)
+    level = (stored_mean(light, binning) / noise).max(axis=(0, 1))
+    assert (level <= 1.03 * probe.level).all()
+    assert (level >= 0.9 * probe.level).all()
+    steps = np.abs(np.diff(light, axis=0))
+    least = np.minimum(noise[1:], noise[:-1])
+    assert (stored_mean(steps, binning) / least).max() <= 1.05 * probe.slope[1].max()
+    assert probe.binning == binning
+
+
+def test_a_bright_sum_counts_by_the_root_of_its_samples() -> None:
+    """Of an even scene the level in sigmas of a sum of 4 is twice that of a sample, in DN 4 times."""
+    scene = scene_of(np.full((50, 60, 1), 3.0))
+    four = replace(SWEEP, binning=4)
+    for unit, growth in (("sigma", 2.0), ("dn", 4.0)):
+        probes = [probe_scene(scene, RIG, [sweep], unit) for sweep in (SWEEP, four)]
+        assert probes[1].level[0] == pytest.approx(growth * probes[0].level[0], rel=1e-4)
+        assert probes[1].unit_least_dn == pytest.approx(probes[0].unit_least_dn / growth, rel=1e-4)
+
+
+def test_a_survey_has_a_probe_for_each_binning() -> None:
+    """The smallest first, each with its own sweeps, and the time and the lines of all."""
+    scene, coarse = mixed(4), replace(SWEEP, name="c", kind="coarse", lines=15, step=4, binning=4)
+    probes = probe_survey(scene, RIG, [coarse, SWEEP])
+    assert [(one.binning, one.sweeps) for one in probes] == [(1, (SWEEP,)), (4, (coarse,))]
+    assert {one.lines for one in probes} == {76}
+    assert probes[0].seconds == probes[1].seconds > probe_scene(scene, RIG, [SWEEP]).seconds
+    with pytest.raises(SettingsError, match=r"one binning, got \[1, 4\]"):
+        probe_scene(scene, RIG, [coarse, SWEEP])
 
 
 def test_unit_of_a_noiseless_rig_is_the_quantisation() -> None:

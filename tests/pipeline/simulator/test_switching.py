@@ -26,7 +26,8 @@ from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.survey_probe import noise_electrons, probe_scene
+from pipeline.simulator.stored_light import noise_electrons
+from pipeline.simulator.survey_probe import probe_scene
 from pipeline.simulator.verification import verify
 
 TOLERANCE = 0.1
@@ -138,8 +139,8 @@ def test_what_is_left_out_keeps_its_bounds_on_the_worst_chips(case: Case):
     ]
     candidates = candidate_chips(whole, probed(case).places, lines=1)
 
-    def units(light: Light32) -> Light32:
-        return noise_electrons(light, rig)
+    def units(light: Light32, binning: int) -> Light32:
+        return noise_electrons(light, rig, binning)
 
     footprint = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[-1]}
     chips = worst_chips(candidates, lambda chip: expected_light(scene, chip, footprint), units)

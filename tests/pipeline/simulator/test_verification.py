@@ -30,7 +30,7 @@ def render(block: Block, chosen: Mapping[Effect, str]) -> Light:
     return light
 
 
-def units(light: Light) -> Floats:
+def units(light: Light, binning: int) -> Floats:
     """100 e- are one unit."""
     return np.full(light.shape, 100.0)
 
@@ -81,3 +81,17 @@ def test_rounding_alone_breaks_no_bound():
     """Sums of float32 in another order differ by some millionths."""
     decision = decided(Brightening("drift", 1e-9, share=2e-6))
     assert verify(decision, render, CHIPS, units)["drift"] == pytest.approx(2.4e-6, rel=0.1)
+
+
+def test_sums_are_held_against_the_bound_as_they_are_stored():
+    """An error that 4 samples share is twice as many sigmas of their sum: one that a sample alone would hide."""
+    coarse = replace(BLOCK, sweep=replace(SWEEP, binning=4))
+    shared = Brightening("drift", 0.01, share=0.01)
+
+    def noise(light: Light, binning: int) -> Floats:
+        return np.full(light.shape, 100.0 / np.sqrt(binning))
+
+    assert verify(decided(shared), render, {"steepest": BLOCK}, noise)["drift"] == pytest.approx(0.01, rel=1e-3)
+    said = r"light by 0\.02 sigma .* sample 0 \(of 4 summed\), band 0 of the steepest chip"
+    with pytest.raises(BoundError, match=said):
+        verify(decided(shared), render, {"steepest": coarse}, noise)

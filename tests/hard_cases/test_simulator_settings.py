@@ -1,0 +1,126 @@
+"""The choice of effects over permitted settings: it ends, and what it leaves out keeps its bounds as it is stored.
+
+Scenes from black to far beyond saturation, exposures from the shortest to the longest, 1 to 16 samples summed, bands at
+any wavelengths, with noise and without.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from pipeline.camera import LineCamera
+from pipeline.scan import Sweep
+from pipeline.simulator.chips import candidate_chips, worst_chips
+from pipeline.simulator.choice import decide
+from pipeline.simulator.effects.effect import Effect, Light
+from pipeline.simulator.effects.registry import EFFECTS
+from pipeline.simulator.effects.rotation import ROTATION
+from pipeline.simulator.effects.slit import SLIT
+from pipeline.simulator.instrument import sweep_block
+from pipeline.simulator.manifest import TOTAL
+from pipeline.simulator.probe import Unit
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Air, Detector, Rig
+from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.stored_light import noise_electrons, stored_mean, unit_at
+from pipeline.simulator.survey_probe import probe_survey
+from pipeline.simulator.verification import verify
+from tests.hard_cases.simulated_scene import scene_of
+
+LOOK: dict[Effect, str] = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[-1]}
+SHAPE = (40, 64)
+PATTERNS = ("black", "even", "rows", "columns", "checkers", "pixel", "disc", "noise", "decades")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Settings of a scan, as a user may give them."""
+
+    pattern: str = "rows"
+    exposure_ms: float = 10_000.0
+    binning: int = 4
+    wavelengths: tuple[float, ...] = (640.0, 550.0, 460.0)
+    tolerance: float = 0.1
+    unit: Unit = "sigma"
+    read_noise_e: float = 20.0
+    noiseless: bool = False
+    distance_m: float | None = None
+    seed: int = 0
+
+    def rig(self) -> Rig:
+        """A narrow one, so that it is fast."""
+        camera = LineCamera(samples=64, exposure_ms=self.exposure_ms, read_noise_e=self.read_noise_e)
+        return Rig(camera, detector=Detector(noiseless=self.noiseless), air=Air(distance_m=self.distance_m))
+
+    def scene(self) -> RasterScene:
+        """A pattern from 0 to 1 in every band, or over four decades."""
+        y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+        rng = np.random.default_rng(self.seed)
+        plane = {
+            "black": np.zeros(SHAPE), "even": np.ones(SHAPE), "rows": y % 2, "columns": x % 2, "checkers": (x + y) % 2,
+            "pixel": (y == 20) & (x == 30), "disc": np.hypot(y - 20, x - 30) < 4, "noise": rng.random(SHAPE),
+            "decades": 10 ** rng.uniform(-2, 2, SHAPE),
+        }[self.pattern]  # fmt: skip
+        values = plane[..., None] * rng.uniform(0.3, 1, len(self.wavelengths))
+        return raster_from_values(values, self.rig().camera, name="t", wavelength_nm=np.array(self.wavelengths))
+
+
+ASKED = st.builds(
+    Asked,
+    pattern=st.sampled_from(PATTERNS),
+    exposure_ms=st.one_of(st.sampled_from([0.5, 100.0, 10_000.0]), st.floats(0.5, 10_000.0)),
+    binning=st.integers(1, 16),
+    wavelengths=st.lists(st.floats(300, 2500), min_size=1, max_size=4, unique=True).map(tuple),
+    tolerance=st.sampled_from([0.0, 1e-3, 0.1, 1.0, np.inf]),
+    unit=st.sampled_from(["sigma", "dn"]),
+    read_noise_e=st.sampled_from([0.0, 20.0]),
+    noiseless=st.booleans(),
+    distance_m=st.sampled_from([None, 10.0, 300.0]),
+    seed=st.integers(0, 20),
+)
+
+
+@settings(max_examples=4, deadline=None)
+@given(ASKED)
+@example(Asked())
+@example(Asked(pattern="columns", binning=14, noiseless=True))
+@example(Asked(pattern="black", exposure_ms=0.5, binning=16, distance_m=300.0, unit="dn"))
+def test_every_permitted_setting_is_decided_and_verified(asked: Asked) -> None:
+    """None ends in an error of ours: no broken bound, no number that is not finite, no warning."""
+    scene, rig = asked.scene(), asked.rig()
+    sweeps = (
+        Sweep("coarse-0", "coarse", "x", 0.0, -20.0, SHAPE[0] // 4, 4, asked.binning),
+        Sweep("full-0", "fine", "x", 0.0, -20.0, SHAPE[0]),
+    )
+    probes = probe_survey(scene, rig, sweeps, asked.unit)
+    decision = decide(probes, rig, EFFECTS, asked.tolerance)
+
+    def units(light: Light, binning: int) -> Light:
+        return unit_at(light, rig, asked.unit, binning)
+
+    chips = [
+        chip
+        for probe in probes
+        for chip in candidate_chips(
+            [sweep_block(scene, rig, sweep, range(sweep.lines)) for sweep in probe.sweeps], probe.places[:4]
+        )
+    ]
+    worst = worst_chips(chips, lambda chip: expected_light(scene, chip, LOOK), units)
+    measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), worst, units)
+    assert np.isfinite(measured[TOTAL])
+
+
+@pytest.mark.parametrize("electrons", [1250.0, 1900.0, 15_000.0])
+def test_what_a_choice_leaves_out_stays_within_the_tolerance_as_it_is_stored(electrons: float) -> None:
+    """An even field in sums of 8: gains that a sample alone would hide within 0.1 sigma change its sums by 0.12 on."""
+    scene, rig = scene_of(np.ones((*SHAPE, 3)), electrons), Asked(exposure_ms=100.0).rig()
+    sweep = Sweep("coarse-0", "coarse", "x", 0.0, -20.0, SHAPE[0] // 4, 4, 8)
+    decision = decide(probe_survey(scene, rig, [sweep]), rig, EFFECTS, 0.1)
+    block = sweep_block(scene, rig, sweep, range(sweep.lines))
+    light, full = (stored_mean(expected_light(scene, block, one), 8) for one in (decision.chosen, decision.exact))
+    assert (np.abs(light - full) / noise_electrons(full, rig, 8)).max() <= decision.error <= 0.1
