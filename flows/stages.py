@@ -41,7 +41,7 @@ from storage.spool import Spool
 from storage.stored_tables import read_table
 
 VERSIONS = {
-    "effects": 1, "capture": 3, "register": 2, "locate": 2, "rectify": 3, "attend": 6, "patches": 3, "segment": 4,
+    "effects": 2, "capture": 4, "register": 2, "locate": 2, "rectify": 3, "attend": 6, "patches": 3, "segment": 4,
     "turned": 1, "ground": 2, "evaluate": 6,
 }  # fmt: skip
 SEATS_AT_ONCE = 64
