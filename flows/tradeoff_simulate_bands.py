@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Shared:
-    """A blur that neighbouring bands share: all bands of a group have the mean of their shifts and variances."""
+    """A blur that neighbouring bands share: all bands of a group have the means of shifts, variances, waves."""
 
     blur: Any
     groups: int
@@ -46,7 +46,8 @@ class Shared:
         """Give shift and variance of each band, the same for all of a group."""
         own = self.blur.moments(rig, wavelength_nm, variant, normal)
         group = np.arange(len(wavelength_nm)) * self.groups // len(wavelength_nm)
-        return Moments(_means(own.shift, group), _means(own.variance, group))
+        waves = None if own.waves is None else _means(own.waves, group)
+        return Moments(_means(own.shift, group), _means(own.variance, group), waves)
 
 
 def _means(values: Floats, group: NDArray[np.int64]) -> Floats:

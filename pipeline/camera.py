@@ -82,26 +82,22 @@ class LineCamera:
 
 
 def footprint_kernel(width_px: float) -> NDArray[np.float64]:
-    """Weights of a box of ``width_px`` over a scene interpolated by Catmull-Rom, centred on a pixel.
+    """Weights of a box of ``width_px`` over a scene that is linear between its pixels, centred on a pixel.
 
-    Odd length, sum 1. The simulator integrates the same product by quadrature at any position; this is its closed
-    form at pixel centres.
+    Odd length, sum 1, none below 0. The simulator has the same product at any position; this is its closed form at
+    pixel centres.
     """
-    half = int(np.ceil(width_px / 2 + 2))
+    half = int(np.ceil(width_px / 2 + 1))
     edges = np.arange(-half, half + 1, dtype=np.float64)
-    upper, lower = _catmull_rom_integral(width_px / 2 - edges), _catmull_rom_integral(-width_px / 2 - edges)
+    upper, lower = _linear_integral(width_px / 2 - edges), _linear_integral(-width_px / 2 - edges)
     return (upper - lower) / width_px
 
 
-def _catmull_rom_integral(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Integral of the Catmull-Rom kernel from minus infinity to t."""
-    a = np.abs(np.clip(t, -2.0, 2.0))
-    inner = a - 2.5 * a**3 / 3 + 1.5 * a**4 / 4
-    outer = 2.0 * a - 2.0 * a**2 + 2.5 * a**3 / 3 - 0.5 * a**4 / 4
-    at_one = 1 - 2.5 / 3 + 1.5 / 4
-    outer_at_one = 2.0 - 2.0 + 2.5 / 3 - 0.5 / 4
-    half = np.where(a <= 1, inner, at_one + outer - outer_at_one)
-    return 0.5 + np.sign(t) * half
+def _linear_integral(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Integral of the kernel of linear interpolation from minus infinity to t."""
+    a = np.minimum(np.abs(t), 1.0)
+    integral: NDArray[np.float64] = 0.5 + np.sign(t) * a * (1 - a / 2)
+    return integral
 
 
 def digitise(

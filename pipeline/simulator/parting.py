@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.simulator.effects.effect import Moments
 from pipeline.simulator.footprint import Footprint, fold
 from pipeline.simulator.rays import Views
 from pipeline.simulator.tap_sums import Beside, part_places, shape_of
@@ -48,7 +49,7 @@ def misplaced(parts: Parts, box: tuple[float, float], shape: tuple[float, ...]) 
 def _weights(parts: Parts, box: tuple[float, float], shape: tuple[float, ...]) -> Floats:
     """Weights (phase, along, scan) of the pixels around a sample, in closed form."""
     none, views = np.zeros((2, 1)), Views(*(np.array([one]) for one in (0.0, 0.0, *shape)))
-    footprint: Footprint = fold(box, parts, 1, none, none)
+    footprint: Footprint = fold(box, parts, 1, Moments(none, none))
     scale = shape_of(footprint, views)
     places = Beside.of(views, scale, 0.0, 0.0).parts(footprint.shift, part_places(footprint))
     along, scan = (one[0, :, 0].astype(np.float64) for one in places)

@@ -53,13 +53,18 @@ class Probe:
         return float(np.minimum(steep, self.span).max(initial=0.0))
 
     def blurred(self, variance_px2: Floats) -> float:
-        """Bound what a kernel of mean 0 and (2, band) variance changes: C s^2 / 2, or G E|x| where that is less.
+        """Bound what a kernel of mean 0 and (2, band) variance changes in any band."""
+        return float(self.change_blurred(variance_px2).max(initial=0.0))
+
+    def change_blurred(self, variance_px2: Floats) -> Floats:
+        """Bound what it changes in each band, (band,): C s^2 / 2, or G E|x| where that is less, or the span.
 
         E|x| is at most s; the smaller bound takes over where the image is a step or a point.
         """
         by_curvature = _times(self.curvature, variance_px2 / 2)
         by_slope = _times(self.slope, np.sqrt(variance_px2))
-        return float(np.minimum(np.minimum(by_curvature, by_slope).sum(axis=0), self.span).max(initial=0.0))
+        change: Floats = np.minimum(np.minimum(by_curvature, by_slope).sum(axis=0), self.span)
+        return change
 
     def scaled(self, share: float | Floats) -> float:
         """Bound what multiplying by 1 + ``share`` (or (band,) shares) changes."""

@@ -15,8 +15,9 @@ _PER_PX = 3  # rays for each px of a box
 
 def footprint_rays(footprint: Footprint, kernel: int) -> list[tuple[float, float, float]]:
     """Give the rays of one kernel: px across and along, of the camera, and weights of sum 1."""
-    turns = _axis(footprint.box[0], footprint.variance[1, kernel], footprint.held)
-    runs = _axis(footprint.box[1], footprint.variance[0, kernel], 1)
+    level = int(footprint.level[kernel])
+    turns = _axis(footprint.box[0], footprint.variance[1, kernel], footprint.held, level)
+    runs = _axis(footprint.box[1], footprint.variance[0, kernel], 1, level)
     beside = footprint.shift[:, kernel]
     return [
         (float(turn + beside[1]), float(run + beside[0]), float(one * other))
@@ -49,10 +50,10 @@ def quadrature(place: Floats, weight: Floats, count: int) -> tuple[Floats, Float
     return node, vectors[0] ** 2
 
 
-def _axis(width: float, variance: float, held: int) -> tuple[Floats, Floats]:
-    """Nodes and weights of a box, a Gaussian and held positions 1 px apart."""
+def _axis(width: float, variance: float, held: int, level: int) -> tuple[Floats, Floats]:
+    """Nodes and weights of a box, a Gaussian and held positions 1 px apart; fewer for what looks at few pixels."""
     spread = width + held - 1 + 4 * math.sqrt(variance)
-    count = math.ceil(_PER_PX * spread) + 1
+    count = math.ceil(_PER_PX * spread / level) + 1
     node, share = np.polynomial.legendre.leggauss(count) if width > 0 else (np.zeros(1), np.full(1, 2.0))
     wave, part = np.polynomial.hermite_e.hermegauss(count) if variance > 0 else (np.zeros(1), np.ones(1))
     place = np.add.outer(node * width / 2, wave * math.sqrt(variance))

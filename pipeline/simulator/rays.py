@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,10 @@ class Views:
     def __getitem__(self, which: slice | NDArray[np.intp]) -> Views:
         """Some of the samples."""
         return Views(*(getattr(self, one.name)[which] for one in fields(self)))
+
+    def thinned(self, level: int) -> Views:
+        """The same places in px of a scene of which every ``level``-th pixel is left, the first one first."""
+        return self if level == 1 else replace(self, along=self.along / level, scan=self.scan / level)
 
     def flat(self) -> Views:
         """All in one row."""

@@ -14,7 +14,7 @@ from pipeline.errors import SettingsError
 from pipeline.mirror import direction_to_scene, position_to_direction, position_to_normal
 from pipeline.scan import Sweep, line_positions, shifted_position
 from pipeline.simulator.block import Block
-from pipeline.simulator.effects.effect import OFF, Effect
+from pipeline.simulator.effects.effect import OFF, Effect, Moments
 from pipeline.simulator.effects.pupil import middle_normal
 from pipeline.simulator.effects.slit import box_of, box_parts
 from pipeline.simulator.effects.smear import folded_positions, smeared_positions
@@ -161,14 +161,11 @@ def _looker(
     rig: Rig, sweep: Sweep, wavelengths: bytes, blurs: tuple[tuple[Any, str], ...], names: tuple[str, ...]
 ) -> Looker:
     wavelength, normal = np.frombuffer(wavelengths), middle_normal(sweep, rig)
-    shift, variance = np.zeros((2, len(wavelength))), np.zeros((2, len(wavelength)))
-    for blur, variant in blurs:
-        moments = blur.moments(rig, wavelength, variant, normal)
-        shift, variance = shift + moments.shift, variance + moments.variance
+    moments = [blur.moments(rig, wavelength, variant, normal) for blur, variant in blurs]
     slit, smear, rotation = names
     views = views_all_over(rig, sweep, exact=rotation != OFF)
-    parts = box_parts(slit, rig, views)
-    return Looker(fold(box_of(slit, rig), parts, folded_positions(sweep, smear), shift, variance), views)
+    together = Moments.together(moments, len(wavelength))
+    return Looker(fold(box_of(slit, rig), box_parts(slit, rig, views), folded_positions(sweep, smear), together), views)
 
 
 def views_all_over(rig: Rig, sweep: Sweep, *, exact: bool) -> Views:

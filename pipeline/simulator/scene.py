@@ -136,7 +136,7 @@ class RasterScene:
 
     def sample(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float32]:
         """Give the components at points, (n,) rows and columns [px] -> (n, component) float32."""
-        return gather(self.planes, y, x)
+        return gather(self.planes, y, x, "bilinear")
 
     def spectra(self) -> NDArray[np.float32]:
         """Scene value per unit of component, shaped as ``electrons``."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -21,6 +22,39 @@ Light = NDArray[np.float32]
 LEAST_COLUMNS = 16  # of a product whose rows come out the same wherever they stand: with 5 or 9 they do not
 
 
+@dataclass(frozen=True)
+class _Bands:
+    """From components through every kernel to bands: kernels are summed to nodes, of which each band is between two.
+
+    Products are always of the same shape, so that a sample's light does not depend on the others.
+    """
+
+    shares: Light  # (node, kernel)
+    mixing: Light  # (node * component, band), or (kernel, band) where every band has a plane of its own
+    own_planes: bool
+
+    @staticmethod
+    def of(shares: Light, between: Floats, spectra: Light) -> _Bands:
+        """Those of spectra (component, band), or (band,)."""
+        if spectra.ndim == 1:
+            return _Bands(shares, ((shares.T @ between) * spectra).astype(np.float32), own_planes=True)
+        mixing = (between[:, None] * spectra).reshape(-1, spectra.shape[1]).astype(np.float32)
+        wide = np.pad(mixing, ((0, 0), (0, max(LEAST_COLUMNS - mixing.shape[1], 0))))
+        return _Bands(shares, wide, own_planes=False)
+
+    def write(self, parts: Light, light: Light) -> None:
+        """Write light (n, band) of the first samples of components (kernel, `AT_ONCE`, component)."""
+        import torch
+
+        rows, (nodes, kernels) = len(light), self.shares.shape
+        if self.own_planes:
+            np.einsum("knb,kb->nb", parts[:, :rows], self.mixing, out=light)
+            return
+        summed = torch.mm(torch.from_numpy(self.shares), torch.from_numpy(parts).view(kernels, -1))
+        table = summed.view(nodes, AT_ONCE, -1).permute(1, 0, 2).reshape(AT_ONCE, -1)
+        light[:] = torch.mm(table, torch.from_numpy(self.mixing)).numpy()[:rows, : light.shape[1]]
+
+
 class Looker:
     """Looks at scenes through one footprint, from views whose shape is within a range."""
 
@@ -30,52 +64,43 @@ class Looker:
         self._extremes = extremes
 
     @cached_property
-    def gatherer(self) -> Gatherer:
-        """What sums pixels."""
-        return Gatherer(self.footprint, self._extremes)
+    def gatherers(self) -> list[tuple[int, NDArray[np.intp], Gatherer]]:
+        """What sums pixels of which level through which kernels."""
+        windows, whole = self.footprint.windows(), self.footprint
+        return [(level, some, Gatherer(whole.part(level, some), self._extremes)) for level, some in windows]
 
     def look(self, scene: Scene, steps: Sequence[Views], *, along_y: bool, exposures: float) -> Light:
         """Give the light (n, band) of samples that look so at each of the held positions. [e-]
 
         A sample's light does not depend on the others: products of matrices are always of the same shape.
         """
-        import torch
-
         spectra = scene.electrons * np.float32(exposures)
-        pixels = _pixels(scene, along_y)
-        mixing = self._mixing(spectra, len(steps) * (math.prod(self.footprint.parts) if pixels else 1))
+        levels = np.unique(self.footprint.level).tolist()
+        pixels = {level: _pixels(scene, along_y, level) for level in levels} if isinstance(scene, RasterScene) else {}
+        shares = self._shares(len(steps), parted=bool(pixels))
         count, components = len(steps[0].along), spectra.shape[0]
         light = np.empty((count, spectra.shape[-1]), np.float32)
-        parts, more = (np.zeros((AT_ONCE, self.footprint.kernels, components), np.float32) for _ in range(2))
-        wide = mixing.shape[1]
-        spare, table = torch.empty((AT_ONCE, wide)), torch.from_numpy(parts).view(AT_ONCE, -1)
+        parts, more = (np.zeros((self.footprint.kernels, AT_ONCE, components), np.float32) for _ in range(2))
+        bands = _Bands.of(shares, self.footprint.between, spectra)
         for first in range(0, count, AT_ONCE):
             chunk = slice(first, min(first + AT_ONCE, count))
             rows = chunk.stop - first
             for number, views in enumerate(steps):
                 into = more if number else parts
-                if pixels is None:
-                    self._sampled(scene, views[chunk], along_y, into[:rows])
-                else:
-                    self.gatherer.gather(pixels, views[chunk], into[:rows])
+                if not pixels:
+                    self._sampled(scene, views[chunk], along_y, into[:, :rows])
+                for level, some, gatherer in self.gatherers if pixels else ():
+                    gatherer.gather(pixels[level], views[chunk].thinned(level), into[:, :rows], some)
                 if number:
-                    parts[:rows] += more[:rows]
-            if spectra.ndim == 1:
-                np.einsum("nkb,kb->nb", parts[:rows], mixing, out=light[chunk])
-                continue
-            whole = torch.from_numpy(light[chunk]) if rows == AT_ONCE and wide == light.shape[1] else spare
-            torch.mm(table, torch.from_numpy(mixing), out=whole)
-            if whole is spare:
-                light[chunk] = spare.numpy()[:rows, : light.shape[1]]
+                    parts[:, :rows] += more[:, :rows]
+            bands.write(parts, light[chunk])
         return light
 
-    def _mixing(self, spectra: Light, sums: int) -> Light:
-        """(kernel * component, band), or (kernel, band) where every band has a plane of its own."""
-        share = self.footprint.mixing / sums
-        if spectra.ndim == 1:
-            return (share * spectra).astype(np.float32)
-        mixing = (share[:, None] * spectra).reshape(-1, spectra.shape[1])
-        return np.pad(mixing.astype(np.float32), ((0, 0), (0, max(LEAST_COLUMNS - mixing.shape[1], 0))))
+    def _shares(self, steps: int, *, parted: bool) -> Light:
+        """(node, kernel), over the sums of held positions, and of parts where there are pixels."""
+        sums = np.where(self.footprint.level == 1, math.prod(self.footprint.parts), 1) if parted else 1
+        share: Light = (self.footprint.shares / np.reshape(steps * sums, (-1, 1))).T.astype(np.float32)
+        return share
 
     def _sampled(self, scene: Scene, views: Views, along_y: bool, out: Light) -> None:
         """Components of a scene without pixels, by rays."""
@@ -85,16 +110,15 @@ class Looker:
                 along = views.along + views.along_run * run + views.along_turn * turn
                 scan = views.scan + views.scan_run * run + views.scan_turn * turn
                 seen = scene.sample(along, scan) if along_y else scene.sample(scan, along)
-                out[:, kernel] += seen * np.float32(weight)
+                out[kernel] += seen * np.float32(weight)
 
     @cached_property
     def _rays(self) -> list[list[tuple[float, float, float]]]:
         return [footprint_rays(self.footprint, kernel) for kernel in range(self.footprint.kernels)]
 
 
-def _pixels(scene: Scene, along_y: bool) -> Pixels | None:
-    """A scene's pixels, None where it has none."""
-    if not isinstance(scene, RasterScene):
-        return None
-    planes = np.ascontiguousarray(scene.planes, np.float32)
-    return Pixels(tensor_rows(planes.reshape(-1, planes.shape[2])), scene.shape, along_y)
+def _pixels(scene: RasterScene, along_y: bool, level: int) -> Pixels:
+    """A scene's pixels, or every ``level``-th of them."""
+    planes = np.ascontiguousarray(scene.raster.thinned(level), np.float32)
+    rows, columns, components = planes.shape
+    return Pixels(tensor_rows(planes.reshape(-1, components)), (rows, columns), along_y)

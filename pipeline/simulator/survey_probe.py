@@ -157,10 +157,8 @@ def _changes(scene: Scene, rig: Rig, views: SampleViews, footprint: Footprint, f
 
 
 def _footprint(variant: str, rig: Rig, parts: tuple[int, int], moments: Moments | None, scene: Scene) -> Footprint:
-    shift, variance = (
-        (np.zeros((2, len(scene.wavelength_nm))),) * 2 if moments is None else (moments.shift, moments.variance)
-    )
-    return fold(box_of(variant, rig), parts, 1, shift, variance)
+    blurs = moments or Moments.together([], len(scene.wavelength_nm))
+    return fold(box_of(variant, rig), parts, 1, blurs)
 
 
 def _blurs(rig: Rig, wavelength_nm: Floats, sweeps: Sequence[Sweep]) -> list[Moments]:
@@ -169,15 +167,18 @@ def _blurs(rig: Rig, wavelength_nm: Floats, sweeps: Sequence[Sweep]) -> list[Mom
     The slit's variants stand beside all other effects: what leaving out a blur changes is bounded for any slit.
     """
     found = [_moments(rig, wavelength_nm, middle_normal(sweep, rig)) for sweep in sweeps]
-    found.sort(key=lambda one: float(one.variance.sum()))
+    found.sort(key=lambda one: float(_size(one).sum()))
     least, most = found[0], found[-1]
-    return [least] if np.allclose(least.variance, most.variance, rtol=_ALIKE) else [least, most]
+    return [least] if np.allclose(_size(least), _size(most), rtol=_ALIKE) else [least, most]
+
+
+def _size(blurs: Moments) -> Floats:
+    return blurs.variance if blurs.waves is None else blurs.variance + blurs.waves**2
 
 
 def _moments(rig: Rig, wavelength_nm: Floats, normal: Floats) -> Moments:
     found = [blur.moments(rig, wavelength_nm, blur.variants[0], normal) for blur in _OPTICS]
-    none = np.zeros((2, len(wavelength_nm)))
-    return Moments(sum((one.shift for one in found), none), sum((one.variance for one in found), none))
+    return Moments.together(found, len(wavelength_nm))
 
 
 def _stored(values: Light, views: SampleViews) -> Light:

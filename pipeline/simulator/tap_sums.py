@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.simulator.footprint import Footprint
 from pipeline.simulator.rays import Views
-from pipeline.simulator.tap_tables import TapTable
+from pipeline.simulator.tap_tables import TAIL, TapTable
 
 if TYPE_CHECKING:  # a second to import: the functions that use it do so, and a plan of a survey never needs it
     import torch
@@ -97,18 +97,20 @@ class Gatherer:
         reach = [float(np.abs(off).max(initial=0.0)) + 0.02 for off in beside.parts(footprint.shift, self.places)]
         width, (across, along) = footprint.box, footprint.parts
         ranges = [(float(one.min()), float(one.max())) for one in (shape.along, shape.scan)]
-        self.along = TapTable.of(width[1] / along, footprint.variance[0], 1, ranges[0], reach[0])
-        self.scan = TapTable.of(width[0] / across, footprint.variance[1], footprint.held, ranges[1], reach[1])
+        tail = TAIL / float(footprint.shares.max(initial=0.0) or 1.0)
+        self.along = TapTable.of(width[1] / along, footprint.variance[0], 1, ranges[0], reach[0], tail)
+        self.scan = TapTable.of(width[0] / across, footprint.variance[1], footprint.held, ranges[1], reach[1], tail)
 
     @cached_property
     def taps(self) -> int:
         """Pixels of a window."""
         return self.along.taps * self.scan.taps
 
-    def gather(self, pixels: Pixels, views: Views, out: NDArray[np.float32]) -> None:
-        """Write the components (n, kernel, component) that some samples see, summed over the parts.
+    def gather(self, pixels: Pixels, views: Views, out: Light, numbers: NDArray[np.intp] | None = None) -> None:
+        """Write the components (number, n, component) that some samples see through every kernel.
 
-        ``views`` are in px of the scene. A sample's numbers do not depend on the others.
+        They are sums over the parts. ``views`` are in px of the pixels, ``numbers`` (kernel,) where in ``out`` kernels
+        belong: one after the other, if it is None. A sample's light does not depend on the others.
         """
         import torch
 
@@ -121,10 +123,10 @@ class Gatherer:
         turned, places = torch.empty((count, self.taps)), index.view(-1)
         off = beside.parts(self.footprint.shift.astype(np.float32), self.places)
         run, turn = self.along.read(off[0], rows[0]), self.scan.read(off[1], rows[1])
-        for kernel in range(self.footprint.kernels):
+        for kernel, number in enumerate(range(self.footprint.kernels) if numbers is None else numbers):
             turned.copy_(torch.from_numpy(_joint(turn[:, kernel], run[:, kernel])).T)
             sums = torch.embedding_bag(pixels.table, places, starts, False, 0, False, turned.view(-1), False)[0]
-            out[:, kernel] = sums.numpy()
+            out[number] = sums.numpy()
 
     def _window(self, pixels: Pixels, along: Floats, scan: Floats) -> torch.Tensor:
         """Rows of the pixels' table, (n, tap); outside of the scene its edge is repeated."""

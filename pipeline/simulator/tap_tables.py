@@ -1,8 +1,9 @@
-"""Tap weights along one axis of a raster: boxes and Gaussians over Catmull-Rom's interpolation, tabulated.
+"""Tap weights along one axis of a raster: boxes and Gaussians over linear interpolation, tabulated.
 
-What a sample sees of a scene of pixels is a sum over pixels. Along one axis their weights are the convolution of
-Catmull-Rom's kernel with the box of slit or pixel, the held positions and the Gaussian of the blurs: a smooth function
-of the distance alone. The box is in closed form, the Gaussian is a product with its transform.
+What a sample sees of a scene of pixels is a sum over pixels. Along one axis their weights are the convolution of the
+kernel of linear interpolation with the box of slit or pixel, the held positions and the Gaussian of the blurs: a
+function of the distance alone, nowhere below 0, whose values at whole distances sum to 1. The box is in closed form,
+the Gaussian is a product with its transform.
 """
 
 from __future__ import annotations
@@ -19,15 +20,15 @@ Weights = NDArray[np.float32]
 PER_PX = 128  # rows of a table; between them weights are linear, right to 8e-6 of a kernel's curvature
 SCALE_STEP = 1 / 4096  # from one tabulated scale to the next; the nearest is taken
 _WORKED_OUT = 16  # every so many of them are worked out, those between are linear: right to 2e-6
-TAIL = 5e-6  # share of a kernel's weight, by size, that may lie beyond its taps; what is left is scaled to sum 1
-TAIL_WEIGHT = 5e-6  # of any one tap beyond them: weights jump by so much where a tap comes in
+TAIL = 5e-6  # share of a kernel's weight that may lie beyond its taps; what is left is scaled to sum 1. No tap beyond
+# has more than that either: weights jump by so much where a tap comes in.
 TABULATED = 2e-5  # share of the light, by size, that a table of either axis misplaces at most, but for what follows
 BETWEEN_ROWS = 1 / (4 * PER_PX**2)  # variance that a kernel gains between two rows at most: half of either [px^2]
 _SDS = 6.5  # of a Gaussian: nothing beyond
 
 
 def box_weight(distance: Floats, width: float, held: int = 1) -> Floats:
-    """Give Catmull-Rom's kernel averaged over a box and over ``held`` positions 1 px apart, at distances [px]."""
+    """Give the linear kernel averaged over a box and over ``held`` positions 1 px apart, at distances [px]."""
     places = np.arange(held) - (held - 1) / 2
     total = np.zeros(np.shape(distance))
     for place in places:
@@ -35,13 +36,14 @@ def box_weight(distance: Floats, width: float, held: int = 1) -> Floats:
         if width > 1e-6:
             total += (_integral(beside + width / 2) - _integral(beside - width / 2)) / width
         else:
-            total += _catmull_rom(beside)
-    return total / held
+            total += _linear(beside)
+    weight: Floats = np.maximum(total / held, 0.0)  # differences of integrals round
+    return weight
 
 
 def blurred_weight(width: float, variance: Floats, held: int = 1, per_px: int = PER_PX) -> tuple[Floats, Floats]:
     """Give distances (place,) from -reach to reach and weights (kernel, place) with Gaussians of variance (kernel,)."""
-    reach = math.ceil(2 + width / 2 + (held - 1) / 2 + _SDS * math.sqrt(variance.max(initial=0.0))) + 1
+    reach = math.ceil(1 + width / 2 + (held - 1) / 2 + _SDS * math.sqrt(variance.max(initial=0.0))) + 1
     distance = np.arange(-reach * per_px, reach * per_px + 1) / per_px
     sharp = box_weight(distance, width, held)
     if not variance.any():
@@ -50,7 +52,7 @@ def blurred_weight(width: float, variance: Floats, held: int = 1, per_px: int = 
     wave = np.fft.rfftfreq(length, 1 / per_px)
     passed = np.exp(-2 * np.pi**2 * variance[:, None] * wave**2)
     blurred = np.fft.irfft(np.fft.rfft(sharp, length) * passed, length)[:, : len(distance)]
-    return distance, np.where(variance[:, None] > 0, blurred, sharp)
+    return distance, np.where(variance[:, None] > 0, np.maximum(blurred, 0.0), sharp)
 
 
 @dataclass(frozen=True)
@@ -68,14 +70,16 @@ class TapTable:
     rows: int  # of one scale
 
     @staticmethod
-    def of(width: float, variance: Floats, held: int, scales: tuple[float, float], beside: float) -> TapTable:
+    def of(
+        width: float, variance: Floats, held: int, scales: tuple[float, float], beside: float, tail: float = TAIL
+    ) -> TapTable:
         """Tabulate kernels of a width and variances (kernel,), between two scales, up to ``beside`` px off centre."""
         least = (math.floor(scales[0] / SCALE_STEP) - 1) * SCALE_STEP
         count = math.ceil((scales[1] - least) / SCALE_STEP) + 2
         worked_out = range(0, count + _WORKED_OUT, _WORKED_OUT)
         sizes = [max(least + SCALE_STEP * number, 1e-3) for number in worked_out]
         found = [blurred_weight(width * size, variance * size**2, held) for size in sizes]
-        reach = max(_reach(*one) for one in found)
+        reach = max(_reach(*one, tail) for one in found)
         off = 0.5 + beside
         left = math.floor(reach + off)
         taps = math.ceil(left + off + reach)
@@ -128,27 +132,23 @@ def _rows(place: Floats, taps: int, reach: float, kernels: tuple[Floats, Floats]
     return rows
 
 
-def _reach(distance: Floats, weight: Floats) -> float:
-    """Distance beyond which a kernel holds no more than `TAIL`, and nowhere more than `TAIL_WEIGHT`."""
+def _reach(distance: Floats, weight: Floats, tail: float) -> float:
+    """Distance beyond which a kernel holds no more than ``tail``, in all and, at either side, in any one tap."""
     half = len(distance) // 2
-    size = np.abs(weight).max(axis=0)
+    size = weight.max(axis=0)
     both = size[half:] + size[half::-1]
     beyond = both[::-1].cumsum()[::-1] * (distance[1] - distance[0])
-    counts = (beyond > TAIL) | (both > 2 * TAIL_WEIGHT)
+    counts = (beyond > tail) | (both > 2 * tail)
     return float(distance[half:][counts][-1]) if counts.any() else 0.0
 
 
-def _catmull_rom(t: Floats) -> Floats:
-    a = np.abs(t)
-    inner, outer = 1 + a**2 * (1.5 * a - 2.5), 2 + a * (-4 + a * (2.5 - 0.5 * a))
-    kernel: Floats = np.where(a <= 1, inner, np.where(a < 2, outer, 0.0))
+def _linear(t: Floats) -> Floats:
+    kernel: Floats = np.maximum(1 - np.abs(t), 0.0)
     return kernel
 
 
 def _integral(t: Floats) -> Floats:
-    """Integral of Catmull-Rom's kernel from 0 to t."""
-    a = np.minimum(np.abs(t), 2.0)
-    inner = a * (1 + a**2 * (-2.5 / 3 + 1.5 / 4 * a))
-    outer = 2 * a * (1 - a) + a**3 * (2.5 / 3 - 0.125 * a) - 1 / 6
-    integral: Floats = np.sign(t) * np.where(a <= 1, inner, outer)
+    """Integral of the kernel of linear interpolation from 0 to t."""
+    a = np.minimum(np.abs(t), 1.0)
+    integral: Floats = np.sign(t) * a * (1 - a / 2)
     return integral

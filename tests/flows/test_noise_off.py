@@ -46,7 +46,14 @@ class Waves:
         smear, binned = (np.cos(2 * np.pi * np.outer(f, held)).mean(axis=1) for f in (scan, line))
         pixels = np.mgrid[: self.shape[0] // factor, : self.shape[1] // factor]
         y, x = pixels * factor + (factor - 1) / 2
-        return self.values(y, x, np.sinc(scan * SLIT_PX) * np.sinc(line) * smear * binned)
+        return self.values(y, x, through(scan, SLIT_PX) * through(line, 1.0) * smear * binned)
+
+
+def through(frequency: NDArray[np.float64], width: float) -> NDArray[np.float64]:
+    """What a box leaves, at pixel centres, of waves that are linear between pixels: with all their images, in phase."""
+    images = frequency + np.arange(-200, 201)[:, None]
+    left: NDArray[np.float64] = (np.sinc(images) ** 2 * np.sinc(images * width)).sum(axis=0)
+    return left
 
 
 def waves(shape: tuple[int, int], shortest_px: float, longest_px: float) -> Waves:

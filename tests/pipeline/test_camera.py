@@ -70,27 +70,27 @@ def test_binned_rays_are_the_middle_of_theirs(binning: int):
 
 
 @given(st.floats(0.2, 9))
-def test_footprint_is_a_box_over_catmull_rom(width: float):
-    """Weights sum to 1, are symmetric, and have the variance of the box: the interpolation adds none."""
+def test_footprint_is_a_box_over_linear_interpolation(width: float):
+    """Weights sum to 1, none is below 0, they are symmetric; pixels a px wide add a little to the box's variance."""
     kernel = footprint_kernel(width)
     place = np.arange(len(kernel)) - len(kernel) // 2
     assert kernel.sum() == pytest.approx(1, abs=1e-12)
     assert kernel == pytest.approx(kernel[::-1], abs=1e-12)
-    assert (kernel * place**2).sum() == pytest.approx(width**2 / 12, abs=1e-9)
+    assert kernel.min() >= 0
+    assert width**2 / 12 <= (kernel * place**2).sum() <= width**2 / 12 + 0.25
 
 
 @pytest.mark.parametrize("width", [1.0, 2.7027027, 5.5])
 def test_footprint_equals_quadrature(width: float):
-    """Each weight is the mean of the Catmull-Rom kernel over the box, integrated piece by piece."""
+    """Each weight is the mean of the linear kernel over the box, integrated piece by piece."""
     kernel = footprint_kernel(width)
     nodes, weights = leggauss(4)
     for place, weight in zip(np.arange(len(kernel)) - len(kernel) // 2, kernel, strict=True):
         low, high = place - width / 2, place + width / 2
-        cuts = np.unique(np.clip([low, -2, -1, 0, 1, 2, high], low, high))
+        cuts = np.unique(np.clip([low, -1, 0, 1, high], low, high))
         middle, half = (cuts[1:] + cuts[:-1]) / 2, np.diff(cuts) / 2
         t = np.abs(middle[:, None] + half[:, None] * nodes)
-        inner, outer = 1 - 2.5 * t**2 + 1.5 * t**3, 2 - 4 * t + 2.5 * t**2 - 0.5 * t**3
-        value = np.where(t <= 1, inner, np.where(t <= 2, outer, 0))
+        value = np.maximum(1 - t, 0)
         assert weight == pytest.approx((half[:, None] * weights * value).sum() / width, abs=1e-12)
 
 

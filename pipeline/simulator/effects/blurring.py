@@ -17,15 +17,21 @@ def blurred_bound(probe: Probe, variance: Floats, cause: str) -> Bound:
 
     The sentence names the band that changes most.
     """
-    value = probe.blurred(variance)
+    return mixture_bound(probe, np.ones(1), variance[None], cause)
+
+
+def mixture_bound(probe: Probe, share: Floats, variance: Floats, cause: str) -> Bound:
+    """Bound what a sum of Gaussians changes, of shares (kernel,) and (kernel, 2, band) variance [px^2]."""
+    change = sum((part * probe.change_blurred(one) for part, one in zip(share, variance, strict=True)), np.zeros(1))
+    value = float(change.max(initial=0.0))
     if not variance.any():
         return Bound(value, f"{cause}: none")
-    along, scan = np.sqrt(variance)
-    band = int(np.argmax((probe.curvature * variance).sum(axis=0)))
+    band = int(np.argmax(change))
+    nearest = np.sqrt(variance[int(np.argmax(share)), :, band])
     nm, detail = probe.wavelength_nm[band], probe.curvature[:, band].max()
     return Bound(
         value,
-        f"{cause}: {along[band]:.2g} px (sd) along the line, {scan[band]:.2g} px along the scan at {nm:.0f} nm,"
+        f"{cause}: {nearest[0]:.2g} px (sd) along the line, {nearest[1]:.2g} px along the scan at {nm:.0f} nm,"
         f" on detail of at most {detail:.3g} {UNITS[probe.unit]}/px^2",
     )
 

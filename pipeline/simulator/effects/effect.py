@@ -8,7 +8,7 @@ the light.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -82,17 +82,29 @@ class Displacement(Effect, Protocol):
 
 @dataclass(frozen=True)
 class Moments:
-    """First two moments of a blur, (2, band) each: along the line and the scan, shift [px] and variance [px^2]."""
+    """What a blur does to each band, (2, band) each: along the line and the scan.
+
+    A shift [px], a Gaussian of a variance [px^2], and diffraction at an elliptic pupil, told by the wavelength over the
+    pupil's widths [px]; None without any. The pattern of a pupil has no variance: no Gaussian stands for it.
+    """
 
     shift: Floats
     variance: Floats
+    waves: Floats | None = None
+
+    @staticmethod
+    def together(blurs: Sequence[Moments], bands: int) -> Moments:
+        """Those of blurs one after the other. At most one of them is diffraction."""
+        none = np.zeros((2, bands))
+        shift, variance = sum((one.shift for one in blurs), none), sum((one.variance for one in blurs), none)
+        return Moments(shift, variance, next((one.waves for one in blurs if one.waves is not None), None))
 
 
 class Blur(Effect, Protocol):
     """The footprint is blurred by a kernel that is not negative and sums to 1; kernels of all blurs are folded."""
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
-        """Give shift and variance in each band; ``normal`` (3,) is the mirror's in the camera frame, None at rest."""
+        """Give what it does to each band; ``normal`` (3,) is the mirror's in the camera frame, None at rest."""
 
 
 class Gain(Effect, Protocol):

@@ -57,7 +57,7 @@ def test_whole_lines_are_made_where_an_effect_needs_them() -> None:
 
 
 def test_nothing_chosen_is_a_straight_line_of_points() -> None:
-    """Without effects a sample sees the scene's value right at its place, as Catmull-Rom has it."""
+    """Without effects a sample at a pixel's centre sees the pixel's value."""
     scene = grainy()
     sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=-20.5, lines=30)  # places are pixel centres
     light = expected_light(scene, block_of(scene, sweep, range(30), samples=range(300, 340)), {})
@@ -114,7 +114,7 @@ def test_blurs_widen_and_shift_each_band_by_its_moments() -> None:
     block = block_of(scene, sweep, range(1), samples=range(280, 360))
     light = expected_light(scene, block, {SLIT: "3x1", Widening(): "only"})[0] / scene.electrons
     grown = np.arange(6) / 6
-    passed = np.exp(-2 * np.pi**2 * 0.2 * grown / 400) * np.sinc(1 / 20)
+    passed = np.exp(-2 * np.pi**2 * 0.2 * grown / 400) * np.sinc(1 / 20) ** 3  # pixel, and linear interpolation
     place = (np.arange(280, 360) - 240)[:, None] + 0.3 * grown
     np.testing.assert_allclose(light, 1 + 0.5 * passed * np.sin(2 * np.pi * place / 20), atol=2e-3)
 

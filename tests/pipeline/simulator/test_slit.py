@@ -67,7 +67,7 @@ def test_stated_share_is_kept(width: float, strip: float) -> None:
 
 @pytest.mark.parametrize("variant", SLIT.variants)
 def test_point_is_spread_by_the_closed_form_of_the_box(variant: str) -> None:
-    """Of a bright pixel, lines at pixel centres show the box over Catmull-Rom along either axis, in closed form."""
+    """Of a bright pixel, lines at pixel centres show the box over linear interpolation, in closed form."""
     values = np.zeros((40, 64, 1))
     values[20, 30] = 1.0
     scene = raster_from_values(values, RIG.camera, name="p", wavelength_nm=np.array([550.0]))

@@ -83,7 +83,7 @@ def test_wave_has_its_slope_and_curvature(along: str) -> None:
     passed = np.sinc(RIG.camera.slit_px / 24)
     high = 0.5 * scene.electrons[0] * passed / RIG.camera.electrons_per_dn
     assert probe.slope[1, 0] == pytest.approx(high * 2 * np.pi / 24, rel=0.03)
-    assert probe.curvature[1, 0] == pytest.approx(high * (2 * np.pi / 24) ** 2, rel=0.08)
+    assert probe.curvature[1, 0] == pytest.approx(high * (2 * np.pi / 24) ** 2, rel=0.12)  # between pixels it is linear
     assert probe.slope[0, 0] < 0.02 * probe.slope[1, 0]
     assert probe.span[0] == pytest.approx(2 * high, rel=0.01)
     assert probe.unit_least_dn == 1.0

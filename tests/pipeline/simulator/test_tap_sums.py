@@ -26,7 +26,7 @@ from tests.pipeline.simulator.fine_footprint import fine_light
 
 CAMERA = LineCamera()
 RIG = Rig(camera=CAMERA, optics=Optics(keystone_px=0.3))
-BLURS: dict[Any, str] = {DIFFRACTION: "airy", ABERRATION: "gaussian", KEYSTONE: "linear"}
+BLURS: dict[Any, str] = {DIFFRACTION: "gaussian", ABERRATION: "gaussian", KEYSTONE: "linear"}
 CORNER = Sweep("corner", "fine", "x", strip_px=960.0, start_px=-1279.0, lines=2560)
 MIDDLE = Sweep("middle", "fine", "y", strip_px=0.0, start_px=-1279.0, lines=2560)
 
@@ -71,8 +71,8 @@ class Moved:
 @pytest.mark.parametrize(
     ("sweep", "line", "variant", "sharp", "blurred"),
     [
-        (MIDDLE, 1280, "1x1", 1e-3, 1e-3),
-        (MIDDLE, 1280, "9x3", 1e-3, 1e-3),
+        (MIDDLE, 1280, "1x1", 1e-3, 2e-3),
+        (MIDDLE, 1280, "9x3", 1e-3, 2e-3),
         (CORNER, 2, "9x3", 1e-3, 1e-2),
         (CORNER, 2, "3x1", 3e-3, 1e-2),
         (CORNER, 2, "1-percent", 3e-2, 3e-2),
@@ -98,7 +98,7 @@ def test_rays_converge_to_the_closed_form() -> None:
     block = Block(RIG, sweep, range(1900, 1901), scene.wavelength_nm, scene.shape, samples=range(300, 340))
     moved = Moved.to(block, scene)
     light = expected_light(scene, block, {moved: "only", ROTATION: "rays", SLIT: "9x3"})
-    errors = [np.abs(fine_light(scene, block, moved, {}, per_px=many) - light).max() for many in (4, 8, 16)]
+    errors = [np.abs(fine_light(scene, block, moved, {}, per_px=many) - light).max() for many in (8, 16, 32)]
     assert errors[1] < errors[0] / 3
     assert errors[2] < errors[1] / 3
 

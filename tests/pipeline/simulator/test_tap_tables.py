@@ -1,4 +1,4 @@
-"""Tap weights: the closed form against sums over fine steps, Gaussians against Hermite's rule, tables against both."""
+"""Tap weights: the closed form against sums over fine steps, Gaussians against a sum of steps, tables against both."""
 
 from __future__ import annotations
 
@@ -13,17 +13,11 @@ from pipeline.simulator.tap_tables import SCALE_STEP, TapTable, blurred_weight, 
 DISTANCE = np.linspace(-5, 5, 401)
 
 
-def catmull_rom(t: np.ndarray) -> np.ndarray:
-    """The kernel as printed (Keys, 1981)."""
-    a = np.abs(t)
-    return np.where(a <= 1, 1 - 2.5 * a**2 + 1.5 * a**3, np.where(a < 2, 2 - 4 * a + 2.5 * a**2 - 0.5 * a**3, 0))
-
-
 @pytest.mark.parametrize("width", [0.3, 1.0, 2.7, 4.4])
 def test_box_is_the_mean_of_the_kernel(width: float) -> None:
-    """The closed form is the mean of Catmull-Rom's kernel over a thousand points of the box."""
+    """The closed form is the mean of linear interpolation's kernel over a thousand points of the box."""
     inside = (np.arange(1000) + 0.5) / 1000 - 0.5
-    wanted = catmull_rom(DISTANCE[:, None] + inside * width).mean(axis=1)
+    wanted = np.interp(DISTANCE[:, None] + inside * width, [-1, 0, 1], [0, 1, 0]).mean(axis=1)
     np.testing.assert_allclose(box_weight(DISTANCE, width), wanted, atol=2e-6)
 
 
@@ -37,19 +31,23 @@ def test_box_at_pixel_centres_is_the_camera_s_kernel(width: float) -> None:
 
 @given(st.floats(0, 6), st.integers(1, 8), st.floats(-1, 1))
 def test_weights_of_all_pixels_sum_to_one(width: float, held: int, place: float) -> None:
-    """A flat scene stays flat, wherever it is looked at."""
-    assert box_weight(place + np.arange(-20.0, 21.0), width, held).sum() == pytest.approx(1, abs=1e-9)
+    """A flat scene stays flat, wherever it is looked at; no weight is below 0."""
+    weight = box_weight(place + np.arange(-20.0, 21.0), width, held)
+    assert weight.sum() == pytest.approx(1, abs=1e-9)
+    assert weight.min() >= 0
 
 
 @pytest.mark.parametrize("held", [1, 4])
-def test_gaussian_is_that_of_hermite_s_rule(held: int) -> None:
-    """Kernels with Gaussians are means of the sharp one over 150 points of Hermite's rule."""
-    node, share = np.polynomial.hermite_e.hermegauss(150)
+def test_gaussian_is_that_of_many_steps(held: int) -> None:
+    """Kernels with Gaussians are means of the sharp one over thousands of even steps."""
+    step = np.arange(-8, 8, 0.002)
+    share = np.exp(-(step**2) / 2)
     variance = np.array([0.0, 0.08, 0.5])
     distance, weight = blurred_weight(2.7, variance, held)
-    for one, row in zip(variance, weight, strict=True):
-        wanted = box_weight(distance[:, None] + node * np.sqrt(one), 2.7, held) @ (share / share.sum())
-        np.testing.assert_allclose(row, wanted, atol=1e-5)
+    some = slice(0, len(distance), 37)
+    for one, row in zip(variance, weight[:, some], strict=True):
+        wanted = box_weight(distance[some, None] + step * np.sqrt(one), 2.7, held) @ (share / share.sum())
+        np.testing.assert_allclose(row, wanted, atol=1e-7)
 
 
 @settings(max_examples=30, deadline=None)
