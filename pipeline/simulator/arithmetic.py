@@ -18,7 +18,7 @@ from pipeline.simulator.effects.effect import Effect, Light
 from pipeline.simulator.effects.rotation import ROTATION
 from pipeline.simulator.effects.slit import SLIT
 from pipeline.simulator.effects.smear import SMEAR
-from pipeline.simulator.footprint import NEGLIGIBLE
+from pipeline.simulator.kernel_fit import NEGLIGIBLE
 from pipeline.simulator.tap_tables import TABULATED
 
 Floats = NDArray[np.float64]
