@@ -34,6 +34,7 @@ _ENOUGH = 1.25  # times the least error: of what comes near it, the fewest kerne
 _OWN = 4  # bands at most that have a kernel each, where there is no diffraction
 _JUDGED = 9  # bands on which a choice of kernels is judged
 _FITTED = (2, 3, 5, 7, 9, 13, 17, 25, 33, 65)  # bands that are fitted: the others are between two of them
+_LESS = 0.09  # of the square of the nodes' steps, by which each is narrower
 _SUM = 30.0  # weight of the sum of 1 in the fit
 _RADII = np.concatenate([np.geomspace(0.002, 0.1, 10), np.linspace(0.13, 1.3, 18)])  # waves [1/px]
 _TURNS = (np.arange(8) + 0.5) * np.pi / 8
@@ -48,6 +49,10 @@ class Kernels:
     shift: Floats
     variance: Floats
     level: NDArray[np.intp]
+
+    def some(self, which: list[int]) -> Kernels:
+        """Some of them."""
+        return Kernels(self.shift[:, which], self.variance[:, which], self.level[which])
 
 
 def fit_kernels(blurs: Moments, box: tuple[float, float], held: int) -> tuple[Kernels, Floats, Floats]:
@@ -85,12 +90,12 @@ def _fit(told: bytes, bands: int, box: tuple[float, float], held: int) -> tuple[
     own, judged = _footprint(box, held), _some(order, _JUDGED)
     wanted, tried = _wanted(moments[:, judged], own), []
     for kernels in _candidates(moments, place):
-        passed = _passed(kernels, own)
-        tried.append((kernels, float(np.abs(passed @ _shares(passed, wanted) - wanted).max())))
+        tried.append((kernels, _error(_passed(kernels, own), wanted)))
         if tried[-1][1] <= NEGLIGIBLE:
             break
     enough = max(_ENOUGH * min(error for _, error in tried), NEGLIGIBLE)
     chosen = next(kernels for kernels, error in tried if error <= enough)
+    chosen = chosen.some(_needed(_passed(chosen, own), wanted, enough))
     passed = _passed(chosen, own)
     for count in _FITTED:
         fitted = _some(order, count)
@@ -99,6 +104,24 @@ def _fit(told: bytes, bands: int, box: tuple[float, float], held: int) -> tuple[
         if error <= enough or count >= bands:
             break
     return chosen, shares, between
+
+
+def _needed(passed: Transfer, wanted: Transfer, enough: float) -> list[int]:
+    """Numbers of kernels without which the others err too much, the least missed left out first."""
+    kept = list(range(passed.shape[1]))
+    while len(kept) > 1:
+        without = [[one for one in kept if one != left] for left in kept]
+        errors = [_error(passed[:, some], wanted) for some in without]
+        least = int(np.argmin(errors))
+        if errors[least] > enough:
+            break
+        kept = without[least]
+    return kept
+
+
+def _error(passed: Transfer, wanted: Transfer) -> float:
+    """What the best shares err by of any wave in any band."""
+    return float(np.abs(passed @ _shares(passed, wanted) - wanted).max())
 
 
 def _between(place: Floats, nodes: Floats) -> Floats:
@@ -134,8 +157,9 @@ def _candidates(moments: Floats, place: Floats) -> Iterator[Kernels]:
             for size, level in ladder:
                 few = count if size <= _SHIFTED_PX[0] else min(count, 2 if size <= _SHIFTED_PX[1] else 1)
                 nodes = _nodes(moments[:4], place, few)
-                wide = np.repeat((size**2 * stretch)[:, None], nodes.shape[1], axis=1)
-                found.append((nodes[:2], nodes[2:] + wide, np.full(nodes.shape[1], level, np.intp)))
+                wide = (size**2 * stretch)[:, None] - _LESS * _steps(nodes[:2]) ** 2
+                variance = np.maximum(nodes[2:] + np.where(level == 1, wide, (size**2 * stretch)[:, None]), 0.0)
+                found.append((nodes[:2], variance, np.full(nodes.shape[1], level, np.intp)))
             shift, variance, level_of = (np.concatenate(parts, axis=-1) for parts in zip(*found, strict=True))
             yield Kernels(shift, variance, level_of)
         if count >= moments.shape[1]:
@@ -154,6 +178,14 @@ def _ladder(widest: Floats, ratio: float) -> list[tuple[float, int]]:
         sizes.append((level * _size_at(level), level))
         level *= 2 if level == 2 else 4
     return sizes
+
+
+def _steps(shift: Floats) -> Floats:
+    """How far neighbouring nodes lie apart, (2, 1): what is between two of them is wider than either."""
+    if shift.shape[1] == 1:
+        return np.zeros((2, 1))
+    steps: Floats = np.abs(np.diff(shift, axis=1)).max(axis=1, keepdims=True)
+    return steps
 
 
 def _size_at(level: int) -> float:

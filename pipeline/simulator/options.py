@@ -12,7 +12,6 @@ the image from the exact one. Noise of samples that are summed grows as their su
 Composition. Kernels that are not negative and sum to 1 have gain 1 at most, readout none. Gains of light (vignetting,
 drift, ...) multiply the errors of all other effects in the light, each by its own greatest factor, and change the unit:
 see `gain_range`. Gains and changes are asked for their bounds with the light that earlier gains leave and add.
-Catmull-Rom's 1.5625 would multiply errors made in the scene's pixels: no effect is so early.
 """
 
 from __future__ import annotations

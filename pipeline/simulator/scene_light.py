@@ -15,10 +15,12 @@ from pipeline.simulator.footprint import Footprint
 from pipeline.simulator.quadrature import footprint_rays
 from pipeline.simulator.rays import Views
 from pipeline.simulator.scene import RasterScene, Scene
-from pipeline.simulator.tap_sums import AT_ONCE, Gatherer, Pixels
+from pipeline.simulator.tap_sums import Gatherer, Pixels
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
+MIXED = 1024  # samples in a product
+MOST_PARTS = 1_500_000  # components of samples through kernels, at once: few calls, and little memory
 LEAST_COLUMNS = 16  # of a product whose rows come out the same wherever they stand: with 5 or 9 they do not
 
 
@@ -43,16 +45,23 @@ class _Bands:
         return _Bands(shares, wide, own_planes=False)
 
     def write(self, parts: Light, light: Light) -> None:
-        """Write light (n, band) of the first samples of components (kernel, `AT_ONCE`, component)."""
+        """Write light (n, band) of the first samples of components (kernel, some times `MIXED`, component)."""
         import torch
 
-        rows, (nodes, kernels) = len(light), self.shares.shape
         if self.own_planes:
-            np.einsum("knb,kb->nb", parts[:, :rows], self.mixing, out=light)
+            np.einsum("knb,kb->nb", parts[:, : len(light)], self.mixing, out=light)
             return
-        summed = torch.mm(torch.from_numpy(self.shares), torch.from_numpy(parts).view(kernels, -1))
-        table = summed.view(nodes, AT_ONCE, -1).permute(1, 0, 2).reshape(AT_ONCE, -1)
-        light[:] = torch.mm(table, torch.from_numpy(self.mixing)).numpy()[:rows, : light.shape[1]]
+        nodes, kernels = self.shares.shape
+        mixing, shares = torch.from_numpy(self.mixing), torch.from_numpy(self.shares)
+        columns, wide = torch.from_numpy(parts).view(kernels, -1), parts.shape[2] * MIXED
+        for number, first in enumerate(range(0, len(light), MIXED)):
+            summed = torch.mm(shares, columns[:, number * wide : (number + 1) * wide]).view(nodes, MIXED, -1)
+            table = summed.permute(1, 0, 2).reshape(MIXED, -1)
+            into = torch.from_numpy(light[first : first + MIXED])
+            if into.shape == (MIXED, mixing.shape[1]):
+                torch.mm(table, mixing, out=into)
+            else:
+                into.copy_(torch.mm(table, mixing)[: into.shape[0], : into.shape[1]])
 
 
 class Looker:
@@ -80,10 +89,12 @@ class Looker:
         shares = self._shares(len(steps), parted=bool(pixels))
         count, components = len(steps[0].along), spectra.shape[0]
         light = np.empty((count, spectra.shape[-1]), np.float32)
-        parts, more = (np.zeros((self.footprint.kernels, AT_ONCE, components), np.float32) for _ in range(2))
+        kernels = self.footprint.kernels
+        at_once = MIXED * int(np.clip(MOST_PARTS // (MIXED * kernels * components), 1, -(-count // MIXED)))
+        parts, more = (np.zeros((kernels, at_once, components), np.float32) for _ in range(2))
         bands = _Bands.of(shares, self.footprint.between, spectra)
-        for first in range(0, count, AT_ONCE):
-            chunk = slice(first, min(first + AT_ONCE, count))
+        for first in range(0, count, at_once):
+            chunk = slice(first, min(first + at_once, count))
             rows = chunk.stop - first
             for number, views in enumerate(steps):
                 into = more if number else parts

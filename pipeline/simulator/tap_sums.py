@@ -24,8 +24,6 @@ if TYPE_CHECKING:  # a second to import: the functions that use it do so, and a 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
 
-AT_ONCE = 1024  # samples whose weights stay in the cache
-
 
 @dataclass(frozen=True)
 class Pixels:

@@ -134,7 +134,7 @@ def test_black_scene_reads_dark() -> None:
 
 
 def test_edges_never_wrap() -> None:
-    """Interpolation overshoots at a black and white edge, below zero light and above the well, are clipped."""
+    """At a black and white edge light reads the dark level at least, and where the well is full its end."""
     values = np.zeros((40, 640, 1))
     values[:, ::7] = values[::5] = 1.0
     source = source_of(values, replace(CAMERA, exposure_ms=170.0), chosen=effects_on("rotation"))

@@ -24,11 +24,11 @@ class Defocus:
 
     name = "defocus"
     variants = ("disc",)
-    cost_ns = MappingProxyType({"disc": 1.1})
+    cost_ns = MappingProxyType({"disc": 0.3})
 
     def merged(self, rig: Rig) -> Merged:
         """Give what it costs in the kernels that diffraction needs anyway."""
-        return Merged(DIFFRACTION.name, AIRY, 0.4)
+        return Merged(DIFFRACTION.name, AIRY, 0.1)
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
         """Give the blur, equal in all bands; ``normal`` (3,) is the mirror's in the camera frame, None at rest."""

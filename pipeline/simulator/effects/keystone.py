@@ -30,11 +30,11 @@ class Keystone:
 
     name = "keystone"
     variants = ("linear",)
-    cost_ns = MappingProxyType({"linear": 4.0})
+    cost_ns = MappingProxyType({"linear": 2.6})
 
     def merged(self, rig: Rig) -> Merged:
-        """Give what it costs in the kernels that diffraction needs anyway."""
-        return Merged(DIFFRACTION.name, AIRY, 0.3)
+        """Give what it costs beside diffraction, whose several widths have to be shifted each."""
+        return Merged(DIFFRACTION.name, AIRY, 5.6)
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
         """Give the shift of each band."""

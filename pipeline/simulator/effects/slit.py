@@ -30,8 +30,8 @@ class SlitBox:
 
     name = "slit"
     variants = ("9x3", "5x2", "3x1", "1-percent", "3-percent", UPRIGHT)
-    # Beside the rig's blurs, which need four kernels whatever the slit, at strips of +-960 px; at +-320 less of them.
-    cost_ns = MappingProxyType({"9x3": 27.7, "5x2": 10.0, "3x1": 2.2, "1-percent": 2.1, "3-percent": 2.0, UPRIGHT: 0.4})
+    # Beside the rig's blurs, which need eleven kernels whatever the slit, at strips of +-960 px; at +-320 less of them.
+    cost_ns = MappingProxyType({"9x3": 38.0, "5x2": 10.0, "3x1": 1.8, "1-percent": 1.4, "3-percent": 1.3, UPRIGHT: 0.3})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
         """Bound by half as much again as the probe measured; where it has not, by the box's variance and the span.

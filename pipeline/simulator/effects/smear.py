@@ -34,7 +34,7 @@ class Smear:
 
     name = "smear"
     variants = (POSITIONS, FOLDED)
-    cost_ns = MappingProxyType({POSITIONS: 7.8, FOLDED: 5.2})
+    cost_ns = MappingProxyType({POSITIONS: 15.0, FOLDED: 5.2})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
         """Bound what a blur of the positions' variance changes; 0 where every line has one position.

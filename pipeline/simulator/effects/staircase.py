@@ -33,7 +33,7 @@ class Staircase:
 
     name = "staircase"
     variants = (EXACT, CENTRES)
-    cost_ns = MappingProxyType({EXACT: 10.5, CENTRES: 0.01})  # exact: five positions a line instead of one
+    cost_ns = MappingProxyType({EXACT: 18.0, CENTRES: 0.01})  # exact: five positions a line instead of one
 
     def aim(self, block: Block, variant: str) -> Floats:
         """Give how far beside the plan the mirror stands, (line, part, 2) along the line and the scan. [px]"""
