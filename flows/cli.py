@@ -219,7 +219,7 @@ def main(arguments: list[str] | None = None) -> None:
     # Read when numpy is first imported, which the verbs do. Split among threads, sums are rounded otherwise: the raw
     # light behind one key, and so the receipt of one seed, would differ with the number of cores.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
-    with terminable():
+    with terminable(last=arguments is None):
         sys.exit(_run(sys.argv[1:] if arguments is None else arguments))
 
 

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 from flows.process_guard import end_with_us
 from flows.survey import Products, StageRunner, Step, survey
+from flows.termination import terminable
 from pipeline.errors import PipelineError
 from storage.archive import StageRef
 from storage.staging import remove_tree, take_lock
@@ -32,6 +33,7 @@ QUIET = {
     "PREFECT_SERVER_EPHEMERAL_ENABLED": "true",
     "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "120",
     "PREFECT_LOGGING_LEVEL": "CRITICAL",  # what fails is told once, in our words
+    "PREFECT_LOGGING_INTERNAL_LEVEL": "CRITICAL",
     "PREFECT_SERVER_LOGGING_LEVEL": "ERROR",
     "PREFECT_LOGGING_TO_API_ENABLED": "false",
     "PREFECT_CLI_PROMPT": "false",
@@ -127,13 +129,15 @@ def _run_flow(runner: StageRunner, finish: Callable[[Step, Products], Left]) -> 
     from prefect import flow
 
     started: list[bool] = []
+    stopped: list[KeyboardInterrupt] = []
     left: list[Left] = []
 
     @flow(name="survey", flow_run_name=f"survey-{runner.run.name}", persist_result=False, validate_parameters=False)
     def survey_flow(scene: str, seed: int, budget: float) -> None:
         """Sweep coarsely, look again where it changes the map, draw the map."""
         started.append(True)
-        left.append(_survey(runner, finish))
+        with _stopping(stopped):
+            left.append(_survey(runner, finish))
 
     settings = runner.run.settings
     try:
@@ -141,10 +145,29 @@ def _run_flow(runner: StageRunner, finish: Callable[[Step, Products], Left]) -> 
     except PipelineError:
         raise
     except Exception as error:
+        if stopped:  # and the server with it, which Prefect could not tell
+            raise stopped[0] from error
         if started:
             raise
         raise EngineUnavailable(f"the Prefect server did not start ({error})") from error
     return left[0]
+
+
+@contextmanager
+def _stopping(stopped: list[KeyboardInterrupt]) -> Iterator[None]:
+    """Hear SIGTERM as everywhere, and not as Prefect does; note what stops the flow.
+
+    Whoever ends a service ends the server too: Prefect then tries but once to tell it, and not for a minute.
+    """
+    from prefect.settings import get_current_settings
+
+    with terminable():
+        try:
+            yield
+        except KeyboardInterrupt as error:
+            stopped.append(error)
+            get_current_settings().client.max_retries = 0
+            raise
 
 
 def _may_help(task: Any, run: Any, state: Any) -> bool:

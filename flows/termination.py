@@ -16,8 +16,11 @@ class Terminated(KeyboardInterrupt):
 
 
 @contextmanager
-def terminable() -> Iterator[None]:
-    """Raise `Terminated` in the main thread where SIGTERM comes while the block runs; other threads are left alone."""
+def terminable(*, last: bool = False) -> Iterator[None]:
+    """Raise `Terminated` in the main thread where SIGTERM comes while the block runs; other threads are left alone.
+
+    Where the block is the ``last`` that the process does, its exit code stands then: SIGTERM has no effect any more.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -25,7 +28,7 @@ def terminable() -> Iterator[None]:
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN if last else before)
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:

@@ -101,3 +101,19 @@ def test_sigterm_ends_every_verb(
     goes_on = "; the same command goes on from here" if verb in GOES_ON else ""
     assert (left.value.code, capsys.readouterr().err.strip()) == (143, f"terminated{goes_on}")
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+ENDING = """
+import atexit, os, signal, sys
+from flows.cli import main
+atexit.register(lambda: os.kill(os.getpid(), signal.SIGTERM))
+sys.argv[1:] = ["--version"]
+main()
+"""
+
+
+def test_sigterm_has_no_effect_once_the_exit_code_stands() -> None:
+    """A command that has done its work and is ending, children and all, ends as it would have."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    ended = subprocess.run([sys.executable, "-c", ENDING], env=environment, capture_output=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, b"")

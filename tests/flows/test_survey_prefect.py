@@ -7,6 +7,7 @@ import json
 import os
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from rich.console import Console
 
 from flows import engine, evaluation
 from flows.survey import STAGES
+from flows.termination import Terminated
 from pipeline.errors import RigError, SceneError
 from storage.archive import Archive
 from tests.flows.conftest import CommandLine
@@ -152,3 +154,34 @@ def test_sigterm_in_a_stage(
     monkeypatch.setitem(STAGES, "rectify", real)
     assert command_line(*words).code == 0
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_sigterm_that_ends_the_server_too(prefect_home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Prefect cannot tell its server any more, tries once, and raises what it likes: the survey was terminated."""
+    import prefect
+    from prefect.settings import PREFECT_CLIENT_MAX_RETRIES, temporary_settings
+
+    tries: list[int] = []
+
+    def flow(**options: Any) -> Any:
+        def call(body: Any) -> Any:
+            def run(*given: Any) -> None:
+                try:
+                    body(*given)
+                except KeyboardInterrupt:
+                    tries.append(PREFECT_CLIENT_MAX_RETRIES.value())
+                    raise ConnectionError("no server") from None
+
+            return run
+
+        return call
+
+    def terminate(*given: Any) -> None:
+        raise Terminated
+
+    monkeypatch.setattr(prefect, "flow", flow)
+    monkeypatch.setattr(engine, "_survey", terminate)
+    settings = SimpleNamespace(scene="farm", seed=0, budget=0.5)
+    with temporary_settings(), pytest.raises(Terminated):
+        engine._run_flow(SimpleNamespace(run=SimpleNamespace(name="farm", settings=settings)), terminate)  # type: ignore[arg-type]
+    assert tries == [0]
