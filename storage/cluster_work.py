@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
@@ -171,7 +172,7 @@ def start(workers: int) -> Team:
         closing.enter_context(dask.config.set(_QUIET))
         scratch = closing.enter_context(TemporaryDirectory(prefix="spectralzoom-", ignore_cleanup_errors=True))
         try:
-            with _interrupts_held():
+            with _termination_held(), _interrupts_held():
                 cluster = closing.enter_context(
                     LocalCluster(  # type: ignore[no-untyped-call]
                         n_workers=workers,
@@ -225,6 +226,26 @@ def _interrupts_held() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _termination_held() -> Iterator[None]:
+    """Have this process hear SIGTERM once its workers have begun: half a cluster cannot be ended in silence.
+
+    It is not blocked, for that they would inherit, and they are to be ended by it.
+    """
+    heard = signal.getsignal(signal.SIGTERM)
+    if threading.current_thread() is not threading.main_thread() or not callable(heard):
+        yield
+        return
+    came: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, frame: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, heard)
+        if came:
+            signal.raise_signal(signal.SIGTERM)
 
 
 @contextmanager

@@ -342,6 +342,37 @@ if __name__ == "__main__":
 """
 
 
+TERMINATED = """
+import os, signal, sys, threading
+from contextlib import suppress
+from pathlib import Path
+from storage.block_work import Crew, run_blocks
+def children():
+    return [child for task in Path("/proc/self/task").glob("*/children") for child in task.read_text().split()]
+def terminate():
+    while True:
+        with suppress(OSError):  # a thread that has ended
+            if len(children()) > 1:  # a tracker, and a worker
+                break
+    os.kill(os.getpid(), signal.SIGTERM)
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    threading.Thread(target=terminate, daemon=True).start()
+    try:
+        run_blocks(abs, range(4), Crew("processes", 1))
+    except KeyboardInterrupt:
+        sys.exit(143)
+"""
+
+
+def test_sigterm_while_workers_begin(tmp_path: Path) -> None:
+    """It is heard once they are there, and they end without a word."""
+    (script := tmp_path / "terminated.py").write_text(TERMINATED)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (143, b"")
+
+
 def touch_slowly(folder: Path, number: int) -> None:
     """Show that a block has begun, and take a while."""
     (folder / f"{number}-{os.getpid()}").touch()
