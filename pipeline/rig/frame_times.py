@@ -7,7 +7,6 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from scipy import ndimage
 
 from pipeline.errors import ShapeError
 from pipeline.rig.clock_fit import Bools, Floats, Ints
@@ -80,6 +79,8 @@ def whole_numbers(number: Ints) -> tuple[Ints, list[str]]:
 
 def _strayed(late: Floats, period_us: float) -> Bools:
     """Stamps off the median of their neighbours by half a period."""
+    from scipy import ndimage  # takes its time to import
+
     if len(late) < 3:
         return np.zeros(len(late), np.bool_)
     window = min(_WINDOW, len(late) - 1 + len(late) % 2)

@@ -287,7 +287,11 @@ REFUSED: dict[str, tuple[Refuse, int, str]] = {
     "no scene": (_no_scene, 1, "there is no file .*scene.png"),
     "a damaged receipt": (_damaged_receipt, 1, "receipt.json has changed .*; run verify --repair"),
     "a store that is gone": (_mosaic_gone, 1, "the mosaic of runs/.* is missing or damaged; run verify --repair"),
-    "an older version": (_newer_stage, 1, "version 4 of the stage segment, which is now 99: reprocess makes a new run"),
+    "an older version": (
+        _newer_stage,
+        1,
+        r"version \d+ of the stage segment, which is now 99: reprocess makes a new run",
+    ),
 }
 
 

@@ -82,7 +82,10 @@ def test_detail_still_helps(surveyed: tuple[dict[str, Any], Path]) -> None:
 
 def test_unseen_pixels_take_the_coarse_look(tmp_path: Path) -> None:
     """What no line reached of a seat has the columns of the coarse pixel over it; a seat never seen is left out."""
-    grid, weights = SceneGrid(12, 16, 4, 2), SimpleNamespace(basis=SpectralBasis(500, 700, 2), columns=lambda v, nm: v)
+    grid = SceneGrid(12, 16, 4, 2)
+    weights = SimpleNamespace(
+        basis=SpectralBasis(500, 700, 2), columns=lambda v, nm: v, normalisation=SimpleNamespace(most_value=np.inf)
+    )
     seats = np.array([1, 6, 7])
     values = np.random.default_rng(0).normal(size=(3, 4, 4, 2)).astype(np.float16)
     values[0, :3, 1:], values[1] = np.nan, np.nan

@@ -19,8 +19,8 @@ from pipeline.simulator.effects.keystone import KEYSTONE
 from pipeline.simulator.effects.rotation import ROTATION
 from pipeline.simulator.effects.slit import SLIT
 from pipeline.simulator.effects.smear import SMEAR
-from pipeline.simulator.footprint import NEGLIGIBLE
 from pipeline.simulator.instrument import sweep_block
+from pipeline.simulator.kernel_fit import NEGLIGIBLE
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import raster_from_values
