@@ -10,8 +10,10 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from flows.process_guard import KeptProcess
+from flows.serve_request import ServeRequest
 from flows.served import NAMED_BY, read_served
 
 PATIENCE_S = 15.0
@@ -43,11 +45,37 @@ def own_temporary_folder() -> Iterator[None]:
             tempfile.tempdir = usual
 
 
+def deployments(request: ServeRequest) -> list[Any]:
+    """A deployment of the survey for each field, and of reprocessing for each archive.
+
+    None has a schedule of Prefect's: the watcher plans each due time once, see `flows.serve_queue`.
+    """
+    from prefect.types.entrypoint import EntrypointType
+
+    from flows.serve_flow import reprocess_archive, survey_scheduled
+
+    made = [
+        survey_scheduled.to_deployment(
+            one.name, schedules=[], parameters={"field": one.name}, tags=[one.settings.source, one.name],
+            description=f"Surveys of {one.name} by {one.file}, {request.timetable.words()}.", version="1",
+            entrypoint_type=EntrypointType.MODULE_PATH,
+        )
+        for one in request.fields
+    ]  # fmt: skip
+    for number, out in enumerate(dict.fromkeys(one.settings.out for one in request.fields), 1):
+        made.append(
+            reprocess_archive.to_deployment(
+                "archive" if number == 1 else f"archive-{number}", parameters={"archive": str(out)},
+                description=f"Surveys of {out} again, with newer weights or stages; on request.", version="1",
+                entrypoint_type=EntrypointType.MODULE_PATH,
+            )
+        )  # fmt: skip
+    return made
+
+
 def main() -> None:
     """Let the deployments of what is served run until told to stop."""
     from prefect import serve
-
-    from flows.serve_request import deployments
 
     request = read_served()
     with suppress(KeyboardInterrupt), own_temporary_folder():
