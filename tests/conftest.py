@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.console import Console
 
-from flows.publish import Published
-from flows.settings import load_settings
-from flows.survey_command import run_survey
+from flows.publish.run_folder import Published
+from flows.publish.survey_command import run_survey
+from flows.settings.survey_settings import load_settings
 from models.segmenter import Segmenter, SegmenterConfig
 from models.spectral import Normalisation, SpectralBasis
 from models.weights import Weights, save_weights

@@ -15,8 +15,8 @@ from measure import Row
 from numpy.typing import NDArray
 from rich.console import Console
 
-from flows.settings import load_settings
-from flows.survey_command import run_survey
+from flows.publish.survey_command import run_survey
+from flows.settings.survey_settings import load_settings
 from models.process import use_one_thread
 from storage.class_maps import load_class_map
 

@@ -17,12 +17,12 @@ from typing import Any
 from bench_tiles import alone
 from measure import Row
 
-from flows import engine
-from flows.engine import QUIET
-from flows.run import open_run
-from flows.serve_server import LocalServer
-from flows.settings import Settings
-from flows.survey import STAGES, StageRunner
+from flows.schedule.server import LocalServer
+from flows.settings.survey_settings import Settings
+from flows.survey import prefect_engine as engine
+from flows.survey.prefect_engine import QUIET
+from flows.survey.run import open_run
+from flows.survey.survey import STAGES, StageRunner
 
 ROUNDS = 11
 GOAL_S = 0.3

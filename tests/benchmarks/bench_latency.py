@@ -28,8 +28,8 @@ if __name__ == "__main__":  # as a command of its own; one thread, as the figure
 from measure import Row
 
 if TYPE_CHECKING:
-    from flows.run import SurveyRun
-    from flows.settings import Settings
+    from flows.settings.survey_settings import Settings
+    from flows.survey.run import SurveyRun
     from pipeline.rig.capture_runner import RigDevices
     from pipeline.rig.emulator.emulated_rig import EmulatedRig
 
@@ -82,8 +82,8 @@ def _in_a_process(*flags: str) -> Moments:
 
 def measure(px: int, *, ahead: bool) -> Moments:
     """Survey a farm through an emulated rig as far as the first fine position."""
-    from flows import stages
-    from flows.settings import load_settings
+    from flows.settings.survey_settings import load_settings
+    from flows.survey import stages
 
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         told = {"size": f"{px}x{px}", "source": "rig", "visit": "first", "out": name, "engine": "plain",
@@ -109,7 +109,7 @@ class _AskedError(Exception):
 @contextmanager
 def _watched(moments: Moments) -> Iterator[None]:
     """Take the time of exposures, lines and the first path of a fine sweep; count what was made ahead."""
-    from flows import placement
+    from flows.survey import placement
     from pipeline.rig.capture_runner import CaptureRunner
     from storage.spool import Spool
 
@@ -141,9 +141,9 @@ def _watched(moments: Moments) -> Iterator[None]:
 
 
 def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
-    from flows.effect_choice import chosen_effects
-    from flows.run import make_source, open_run
-    from flows.survey import StageRunner, survey
+    from flows.survey.effect_choice import chosen_effects
+    from flows.survey.run import make_source, open_run
+    from flows.survey.survey import StageRunner, survey
     from pipeline.rig.clock import ManualClock
     from pipeline.rig.emulator.emulated_rig import EmulatedRig
 
@@ -163,7 +163,7 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
     source = make_source(run.scene, settings)
     rig = EmulatedRig(replace(source, chosen=chosen_effects(effects)), ManualClock(10.0))
     line = stack.enter_context(rig.in_process())
-    stack.enter_context(patch("flows.rig_run.open_devices", _devices(rig, line)))
+    stack.enter_context(patch("flows.survey.rig_run.open_devices", _devices(rig, line)))
     try:
         survey(step)
     except _AskedError:

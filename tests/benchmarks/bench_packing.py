@@ -45,8 +45,8 @@ def rows() -> list[Row]:
 def _survey(archive: Path) -> None:
     from rich.console import Console
 
-    from flows.settings import load_settings
-    from flows.survey_command import run_survey
+    from flows.publish.survey_command import run_survey
+    from flows.settings.survey_settings import load_settings
 
     flags = {"scene": "farm", "size": "256x256", "seed": "5", "budget": "0.8", "engine": "plain", "controls": False}
     run_survey(load_settings(None, flags | {"out": str(archive)}), Console(quiet=True))
@@ -55,7 +55,7 @@ def _survey(archive: Path) -> None:
 def _ingest(archive: Path) -> None:
     from rich.console import Console
 
-    from flows.ingest_command import IngestRequest, run_ingest
+    from flows.archive.ingest_command import IngestRequest, run_ingest
 
     data = Path(os.environ.get("SPECTRALZOOM_DATA", Path(__file__).parents[3] / "shared" / "data"))
     for pattern in MIXED:

@@ -182,7 +182,7 @@ def _peer(name: str, values: Values, split: Split, classifier: Any, grid: dict[s
 
 def _trained(folder: Path, out: Path) -> Path:
     """Weights as the command makes them."""
-    from flows.train import TrainRequest, train_weights
+    from flows.training.train import TrainRequest, train_weights
 
     path = out / "pines.safetensors"
     train_weights(TrainRequest(str(folder / SCENE), path, choices=_choices(folder), settings=_settings()))
@@ -196,7 +196,7 @@ def _settings() -> TrainingSettings:
 
 
 def _scene(folder: Path) -> RasterScene:
-    from flows.training_data import scene_of_file
+    from flows.training.data import scene_of_file
     from pipeline.camera import LineCamera
     from storage.datasets import load_data_set
 
@@ -216,7 +216,7 @@ def _seen_by_camera(folder: Path) -> Values:
 
 def _through_camera(folder: Path, path: Path) -> list[Result]:
     """The segmenter that the command trained, with several shares of the seats."""
-    from flows.benchmark_frames import look_at
+    from flows.evaluate.frames import look_at
     from models.weights import load_weights
     from pipeline.camera import LineCamera
 

@@ -68,7 +68,7 @@ def _clocks(folder: Path, small: Path) -> list[Row]:
 
 def _clock(what: str, archive: Path) -> Row:
     """Wall seconds of the process, the best of some, and its processor seconds."""
-    command = [sys.executable, "-m", "flows.cli", "plan", "--scene", "farm", "--out", str(archive), "--json"]
+    command = [sys.executable, "-m", "flows.cli.main", "plan", "--scene", "farm", "--out", str(archive), "--json"]
     command += ["--no-controls", "--size", f"{FIELD_PX}x{FIELD_PX}"]
     walls, cpus = [], []
     for _ in range(TURNS):
@@ -85,10 +85,10 @@ def _survey(archive: Path, side: int) -> dict[str, Cost]:
     """Survey a square of the farm, or find that it was; gives its stages by name."""
     from rich.console import Console
 
-    from flows.run import open_run
-    from flows.stage_costs import PARTS
-    from flows.survey import StageRunner, survey
-    from flows.survey_command import run_survey
+    from flows.archive.stage_costs import PARTS
+    from flows.publish.survey_command import run_survey
+    from flows.survey.run import open_run
+    from flows.survey.survey import StageRunner, survey
 
     settings = _settings(archive, side)
     run_survey(settings, Console(quiet=True))
@@ -105,7 +105,7 @@ def _survey(archive: Path, side: int) -> dict[str, Cost]:
 
 def _plan(archive: Path, side: int, clock: str = "wall_s") -> dict[str, Any]:
     """The plan's content; its seconds by what the records say of one clock."""
-    from flows.forecast_command import plan_content
+    from flows.archive.plan_command import plan_content
     from storage.manifests import cost_of
 
     def timed(manifest: dict[str, Any]) -> Cost | None:
@@ -117,7 +117,7 @@ def _plan(archive: Path, side: int, clock: str = "wall_s") -> dict[str, Any]:
 
 
 def _settings(archive: Path, side: int) -> Any:
-    from flows.settings import load_settings
+    from flows.settings.survey_settings import load_settings
 
     flags = {"scene": "farm", "size": f"{side}x{side}", "out": str(archive), "engine": "plain", "controls": False}
     return load_settings(None, flags)

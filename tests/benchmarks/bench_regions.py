@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from paper_scale import peak_bytes
 from rich.console import Console
 
-from flows.field_work import SHARD, FieldWork
-from flows.region_work import WeightsFile
-from flows.run import SurveyRun, open_run
-from flows.settings import load_settings
-from flows.survey_command import run_survey
+from flows.publish.survey_command import run_survey
+from flows.settings.survey_settings import load_settings
+from flows.survey.field_work import SHARD, FieldWork
+from flows.survey.region_work import WeightsFile
+from flows.survey.run import SurveyRun, open_run
 from models.metrics import confusion, mean_iou
 from models.process import use_one_thread
 from models.regions import HALO_CELLS, Region, most_bytes, plan_regions

@@ -106,10 +106,10 @@ def _warm(folder: Path) -> Row:
     """A finished survey asked for again: what its stages take beside what they took."""
     from rich.console import Console
 
-    from flows.run import open_run
-    from flows.settings import load_settings
-    from flows.survey import StageRunner, survey
-    from flows.survey_command import run_survey
+    from flows.publish.survey_command import run_survey
+    from flows.settings.survey_settings import load_settings
+    from flows.survey.run import open_run
+    from flows.survey.survey import StageRunner, survey
 
     flags = {"scene": "farm", "out": str(folder / "archive"), "engine": "plain", "controls": False}
     settings = load_settings(None, flags)

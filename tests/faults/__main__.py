@@ -94,7 +94,7 @@ def _flips(quick: bool) -> Sequence[Row]:
     """Bits flipped in an archive that is made for it."""
     words = ("a bit flips", "one bit of a random file of an archive", "each found by verify, and named")
     with tempfile.TemporaryDirectory(prefix="flips-") as name:
-        command = [sys.executable, "-m", "flows.cli", *SURVEY, name]
+        command = [sys.executable, "-m", "flows.cli.main", *SURVEY, name]
         subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
         return [_run_script("flips", words, 20 if quick else 200, [name])]
 

@@ -26,7 +26,7 @@ START_S = 0.3  # of importing, in which nothing can go wrong
 
 def start(archive: Path) -> subprocess.Popen[bytes]:
     """Begin the survey in a process of its own."""
-    command = [sys.executable, "-m", "flows.cli", "survey", *SURVEY, "--out", str(archive)]
+    command = [sys.executable, "-m", "flows.cli.main", "survey", *SURVEY, "--out", str(archive)]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 

@@ -126,10 +126,10 @@ class Nursery:
 def serve() -> None:
     """Fork a child for each request on stdin, or wait for one."""
     for name in (
-        "flows.cli",
-        "flows.publish",
-        "flows.survey_command",
-        "flows.archive_verbs",
+        "flows.cli.main",
+        "flows.publish.run_folder",
+        "flows.publish.survey_command",
+        "flows.cli.archive_verbs",
         "matplotlib.backends.backend_agg",
     ):
         importlib.import_module(name)
@@ -155,7 +155,7 @@ def _live(request: dict[str, Any]) -> None:
         if request["fault"] is not None:
             injection = importlib.import_module("tests.faults.injection")
             getattr(injection, request["fault"])(**request["arguments"])
-        importlib.import_module("flows.cli").main(request["words"])
+        importlib.import_module("flows.cli.main").main(request["words"])
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1
     except BaseException:
@@ -167,7 +167,7 @@ def _live(request: dict[str, Any]) -> None:
 
 def _keep_place(path: Path) -> None:
     """When the command line tells of an error, note the functions of ours that it came through."""
-    cli = importlib.import_module("flows.cli")
+    cli = importlib.import_module("flows.cli.main")
     say, descriptor = cli.say, os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
 
     def noting(message: str) -> None:

@@ -22,8 +22,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from flows.receipt import comparable, is_pending
-from flows.termination import EXIT_CODE
+from flows.publish.receipt import comparable, is_pending
+from flows.terminal.termination import EXIT_CODE
 from storage.archive import Archive
 from tests.faults.fault_table import Clock, Row
 from tests.faults.small_survey import problems
@@ -65,7 +65,7 @@ class Under:
     @classmethod
     def way(cls, out: Path, engine: str) -> Under:
         """Begin it."""
-        command = [sys.executable, "-m", "flows.cli", "survey", *SURVEY, "--engine", engine, "--out", str(out)]
+        command = [sys.executable, "-m", "flows.cli.main", "survey", *SURVEY, "--engine", engine, "--out", str(out)]
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
         say = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
         return cls(subprocess.Popen(command, cwd=ROOT, env=environment, start_new_session=True, text=True, **say))

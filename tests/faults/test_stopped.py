@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from flows.receipt import check_receipt, comparable, is_pending
-from flows.termination import EXIT_CODE
+from flows.publish.receipt import check_receipt, comparable, is_pending
+from flows.terminal.termination import EXIT_CODE
 from storage.archive import Archive
 from storage.spool import Spool
 from tests.faults.nursery import Ended, Nursery
@@ -26,12 +26,12 @@ GOING_ON = "terminated; the same command goes on from here"
 SYNCS = (2, 30, 60, 110)  # of a survey's files, before which it is stopped
 TAKEN = 20  # lines of a sweep
 CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: EXIT_CODE}
-BEGUN = ("flows.evaluation:load_class_map", 1)
+BEGUN = ("flows.survey.accuracy:load_class_map", 1)
 PLACES = {  # function and call before which a survey is stopped that has its map, and with what
     "before the map is looked at": (*BEGUN, signal.SIGTERM),
-    "in the controls": ("flows.evaluation:run_controls", 1, signal.SIGKILL),
-    "stored and not added": ("flows.judging:add_accuracy", 1, signal.SIGKILL),
-    "drawn anew": ("flows.publish:draw_quicklook", 1, signal.SIGTERM),
+    "in the controls": ("flows.survey.accuracy:run_controls", 1, signal.SIGKILL),
+    "stored and not added": ("flows.publish.judging:add_accuracy", 1, signal.SIGKILL),
+    "drawn anew": ("flows.publish.run_folder:draw_quicklook", 1, signal.SIGTERM),
     "after the run has changed": ("storage.run_folders:remove_tree", 1, signal.SIGKILL),
 }
 ADDED = "after the run has changed"
@@ -100,7 +100,7 @@ def test_an_evaluation_goes_on(subject: Subject, tmp_path: Path) -> None:
     field, file, out = write_field(tmp_path / "field"), tmp_path / "w.safetensors", tmp_path / "out"
     asked = ["evaluate", str(field), "--weights", str(write_weights(file)), "-o", str(out), "--shares", "0.5",
              "--policies", "random", "--timed-frames", "0", "--draws", "20", "--no-rig", "--no-pooled"]  # fmt: skip
-    place = {"place": "flows.benchmark_work:judge_frame", "number": signal.SIGTERM}
+    place = {"place": "flows.evaluate.work:judge_frame", "number": signal.SIGTERM}
     ended = subject.nursery.run(asked, "end_before", call=3, **place)
     assert told(ended), ended.text
     again = subject.nursery.run(asked, "end_before", call=2, **place)  # one frame is left

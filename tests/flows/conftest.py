@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from flows.cli import main
-from flows.engine import PASSWORD, QUIET
-from flows.served import NAMED_BY
+from flows.cli.main import main
+from flows.schedule.served import NAMED_BY
+from flows.survey.prefect_engine import PASSWORD, QUIET
 
 CommandLine = Callable[..., "Ended"]
 

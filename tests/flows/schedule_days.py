@@ -6,9 +6,9 @@ from collections import Counter
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from flows.field_schedule import FieldSchedule
-from flows.schedule_state import ENDINGS, read_moment, read_state
-from flows.schedule_times import Timetable, parse_timetable
+from flows.schedule.field_schedule import FieldSchedule
+from flows.schedule.ledger_state import ENDINGS, read_moment, read_state
+from flows.schedule.times import Timetable, parse_timetable
 from storage.ledger import Ledger
 
 NOON = datetime(2026, 6, 1, 12, tzinfo=UTC)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from flows.benchmark_frames import Look, look_at, open_frames
+from flows.evaluate.frames import Look, look_at, open_frames
 from models.sizes import PRESETS, Preset
 from models.weights import AnyWeights, Weights, load_weights, save_weights
 from pipeline.camera import LineCamera

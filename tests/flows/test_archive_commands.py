@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from flows import archive_tables
-from flows.archive_commands import DONE, FAILED, PARTLY, run_explain, run_gc, run_ls, run_verify
-from flows.archive_contents import command, contents
-from flows.figures import DASH
-from flows.settings import load_settings
+from flows.archive import tables as archive_tables
+from flows.archive.commands import DONE, FAILED, PARTLY, run_explain, run_gc, run_ls, run_verify
+from flows.archive.contents import command, contents
+from flows.settings.survey_settings import load_settings
+from flows.terminal.figures import DASH
 from pipeline.errors import ArchiveError
 from storage.archive import Archive
 from storage.lineage import Catalogue

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.survey import STAGES
+from flows.survey.survey import STAGES
 from storage.archive import Archive
 from storage.class_maps import load_class_map
 
@@ -245,7 +245,7 @@ def test_training_refused_with_one_message(
 ])  # fmt: skip
 def test_real_process_ends_with_the_code(words: list[str], code: int, says: str, folder: Path) -> None:
     """What the shell sees: exit code, one message on stderr, nothing on stdout."""
-    command = [sys.executable, "-m", "flows.cli", *words]
+    command = [sys.executable, "-m", "flows.cli.main", *words]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "80"}
     ended = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stdout) == (code, "")

@@ -13,12 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from flows import benchmark_work
-from flows.benchmark_pooled import buy_by_seed, buy_together, judge_pooled, pooled_policies, score_frame
-from flows.benchmark_request import EvaluateRequest
-from flows.benchmark_rows import Trial, judge_frame
-from flows.evaluate_command import evaluate_weights, run_evaluate
-from flows.evaluation_plot import evaluation_figure
+from flows.evaluate import work as benchmark_work
+from flows.evaluate.command import evaluate_weights, run_evaluate
+from flows.evaluate.plot import evaluation_figure
+from flows.evaluate.pooled import buy_by_seed, buy_together, judge_pooled, pooled_policies, score_frame
+from flows.evaluate.request import EvaluateRequest
+from flows.evaluate.rows import Trial, judge_frame
 from models.policies import score_seats
 from pipeline.selection import seat_count
 from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_field, write_weights

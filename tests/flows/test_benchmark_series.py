@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.benchmark_series import Row, by_seed, collect_row, difference, seeds_of
+from flows.evaluate.series import Row, by_seed, collect_row, difference, seeds_of
 
 TRIAL = {"draws": 30, "seed": 0}
 

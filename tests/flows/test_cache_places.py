@@ -12,15 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from flows.cache_places import place_caches, place_pages
-from flows.serve_runner import own_temporary_folder
+from flows.schedule.runner import own_temporary_folder
+from flows.terminal.cache_places import place_caches, place_pages
 from pipeline.errors import SettingsError
 
 ROOT = Path(__file__).parents[2]
 NOWHERE = "/proc/nonexistent"  # where not even root can write
 FARM = ["--scene", "farm", "--size", "64x64", "--effects", "shot"]
 VERBS = """
-from flows.cli import main
+from flows.cli.main import main
 for words in ({survey}, {plan}, {report}):
     try:
         main(words)

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from flows.capture_plan import plan_capture
-from flows.settings import parse_settings
+from flows.settings.survey_settings import parse_settings
+from flows.survey.capture_plan import plan_capture
 from pipeline.coverage import coarse_sweeps, full_sweeps, reach_px
 from pipeline.errors import SettingsError
 from pipeline.grid import SceneGrid

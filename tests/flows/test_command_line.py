@@ -13,14 +13,14 @@ from typing import Any
 
 import pytest
 
-from flows import cli
-from flows.app import GOES_ON, app, print_json
-from flows.setting_keys import SURVEY, TABLES
-from flows.survey_flags import IN_TABLES
+from flows.cli import main as cli
+from flows.cli.app import GOES_ON, app, print_json
+from flows.cli.survey_flags import IN_TABLES
+from flows.settings.keys import SURVEY, TABLES
 
 ONE_THREAD = """
 import os, sys
-from flows.cli import main
+from flows.cli.main import main
 assert "numpy" not in sys.modules, "numpy has read its number of threads already"
 try:
     main(["--version"])
@@ -105,7 +105,7 @@ def test_sigterm_ends_every_verb(
 
 ENDING = """
 import atexit, os, signal, sys
-from flows.cli import main
+from flows.cli.main import main
 atexit.register(lambda: os.kill(os.getpid(), signal.SIGTERM))
 sys.argv[1:] = ["--version"]
 main()

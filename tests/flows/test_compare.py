@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.compare_command import _classes, _confidence, _pair_of, find_run, run_compare
-from flows.difference_picture import OTHER, SAME, MapPair, change_rgb, draw_difference, thin_changes
+from flows.archive.compare_command import _classes, _confidence, _pair_of, find_run, run_compare
+from flows.archive.difference_picture import OTHER, SAME, MapPair, change_rgb, draw_difference, thin_changes
 from pipeline.errors import ArchiveError, SceneError, SettingsError, ShapeError
 from pipeline.grid import UNLABELLED
 from storage.archive import Archive

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from flows import effect_choice
-from flows.effect_choice import choose_effects, chosen_effects, load_manifest, source_with
-from flows.run import CaptureRun
-from flows.settings import load_settings
-from flows.simulate_command import open_simulation
-from flows.stages import VERSIONS
+from flows.settings.survey_settings import load_settings
+from flows.simulate.command import open_simulation
+from flows.survey import effect_choice
+from flows.survey.effect_choice import choose_effects, chosen_effects, load_manifest, source_with
+from flows.survey.run import CaptureRun
+from flows.survey.stages import VERSIONS
 from pipeline.errors import BoundError, IncompleteStoreError
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.scene import RasterScene

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows import effect_comparison
-from flows.effect_choice import load_manifest
-from flows.effect_comparison import Comparison, View, compare_with_everything, everything
-from flows.effect_picture import Words, draw_comparison
-from flows.run import CaptureRun
-from flows.settings import load_settings
-from flows.simulate_command import open_simulation
+from flows.settings.survey_settings import load_settings
+from flows.simulate import effect_comparison
+from flows.simulate.command import open_simulation
+from flows.simulate.effect_comparison import Comparison, View, compare_with_everything, everything
+from flows.simulate.effect_picture import Words, draw_comparison
+from flows.survey.effect_choice import load_manifest
+from flows.survey.run import CaptureRun
 from pipeline.errors import BoundError
 from pipeline.scan import Sweep
 from pipeline.simulator.effects.registry import BY_NAME

@@ -11,21 +11,21 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flows import benchmark_work
-from flows.benchmark_costs import Prices
-from flows.benchmark_files import ends
-from flows.benchmark_frames import open_candidates
-from flows.benchmark_request import EvaluateRequest
-from flows.benchmark_rows import ORACLE, Trial, captured_px, judge_frame, placings
-from flows.benchmark_series import collect_row
-from flows.benchmark_store import KeptResults
-from flows.benchmark_summary import summarise
-from flows.benchmark_timing import Rounds, cpu_seconds, row_seconds
-from flows.cli import main
-from flows.evaluate_command import evaluate_weights, run_evaluate
-from flows.evaluation_table import print_evaluation
-from flows.train import TrainRequest, train_weights
-from flows.training_data import farm_test_data, pack_mask
+from flows.cli.main import main
+from flows.evaluate import work as benchmark_work
+from flows.evaluate.command import evaluate_weights, run_evaluate
+from flows.evaluate.costs import Prices
+from flows.evaluate.files import ends
+from flows.evaluate.frames import open_candidates
+from flows.evaluate.kept_results import KeptResults
+from flows.evaluate.request import EvaluateRequest
+from flows.evaluate.rows import ORACLE, Trial, captured_px, judge_frame, placings
+from flows.evaluate.series import collect_row
+from flows.evaluate.summary import summarise
+from flows.evaluate.table import print_evaluation
+from flows.evaluate.timing import Rounds, cpu_seconds, row_seconds
+from flows.training.data import farm_test_data, pack_mask
+from flows.training.train import TrainRequest, train_weights
 from models.metrics import average_accuracy, kappa, mean_iou, overall_accuracy
 from models.training import TrainingSettings
 from models.weights import load_weights, save_weights
@@ -258,7 +258,7 @@ def test_one_frame_has_accuracies_over_its_pixels(
 ):
     """Overall and average accuracy and kappa stand in the table of one frame alone; freed memory is kept."""
     kept: list[bool] = []
-    monkeypatch.setattr("flows.evaluate_command.keep_freed_memory", lambda: kept.append(True))
+    monkeypatch.setattr("flows.evaluate.command.keep_freed_memory", lambda: kept.append(True))
     weights = (write_weights(tmp_path / "w.safetensors"),)
     request = EvaluateRequest(str(data), weights, frames=("001",), **{**QUICK, "timed_frames": 0})
     row = run_evaluate(request, Console(stderr=True))["rows"][0]
@@ -380,8 +380,8 @@ def test_everything_timed_goes_in_turn():
 
 def test_the_farm_is_judged_on_seeds_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Small built-in fields, neither trained on nor shown, noisy: with equal time beside equal exposure."""
-    monkeypatch.setattr("flows.training_data.FARM_SHAPE", (32, 48))
-    monkeypatch.setattr("flows.training_look.chosen_effects", lambda *given: USUAL)  # choosing takes seconds a look
+    monkeypatch.setattr("flows.training.data.FARM_SHAPE", (32, 48))
+    monkeypatch.setattr("flows.training.look.chosen_effects", lambda *given: USUAL)  # choosing takes seconds a look
     made, weights = make_weights(classes=len(CLASSES), columns=6), tmp_path / "w.safetensors"
     save_weights(replace(made, class_names=CLASSES), weights)
     quick = {**QUICK, "policies": ("entropy",), "shares": (0.25,), "timed_frames": 0, "equal_time": True}

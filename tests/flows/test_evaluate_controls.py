@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flows.benchmark_controls import open_controls
-from flows.benchmark_frames import open_candidates
-from flows.benchmark_request import EvaluateRequest
-from flows.benchmark_series import Row
-from flows.benchmark_summary import choose_baseline
-from flows.evaluate_command import evaluate_weights, run_evaluate
-from flows.evaluation_plot import evaluation_figure
+from flows.evaluate.command import evaluate_weights, run_evaluate
+from flows.evaluate.controls import open_controls
+from flows.evaluate.frames import open_candidates
+from flows.evaluate.plot import evaluation_figure
+from flows.evaluate.request import EvaluateRequest
+from flows.evaluate.series import Row
+from flows.evaluate.summary import choose_baseline
 from models.weights import save_weights
 from pipeline.errors import SceneError, SettingsError
 from tests.flows.small_fields import FRAMES, QUICK, scene_at, write_field, write_weights

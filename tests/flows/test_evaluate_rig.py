@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flows.benchmark_budgets import summarise_equal_time, summarise_rig
-from flows.benchmark_capture import plan_seconds
-from flows.benchmark_equal_time import camera_of_equal_time, judge_equal_time
-from flows.benchmark_frames import Look
-from flows.benchmark_rig import BUDGETS, judge_rig
-from flows.benchmark_rows import Trial, judge_frame
-from flows.evaluation_budget_table import budget_tables
-from flows.evaluation_rig_plot import rig_figure
+from flows.evaluate.budget_table import budget_tables
+from flows.evaluate.budgets import summarise_equal_time, summarise_rig
+from flows.evaluate.capture_costs import plan_seconds
+from flows.evaluate.equal_time import camera_of_equal_time, judge_equal_time
+from flows.evaluate.frames import Look
+from flows.evaluate.rig_plans import BUDGETS, judge_rig
+from flows.evaluate.rig_plot import rig_figure
+from flows.evaluate.rows import Trial, judge_frame
 from models.metrics import mean_iou
 from models.weights import Weights
 from pipeline.camera import LineCamera

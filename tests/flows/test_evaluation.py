@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows import evaluation, placement, pointing_stage
+from flows.survey import accuracy as evaluation
+from flows.survey import placement
+from flows.survey import pointing as pointing_stage
 from models.metrics import confusion
 from pipeline.camera import LineCamera
 from pipeline.grid import UNLABELLED

@@ -15,10 +15,10 @@ import pytest
 import xarray as xr
 from rich.console import Console
 
-from flows.export_command import run_export
-from flows.publish import Published
-from flows.settings import load_settings
-from flows.survey_command import run_survey
+from flows.archive.export_command import run_export
+from flows.publish.run_folder import Published
+from flows.publish.survey_command import run_survey
+from flows.settings.survey_settings import load_settings
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.ground import RigPose
 from storage.archive import Archive

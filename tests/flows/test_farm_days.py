@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.compare_command import find_run, run_compare
-from flows.generations import asked_again, newest_runs
-from flows.settings import Settings, parse_settings
-from flows.survey_scene import check_labels, farm_refusal, open_scene
-from flows.training_data import farm_data, farm_looks, farm_test_data, read_farm_name
-from flows.training_look import observe_scene
+from flows.archive.compare_command import find_run, run_compare
+from flows.archive.stale_runs import asked_again, newest_runs
+from flows.settings.survey_settings import Settings, parse_settings
+from flows.survey.scene import check_labels, farm_refusal, open_scene
+from flows.training.data import farm_data, farm_looks, farm_test_data, read_farm_name
+from flows.training.look import observe_scene
 from models.examples import observe
 from models.sizes import SegmenterConfig
 from models.spectral import SpectralBasis
@@ -181,5 +181,5 @@ def test_training_sees_the_farm_through_the_rig() -> None:
 def test_a_machine_too_small_for_a_farm_is_told(size: str, measured: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """By what a survey of it took; one with a tenth more is enough."""
     for there, refused in ((measured, True), (1.1 * measured, False)):
-        monkeypatch.setattr("flows.survey_scene.machine_bytes", lambda there=there: int(there))
+        monkeypatch.setattr("flows.survey.scene.machine_bytes", lambda there=there: int(there))
         assert (farm_refusal(_settings(size=size)) is not None) == refused

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flows.field_work import SHARD, FieldWork, region_params
-from flows.region_work import Scoring, WeightsFile
-from flows.run import SurveyRun, open_run
-from flows.settings import load_settings
+from flows.settings.survey_settings import load_settings
+from flows.survey.field_work import SHARD, FieldWork, region_params
+from flows.survey.region_work import Scoring, WeightsFile
+from flows.survey.run import SurveyRun, open_run
 from models.regions import Region, plan_regions
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.grid import SceneGrid
@@ -118,7 +118,7 @@ def test_a_worker_at_regions_keeps_no_tiles(
     """What it held for the mosaic is given back before a region is read: the memory was promised once."""
     run, stages = surveyed
     let_go: list[bool] = []
-    monkeypatch.setattr("flows.region_work.let_tiles_go", lambda: let_go.append(True))
+    monkeypatch.setattr("flows.survey.region_work.let_tiles_go", lambda: let_go.append(True))
     work = _work(run, Crew(workers=1), 1)
     work.score("entropy", _store(stages, "rectify/*/mosaic.zarr"), lambda done: None)
     assert len(let_go) == 2

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from flows.forecast import StageForecast, forecast
-from flows.forecast_command import run_plan
-from flows.run import open_run
-from flows.settings import Settings, load_settings
-from flows.stage_costs import scaled_cost
-from flows.stages import VERSIONS
+from flows.archive.forecast import StageForecast, forecast
+from flows.archive.plan_command import run_plan
+from flows.archive.stage_costs import scaled_cost
+from flows.settings.survey_settings import Settings, load_settings
+from flows.survey.run import open_run
+from flows.survey.stages import VERSIONS
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive import Archive
@@ -189,7 +189,7 @@ def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
 def test_a_plan_loads_neither_torch_nor_figures_nor_maps() -> None:
     """They take seconds: who needs one imports it in the function that does."""
     heavy = {"torch", "matplotlib", "xarray", "odc.geo", "rasterio", "scipy", "pandas", "prefect", "distributed"}
-    code = "import sys, flows.cli, flows.forecast_command; print(*sys.modules)"
+    code = "import sys, flows.cli.main, flows.archive.plan_command; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not heavy & set(done.stdout.split())
 

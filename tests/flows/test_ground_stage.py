@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from flows.ground_stage import STORE, coarse_colours, ground, survey_grid
-from flows.run import SurveyRun
-from flows.setting_keys import MapChoice
-from flows.settings import Settings
+from flows.settings.keys import MapChoice
+from flows.settings.survey_settings import Settings
+from flows.survey.ground import STORE, coarse_colours, ground, survey_grid
+from flows.survey.run import SurveyRun
 from pipeline.errors import PoseError
 from pipeline.grid import UNLABELLED, SceneGrid
 from pipeline.ground import RigPose, pixel_places

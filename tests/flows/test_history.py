@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from flows.field_history import FieldHistory, read_histories
-from flows.history_page import render_history, render_index, way_to
-from flows.line_chart import line_chart
+from flows.publish.line_chart import line_chart
+from flows.schedule.field_history import FieldHistory, read_histories
+from flows.schedule.history_page import render_history, render_index, way_to
 from storage.archive import Archive
 from storage.class_maps import load_class_map
 from storage.ledger import Ledger

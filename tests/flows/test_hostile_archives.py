@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from flows.cli import main
+from flows.cli.main import main
 from storage.archive import Archive
 from storage.manifests import _seal, _text
 from storage.staging import file_hash

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.console import Console
 
-import flows.ingest_command
-from flows.ingest_command import IngestRequest, run_ingest
+import flows.archive.ingest_command
+from flows.archive.ingest_command import IngestRequest, run_ingest
 from pipeline.errors import ArchiveError, SceneError, WavelengthError
 from storage.archive import Archive
 from storage.cube_sources import CubeSource
@@ -201,7 +201,7 @@ def test_a_source_that_fails_half_way(tmp_path: Path, raw: NDArray[np.uint16], m
         return source
 
     with monkeypatch.context() as patch:
-        patch.setattr(flows.ingest_command, "_opened", torn)
+        patch.setattr(flows.archive.ingest_command, "_opened", torn)
         with pytest.raises(SceneError, match="torn"):
             ingest(header, tmp_path / "archive")
     archive = Archive.open(tmp_path / "archive")
@@ -219,14 +219,14 @@ def test_a_source_that_changes_meanwhile(
 ) -> None:
     """Files that change while they are read are not kept."""
     header = write_envi(tmp_path / "a.img", raw)
-    real = flows.ingest_command.write_ingested_cube
+    real = flows.archive.ingest_command.write_ingested_cube
 
     def grows(*arguments: Any, **named: Any) -> None:
         real(*arguments, **named)
         with (tmp_path / "a.img").open("ab") as file:
             file.write(b"more")
 
-    monkeypatch.setattr(flows.ingest_command, "write_ingested_cube", grows)
+    monkeypatch.setattr(flows.archive.ingest_command, "write_ingested_cube", grows)
     with pytest.raises(SceneError, match="changed while it was read; ingest it again once it is whole"):
         ingest(header, tmp_path / "archive")
     assert Archive.open(tmp_path / "archive").refs() == []
@@ -248,7 +248,7 @@ CODE = """
 import sys
 from pathlib import Path
 from rich.console import Console
-from flows.ingest_command import IngestRequest, run_ingest
+from flows.archive.ingest_command import IngestRequest, run_ingest
 print("go", flush=True)
 run_ingest(IngestRequest(sys.argv[1], Path(sys.argv[2])), Console(quiet=True))
 """

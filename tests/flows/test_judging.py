@@ -13,11 +13,13 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from flows import evaluation, publish, stages
-from flows.judge_command import split_address
-from flows.receipt import check_receipt, comparable, is_pending
-from flows.reprocess_command import ReprocessRequest, run_reprocess
-from flows.survey import STAGES
+from flows.archive.judge_command import split_address
+from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
+from flows.publish import run_folder as publish
+from flows.publish.receipt import check_receipt, comparable, is_pending
+from flows.survey import accuracy as evaluation
+from flows.survey import stages
+from flows.survey.survey import STAGES
 from storage.archive import Archive
 from tests.conftest import WeightsMaker
 from tests.flows.conftest import CommandLine

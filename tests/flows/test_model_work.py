@@ -8,8 +8,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from flows.model_work import work_done, work_of_map
-from flows.run import SurveyRun
+from flows.survey.model_work import work_done, work_of_map
+from flows.survey.run import SurveyRun
 from models.cost import multiply_adds
 from models.sizes import SegmenterConfig
 from pipeline.grid import SceneGrid

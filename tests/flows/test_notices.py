@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from flows.notices import NAMED_BY, notice_address, send_notice
-from flows.schedule_lock import RigLock
-from flows.schedule_news import ScheduleNews, Several, together
-from flows.schedule_runs import Outcome
-from flows.serve_plain import serve_plain
+from flows.schedule.due_runs import Outcome
+from flows.schedule.news import ScheduleNews, Several, together
+from flows.schedule.notices import NAMED_BY, notice_address, send_notice
+from flows.schedule.plain_schedule import serve_plain
+from flows.schedule.rig_lock import RigLock
 from pipeline.errors import PipelineError, SettingsError
 from tests.flows.schedule_days import NOON, HandClock, field_schedule
 
@@ -88,7 +88,7 @@ def test_an_answer_that_is_none_ends_nothing(stranger: str) -> None:
 
 def test_a_named_server_that_speaks_another_protocol(stranger: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is refused in one message, as one that does not answer."""
-    from flows.serve_server import server_for
+    from flows.schedule.server import server_for
 
     for url in (stranger, "http://127.0.0.1:port/api"):
         monkeypatch.setenv("PREFECT_API_URL", url)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
-from flows.publish import Published
-from flows.survey import OF_ROUND_TWO, STAGES
+from flows.publish.run_folder import Published
+from flows.survey.survey import OF_ROUND_TWO, STAGES
 from pipeline.errors import SceneError
 from storage.archive import Archive
 from storage.class_maps import load_class_map
@@ -128,7 +128,7 @@ def test_a_broken_store_is_made_again_where_no_copy_is(
     rot_mosaic(bucket)
     monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "elsewhere"))
     with monkeypatch.context() as patch:
-        patch.setattr("flows.survey_command.open_run", _refuse)
+        patch.setattr("flows.publish.survey_command.open_run", _refuse)
         failed = json.loads(command_line("verify", bucket, "--repair", "--json").out)
     assert len(failed["repair"]["put_back"]) == len(failed["to_remake"])
     assert len(json.loads(command_line("verify", bucket, "--json").out)["problems"]) == 1

@@ -13,10 +13,10 @@ import pytest
 import zarr
 from rich.console import Console
 
-from flows.publish import Published
-from flows.receipt import comparable
-from flows.settings import load_settings
-from flows.survey_command import run_survey
+from flows.publish.receipt import comparable
+from flows.publish.run_folder import Published
+from flows.publish.survey_command import run_survey
+from flows.settings.survey_settings import load_settings
 from storage.archive import Archive
 from storage.cubes import RawCube, open_raw_cube
 from storage.quicklooks import pictures_of

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flows.finding_words import sentences
-from flows.settings import load_settings
-from flows.stages import patch_columns
-from flows.survey_command import run_survey
+from flows.publish.finding_words import sentences
+from flows.publish.survey_command import run_survey
+from flows.settings.survey_settings import load_settings
+from flows.survey.stages import patch_columns
 from models.inference import Glance
 from models.spectral import SpectralBasis
 from pipeline.grid import SceneGrid

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from flows import process_guard
-from flows.process_guard import KeptProcess, end_with_us
+from flows.terminal import process_guard
+from flows.terminal.process_guard import KeptProcess, end_with_us
 from tests.soak.processes import children_of, is_alive
 
 SLEEPS = [sys.executable, "-c", "import time; print('up', flush=True); time.sleep(60)"]
@@ -23,7 +23,7 @@ DEAF = [
 ]  # fmt: skip
 ENDS = """
 import os, signal, subprocess, sys
-from flows.process_guard import end_with_us
+from flows.terminal.process_guard import end_with_us
 child = subprocess.Popen(["sleep", "60"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 let_go = end_with_us(child.pid)
 if "let go" in sys.argv:

@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from flows.progress import StageProgress
+from flows.terminal.progress import StageProgress
 
 
 def test_a_log_gets_one_line_when_a_stage_ends() -> None:
@@ -54,7 +54,7 @@ def test_words_go_beside_the_stage_that_runs() -> None:
 def test_a_log_says_what_a_long_stage_is_at(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where there is no terminal the words come with the line that is due."""
     out = io.StringIO()
-    monkeypatch.setattr("flows.progress.LINE_EVERY_S", -1.0)
+    monkeypatch.setattr("flows.terminal.progress.LINE_EVERY_S", -1.0)
     with StageProgress(Console(file=out), {"capture": "coarse sweep"}) as progress:
         progress.show("capture", 0.0)
         progress.say("fetching 3 of 55 MB")

@@ -10,8 +10,8 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from flows.panels import choose_bands, class_palette, class_rgb, grey_of, outline, stretch
-from flows.quicklook import QuicklookData, _draw_raw, draw_quicklook
+from flows.publish.panels import choose_bands, class_palette, class_rgb, grey_of, outline, stretch
+from flows.publish.quicklook import QuicklookData, _draw_raw, draw_quicklook
 
 WAVES = np.linspace(400, 1000, 61)
 

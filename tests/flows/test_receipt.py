@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flows.receipt import (
+from flows.publish.receipt import (
     COSTS,
     Header,
     Receipt,
@@ -20,8 +20,8 @@ from flows.receipt import (
     comparable,
     to_json,
 )
-from flows.receipt_table import headline, print_table
-from flows.settings import Settings
+from flows.publish.receipt_table import headline, print_table
+from flows.settings.survey_settings import Settings
 from pipeline.errors import ShapeError
 
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows import placement
-from flows.publish import Published
-from flows.run import open_run
-from flows.survey import STAGES, StageRunner
-from flows.survey_command import run_survey
+from flows.publish.run_folder import Published
+from flows.publish.survey_command import run_survey
+from flows.survey import placement
+from flows.survey.run import open_run
+from flows.survey.survey import STAGES, StageRunner
 from pipeline.errors import RigError
 from pipeline.rig.rig_source import RigSource
 from pipeline.scan import Sweep
@@ -100,7 +100,7 @@ def test_a_capture_does_not_fail_for_want_of_room_for_what_is_ahead(
 
     settings = small_settings(tmp_path, source="rig", visit="first", budget=0.5)
     with emulated(settings, {}, monkeypatch), monkeypatch.context() as patch:
-        patch.setattr("flows.rectify_ahead.MosaicAhead", full)
+        patch.setattr("flows.survey.rectify_ahead.MosaicAhead", full)
         run_survey(settings, QUIET)
     assert [len(tiles) for tiles in taken] == [0]
 

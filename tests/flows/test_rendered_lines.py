@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flows.rendered_lines import rendering_crew, take_lines
+from flows.survey.rendered_lines import rendering_crew, take_lines
 from pipeline.camera import LineCamera
 from pipeline.errors import RigError, SceneError
 from pipeline.scan import Sweep

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.report import Picture, render_report, write_report
+from flows.publish.report import Picture, render_report, write_report
 from tests.flows.test_receipt import make_receipt
 
 PNG = b"\x89PNG\r\n\x1a\nnot a real picture"

@@ -16,10 +16,10 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from flows import generations
-from flows.archive_commands import DONE, FAILED, PARTLY, run_verify
-from flows.reprocess_command import ReprocessRequest, _survey, run_reprocess
-from flows.settings import Settings
+from flows.archive import stale_runs as generations
+from flows.archive.commands import DONE, FAILED, PARTLY, run_verify
+from flows.archive.reprocess_command import ReprocessRequest, _survey, run_reprocess
+from flows.settings.survey_settings import Settings
 from models.weights import content_key
 from pipeline.errors import ArchiveError, SettingsError, WeightsError
 from pipeline.simulator.farm import CLASSES

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from flows import schedule_lock
-from flows.schedule_lock import RigLock, rig_lock
-from flows.settings import Settings
+from flows.schedule import rig_lock as schedule_lock
+from flows.schedule.rig_lock import RigLock, rig_lock
+from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError, RigError
 from storage.ledger import Ledger
 from storage.staging import take_lock
@@ -26,8 +26,8 @@ import os, sys
 from dataclasses import replace
 from pathlib import Path
 os.access = lambda *given, **named: False  # /run/lock is for others
-from flows.schedule_lock import rig_lock
-from flows.settings import Settings
+from flows.schedule.rig_lock import rig_lock
+from flows.settings.survey_settings import Settings
 settings = Settings()
 lock = rig_lock(replace(settings, source="rig", rig=replace(settings.rig, port=sys.argv[1])), Path())
 print(lock.take("a survey"), flush=True)

@@ -19,8 +19,8 @@ import pytest
 import serial
 from rich.console import Console
 
-from flows.rig_emulation import EmulateRequest, emulated_settings, run_emulate
-from flows.settings import load_settings
+from flows.settings.survey_settings import load_settings
+from flows.simulate.rig_emulation import EmulateRequest, emulated_settings, run_emulate
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, ServedRig
 from pipeline.rig.emulator.fast_clock import FastClock
 from pipeline.rig.emulator.faults import make_fault
@@ -222,7 +222,7 @@ def test_emulation_ends_in_order() -> None:
     """At Ctrl-C: exit code 0, and the port is gone."""
     words = ["rig", "emulate", "--size", "48x48", "--bands", "40", "--effects", "none"]
     with subprocess.Popen(
-        [sys.executable, "-m", "flows.cli", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "flows.cli.main", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None
         lines = iter(process.stdout.readline, "")

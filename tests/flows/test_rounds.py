@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from flows.finding_words import sentences
-from flows.forecast import StageForecast, forecast
-from flows.generations import asked_again
-from flows.publish import Published
-from flows.receipt import comparable
-from flows.run import open_run
-from flows.settings import load_settings
-from flows.stage_costs import PastCosts
-from flows.survey import OF_ROUND_TWO, STAGES
+from flows.archive.forecast import StageForecast, forecast
+from flows.archive.stage_costs import PastCosts
+from flows.archive.stale_runs import asked_again
+from flows.publish.finding_words import sentences
+from flows.publish.receipt import comparable
+from flows.publish.run_folder import Published
+from flows.settings.survey_settings import load_settings
+from flows.survey.run import open_run
+from flows.survey.survey import OF_ROUND_TWO, STAGES
 from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
 from pipeline.scan import CostModel, Sweep

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from flows.schedule_lock import RigLock
-from flows.schedule_runs import run_due
-from flows.schedule_state import moment_words
+from flows.schedule.due_runs import run_due
+from flows.schedule.ledger_state import moment_words
+from flows.schedule.rig_lock import RigLock
 from tests.flows.schedule_days import NOON, HandClock, accounted, field_schedule
 
 FIRST, SECOND, THIRD = (NOON + timedelta(minutes=20 * number) for number in (1, 2, 3))

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from flows.field_schedule import FieldSchedule
-from flows.schedule_lock import RigLock
-from flows.schedule_runs import run_all
-from flows.schedule_times import exact_words, parse_every, parse_timetable, read_timetable
+from flows.schedule.due_runs import run_all
+from flows.schedule.field_schedule import FieldSchedule
+from flows.schedule.rig_lock import RigLock
+from flows.schedule.times import exact_words, parse_every, parse_timetable, read_timetable
 from pipeline.errors import RigError, SettingsError
 from storage.ledger import Ledger
 from tests.flows.schedule_days import NOON, HandClock, accounted, field_schedule
@@ -150,7 +150,7 @@ def test_nonsense_is_refused(cron: str | None, every: str | None, zone: str | No
 
 def test_times_read_back_as_they_were_written() -> None:
     """The ledger's words of a timetable give the same timetable."""
-    from flows.schedule_times import read_timetable
+    from flows.schedule.times import read_timetable
 
     for table in (parse_timetable("0 6 * * 1", None, "Europe/Berlin"), parse_timetable(None, "90s", "UTC")):
         assert read_timetable(table.to_dict()) == table

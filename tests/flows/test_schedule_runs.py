@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flows.field_schedule import NOT_SERVED, FieldSchedule
-from flows.schedule_lock import RigLock, rig_lock
-from flows.schedule_runs import run_all, run_due
-from flows.settings import Settings
+from flows.schedule.due_runs import run_all, run_due
+from flows.schedule.field_schedule import NOT_SERVED, FieldSchedule
+from flows.schedule.rig_lock import RigLock, rig_lock
+from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError, RigError
 from storage.ledger import Ledger
 from tests.flows.schedule_days import NOON, HandClock, accounted, field_schedule
@@ -263,7 +263,7 @@ def test_a_full_disk_is_told_of_and_the_run_accounted_for_later(
 HOLDS = """
 import sys, time
 from pathlib import Path
-from flows.schedule_lock import RigLock
+from flows.schedule.rig_lock import RigLock
 print(RigLock(Path(sys.argv[1])).take("a survey"), flush=True)
 time.sleep(60)
 """

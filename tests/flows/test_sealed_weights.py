@@ -10,11 +10,12 @@ import pytest
 from rich.console import Console
 from safetensors.torch import load_file, save_file
 
-from flows import cli, evaluate_command
-from flows.benchmark_request import EvaluateRequest
-from flows.evaluate_command import run_evaluate
-from flows.run import open_run
-from flows.settings import load_settings
+from flows.cli import main as cli
+from flows.evaluate import command as evaluate_command
+from flows.evaluate.command import run_evaluate
+from flows.evaluate.request import EvaluateRequest
+from flows.settings.survey_settings import load_settings
+from flows.survey.run import open_run
 from models.sealed_files import SEAL, TENSORS
 from models.weights import UNSEALED, describe_weights
 from tests.flows.small_fields import write_field, write_weights

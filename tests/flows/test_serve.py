@@ -18,13 +18,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows import serve_command, serve_prefect
-from flows.schedule_times import parse_timetable
-from flows.serve_fields import ServedField, alone_on, load_fields
-from flows.serve_plain import serve_plain
-from flows.serve_request import ServeRequest
-from flows.settings import Settings
-from flows.survey_artifacts import MOST_BYTES, artifact_key, savings_rows, small_jpeg, survey_markdown
+from flows.publish.prefect_artifacts import MOST_BYTES, artifact_key, savings_rows, small_jpeg, survey_markdown
+from flows.schedule import prefect_schedule as serve_prefect
+from flows.schedule import serve_command
+from flows.schedule.fields import ServedField, alone_on, load_fields
+from flows.schedule.plain_schedule import serve_plain
+from flows.schedule.request import ServeRequest
+from flows.schedule.times import parse_timetable
+from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError
 from storage.archive import Archive
 from storage.ledger import Ledger

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from flows import serve_fields
-from flows.schedule_state import moment_words
-from flows.schedule_times import parse_timetable
-from flows.serve_fields import load_fields
-from flows.served import KEYS, NAMED_BY
+from flows.schedule import fields as serve_fields
+from flows.schedule.fields import load_fields
+from flows.schedule.ledger_state import moment_words
+from flows.schedule.served import KEYS, NAMED_BY
+from flows.schedule.times import parse_timetable
 from storage.archive import Archive
 from storage.ledger import Ledger
 from storage.staging import take_lock
@@ -38,8 +38,8 @@ def test_a_scheduled_run_by_prefect(
     from prefect.client.orchestration import get_client
     from prefect.states import Running
 
-    from flows.serve_flow import survey_scheduled
-    from flows.serve_watcher import reap_flow_runs
+    from flows.schedule.prefect_flows import survey_scheduled
+    from flows.schedule.watcher import reap_flow_runs
 
     file = tmp_path / "north.toml"
     file.write_text(
@@ -74,7 +74,7 @@ def test_only_what_is_served_can_be_named(
     on_server: Path, tmp_path: Path, field_file: Callable[..., Path], served: Callable[..., Path]
 ) -> None:
     """Another field, archive or file of weights, or any file at all, ends a run as failed, before anything is read."""
-    from flows.serve_flow import reprocess_archive, survey_scheduled
+    from flows.schedule.prefect_flows import reprocess_archive, survey_scheduled
 
     file, elsewhere = field_file(), tmp_path / "elsewhere"
     Archive.open(elsewhere)
@@ -105,7 +105,7 @@ def test_a_wrong_record_of_what_is_served(
     on_server: Path, served: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, content: str | None, message: str
 ) -> None:
     """It ends a run as failed, with one message that says what was expected."""
-    from flows.serve_flow import survey_scheduled
+    from flows.schedule.prefect_flows import survey_scheduled
 
     if content is None:
         monkeypatch.delenv(NAMED_BY, raising=False)
@@ -120,7 +120,7 @@ def test_a_run_that_prefect_begins_early_waits(
     on_server: Path, field_file: Callable[..., Path], served: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Prefect begins runs up to seconds before their time: the survey is of that time, and done once."""
-    from flows import serve_flow
+    from flows.schedule import prefect_flows as serve_flow
 
     clock, due = HandClock(NOON + timedelta(minutes=20) - timedelta(seconds=0.3)), NOON + timedelta(minutes=20)
     monkeypatch.setattr(serve_fields, "SystemWallClock", lambda: clock)
@@ -143,7 +143,7 @@ def test_one_reprocessing_at_a_time(
     on_server: Path, tmp_path: Path, field_file: Callable[..., Path], served: Callable[..., Path]
 ) -> None:
     """A second one of an archive is skipped and says why; the lock is free again after a run."""
-    from flows.serve_flow import REPROCESS_LOCK, reprocess_archive
+    from flows.schedule.prefect_flows import REPROCESS_LOCK, reprocess_archive
 
     out = tmp_path / "archive"
     served(field_file(), every="1h")
@@ -187,8 +187,8 @@ def test_deployments_of_the_file_fit_the_flows(prefect_home: Path, field_file: C
 
 def test_deployments_of_serve_fit_the_flows(prefect_home: Path, field_file: Callable[..., Path]) -> None:
     """A deployment for each field, and one to reprocess the archive; Prefect schedules none, and names no file."""
-    from flows.serve_request import ServeRequest
-    from flows.serve_runner import deployments
+    from flows.schedule.request import ServeRequest
+    from flows.schedule.runner import deployments
 
     fields = load_fields([field_file("north"), field_file("south")])
     table = parse_timetable(None, "30d", "UTC")

@@ -16,8 +16,8 @@ from threading import Thread
 
 import pytest
 
-from flows.serve_pages import OwnPagesOnly, own_origins
-from flows.serve_server import server_for
+from flows.schedule.guarded_server import OwnPagesOnly, own_origins
+from flows.schedule.server import server_for
 from pipeline.errors import SettingsError
 from tests.soak.prefect_schedule import free_port
 

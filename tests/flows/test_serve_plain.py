@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from flows.schedule_lock import RigLock
-from flows.schedule_runs import Outcome
-from flows.serve_plain import serve_plain
+from flows.schedule.due_runs import Outcome
+from flows.schedule.plain_schedule import serve_plain
+from flows.schedule.rig_lock import RigLock
 from pipeline.errors import ArchiveError
 from storage.ledger import Ledger
 from tests.flows.schedule_days import NOON, HandClock, field_schedule

@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flows import setting_keys
-from flows.receipt import to_json
-from flows.setting_keys import MapChoice
-from flows.setting_values import Tolerance
-from flows.settings import Settings, load_settings, of_this_version, parse_settings
+from flows.publish.receipt import to_json
+from flows.settings import keys as setting_keys
+from flows.settings.keys import MapChoice
+from flows.settings.survey_settings import Settings, load_settings, of_this_version, parse_settings
+from flows.settings.values import Tolerance
 from models import policies
 from pipeline.camera import LineCamera
 from pipeline.errors import BudgetError, SettingsError

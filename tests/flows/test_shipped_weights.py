@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flows.full_look import columns_of_all_seats
-from flows.run import SHIPPED
+from flows.survey.full_look import columns_of_all_seats
+from flows.survey.run import SHIPPED
 from models.controls import Controls, run_controls
 from models.inference import glance
 from models.metrics import mean_iou

@@ -13,8 +13,8 @@ import pytest
 import xarray as xr
 from rich.console import Console
 
-from flows import effect_choice
-from flows.effect_table import print_effects
+from flows.publish.effect_table import print_effects
+from flows.survey import effect_choice
 from pipeline.errors import BoundError
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.scene import RasterScene

@@ -17,12 +17,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows import engine, publish
-from flows.cli import main
-from flows.schedule_state import moment_words
-from flows.schedule_times import parse_timetable
-from flows.serve_fields import load_fields
-from flows.survey import OF_ROUND_TWO, STAGES
+from flows.cli.main import main
+from flows.publish import run_folder as publish
+from flows.schedule.fields import load_fields
+from flows.schedule.ledger_state import moment_words
+from flows.schedule.times import parse_timetable
+from flows.survey import prefect_engine as engine
+from flows.survey.survey import OF_ROUND_TWO, STAGES
 from pipeline.errors import ArchiveError, RigError
 from storage.archive import Archive
 from storage.class_maps import load_class_map
@@ -266,7 +267,7 @@ def test_a_due_run_of_which_a_stage_fails(
     served: Callable[..., Path],
 ) -> None:  # fmt: skip
     """The scheduled flow ends Failed with the stage's words alone, the ledger has them, and no run is published."""
-    from flows.serve_flow import survey_scheduled
+    from flows.schedule.prefect_flows import survey_scheduled
 
     out, file = tmp_path / "archive", tmp_path / "north.toml"
     file.write_text(f'scene = "{scene_files / "scene.png"}"\nweights = "{weights}"\nbudget = 0.8\nout = "{out}"\n')
@@ -293,7 +294,7 @@ def test_a_reprocessing_of_which_a_stage_fails(
     served: Callable[..., Path],
 ) -> None:  # fmt: skip
     """It ends Failed and says where the reason stands; the next one makes what was missing, and completes."""
-    from flows.serve_flow import reprocess_archive
+    from flows.schedule.prefect_flows import reprocess_archive
 
     out = Path(shutil.copytree(walk.undisturbed, tmp_path / "archive"))
     served(field_file(out=str(out)), every="1h")

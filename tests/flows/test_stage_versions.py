@@ -1,7 +1,7 @@
 """A stage's code does not change without its version: what an archive holds would otherwise pass for the new result.
 
-After a change, either raise the stage's number in ``flows.stages.VERSIONS`` (that of ingest in its command) or, where
-the change has no effect on what the stage writes, keep it; then record the code as it is:
+After a change, either raise the stage's number in ``flows.survey.stages.VERSIONS`` (that of ingest in its command) or,
+where the change has no effect on what the stage writes, keep it; then record the code as it is:
 
     python tests/flows/test_stage_versions.py
 """
@@ -15,7 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from flows import ingest_command, stages
+from flows.archive import ingest_command
+from flows.survey import stages
 
 VERSIONS = {**stages.VERSIONS, ingest_command.STAGE: ingest_command.VERSION}
 
@@ -26,7 +27,7 @@ GEOMETRY = ("pipeline/camera.py", "pipeline/mirror.py", "pipeline/scan.py", "pip
 RECTIFY = (*GEOMETRY, "pipeline/rectify")
 READ = ("models/spectral.py", "models/sizes.py", "models/tokens.py", "models/encoder.py", "models/patches.py",
         "models/segmenter.py", "models/inference.py", "models/regions.py", "models/weights.py", "pipeline/grid.py",
-        "flows/region_work.py", "storage/mosaic_strips.py")  # fmt: skip
+        "flows/survey/region_work.py", "storage/mosaic_strips.py")  # fmt: skip
 PLANNING = ("pipeline/planning.py", "pipeline/runs.py", "pipeline/covering.py", "pipeline/spending.py",
             "pipeline/strips.py")  # fmt: skip
 GATHER = ("pipeline/rectify/resample.py", "pipeline/rectify/kernels.py", "pipeline/rectify/line_table.py",
@@ -37,32 +38,33 @@ READERS = ("storage/scan_files.py", "storage/envi_header.py", "storage/envi_cube
            "storage/wavelengths.py", "storage/scene_toml.py", "pipeline/rig/frame_index.py")  # fmt: skip
 SIMULATOR = ("pipeline/simulator", "pipeline/simulator/effects")
 SOURCES = {
-    "effects": (*GEOMETRY, *GATHER, *SIMULATOR, "flows/effect_choice.py"),
+    "effects": (*GEOMETRY, *GATHER, *SIMULATOR, "flows/survey/effect_choice.py"),
     "capture": (*GEOMETRY, *GATHER, *SIMULATOR, "storage/cubes.py"),
-    "register": (*RECTIFY, "storage/sightings.py", "flows/pointing_stage.py"),
+    "register": (*RECTIFY, "storage/sightings.py", "flows/survey/pointing.py"),
     "locate": (*RECTIFY, "storage/sightings.py", "storage/lookups.py"),
     "rectify": (*RECTIFY, "storage/sightings.py", "storage/mosaics.py", "storage/mosaic_work.py",
                 "storage/tile_work.py"),
-    "attend": (*READ, *PLANNING, "flows/field_work.py", "flows/second_round.py", "models/second_look.py",
+    "attend": (*READ, *PLANNING, "flows/survey/field_work.py", "flows/survey/second_round.py", "models/second_look.py",
                "models/policies.py", "models/saliency.py", "models/spacing.py", "models/vgg.py",
                "models/vgg_saliency.py", "storage/attention.py"),
     "patches": (*RECTIFY, "pipeline/strips.py", "storage/sightings.py", "storage/patches.py"),
-    "segment": (*READ, "flows/field_work.py", "storage/class_maps.py"),
+    "segment": (*READ, "flows/survey/field_work.py", "storage/class_maps.py"),
     "turned": (*PLANNING, "pipeline/orientation.py", "pipeline/crop_rows.py", "storage/mosaic_strips.py",
-               "storage/attention.py", "flows/orientation_stage.py"),
+               "storage/attention.py", "flows/survey/orientation.py"),
     "ground": ("pipeline/ground.py", "pipeline/ground_grid.py", "pipeline/projection.py", *GATHER,
-               "storage/georeference.py", "storage/ground_maps.py", "flows/ground_stage.py", "flows/panels.py",
-               "flows/tones.py"),
+               "storage/georeference.py", "storage/ground_maps.py", "flows/survey/ground.py", "flows/publish/panels.py",
+               "flows/publish/colour_stretch.py"),
     "evaluate": (*READ, *RECTIFY, *PLANNING, "models/controls.py", "models/metrics.py", "models/policies.py",
-                 "pipeline/savings.py", "pipeline/selection.py", "flows/evaluation.py", "flows/full_look.py"),
+                 "pipeline/savings.py", "pipeline/selection.py", "flows/survey/accuracy.py",
+                 "flows/survey/full_look.py"),
     "ingest": (*READERS, "storage/cube_sources.py", "storage/ingested_cubes.py"),
 }  # fmt: skip
-STAGES_FILE, PLACEMENT = "flows/stages.py", "flows/placement.py"
+STAGES_FILE, PLACEMENT = "flows/survey/stages.py", "flows/survey/placement.py"
 FUNCTIONS: dict[str, dict[str, tuple[str, ...]]] = {  # of files that several stages share
     "effects": {},
     "capture": {
         STAGES_FILE: ("capture_coarse", "capture_fine", "capture_again", "capture_sweeps", "_capture_sweep"),
-        "flows/effect_choice.py": ("chosen_effects", "source_with"),
+        "flows/survey/effect_choice.py": ("chosen_effects", "source_with"),
     },
     "register": {PLACEMENT: ("sighted",), STAGES_FILE: ("captured",)},
     "locate": {PLACEMENT: ("sighted", "locate"), STAGES_FILE: ("captured",)},
@@ -76,7 +78,7 @@ FUNCTIONS: dict[str, dict[str, tuple[str, ...]]] = {  # of files that several st
     "turned": {STAGES_FILE: ("load_plan",)},
     "ground": {},
     "evaluate": {STAGES_FILE: ("glance_at", "patch_columns")},
-    "ingest": {"flows/ingest_command.py": ("hash_files", "_opened", "_key")},
+    "ingest": {"flows/archive/ingest_command.py": ("hash_files", "_opened", "_key")},
 }
 
 

@@ -11,8 +11,8 @@ import pytest
 import xarray as xr
 from rich.console import Console
 
-from flows.archive_commands import DONE
-from flows.statistics_command import run_statistics
+from flows.archive.commands import DONE
+from flows.archive.statistics_command import run_statistics
 from pipeline.errors import ArchiveError, SettingsError
 from tests.conftest import Survey
 

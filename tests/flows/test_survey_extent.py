@@ -9,7 +9,7 @@ from typing import get_args
 
 import pytest
 
-from flows.survey_extent import Extent, Unit
+from flows.survey.extent import Extent, Unit
 from models.sizes import SegmenterConfig
 from pipeline.camera import LineCamera
 from pipeline.grid import SceneGrid

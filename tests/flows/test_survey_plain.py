@@ -15,11 +15,11 @@ import xarray as xr
 from PIL import Image
 from rich.console import Console
 
-from flows.publish import Published
-from flows.receipt import check_receipt, comparable
-from flows.settings import load_settings
-from flows.survey_command import run_survey
-from flows.survey_scene import open_scene
+from flows.publish.receipt import check_receipt, comparable
+from flows.publish.run_folder import Published
+from flows.publish.survey_command import run_survey
+from flows.settings.survey_settings import load_settings
+from flows.survey.scene import open_scene
 from models.inference import glance
 from models.weights import load_weights
 from pipeline.camera import LineCamera

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flows.field_work import SHARD, FieldWork
-from flows.receipt import check_receipt
-from flows.run import open_run
-from flows.settings import load_settings
-from flows.stages import attend
-from flows.survey_command import run_survey
+from flows.publish.receipt import check_receipt
+from flows.publish.survey_command import run_survey
+from flows.settings.survey_settings import load_settings
+from flows.survey.field_work import SHARD, FieldWork
+from flows.survey.run import open_run
+from flows.survey.stages import attend
 from models.policies import IMAGE_POLICIES, NETWORK_POLICIES, POLICIES, SEEDED_POLICIES
 from models.regions import plan_regions
 from pipeline.errors import SettingsError

@@ -13,9 +13,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from flows import engine, evaluation
-from flows.survey import STAGES
-from flows.termination import Terminated
+from flows.survey import accuracy as evaluation
+from flows.survey import prefect_engine as engine
+from flows.survey.survey import STAGES
+from flows.terminal.termination import Terminated
 from pipeline.errors import RigError, SceneError
 from storage.archive import Archive
 from tests.flows.conftest import CommandLine

@@ -20,14 +20,14 @@ import pytest
 import serial
 from rich.console import Console
 
-import flows.progress
-import flows.rig_run
-from flows.effect_choice import chosen_effects
-from flows.publish import Published
-from flows.run import make_source
-from flows.settings import Settings, load_settings
-from flows.survey_command import run_survey
-from flows.survey_scene import open_scene
+import flows.survey.rig_run
+import flows.terminal.progress
+from flows.publish.run_folder import Published
+from flows.publish.survey_command import run_survey
+from flows.settings.survey_settings import Settings, load_settings
+from flows.survey.effect_choice import chosen_effects
+from flows.survey.run import make_source
+from flows.survey.scene import open_scene
 from pipeline.errors import SettingsError
 from pipeline.rig.camera_references import mean_frame
 from pipeline.rig.capture_names import REFERENCES
@@ -83,7 +83,7 @@ def emulated(
             mirror.connect()
             return RigDevices(mirror, line.camera(), line.clock)
 
-        patch.setattr(flows.rig_run, "open_devices", open_devices)
+        patch.setattr(flows.survey.rig_run, "open_devices", open_devices)
         yield whole
 
 
@@ -199,7 +199,7 @@ def test_log_beside_pulses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 def test_what_the_rig_is_at_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Long before the first line: the path goes up, lines are captured, files are fetched, each with how far it is."""
     out = io.StringIO()
-    monkeypatch.setattr(flows.progress, "LINE_EVERY_S", -1.0)  # every word, as bars on a terminal show them
+    monkeypatch.setattr(flows.terminal.progress, "LINE_EVERY_S", -1.0)  # every word, as bars on a terminal show them
     settings = small_settings(tmp_path, source="rig", visit="first", budget=0.5)
     with emulated(settings, {}, monkeypatch):
         run_survey(settings, Console(file=out, width=200))
@@ -374,7 +374,7 @@ def test_default_engine_says_it_once_as_well(tmp_path: Path):
     """Through Prefect, which tries again, a port that is not there is one message too, and no traceback."""
     file = tmp_path / "rig.toml"
     file.write_text('source = "rig"\nscene = "farm"\nsize = "96x96"\nbands = [40, 90]\n[rig]\nport = "/dev/ttyNONE"\n')
-    words = [sys.executable, "-m", "flows.cli", "survey", str(file), "--out", str(tmp_path / "archive")]
+    words = [sys.executable, "-m", "flows.cli.main", "survey", str(file), "--out", str(tmp_path / "archive")]
     ended = subprocess.run(words, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
     assert ended.returncode == 1
     assert ended.stderr.count("/dev/ttyNONE") == 1

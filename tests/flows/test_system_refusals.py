@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.system_refusals import refusal_words
+from flows.terminal.system_refusals import refusal_words
 
 ROOT = Path(__file__).parents[2]
 
@@ -43,7 +43,9 @@ def test_words(error: Exception, words: str | None) -> None:
 )
 def test_a_survey_within_narrow_limits(tmp_path: Path, limit: str, words: str) -> None:
     """An address space of 1 GB, files of 100 kB: one message, exit code 1, and no report of a defect."""
-    survey = f"{sys.executable} -m flows.cli survey --scene farm --size 64x64 --engine plain --out {tmp_path / 'a'}"
+    survey = (
+        f"{sys.executable} -m flows.cli.main survey --scene farm --size 64x64 --engine plain --out {tmp_path / 'a'}"
+    )
     command = ["sh", "-c", f"{limit}; exec {survey}"]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     errors = [line for line in ended.stderr.splitlines() if line.startswith("error: ")]

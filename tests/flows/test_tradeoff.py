@@ -14,9 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from flows import tradeoff as tradeoff_module
-from flows import tradeoff_machine
-from flows.tradeoff import (
+from flows.tradeoff import entries as tradeoff_module
+from flows.tradeoff import machine as tradeoff_machine
+from flows.tradeoff.command import run_tradeoff
+from flows.tradeoff.entries import (
     Level,
     Point,
     Result,
@@ -28,9 +29,8 @@ from flows.tradeoff import (
     register,
     registered,
 )
-from flows.tradeoff_command import run_tradeoff
-from flows.tradeoff_figures import draw_tradeoffs, tradeoff_figure
-from flows.tradeoff_table import print_tradeoff
+from flows.tradeoff.plots import draw_tradeoffs, tradeoff_figure
+from flows.tradeoff.table import print_tradeoff
 from pipeline.errors import ArchiveError, SettingsError
 
 

@@ -8,14 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flows import tradeoff_budget, tradeoff_store
-from flows.tradeoff import measure_tradeoff
-from flows.tradeoff_line_model import LINE_MODEL
-from flows.tradeoff_overlap import OVERLAP, Seams
-from flows.tradeoff_resample import RESAMPLE, draw_waves, noise_levels
-from flows.tradeoff_scan_step import SCAN_STEP
-from flows.tradeoff_store import BITS, CODEC, SIZE
-from flows.tradeoff_tie_spacing import TIE_SPACING
+from flows.tradeoff import budget as tradeoff_budget
+from flows.tradeoff import store as tradeoff_store
+from flows.tradeoff.entries import measure_tradeoff
+from flows.tradeoff.line_model import LINE_MODEL
+from flows.tradeoff.overlap import OVERLAP, Seams
+from flows.tradeoff.resample import RESAMPLE, draw_waves, noise_levels
+from flows.tradeoff.scan_step import SCAN_STEP
+from flows.tradeoff.store import BITS, CODEC, SIZE
+from flows.tradeoff.tie_spacing import TIE_SPACING
 from pipeline.camera import LineCamera
 from pipeline.coverage import cheapest_full
 from pipeline.grid import SceneGrid

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from flows import tradeoff_farm, tradeoff_segment
-from flows.tradeoff import find_tradeoffs
-from flows.tradeoff_segment import AGREEMENT, BAND_COUNT, BANDS, PRECISION, PRECISIONS, SEATS, SHARES, Farm
+from flows.tradeoff import farm as tradeoff_farm
+from flows.tradeoff import segment as tradeoff_segment
+from flows.tradeoff.entries import find_tradeoffs
+from flows.tradeoff.segment import AGREEMENT, BAND_COUNT, BANDS, PRECISION, PRECISIONS, SEATS, SHARES, Farm
 from models.segmenter import Segmenter, SegmenterConfig
 from models.spectral import Normalisation, SpectralBasis
 from models.weights import Weights

@@ -11,15 +11,18 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flows import simulated_lines, tradeoff_simulate, tradeoff_simulate_noise, tradeoff_simulate_rays
-from flows.simulated_lines import Against, FarmLines, look_at_lines, with_variant
-from flows.tradeoff import Level, Point, Tradeoff, find_tradeoffs, mark_pareto, measure_tradeoff
-from flows.tradeoff_figures import tradeoff_figure
-from flows.tradeoff_simulate import ALL_CHEAP, EXACT, FOOTPRINT, TOLERANCE, TOLERANCES, Seen
-from flows.tradeoff_simulate_bands import BAND_COUNT, EACH, GROUP_COUNT, InBands, Shared, some_bands
-from flows.tradeoff_simulate_noise import DIM_NOISE, NOISE, law_of_numbers
-from flows.tradeoff_simulate_rays import SUPERSAMPLING
-from flows.tradeoff_table import print_tradeoff
+from flows.tradeoff import simulate as tradeoff_simulate
+from flows.tradeoff import simulate_noise as tradeoff_simulate_noise
+from flows.tradeoff import simulate_rays as tradeoff_simulate_rays
+from flows.tradeoff import simulated_lines
+from flows.tradeoff.entries import Level, Point, Tradeoff, find_tradeoffs, mark_pareto, measure_tradeoff
+from flows.tradeoff.plots import tradeoff_figure
+from flows.tradeoff.simulate import ALL_CHEAP, EXACT, FOOTPRINT, TOLERANCE, TOLERANCES, Seen
+from flows.tradeoff.simulate_bands import BAND_COUNT, EACH, GROUP_COUNT, InBands, Shared, some_bands
+from flows.tradeoff.simulate_noise import DIM_NOISE, NOISE, law_of_numbers
+from flows.tradeoff.simulate_rays import SUPERSAMPLING
+from flows.tradeoff.simulated_lines import Against, FarmLines, look_at_lines, with_variant
+from flows.tradeoff.table import print_tradeoff
 from pipeline.camera import LineCamera
 from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.keystone import KEYSTONE

@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from flows import train as flow
-from flows.cli import main
-from flows.run import open_run
-from flows.settings import load_settings
-from flows.train import TrainRequest, suggested_patch, train_weights, usual_crop
-from flows.train_command import run_train
+from flows.cli.main import main
+from flows.settings.survey_settings import load_settings
+from flows.survey.run import open_run
+from flows.training import train as flow
+from flows.training.command import run_train
+from flows.training.train import TrainRequest, suggested_patch, train_weights, usual_crop
 from models.sizes import PRESETS, Preset
 from models.training import TrainingSettings
 from models.weights import load_any_weights, load_weights

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from flows import train as flow
-from flows import train_start
-from flows.train import TrainRequest, train_weights
-from flows.train_start import joined_split
-from flows.training_data import pack_mask, unpack_mask
+from flows.training import start as train_start
+from flows.training import train as flow
+from flows.training.data import pack_mask, unpack_mask
+from flows.training.start import joined_split
+from flows.training.train import TrainRequest, train_weights
 from models.start_weights import StartFile
 from models.training import TrainingSettings
 from models.weights import describe_weights, load_weights

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.run import open_run
-from flows.settings import load_settings
-from flows.train import TrainRequest, train_weights
-from flows.training_data import open_training_data, pack_mask, read_farm_name, unpack_mask
+from flows.settings.survey_settings import load_settings
+from flows.survey.run import open_run
+from flows.training.data import open_training_data, pack_mask, read_farm_name, unpack_mask
+from flows.training.train import TrainRequest, train_weights
 from models.training import TrainingSettings
 from models.weights import load_weights
 from pipeline.camera import LineCamera

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from flows.settings import load_settings, parse_settings
+from flows.settings.survey_settings import load_settings, parse_settings
 from models.vgg import VggFeatures
 from models.vgg_sizes import saliency_multiply_adds
 from models.weights import describe_weights

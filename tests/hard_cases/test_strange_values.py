@@ -12,7 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flows.region_work import seat_columns
+from flows.survey.region_work import seat_columns
 from models.holes import MOST_COLUMN
 from models.inference import ClassMap, Glance, decide, glance, glance_of_columns, look_coarsely, segment
 from models.policies import score_seats

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
-from flows.schedule_state import ENDINGS, moment_words, read_moment
+from flows.schedule.ledger_state import ENDINGS, moment_words, read_moment
 from storage.archive import Archive
 from storage.garbage import clear_up
 from storage.lineage import Catalogue

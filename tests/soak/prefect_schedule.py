@@ -20,9 +20,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from flows.field_schedule import FieldSchedule
-from flows.schedule_state import read_moment
-from flows.schedule_times import parse_timetable
+from flows.schedule.field_schedule import FieldSchedule
+from flows.schedule.ledger_state import read_moment
+from flows.schedule.times import parse_timetable
 from storage.archive import Archive
 from storage.ledger import Ledger, ledgers
 from tests.faults.fault_table import Clock, Row
@@ -95,7 +95,7 @@ def serving(
     for seed, name in enumerate(fields, 1):
         files.append(folder / f"{name}.toml")
         files[-1].write_text(SETTINGS.format(name=name, seed=seed))
-    words = [sys.executable, "-m", "flows.cli", "serve", *map(str, files), "--every", f"{every_s}s"]
+    words = [sys.executable, "-m", "flows.cli.main", "serve", *map(str, files), "--every", f"{every_s}s"]
     words += ["--limit", str(len(fields)), "--out", str(folder / "archive"), "--port", str(port)]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
     process = subprocess.Popen(words, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, stdout=sys.stderr)

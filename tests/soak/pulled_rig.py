@@ -17,8 +17,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
-from flows.emulated_scene import emulated_source
-from flows.settings import load_settings
+from flows.settings.survey_settings import load_settings
+from flows.simulate.emulated_scene import emulated_source
 from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.rig.emulator.emulated_rig import EmulatedRig
 from pipeline.rig.emulator.fast_clock import FastClock

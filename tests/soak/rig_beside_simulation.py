@@ -24,8 +24,8 @@ import numpy as np
 import xarray as xr
 import zarr
 
-from flows.figures import format_bytes, format_count, format_seconds
-from flows.receipt_table import COST_LABELS
+from flows.publish.receipt_table import COST_LABELS
+from flows.terminal.figures import format_bytes, format_count, format_seconds
 from tests.faults.fault_table import Clock, Row
 from tests.faults.nursery import ROOT
 
@@ -82,7 +82,18 @@ def rows(quick: bool) -> list[Row]:
 @contextmanager
 def emulated(file: Path, scene: Sequence[str]) -> Iterator[tuple[Path, subprocess.Popen[bytes]]]:
     """Have a rig, and the settings of a survey of it, while the block runs; then it is told to end, as by Ctrl-C."""
-    words = [sys.executable, "-m", "flows.cli", "rig", "emulate", *scene, "--speed", str(SPEED), "--out", str(file)]
+    words = [
+        sys.executable,
+        "-m",
+        "flows.cli.main",
+        "rig",
+        "emulate",
+        *scene,
+        "--speed",
+        str(SPEED),
+        "--out",
+        str(file),
+    ]
     process = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL)
     try:
         end = time.monotonic() + BEGUN_WITHIN_S
@@ -100,7 +111,7 @@ def emulated(file: Path, scene: Sequence[str]) -> Iterator[tuple[Path, subproces
             process.wait()
 
 
-def command(*words: str, program: str = "flows.cli") -> subprocess.CompletedProcess[str]:
+def command(*words: str, program: str = "flows.cli.main") -> subprocess.CompletedProcess[str]:
     """Run a command to its end; progress goes on to stderr."""
     print(f"  {program} {' '.join(words)}", file=sys.stderr, flush=True)
     return subprocess.run(
@@ -108,7 +119,7 @@ def command(*words: str, program: str = "flows.cli") -> subprocess.CompletedProc
     )
 
 
-def survey(archive: Path, *words: str, program: str = "flows.cli") -> Surveyed:
+def survey(archive: Path, *words: str, program: str = "flows.cli.main") -> Surveyed:
     """Survey into an archive."""
     clock = Clock()
     done = command(SURVEY[0], *words, *SURVEY[1:], "--out", str(archive), program=program)

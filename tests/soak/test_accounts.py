@@ -14,7 +14,7 @@ from typing import cast
 
 import pytest
 
-from flows.schedule_state import moment_words
+from flows.schedule.ledger_state import moment_words
 from storage.archive import Archive
 from tests.flows.schedule_days import NOON
 from tests.soak.accounts import Account, Leftovers, clear

@@ -1,0 +1,237 @@
+"""What `spectralzoom compare` does: two runs of one field side by side, and a picture of where they differ."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.archive.commands import check_outside
+from flows.archive.comparison_table import SAVINGS, change_words, panel_words, show_comparison
+from flows.archive.difference_picture import MapPair, draw_difference
+from flows.publish.receipt import to_json
+from flows.settings.keys import BUILT_IN_SCENES
+from flows.survey.scores import score_of
+from flows.terminal.shown_text import on_stdout
+from pipeline.errors import ArchiveError, SceneError, ShapeError
+from pipeline.grid import UNLABELLED
+from pipeline.simulator.farm_laws import law_of_key
+from storage.addresses import in_text
+from storage.archive import Archive
+from storage.changes import ABSENT, flatten
+from storage.class_maps import ClassMap, load_class_map
+from storage.lineage import Catalogue
+from storage.product_names import find_product
+from storage.records import Run
+from storage.whole_files import written_aside
+
+LARGEST_PAIRS = 10
+NOT_ASKED = ("notes", "out")  # of a receipt's settings
+
+
+def run_compare(archive: str | Path, old: str, new: str, out: Path | None = None, *, as_json: bool = False) -> int:
+    """Compare run ``old`` (A) with run ``new`` (B) on stdout; the picture goes to ``out``, or beside the archive.
+
+    Raises
+    ------
+    ArchiveError : there is no such run, or it cannot be read.
+    SceneError, ShapeError : the runs are of different fields.
+    SettingsError : ``out`` lies in the archive.
+    """
+    opened = Archive.open(archive, create=False, write=False)
+    folder = opened.around if out is None else check_outside(out, opened)
+    catalogue = Catalogue.read(opened.root)
+    runs = (find_run(catalogue, old), find_run(catalogue, new))
+    _check_same_field(*runs)
+    pair = _pair_of([_class_map(catalogue, opened, run) for run in runs])
+    content = _comparison(catalogue, runs, pair)
+    name = f"compare-{runs[0].folder.name}-{runs[1].folder.name}.png"
+    words = [*(panel_words(side) for side in (content["a"], content["b"])), change_words(content["differing"])]
+    with written_aside(folder, [name]) as aside:
+        (aside / name).write_bytes(draw_difference(pair.maps, words))
+    content["picture"] = str(folder / name)
+    if as_json:
+        sys.stdout.write(to_json(content))
+    else:
+        show_comparison(content, on_stdout())
+    return 0
+
+
+def find_run(catalogue: Catalogue, text: str) -> Run:
+    """A run by its id; ``latest`` is the newest that left a map, ``previous`` the one before it of the same field.
+
+    Raises
+    ------
+    ArchiveError : there is none.
+    """
+    mapped = [run for run in catalogue.runs if "class_map" in run.products]
+    if text not in ("latest", "previous"):
+        found = find_product(catalogue, f"runs/{text.rstrip('/').removeprefix('runs/')}")
+        assert isinstance(found, Run)
+        return found
+    if not mapped:
+        raise ArchiveError("no run of this archive has left a class map that can be read; see ls")
+    if text == "latest":
+        return mapped[-1]
+    before = [run for run in mapped[:-1] if _is_same_field(run, mapped[-1])]
+    if not before:
+        raise ArchiveError(f"there is no run of the field of {mapped[-1].uri} before it; see ls, and give two runs")
+    return before[-1]
+
+
+def _is_same_field(old: Run, new: Run) -> bool:
+    """By the scene's key without its bands, or by the scene's file, which may show the field as it is now."""
+    files = [run.settings.get("scene") for run in (old, new)]
+    same_file = files[0] == files[1] and files[0] not in (None, *BUILT_IN_SCENES)
+    return _field_key(old) == _field_key(new) or same_file
+
+
+def _field_key(run: Run) -> str:
+    """What names the land: not the bands, nor the day and hour at which a farm was looked at."""
+    key = str(run.receipt.get("scene", run.uri)).split("/bands=")[0].split("/only=")[0]
+    if law_of_key(key) is None:
+        return key
+    return "/".join(part for part in key.split("/") if not part.startswith(("day=", "hour=")))
+
+
+def _field_words(run: Run) -> str:
+    scene = run.settings.get("scene")
+    return str(_field_key(run) if scene in (None, *BUILT_IN_SCENES) else scene)
+
+
+def _check_same_field(old: Run, new: Run) -> None:
+    for run in (old, new):
+        if "class_map" not in run.products:
+            raise ArchiveError(f"{run.uri} has no class map to compare: {run.problem or 'it left none'}; see verify")
+    if not _is_same_field(old, new):
+        fields = (f"{run.uri} is of {_field_words(run)}" for run in (old, new))
+        raise SceneError(f"these runs are of different fields: {', '.join(fields)}; give two runs of one field")
+
+
+def _class_map(catalogue: Catalogue, archive: Archive, run: Run) -> ClassMap:
+    address = run.products["class_map"]
+    store = in_text(address)
+    if store not in catalogue.stores or catalogue.stores[store].problem is not None:
+        raise ArchiveError(f"the class map {address} of {run.uri} is missing or damaged; run verify --repair")
+    return load_class_map(archive.locate(address))
+
+
+class _Pair:
+    """Two maps with one list of classes, matched by name, and how often each meets each."""
+
+    def __init__(self, maps: MapPair, joint: NDArray[np.int64], confidence: list[NDArray[np.float32]]) -> None:
+        self.maps, self.joint, self.confidence = maps, joint, confidence  # joint: (class of A, class of B), last: none
+
+
+def _pair_of(found: list[ClassMap]) -> _Pair:
+    shapes = [one.classes.shape for one in found]
+    if shapes[0] != shapes[1]:
+        raise ShapeError(f"the maps are {shapes[0]} and {shapes[1]} px (y, x); give two runs of one field and size")
+    names = tuple(dict.fromkeys(name for one in found for name in one.names))
+    colours = {name: colour for one in reversed(found) for name, colour in zip(one.names, one.colours, strict=True)}
+    old, new = (_renumbered(one, names) for one in found)
+    none, count = len(names), len(names) + 1
+    codes = np.minimum(old, none).astype(np.intp) * count + np.minimum(new, none)
+    joint = np.bincount(codes.ravel(), minlength=count * count).reshape(count, count)
+    palette = np.array([colours[name] for name in names], np.uint8).reshape(-1, 3)
+    changed = joint - np.diag(np.diag(joint))
+    order = np.argsort(-changed, axis=None, kind="stable")[: np.count_nonzero(changed)]
+    numbers = [*range(none), UNLABELLED]
+    pairs = [(numbers[i // count], numbers[i % count], int(changed.flat[i])) for i in order.tolist()]
+    return _Pair(MapPair(old, new, names, palette, pairs), joint, [one.confidence for one in found])
+
+
+def _renumbered(found: ClassMap, names: tuple[str, ...]) -> NDArray[np.uint8]:
+    """A map's classes by their places in another list."""
+    table = np.full(256, UNLABELLED, np.uint8)
+    table[: len(found.names)] = [names.index(name) for name in found.names]
+    return np.asarray(table[found.classes], np.uint8)
+
+
+def _comparison(catalogue: Catalogue, runs: tuple[Run, Run], pair: _Pair) -> dict[str, Any]:
+    total, same = pair.maps.old.size, int(np.trace(pair.joint))
+    largest = [
+        {"from": pair.maps.name(old), "to": pair.maps.name(new), "pixels": count, "share": count / total}
+        for old, new, count in pair.maps.pairs[:LARGEST_PAIRS]
+    ]
+    asked = [{name: value for name, value in run.settings.items() if name not in NOT_ASKED} for run in runs]
+    return {
+        **{side: _side(run) for side, run in zip("ab", runs, strict=True)},
+        "classes": _classes(runs, pair),
+        "differing": {"pixels": total - same, "share": (total - same) / total, "pairs": len(pair.maps.pairs)},
+        "largest": largest,
+        "confidence": _confidence(*pair.confidence),
+        "settings": list(_changes(*(flatten(one) for one in asked))),
+        "versions": list(_changes(*(_versions(catalogue, run) for run in runs))),
+        "savings": {name: [_number(run.receipt, "savings", name, "done") for run in runs] for name in SAVINGS},
+    }
+
+
+def _side(run: Run) -> dict[str, Any]:
+    scene, seed = run.settings.get("scene"), run.settings.get("seed")
+    return {"run": run.folder.name, "created": run.created, "scene": scene, "seed": seed, **score_of(run.receipt)}
+
+
+def _classes(runs: tuple[Run, Run], pair: _Pair) -> list[dict[str, Any]]:
+    """Area in each map, its change and the agreement of both, for each class that is in one of them."""
+    areas = [run.receipt["ground"]["areas_ha"] for run in runs if _on_ground(run)]
+    rows, columns, total = pair.joint.sum(axis=1), pair.joint.sum(axis=0), pair.maps.old.size
+    found = []
+    for number, name in enumerate((*pair.maps.names, "no class")):
+        both, pixels = int(pair.joint[number, number]), [int(rows[number]), int(columns[number])]
+        either = sum(pixels) - both
+        if either:
+            row = {"name": name, "pixels": pixels, "share": [count / total for count in pixels], "iou": both / either}
+            if len(areas) == 2 and number < len(pair.maps.names):
+                row["ha"] = [float(area.get(name, 0.0)) for area in areas]
+            found.append(row)
+    return found
+
+
+def _on_ground(run: Run) -> bool:
+    ground = run.receipt.get("ground")
+    return isinstance(ground, Mapping) and isinstance(ground.get("areas_ha"), Mapping)
+
+
+def _confidence(old: NDArray[np.float32], new: NDArray[np.float32]) -> dict[str, float | None]:
+    """Mean confidence of both where both have a class, the mean change, and the share of pixels where it rose."""
+    known = np.isfinite(old) & np.isfinite(new)
+    if not known.any():
+        return {"a": None, "b": None, "change": None, "rose": None}
+    before, after = old[known].astype(np.float64), new[known].astype(np.float64)
+    change = float(after.mean() - before.mean())
+    return {
+        "a": float(before.mean()),
+        "b": float(after.mean()),
+        "change": change,
+        "rose": float(np.mean(after > before)),
+    }
+
+
+def _versions(catalogue: Catalogue, run: Run) -> dict[str, str]:
+    """Of software, of each stage that made something, and of the weights by their content."""
+    found = {str(name): str(value) for name, value in dict(run.receipt.get("versions", {})).items()}
+    for row in run.stages:
+        for uri in catalogue.by_key.get(str(row.get("key")), []):
+            if uri in catalogue.stores:
+                found[f"stage.{row.get('name')}"] = catalogue.stores[uri].version
+                if "weights" in catalogue.stores[uri].params:
+                    found["weights"] = str(catalogue.stores[uri].params["weights"])
+    return found
+
+
+def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    for name in sorted(old.keys() | new.keys()):
+        if old.get(name, ABSENT) != new.get(name, ABSENT):
+            yield {"name": name, "old": old.get(name, ABSENT), "new": new.get(name, ABSENT)}
+
+
+def _number(table: Any, *names: str) -> float | int | None:
+    """A figure deep in a receipt; None where there is none."""
+    for name in names:
+        table = table.get(name) if isinstance(table, Mapping) else None
+    return table if isinstance(table, int | float) and not isinstance(table, bool) else None

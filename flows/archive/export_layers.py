@@ -1,0 +1,224 @@
+"""What an export takes from a run: its images for map programs, its cubes for ENVI, its stores for the catalogue."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+
+from flows.publish.receipt import Receipt, check_receipt
+from flows.survey.ground import coarse_colours
+from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
+from pipeline.grid import UNLABELLED
+from storage.archive import Archive, StageRef
+from storage.cog_files import ANGULAR, CogImage, Place
+from storage.georeference import load_geobox
+from storage.ground_maps import ClassLegend
+from storage.layout import grid_of
+from storage.records import RECEIPT, read_run
+from storage.stac_fields import classes
+from storage.stored_images import StoredImage, open_image
+
+Rows = Iterator[tuple[int, NDArray[Any]]]
+RGB = ("red", "green", "blue")
+LATEST = "latest"
+
+
+@dataclass(frozen=True)
+class ExportedRun:
+    """A published run, opened for export."""
+
+    archive: Archive
+    folder: Path
+    receipt: Receipt
+
+    @property
+    def id(self) -> str:
+        """The run's name in the archive."""
+        return self.folder.name
+
+    def store(self, product: str) -> StageRef | None:
+        """The store behind a product, None where the run has no such product.
+
+        Raises
+        ------
+        IncompleteStoreError : the archive does not have it any more, or a file of it is missing or cut short.
+        """
+        uri = self.receipt["products"].get(product)
+        if uri is None:
+            return None
+        _, stage, key = uri.split("/")[:3]
+        ref = self.archive.find(stage, key)
+        if ref is None:
+            raise IncompleteStoreError(
+                f"the {product} of run {self.id} should lie in {uri} of {self.archive.name} and does not; run its "
+                "survey again, or restore the store from a copy"
+            )
+        return ref
+
+    def path(self, product: str) -> Path:
+        """Where a product lies that every finished run has (IncompleteStoreError: this one has not)."""
+        if self.store(product) is None:
+            raise IncompleteStoreError(f"the run {self.id} has no {product}: it did not finish; export another run")
+        return self.archive.locate(self.receipt["products"][product])
+
+    def sweeps(self) -> list[Path]:
+        """Stores of the raw sweeps, coarse ones first."""
+        refs = [self.store(product) for product in ("raw_coarse", "raw_fine", "raw_again")]
+        return [path for ref in refs if ref is not None for path in sorted(ref.path.glob("*.zarr"))]
+
+    @cached_property
+    def geobox(self) -> GeoBox | None:
+        """Where the run's map lies on the earth; None without a pose."""
+        return None if self.store("ground_map") is None else load_geobox(self.path("ground_map"))
+
+    @property
+    def software(self) -> str:
+        """Name and version of what made the run."""
+        return f"spectralzoom {self.receipt['versions'].get('spectralzoom', 'of unknown version')}"
+
+
+def open_exported(archive: Archive, name: str | None) -> ExportedRun:
+    """Open a run by its name or address, the latest without one.
+
+    Raises
+    ------
+    SettingsError : there is no such run, or none at all.
+    IncompleteStoreError : its receipt cannot be read.
+    """
+    runs = archive.runs()
+    if not runs:
+        raise SettingsError(f"{archive.name} has no published run; survey into it first")
+    called = LATEST if name is None else name.rstrip("/").removeprefix("runs/")
+    folder = runs[-1] if called == LATEST else next((run for run in runs if run.name == called), None)
+    if folder is None:
+        known = ", ".join(run.name for run in runs[-5:])
+        raise SettingsError(f"{archive.name} has no run {name!r}; its latest are {known}")
+    run = read_run(folder, {})
+    if run.problem is not None:
+        raise IncompleteStoreError(f"{folder} is damaged: {run.problem}; run verify on the archive")
+    try:
+        receipt = check_receipt(run.receipt)
+    except ShapeError as error:
+        raise IncompleteStoreError(f"{folder / RECEIPT} is no survey's: {error}; export another run") from error
+    return ExportedRun(archive, folder, receipt)
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One image to export."""
+
+    name: str
+    title: str
+    roles: tuple[str, ...]
+    image: CogImage
+    rows: Callable[[], Rows]
+    unit: str | None = None
+    fields: Mapping[str, Any] = field(default_factory=dict)  # STAC's, beside its bands and its grid
+
+
+def map_layers(run: ExportedRun) -> list[Layer]:
+    """Class map, confidence, attention and picture of a run: on the map where there is one, on angles where not.
+
+    Attention keeps its grid of seats.
+    """
+    product = "class_map" if run.geobox is None else "ground_map"
+    legend = _legend(open_image(run.path(product), "classes"))
+    made = [
+        _layer(run, product, "classes", ("class",), nodata=UNLABELLED, legend=legend),
+        _layer(run, product, "confidence", ("confidence",), nodata=np.nan),
+        _attention(run),
+        _picture(run) if run.geobox is None else _layer(run, product, "picture", RGB, nodata=0),
+    ]
+    names = {
+        "class_map": ("Class map", ("data",), None, classes(legend)),
+        "confidence": ("Probability of the class given", ("data", "confidence"), "1", {}),
+        "attention": ("Worth of a fine look, by seat", ("data",), "1", {}),
+        "rgb": ("Picture of the coarse look", ("visual", "overview"), None, {}),
+    }
+    return [
+        Layer(name, title, roles, image, rows, unit, about)
+        for (name, (title, roles, unit, about)), (image, rows) in zip(names.items(), made, strict=True)
+    ]
+
+
+def _legend(stored: StoredImage) -> ClassLegend:
+    names, colours = (stored.about.get(f"class_{word}", ()) for word in ("names", "colours"))
+    return ClassLegend(tuple(names), np.array(colours, np.uint8).reshape(-1, 3))
+
+
+def _tags(run: ExportedRun, product: str, place: Place) -> dict[str, str]:
+    """What a file says of where it comes from and where it lies."""
+    return {
+        "TIFFTAG_SOFTWARE": run.software,
+        "run": run.id,
+        "product": run.receipt["products"][product],
+        "surveyed": run.receipt["started"],
+        "place": ANGULAR if place.crs_wkt is None else "map",
+    }
+
+
+def _place(run: ExportedRun, stored: StoredImage) -> Place:
+    """Where a store's images lie, as the store itself says."""
+    if run.geobox is not None and stored.on_map:
+        return Place.on_map(run.geobox)
+    transform = stored.about.get("spatial:transform")
+    if transform is None:
+        raise IncompleteStoreError(f"the {stored.name} of run {run.id} do not say where they lie; verify the archive")
+    return Place(tuple(float(number) for number in transform))
+
+
+def _layer(
+    run: ExportedRun,
+    product: str,
+    array: str,
+    bands: tuple[str, ...],
+    *,
+    nodata: float,
+    legend: ClassLegend | None = None,
+) -> tuple[CogImage, Callable[[], Rows]]:
+    stored = open_image(run.path(product), array)
+    place = _place(run, stored)
+    shape = (stored.shape[0], stored.shape[1])
+    image = CogImage(shape, stored.dtype.name, place, bands, nodata, legend, _tags(run, product, place))
+    return image, stored.rows
+
+
+def _attention(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
+    """Scores of the seats, on the angular grid that their size in pixels gives."""
+    stored, ref = open_image(run.path("attention"), "score"), run.store("attention")
+    scene = grid_of(open_image(run.path("class_map"), "classes").about)
+    if ref is None or scene is None:
+        raise IncompleteStoreError(f"the class map of run {run.id} does not say its grid; run its survey again")
+    patch = int(run.archive.manifest(ref)["params"]["grid"]["patch"])
+    shape = (stored.shape[0], stored.shape[1])
+    place = Place.on_angles(replace(scene, factor=patch), shape)
+    policy = str(stored.about.get("policy", ""))
+    tags = {**_tags(run, "attention", place), "policy": policy, "seat_px": str(patch)}
+    return CogImage(shape, stored.dtype.name, place, ("score",), np.nan, tags=tags), stored.rows
+
+
+def _picture(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
+    """The coarse mosaic in a photograph's tones, 1 to 255, and 0 where nothing was captured."""
+    stored, ref = open_image(run.path("mosaic"), "coverage"), run.store("mosaic")
+    assert ref is not None
+    place = _place(run, stored)
+    image = CogImage((stored.shape[0], stored.shape[1]), "uint8", place, RGB, 0, tags=_tags(run, "mosaic", place))
+
+    def rows() -> Rows:
+        yield 0, np.nan_to_num(np.rint(coarse_colours(ref))).astype(np.uint8)
+
+    return image, rows
+
+
+def seen_rows(run: ExportedRun) -> Iterator[tuple[int, NDArray[np.bool_]]]:
+    """Where a run's map shows anything, some rows at a time."""
+    found, pictures = (open_image(run.path("ground_map"), name).rows() for name in ("classes", "picture"))
+    for (first, numbers), (_, picture) in zip(found, pictures, strict=True):
+        yield first, (numbers != UNLABELLED) | (picture.max(axis=2) > 0)

@@ -1,0 +1,182 @@
+"""What a survey would run: its own stage functions, asked which store they want, with nothing built or written."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from flows.archive.stage_costs import PARTS, PastCosts
+from flows.settings.survey_settings import Settings
+from flows.survey.run import SurveyRun, open_run
+from flows.survey.stages import VERSIONS
+from flows.survey.survey import STAGES, judge, survey
+from pipeline.errors import IncompleteStoreError, PipelineError
+from storage.addresses import store_at
+from storage.archive import Archive, StageRef, stage_key
+from storage.changes import Change, changes_between
+from storage.keys import plain
+from storage.lineage import Catalogue
+from storage.records import Store
+
+State = Literal["cached", "to run", "blocked", "skipped"]
+
+
+@dataclass(frozen=True)
+class StageForecast:
+    """What would become of one stage. ``seconds`` and ``size`` are None where the archive has nothing to go by."""
+
+    stage: str
+    state: State
+    key: str | None  # None while an input of it is not known
+    why: str
+    seconds: float | None = 0.0
+    size: int | None = 0  # [bytes]
+    basis: str = ""  # what the estimate comes from, or why there is none
+    changes: tuple[Change, ...] = ()  # against the newest store of the same stage and scene
+
+
+class _WaitsError(IncompleteStoreError):
+    """A stage asks for the content, or for the key, of what is still to be made."""
+
+
+@dataclass(frozen=True)
+class _Awaited(StageRef):
+    """Where a store would be: whoever asks for its path, or for a key that is not known, waits for ``made_by``."""
+
+    made_by: str
+
+    def __getattribute__(self, name: str) -> Any:
+        value = object.__getattribute__(self, name)
+        if name == "path" or (name == "key" and not value):
+            raise _WaitsError(object.__getattribute__(self, "made_by"))
+        return value
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What a survey would do, stage by stage in order, and why this machine would refuse to (None: it would not)."""
+
+    stages: list[StageForecast]
+    refused: str | None = None
+
+
+def forecast(settings: Settings) -> Forecast:
+    """Tell of every stage what a survey of these settings would do. Writes nothing.
+
+    Raises
+    ------
+    PipelineError : what the survey itself would refuse at its start, but for a scene that this machine cannot hold.
+    """
+    with _opened(settings) as run:
+        planner = Planner(run, Catalogue.read(run.archive.root))
+        judge(planner, survey(planner, settings.rounds))
+    return Forecast(planner.rows, run.refused)
+
+
+@contextmanager
+def _opened(settings: Settings) -> Iterator[SurveyRun]:
+    """The survey's context on its archive as it is; where there is none yet, on an empty one that goes away again."""
+    with tempfile.TemporaryDirectory(prefix="spectralzoom-plan-") as empty:
+        archive = Archive(Path(empty), writes=False)
+        if Archive.is_there(settings.out):
+            archive = Archive.open(settings.out, create=False, write=False)
+        run = open_run(replace(settings, out=empty), planning=True)
+        yield replace(run, settings=settings, archive=archive)
+
+
+@dataclass
+class Planner:
+    """An engine for `flows.survey.survey.survey` that asks every stage for its key, and runs none."""
+
+    run: SurveyRun
+    catalogue: Catalogue
+    rows: list[StageForecast] = field(default_factory=list)
+    _planned: dict[str, Store] = field(default_factory=dict)  # by address
+
+    def __post_init__(self) -> None:
+        self._costs = PastCosts(self.catalogue, self.run)
+
+    def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef | None:
+        """Forecast one of ``STAGES`` by its name."""
+        row, ref = self._ask(stage, inputs)
+        self.rows.append(row)
+        return ref
+
+    def _ask(self, stage: str, inputs: Sequence[StageRef]) -> tuple[StageForecast, StageRef | None]:
+        asked: list[StageForecast] = []
+
+        def produce(
+            name: str, build: Callable[[Path], None], params: Mapping[str, Any], refs: Sequence[StageRef]
+        ) -> StageRef:
+            row, ref = self._look(stage, name, params, refs)
+            asked.append(row)
+            return ref
+
+        try:
+            ref = STAGES[stage](self.run, produce, *inputs)
+        except _WaitsError as wait:
+            return self._blocked(stage, f"waits for {wait}")
+        except (PipelineError, OSError) as error:  # what is there cannot be used: the survey would stop here
+            return self._blocked(stage, str(error))
+        if ref is None:
+            return StageForecast(stage, "skipped", None, "nothing to do with these settings"), None
+        return asked[-1], ref
+
+    def _blocked(self, stage: str, why: str) -> tuple[StageForecast, StageRef]:
+        seconds, size, basis = self._costs.estimate(stage)
+        row = StageForecast(stage, "blocked", None, why, seconds, size, basis)
+        return row, _Awaited(PARTS[stage].stage, "", Path(), stage)
+
+    def _look(
+        self, stage: str, name: str, params: Mapping[str, Any], refs: Sequence[StageRef]
+    ) -> tuple[StageForecast, StageRef]:
+        """Find the store of these facts, or say why there is none."""
+        keys = [ref.key for ref in refs]
+        key = stage_key(name, VERSIONS[name], params, keys)
+        if stage in ("capture_fine", "capture_again"):
+            self._costs.plan_fine(stage, sum(sweep["lines"] for sweep in params["sweeps"]))
+        found = self.run.archive.find(name, key)
+        if found is not None:
+            return StageForecast(stage, "cached", key, "stored"), found
+        ref = store_at(self.run.archive.root, name, key)
+        facts = {"version": VERSIONS[name], "params": plain(params), "inputs": keys}
+        self._planned[ref.uri] = Store(ref, facts)
+        why, changes = self._reason(stage, self._planned[ref.uri])
+        row = StageForecast(stage, "to run", key, why, *self._costs.estimate(stage), changes)
+        return row, _Awaited(name, key, ref.path, stage)
+
+    def _reason(self, stage: str, store: Store) -> tuple[str, tuple[Change, ...]]:
+        """What differs from the newest store of the same stage of the same scene, in words and in full."""
+        stored = self._costs.stored(stage)
+        before = next((one for one in stored if self._costs.of_scene(one)), None)
+        if before is None:
+            return ("nothing stored yet of this scene" if stored else "nothing stored yet"), ()
+        known = replace(self.catalogue, stores=self.catalogue.stores | self._planned)
+        found = tuple(change for change in changes_between(known, before, store) if change.kind != "library")
+        return _in_words(found, store.ref.stage), found
+
+
+def _in_words(changes: Sequence[Change], stage: str) -> str:
+    """The first thing that differs where it began, and how many more."""
+    causes = [change for change in changes if change.kind != "input"] or list(changes)
+    if not causes:
+        return "nothing differs but its key"
+    first = causes[0]
+    where = "" if first.where == stage else f" of {first.where}"
+    more = f", and {len(causes) - 1} more" if len(causes) > 1 else ""
+    if first.kind == "input":
+        return f"other {first.name} than in the newest store{more}"
+    if first.name == "weights":
+        return f"other weights than in the newest store{where}{more}"
+    name = "version" if first.kind == "version" else first.name
+    return f"{name}{where}: {_shown(first.old)} before, {_shown(first.new)} now{more}"
+
+
+def _shown(value: object) -> str:
+    """A value as a person writes it: lists with commas, nothing as none."""
+    parts = value if isinstance(value, list) else [value]
+    return ", ".join("none" if part is None else str(part) for part in parts) or "none"

@@ -1,0 +1,150 @@
+"""What `spectralzoom ingest` does and shows: one file or folder becomes one immutable store of an archive."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+
+from flows.terminal.progress import StageProgress
+from pipeline.errors import SceneError
+from storage.archive import Archive, StageRef
+from storage.cube_sources import CubeSource
+from storage.ingested_cubes import Report, SourceFile, write_ingested_cube
+from storage.scan_files import open_cube_source, with_wavelengths
+from storage.staging import check_name, file_hash
+
+STAGE = "ingest"
+VERSION = 2
+TITLES = {"read": "reading the files", STAGE: "storing the cube"}
+
+
+@dataclass(frozen=True)
+class IngestRequest:
+    """What to ingest, as the flags say it."""
+
+    source: str
+    archive: str | Path
+    name: str | None = None
+    dark: str | None = None
+    white: str | None = None
+    wavelengths: Sequence[float] | None = None  # [nm], one a band
+
+
+def run_ingest(request: IngestRequest, console: Console) -> dict[str, Any]:
+    """Store a source in an archive, with progress on ``console``; give the record that --json prints.
+
+    What the files hold and the flags say is the store's key: the same content is stored once, whatever it is called and
+    wherever it lies. Killed anywhere it leaves nothing under that key.
+
+    Raises
+    ------
+    SceneError, WavelengthError : the source cannot be used, or changed while it was read.
+    ArchiveError : the name cannot be one in an archive, or the archive cannot be written to.
+    """
+    if request.name is not None:
+        check_name(request.name)
+    with console.status("opening the source"):
+        source = _opened(request)
+        archive = Archive.open(request.archive)
+        archive.reclaim()  # what a killed ingest left half made
+    with archive.in_use(), StageProgress(console, TITLES) as progress:
+        before = _stamps(source)
+        files = hash_files(source, lambda done: progress.show("read", done))
+        progress.show("read", 1.0, ended=True)
+
+        def build(path: Path) -> None:
+            name = request.name or source.name
+            write_ingested_cube(path, source, files, name=name, report=lambda done: progress.show(STAGE, done))
+            if _stamps(source) != before:  # what was written is not what was hashed
+                raise SceneError(f"{request.source} changed while it was read; ingest it again once it is whole")
+
+        ref, built = archive.produce(STAGE, build, version=VERSION, params=_key(request, source, files))
+        progress.show(STAGE, 1.0, "" if built else "cached", ended=True)
+    record = _record(archive, ref, source, files, cached=not built)
+    _print(record, source, console)
+    return record
+
+
+def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[SourceFile]:
+    """Size and SHA-256 of every file that a cube comes from; names are without folders, but those within a store."""
+    files: list[SourceFile] = []
+    for number, path in enumerate(source.files):
+        name = path.name if source.root is None or not path.is_relative_to(source.root) else _within(path, source.root)
+        files.append(SourceFile(name, path.stat().st_size, file_hash(path)))
+        report((number + 1) / len(source.files))
+    return files
+
+
+def _within(path: Path, root: Path) -> str:
+    return path.relative_to(root).as_posix()
+
+
+def _opened(request: IngestRequest) -> CubeSource:
+    source = open_cube_source(request.source, dark=request.dark, white=request.white)
+    return source if request.wavelengths is None else with_wavelengths(source, request.wavelengths)
+
+
+def _stamps(source: CubeSource) -> list[tuple[int, int]]:
+    return [(path.stat().st_size, path.stat().st_mtime_ns) for path in source.files]
+
+
+def _key(request: IngestRequest, source: CubeSource, files: Sequence[SourceFile]) -> dict[str, Any]:
+    """What the store depends on: content, the flags, and wavelengths that come from elsewhere than the files."""
+    named = source.root is not None  # in a Zarr store names say where a chunk lies
+    centres, widths = source.bands.wavelength_nm, source.bands.fwhm_nm
+    return {
+        "files": [[file.name if named else "", file.size, file.sha256] for file in files],
+        "shape": source.shape,
+        "name": request.name,
+        "references": [source.dark, source.white],
+        "wavelength_nm": None if centres is None else centres.tolist(),
+        "fwhm_nm": None if widths is None else widths.tolist(),
+        **({"numbers_in_names": source.by_names} if source.by_names else {}),
+    }
+
+
+def _record(
+    archive: Archive, ref: StageRef, source: CubeSource, files: Sequence[SourceFile], *, cached: bool
+) -> dict[str, Any]:
+    centres = source.bands.wavelength_nm
+    return {
+        "stage": ref.stage,
+        "key": ref.key,
+        "uri": ref.uri,
+        "path": str(ref.path),
+        "cached": cached,
+        "name": source.name,
+        "shape": list(source.shape),
+        "source_dtype": source.dtype.str,
+        "lost_lines": source.lost_lines,
+        "wavelength_nm": None if centres is None else [float(centres.min()), float(centres.max())],
+        "dark": source.dark is not None,
+        "white": source.white is not None,
+        "bytes_read": sum(file.size for file in files),
+        "bytes_stored": archive.stored_bytes(ref),
+        "files": [file.record() for file in files],
+        "notes": list(source.notes),
+    }
+
+
+def _print(record: dict[str, Any], source: CubeSource, console: Console) -> None:
+    """The record in a few lines: what came in, what is doubtful, where it lies."""
+    lines, samples, bands = record["shape"]
+    span = record["wavelength_nm"]
+    light = "no wavelengths (give --wavelengths)" if span is None else f"{span[0]:g}-{span[1]:g} nm"
+    console.print(
+        f"{escape(record['name'])}: {lines} x {samples} px, {bands} bands, {light}", highlight=False, soft_wrap=True
+    )
+    for note in (*source.notes, *([source.bands.origin] if source.bands.origin else [])):
+        console.print(f"[dim]note: {escape(note)}[/]", highlight=False, soft_wrap=True)
+    lost = record["lost_lines"]
+    if lost:
+        console.print(f"[yellow]{lost} of {lines} lines are in no file and flagged[/]", highlight=False)
+    done = "already there" if record["cached"] else "stored"
+    sizes = f"{record['bytes_read'] / 1e6:.1f} MB read, {record['bytes_stored'] / 1e6:.1f} MB stored"
+    console.print(f"{done}: {escape(record['path'])} ({sizes})", highlight=False, soft_wrap=True)

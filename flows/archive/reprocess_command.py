@@ -1,0 +1,223 @@
+"""What `spectralzoom reprocess` does: the surveys of an archive again, each beside the one before it.
+
+What the archive holds is found by its key, raw light above all; only what new weights or newer stages change is made.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+
+from flows.archive.commands import DONE, FAILED, PARTLY, check_outside
+from flows.archive.stale_runs import (
+    Generation,
+    asked_again,
+    check_stage,
+    file_key,
+    is_called,
+    is_current,
+    is_whole,
+    newest_runs,
+    would_remake,
+)
+from flows.publish.receipt import to_json
+from flows.settings.survey_settings import Settings
+from flows.survey.scores import score_of
+from flows.terminal.figures import format_points, format_seconds
+from pipeline.errors import PipelineError, SettingsError
+from pipeline.visible_text import visible
+from storage.archive import Archive
+from storage.block_work import THREADS, Crew
+from storage.lineage import Catalogue
+from storage.records import read_run
+from storage.whole_files import new_file, write_whole
+
+Survey = Callable[[Settings, Console], Path]  # settings in, the folder of the published run out
+STATES = ("ran", "would run", "skipped", "failed")
+
+
+@dataclass(frozen=True)
+class ReprocessRequest:
+    """Which fields, and with what."""
+
+    archive: str | Path
+    since: str | None = None  # ISO date (UTC); the newest run of the field is of this day or later
+    stage: str | None = None  # only where it would be made anew
+    field: str | None = None  # what survey, scene file or run is called; * for any letters
+    failed: bool = False  # only where the newest run is damaged or lacks stores
+    weights: Path | None = None
+    dry_run: bool = False
+    out: Path | None = None  # folder for reprocess-TIME.json; beside the archive without one
+    crew: Crew = THREADS  # who makes blocks; what the old runs were made by need not be there
+
+
+def run_reprocess(
+    request: ReprocessRequest, console: Console, *, survey: Survey | None = None, as_json: bool = False
+) -> int:
+    """Survey again what was asked for; progress on ``console``, the summary on stdout and in a file.
+
+    Fields whose newest run is already as it would become are skipped: the same command goes on after an interruption.
+    The file is there before the first field is begun, and its ``finished`` is null until all have been.
+
+    Raises
+    ------
+    SettingsError : a date or stage that is none, no field is called so, or ``out`` lies in the archive.
+    ArchiveError : the archive cannot be read or written, or there is no room for the summary.
+    """
+    opened = Archive.open(request.archive, create=False, write=not request.dry_run)
+    folder = opened.around if request.out is None else check_outside(request.out, opened)
+    catalogue = Catalogue.read(opened.root)
+    wanted = _chosen(catalogue, request, opened.name)
+    rows: list[dict[str, Any]] = []
+    content: dict[str, Any] = {
+        "archive": opened.name, "started": f"{datetime.now(UTC):%Y%m%dT%H%M%S}", "finished": None,
+        "dry_run": request.dry_run, "asked": _asked(request), "fields": rows,
+    }  # fmt: skip
+    file = None
+    if wanted and not request.dry_run:
+        file = new_file(folder, f"reprocess-{content['started']}", ".json")
+        write_whole(file, to_json(content))
+    with request.crew.open():  # one start of its workers for all fields
+        for number, generation in enumerate(wanted, 1):
+            told = f"{number} of {len(wanted)}: {generation.field} ({generation.run.folder.name})"
+            console.print(f"[bold]reprocess {escape(told)}[/]", highlight=False, soft_wrap=True)
+            rows.append(_again(catalogue, generation, request, console, survey or _survey))
+            console.print(escape(_words(rows[-1])), highlight=False, soft_wrap=True)
+            if file is not None:
+                write_whole(file, to_json(content))  # also of what was done before an interruption
+    content["finished"] = f"{datetime.now(UTC):%Y%m%dT%H%M%S}"
+    if file is not None:
+        file = _end_summary(file, content, wanted=request.out is not None)
+    if as_json:
+        sys.stdout.write(to_json(content))
+    else:
+        _show(content, file)
+    return _exit_code([row["state"] for row in rows])
+
+
+def _end_summary(file: Path, content: Mapping[str, Any], *, wanted: bool) -> Path | None:
+    """Write the whole summary; where there was nothing to do and nobody asked for the file, take it away."""
+    if not wanted and all(row["state"] == "skipped" for row in content["fields"]):
+        file.unlink(missing_ok=True)
+        return None
+    write_whole(file, to_json(content))
+    return file
+
+
+def _asked(request: ReprocessRequest) -> dict[str, Any]:
+    """What was asked for, as it can be told years later: the weights by their content too."""
+    weights = None if request.weights is None else str(request.weights.absolute())
+    return {
+        "since": request.since, "stage": request.stage, "field": request.field, "failed": request.failed,
+        "weights": weights, "weights_key": None if weights is None else file_key(Path(weights)),
+    }  # fmt: skip
+
+
+def _chosen(catalogue: Catalogue, request: ReprocessRequest, out: str) -> list[Generation]:
+    """Newest runs of the fields that were asked for."""
+    if request.weights is not None and not request.weights.is_file():
+        raise SettingsError(f"--weights {request.weights}: there is no such file; give weights that train has written")
+    since = None if request.since is None else _moment(request.since)
+    fields = newest_runs(catalogue)
+    if request.field is not None:
+        names = ", ".join(dict.fromkeys(one.field for one in fields)) or "none"
+        fields = [one for one in fields if is_called(one, request.field)]
+        if not fields:
+            raise SettingsError(f"--field {request.field}: no field of this archive is called so; there are {names}")
+    if since is not None:
+        fields = [one for one in fields if _moment(one.run.created or "0001-01-01") >= since]
+    if request.failed:
+        fields = [one for one in fields if not is_whole(catalogue, one.run)]
+    if request.stage is not None:
+        check_stage(request.stage)
+        fields = [one for one in fields if _would_remake(catalogue, one, request, out)]
+    return fields
+
+
+def _would_remake(catalogue: Catalogue, one: Generation, request: ReprocessRequest, out: str) -> bool:
+    try:
+        settings = asked_again(one.run, out, request.weights)
+    except PipelineError:
+        return True  # said when its turn comes
+    return would_remake(catalogue, one.run, str(request.stage), settings)
+
+
+def _moment(text: str) -> datetime:
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise SettingsError(f"--since expects a date such as 2026-05-01, got {text!r}") from None
+    return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+
+
+def _again(
+    catalogue: Catalogue, generation: Generation, request: ReprocessRequest, console: Console, survey: Survey
+) -> dict[str, Any]:
+    """One field surveyed again; an error is said in its row."""
+    run, begun = generation.run, time.perf_counter()
+    row: dict[str, Any] = {
+        "field": generation.field, "scene": run.settings.get("scene"), "old": run.folder.name, "new": None,
+        "state": "failed", "message": None, **_scores(run.receipt, "before"), **_scores({}, "after"), "seconds": None,
+    }  # fmt: skip
+    try:
+        settings = asked_again(run, str(request.archive), request.weights)
+        settings = replace(settings, scheduler=request.crew.scheduler, workers=request.crew.workers)
+        if is_current(catalogue, run, settings):
+            same = {"state": "skipped", "message": "is as it would become"}
+            return row | same | _scores(run.receipt, "after")
+        if request.dry_run:
+            return row | {"state": "would run"}
+        folder = survey(settings, console)
+    except PipelineError as error:
+        return row | {"message": str(error), "seconds": time.perf_counter() - begun}
+    after, seconds = _scores(read_run(folder, {}).receipt, "after"), time.perf_counter() - begun
+    return row | {"new": folder.name, "state": "ran", **after, "seconds": seconds}
+
+
+def _survey(settings: Settings, console: Console) -> Path:
+    from flows.publish.survey_command import run_survey
+
+    return run_survey(settings, console).folder
+
+
+def _scores(receipt: Mapping[str, Any], when: str) -> dict[str, float | None]:
+    return {f"{name}_{when}": score for name, score in score_of(receipt).items()}
+
+
+def _exit_code(states: Sequence[str]) -> int:
+    """Done, partly, or failed where every field did."""
+    failed = states.count("failed")
+    return DONE if not failed else FAILED if failed == len(states) else PARTLY
+
+
+def _words(row: Mapping[str, Any]) -> str:
+    """What became of one field, in one line."""
+    words = f"{row['field']} ({row['old']}) {row['state']}"
+    if row["state"] == "ran":
+        scored = [_change("mIoU", row, "miou"), _change("overall", row, "overall_accuracy")]
+        return f"{words}: {row['new']}, {format_seconds(row['seconds'])}{''.join(scored)}"
+    return words + (f": {row['message']}" if row["message"] else "")
+
+
+def _change(label: str, row: Mapping[str, Any], name: str) -> str:
+    scores = [row[f"{name}_before"], row[f"{name}_after"]]
+    return "" if None in scores else f", {label} {' to '.join(map(format_points, scores))}"
+
+
+def _show(content: Mapping[str, Any], file: Path | None) -> None:
+    """Print the summary on stdout, a line a field."""
+    rows = content["fields"]
+    counts = {state: sum(row["state"] == state for row in rows) for state in STATES}
+    told = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
+    count = f"{len(rows)} field{'' if len(rows) == 1 else 's'}: {told}"
+    lines = [*map(_words, rows), count if rows else "no field matches: nothing to do"]
+    lines += [] if file is None else [f"  {file}"]
+    sys.stdout.write(visible("\n".join(lines)) + "\n")

@@ -1,0 +1,216 @@
+"""What stages of a survey took before, and what they would take now: scaled by how much there is to do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+from flows.survey.extent import Extent, Unit
+from flows.survey.run import SurveyRun
+from pipeline.errors import PipelineError
+from pipeline.grid import SceneGrid
+from storage.cubes import open_raw_cube
+from storage.lineage import Catalogue
+from storage.manifests import Cost
+from storage.records import Store
+
+
+@dataclass(frozen=True)
+class Part:
+    """A stage's stores in the archive, and the units of `Extent` that its seconds and its bytes grow with."""
+
+    stage: str
+    unit: Unit
+    inputs: int | None = None  # these two tell apart stages of one name
+    fine: bool | None = None
+    size: Unit | None = None  # the same as for seconds
+
+
+PARTS = {
+    "choose_effects": Part("effects", "surveys"),
+    "capture_coarse": Part("capture", "coarse values", fine=False),
+    "register_coarse": Part("register", "coarse values", 1),
+    "locate": Part("locate", "coarse pixels"),
+    "rectify": Part("rectify", "mosaic values"),
+    "attend": Part("attend", "pixels", 1),
+    "capture_fine": Part("capture", "fine values", fine=True),
+    "register_fine": Part("register", "fine values", 2),
+    "cut_patches": Part("patches", "patch values"),
+    "attend_again": Part("attend", "operations of the map", 3),
+    "capture_again": Part("capture", "fine values", fine=True),
+    "register_again": Part("register", "fine values", 2),
+    "cut_again": Part("patches", "patch values"),
+    "draw_map": Part("segment", "operations of the map", size="pixels"),
+    "compare_turned": Part("turned", "pixels"),
+    "ground": Part("ground", "pixels"),
+    "evaluate": Part("evaluate", "operations of a glance", size="surveys"),
+}
+OF_ONE_ROUND = ("attend", "capture_fine", "register_fine", "cut_patches", "attend_again", "capture_again",
+                "register_again")  # fmt: skip
+MOST_RECORDS = 5  # of a stage that are looked into
+APART = 2.0  # times the work of another: then the two tell what starting takes
+CONTROLS_UNIT: Unit = "scene values"  # judging with controls scans the whole field
+
+
+class PastCosts:
+    """The stores of an archive as records of what a run of these settings would cost."""
+
+    def __init__(self, catalogue: Catalogue, run: SurveyRun) -> None:
+        self._catalogue, self._run = catalogue, run
+        self._extent = Extent(
+            run.described.config, run.grid, run.camera, run.settings.cost, run.plan.along,
+            len(run.scene.wavelength_nm), sum(sweep.lines for sweep in run.plan.coarse),
+        )  # fmt: skip
+        self._fine_lines: dict[str, int] = {}
+
+    def plan_fine(self, stage: str, lines: int) -> None:
+        """Take note of how many lines a fine pass has; before that they are what its seconds are likely to buy."""
+        self._fine_lines[stage] = lines
+
+    def stored(self, stage: str) -> list[Store]:
+        """Whole stores of a stage, newest first."""
+        part = PARTS[stage]
+        found = [
+            store
+            for store in self._by_stage.get(part.stage, [])
+            if store.problem is None
+            and part.inputs in (None, len(store.inputs))
+            and part.fine in (None, _is_fine(store))
+        ]
+        return sorted(found, key=lambda store: store.created, reverse=True)
+
+    @cached_property
+    def _by_stage(self) -> dict[str, list[Store]]:
+        found: dict[str, list[Store]] = {}
+        for store in self._catalogue.stores.values():
+            found.setdefault(store.ref.stage, []).append(store)
+        return found
+
+    def of_scene(self, store: Store) -> bool:
+        """Whether a store is of the run's scene, or of none: a lookup is of a path."""
+        scenes = {str(one.params["scene"]) for one in self._below(store) if "scene" in one.params}
+        return scenes <= {self._run.scene.key}
+
+    def estimate(self, stage: str) -> tuple[float | None, int | None, str]:
+        """Seconds and bytes by the newest record, of this scene if there is one, and what they come from.
+
+        The record is scaled by the stage's unit of work; where there is a second one of a much larger or smaller
+        survey, what both spent on starting is told apart first. None and None where there is no record, or none that
+        tells how much work it was.
+        """
+        records = [store for store in self.stored(stage) if store.cost is not None and self._alike(store)]
+        if not records:
+            return None, None, "no such store has a record of what it took"
+        unit = CONTROLS_UNIT if stage == "evaluate" and self._run.settings.controls else PARTS[stage].unit
+        known = self._known(sorted(records, key=lambda store: not self.of_scene(store)), unit)
+        if not known:
+            return None, None, f"{records[0].ref.uri} does not tell how much work it was"
+        seconds = self._line(stage, known, unit, [cost.wall_s for _, cost, _ in known])
+        size = self._line(stage, known, PARTS[stage].size or unit, [cost.size for _, cost, _ in known])
+        address, first, _ = known[0]
+        rest = "" if len(known) == 1 else f", and {known[1][0]}"
+        times = seconds / first.wall_s if first.wall_s else 0.0
+        return seconds, round(size), f"{address} times {times:.3g}, by {unit}{rest}"
+
+    def _known(self, records: Sequence[Store], unit: Unit) -> list[tuple[str, Cost, Extent]]:
+        """The first record that tells how much work it was, and the first of those that were much more or less."""
+        known: list[tuple[str, Cost, Extent]] = []
+        for record in records[:MOST_RECORDS]:
+            try:
+                then = self._extent_then(record)
+                work, first = then.work(unit), known[0][2].work(unit) if known else 0.0
+            except (LookupError, TypeError, ValueError, OSError, PipelineError):  # of a version with other parameters
+                continue
+            if record.cost is not None and work and (not known or not 1 / APART < work / first < APART):
+                known.append((record.ref.uri, record.cost, then))
+            if len(known) == 2:
+                break
+        return known
+
+    def _line(self, stage: str, known: Sequence[tuple[str, Cost, Extent]], unit: Unit, took: Sequence[float]) -> float:
+        """What this run takes: the first record by its work, less what starting took where two records tell it."""
+        works = [then.work(unit) for _, _, then in known]
+        return scaled_cost(works, took, self._extent_like(stage, known[0][2]).work(unit))
+
+    def _alike(self, store: Store) -> bool:
+        """Controls are many times the work of judging a map alone."""
+        return store.ref.stage != "evaluate" or store.params.get("controls") == self._run.settings.controls
+
+    def _extent_like(self, stage: str, then: Extent) -> Extent:
+        """This run, with a fine pass's lines as planned, else as many as its seconds buy in runs as long as then.
+
+        A stage of one of several rounds has the lines of that one, as it is planned; half of the seconds are its own.
+        """
+        plan, rounds, of_one = self._run.plan, self._run.settings.rounds, stage in OF_ONE_ROUND
+        passes = ["capture_fine", "capture_again"][:rounds]
+        if of_one:
+            passes = ["capture_again" if stage.endswith("_again") and stage != "attend_again" else "capture_fine"]
+        if all(name in self._fine_lines for name in passes):
+            return replace(self._extent, fine_lines=sum(self._fine_lines[name] for name in passes))
+        most = sum(sweep.lines for sweep in plan.full)
+        seconds = plan.fine_s / rounds if of_one else plan.fine_s
+        return self._extent.buying(seconds, run_lines=then.run_lines, most=most)
+
+    def _extent_then(self, record: Store) -> Extent:
+        """How much a survey was, as far as a store and those that it rests on tell by their parameters."""
+        below = self._below(record)
+        captures = {_is_fine(store): store for store in below if store.ref.stage == "capture"}
+        passes = [store for store in below if store.ref.stage == "capture" and _is_fine(store)]
+        if record.ref.stage in ("capture", "register"):  # of a second round: the first is none of its work
+            passes = [store for store in passes if store.ref.key in (record.ref.key, *record.inputs)]
+        own = self._extent
+        if record.ref.stage == "effects":  # looks at a few places of a scene, whatever its size
+            return own
+        if record.ref.stage == "locate":  # is of a path, and of no field: its own grid is that of coarse pixels
+            height, width = record.params["grid"]["shape"]
+            factor = own.grid.factor
+            return replace(own, grid=SceneGrid(height * factor, width * factor, own.grid.patch, factor))
+        grids = [store.params["grid"] for store in below if "patch" in store.params.get("grid", {})]
+        coarse = captures[False].params["sweeps"]
+        fine = [sweep for store in passes for sweep in store.params["sweeps"]] if passes else None
+        return replace(
+            own,
+            grid=SceneGrid(**grids[0]) if grids else own.grid,
+            camera=replace(own.camera, samples=captures[False].params["camera"]["samples"]),
+            along=coarse[0]["along"],
+            bands=_bands_of(captures[False]),
+            coarse_lines=_lines(coarse),
+            fine_lines=None if fine is None else _lines(fine),
+            fine_runs=None if fine is None else len(fine),
+        )
+
+    def _below(self, store: Store) -> list[Store]:
+        """A store and all that it rests on."""
+        stores = self._catalogue.stores
+        below = self._catalogue.ancestors([store.ref.uri])
+        return [store, *(stores[uri] for uri in sorted(below) if uri in stores)]
+
+
+def scaled_cost(works: Sequence[float], took: Sequence[float], wanted: float) -> float:
+    """What ``wanted`` takes by what one or two amounts of work took: in proportion to the first, but for the start.
+
+    The start is where the line through both meets no work: none below 0, and at most half of what the larger one took,
+    for two noisy records say little of it.
+    """
+    start = 0.0
+    if len(works) == 2 and works[0] != works[1]:
+        slope = (took[1] - took[0]) / (works[1] - works[0])
+        start = min(max(took[0] - slope * works[0], 0.0), max(took) / 2)
+        start = start if start < took[0] else 0.0
+    return start + (took[0] - start) * wanted / works[0]
+
+
+def _is_fine(capture: Store) -> bool:
+    """Whether a stored capture is of a fine pass, which may have no sweep at all."""
+    return not any(sweep["kind"] == "coarse" for sweep in capture.params.get("sweeps", []))
+
+
+def _lines(sweeps: Sequence[dict[str, Any]]) -> int:
+    return sum(int(sweep["lines"]) for sweep in sweeps)
+
+
+def _bands_of(capture: Store) -> int:
+    """Bands of a stored capture, by the first of its sweeps."""
+    return len(open_raw_cube(min(capture.ref.path.glob("*.zarr"))).wavelength_nm)

@@ -1,0 +1,163 @@
+"""Fields of an archive, the newest run of each, and whether it is as the present code, weights and settings make it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from functools import cache
+from importlib import resources
+from pathlib import Path, PurePath
+from typing import Any
+
+from flows.publish.receipt import is_pending
+from flows.settings.keys import BUILT_IN_SCENES
+from flows.settings.survey_settings import OF_THE_MACHINE, Settings, of_this_version, parse_settings
+from flows.survey.run import SHIPPED
+from flows.survey.stages import VERSIONS
+from flows.survey.survey import STAGES
+from models.weights import content_key
+from pipeline.errors import SettingsError, WeightsError
+from pipeline.simulator.farm_laws import USUAL_DAY, USUAL_HOUR, farm_law, has_days, law_of_key
+from storage.keys import canonical_json
+from storage.lineage import Catalogue
+from storage.records import Run
+
+# what the light of a field depends on; surveys that agree in these are generations of one
+OF_THE_LIGHT = (
+    "scene", "bands", "wavelengths", "source", "seed", "effects", "size", "day", "hour", "camera", "pointing_px",
+    "pose", "visit",
+)  # fmt: skip
+WEIGHED = ("attend", "segment", "evaluate")  # stages of which the weights are a parameter
+
+
+@dataclass(frozen=True)
+class Generation:
+    """The newest run of one field."""
+
+    field: str  # what its survey is called
+    run: Run
+
+
+def newest_runs(catalogue: Catalogue) -> list[Generation]:
+    """The newest run of every field, oldest first; runs whose settings cannot be read are fields of their own."""
+    found: dict[str, Generation] = {}
+    for run in catalogue.runs:  # oldest first
+        name = str(run.receipt.get("survey") or run.facts.get("survey") or run.folder.name)
+        field = canonical_json([name, _light_of(run) if run.settings else run.uri])
+        found.pop(field, None)
+        found[field] = Generation(name, run)
+    return list(found.values())
+
+
+def _light_of(run: Run) -> dict[str, Any]:
+    """What the light of a run depends on, with the farm by its law: ``farm`` has not always meant the present one."""
+    settings = {**run.settings, **_scene_of(run)}
+    light = {key: settings.get(key) for key in OF_THE_LIGHT}
+    if has_days(str(settings.get("scene"))):
+        usual = {"day": USUAL_DAY, "hour": USUAL_HOUR}
+        light |= {key: value if light[key] is None else light[key] for key, value in usual.items()}
+    return light
+
+
+def _scene_of(run: Run) -> Mapping[str, str]:
+    """The scene of a run's settings, where it is a built-in farm: the law that the run was drawn by."""
+    scene = run.settings.get("scene")
+    if scene not in BUILT_IN_SCENES:
+        return {}
+    return {"scene": law_of_key(str(run.receipt.get("scene"))) or farm_law(str(scene))}
+
+
+def is_called(generation: Generation, pattern: str) -> bool:
+    """Whether a field's survey, scene or run is called so; ``*`` stands for any letters."""
+    scene = str(generation.run.settings.get("scene", ""))
+    names = (generation.field, scene, PurePath(scene).name, generation.run.folder.name)
+    return any(fnmatchcase(name, pattern.replace("[", "[[]").replace("?", "[?]")) for name in names)
+
+
+def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
+    """The settings of a run for another survey into the archive ``out``, with other weights if they are given.
+
+    A farm is asked for by the law that the run was drawn by: it is the same land, whatever ``farm`` means by now.
+
+    Raises
+    ------
+    SettingsError, BudgetError : the run's settings cannot be read, or are not of this version.
+    """
+    if not run.settings:
+        raise SettingsError(f"the settings of {run.uri} cannot be read ({run.problem}); survey this field by hand")
+    known = of_this_version(run.settings) | dict.fromkeys(OF_THE_MACHINE) | {**_scene_of(run)}
+    return parse_settings({**known, "out": str(out), **({} if weights is None else {"weights": str(weights)})})
+
+
+def stale_stores(catalogue: Catalogue, uris: set[str], weights: str | None) -> set[str]:
+    """Stores that a survey would not find as it wants them: gone, damaged, of another version, of other weights."""
+    return {uri for uri in uris if _is_stale(catalogue, uri, weights)}
+
+
+def _is_stale(catalogue: Catalogue, uri: str, weights: str | None) -> bool:
+    store = catalogue.stores.get(uri)
+    if store is None or store.problem is not None or store.version != str(VERSIONS.get(store.ref.stage)):
+        return True
+    return store.ref.stage in WEIGHED and store.params.get("weights", weights) != weights
+
+
+def is_whole(catalogue: Catalogue, run: Run) -> bool:
+    """Whether run and stores are there, told from manifests alone, and none of its stages failed."""
+    stores = [catalogue.stores.get(uri) for uri in catalogue.named_and_below[run.uri]]
+    failed = any(row.get("state") == "failed" for row in run.stages)
+    return run.problem is None and not failed and all(one is not None and one.problem is None for one in stores)
+
+
+def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
+    """Whether its survey with these settings would find all that this run names or rests on, by versions and weights.
+
+    A run whose accuracy is not there yet is not: the survey adds it.
+    What lies in a scene's file is not looked at.
+    """
+    drawn_by = law_of_key(str(run.receipt.get("scene")))
+    of_this_law = settings.scene not in BUILT_IN_SCENES or drawn_by == farm_law(settings.scene)
+    stale = stale_stores(catalogue, catalogue.named_and_below[run.uri], weights_key(settings))
+    return of_this_law and not stale and is_whole(catalogue, run) and not is_pending(run.receipt)
+
+
+def would_remake(catalogue: Catalogue, run: Run, stage: str, settings: Settings) -> bool:
+    """Whether a stage (a store's, such as segment, or a survey's, such as draw_map) would be made anew.
+
+    Told from versions and weights in the manifests; what new weights of another patch size change in the plan is not.
+    """
+    own = [
+        uri for uri in catalogue.named_and_below[run.uri] if uri.split("/")[1] == stage or stage in _called(run, uri)
+    ]
+    return bool(stale_stores(catalogue, set(own) | catalogue.ancestors(own), weights_key(settings)))
+
+
+def check_stage(stage: str) -> None:
+    """Raise SettingsError unless a stage is called so."""
+    known = sorted({*VERSIONS, *STAGES})
+    if stage not in known:
+        raise SettingsError(f"--stage {stage}: there is no such stage; there are {', '.join(known)}")
+
+
+def weights_key(settings: Settings) -> str | None:
+    """What the weights are called by what they hold, as stages know it; None where they cannot be read."""
+    shipped = Path(str(resources.files("models") / "shipped" / SHIPPED))
+    return file_key(shipped if settings.weights is None else Path(settings.weights))
+
+
+def file_key(path: Path) -> str | None:
+    """What a file of weights is called by what it holds; None where it cannot be read."""
+    try:
+        return _file_key(path, path.stat().st_mtime_ns, path.stat().st_size)
+    except (OSError, WeightsError):
+        return None
+
+
+@cache
+def _file_key(path: Path, changed_ns: int, size: int) -> str:
+    """Read once for all fields, and again when the file has changed."""
+    return content_key(path)
+
+
+def _called(run: Run, uri: str) -> set[str]:
+    return {str(row.get("name")) for row in run.stages if row.get("key") == uri.rpartition("/")[2]}

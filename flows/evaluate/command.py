@@ -1,0 +1,158 @@
+"""`spectralzoom evaluate`: weights judged on frames that they were not trained on, with intervals and costs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from flows.evaluate.budgets import summarise_equal_time, summarise_rig
+from flows.evaluate.controls import design_of, open_controls
+from flows.evaluate.costs import Prices
+from flows.evaluate.curve import REFERENCE
+from flows.evaluate.files import publish_evaluation
+from flows.evaluate.frames import Candidate, open_candidates, open_frames
+from flows.evaluate.jobs import Jobs, Show, sort_frames
+from flows.evaluate.kept_results import writing
+from flows.evaluate.request import COST, EvaluateRequest, checked_request
+from flows.evaluate.rows import known_or_none
+from flows.evaluate.series import Record, seeds_of
+from flows.evaluate.summary import summarise
+from flows.evaluate.table import print_evaluation
+from flows.evaluate.work import Judged, Work
+from flows.publish.receipt import to_json
+from flows.terminal.progress import StageProgress
+from flows.terminal.shown_text import on_stdout
+from models.bootstrap import LEVEL
+from models.metrics import agreement, false_pixels, iou_per_class
+from models.process import keep_freed_memory
+from models.weights import describe_weights, unsealed_note
+
+
+def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = False) -> dict[str, Any]:
+    """Judge with progress on ``console``; figures as a table or JSON on stdout, and all of them into the folder."""
+    with StageProgress(console) as progress:
+        content = evaluate_weights(request, lambda what, done, words: progress.show(what, done, words))
+    if as_json:
+        sys.stdout.write(to_json(content))
+    else:
+        print_evaluation(content, on_stdout())
+    for path in (*request.weights, *request.controls):
+        if not describe_weights(path).sealed:
+            console.print(f"note: {unsealed_note(path)}", highlight=False, markup=False, soft_wrap=True)
+    for path in content["files"]:
+        console.print(path, highlight=False, soft_wrap=True)
+    return content
+
+
+def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, words: None) -> dict[str, Any]:
+    """Judge weights on every frame of a data set that they were not trained on.
+
+    Raises
+    ------
+    SettingsError : shares, policies, weights or controls that cannot be.
+    SceneError : no frame is left, one that was asked for by name has no weights left, or one has no labels.
+    """
+    request = checked_request(request)
+    keep_freed_memory()
+    candidates = open_candidates(request.weights)
+    controls = open_controls(request.controls, candidates)
+    data = open_frames(request.dataset, request.frames, request.scenes, candidates[0].camera, request.choices)
+    if request.out is not None:
+        with writing(request.out):
+            request.out.mkdir(parents=True, exist_ok=True)  # before minutes are spent on what cannot be kept
+    jobs = sort_frames(request, data, candidates, controls, show)
+    work = Work(request, data, candidates, controls)
+    judged = work.judge(jobs, show)
+    content = {"dataset": data.law, **_files(candidates, controls, jobs), **_figures(request, work, judged)}
+    content["files"] = publish_evaluation(work, content, judged.runs, show)
+    return content
+
+
+def _files(candidates: Sequence[Candidate], controls: Sequence[Candidate], jobs: Jobs) -> dict[str, Any]:
+    """What was judged, and on which frames."""
+    names = [job.name for job in jobs.frames] + jobs.left_out
+
+    def told(one: Candidate, number: int, *, control: bool) -> Record:
+        covers = jobs.covered(number, control=control)
+        gone = sorted(set(names) - set(covers))
+        return {"file": one.path.name, "key": one.key, "frames": len(covers), "covers": covers, "left_out": gone}
+
+    return {
+        "weights": [told(one, number, control=False) for number, one in enumerate(candidates)],
+        "controls": [
+            {"design": design_of(one), **told(one, number, control=True)} for number, one in enumerate(controls)
+        ],
+        "frames": [job.name for job in jobs.frames],
+        "left_out": jobs.left_out,
+    }
+
+
+def _figures(request: EvaluateRequest, work: Work, judged: Judged) -> dict[str, Any]:
+    trial = {"shares": request.shares, "policies": request.policies, "seed": request.seed, "draws": request.draws}
+    camera, names = asdict(work.camera), work.candidates[0].described.class_names
+    designs = [design_of(one) for one in work.controls]
+    prices = Prices(judged.timed, judged.captured)
+    return {
+        "settings": {**trial, "level": LEVEL, "mode": "frame", "camera": camera, "cost_model": asdict(COST)},
+        "seeds": [[work.candidates[number].path.name for number in one] for one in seeds_of(judged.runs)],
+        **summarise(judged.runs, names, trial, prices, judged.controls, designs),
+        "rig": summarise_rig(judged.rig, trial) if request.rig else {"rows": [], "left_out": []},
+        "equal_time": summarise_equal_time(judged.equal, judged.runs, judged.rig, trial) if request.equal_time else [],
+        "timed": judged.timed,
+        "captured": judged.captured,
+        "per_frame": _per_frame(judged.runs),
+        "notes": NOTES,
+        "files": [],
+    }
+
+
+NOTES = {
+    "bytes": "estimated: samples x bands x 2 bytes, before compression",
+    "samples": "coarse pixels and the pixels of the seats, seats free of each other (frame mode)",
+    "multiply_adds": "closed form; glance, scores and map; none and all are the map alone",
+    "cpu_s": "one thread, from spectral columns to the map: glance, scores and map; none, all and a dense control are "
+    "the map alone, their fastest path; median of the rounds, all rows in turn",
+    "capture_s": "by the cost model, coarse pass included; frame: as if each seat took its share of the full scan; "
+    "rig: the same seats by runs of lines, or the full scan where cheaper; all is the full scan alone",
+    "pooled": "one threshold for the scores of all frames of a seed: the best seats of all of them together, as many as"
+    " the share of them; intervals over frames hold the threshold. CPU and frame seconds are those of the share on "
+    "every frame, on which a frame has as many seats in the mean",
+    "intervals": "paired bootstrap over frames, and over seeds of the training where there are several",
+    "baseline": "the better of all and the dense control",
+    "curves": f"over multiply-adds; reference of the hypervolume: {REFERENCE}",
+    "equal_time": "exposure changed until the plan takes what the full scan takes; both clip at the same full well; "
+    "seats by runs of lines as above, lines: plans of the rig, by budget instead of K",
+    "rig": "lines: every plan pays coarse pass, set-ups and reloads; uniform lines and random lines are blocks of as "
+    "many rows of seats as show most seats for the seconds",
+    "oracle": "uses labels",
+}
+
+
+def _per_frame(runs: list[list[Record]]) -> list[Record]:
+    return [
+        {
+            "frame": record["frame"],
+            "weights": number,
+            "seats": record["seats"],
+            "positive_seats": record["positive_seats"],
+            "rows": [_of_frame(row) for row in record["rows"]],
+        }
+        for number, records in enumerate(runs)
+        for record in records
+    ]
+
+
+def _of_frame(row: Record) -> Record:
+    """The figures of a frame alone, over the classes of its own labels."""
+    counts = np.array(row["counts"])
+    return {
+        **{name: row[name] for name in ("policy", "draw", "share", "seats")},
+        **{name: known_or_none(figure) for name, figure in agreement(counts).items()},
+        "per_class_iou": [known_or_none(iou) for iou in iou_per_class(counts)],
+        "false_pixels": false_pixels(counts).tolist(),
+    }

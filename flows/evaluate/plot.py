@@ -1,0 +1,148 @@
+"""An evaluation as a plot: mIoU over CPU seconds, one line a policy, none, all and the baseline as lines across."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from flows.publish.panels import INK, MUTED
+from flows.terminal.figures import format_percent
+
+_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#882255", "#332288", "#999933")
+PAPER, GRID = "#fbfaf7", "#e3e1d8"
+
+
+def draw_evaluation(path: Path, content: dict[str, Any]) -> None:
+    """Draw mIoU over CPU seconds, and over bytes, into a PNG file."""
+    figure = evaluation_figure(content)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, format="png")
+
+
+def evaluation_figure(content: dict[str, Any]) -> Figure:
+    """Give the figure. Where no frame was timed the seconds are left out."""
+    timed = any(row["cost"]["cpu_s"]["done"] is not None for row in content["rows"])
+    wanted = [("cpu_s", "CPU seconds a frame, one thread", 1.0)] if timed else []
+    wanted.append(("bytes", "MB a frame, estimated from samples", 1e6))
+    figure = Figure(figsize=(7.0 * len(wanted), 5.4), dpi=110, layout="constrained", facecolor=PAPER)
+    for number, (panel, (what, label, unit)) in enumerate(
+        zip(figure.subplots(1, len(wanted), squeeze=False).ravel(), wanted, strict=True)
+    ):
+        _draw_panel(panel, content, what, unit)
+        panel.set_xlabel(label, color=INK)
+        panel.set_ylabel("mIoU [%]", color=INK)
+        if not number:
+            panel.set_title(
+                f"{content['dataset']}: {counted(len(content['frames']))}", loc="left", color=INK, weight="bold"
+            )
+    figure.legend(
+        *panel.get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False, labelcolor=INK
+    )
+    return figure
+
+
+def _draw_panel(axes: Axes, content: dict[str, Any], what: str, unit: float) -> None:
+    rows = [row for row in content["rows"] if row["miou"] is not None]
+    low, high = _reach(rows)
+    far = [row for row in rows if 100 * row["miou"] < low]
+    rows = [row for row in rows if 100 * row["miou"] >= low]
+    single = {row["policy"]: row for row in rows if row["share"] in (0.0, 1.0)}
+    base = single[content["baseline"]["policy"]]
+    lines = {"none": ("none", (0, (2, 2))), base["policy"]: (f"baseline: {base['policy']}", "-")}
+    for name, row in single.items():
+        if name in lines:
+            label, style = lines[name]
+            axes.axhline(100 * row["miou"], color=MUTED, linewidth=1.1, linestyle=style, label=label, zorder=1)
+        _mark(axes, row, what, unit, name not in lines)
+    policies = list(dict.fromkeys(row["policy"] for row in rows if row["policy"] not in single))
+    for number, policy in enumerate(policies):
+        own = sorted((row for row in rows if row["policy"] == policy), key=lambda row: row["share"])
+        known = [row for row in own if row["cost"][what]["done"] is not None]
+        if known:
+            _draw_line(axes, known, what, unit, _COLOURS[number % len(_COLOURS)], base["miou"])
+    _name_shares(axes, [row for row in rows if row["policy"] not in single], what, unit)
+    axes.set_xscale("log")
+    axes.set_ylim(low, high)
+    _point_down(axes, far, what, unit)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_facecolor(PAPER)
+    axes.grid(visible=True, which="major", color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _reach(rows: list[dict[str, Any]]) -> tuple[float, float]:
+    """Ends of the axis [%]: all rows of the weights, with controls that are no further below than these span."""
+    own = [100 * row["miou"] for row in rows if not row["control"]]
+    span = max(max(own) - min(own), 1.0)
+    shown = [100 * row["miou"] for row in rows if 100 * row["miou"] >= min(own) - span]
+    return min(shown) - 0.25 * span, max(shown) + 0.15 * span
+
+
+def _point_down(axes: Axes, far: list[dict[str, Any]], what: str, unit: float) -> None:
+    """Arrows at the lower edge for controls below it, the best row of each, with name and mIoU [%]."""
+    best = {row["policy"]: row for row in sorted(far, key=lambda row: float(row["miou"]))}
+    known = [row for row in best.values() if row["cost"][what]["done"] is not None]
+    edge = axes.get_xaxis_transform()
+    for row in known:
+        axes.plot(row["cost"][what]["done"] / unit, 0.025, "v", color=MUTED, transform=edge, zorder=2)
+    left, right = axes.get_xlim()
+    for number, row in enumerate(known):
+        x = row["cost"][what]["done"] / unit
+        side, away = ("left", 7) if x**2 < left * right else ("right", -7)  # towards the middle of the axis
+        axes.annotate(
+            f"{row['policy']} {100 * row['miou']:.1f}", (x, 0.025), (away, 13 * number - 3), xycoords=edge,
+            textcoords="offset points", color=INK, size=9, ha=side,
+            arrowprops={"arrowstyle": "-", "color": MUTED, "linewidth": 0.6, "shrinkB": 4},
+        )  # fmt: skip
+
+
+def _mark(axes: Axes, row: dict[str, Any], what: str, unit: float, named: bool) -> None:
+    """A square for a row without a curve, and its name where no line across has it."""
+    x = row["cost"][what]["done"]
+    if x is None:
+        return
+    place = (x / unit, 100 * row["miou"])
+    axes.plot(*place, "s", color=MUTED, zorder=2)
+    if named:
+        axes.annotate(row["policy"], place, (0, 7), textcoords="offset points", color=INK, size=9, ha="center")
+
+
+def _draw_line(axes: Axes, own: list[dict[str, Any]], what: str, unit: float, colour: str, base: float) -> None:
+    x = [row["cost"][what]["done"] / unit for row in own]
+    oracle, control = own[0]["uses_labels"], own[0]["control"]
+    named = f"{own[0]['policy']} (uses labels)" if oracle else own[0]["policy"]
+    axes.plot(
+        x, [100 * row["miou"] for row in own], marker="x" if control else "o", markersize=5, linewidth=1.5, zorder=3,
+        linestyle="--" if oracle else ":" if control else "-", color=INK if oracle else colour, label=named,
+    )  # fmt: skip
+    bounds = [row["against_baseline"] for row in own]
+    if oracle or any(one is None or one["low"] is None for one in bounds):
+        return
+    low, high = ([100 * (base + one[end]) for one in bounds] for end in ("low", "high"))
+    axes.fill_between(x, low, high, color=colour, alpha=0.12, linewidth=0, zorder=0)
+
+
+def counted(frames: int) -> str:
+    """Name a number of frames."""
+    return "1 frame" if frames == 1 else f"{frames} frames"
+
+
+def _name_shares(axes: Axes, rows: list[dict[str, Any]], what: str, unit: float) -> None:
+    """Name each share below the lowest of its points."""
+    for share in sorted({row["share"] for row in rows}):
+        lowest = min(
+            (row for row in rows if row["share"] == share and row["cost"][what]["done"] is not None),
+            key=lambda row: row["miou"],
+        )
+        place = (lowest["cost"][what]["done"] / unit, 100 * lowest["miou"])
+        axes.annotate(
+            format_percent(share), place, (0, -14), textcoords="offset points", color=INK, size=9, ha="center"
+        )  # fmt: skip

@@ -1,0 +1,158 @@
+"""What a survey found out on the way: how it was planned, where the mirror looked, lines that were lost, hectares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from flows.survey.ground import STORE
+from flows.survey.orientation import load_orientation
+from flows.survey.placement import line_facts, seen_shares
+from flows.survey.pointing import load_registration
+from flows.survey.run import SurveyRun
+from flows.survey.stages import load_plan, strange_pixels
+from flows.survey.survey import Products
+from pipeline.grid import UNLABELLED
+from pipeline.planning import FinePlan, joined_plan
+from storage.archive import StageRef
+from storage.attention import load_attention
+from storage.class_maps import load_class_map
+from storage.ground_maps import load_ground_map
+
+
+def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
+    """Gather ``plan`` and the parts of the receipt that not every survey has.
+
+    These are ``pointing``, ``ground``, ``pixels`` and ``lines``.
+    """
+    found: dict[str, Any] = {"plan": _plan(run, products)}
+    passes = {
+        "coarse": products.coarse_pointing, "fine": products.fine_pointing, "second fine": products.pointing_again,
+    }  # fmt: skip
+    pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
+    if "fine" in pointing:
+        pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_shares(run, products.patches) < 1))
+    if pointing:
+        found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
+    if products.ground_map is not None:
+        found["ground"] = _ground(products.ground_map)
+    pixels = _pixels(run, products.class_map)
+    if any(pixels.values()):
+        found["pixels"] = pixels
+    troubled = {name: facts for name, facts in line_facts(products.mosaic).items() if any(facts.values())}
+    if troubled:
+        found["lines"] = troubled
+    return found
+
+
+def _pixels(run: SurveyRun, class_map: StageRef) -> dict[str, int]:
+    """Pixels of which not all was known: of the scene, of what was captured, and of the map."""
+    classes = load_class_map(class_map.path / "class_map.zarr").classes
+    return {
+        "scene_without_a_value": run.scene.filled_px,
+        "coarse_px_no_reading": 0,
+        "fine_px_no_reading": 0,
+        **{f"{name}_no_reading": count for name, count in strange_pixels(class_map).items()},
+        "map_without_a_class": int(np.count_nonzero(classes == UNLABELLED)),
+    }
+
+
+def _plan(run: SurveyRun, products: Products) -> dict[str, Any]:
+    """How the fine pass was laid out, and what the other orientation would have shown.
+
+    Of two rounds the score is that of the first look, and the other orientation that of the first round.
+    """
+    attention = products.attention
+    plans, turned = [load_plan(attention) for attention in products.attentions], load_orientation(products.turned)
+    plan = joined_plan(plans)
+    if len(plans) > 1:
+        plan = replace(plan, worth=_worth_by_first_look(plan, attention))
+    return {
+        "kind": plan.kind,
+        "reason": plan.reason,
+        "lines": plan.lines,
+        "seconds": plan.seconds,
+        "score_share": plan.worth / plan.wanted_worth if plan.wanted_worth else None,
+        "score_per_second": plan.worth_per_second,
+        "full_seconds": plan.full_seconds,
+        "out_of_reach": plan.out_of_reach,
+        "orientation": turned,
+        **_spared(run, plans),
+        **_rounds(run, plans),
+    }
+
+
+def _worth_by_first_look(plan: FinePlan, attention: StageRef) -> float:
+    """What all seats that were shown were worth by the scores of the first look: no more than was wanted."""
+    score = load_attention(attention.path / "attention.zarr").score.ravel()[plan.seats]
+    return min(float(score[score > 0].sum()), plan.wanted_worth)
+
+
+def _spared(run: SurveyRun, plans: Sequence[FinePlan]) -> dict[str, Any]:
+    """What the threshold left: seconds, their share of the full scan's, and the score that was not worth more of them.
+
+    Nothing without a threshold. Seconds are those of the last round: an earlier one leaves its own to the next.
+    """
+    last = plans[-1]
+    if last.threshold is None:
+        return {}
+    return {
+        "threshold": last.threshold,
+        "spared_s": last.spared_s,
+        "spared_share": None if last.spared_s is None else last.spared_s / run.plan.full_s,
+        "spared_score": last.wanted_worth - last.worth,
+    }
+
+
+def _rounds(run: SurveyRun, plans: Sequence[FinePlan]) -> dict[str, Any]:
+    """What each of several rounds bought, and what going back a second time cost; nothing of a single one.
+
+    ``second_move_s``: both rounds as they were priced, less the same sweeps in one go.
+    """
+    if len(plans) == 1:
+        return {}
+    apart, together = sum(plan.seconds for plan in plans), [sweep for plan in plans for sweep in plan.sweeps]
+    rows = [
+        {
+            "seats": len(plan.seats),
+            "lines": plan.lines,
+            "sweeps": len(plan.sweeps),
+            "seconds": plan.seconds,
+            "score": plan.worth,
+            "score_share": plan.worth / plan.wanted_worth if plan.wanted_worth else None,
+        }
+        for plan in plans
+    ]
+    return {"rounds": rows, "second_move_s": apart - run.settings.cost.seconds(together, run.camera)}
+
+
+def _pointing(ref: StageRef) -> dict[str, Any]:
+    """Corrections of one pass, and what its windows say of them.
+
+    Each sweep beside the held one has an offset and a drift: where windows are no more than these, they leave nothing.
+    """
+    record = load_registration(ref)
+    left = np.array([window["residual_px"] for window in record["windows"] if window.get("residual_px")])
+    tells = len(left) > 2 * (len(record["sweeps"]) - len(record["untied"]) - 1)
+    return {
+        "held": record["reference"],
+        "sweeps": {name: one["offset_px"] for name, one in record["sweeps"].items()},
+        "residual_rms_px": float(np.sqrt(np.mean(left**2))) if left.size and tells else None,
+        "not_found": record["untied"],
+        "too_narrow": record["narrow"],
+    }
+
+
+def _ground(ref: StageRef) -> dict[str, Any]:
+    """The map's grid and what each class covers on the ground."""
+    found = load_ground_map(ref.path / STORE)
+    box = found.geobox
+    return {
+        "crs": str(box.crs),
+        "resolution_m": abs(float(box.resolution.x)),
+        "shape": [int(size) for size in box.shape],
+        "areas_ha": {name: area["ha"] for name, area in found.areas.items()},
+    }

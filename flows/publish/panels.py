@@ -1,0 +1,93 @@
+"""What panels of a map are made of: stretched colours, class palettes, outlines of seats, scale bars."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib import patheffects
+from matplotlib.axes import Axes
+from matplotlib.colors import hsv_to_rgb, to_rgb
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+
+from flows.publish.colour_stretch import choose_bands as choose_bands
+from flows.publish.colour_stretch import develop as develop
+from flows.publish.colour_stretch import stretch as stretch
+from pipeline.grid import UNLABELLED
+
+INK = "#22241f"
+MUTED = "#6a6d64"
+UNLABELLED_COLOUR = (0.86, 0.86, 0.84)
+HALO: list[patheffects.AbstractPathEffect] = [patheffects.withStroke(linewidth=3, foreground="black")]
+# Okabe and Ito (2008), then Paul Tol's muted scheme (2021) without near twins: told apart by colour-blind readers
+_SAFE = (
+    "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#F0E442", "#0072B2", "#CC79A7", "#882255", "#44AA99", "#332288",
+    "#999933", "#DDCC77", "#AA4499", "#117733", "#88CCEE", "#CC6677",
+)  # fmt: skip
+
+
+def grey_of(image: NDArray[np.floating]) -> NDArray[np.float32]:
+    """(y, x) brightness 0..1 of a field, the mean of its bands stretched."""
+    known = np.isfinite(image)
+    total = np.where(known, image, 0).sum(axis=-1, dtype=np.float32)
+    count = known.sum(axis=-1)
+    mean = np.divide(total, count, out=np.full(total.shape, np.nan, np.float32), where=count > 0)
+    return stretch(mean[..., None])[..., 0]
+
+
+def class_palette(count: int, colours: NDArray[np.integer] | None = None) -> NDArray[np.float32]:
+    """(class, 3) colours 0..1: those given (0..255), else colour-blind safe ones, evenly spaced hues above 16."""
+    if colours is not None:
+        return np.asarray(colours, np.float32) / np.float32(255)
+    number = np.arange(count)
+    if count <= len(_SAFE):
+        return np.array([to_rgb(name) for name in _SAFE[:count]], np.float32)
+    lightness = np.where(number % 3 == 2, 0.55, 0.9)
+    return hsv_to_rgb(np.stack([number / count, 0.55 + 0.4 * (number % 2), lightness], axis=-1)).astype(np.float32)
+
+
+def class_rgb(classes: NDArray[np.integer], palette: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(y, x, 3) picture of a class map; numbers without a colour (255 among them) are light grey."""
+    table = np.tile(np.asarray(UNLABELLED_COLOUR, np.float32), (256, 1))
+    table[: len(palette)] = palette
+    picture: NDArray[np.float32] = table[np.clip(classes, 0, UNLABELLED)]
+    return picture
+
+
+def outline(chosen: NDArray[np.bool_], patch_px: int, shape: tuple[int, int]) -> list[list[tuple[float, float]]]:
+    """Border of a set of seats as line segments ((x, y), (x, y)) in scene px, clipped to the scene's (y, x) size."""
+    padded = np.pad(chosen, 1)
+    limit = np.array([shape[1], shape[0]], np.float64)
+    segments = []
+    for axis in (0, 1):
+        row, column = np.nonzero(np.diff(padded, axis=axis))
+        start = np.stack([column - (axis == 0), row - (axis == 1)], axis=-1)
+        end = start + ((1, 0) if axis == 0 else (0, 1))
+        ends = np.minimum(np.stack([start, end], axis=1) * patch_px, limit) - 0.5
+        segments += [[tuple(point) for point in pair] for pair in ends if (pair[0] != pair[1]).any()]
+    return segments
+
+
+def draw_scale(axes: Axes, shape: tuple[int, ...], pixel_mrad: float) -> None:
+    """A bar of a round number of px in the lower left corner, with its angle."""
+    height, width = shape[:2]
+    inch_x, inch_y = (size / inches for size, inches in zip((width, height), panel_inches(axes), strict=True))
+    length = _round_length(width / 4)
+    left, bottom = 0.14 * inch_x - 0.5, height - 0.5 - 0.14 * inch_y
+    bar = Rectangle((left, bottom - 0.07 * inch_y), length, 0.07 * inch_y, facecolor="white", edgecolor="black")
+    axes.add_patch(bar)
+    text = f"{length} px = {length * pixel_mrad:.3g} mrad"
+    label = axes.text(left, bottom - 0.12 * inch_y, text, color="white", size=11, va="bottom", weight="bold")
+    label.set_path_effects(HALO)
+
+
+def panel_inches(axes: Axes) -> tuple[float, float]:
+    """(width, height) of a panel on the page [in]."""
+    box, page = axes.get_window_extent(), axes.get_figure(root=True)
+    dpi = 100.0 if page is None else page.dpi
+    return float(box.width / dpi), float(box.height / dpi)
+
+
+def _round_length(px: float) -> int:
+    """The largest of 1, 2, 5 times a power of ten that is not above ``px`` (at least 1)."""
+    power = 10 ** int(np.floor(np.log10(max(px, 1))))
+    return int(max(step * power for step in (1, 2, 5) if step * power <= max(px, 1)))

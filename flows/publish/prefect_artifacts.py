@@ -1,0 +1,131 @@
+"""What Prefect's pages show of a survey: one text with its picture and receipt, and a table of savings by field."""
+
+from __future__ import annotations
+
+import base64
+import io
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, cast
+
+from flows.publish.finding_words import sentences
+from flows.publish.receipt import Receipt, Saving
+from flows.publish.receipt_table import COST_LABELS, headline
+from flows.publish.run_folder import Published
+from flows.terminal.figures import format_percent
+from pipeline.visible_text import visible
+
+MOST_BYTES = 100 * 1024  # of the picture, as it stands in the text
+WIDTHS_PX = (1200, 1000, 800, 600, 400, 200)
+
+
+def publish_artifacts(published: Published, field: str, archive: str) -> None:
+    """Give a survey's text and table to the Prefect server of the flow that this is called in."""
+    from prefect.artifacts import create_markdown_artifact, create_table_artifact
+
+    key, where = artifact_key(field), f"{archive}/runs/{published.folder.name}"
+    text = survey_markdown(published, where)
+    create_markdown_artifact(text, key=f"survey-{key}", description=where)
+    create_table_artifact(savings_rows(published.receipt), key=f"savings-{key}", description=where)
+
+
+def artifact_key(field: str) -> str:
+    """A field's name as Prefect's keys are: small letters, digits and dashes."""
+    return "".join(letter if letter.isalnum() and letter.isascii() else "-" for letter in field.lower()).strip("-")
+
+
+def survey_markdown(published: Published, where: str) -> str:
+    """Headline, quicklook (at most 100 KiB), receipt, and where the report lies."""
+    receipt = published.receipt
+    picture = small_jpeg((published.folder / "quicklook.png").read_bytes())
+    data = base64.b64encode(picture).decode("ascii")
+    rows = savings_rows(receipt)
+    columns = list(rows[0])
+    lines = [
+        f"# {_plain(receipt['survey'])}", "", _plain(headline(receipt, published.looked_twice)), "",
+        f"![the survey at a glance](data:image/jpeg;base64,{data})", "",
+        f"| {' | '.join(columns)} |", f"|{'---|' * len(columns)}",
+        *(f"| {' | '.join(row[name] for name in columns)} |" for row in rows), "",
+        *(f"- {_plain(sentence)}" for sentence in sentences(receipt)), "",
+        f"Report: `{where}/report.html`", "", f"Receipt: `{where}/receipt.json`",
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def savings_rows(receipt: Receipt) -> list[dict[str, str]]:
+    """The receipt's savings, a row each, in words."""
+    rows = []
+    for name, (label, show) in COST_LABELS.items():
+        entry = cast("Saving", receipt["savings"][name])  # type: ignore[literal-required]
+        words: Callable[[float | None], str] = show
+        rows.append(
+            {
+                "cost": label,
+                "this survey": words(entry["done"]),
+                "everything": words(entry["full"]),
+                "share": format_percent(entry["ratio"]),
+            }
+        )
+    return rows
+
+
+def small_jpeg(png: bytes) -> bytes:
+    """A picture as a JPEG that takes at most 100 KiB in base64, as large as that lets it be."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(png)) as opened:
+        picture = opened.convert("RGB")
+    for width in WIDTHS_PX:
+        smaller = picture.copy()
+        smaller.thumbnail((width, 10 * width))
+        for quality in (85, 70):
+            file = io.BytesIO()
+            smaller.save(file, "JPEG", quality=quality, optimize=True)
+            if len(file.getvalue()) * 4 / 3 <= MOST_BYTES - 4:
+                return file.getvalue()
+    return file.getvalue()
+
+
+def _plain(text: str) -> str:
+    """Words in which nothing is markup."""
+    return "".join(f"\\{letter}" if letter in "\\`*_{}[]<>#|" else letter for letter in visible(text))
+
+
+def progress_shown(field: str) -> Callable[[str, str, float], None]:
+    """What shows how far stages are on Prefect's pages: nothing outside of a flow, or where the server is gone."""
+    from flows.survey.prefect_engine import inside_flow
+
+    if not inside_flow():
+        return lambda stage, state, done: None
+    shown = TaskProgress(field, time.monotonic)
+
+    def show(stage: str, state: str, done: float) -> None:
+        with suppress(Exception):
+            shown(stage, state, done)
+
+    return show
+
+
+class TaskProgress:
+    """How far the stages of a flow are, as Prefect artifacts: one for a stage that takes longer than a moment."""
+
+    def __init__(self, field: str, clock: Callable[[], float]) -> None:
+        self._field, self._clock = artifact_key(field), clock
+        self._shown: dict[str, Any] = {}
+        self._last: dict[str, float] = {}
+
+    def __call__(self, stage: str, state: str, done: float) -> None:
+        """Show it, at most every two seconds."""
+        from prefect.artifacts import create_progress_artifact, update_progress_artifact
+
+        now = self._clock()
+        since = now - self._last.setdefault(stage, now)
+        if since < 2.0 and not (stage in self._shown and state != "running"):
+            return
+        self._last[stage] = now
+        if stage in self._shown:
+            update_progress_artifact(self._shown[stage], progress=round(100 * done, 1))
+        else:
+            name = stage.replace("_", "-")
+            self._shown[stage] = create_progress_artifact(100 * done, key=f"{name}-{self._field}", description=stage)

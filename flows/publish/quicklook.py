@@ -1,0 +1,306 @@
+"""The quicklook: one PNG with four captioned panels that shows a survey at a glance.
+
+Raw lines against the rectified field, where the camera looked twice, the class map, and the truth (or the confidence).
+"""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Colormap
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.patches import Patch, Rectangle
+from numpy.typing import NDArray
+
+from flows.publish.panels import (
+    HALO,
+    INK,
+    MUTED,
+    UNLABELLED_COLOUR,
+    choose_bands,
+    class_palette,
+    class_rgb,
+    develop,
+    draw_scale,
+    grey_of,
+    outline,
+    panel_inches,
+    stretch,
+)
+from pipeline.grid import UNLABELLED
+from pipeline.scan import Axis
+
+Box = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class QuicklookData:
+    """What the four panels show, as plain arrays. Pixels are scene pixels; seats are numbered row by row."""
+
+    survey: str
+    seed: int
+    budget: float
+    policy: str
+    raw: tuple[NDArray[np.generic], ...]  # sweeps as they came, calibrated, (line, sample, band) each, by strip
+    rectified: NDArray[np.floating]  # (y, x, band), NaN where nothing was captured
+    wavelength_nm: NDArray[np.floating]  # (band,) of raw and rectified
+    score: NDArray[np.floating]  # (row, column) of the padded grid's seats; NaN or -inf without a score
+    patch_px: int
+    seats: NDArray[np.integer]  # asked for, in order of rank
+    blocks: tuple[Box, ...]  # captured in detail: (y0, y1, x0, x1), half open [px]
+    class_map: NDArray[np.integer]  # (y, x), 255 unlabelled
+    class_names: tuple[str, ...]
+    class_colours: NDArray[np.integer] | None = None  # (class, 3) 0..255; None for a colour-blind safe palette
+    truth: NDArray[np.integer] | None = None  # (y, x), 255 unlabelled
+    confidence: NDArray[np.floating] | None = None  # (y, x) 0..1, shown where there is no truth
+    pixel_mrad: float = 0.105714
+    along: Axis = "x"  # of the scene along which the raw lines lie
+    note: str = ""  # at the end of the title line, such as the accuracy
+
+
+def draw_quicklook(path: str | Path, panels: QuicklookData) -> None:
+    """Draw the four panels as a PNG of about 1800 x 1400 px (flatter or taller for fields that are).
+
+    Raises
+    ------
+    OSError : the file cannot be written.
+    """
+    with mpl.rc_context(_STYLE):
+        figure = _compose(panels)
+        FigureCanvasAgg(figure)
+        figure.savefig(path, format="png")
+
+
+_STYLE: Any = {
+    "font.size": 12,
+    "text.parse_math": False,  # names of surveys and classes may hold dollar signs
+    "font.family": "DejaVu Sans",
+    "axes.titlesize": 14,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.edgecolor": "#b8b8b0",
+    "axes.linewidth": 0.8,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "figure.facecolor": "#fbfaf7",
+    "savefig.facecolor": "#fbfaf7",
+}
+_DPI = 100
+_SEAT_COLOUR = "#7df9ff"
+_BLOCK: dict[str, Any] = {"facecolor": "none", "edgecolor": "white", "linewidth": 1.2, "linestyle": (0, (4, 2))}
+_MARGIN_IN, _GAP_IN, _HEAD_IN, _LEGEND_ROW_IN = 0.35, 0.3, 0.85, 0.31
+_FLAT, _TALL = 0.3, 2.0  # height over width beyond which the panels are stacked, or stand abreast
+
+
+def _compose(data: QuicklookData) -> Figure:
+    """Place title, panels and legend on a page that is as large as the panels need."""
+    height, width = data.class_map.shape
+    page_width, rows = _arrange(height / width)
+    caption = _caption_height(height / width)
+    legend_columns = max(1, int(page_width / 2.9))
+    legend_in = 0.45 + _LEGEND_ROW_IN * -(-(len(data.class_names) + 1) // legend_columns)
+    page_height = _HEAD_IN + sum(tall + caption for tall, _ in rows) + legend_in
+    figure = Figure(figsize=(page_width, page_height), dpi=_DPI)
+    title_y = 1 - 0.42 / page_height
+    figure.text(_MARGIN_IN / page_width, title_y, data.survey, size=23, weight="bold", va="center")
+    figure.text(1 - _MARGIN_IN / page_width, title_y, _title_line(data), size=13, color=MUTED, va="center", ha="right")
+    panels = iter((_draw_raw, _draw_rectified, _draw_attention, _draw_classes, _draw_truth))
+    top = page_height - _HEAD_IN
+    for tall, places in rows:
+        for left, wide in places:
+            bottom = top - caption - tall
+            box = (left / page_width, bottom / page_height, wide / page_width, tall / page_height)
+            next(panels)(figure.add_axes(box), data)
+        top -= tall + caption
+    _draw_legend(figure, data, legend_columns)
+    return figure
+
+
+def _caption_height(tallness: float) -> float:
+    """Inches above a panel; narrow panels need another line of words or two."""
+    return 1.25 if tallness > _TALL else 0.72
+
+
+def _arrange(tallness: float) -> tuple[float, list[tuple[float, list[tuple[float, float]]]]]:
+    """Page width and rows of panels, (height, [(left, width)]) in inches: stacked for flat fields, abreast for tall."""
+    if tallness < _FLAT:
+        wide = 18 - 2 * _MARGIN_IN
+        return 18.0, [(max(wide * tallness, 1.1), [(_MARGIN_IN, wide)])] * 5
+    counts = (5,) if tallness > _TALL else (3, 2)
+    page = 18.0 if tallness > _TALL else min(18.0, 12.5 / (tallness * sum(1 / count for count in counts)))
+    rows = []
+    for count in counts:
+        wide = (page - 2 * _MARGIN_IN - (count - 1) * _GAP_IN) / count
+        tall = min(wide * tallness, 12.0)
+        wide = tall / tallness
+        step = (page - 2 * _MARGIN_IN + _GAP_IN) / count
+        rows.append((tall, [(_MARGIN_IN + number * step, wide) for number in range(count)]))
+    return page, rows
+
+
+def _title_line(data: QuicklookData) -> str:
+    height, width = data.class_map.shape
+    parts = [f"{width} × {height} px", f"budget {data.budget:g}", f"policy {data.policy}", f"seed {data.seed}"]  # noqa: RUF001
+    return "   ·   ".join([*parts, data.note] if data.note else parts)
+
+
+def _draw_raw(axes: Axes, data: QuicklookData) -> None:
+    """Panel 1, first half: the sweeps as they came, lying as they looked at the field, stretched to its shape."""
+    image = _side_by_side([_colours(data, np.asarray(sweep)) for sweep in data.raw])
+    _show(axes, image if data.along == "x" else image.swapaxes(0, 1))
+    axes.set_aspect("auto")
+    lines, count = sum(sweep.shape[0] for sweep in data.raw), len(data.raw)
+    _caption(axes, "1  Raw lines", f"{count} coarse sweep{'s' if count != 1 else ''}, {lines} lines as they came")
+
+
+def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
+    """Panel 1, second half: the same bands of the field put straight."""
+    _, words = choose_bands(data.wavelength_nm)
+    _show(axes, _colours(data, data.rectified))
+    draw_scale(axes, data.class_map.shape, data.pixel_mrad)
+    _caption(axes, "Rectified", words)
+
+
+def _colours(data: QuicklookData, image: NDArray[np.generic]) -> NDArray[np.float32]:
+    """Three bands of lines or field: true colours on one scale, others stretched band by band."""
+    bands, words = choose_bands(data.wavelength_nm)
+    chosen = list(bands)
+    if words.startswith("true colour"):
+        return develop(image[..., chosen], data.rectified[..., chosen])
+    return stretch(image[..., chosen])
+
+
+def _side_by_side(images: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Sweeps next to each other with a light gap; shorter ones are filled up below."""
+    tall = max(image.shape[0] for image in images)
+    gap = max(1, sum(image.shape[1] for image in images) // 60)
+    parts: list[NDArray[np.float32]] = []
+    for number, image in enumerate(images):
+        filled = np.full((tall, image.shape[1] + (gap if number else 0), 3), 0.98, np.float32)
+        filled[: image.shape[0], -image.shape[1] :] = image
+        parts.append(filled)
+    return np.concatenate(parts, axis=1)
+
+
+def _draw_attention(axes: Axes, data: QuicklookData) -> None:
+    """Panel 2: the score of every seat over the field in grey, seats asked for and blocks captured outlined."""
+    height, width = data.class_map.shape
+    rows, columns = data.score.shape
+    axes.imshow(grey_of(data.rectified), cmap="gray", vmin=-0.4, vmax=1.4)
+    scores, low, high = _score_range(data.score)
+    heat = axes.imshow(
+        scores, cmap=_heat(), alpha=0.72, vmin=low, vmax=high, interpolation="nearest",
+        extent=(-0.5, columns * data.patch_px - 0.5, rows * data.patch_px - 0.5, -0.5),
+    )  # fmt: skip
+    for y0, y1, x0, x1 in data.blocks:
+        axes.add_patch(Rectangle((x0 - 0.5, y0 - 0.5), x1 - x0, y1 - y0, **_BLOCK))
+    chosen = np.zeros(rows * columns, bool)
+    chosen[np.asarray(data.seats, np.intp)] = True
+    segments = outline(chosen.reshape(rows, columns), data.patch_px, (height, width))
+    wide = 0.75 if panel_inches(axes)[0] * data.patch_px / width < 0.1 else 1.5
+    for colour, thickness in (("black", 2 * wide), (_SEAT_COLOUR, wide)):
+        axes.add_collection(LineCollection(segments, colors=colour, linewidths=thickness, capstyle="projecting"))
+    _frame(axes, (height, width))
+    _heat_key(axes, heat)
+    words = f"{len(data.seats)} seats chosen by {data.policy} (cyan); captured in detail (dashed)"
+    _caption(axes, "2  Where it looked twice", words)
+
+
+def _score_range(score: NDArray[np.floating]) -> tuple[NDArray[np.float64], float, float]:
+    """Scores fit to draw (NaN where there is none, the greatest for +inf) with the ends of their scale."""
+    known = score[np.isfinite(score)].astype(np.float64)
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    shown = np.where(np.isposinf(score), high, np.where(np.isfinite(score), score, np.nan)).astype(np.float64)
+    return shown, low, high if high > low else low + 1
+
+
+def _draw_classes(axes: Axes, data: QuicklookData) -> None:
+    """Panel 3: the class map in the legend's colours."""
+    _show(axes, class_rgb(data.class_map, _palette(data)), interpolation="nearest")
+    draw_scale(axes, data.class_map.shape, data.pixel_mrad)
+    _caption(axes, "3  Class map", "what the model says grows where")
+
+
+def _draw_truth(axes: Axes, data: QuicklookData) -> None:
+    """Panel 4: the truth, without it the confidence, without both a word that there is neither."""
+    if data.truth is not None:
+        _show(axes, class_rgb(data.truth, _palette(data)), interpolation="nearest")
+        labelled = data.truth != UNLABELLED
+        right = float(np.mean(data.truth[labelled] == data.class_map[labelled])) if labelled.any() else float("nan")
+        words = f"{100 * right:.1f} % of the labelled pixels agree" if labelled.any() else "no pixel is labelled"
+        draw_scale(axes, data.truth.shape, data.pixel_mrad)
+        return _caption(axes, "4  Truth", words)
+    if data.confidence is not None:
+        image = axes.imshow(data.confidence, cmap="viridis", vmin=0, vmax=1)
+        _frame(axes, data.confidence.shape)
+        _heat_key(axes, image, ("0", "1"))
+        return _caption(axes, "4  Confidence", "of the model in its own map (no labels given)")
+    axes.axis("off")
+    return _caption(axes, "4  Truth", "no labels were given")
+
+
+def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
+    """Class names with their colours and shares of the map, along the bottom."""
+    palette = _palette(data)
+    shares = np.bincount(data.class_map.ravel(), minlength=256)[: len(data.class_names)] / max(data.class_map.size, 1)
+    marks = [Patch(facecolor=tuple(colour), edgecolor="#555555", linewidth=0.6) for colour in palette]
+    names = [f"{name.replace('_', ' ')}  {_share(share)}" for name, share in zip(data.class_names, shares, strict=True)]
+    others = [data.class_map] if data.truth is None else [data.class_map, data.truth]
+    if any((image == UNLABELLED).any() for image in others):
+        marks.append(Patch(facecolor=UNLABELLED_COLOUR, edgecolor="#555555", linewidth=0.6))
+        names.append("unlabelled")
+    figure.legend(
+        marks, names, loc="lower center", ncol=min(columns, len(names)), frameon=False, fontsize=13,
+        handlelength=1.4, handleheight=1.2, columnspacing=2.0, bbox_to_anchor=(0.5, 0.0), borderaxespad=0.6,
+    )  # fmt: skip
+
+
+def _share(share: float) -> str:
+    return "< 0.1 %" if 0 < share < 0.001 else f"{100 * share:.1f} %"
+
+
+def _palette(data: QuicklookData) -> NDArray[np.float32]:
+    return class_palette(len(data.class_names), data.class_colours)
+
+
+def _show(axes: Axes, image: NDArray[np.float32], *, interpolation: str = "antialiased") -> None:
+    axes.imshow(image, interpolation=interpolation)
+    _frame(axes, image.shape)
+
+
+def _frame(axes: Axes, shape: tuple[int, ...]) -> None:
+    """No ticks, limits on the scene's own pixels."""
+    axes.set(xticks=[], yticks=[], xlim=(-0.5, shape[1] - 0.5), ylim=(shape[0] - 0.5, -0.5))
+
+
+def _caption(axes: Axes, title: str, words: str) -> None:
+    """A bold title over a line of words, two lines where the panel is narrow."""
+    lines = textwrap.wrap(words, max(20, int(panel_inches(axes)[0] * 11.5)))
+    axes.set_title(title, pad=8 + 16 * len(lines))
+    axes.annotate(
+        "\n".join(lines), (0, 1), (0, 7), xycoords="axes fraction", textcoords="offset points", color=MUTED, size=12
+    )
+
+
+def _heat_key(axes: Axes, image: AxesImage, ends: tuple[str, str] = ("low", "high")) -> None:
+    """A small colour bar inside the panel's lower right corner."""
+    wide, tall = panel_inches(axes)
+    length = min(1.1, 0.3 * wide)
+    box = axes.inset_axes((1 - (length + 0.5) / wide, 0.14 / tall, length / wide, 0.12 / tall))
+    axes.figure.colorbar(image, cax=box, orientation="horizontal").set_ticks([])
+    for x, text, side in ((-0.05 / length, ends[0], "right"), (1 + 0.05 / length, ends[1], "left")):
+        label = box.text(x, 0.45, text, transform=box.transAxes, ha=side, va="center", color="white", size=11)
+        label.set_path_effects(HALO)
+
+
+def _heat() -> Colormap:
+    return mpl.colormaps["inferno"].with_extremes(bad=(0, 0, 0, 0))

@@ -1,0 +1,334 @@
+"""The receipt of a run: what was captured, stored and computed against everything, and what that did to accuracy.
+
+One plain dictionary feeds ``receipt.json``, the terminal's last block (`flows.publish.receipt_table`) and the report.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, NotRequired, TypedDict, cast, get_args
+
+from pipeline.errors import ShapeError
+from pipeline.visible_text import is_visible
+
+State = Literal["ran", "cached", "skipped", "failed"]
+AccuracyIs = Literal["judged", "pending", "left out", "without labels"]  # pending: it is worked out after the map
+
+
+class Saving(TypedDict):
+    """One cost: what was spent, what the full scan costs, their ratio (null where full is 0)."""
+
+    done: float
+    full: float
+    ratio: float | None
+    full_is: Literal["measured", "predicted"]
+
+
+class Split(Saving):
+    """Multiply-adds, also told apart by what they were for."""
+
+    glance: float
+    score: float
+    encode: float
+    decode: float
+
+
+class Savings(TypedDict):
+    """What the run spent against the cheapest full scan."""
+
+    lines: Saving
+    samples: Saving
+    bytes_raw: Saving
+    bytes_stored: Saving
+    capture_s: Saving
+    tokens: Saving
+    multiply_adds: Split
+    segment_wall_s: NotRequired[dict[str, float]]
+
+
+class Score(TypedDict):
+    """What one map scores, 0..1, over the classes that the truth has (`models.metrics`); receipts of before lack some.
+
+    IoU is null for a class that the truth lacks; ``false_classes`` are those of them that the map shows, with pixels.
+    """
+
+    miou: float | None
+    per_class_iou: dict[str, float | None]
+    false_classes: NotRequired[dict[str, int]]
+    miou_of_shown_classes: NotRequired[float | None]  # by the definition of before
+    overall_accuracy: NotRequired[float | None]
+
+
+class Control(TypedDict):
+    """mIoU of another placement of seats, and its spread over repeats (null where chance has no part)."""
+
+    miou: float | None
+    spread: float | None
+    miou_of_shown_classes: NotRequired[float | None]
+    overall_accuracy: NotRequired[float | None]
+
+
+class Accuracy(Score):
+    """Accuracy against labels: this map, no fine seat, every fine seat, and other placements."""
+
+    none: Score
+    all: Score
+    gap_closed: float | None
+    controls: dict[str, Control]
+    controls_mode: NotRequired[dict[str, Any]]  # seats of the controls, and their share of samples, lines, seconds
+
+
+class Receipt(TypedDict):
+    """Everything that a run has to say for itself; `check_receipt` says whether it is complete."""
+
+    survey: str
+    source: str
+    scene: str
+    seed: int
+    started: str
+    finished: str
+    versions: dict[str, str]
+    settings: dict[str, Any]
+    stages: list[dict[str, Any]]
+    savings: Savings
+    accuracy_is: NotRequired[AccuracyIs]  # receipts of before have none
+    judged: NotRequired[str]  # when accuracy was added, ISO 8601
+    accuracy: NotRequired[Accuracy]
+    effects: NotRequired[list[dict[str, Any]]]
+    effects_total: NotRequired[dict[str, Any]]  # sum of the bounds beside the tolerance, and seconds saved
+    plan: NotRequired[dict[str, Any]]  # how the fine pass was laid out, and what the other orientation would cost
+    pointing: NotRequired[dict[str, Any]]  # only where the mirror may look beside the plan
+    lines: NotRequired[dict[str, Any]]  # sweeps with lines lost, repeated, out of order, late or invalid
+    ground: NotRequired[dict[str, Any]]  # only with a pose: grid and hectares
+    pixels: NotRequired[dict[str, int]]  # only where some have no value, no reading or no class: how many
+    products: dict[str, str]
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """One stage of a run. What was not measured (a stage read from the archive) is None."""
+
+    name: str
+    key: str
+    state: State
+    wall_s: float | None = None
+    cpu_s: float | None = None
+    peak_rss_bytes: int | None = None
+    bytes_in: int | None = None
+    bytes_out: int | None = None
+    manifest_sha256: str | None = None  # of the store that the stage left; receipts of before have none
+
+
+@dataclass(frozen=True)
+class Header:
+    """Who looked at what, when, with which code and settings. Times are ISO 8601."""
+
+    survey: str
+    source: str
+    scene: str
+    seed: int
+    started: str
+    finished: str
+    versions: Mapping[str, str]
+    settings: Mapping[str, object]
+
+
+COSTS = ("lines", "samples", "bytes_raw", "bytes_stored", "capture_s", "tokens", "multiply_adds")
+FINDINGS = ("plan", "pointing", "lines", "ground", "pixels")
+_SAVING_FIELDS = ("done", "full", "ratio", "full_is")
+_SPLIT_FIELDS = ("glance", "score", "encode", "decode")
+_STAGE_FIELDS = ("name", "key", "state", "wall_s", "cpu_s", "peak_rss_bytes", "bytes_in", "bytes_out")
+_EFFECT_FIELDS = ("name", "state", "variant", "bound", "measured", "cost_s", "why")
+_TOTAL_FIELDS = ("asked", "tolerance", "unit", "bound", "measured", "on", "off", "cost_s", "saved_s", "saved_cheap_s")
+_HEADER_FIELDS = ("survey", "source", "scene", "seed", "started", "finished", "versions", "settings")
+# what another run of the same seed has otherwise
+_OF_ONE_RUN = ("wall_s", "cpu_s", "peak_rss_bytes", "state", "manifest_sha256")
+_STATES = ("ran", "cached", "skipped", "failed")
+JUDGING = "evaluate"  # the stage that judges the map
+
+
+def build_receipt(
+    header: Header,
+    stages: Iterable[StageRecord],
+    savings: Mapping[str, object],
+    products: Mapping[str, str],
+    *,
+    accuracy: Mapping[str, object] | None = None,
+    accuracy_is: AccuracyIs | None = None,
+    judged: str | None = None,
+    simulation: Mapping[str, Any] | None = None,
+    findings: Mapping[str, object] | None = None,
+) -> Receipt:
+    """Put a receipt together in its fixed order and check that nothing is missing.
+
+    Parameters
+    ----------
+    savings
+        `COSTS` and, where measured, ``segment_wall_s``; each a mapping with the fields of `Saving`.
+    accuracy
+        Fields of `Accuracy`, and ``judged``, when they were worked out; None where the map is not judged, or not yet:
+        ``accuracy_is`` says which.
+    simulation
+        ``effects``, rows with name, state, variant, bound, measured, cost_s, why, unit, and ``total``, their sums; None
+        for a source that is not simulated.
+    findings
+        Parts that not every survey has: `FINDINGS`.
+
+    Raises
+    ------
+    ShapeError : a field is missing or not of the design; names it.
+    """
+    receipt: dict[str, object] = {**asdict(header), "stages": [asdict(stage) for stage in stages]}
+    receipt["savings"] = {name: savings[name] for name in (*COSTS, "segment_wall_s") if name in savings}
+    told = {"accuracy_is": accuracy_is, "judged": judged, "accuracy": accuracy}
+    receipt |= {name: value for name, value in told.items() if value is not None}
+    if simulation is not None:
+        receipt |= {"effects": list(simulation["effects"]), "effects_total": simulation["total"]}
+    receipt |= {name: found for name in FINDINGS if (found := (findings or {}).get(name))}
+    receipt["products"] = dict(products)
+    return check_receipt(json.loads(to_json(receipt)))
+
+
+def with_accuracy(
+    receipt: Receipt, accuracy: Mapping[str, Any], stage: StageRecord, address: str, *,
+    settings: Mapping[str, object], judged: str,
+) -> Receipt:  # fmt: skip
+    """The receipt of a run once its map is judged; nothing that was spent on the survey itself changes.
+
+    Parameters
+    ----------
+    accuracy
+        Fields of `Accuracy` and, where measured, ``segment_wall_s``, which belongs to the savings.
+    stage
+        Of the judging; it takes the place of an earlier one.
+    address
+        Of the product ``accuracy``.
+    settings
+        By which the map was judged; ``judged`` is when, ISO 8601.
+
+    Raises
+    ------
+    ShapeError : a field is missing or not of the design; names it.
+    """
+    figures = {name: value for name, value in accuracy.items() if name != "segment_wall_s"}
+    walls = {name: accuracy[name] for name in ("segment_wall_s",) if name in accuracy}
+    added = {"accuracy_is": "judged", "judged": judged, "accuracy": figures}
+    found: dict[str, object] = {}
+    for name, value in receipt.items():
+        if name not in added:
+            found[name] = value
+        if name == "savings":  # accuracy follows it
+            found |= added
+    found["settings"] = {**receipt["settings"], **settings}
+    found["stages"] = [*(row for row in receipt["stages"] if row["name"] != stage.name), asdict(stage)]
+    found["savings"] = {**receipt["savings"], **walls}
+    files = {name: place for name, place in receipt["products"].items() if place.startswith("runs/")}
+    stores = {name: place for name, place in receipt["products"].items() if name not in (*files, "accuracy")}
+    found["products"] = {**stores, "accuracy": address, **files}
+    return check_receipt(json.loads(to_json(found)))
+
+
+def check_receipt(receipt: Mapping[str, Any]) -> Receipt:
+    """The receipt itself if it has every field of the design; ShapeError naming the first that it lacks."""
+    _need(receipt, (*_HEADER_FIELDS, "stages", "savings", "products"), "receipt")
+    for number, stage in enumerate(receipt["stages"]):
+        _need(stage, _STAGE_FIELDS, f"receipt.stages[{number}]")
+        if stage["state"] not in _STATES:
+            place = f"receipt.stages[{number}].state"
+            raise ShapeError(f"{place} must be one of {', '.join(_STATES)}; got {stage['state']!r}")
+    _check_savings(receipt["savings"])
+    if receipt.get("accuracy_is", "judged") not in get_args(AccuracyIs):
+        known = ", ".join(get_args(AccuracyIs))
+        raise ShapeError(f"receipt.accuracy_is must be one of {known}; got {receipt['accuracy_is']!r}")
+    if receipt.get("accuracy_is") == "judged":
+        _need(receipt, ("judged", "accuracy"), "receipt")
+    if "accuracy" in receipt:
+        _check_accuracy(receipt["accuracy"])
+    for number, effect in enumerate(receipt.get("effects", ())):
+        _need(effect, _EFFECT_FIELDS, f"receipt.effects[{number}]")
+    if "effects_total" in receipt:
+        _need(receipt["effects_total"], _TOTAL_FIELDS, "receipt.effects_total")
+    return cast("Receipt", receipt)
+
+
+def is_pending(receipt: Mapping[str, Any]) -> bool:
+    """Whether a run was published before its map was judged, and has not been judged since."""
+    return receipt.get("accuracy_is") == "pending"
+
+
+def _check_savings(savings: Mapping[str, Any]) -> None:
+    _need(savings, COSTS, "receipt.savings")
+    for name in COSTS:
+        place = f"receipt.savings.{name}"
+        _need(savings[name], _SAVING_FIELDS + (_SPLIT_FIELDS if name == "multiply_adds" else ()), place)
+        if savings[name]["full_is"] not in ("measured", "predicted"):
+            raise ShapeError(f"{place}.full_is must be measured or predicted, got {savings[name]['full_is']!r}")
+    if "segment_wall_s" in savings:
+        _need(savings["segment_wall_s"], ("done", "full"), "receipt.savings.segment_wall_s")
+
+
+def _check_accuracy(accuracy: Mapping[str, Any]) -> None:
+    place = "receipt.accuracy"
+    _need(accuracy, ("miou", "per_class_iou", "none", "all", "gap_closed", "controls"), place)
+    for name in ("none", "all"):
+        _need(accuracy[name], ("miou", "per_class_iou"), f"{place}.{name}")
+    for policy, control in accuracy["controls"].items():
+        _need(control, ("miou", "spread"), f"{place}.controls.{policy}")
+
+
+def _need(part: object, names: Iterable[str], place: str) -> None:
+    """Raise unless ``part`` is a mapping with all ``names``."""
+    if not isinstance(part, Mapping):
+        raise ShapeError(f"{place} must be a table with named fields, got {type(part).__name__}")
+    for name in names:
+        if name not in part:
+            raise ShapeError(f"{place}.{name} is missing; a receipt has every field of the design (null if not known)")
+
+
+def to_json(receipt: Mapping[str, object]) -> str:
+    (
+        """JSON text, two spaces a level, in the receipt's own order; numbers that are not finite become null.
+
+    What would steer a terminal or turn words round stands as escapes, as JSON has them.
+    """
+        ""
+    )
+    text = json.dumps(_plain(receipt), indent=2, ensure_ascii=False, allow_nan=False)
+    return "".join(letter if is_visible(letter) else json.dumps(letter)[1:-1] for letter in text) + "\n"
+
+
+def _plain(value: object) -> object:
+    """Plain lists, dictionaries and numbers; numpy's scalars by their ``item``."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def comparable(receipt: Receipt) -> dict[str, Any]:
+    """What two runs of the same seed and settings must agree on.
+
+    Without times, memory, the archive's place, whether a stage was read or made, hashes of manifests (which hold their
+    times), the size of the evaluation (which holds times, in more digits or fewer), and the addresses of the products
+    (their names stay).
+    """
+    times = ("started", "finished", "judged")
+    same: dict[str, Any] = {key: value for key, value in receipt.items() if key not in times}
+    same["settings"] = {key: value for key, value in receipt["settings"].items() if key != "out"}
+    same["stages"] = [
+        _without(stage, (*_OF_ONE_RUN, *(("bytes_out",) if stage["name"] == JUDGING else ())))
+        for stage in receipt["stages"]
+    ]
+    same["savings"] = _without(receipt["savings"], ("segment_wall_s",))
+    same["products"] = sorted(receipt["products"])
+    return same
+
+
+def _without(part: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    return {key: value for key, value in part.items() if key not in set(names)}

@@ -1,0 +1,315 @@
+"""The end of a survey: receipt, quicklook and report from what the stages left, published as one run folder.
+
+Once the map is judged they are made again with its accuracy, and take the place of those that were published.
+"""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.publish.findings import find_out
+from flows.publish.ground_picture import draw_ground
+from flows.publish.panels import choose_bands
+from flows.publish.quicklook import QuicklookData, draw_quicklook
+from flows.publish.receipt import (
+    AccuracyIs,
+    Header,
+    Receipt,
+    StageRecord,
+    build_receipt,
+    check_receipt,
+    to_json,
+    with_accuracy,
+)
+from flows.publish.report import Picture, write_report
+from flows.settings.survey_settings import anchor_paths
+from flows.survey.accuracy import load_accuracy
+from flows.survey.effect_choice import RECORD as EFFECTS_RECORD
+from flows.survey.effect_choice import load_manifest
+from flows.survey.ground import STORE
+from flows.survey.model_work import work_done, work_of_map
+from flows.survey.placement import seen_shares
+from flows.survey.pointing import RECORD
+from flows.survey.run import SurveyRun, now
+from flows.survey.stages import SEATS_AT_ONCE, captured, load_plan
+from flows.survey.survey import Products, StageRunner
+from pipeline.coverage import on_scene
+from pipeline.errors import IncompleteStoreError
+from pipeline.planning import FinePlan, joined_plan
+from pipeline.rectify.calibrate import of_bands, reflectance
+from pipeline.savings import Entry, capture_savings
+from pipeline.scan import Sweep
+from storage.archive import StageRef
+from storage.attention import load_attention
+from storage.class_maps import ClassMap, load_class_map
+from storage.cubes import RawCube
+from storage.ground_maps import load_ground_map
+from storage.patches import open_patches
+from storage.records import read_run
+from storage.run_folders import RunDraft
+from storage.stored_images import open_image
+
+LIBRARIES = ("spectralzoom", "numpy", "torch", "zarr", "xarray", "prefect")
+
+
+@dataclass(frozen=True)
+class Published:
+    """What a survey leaves for people: the receipt and where its folder lies."""
+
+    receipt: Receipt
+    folder: Path
+    looked_twice: float  # share of the field's seats captured in detail
+
+
+def publish_run(runner: StageRunner, products: Products, started: str) -> Published:
+    """Write receipt.json, quicklook.png and report.html into a run folder and publish it as a whole."""
+    run = runner.run
+    plan = _whole_plan(products)
+    with run.archive.new_run(run.name) as draft:
+        receipt = make_receipt(runner, products, plan, started, f"runs/{draft.id}")
+        return _publish(run, draft, products, plan, receipt)
+
+
+def add_accuracy(run: SurveyRun, draft: RunDraft, products: Products, stage: StageRecord) -> Published:
+    """Publish a run again with its accuracy, in the place of what was published before.
+
+    ``draft`` is of `Archive.extend_run`, ``stage`` the record of the judging. All that the receipt says of the survey
+    itself stays as it is.
+    """
+    assert products.accuracy is not None
+    before, asked = load_receipt(draft.published), asked_settings(run)
+    other_labels = asked["labels"] != before["settings"].get("labels")
+    names = ("accuracy", "controls", *(("labels", "notes") if other_labels else ()))
+    receipt = with_accuracy(
+        before, load_accuracy(products.accuracy), stage, accuracy_address(products.accuracy),
+        settings={name: asked[name] for name in names}, judged=now(),
+    )  # fmt: skip
+    return _publish(run, draft, products, _whole_plan(products), receipt)
+
+
+def load_receipt(folder: Path) -> Receipt:
+    """Read the receipt of a published run.
+
+    Raises
+    ------
+    IncompleteStoreError : it is not as it was published.
+    ShapeError : it lacks what a receipt has.
+    """
+    found = read_run(folder, {})
+    if found.problem is not None:
+        raise IncompleteStoreError(f"{found.uri}: {found.problem}; run verify --repair on the archive")
+    return check_receipt(found.receipt)
+
+
+def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan, receipt: Receipt) -> Published:
+    """Draw and write what a run's folder holds, and publish it."""
+    looked_twice = float(seen_shares(run, products.patches).sum()) / len(run.grid.valid_seats())
+    draw_quicklook(draft.folder / "quicklook.png", quicklook_data(run, products, plan, receipt))
+    draft.write_file("receipt.json", to_json(receipt))
+    picture = (draft.folder / "quicklook.png").read_bytes()
+    write_report(draft.folder / "report.html", receipt, picture, _pictures(products), looked_twice=looked_twice)
+    named = [ref for ref in vars(products).values() if ref is not None]
+    folder = draft.publish(
+        survey=receipt["survey"], settings=receipt["settings"], rests_on=run.archive.manifest_hashes(named)
+    )
+    return Published(receipt, folder, looked_twice)
+
+
+def _whole_plan(products: Products) -> FinePlan:
+    return joined_plan([load_plan(attention) for attention in products.attentions])
+
+
+def _pictures(products: Products) -> list[Picture]:
+    """Pictures that not every survey has."""
+    if products.ground_map is None:
+        return []
+    drawn = draw_ground(load_ground_map(products.ground_map.path / STORE))
+    return [Picture(drawn, "The map on the ground, north up.")]
+
+
+def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, started: str, folder: str) -> Receipt:
+    """Put together what the run has to say for itself."""
+    run = runner.run
+    accuracy = None if products.accuracy is None else load_accuracy(products.accuracy)
+    savings = _savings(run, products, plan)
+    simulation = None if run.rig else load_manifest(products.effects)
+    if accuracy is not None and "segment_wall_s" in accuracy:
+        savings["segment_wall_s"] = accuracy.pop("segment_wall_s")
+    header = Header(
+        run.name, run.source.name, run.scene.key, run.settings.seed, started, now(),
+        _versions(),
+        asked_settings(run),
+    )  # fmt: skip
+    return build_receipt(
+        header, runner.records.values(), savings, _addresses(products, folder),
+        accuracy=accuracy, accuracy_is=_accuracy_is(run, products), judged=None if accuracy is None else now(),
+        simulation=simulation, findings=find_out(run, products),
+    )  # fmt: skip
+
+
+def _accuracy_is(run: SurveyRun, products: Products) -> AccuracyIs:
+    if products.accuracy is not None:
+        return "judged"
+    return "without labels" if not run.scene.labelled else "pending" if run.settings.accuracy else "left out"
+
+
+def accuracy_address(accuracy: StageRef) -> str:
+    """Where a receipt says that a run's accuracy lies."""
+    return f"{accuracy.uri}/accuracy.json"
+
+
+def asked_settings(run: SurveyRun) -> dict[str, object]:
+    """The settings, so that they can be asked for from anywhere, and what was assumed beside them."""
+    return {**anchor_paths(run.settings.to_dict(), Path.cwd()), "notes": list(run.notes)}
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        with suppress(PackageNotFoundError):  # run from a source tree that is not installed
+            found[name] = version(name)
+    return found
+
+
+def _addresses(products: Products, folder: str) -> dict[str, str]:
+    named = {
+        "effects": f"{products.effects.uri}/{EFFECTS_RECORD}",
+        "raw_coarse": products.raw_coarse.uri,
+        "lookup": f"{products.lookup.uri}/lookup.zarr",
+        "mosaic": f"{products.mosaic.uri}/mosaic.zarr",
+        "attention": f"{products.attentions[-1].uri}/attention.zarr",
+        "plan": f"{products.attention.uri}/plan.json",
+        "raw_fine": products.raw_fine.uri,
+        "patches": f"{products.patches.uri}/patches.zarr",
+        "class_map": f"{products.class_map.uri}/class_map.zarr",
+    }
+    if products.attention_again is not None and products.raw_again is not None:
+        named |= {"raw_again": products.raw_again.uri, "plan_again": f"{products.attention_again.uri}/plan.json"}
+    pointing = {name: getattr(products, name) for name in ("coarse_pointing", "fine_pointing", "pointing_again")}
+    for name, ref in pointing.items():
+        if ref is not None:
+            named[name] = f"{ref.uri}/{RECORD}"
+    if products.ground_map is not None:
+        named["ground_map"] = f"{products.ground_map.uri}/{STORE}"
+    if products.accuracy is not None:
+        named["accuracy"] = accuracy_address(products.accuracy)
+    return named | {name: f"{folder}/{name}" for name in ("receipt.json", "quicklook.png", "report.html")}
+
+
+def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, Any]:
+    """Everything done against the full scan; stored bytes of the full scan are predicted from the ratio seen here."""
+    bands = len(run.scene.wavelength_nm)
+    done = [*run.plan.coarse, *plan.sweeps]
+    entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
+    stored = [run.archive.stored_bytes(ref) for ref in (products.raw_coarse, *products.raws_fine)]
+    # Fine lines compress like the full scan's would; without any, the coarse ones have to stand for them.
+    like, kept = (plan.sweeps, sum(stored[1:])) if plan.sweeps else (run.plan.coarse, stored[0])
+    of_these = capture_savings(like, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
+    full_stored = entries["bytes_raw"].full * kept / of_these["bytes_raw"].done
+    config, valid = run.weights.config, len(run.grid.valid_seats())
+    cells, each = int(np.prod(run.grid.padded_shape)) // (config.patch * config.factor) ** 2, config.token_side**2
+    return {
+        **{name: entry.as_dict() for name, entry in entries.items()},
+        "capture_s": Entry(run.plan.coarse_s + plan.seconds, run.plan.full_s, "predicted").as_dict(),
+        "bytes_stored": Entry(sum(stored), round(full_stored), "predicted").as_dict(),
+        "tokens": Entry(each * (cells + len(plan.seats)), each * (cells + valid), "predicted").as_dict(),
+        "multiply_adds": _multiply_adds(run, [load_plan(attention) for attention in products.attentions]),
+    }
+
+
+def _multiply_adds(run: SurveyRun, plans: Sequence[FinePlan]) -> dict[str, Any]:
+    """What the model did, beside the map of a full scan."""
+    done, full = work_done(run, plans), work_of_map(run, run.grid.valid_seats())
+    return {**Entry(done.total, full.total, "predicted").as_dict(), **asdict(done)}
+
+
+def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: Receipt) -> QuicklookData:
+    """Gather what the four panels show, three bands of it."""
+    bands, _ = choose_bands(run.scene.wavelength_nm)
+    chosen = list(bands)
+    attention = load_attention(products.attentions[-1].path / "attention.zarr")
+    found: ClassMap = load_class_map(products.class_map.path / "class_map.zarr")
+    order = np.argsort(attention.rank.ravel(), kind="stable")
+    accuracy = receipt.get("accuracy")
+    miou = None if accuracy is None else accuracy["miou"]
+    return QuicklookData(
+        survey=run.name,
+        seed=run.settings.seed,
+        budget=run.settings.budget,
+        policy=run.settings.policy,
+        raw=tuple(_calibrated(run, cube, chosen) for cube in _by_strip(captured(products.raw_coarse))),
+        rectified=_both_scales(run, products, chosen),
+        wavelength_nm=run.scene.wavelength_nm[chosen],
+        score=attention.score,
+        patch_px=run.grid.patch,
+        seats=order[attention.rank.ravel()[order] >= 0],
+        blocks=tuple(block_of(sweep, run) for sweep in plan.sweeps),
+        class_map=found.classes,
+        class_names=found.names,
+        class_colours=found.colours,
+        truth=run.labels,
+        confidence=found.confidence,
+        pixel_mrad=run.camera.ifov_rad * 1e3,
+        along=run.plan.along,
+        note="   ·   ".join(_title_notes(run, miou)),
+    )
+
+
+def _title_notes(run: SurveyRun, miou: float | None) -> list[str]:
+    """What ends the title line: when a farm that grows was looked at, and how good the map is."""
+    moment = run.settings.moment
+    when = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]
+    return when if miou is None else [*when, f"mIoU {100 * miou:.1f} %"]
+
+
+def _by_strip(cubes: list[RawCube]) -> list[RawCube]:
+    """Sweeps in the order in which they lie side by side on the field: of their names, coarse-10 precedes coarse-2."""
+    return sorted(cubes, key=lambda cube: cube.sweep.strip_px)
+
+
+def _calibrated(run: SurveyRun, cube: RawCube, bands: list[int]) -> NDArray[np.float32]:
+    """Some bands of a sweep in scene values, by its stored picture alone; NaN where a sample looked past the scene."""
+    seen = cube.quicklook()
+    if seen is not None and list(seen.bands) == bands:
+        thin = slice(None, None, seen.step)
+        picture = seen.values()
+        picture[~on_scene(run.scene.shape, run.camera, cube.sweep)[thin, thin] | ~cube.valid_line[thin, None]] = np.nan
+        return picture
+    position = np.where(cube.valid_line[:, None], cube.position, np.nan)  # what an invalid line reports may be anything
+    values = reflectance(cube.read()[..., bands], of_bands(cube.references, bands), position=position)
+    values[~on_scene(run.scene.shape, run.camera, cube.sweep)] = np.nan
+    return values
+
+
+def _both_scales(run: SurveyRun, products: Products, bands: list[int]) -> NDArray[np.float32]:
+    """The coarse mosaic at the scene's size with the fine patches laid in, (y, x, 3)."""
+    rows = open_image(products.mosaic.path / "mosaic.zarr", "values").rows()
+    coarse = np.concatenate([values[..., bands] for _, values in rows])  # never all bands of all rows at once
+    s, p = run.grid.factor, run.grid.patch
+    canvas = np.repeat(np.repeat(coarse, s, axis=0), s, axis=1)[: run.grid.height, : run.grid.width].copy()
+    store = open_patches(products.patches.path / "patches.zarr")
+    for first in range(0, len(store.seats), SEATS_AT_ONCE):
+        values = store.read(first, first + SEATS_AT_ONCE)[..., bands]
+        for patch, (y, x) in zip(values, run.grid.seat_origin(store.seats[first : first + len(values)]), strict=True):
+            place = canvas[y : y + p, x : x + p]
+            place[...] = patch[: place.shape[0], : place.shape[1]]
+    return canvas
+
+
+def block_of(sweep: Sweep, run: SurveyRun) -> tuple[int, int, int, int]:
+    """Rows and columns (y0, y1, x0, x1) that a fine sweep's line centres and samples span, cut to the scene."""
+    size = (run.grid.width, run.grid.height) if sweep.along == "x" else (run.grid.height, run.grid.width)
+    across = np.array([-0.5, 0.5]) * run.camera.samples + sweep.strip_px + size[0] / 2
+    scan = np.array([0, sweep.lines]) + sweep.start_px + size[1] / 2 - 0.5
+    x0, x1 = np.clip(np.rint(across), 0, size[0]).astype(int).tolist()
+    y0, y1 = np.clip(np.rint(scan), 0, size[1]).astype(int).tolist()
+    return (y0, y1, x0, x1) if sweep.along == "x" else (x0, x1, y0, y1)

@@ -1,0 +1,141 @@
+"""The history of a field: its runs and what its ledger says, oldest first, as plain rows for a page."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from flows.schedule.ledger_state import ENDINGS, read_moment
+from flows.survey.scores import score_of
+from pipeline.errors import ArchiveError
+from storage.archive import Archive
+from storage.class_maps import load_class_map, load_class_names
+from storage.ledger import Ledger, ledgers
+from storage.lineage import Catalogue
+from storage.records import Run
+
+
+@dataclass(frozen=True)
+class FieldHistory:
+    """What is known of one field. ``events``: endings and passed-over times of its ledger; ``runs``: rows by run."""
+
+    field: str
+    archive: str
+    runs: Sequence[Mapping[str, Any]]
+    events: Sequence[Mapping[str, Any]]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many due runs were done, skipped and failed."""
+        found = dict.fromkeys(ENDINGS, 0)
+        for event in self.events:
+            if event["event"] == "passed":
+                found["skipped"] += event.get("count") or 0
+            else:
+                found[event["event"]] += 1
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for --json."""
+        return {"field": self.field, "archive": self.archive, "counts": self.counts,
+                "runs": list(self.runs), "events": list(self.events)}  # fmt: skip
+
+
+def read_histories(archive: Archive, field: str | None = None) -> list[FieldHistory]:
+    """The histories of all fields by name, or of one.
+
+    Raises
+    ------
+    ArchiveError : no field is called so.
+    """
+    catalogue = Catalogue.read(archive.root)
+    kept = {ledger.field: ledger for ledger in ledgers(archive.root)}
+    names = sorted({*kept, *(called(run) for run in catalogue.runs)})
+    if field is not None and field not in names:
+        near = difflib.get_close_matches(field, names, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(names) or 'none'}"
+        raise ArchiveError(f"no field of {archive.name} is called {field!r}; {hint}")
+    wanted = names if field is None else [field]
+    return [_history(archive, catalogue, name, kept.get(name)) for name in wanted]
+
+
+def called(run: Run) -> str:
+    """The field that a run is of."""
+    return str(run.receipt.get("survey") or run.facts.get("survey") or run.folder.name)
+
+
+def _history(archive: Archive, catalogue: Catalogue, name: str, ledger: Ledger | None) -> FieldHistory:
+    lines = [] if ledger is None else ledger.lines()
+    events = [line for line in lines if line.get("event") in (*ENDINGS, "passed")]
+    by_run = {line["run"]: line for line in events if isinstance(line.get("run"), str)}
+    rows = [
+        _row(archive, catalogue, run, by_run.get(run.uri, {}))
+        for run in catalogue.runs
+        if run.uri in by_run or called(run) == name
+    ]
+    return FieldHistory(name, archive.name, rows, events)
+
+
+def _row(archive: Archive, catalogue: Catalogue, run: Run, line: Mapping[str, Any]) -> dict[str, Any]:
+    receipt = run.receipt
+    savings = receipt.get("savings")
+    shares, unit = _areas(archive, catalogue, run)
+    return {
+        "run": run.uri,
+        "created": run.created,
+        "due": line.get("due"),
+        "attempts": line.get("attempts"),
+        **score_of(receipt),
+        "savings": {name: _ratio(savings, name) for name in ("capture_s", "lines", "bytes_stored", "multiply_adds")},
+        "areas": shares,
+        "colours": _colours(archive, run),
+        "unit": unit,
+        "problem": run.problem,
+    }
+
+
+def _areas(archive: Archive, catalogue: Catalogue, run: Run) -> tuple[dict[str, float], str]:
+    """What each class covers: hectares where the survey was put on the ground, else shares of the map."""
+    ground = run.receipt.get("ground")
+    if isinstance(ground, Mapping) and isinstance(ground.get("areas_ha"), Mapping):
+        return {str(name): float(area) for name, area in ground["areas_ha"].items() if _number(area) is not None}, "ha"
+    address = run.products.get("class_map")
+    store = None if address is None else catalogue.stores.get("/".join(address.split("/")[:3]))
+    if address is None or store is None or store.problem is not None:
+        return {}, "share"
+    try:
+        found = load_class_map(archive.locate(address))
+    except (OSError, LookupError, ValueError):
+        return {}, "share"
+    counts = {name: int((found.classes == number).sum()) for number, name in enumerate(found.names)}
+    total = sum(counts.values()) or 1
+    return {name: count / total for name, count in counts.items()}, "share"
+
+
+def _colours(archive: Archive, run: Run) -> dict[str, str]:
+    """The colours in which the run's map shows its classes, as CSS writes them; none where there is no map."""
+    address = run.products.get("class_map")
+    try:
+        found = None if address is None else load_class_names(archive.locate(address))
+    except (OSError, LookupError, ValueError):
+        found = None
+    if found is None:
+        return {}
+    return {name: f"#{bytes(map(int, rgb)).hex()}" for name, rgb in zip(found.names, found.colours, strict=False)}
+
+
+def _ratio(savings: object, name: str) -> float | None:
+    entry = savings.get(name) if isinstance(savings, Mapping) else None
+    return _number(entry.get("ratio")) if isinstance(entry, Mapping) else None
+
+
+def _number(value: object) -> float | None:
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def day_of(row: Mapping[str, Any]) -> float | None:
+    """When a row's run was due or else published, in seconds since 1970; None where that is not known."""
+    moment = read_moment(row.get("due")) or read_moment(row.get("created"))
+    return None if moment is None else moment.timestamp()

@@ -1,0 +1,207 @@
+"""The schedule of one field: what is due, what may still begin, what is skipped; each due time accounted for once.
+
+The ledger is the truth, and every look at it that leads to a line holds it against other writers.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from itertools import islice
+from typing import Any
+
+from flows.schedule.ledger_state import Ending, ScheduleState, moment_words, read_state
+from flows.schedule.times import Timetable
+from flows.schedule.wall_clock import WallClock
+from storage.ledger import Ledger
+
+SET_BACK = timedelta(minutes=1)  # a clock that goes back by less is being put right
+MOST_LINES = 100  # due times that passed and have a line each; more have one together
+MOST_COUNTED = 100_000
+MOST_ATTEMPTS = 3
+NOT_SERVED = "nothing was serving the schedule when it was due, or was killed before it could begin"
+TOO_LATE = "it could not begin in time"
+OVERTAKEN = "a later one came first"
+
+
+@dataclass(frozen=True)
+class FieldSchedule:
+    """Due times of one field and its ledger. ``late``: share of the interval after which a run may not begin."""
+
+    ledger: Ledger
+    timetable: Timetable
+    late: float
+    clock: WallClock
+
+    @property
+    def field(self) -> str:
+        """The field's name."""
+        return self.ledger.field
+
+    def state(self) -> ScheduleState:
+        """What the ledger says by now."""
+        return read_state(self.ledger.lines())
+
+    def open(self, first: datetime | None = None) -> None:
+        """Begin to serve, or go on where a process died that served; what it missed is accounted for.
+
+        ``first`` is a due time that is served still, though it may have come already.
+        """
+        with self.ledger.held():
+            state, now = self._state_now()
+            same = state.timetable == self.timetable and state.late == self.late
+            if state.serving and state.timetable is not None:
+                before = now if first is None else min(now, first - timedelta.resolution)
+                self._pass_over(state, now, NOT_SERVED, keep=same, until=before)
+            if not (state.serving and same):
+                facts = {"schedule": self.timetable.to_dict(), "late": self.late, "host": platform.node()}
+                known = {} if first is None else {"first": moment_words(first)}
+                self._write("opened", now, **facts, **known, pid=os.getpid())
+
+    def join(self, due: datetime) -> bool:
+        """Serve a due time as part of what serves the field; open the schedule where nothing does, or by another one.
+
+        What started the run for that time was scheduling before it, with or without a line in the ledger. False where
+        that is not so any more: another schedule was opened after that time, and this run is left over from before.
+        """
+        state = self.state()
+        if not state.serving or state.timetable != self.timetable or state.late != self.late:
+            if state.serving and state.opened is not None and due < state.opened:
+                return False
+            self.open(due)
+        return True
+
+    def close(self, at: datetime | None = None) -> None:
+        """Stop serving: nothing is due from now on, or from ``at`` on, when it was told to stop."""
+        with self.ledger.held():
+            state, now = self._state_now()
+            if state.serving:
+                self._pass_over(state, now, "the schedule was stopped", keep=False, until=at)
+                self._write("closed", now)
+
+    def pending(self, why: str | None = None) -> list[datetime]:
+        """Skip what is too late by now, for the reason given, and tell which due times are to be run now."""
+        with self.ledger.held():
+            state, now = self._state_now()
+            return self._pass_over(state, now, why or TOO_LATE, keep=True) if state.serving else []
+
+    def begin(self, due: datetime, **facts: object) -> int | None:
+        """Note that a run begins: which attempt it is, or None where the due time is accounted for already.
+
+        A run that began and has not ended is begun again only by whoever knows that it is dead.
+        """
+        with self.ledger.held():
+            state, now = self._state_now()
+            waiting = self._pass_over(state, now, TOO_LATE, keep=True)
+            attempts = len(state.begun.get(due, ()))
+            if due in state.ended or (not attempts and due not in waiting):
+                return None
+            if not attempts:
+                self._overtake(state, now, due)
+            self._write("begun", now, due=moment_words(due), attempt=attempts + 1, pid=os.getpid(), **facts)
+            return attempts + 1
+
+    def end(self, due: datetime, ending: Ending, reason: str | None = None, **facts: object) -> bool:
+        """Note how a due time ended; False where that is noted already."""
+        with self.ledger.held():
+            state, now = self._state_now()
+            if due in state.ended:
+                return False
+            began = state.begun.get(due)
+            if began is None:
+                self._overtake(state, now, due)
+            attempts = {} if began is None else {"attempts": len(began)}
+            self._write(ending, now, due=moment_words(due), reason=reason, **attempts, **facts)
+            return True
+
+    def reap(self, why: Callable[[Mapping[str, Any]], str | None] = lambda line: None) -> list[datetime]:
+        """End runs whose process is gone, and tell which may be resumed: those whose next due time has not come.
+
+        Only for whoever holds the rig's lock, so that no run of the field can be alive. ``why`` may know why a run
+        (by its last line) is not to be resumed.
+        """
+        resumed: list[datetime] = []
+        for due, lines in self.state().open.items():
+            told = why(lines[-1]) or self._why_not_again(due, len(lines))
+            if told is None:
+                resumed.append(due)
+            else:
+                self.end(due, "failed", told)
+        return resumed
+
+    def _why_not_again(self, due: datetime, attempts: int) -> str | None:
+        gone = "its process was gone before it ended (killed, or a power cut)"
+        if attempts >= MOST_ATTEMPTS:
+            return f"{gone}, {attempts} times over; what it captured is kept"
+        if self.clock.now() >= due + self.timetable.interval(due):
+            return f"{gone}, and the next one was due before it could be resumed; what it captured is kept"
+        return None
+
+    def _overtake(self, state: ScheduleState, now: datetime, due: datetime) -> None:
+        """Skip what is due before a due time that is about to be accounted for: later looks begin after that."""
+        if state.serving:
+            self._pass_over(state, now, OVERTAKEN, keep=False, until=due - timedelta.resolution)
+
+    def _pass_over(
+        self, state: ScheduleState, now: datetime, why: str, *, keep: bool, until: datetime | None = None
+    ) -> list[datetime]:
+        """Account for due times until now that have not begun; with ``keep`` those that may begin are given instead.
+
+        With ``until`` only for those until then.
+        """
+        timetable = state.timetable or self.timetable
+        if state.since is None:
+            return []
+        end = now if until is None else until
+        passed = list(islice(timetable.due_between(state.since, end), MOST_LINES + 1))
+        if len(passed) > MOST_LINES:
+            return self._pass_many(state, now, why, keep=keep, end=end)
+        kept: list[datetime] = []
+        for due in passed:
+            if due in state.ended or due in state.begun:
+                continue
+            if keep and now <= timetable.latest_start(due, state.late):
+                kept.append(due)
+            else:
+                self._write("skipped", now, due=moment_words(due), reason=_lateness(why, due, now))
+                state.ended[due] = {"event": "skipped"}
+        return kept
+
+    def _pass_many(self, state: ScheduleState, now: datetime, why: str, *, keep: bool, end: datetime) -> list[datetime]:
+        """One line for very many due times; a newest one that may still begin is left out of it."""
+        timetable, since = state.timetable or self.timetable, state.since
+        assert since is not None
+        count, looked, last, before = 0, 0, since, since
+        for due in islice(timetable.due_between(since, end), MOST_COUNTED):
+            count += due not in state.ended and due not in state.begun
+            looked, last, before = looked + 1, due, last
+        if looked == MOST_COUNTED:  # counting them all would take too long
+            self._write("passed", now, after=moment_words(since), until=moment_words(end), count=None, reason=why)
+            state.since = end
+            return []
+        fresh = last not in state.ended and last not in state.begun
+        spared = keep and fresh and now <= timetable.latest_start(last, state.late)
+        until, number = (before, count - 1) if spared else (last, count)
+        self._write("passed", now, after=moment_words(since), until=moment_words(until), count=number, reason=why)
+        state.since = until
+        return [last] if spared else []
+
+    def _state_now(self) -> tuple[ScheduleState, datetime]:
+        """State and time; a clock that was set back is noted first."""
+        state, now = self.state(), self.clock.now().astimezone(UTC)
+        if state.seen is not None and now < state.seen - SET_BACK:
+            self._write("clock", now, was=moment_words(state.seen), reason="the clock was set back")
+            state = self.state()
+        return state, now
+
+    def _write(self, event: str, now: datetime, **facts: object) -> None:
+        line = {"event": event, "at": moment_words(now), **facts}
+        self.ledger.append({name: value for name, value in line.items() if value is not None or name == "count"})
+
+
+def _lateness(why: str, due: datetime, now: datetime) -> str:
+    minutes = (now - due).total_seconds() / 60
+    return f"{why} (noted {minutes:.1f} min after it was due)"

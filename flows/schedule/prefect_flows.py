@@ -1,0 +1,180 @@
+"""The flows that Prefect runs on a schedule or on request: a field's survey, and the reprocessing of an archive.
+
+Their parameters can only name what is served; all else stands in the file of `flows.schedule.served`. What a survey
+needs is imported when it has begun: on a busy machine that takes longer than a run may be late.
+
+No ``from __future__ import annotations`` here: Prefect reads the signatures. What is done is in plain functions.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from prefect import State, flow
+from prefect.concurrency.sync import concurrency
+from prefect.context import FlowRunContext
+from prefect.states import Cancelled, Completed, Failed
+
+from flows.schedule.due_runs import Outcome, run_due
+from flows.schedule.field_schedule import FieldSchedule
+from flows.schedule.fields import ServedField
+from flows.schedule.ledger_state import read_moment
+from flows.schedule.news import ScheduleNews, together
+from flows.schedule.notices import send_notice
+from flows.schedule.queue import SKIPPED
+from flows.schedule.request import ServeRequest
+from flows.schedule.served import read_served, served_archive, served_field, served_weights
+from flows.schedule.wall_clock import WallClock
+from flows.terminal.shown_text import on_stderr
+from pipeline.errors import PipelineError, RigError
+from storage.archive import Archive
+from storage.staging import take_lock
+
+LIMIT = "rig"  # a Prefect concurrency limit that shows who waits; the kernel's lock decides
+REPROCESS_LOCK = "reprocess-flow.lock"
+A_LOOK_S = 1.0
+AHEAD = timedelta(minutes=2)  # a run that is begun earlier than this was begun by hand
+
+
+@flow(name="survey", flow_run_name="survey-{field}", persist_result=False)
+def survey_scheduled(field: str, due: str | None = None) -> State:
+    """Survey one served field: for the due time that this run was made for, or at once where it was asked by hand."""
+    try:
+        request = read_served()
+        one = served_field(request, field)
+        schedule = one.schedule(request.timetable, request.late)
+        moment = read_moment(due) or _scheduled()
+        if moment is None or not _wait_for(moment, schedule.clock):
+            return _by_hand(one, request)
+        news = ScheduleNews({field: schedule}, lambda name, error: None)
+        if not schedule.join(moment):
+            return _skipped("it is of a schedule that is not served any more")
+        outcome = _run(one, schedule, moment, request)
+    except PipelineError as error:
+        return Failed(message=str(error))
+    for known in together(news.fresh()):
+        send_notice(request.notify, known, one.settings.out)
+    return _state(outcome)
+
+
+def _run(one: ServedField, schedule: FieldSchedule, moment: datetime, request: ServeRequest) -> Outcome:
+    waiting = [*schedule.state().open, *schedule.pending()]
+    known = next((found for found in waiting if abs((found - moment).total_seconds()) < 1), None)
+    if known is None:
+        line = schedule.state().ended.get(moment, {})
+        return Outcome(one.name, moment, None, str(line.get("reason") or "it is accounted for in the ledger already"))
+    with _shown_in_queue():
+        return run_due(schedule, known, one.lock(), lambda field, due: _survey(one, due, request), facts=_flow_run())
+
+
+def _survey(one: ServedField, due: datetime, request: ServeRequest) -> Path:
+    from flows.publish.prefect_artifacts import publish_artifacts
+    from flows.publish.survey_command import run_survey
+
+    published = run_survey(one.settings_of(due, request.timetable), on_stderr())
+    with suppress(Exception):  # a server that is gone: the archive has it all
+        publish_artifacts(published, one.name, one.settings.out)
+    return published.folder
+
+
+def _by_hand(one: ServedField, request: ServeRequest) -> State:
+    """A survey that somebody asked for on Prefect's pages: it has no due time, and waits for nobody."""
+    lock = one.lock()
+    if not lock.take_soon(f"{one.name}, by hand"):
+        raise RigError(f"the rig is in use by {lock.holder()}; run again when that survey has ended")
+    try:
+        folder = _survey(one, datetime.now(UTC).replace(microsecond=0), request)
+    finally:
+        lock.release()
+    return Completed(message=f"runs/{folder.name}")
+
+
+@contextmanager
+def _shown_in_queue() -> Iterator[None]:
+    """Take a place in Prefect's queue of the rig, where it has one; without one, or with a stale one, go on."""
+    held = ExitStack()
+    with suppress(Exception):
+        held.enter_context(concurrency(LIMIT, occupy=1, timeout_seconds=5, lease_duration=60))
+    try:
+        yield
+    finally:
+        with suppress(Exception):  # a server that has gone meanwhile: the place is free when its lease is over
+            held.close()
+
+
+def _wait_for(moment: datetime, clock: WallClock) -> bool:
+    """Wait until a due time has come: Prefect begins runs up to seconds before it. False where it is far away."""
+    if moment - clock.now() > AHEAD:
+        return False
+    while (left := (moment - clock.now()).total_seconds()) > 0:
+        clock.sleep(min(left, 1.0))
+    return True
+
+
+def _scheduled() -> datetime | None:
+    """The time that Prefect's scheduler meant; None of a run that it did not make."""
+    context = FlowRunContext.get()
+    if context is None or context.flow_run is None or not context.flow_run.auto_scheduled:
+        return None
+    expected = context.flow_run.expected_start_time
+    return None if expected is None else datetime.fromtimestamp(expected.timestamp(), UTC)
+
+
+def _flow_run() -> dict[str, object]:
+    context = FlowRunContext.get()
+    known = None if context is None or context.flow_run is None else str(context.flow_run.id)
+    return {} if known is None else {"flow_run": known}
+
+
+def _state(outcome: Outcome) -> State:
+    if outcome.ending == "failed":
+        return Failed(message=outcome.reason)
+    if outcome.ending == "done":
+        return Completed(message=outcome.run)
+    return _skipped(outcome.reason or "it is accounted for already")
+
+
+def _skipped(why: str) -> State:
+    """The end of a run that did nothing: not the green of one that surveyed."""
+    return Cancelled(name=SKIPPED, message=why)
+
+
+@flow(name="reprocess", flow_run_name="reprocess-{archive}", persist_result=False)
+def reprocess_archive(
+    archive: str,
+    since: str | None = None,
+    stage: str | None = None,
+    field: str | None = None,
+    failed: bool = False,
+    weights: str | None = None,
+    dry_run: bool = False,
+) -> State:
+    """Survey every field of a served archive again: light is found there, only what has changed is made anew.
+
+    ``weights`` may be those that a served field's settings name.
+    """
+    from flows.archive.commands import FAILED, PARTLY
+    from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
+
+    try:
+        served = read_served()
+        archive = served_archive(served, archive)
+        request = ReprocessRequest(archive, since, stage, field, failed, served_weights(served, weights), dry_run)
+        lock = Archive.open(archive, create=False, write=False).root / ".locks" / REPROCESS_LOCK
+        release = take_lock(lock, wait=False)
+        if release is None:  # it may be but the watcher's look
+            time.sleep(A_LOOK_S)
+            release = take_lock(lock, wait=False)
+        if release is None:
+            return _skipped("this archive is being reprocessed already")
+        try:
+            code = run_reprocess(request, on_stderr())
+        finally:
+            release()
+    except PipelineError as error:
+        return Failed(message=str(error))
+    if code == FAILED:
+        return Failed(message="no field could be reprocessed; reprocess-TIME.json beside the archive says why")
+    return Completed(message="some fields failed: see reprocess-TIME.json" if code == PARTLY else "done")

@@ -1,0 +1,1 @@
+"""Scans of a scene without a survey, and emulated rigs."""

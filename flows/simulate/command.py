@@ -1,0 +1,217 @@
+"""What `spectralzoom simulate` does and shows: one scan of a scene as raw cubes, and the manifest of its effects."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+
+from flows.publish.effect_table import print_effects
+from flows.settings.survey_settings import Settings
+from flows.simulate.effect_comparison import Comparison, compare_with_everything
+from flows.survey.capture_plan import lay_out_sweeps
+from flows.survey.effect_choice import choose_effects, load_manifest
+from flows.survey.run import CaptureRun, make_source
+from flows.survey.scene import farm_refusal, open_scene
+from flows.survey.stages import VERSIONS, Build, capture_sweeps
+from flows.terminal.figures import format_bytes, format_seconds
+from flows.terminal.progress import StageProgress
+from models.process import keep_freed_memory, use_one_thread
+from pipeline.errors import ArchiveError, SceneError, SettingsError
+from pipeline.grid import SceneGrid
+from pipeline.scan import Sweep
+from pipeline.simulator.manifest import UNIT_WORDS
+from storage.archive import Archive, StageRef
+from storage.scene_files import load_scene_file
+
+TITLES = {"effects": "effects that matter", "capture": "scan", "comparison": "the same with everything on"}
+PATCH, FACTOR = 16, 4  # of the weights that come with the house: scans are those of its surveys
+
+
+@dataclass
+class _Maker:
+    """Finds stores or has them built, with progress, and remembers what building the last of them took."""
+
+    run: CaptureRun
+    progress: StageProgress
+    spent: dict[str, float | None] = field(default_factory=dict)  # CPU seconds by stage; None where it was there
+
+    def __call__(self, name: str, build: Build, params: Mapping[str, Any], inputs: Sequence[StageRef]) -> StageRef:
+        """Find or make the store of one stage."""
+        began = time.process_time()
+        self.progress.show(name, 0.0)
+        ref, built = self.run.archive.produce(
+            name, build, version=VERSIONS[name], params=params, inputs=[given.key for given in inputs]
+        )
+        self.spent[name] = time.process_time() - began if built else None
+        self.progress.show(name, 1.0, "" if built else "cached", ended=True)
+        return ref
+
+    def watching(self, name: str) -> CaptureRun:
+        """The run, whose reports are of this stage."""
+        return replace(self.run, report=lambda done: self.progress.show(name, done))
+
+
+def run_simulate(
+    settings: Settings, console: Console, *, coarse: bool = False, picture: Path | None = None
+) -> dict[str, Any]:
+    """Scan a scene into an archive, with progress on ``console``; give the record that --json prints.
+
+    With a ``picture`` (PNG) the scan is held against one with everything on.
+
+    Raises
+    ------
+    BoundError : what would be left out changes the worst part of the scene by more than its bound says.
+    SettingsError, SceneError, ArchiveError : what was asked for cannot be.
+    """
+    if picture is not None:
+        _check_picture(picture)
+    use_one_thread()
+    keep_freed_memory()
+    with console.status("opening the scene"):
+        run, sweeps, notes = open_simulation(settings, coarse=coarse)
+        run.archive.reclaim()  # what a killed scan left half made
+    for note in notes:
+        console.print(f"[dim]note: {escape(note)}[/]", highlight=False)
+    with run.archive.in_use(), StageProgress(console, TITLES) as progress:
+        make = _Maker(run, progress)
+        effects = choose_effects(make.watching("effects"), make)
+        raw = capture_sweeps(make.watching("capture"), make, sweeps, [effects])
+        record = _record(run, sweeps, effects, raw, make.spent)
+        found = None if picture is None else _compare(make, sweeps, effects, console)
+    _print(record, console)
+    if picture is None or found is None:
+        return record
+    _draw(picture, found, settings)
+    _print_comparison(found, picture, console)
+    return record | {"comparison": {**found.record(), "picture": str(picture)}}
+
+
+def _compare(make: _Maker, sweeps: Sequence[Sweep], effects: StageRef, console: Console) -> Comparison:
+    """Take the lines with everything on as well."""
+
+    def say(words: str) -> None:
+        console.print(f"[dim]everything on, exact: {escape(words)}[/]", highlight=False)
+
+    make.progress.show("comparison", 0.0)
+    found = compare_with_everything(make.watching("comparison"), sweeps, effects, say)
+    make.progress.show("comparison", 1.0, ended=True)
+    return found
+
+
+def _check_picture(path: Path) -> None:
+    """Refuse what cannot be written before minutes are spent on it."""
+    if path.suffix.lower() != ".png":
+        raise SettingsError(f"--compare writes a PNG, got {path}; name a file that ends with .png")
+    if path.is_dir():
+        raise SettingsError(f"--compare {path} is a folder; name a file in it, such as {path / 'difference.png'}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab"):
+            pass
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    if not path.stat().st_size:
+        path.unlink()
+
+
+def _unwritable(path: Path, error: OSError) -> ArchiveError:
+    return ArchiveError(f"cannot write to {path}: {error.strerror}; choose another --compare")
+
+
+def _draw(path: Path, found: Comparison, settings: Settings) -> None:
+    from flows.simulate.effect_picture import Words, draw_comparison
+
+    try:
+        draw_comparison(path, found, Words(f"{Path(settings.scene).stem}, seed {settings.seed}", settings.effects))
+    except OSError as error:
+        raise _unwritable(path, error) from error
+
+
+def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[CaptureRun, list[Sweep], tuple[str, ...]]:
+    """Open scene and archive; give also the sweeps to take, and what was assumed of the scene. Draws nothing."""
+    if settings.source != "sim":
+        raise SettingsError(f"source = {settings.source!r}: a simulation is of the simulated rig; leave it out")
+    refused = farm_refusal(settings)
+    if refused is not None:
+        raise SettingsError(refused)
+    scene, notes = open_scene(settings)
+    if scene.filled_px:
+        raise SceneError(_gap(settings))
+    _, coarse_pass, full = lay_out_sweeps(settings, SceneGrid(*scene.shape, PATCH, FACTOR))
+    run = CaptureRun(
+        settings=settings, archive=Archive.open(settings.out), source=make_source(scene, settings), scene=scene,
+        planned=(*coarse_pass, *full),
+    )  # fmt: skip
+    return run, coarse_pass if coarse else full, notes
+
+
+def _gap(settings: Settings) -> str:
+    """Where a file first has no value. A survey goes on without; a simulation would have to invent light."""
+    file = load_scene_file(settings.scene, bands=settings.bands, wavelengths=settings.wavelengths)
+    missing = ~np.isfinite(file.values)
+    row, column, band = (int(one) for one in np.unravel_index(int(missing.argmax()), missing.shape))
+    number = band if settings.bands is None else settings.bands[band]
+    pixels = int(missing.any(axis=2).sum())
+    return (
+        f"{settings.scene} has no finite value at row {row}, column {column}, band {number} (pixels without: {pixels}),"
+        " and a simulation invents no light; fill or crop it, or choose other --bands"
+    )
+
+
+def _record(
+    run: CaptureRun, sweeps: Sequence[Sweep], effects: StageRef, raw: StageRef, spent: Mapping[str, float | None]
+) -> dict[str, Any]:
+    manifest, camera = load_manifest(effects), run.camera
+    lines, bands = sum(sweep.lines for sweep in sweeps), len(run.scene.wavelength_nm)
+    px_bands = lines * camera.samples * bands
+    took = spent["capture"]
+    return {
+        "scene": run.scene.key,
+        "seed": run.settings.seed,
+        "archive": run.archive.name,
+        "store": raw.uri,
+        "cubes": [f"{raw.uri}/{path.name}" for path in sorted(raw.path.glob("*.zarr"))],
+        "cached": took is None,
+        "sweeps": len(sweeps),
+        "lines": lines,
+        "px_bands": px_bands,
+        "cpu_s": took,
+        "px_bands_per_cpu_s": px_bands / took if took else None,
+        "bytes_stored": run.archive.stored_bytes(raw),
+        "choice_cpu_s": spent["effects"],
+        "effects_store": effects.uri,
+        "effects": manifest["effects"],
+        "effects_total": manifest["total"],
+        "path": str(raw.path),
+    }
+
+
+def _print(record: Mapping[str, Any], console: Console) -> None:
+    print_effects(record["effects"], record["effects_total"], console)
+    done = "already there" if record["cached"] else f"{format_seconds(record['cpu_s'])} of CPU"
+    console.print(
+        f"{record['lines']} lines in {record['sweeps']} sweeps: {done}, {format_bytes(record['bytes_stored'])} stored",
+        highlight=False,
+    )
+    for name in record["cubes"]:
+        console.print(f"  {escape(str(Path(record['path']) / Path(name).name))}", highlight=False, soft_wrap=True)
+
+
+def _print_comparison(found: Comparison, picture: Path, console: Console) -> None:
+    unit = UNIT_WORDS[found.unit]
+    which = "all" if found.lines == found.of_lines else f"{found.lines} of the {found.of_lines}"
+    bound = "there is no bound" if found.bound is None else f"the bound is {found.bound:.2g}"
+    console.print(
+        f"Everything on, exact, takes {format_seconds(found.exact_cpu_s)} of CPU for {which} lines, these effects"
+        f" {format_seconds(found.cpu_s)}: {found.ratio:.1f} times less. Light differs by {found.measured:.2g} {unit}"
+        f" at most ({bound}).",
+        highlight=False,
+    )
+    console.print(f"  {escape(str(picture))}", highlight=False, soft_wrap=True)

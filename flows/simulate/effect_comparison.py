@@ -1,0 +1,344 @@
+"""A scan beside the same scan with everything on and exact: what both cost, and how far their light is apart.
+
+Both have the same random streams. All lines are compared where that takes about a minute, else blocks spread evenly
+over the scan; what is looked at closely is where the two differ most.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.publish.colour_stretch import choose_bands
+from flows.survey.effect_choice import chosen_effects, load_manifest, source_with
+from flows.survey.run import CaptureRun
+from pipeline.camera import bin_samples
+from pipeline.errors import BoundError
+from pipeline.scan import Sweep
+from pipeline.simulator.arithmetic import contrast_about, misplaced_electrons, misplaced_share
+from pipeline.simulator.block import Block
+from pipeline.simulator.effects.effect import Effect
+from pipeline.simulator.effects.registry import BY_NAME
+from pipeline.simulator.instrument import BLOCK_LINES
+from pipeline.simulator.manifest import UNIT_WORDS
+from pipeline.simulator.probe import Unit
+from pipeline.simulator.readout import dark_frame, read_out
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.simulated import SimulatedSource
+from pipeline.simulator.stored_light import stored_mean, unit_at
+from pipeline.simulator.survey_clock import sweep_starts
+from storage.archive import StageRef
+
+MOST_S = 60.0  # of processor time for both ways together; beyond, not all lines are compared
+VIEW_PX = 160  # of the camera, along the line and along the scan
+
+Light = NDArray[np.float32]
+Raw = NDArray[np.uint16]
+
+
+@dataclass(frozen=True)
+class Place:
+    """A stored number: a band of a sample, or of some that are summed."""
+
+    sweep: str
+    line: int
+    sample: int  # of the camera: the first of those that are summed
+    band: int
+
+
+@dataclass(frozen=True)
+class View:
+    """Some lines and samples as both ways show them, about the place where they differ most."""
+
+    exact: Light  # (line, binned sample, 3) over the white panel
+    chosen: Light  # the same
+    change: NDArray[np.float64]  # (line, binned sample), the band that differs most, in the unit of the tolerance
+    bands: str  # which three, in words
+    lines: range
+    samples: range  # of the camera
+    sweep: Sweep
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What everything on and the effects chosen cost, and how far apart they are, over all lines compared."""
+
+    lines: int
+    of_lines: int
+    exact_cpu_s: float
+    cpu_s: float
+    effects_exact: int  # how many the rig has
+    effects_on: int
+    unit: Unit
+    tolerance: float | None  # None: any
+    bound: float | None  # None: there is none
+    measured: float  # greatest change of expected light
+    rms: float
+    place: Place  # of the greatest
+    raw_unequal: float  # share of raw numbers that differ where light alone does: noise and digits as chosen
+    raw_most_dn: int
+    left_out: tuple[str, ...]  # of what the rig has
+    cheaper: tuple[str, ...]  # name and variant
+    view: View = field(repr=False)
+
+    @property
+    def ratio(self) -> float:
+        """How many times less processor time the effects chosen take."""
+        return self.exact_cpu_s / self.cpu_s if self.cpu_s else float("nan")
+
+    def record(self) -> dict[str, Any]:
+        """Give the figures as plain values."""
+        figures = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in ("view", "place")}
+        return {**figures, "ratio": self.ratio, "place": asdict(self.place)}
+
+
+@dataclass
+class _Sums:
+    """What blocks add up to."""
+
+    exact_cpu_s: float = 0.0
+    cpu_s: float = 0.0
+    greatest: float = -1.0
+    unexplained: float = -1.0  # of the greatest change, what arithmetic can not have made
+    place: Place | None = None
+    squares: float = 0.0
+    numbers: int = 0
+    unequal: int = 0
+    raw_numbers: int = 0
+    most_dn: int = 0
+
+
+@dataclass(frozen=True)
+class _Both:
+    """A block both ways: expected electrons with those of the dark, as means over the samples summed; raw numbers.
+
+    ``alike_raw`` is exact light with the noise and the digits of the effects chosen.
+    """
+
+    exact: NDArray[np.floating]
+    chosen: NDArray[np.floating]
+    exact_raw: Raw
+    chosen_raw: Raw
+    alike_raw: Raw
+    exact_cpu_s: float
+    cpu_s: float
+
+
+def everything(effects: StageRef) -> dict[Effect, str]:
+    """Give all effects that the rig has, exact, in the order of the chain, out of a stored decision."""
+    rows = [row for row in load_manifest(effects)["effects"] if row["reason"] != "absent"]
+    return {BY_NAME[row["name"]]: BY_NAME[row["name"]].variants[0] for row in rows}
+
+
+def compare_with_everything(
+    run: CaptureRun, sweeps: Sequence[Sweep], effects: StageRef, say: Callable[[str], None]
+) -> Comparison:
+    """Take lines of a scan with the effects chosen and with everything on, exact; ``say`` is told how many, and why.
+
+    Raises
+    ------
+    BoundError : expected light differs by more than the bound of the decision; names the place.
+    """
+    clock = sweep_starts(sweeps, run.camera, run.settings.cost)
+    chosen = source_with(run.source, effects, clock)
+    total = load_manifest(effects)["total"]
+    bound = math.inf if total["bound"] is None else total["bound"]
+    ways = _Ways(replace(chosen, chosen=everything(effects)), chosen, total["unit"], bound)
+    blocks = _blocks(sweeps)
+    taken = _affordable(ways, blocks, say)
+    sums = _Sums()
+    for number, (sweep, lines) in enumerate(taken):
+        ways.add(sweep, lines, sums)
+        run.report((number + 1) / (len(taken) + 1))
+    found = _compared(run, ways, sums, taken, blocks, effects)
+    _check(found, sums)
+    run.report(1.0)
+    return found
+
+
+def _blocks(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, range]]:
+    """All lines of a scan, as they are rendered at a time."""
+    return [
+        (sweep, range(first, min(first + BLOCK_LINES, sweep.lines)))
+        for sweep in sweeps
+        for first in range(0, sweep.lines, BLOCK_LINES)
+    ]
+
+
+def _affordable(
+    ways: _Ways, blocks: list[tuple[Sweep, range]], say: Callable[[str], None]
+) -> list[tuple[Sweep, range]]:
+    """Blocks of which both ways take about `MOST_S` seconds, evenly out of all; ``say`` how many."""
+    middle = blocks[len(blocks) // 2]
+    for sweep in {sweep.name: sweep for sweep, _ in blocks}.values():
+        ways.take(sweep, range(1))  # tables of a sweep are made once
+    trial = ways.take(*middle)
+    block_s = max(trial.exact_cpu_s + trial.cpu_s, 1e-6)
+    count = max(1, min(len(blocks), int(MOST_S / block_s)))
+    kept = np.unique(np.linspace(0, len(blocks) - 1, count).round().astype(int))
+    taken = [blocks[number] for number in kept] if count < len(blocks) else blocks
+    lines, of_lines = _count(taken), _count(blocks)
+    which = "all" if lines == of_lines else f"{lines} of"
+    seconds = block_s * len(taken)
+    all_s = "" if lines == of_lines else f" (all would take about {block_s * len(blocks):.0f} s)"
+    say(f"{which} {of_lines} lines are taken both ways: about {seconds:.0f} s of CPU{all_s}")
+    return taken
+
+
+def _count(blocks: Sequence[tuple[Sweep, range]]) -> int:
+    return sum(len(lines) for _, lines in blocks)
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """A block one way: expected electrons without and with those of the dark, raw numbers of all samples."""
+
+    light: Light
+    shown: Light
+    raw: Raw
+    cpu_s: float
+
+
+def _taken(source: SimulatedSource, block: Block) -> _Taken:
+    began = time.process_time()
+    light = expected_light(source.scene, block, source.choice)
+    raw = read_out(light, block, source.choice)
+    spent = time.process_time() - began
+    shown = light + dark_frame(block, source.choice) * np.float32(block.rig.camera.electrons_per_dn)
+    return _Taken(light, shown, raw, spent)
+
+
+@dataclass(frozen=True)
+class _Ways:
+    """One scan with everything on, exact, and with the effects chosen; their seed and clock are the same."""
+
+    exact: SimulatedSource
+    chosen: SimulatedSource
+    unit: Unit
+    bound: float
+
+    def take(self, sweep: Sweep, lines: range) -> _Both:
+        """Render some lines both ways."""
+        exact, chosen = (_taken(source, source.block(sweep, lines)) for source in (self.exact, self.chosen))
+        alike = read_out(exact.light, self.chosen.block(sweep, lines), self.chosen.choice)
+        exact_raw, chosen_raw, alike_raw = (bin_samples(raw, sweep.binning) for raw in (exact.raw, chosen.raw, alike))
+        shown, other = (stored_mean(one.shown, sweep.binning) for one in (exact, chosen))
+        return _Both(shown, other, exact_raw, chosen_raw, alike_raw, exact.cpu_s, chosen.cpu_s)
+
+    def change(self, both: _Both, sweep: Sweep) -> NDArray[np.float64]:
+        """By how much the stored light differs, in the unit of the tolerance, (line, binned sample, band)."""
+        difference: NDArray[np.float64] = (both.chosen.astype(np.float64) - both.exact) / self._unit(both, sweep)
+        return difference
+
+    def _arithmetic(self, both: _Both, sweep: Sweep, lines: range) -> NDArray[np.float64]:
+        """What of a difference arithmetic may have made, (line or 1, binned sample, band). [e-]"""
+        share = misplaced_share(dict(self.exact.choice.effects), dict(self.chosen.choice.effects))
+        contrast = contrast_about(self.exact.block(sweep, lines), partial(expected_light, self.exact.scene))
+        return misplaced_electrons(both.exact, stored_mean(contrast, sweep.binning), share)
+
+    def _unit(self, both: _Both, sweep: Sweep) -> NDArray[np.floating]:
+        return unit_at(both.exact, self.exact.rig, self.unit, sweep.binning)
+
+    def add(self, sweep: Sweep, lines: range, sums: _Sums) -> None:
+        """Take some lines both ways and add up how they differ."""
+        both = self.take(sweep, lines)
+        change = self.change(both, sweep)
+        sums.exact_cpu_s += both.exact_cpu_s
+        sums.cpu_s += both.cpu_s
+        sums.squares += float(np.square(change).sum())
+        sums.numbers += change.size
+        np.abs(change, out=change)
+        line, sample, band = (int(one) for one in np.unravel_index(int(np.argmax(change)), change.shape))
+        if change[line, sample, band] > sums.greatest:
+            sums.greatest = float(change[line, sample, band])
+            sums.place = Place(sweep.name, lines[line], sample * sweep.binning, band)
+        if change.max() > self.bound:
+            change -= self._arithmetic(both, sweep, lines) / self._unit(both, sweep)
+        sums.unexplained = max(sums.unexplained, float(change.max()))
+        apart = np.abs(both.chosen_raw.astype(np.int32) - both.alike_raw)
+        sums.unequal += int(np.count_nonzero(apart))
+        sums.raw_numbers += apart.size
+        sums.most_dn = max(sums.most_dn, int(apart.max()))
+
+
+def _compared(
+    run: CaptureRun,
+    ways: _Ways,
+    sums: _Sums,
+    taken: list[tuple[Sweep, range]],
+    blocks: list[tuple[Sweep, range]],
+    effects: StageRef,
+) -> Comparison:
+    if sums.place is None:
+        raise BoundError("there is no line to compare; give a scene that the rig sees")
+    total, place = load_manifest(effects)["total"], sums.place
+    sweep = next(sweep for sweep, _ in blocks if sweep.name == place.sweep)
+    left_out, cheaper = _inexact(effects)
+    return Comparison(
+        lines=_count(taken), of_lines=_count(blocks), exact_cpu_s=sums.exact_cpu_s, cpu_s=sums.cpu_s,
+        effects_exact=len(everything(effects)), effects_on=len(chosen_effects(effects)),
+        unit=total["unit"], tolerance=total["tolerance"], bound=total["bound"],
+        measured=sums.greatest, rms=float(np.sqrt(sums.squares / sums.numbers)), place=place,
+        raw_unequal=sums.unequal / sums.raw_numbers, raw_most_dn=sums.most_dn,
+        left_out=left_out, cheaper=cheaper, view=_view(run, ways, sweep, place),
+    )  # fmt: skip
+
+
+def _inexact(effects: StageRef) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What is left out of all that the rig has, and what is computed more cheaply than exactly."""
+    exact, chosen = everything(effects), chosen_effects(effects)
+    left_out = tuple(effect.name for effect in exact if effect not in chosen)
+    cheaper = tuple(f"{one.name} as {variant}" for one, variant in chosen.items() if variant != one.variants[0])
+    return left_out, cheaper
+
+
+def _view(run: CaptureRun, ways: _Ways, sweep: Sweep, place: Place) -> View:
+    """Take the lines about a place once more and keep what a picture shows of them."""
+    binning, camera = sweep.binning, run.camera
+    lines = _about(place.line, VIEW_PX // sweep.step, sweep.lines)
+    samples = _about(place.sample // binning, VIEW_PX // binning, camera.samples // binning)
+    of_camera = range(samples.start * binning, samples.stop * binning)
+    bands, words = choose_bands(run.scene.wavelength_nm)
+    exact: list[Raw] = []
+    chosen: list[Raw] = []
+    changes = []
+    for first in range(lines.start, lines.stop, BLOCK_LINES):
+        both = ways.take(sweep, range(first, min(first + BLOCK_LINES, lines.stop)))
+        for kept, raw in ((exact, both.exact_raw), (chosen, both.chosen_raw)):
+            kept.append(raw[:, samples.start : samples.stop, list(bands)])
+        changes.append(_strongest(ways.change(both, sweep)[:, samples.start : samples.stop]))
+    white = np.maximum(run.scene.panel_electrons[list(bands)] / camera.electrons_per_dn, np.float32(1e-6))
+    dark = np.float32(binning * camera.dark_dn)
+    shown = [(np.concatenate(kept).astype(np.float32) - dark) / (binning * white) for kept in (exact, chosen)]
+    return View(shown[0], shown[1], np.concatenate(changes), words, lines, of_camera, sweep)
+
+
+def _about(middle: int, count: int, most: int) -> range:
+    """So many numbers in a row below ``most`` about a middle; all where there are fewer."""
+    count = min(count, most)
+    first = max(0, min(middle - count // 2, most - count))
+    return range(first, first + count)
+
+
+def _strongest(change: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of each sample the change of the band that changes most, with its sign."""
+    band = np.abs(change).argmax(axis=2)[..., None]
+    return np.take_along_axis(change, band, axis=2)[..., 0]
+
+
+def _check(found: Comparison, sums: _Sums) -> None:
+    if found.bound is None or sums.unexplained <= found.bound:
+        return
+    place = found.place
+    raise BoundError(
+        f"against everything on, light differs by {found.measured:.3g} {UNIT_WORDS[found.unit]} at sweep {place.sweep},"
+        f" line {place.line}, sample {place.sample}, band {place.band}, above the bound of {found.bound:.3g}; simulate"
+        " with --tol 0 or --effects all, and please report it with the rig's settings"
+    )

@@ -1,0 +1,125 @@
+"""What `rig check` does and shows, and the list of faults of emulated rigs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from flows.cli.app import print_json
+from flows.settings.survey_settings import load_settings
+from flows.terminal.shown_text import on_stdout
+from pipeline.errors import SettingsError
+from pipeline.rig.emulator.fault_names import fault_table
+from pipeline.rig.headwall_camera import HeadwallCamera
+from pipeline.rig.mirror_port import open_mirror
+from pipeline.rig.rig_check import CheckRow, Device, check_camera, check_mirror, works
+from pipeline.rig.survey_rig import SurveyRig
+from pipeline.scan import CostModel
+
+DONE, FAILED, PARTLY = 0, 1, 3
+LIST = "list"
+_COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
+
+
+def show_faults(*, as_json: bool = False) -> int:
+    """List the faults that can be asked for, on stdout."""
+    if as_json:
+        rows = [{"name": name, "strikes": where, "what": what} for name, where, what in fault_table()]
+        print_json({"faults": rows})
+        return DONE
+    table = Table("fault", "strikes", "what happens", box=SIMPLE_HEAD)
+    for row in fault_table():
+        table.add_row(*map(escape, row))
+    on_stdout().print(table)
+    return DONE
+
+
+@dataclass(frozen=True)
+class CheckRequest:
+    """Which devices to check; None leaves one out."""
+
+    rig: SurveyRig
+    mirror: bool = True
+    camera: bool = True
+    move: bool = False
+    vector_pairs: int = CostModel.vector_pairs
+
+
+def check_request(settings: Path | None, port: str | None, camera: str | None, *, move: bool = False) -> CheckRequest:
+    """Say what to check: both devices of the settings, or those that are named where there are none.
+
+    Raises
+    ------
+    SettingsError : the settings, or the camera's address, cannot be used.
+    """
+    wanted = load_settings(settings)
+    rig = wanted.rig
+    if port is not None:
+        rig = replace(rig, port=port)
+    if camera is not None:
+        rig = _at(rig, camera)
+    both = settings is not None or port is camera is None
+    return CheckRequest(rig, both or port is not None, both or camera is not None, move, wanted.cost.vector_pairs)
+
+
+def run_check(request: CheckRequest, console: Console, *, as_json: bool = False) -> int:
+    """Check the devices, with a table on stdout; 0 where nothing failed, 3 where one of two works, 1 otherwise."""
+    rig = request.rig
+    asked: dict[Device, bool] = {"mirror": request.mirror, "camera": request.camera}
+    settings = replace(rig.mirror(request.vector_pairs), park_at_close=False)  # the square ends at 0; 0 by itself
+    rows: list[CheckRow] = []
+    if request.mirror:
+        with console.status(f"asking the mirror at {rig.port}"):
+            rows += check_mirror(lambda: open_mirror(settings), move=request.move)
+    if request.camera:
+        with console.status(f"asking the camera at {rig.host}"):
+            rows += check_camera(HeadwallCamera.at(rig.camera, rig.files), rig.files)
+    good = [works(rows, device) for device, is_asked in asked.items() if is_asked]
+    code = DONE if all(good) else PARTLY if any(good) else FAILED
+    if as_json:
+        print_json(_record(request, rows, code))
+    else:
+        _print(rows, on_stdout())
+    return code
+
+
+def _record(request: CheckRequest, rows: Sequence[CheckRow], code: int) -> dict[str, Any]:
+    return {
+        "port": request.rig.port if request.mirror else None,
+        "camera": f"{request.rig.host}:{request.rig.control_port}" if request.camera else None,
+        "move": request.move,
+        "rows": [row.record() for row in rows],
+        "failed": sum(row.verdict == "fail" for row in rows),
+        "warned": sum(row.verdict == "warn" for row in rows),
+        "exit_code": code,
+    }
+
+
+def _print(rows: Sequence[CheckRow], console: Console) -> None:
+    table = Table("device", "asked", "came", "", box=SIMPLE_HEAD)
+    for row in rows:
+        verdict = f"[{_COLOURS[row.verdict]}]{row.verdict}[/]"
+        table.add_row(row.device, escape(row.asked), escape(row.came), verdict)
+    console.print(table)
+    mend = [row for row in rows if row.mend]
+    for row in mend:
+        say = f"[{_COLOURS[row.verdict]}]{row.verdict}[/] {row.device}, {escape(row.asked)}: {escape(row.mend)}"
+        console.print(say, highlight=False, soft_wrap=True)
+    if not mend:
+        console.print("nothing to mend", highlight=False)
+
+
+def _at(rig: SurveyRig, camera: str) -> SurveyRig:
+    """The rig with the camera at HOST, HOST:PORT or HOST:PORT:FILE_PORT."""
+    host, *ports = camera.split(":")
+    if not host or len(ports) > 2 or not all(port.isdecimal() and 0 < int(port) < 65536 for port in ports):
+        raise SettingsError(f"--camera expects HOST, HOST:PORT or HOST:PORT:FILE_PORT, got {camera!r}")
+    control, files = (*map(int, ports), *(rig.control_port, rig.file_port)[len(ports) :])
+    return replace(rig, host=host, control_port=control, file_port=files)

@@ -1,0 +1,169 @@
+"""What `rig emulate` does and shows: a rig behind a pty and sockets, until it is told to end."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+
+from flows.cli.app import print_json
+from flows.settings.keys import BUILT_IN_SCENES
+from flows.settings.survey_settings import Settings, load_settings
+from flows.simulate.emulated_scene import emulated_source
+from pipeline.errors import SettingsError
+from pipeline.rig.emulator.emulated_rig import EmulatedRig, ServedRig
+from pipeline.rig.emulator.fast_clock import FastClock
+from pipeline.rig.emulator.fault_names import read_faults
+
+EVERY_S = 0.2
+KEPT_CAPTURES = 64
+USUAL_SIZE = (256, 256)  # of a built-in scene [px]
+
+
+@dataclass(frozen=True)
+class EmulateRequest:
+    """What to emulate, and how."""
+
+    settings: Settings
+    faults: tuple[str, ...] = ()
+    baud: int = 115200
+    speed: float = 1.0
+    out: Path | None = None  # a survey's TOML to write
+
+    def check(self) -> None:
+        """Refuse what cannot be, before minutes are spent on the scene.
+
+        Raises
+        ------
+        SettingsError : a fault, a speed or a file that cannot be.
+        """
+        read_faults(self.faults)
+        FastClock(self.speed)
+        if self.baud < 0:
+            raise SettingsError(f"--baud expects bits a second, or 0 for no pace, got {self.baud}")
+        if self.out is not None and not self.out.parent.is_dir():
+            raise SettingsError(f"--out {self.out}: there is no folder {self.out.parent}; make it, or choose another")
+
+
+def emulated_settings(path: Path | None, flags: Mapping[str, object]) -> Settings:
+    """Read the settings of what is emulated; a built-in scene is small where nothing says how large.
+
+    Raises
+    ------
+    SettingsError : a key or a flag cannot be used.
+    """
+    wanted = load_settings(path, flags)
+    small = wanted.scene in BUILT_IN_SCENES and wanted.size is None
+    return replace(wanted, size=USUAL_SIZE) if small else wanted
+
+
+def run_emulate(
+    request: EmulateRequest, console: Console, *, as_json: bool = False, ended: threading.Event | None = None
+) -> int:
+    """Emulate a rig until Ctrl-C, a SIGTERM or ``ended``; how to connect goes to stdout, its state to ``console``.
+
+    Raises
+    ------
+    PipelineError : what was asked for cannot be.
+    """
+    request.check()
+    mirror_faults, camera_faults = read_faults(request.faults)
+    with console.status("drawing the scene"):
+        source, notes = emulated_source(request.settings)
+    for note in notes:
+        console.print(f"[dim]note: {escape(note)}[/]", highlight=False)
+    rig = EmulatedRig(
+        source, FastClock(request.speed), mirror_faults=mirror_faults, camera_faults=camera_faults, kept=KEPT_CAPTURES
+    )
+    with _ending(ended or threading.Event()) as end, rig.serve(baud=request.baud) as served:
+        _tell(request, served, console, as_json=as_json)
+        with console.status(_state(rig)) as line:
+            while not end.wait(EVERY_S):
+                line.update(_state(rig))
+        console.print(f"closed: {_state(rig)}", highlight=False, soft_wrap=True)
+    return 0
+
+
+def _tell(request: EmulateRequest, served: ServedRig, console: Console, *, as_json: bool) -> None:
+    """Say how to connect, and write the file that was asked for."""
+    table = _rig_table(served)
+    if request.out is not None:
+        _write(request.out, _survey_toml(request.settings, table))
+        console.print(f"survey it with: spectralzoom survey {escape(str(request.out))}", highlight=False)
+    if as_json:
+        faults = list(request.faults)
+        print_json({"rig": table, "speed": request.speed, "faults": faults, "toml": request.out and str(request.out)})
+    else:
+        sys.stdout.write(f"{_toml_table('rig', table)}\n")
+    sys.stdout.flush()
+    console.print("emulating a rig; Ctrl-C ends it", highlight=False)
+
+
+def _rig_table(served: ServedRig) -> dict[str, object]:
+    panel = served.rig.camera.view.source.scene.panel
+    return {
+        "port": served.port, "host": served.host, "control_port": served.camera_port, "file_port": served.file_port,
+        "pulses": served.rig.camera.wired, "panel": round(float(panel.mean()), 6), "provenance": "emulated",
+    }  # fmt: skip
+
+
+def _survey_toml(settings: Settings, table: dict[str, object]) -> str:
+    """A survey of the emulated rig: the scene says how large the field is, and what is true there."""
+    size = None if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
+    wanted = {
+        "scene": settings.scene, "size": size, "day": settings.day, "hour": settings.hour, "bands": settings.bands,
+        "wavelengths": settings.wavelengths, "seed": settings.seed, "effects": settings.effects,
+        "tol": str(settings.tol), "source": "rig",
+    }  # fmt: skip
+    given = [f"{key} = {_toml_value(value)}" for key, value in wanted.items() if value is not None]
+    return "\n".join(
+        ["# A survey of an emulated rig, for as long as that runs.", *given, "", _toml_table("rig", table)]
+    )
+
+
+def _toml_table(name: str, values: dict[str, object]) -> str:
+    return "\n".join([f"[{name}]", *(f"{key} = {_toml_value(value)}" for key, value in values.items()), ""])
+
+
+def _toml_value(value: object) -> str:
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return f"[{', '.join(map(_toml_value, value))}]" if isinstance(value, tuple) else str(value)
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise SettingsError(f"cannot write {path}: {error.strerror}; choose another --out") from error
+
+
+def _state(rig: EmulatedRig) -> str:
+    """What both devices do, in a line."""
+    seen = rig.seen()
+    x, y = seen.position
+    last = f", last: {seen.last}" if seen.last else ""
+    camera = "capturing" if seen.capturing else "idle"
+    return escape(f"mirror {x:+.4f}; {y:+.4f}, {seen.mode}{last} | camera {camera}, {seen.captures} captures")
+
+
+@contextmanager
+def _ending(event: threading.Event) -> Iterator[threading.Event]:
+    """Set an event at Ctrl-C and SIGTERM, instead of breaking off."""
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    before = {number: signal.signal(number, lambda *_: event.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield event
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,213 @@
+"""Judging a map by labels: its own accuracy, and what no detail, all detail and other placements would have given.
+
+A stage like the others, but outside the survey's savings: it looks at the whole scene in full and needs labels. Labels
+come with simulated fields alone, which memory holds as well: columns and maps are of the whole field, and the model
+reads it as one region however large it is.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.publish.receipt import to_json
+from flows.survey.effect_choice import source_with
+from flows.survey.full_look import columns_of_all_seats
+from flows.survey.pointing import load_registration
+from flows.survey.run import SurveyRun
+from flows.survey.stages import Produce, digest, glance_at, patch_columns
+from models.controls import CONTROL_SHARE, Controls, run_controls
+from models.inference import CoarseLook, Glance, glance_of_columns, segment
+from models.metrics import agreement, average_accuracy, confusion, false_pixels, gap_closed, iou_per_class, kappa
+from models.policies import score_seats
+from models.second_look import surprise
+from pipeline.grid import UNLABELLED
+from pipeline.planning import price_of_seats
+from pipeline.savings import count_lines
+from pipeline.selection import frame_seats
+from pipeline.simulator.pointing import CommonOffset, PointingErrors
+from pipeline.simulator.simulated import SimulatedSource
+from storage.archive import StageRef
+from storage.class_maps import load_class_map
+from storage.stored_tables import read_table
+
+
+def evaluate(
+    run: SurveyRun,
+    produce: Produce,
+    mosaic: StageRef,
+    patches: StageRef,
+    class_map: StageRef,
+    effects: StageRef,
+    *pointing: StageRef,
+) -> StageRef | None:
+    """Judge the map by the labels, and what other placements would have given. Not part of the survey's own cost.
+
+    What controls see has the effects of the survey.
+    """
+    if not run.scene.labelled or not run.settings.accuracy:
+        return None
+    inputs = [mosaic, patches, class_map, effects, *pointing]
+    _wait_for(inputs)
+    off = _map_offset(run, pointing)
+    labels = _moved(run, off)
+
+    def build(path: Path) -> None:
+        """Judge the map, the coarse look alone, and with controls other placements."""
+        classes = load_class_map(class_map.path / "class_map.zarr").classes
+        judged = np.where(classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # what has no class is not
+        seen = glance_at(run, mosaic)
+        counts = confusion(judged, classes, run.weights.config.classes)
+        result: dict[str, Any] = _figures(run, counts)
+        empty = np.empty((0, run.grid.patch, run.grid.patch, run.weights.basis.columns), np.float32)
+        none = segment(run.weights, seen, empty, np.empty(0, np.int64))
+        result["none"] = _figures(run, confusion(judged, none.classes, run.weights.config.classes))
+        result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
+        if run.settings.controls:
+            source = source_with(_sure_source(run, off), effects)
+            result |= _controls(replace(run, source=source), seen, patches, judged, result)
+        (path / "accuracy.json").write_text(to_json(result), encoding="utf-8")  # no NaN, which JSON does not know
+
+    params = {
+        "weights": run.weights_key,
+        "labels": digest(labels),
+        "controls": run.settings.controls,
+        "kernel": run.settings.kernel,
+        **run.source_key(),
+    }
+    return produce("evaluate", build, params, inputs)
+
+
+def _wait_for(inputs: Sequence[StageRef]) -> None:
+    """Let a plan stop here where a key is not known yet: for its own the labels have to be drawn."""
+    for ref in inputs:
+        _ = ref.key
+
+
+def _map_offset(run: SurveyRun, pointing: Sequence[StageRef]) -> NDArray[np.float64]:
+    """How far the whole map lies beside the scene, (along, scan) px: what the sweep that registration held is off by.
+
+    Overlaps tie sweeps to each other and not to the ground. Only the simulator knows the rest.
+    """
+    errors = run.source.pointing
+    if not isinstance(errors, PointingErrors) or not pointing:
+        return np.zeros(2)
+    return errors.offset(load_registration(pointing[0])["reference"])
+
+
+def _moved(run: SurveyRun, off: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """The labels as the map shows the scene, to the nearest pixel; what it shows beyond them is unlabelled."""
+    labels = run.labels
+    assert labels is not None
+    down, across = np.rint(off[::-1] if run.plan.along == "x" else off).astype(int)
+    rows, columns = (np.arange(size) + by for size, by in zip(labels.shape, (down, across), strict=True))
+    inside = ((rows >= 0) & (rows < labels.shape[0]))[:, None] & ((columns >= 0) & (columns < labels.shape[1]))
+    moved = labels[np.clip(rows, 0, labels.shape[0] - 1)[:, None], np.clip(columns, 0, labels.shape[1] - 1)]
+    return np.where(inside, moved, np.uint8(UNLABELLED))
+
+
+def _sure_source(run: SurveyRun, off: NDArray[np.float64]) -> SimulatedSource:
+    """A mirror that looks as far beside the scene as the map lies, everywhere: controls share the map's pixels."""
+    if run.source.pointing is None:
+        return run.source
+    return replace(run.source, pointing=CommonOffset((float(off[0]), float(off[1]))))
+
+
+def _controls(
+    run: SurveyRun, seen: Glance, patches: StageRef, labels: NDArray[np.uint8], result: dict[str, Any]
+) -> dict[str, Any]:
+    """`all`, the other placements, and how long either reading takes."""
+    columns = columns_of_all_seats(
+        run.source, run.plan.full, run.grid, run.weights,
+        memory=run.settings.memory, kernel=run.settings.kernel, report=lambda done: run.report(0.6 * done),
+    )  # fmt: skip
+    rows = 0
+
+    def report(row: str) -> None:
+        nonlocal rows
+        rows += 1
+        run.report(0.6 + 0.035 * rows)
+
+    controls = run_controls(
+        run.weights, seen, columns, labels, share=CONTROL_SHARE, seed=run.settings.seed, report=report
+    )
+    figures = _figures(run, controls.every)
+    return {
+        "all": figures,
+        "gap_closed": gap_closed(result["miou"], result["none"]["miou"], figures["miou"]),
+        "controls": controls.as_dict(),
+        "controls_mode": _controls_mode(run, seen, controls),
+        "segment_wall_s": _segment_seconds(run, seen, patches, columns),
+    }
+
+
+def _controls_mode(run: SurveyRun, seen: Glance, controls: Controls) -> dict[str, Any]:
+    """What the controls' seats are, and what those of most gain would cost the rig: seats are not lines."""
+    grid, share = run.grid, run.grid.valid_share().ravel()
+    seats = frame_seats(score_seats("gain", seen), controls.share, share > 0).seats
+    fine = share[seats].sum() * grid.patch**2  # samples beside the scene do not count
+    price = price_of_seats(grid, run.camera, run.settings.cost, run.plan.along, seats)
+    coarse_lines, full_lines = count_lines(run.plan.coarse), count_lines(run.plan.full)
+    return {
+        "mode": "frame",
+        "share_of_seats": controls.share,
+        "seats": controls.seats,
+        "share_of_samples": (fine + np.prod(grid.coarse_shape)) / (grid.height * grid.width),
+        "share_of_lines": (coarse_lines + price.lines) / full_lines,
+        "share_of_seconds": (run.plan.coarse_s + price.seconds) / run.plan.full_s,
+    }
+
+
+def _segment_seconds(run: SurveyRun, seen: Glance, patches: StageRef, columns: NDArray[np.float32]) -> dict[str, float]:
+    """Wall time of the model from spectral columns to the map, the better of two each [s].
+
+    As captured: glance, scores and map; of two rounds the second look as well, at all patches, which are more than it
+    had. With every seat there is nothing to choose: the map alone.
+    """
+    (seats, own), settings = patch_columns(run, patches, seen), run.settings
+    valid = run.grid.valid_seats()
+    every, bare = columns[valid], CoarseLook(seen.grid, seen.columns, living=seen.living)  # to be read anew
+    network = None if run.vgg is None else run.vgg.saliency(run.weights)
+
+    def look_choose_draw() -> None:
+        looked = glance_of_columns(run.weights, seen.columns, run.grid)
+        score_seats(settings.policy, looked, seed=settings.seed, mask=run.mask, network=network)
+        if settings.rounds > 1:
+            surprise(run.weights, looked, own, seats)
+        segment(run.weights, looked, own, seats)
+
+    return {
+        "done": min(_seconds(look_choose_draw) for _ in range(2)),
+        "full": min(_seconds(lambda: segment(run.weights, bare, every, valid)) for _ in range(2)),
+    }
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def _figures(run: SurveyRun, counts: NDArray[np.int64]) -> dict[str, Any]:
+    """What is said of a map; every map of a run is judged by the same labels, and so over the same classes."""
+    names = run.weights.class_names
+    false = zip(names, false_pixels(counts).tolist(), strict=True)
+    return {
+        **agreement(counts),
+        "average_accuracy": average_accuracy(counts),
+        "kappa": kappa(counts),
+        "pixels": int(counts.sum()),
+        "per_class_iou": dict(zip(names, iou_per_class(counts).tolist(), strict=True)),
+        "false_classes": {name: pixels for name, pixels in false if pixels},
+    }
+
+
+def load_accuracy(evaluated: StageRef) -> dict[str, Any]:
+    """Read the figures of an evaluation."""
+    return read_table(evaluated.path / "accuracy.json")

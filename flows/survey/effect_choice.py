@@ -1,0 +1,160 @@
+"""The stage that decides which effects of the rig are simulated, and how: probed, decided and verified once, then kept.
+
+Its store is one small table, the manifest: what was computed, what was left out, and why. The captures follow from it,
+and nothing of the scene is drawn to read it. The coarse pass and the scan of everything stand for all sweeps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flows.publish.receipt import to_json
+from flows.settings.survey_settings import plain_value
+from flows.survey.run import CaptureRun
+from pipeline.errors import IncompleteStoreError
+from pipeline.simulator.block import Block
+from pipeline.simulator.chips import candidate_chips, worst_chips
+from pipeline.simulator.choice import Decision, decide
+from pipeline.simulator.effects.effect import Effect, Light
+from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
+from pipeline.simulator.effects.rotation import ROTATION
+from pipeline.simulator.effects.slit import SLIT
+from pipeline.simulator.instrument import sweep_block
+from pipeline.simulator.manifest import list_effects, sum_up
+from pipeline.simulator.probe import Probe
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.simulated import SimulatedSource
+from pipeline.simulator.stored_light import unit_at
+from pipeline.simulator.survey_clock import sweep_starts
+from pipeline.simulator.survey_probe import probe_survey
+from pipeline.simulator.verification import verify
+from storage.archive import StageRef
+from storage.stored_tables import read_table
+
+if TYPE_CHECKING:
+    from flows.survey.stages import Produce
+
+RECORD = "effects.json"
+LOOK = {
+    ROTATION: ROTATION.variants[0],
+    SLIT: SLIT.variants[-1],
+}  # what chips are chosen by: the footprint alone, where lines really lie
+DRAFT, VERIFIED = 0.3, 1.0
+
+
+def choose_effects(run: CaptureRun, produce: Produce) -> StageRef:
+    """Decide for scene and rig which effects to simulate, and check it on the worst chips of the scene.
+
+    Where a rig takes the lines there is nothing to decide.
+
+    Raises
+    ------
+    BoundError : what would be left out changes a chip by more than its bound says.
+    SceneError : the scene holds a number that is not finite.
+    """
+    tolerance, asked = run.settings.tol, run.settings.effects
+
+    if run.rig is not None:
+        return produce("effects", _write_nothing, {"source": run.source.name}, [])
+
+    def build(path: Path) -> None:
+        rig = run.settings.simulated_rig
+        probes = probe_survey(run.scene, rig, run.planned, tolerance.unit)
+        decision = decide(probes, rig, EFFECTS, tolerance.value, asked)
+        run.report(DRAFT)
+        measured = _verified(run, decision, probes)
+        manifest = {"effects": list_effects(decision, measured), "total": sum_up(decision, measured)}
+        (path / RECORD).write_text(to_json(manifest), encoding="utf-8")
+        run.report(VERIFIED)
+
+    params = {
+        "scene": run.scene.key,
+        "seed": run.settings.seed,  # of what is drawn for the chips
+        "asked": asked,
+        "tol": str(tolerance),
+        "camera": asdict(run.camera),
+        "rig": rig_table(run.settings.simulated_rig),
+        "sweeps": [asdict(sweep) for sweep in run.planned],
+    }
+    return produce("effects", build, params, [])
+
+
+def _write_nothing(path: Path) -> None:
+    """The manifest of a rig, of which nothing is simulated."""
+    (path / RECORD).write_text(to_json({"effects": [], "total": None}), encoding="utf-8")
+
+
+def rig_table(rig: Rig) -> dict[str, Any]:
+    """What a rig is like beyond its camera, as plain tables."""
+    table = {name: plain_value(part) for name, part in asdict(rig).items()}
+    return {name: part for name, part in table.items() if name != "camera"}
+
+
+def load_manifest(effects: StageRef) -> dict[str, Any]:
+    """Read what was decided: ``effects``, a row for each, and ``total``."""
+    return read_table(effects.path / RECORD)
+
+
+def chosen_effects(effects: StageRef) -> dict[Effect, str]:
+    """Read the effects that are on with their variants, in the order of the chain.
+
+    Raises
+    ------
+    IncompleteStoreError : the store names an effect that this version does not know.
+    """
+    chosen: dict[Effect, str] = {}
+    for row in load_manifest(effects)["effects"]:
+        if row["state"] != "on":
+            continue
+        if row["name"] not in BY_NAME or row["variant"] not in BY_NAME[row["name"]].variants:
+            raise IncompleteStoreError(
+                f"{effects.uri} has the effect {row['name']}, {row['variant']}, which this version does not know;"
+                " discard the store to have it made again"
+            )
+        chosen[BY_NAME[row["name"]]] = row["variant"]
+    return chosen
+
+
+def source_with(
+    source: SimulatedSource, effects: StageRef, clock: Mapping[str, float] | None = None
+) -> SimulatedSource:
+    """Give the source with the effects that were decided; ``clock`` says when its sweeps start, by name [s]."""
+    return replace(source, chosen=chosen_effects(effects), clock=clock)
+
+
+def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> dict[str, float]:
+    """Measure what is left out on the worst chips of the scene, in the unit of the tolerance."""
+    scene, rig = run.scene, run.settings.simulated_rig
+
+    def units(light: Light, binning: int) -> Light:
+        return unit_at(light, rig, decision.unit, binning)
+
+    renders = 0
+
+    def render(block: Block, chosen: Mapping[Effect, str]) -> Light:
+        nonlocal renders
+        renders += 1
+        run.report(DRAFT + (VERIFIED - DRAFT) * renders / (renders + len(EFFECTS)))  # how many there will be is open
+        return expected_light(scene, block, chosen)
+
+    whole = _whole_sweeps(run)
+    candidates = [
+        chip
+        for probe in probes
+        for chip in candidate_chips([one for one in whole if one.sweep in probe.sweeps], probe.places)
+    ]
+    worst = worst_chips(candidates, lambda block: expected_light(scene, block, LOOK), units)
+    return verify(decision, render, worst, units)
+
+
+def _whole_sweeps(run: CaptureRun) -> list[Block]:
+    """Every sweep as one block, each after those before it."""
+    scene, rig, clock = run.scene, run.settings.simulated_rig, sweep_starts(run.planned, run.camera, run.settings.cost)
+    return [
+        sweep_block(scene, rig, sweep, range(sweep.lines), seed=run.settings.seed, started_s=clock[sweep.name])
+        for sweep in run.planned
+    ]

@@ -1,0 +1,79 @@
+"""The stage that draws a posed survey on the ground: class map, confidence and picture on a map, and hectares."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.publish.colour_stretch import choose_bands, develop, stretch
+from flows.survey.run import SurveyRun
+from flows.survey.stages import Produce
+from pipeline.ground import GroundView
+from pipeline.ground_grid import GroundGrid, classes_at, ground_grid, image_at, map_blocks
+from storage.archive import StageRef
+from storage.class_maps import ClassMap, load_class_map
+from storage.ground_maps import BLOCK, ClassLegend, GroundMapWriter
+from storage.layout import SHARD_ROWS, open_group, read_array, read_bands
+
+STORE = "ground_map.zarr"
+
+
+def ground(run: SurveyRun, produce: Produce, class_map: StageRef, mosaic: StageRef) -> StageRef | None:
+    """Draw the class map and the coarse picture on the ground; nothing where the settings have no pose."""
+    grid = survey_grid(run)
+    if grid is None:
+        return None
+    pose, choice = run.settings.pose, run.settings.map
+
+    def build(path: Path) -> None:
+        found = load_class_map(class_map.path / "class_map.zarr")
+        colours = coarse_colours(mosaic)
+        about = {"rig_pose": asdict(grid.frame.view.pose), "scene_pixels": grid.counts()}
+        writer = GroundMapWriter(path / STORE, grid.geobox, ClassLegend(found.names, found.colours), about=about)
+        for rows, columns in map_blocks(grid.shape, BLOCK):
+            writer.write_block(rows, columns, *_draw_block(grid, found, colours, run.grid.factor, (rows, columns)))
+            run.report(rows.stop / grid.shape[0])
+        writer.finish(grid.class_areas_m2(found.classes, len(found.names)))
+
+    params = {
+        "pose": None if pose is None else asdict(pose),
+        "map": asdict(choice),
+        "ifov_rad": run.camera.ifov_rad,
+        "scene_shape": run.scene.shape,
+        "factor": run.grid.factor,
+    }
+    return produce("ground", build, params, [class_map, mosaic])
+
+
+def survey_grid(run: SurveyRun) -> GroundGrid | None:
+    """The map's grid that the settings ask for, None without a pose. Raises PoseError where there can be none."""
+    pose, choice = run.settings.pose, run.settings.map
+    if pose is None:
+        return None
+    view = GroundView(pose, run.camera.ifov_rad)
+    return ground_grid(view, run.scene.shape, epsg=choice.epsg, resolution_m=choice.resolution_m)
+
+
+def coarse_colours(mosaic: StageRef) -> NDArray[np.float32]:
+    """Three bands of the coarse mosaic in a photograph's tones, (y, x, 3) in 1..255; NaN where nothing was captured."""
+    group = open_group(mosaic.path / "mosaic.zarr")
+    bands, words = choose_bands(read_bands(group)[0])
+    height = len(read_array(group, "coverage"))
+    rows = (slice(first, min(first + SHARD_ROWS, height)) for first in range(0, height, SHARD_ROWS))
+    values = np.concatenate([read_array(group, "values", block)[..., list(bands)] for block in rows])
+    tones = develop(values, values) if words.startswith("true colour") else stretch(values)
+    picture: NDArray[np.float32] = np.where(np.isfinite(values), 1 + 254 * tones, np.nan).astype(np.float32)
+    return picture
+
+
+def _draw_block(
+    grid: GroundGrid, found: ClassMap, colours: NDArray[np.float32], factor: int, place: tuple[slice, slice]
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
+    """Classes (nearest), confidence and picture (bilinear) of one block of the map; what is not seen is 255, NaN, 0."""
+    pixels = grid.scene_pixels(*place)
+    confidence = image_at(found.confidence[..., None], pixels)[..., 0]
+    picture = image_at(colours, pixels, factor=factor)
+    return classes_at(found.classes, pixels), confidence, np.nan_to_num(np.rint(picture)).astype(np.uint8)

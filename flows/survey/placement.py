@@ -1,0 +1,209 @@
+"""Where the lines of a capture lie, and what they show on the grid: registration, lookup, mosaic, patches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.survey.rectify_ahead import begin_mosaic, drop_ahead, mosaic_picture, take_mosaic
+from flows.survey.run import SurveyRun
+from flows.survey.stages import SEATS_AT_ONCE, VERSIONS, Produce, captured, load_plan, write_json
+from pipeline.errors import ShapeError
+from pipeline.rectify.line_cache import LineCache
+from pipeline.rectify.placed import PixelGrid
+from pipeline.rectify.region import read_seats
+from pipeline.rectify.ties import TieTable
+from pipeline.rectify.tracks import Track
+from storage.archive import StageRef
+from storage.layout import read_array
+from storage.lookups import path_digest, write_lookup
+from storage.mosaics import MosaicWriter
+from storage.patches import PatchStore, PatchWriter, open_patches
+from storage.quicklooks import stretched
+from storage.sightings import Sighted, sight_sweeps
+from storage.stored_tables import read_table
+from storage.tile_work import MosaicRecipe, write_mosaic
+
+CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the memory
+
+
+def sighted(run: SurveyRun, raw: StageRef, registration: StageRef | None) -> list[Sighted]:
+    """Open the sweeps of a capture with what registration found of them."""
+    return sight_sweeps(captured(raw), _record(registration), run.camera)
+
+
+def _record(registration: StageRef | None) -> Path | None:
+    return None if registration is None else registration.path / "registration.json"
+
+
+def locate(run: SurveyRun, produce: Produce, raw: StageRef, *registration: StageRef) -> StageRef:
+    """Look up where each coarse pixel was seen: a table that every survey along the same path shares."""
+    grid = PixelGrid.of_scene(run.grid, run.grid.factor)
+    sweeps = sighted(run, raw, _only(registration))
+    camera = {name: getattr(run.camera, name) for name in ("samples", "pitch_um", "focal_length_mm")}
+    params = {
+        "camera": camera,
+        "grid": asdict(grid),
+        "paths": {
+            one.cube.sweep.name: {
+                "path": path_digest(one.cube.position, one.usable, one.shift_px),
+                **{name: getattr(one.cube.sweep, name) for name in ("along", "step", "binning")},
+            }
+            for one in sweeps
+        },
+    }
+
+    def build(path: Path) -> None:
+        tables: dict[str, list[tuple[Track, TieTable]]] = {}
+        for number, one in enumerate(sweeps):
+            made = one.placed(run.camera, grid).tracks
+            whole = [(track, table) for track, table in made if table is not None]
+            # Where lines lie too unevenly for ties there is nothing to keep: such a sweep is looked up directly.
+            tables[one.cube.sweep.name] = whole if len(whole) == len(made) else []
+            run.report((number + 1) / len(sweeps))
+        write_lookup(path / "lookup.zarr", tables, params)
+
+    return produce("locate", build, params, [])  # keyed by the paths, not by what was seen along them
+
+
+def rectify(run: SurveyRun, produce: Produce, raw: StageRef, lookup: StageRef, *registration: StageRef) -> StageRef:
+    """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
+
+    def build(path: Path) -> None:
+        """Make the tiles that were not made while lines arrived, and the picture."""
+        grid = PixelGrid.of_scene(run.grid, run.grid.factor)
+        recipe = MosaicRecipe(
+            raw.path, run.camera, grid, run.settings.kernel,
+            lookup=lookup.path / "lookup.zarr", registration=_record(_only(registration)),
+        )  # fmt: skip
+        out, settings, picture = path / "mosaic.zarr", run.settings, mosaic_picture(run)
+        there = take_mosaic(run, VERSIONS["rectify"], raw, out, recipe.sweeps(), picture)
+        writer = MosaicWriter.reopen(out) if there else begin_mosaic(run, out, captured(raw)[0].simulation)
+        write_mosaic(
+            recipe, writer, memory=settings.memory, crew=settings.crew, seen=picture, there=there, report=run.report
+        )
+        writer.write_quicklook(stretched(picture.image).image)
+        write_json(path / "lines.json", {one.cube.sweep.name: one.facts() for one in recipe.sweeps()})
+
+    params = {"grid": asdict(run.grid), "kernel": run.settings.kernel}
+    ref = produce("rectify", build, params, [raw, lookup, *registration])
+    drop_ahead(run, raw)
+    return ref
+
+
+def cut_patches(
+    run: SurveyRun, produce: Produce, attention: StageRef, raw: StageRef, *registration: StageRef
+) -> StageRef:
+    """Bring every chosen seat onto the scene grid, one patch a seat; NaN where a mirror off the plan did not look."""
+
+    def build(path: Path) -> None:
+        """Read the seats in the order in which lines show them."""
+        ordered = _along_scan(run, load_plan(attention).seats)
+        writer = PatchWriter(
+            path / "patches.zarr", ordered, run.grid.seat_origin(ordered), run.grid.patch,
+            run.scene.wavelength_nm, fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(),
+        )  # fmt: skip
+        sweeps = [one.placed(run.camera) for one in sighted(run, raw, _only(registration))]
+        cache = LineCache(run.settings.memory // CACHE_SHARE)
+        for first in range(0, len(ordered), SEATS_AT_ONCE):
+            seats = ordered[first : first + SEATS_AT_ONCE]
+            writer.write(first, *read_seats(sweeps, run.camera, run.grid, seats, run.settings.kernel, cache=cache))
+            run.report((first + len(seats)) / len(ordered))
+
+    params = {"grid": asdict(run.grid), "kernel": run.settings.kernel}
+    return produce("patches", build, params, [attention, raw, *registration])
+
+
+def cut_again(
+    run: SurveyRun, produce: Produce, attention: StageRef, raw: StageRef, patches: StageRef, *registration: StageRef
+) -> StageRef:
+    """Bring the seats of the second round onto the grid and store them with those of the first.
+
+    A pixel that the first round saw keeps its value; what a mirror off the plan left unseen is filled in.
+    """
+
+    def build(path: Path) -> None:
+        """Read the seats of this round, and put those of the first beside them."""
+        kept, wanted = _Kept.of(patches), load_plan(attention).seats
+        ordered = _along_scan(run, np.union1d(kept.store.seats, wanted))
+        bands, patch = run.scene.wavelength_nm, run.grid.patch
+        writer = PatchWriter(
+            path / "patches.zarr", ordered, run.grid.seat_origin(ordered), patch,
+            bands, fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(),
+        )  # fmt: skip
+        sweeps = [one.placed(run.camera) for one in sighted(run, raw, _only(registration))]
+        cache = LineCache(run.settings.memory // CACHE_SHARE)
+        for first in range(0, len(ordered), SEATS_AT_ONCE):
+            seats = ordered[first : first + SEATS_AT_ONCE]
+            values, valid = kept.read(seats, len(bands), patch)
+            new = np.flatnonzero(np.isin(seats, wanted))
+            if len(new):
+                seen = read_seats(sweeps, run.camera, run.grid, seats[new], run.settings.kernel, cache=cache)
+                _fill(values, valid, new, *seen)
+            writer.write(first, values, valid)
+            run.report((first + len(seats)) / len(ordered))
+
+    params: dict[str, Any] = {"round": 2, "kernel": run.settings.kernel}
+    return produce("patches", build, params, [attention, raw, patches, *registration])
+
+
+def _fill(
+    values: NDArray[np.float32], valid: NDArray[np.bool_], at: NDArray[np.intp],
+    seen: NDArray[np.floating], there: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    """Put what the second round saw where the first saw nothing, in place."""
+    missing = ~valid[at]
+    values[at] = np.where(missing[..., None], seen, values[at])
+    valid[at] |= there
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """Patches of the first round, by seat."""
+
+    store: PatchStore
+    valid: NDArray[np.bool_]  # (patch, y, x)
+
+    @staticmethod
+    def of(patches: StageRef) -> _Kept:
+        store = open_patches(patches.path / "patches.zarr")
+        return _Kept(store, read_array(store.group, "valid"))
+
+    def read(self, seats: NDArray[np.integer], bands: int, patch: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Values (seat, y, x, band) and validity of seats in the order of the store; NaN where there is none."""
+        values = np.full((len(seats), patch, patch, bands), np.nan, np.float32)
+        valid = np.zeros(values.shape[:3], np.bool_)
+        order, there = np.argsort(self.store.seats, kind="stable"), np.isin(seats, self.store.seats)
+        entries = order[np.searchsorted(self.store.seats[order], seats[there])]
+        values[there], valid[there] = self.store.pick(entries), self.valid[entries]
+        return values, valid
+
+
+def seen_shares(run: SurveyRun, patches: StageRef) -> NDArray[np.float64]:
+    """How much of each patch was seen, (patch,) 0..1 of its pixels on the scene."""
+    store = open_patches(patches.path / "patches.zarr")
+    seen: NDArray[np.float64] = read_array(store.group, "valid").mean(axis=(1, 2))
+    return seen / run.grid.valid_share().ravel()[store.seats]
+
+
+def _along_scan(run: SurveyRun, seats: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Seats in the order in which the sweeps pass them, so that a few of them need few lines at a time."""
+    row, column = np.divmod(seats, run.grid.seat_shape[1])
+    return seats[np.lexsort((column, row) if run.plan.along == "x" else (row, column))]
+
+
+def _only(registration: Sequence[StageRef]) -> StageRef | None:
+    """The registration where there is one."""
+    if len(registration) > 1:
+        raise ShapeError(f"expected one registration or none, got {len(registration)}")
+    return registration[0] if registration else None
+
+
+def line_facts(mosaic: StageRef) -> dict[str, dict[str, Any]]:
+    """Read, by sweep, how many lines were lost, repeated, out of order, late or invalid."""
+    return read_table(mosaic.path / "lines.json")

@@ -1,0 +1,237 @@
+"""One survey's context: scene, source, weights, grid and archive, opened and checked before anything runs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.settings.keys import BUILT_IN_SCENES
+from flows.settings.survey_settings import Settings
+from flows.survey.capture_plan import CapturePlan, check_memory, plan_capture
+from flows.survey.rig_run import for_rig, rig_source
+from flows.survey.scene import check_labels, check_mask, farm_refusal, judged_labels, open_scene
+from models.vgg_file import VggFile
+from models.weights import (
+    Description,
+    Weights,
+    check_two_scale,
+    content_key,
+    describe_weights,
+    load_weights,
+    unsealed_note,
+)
+from pipeline.camera import LineCamera
+from pipeline.errors import SettingsError, WeightsError
+from pipeline.grid import SceneGrid
+from pipeline.ground import GroundView
+from pipeline.ground_grid import ground_grid
+from pipeline.once import Once
+from pipeline.scan import Sweep
+from pipeline.simulator.pointing import PointingErrors
+from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.simulated import SimulatedSource
+from storage.archive import Archive
+from storage.layout import AngularGrid
+from storage.raster_files import load_raster
+
+if TYPE_CHECKING:
+    from pipeline.rig.rig_source import RigSource
+
+SHIPPED = "farm.safetensors"
+
+Report = Callable[[float], None]  # how far a stage is, 0..1
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureRun:
+    """What deciding on effects and capturing need to know."""
+
+    settings: Settings
+    archive: Archive
+    source: SimulatedSource  # without effects: which there are is a stage's to decide
+    scene: RasterScene
+    planned: tuple[Sweep, ...]  # that stand for all the rig may take: the coarse pass and the scan of everything
+    report: Report = field(default=lambda done: None)
+    rig: RigSource | None = None  # takes the lines, where one does; then ``source`` only stands for their plan
+
+    @property
+    def camera(self) -> LineCamera:
+        """The camera of the settings."""
+        return self.settings.camera
+
+    @property
+    def name(self) -> str:
+        """What the survey is called: its field, or its scene."""
+        return self.settings.name or Path(self.scene.name).stem
+
+    def source_key(self) -> dict[str, Any]:
+        """What the captured light depends on, beside the sweeps and the effects."""
+        return {
+            "source": self.source.name,
+            "scene": self.scene.key,
+            "seed": self.settings.seed,
+            "camera": asdict(self.camera),
+            "pointing_px": self.settings.pointing_px,
+            **({} if self.settings.visit is None else {"visit": self.settings.visit}),
+            **({} if self.rig is None else {"field": self.name}),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurveyRun(CaptureRun):
+    """Everything a stage may look at. Made by `open_run`, which refuses what cannot work."""
+
+    described: Description  # what the weights say of themselves
+    load: Once[Weights]
+    weights_key: str
+    grid: SceneGrid
+    plan: CapturePlan
+    notes: tuple[str, ...] = ()
+    refused: str | None = None  # why this machine would refuse the survey; it is planned nevertheless
+
+    @property
+    def weights(self) -> Weights:
+        """The weights, read when they are first asked for."""
+        return self.load()
+
+    @cached_property
+    def labels(self) -> NDArray[np.uint8] | None:
+        """What to judge by, (y, x) in the weights' classes: trained pixels taken out. Draws the scene."""
+        return judged_labels(self.scene, self.described)
+
+    @cached_property
+    def mask(self) -> NDArray[np.generic] | None:
+        """The mask of policy ``mask``, (y, x) or (y, x, channel)."""
+        return None if self.settings.mask is None else load_raster(self.settings.mask, dims=2).values
+
+    @cached_property
+    def vgg(self) -> VggFile | None:
+        """VGG19 for the policies ``vgg-static`` and ``vgg-trained``."""
+        return _vgg_file(self.settings)
+
+    def angular_grid(self, factor: int = 1) -> AngularGrid:
+        """Where pixels of ``factor`` fine px lie."""
+        return AngularGrid(self.camera.ifov_rad, self.scene.shape, factor)
+
+
+def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
+    """Open everything that a survey needs; the archive last, so that bad input leaves no trace of itself.
+
+    With ``planning`` a scene that this machine cannot hold is no error: ``refused`` of the run says so.
+
+    Raises
+    ------
+    PipelineError : the first thing that cannot be used; see `pipeline.errors` for the kinds.
+    """
+    settings = for_rig(settings)
+    path = weights_path(settings)
+    described, load = describe_weights(path), Once(lambda: load_weights(path))
+    check_two_scale(described.config, path)
+    if not planning:
+        load()  # refuses tensors that do not fit
+    refused = farm_refusal(settings)
+    if refused is not None and not planning:
+        raise SettingsError(refused)
+    scene, notes = open_scene(settings)
+    if not planning:  # what the rig would find there: no stage's work
+        scene.raster.drawn()
+        scene.light()
+    label_notes = check_labels(scene, described)
+    grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
+    plan = plan_capture(settings, grid)
+    band_notes = _check_bands(scene, described, path)
+    if settings.mask is not None:
+        check_mask(settings.mask, scene.shape)
+    sealing = () if described.sealed else (unsealed_note(path),)
+    vgg_notes = _check_vgg(settings, None if planning else load)
+    source = make_source(scene, settings)
+    rig = rig_source(scene, settings) if settings.source == "rig" else None
+    check_memory(settings, source, grid, plan)
+    _check_pose(settings, scene.shape)
+    key = content_key(path)
+    return SurveyRun(
+        settings=settings, archive=Archive.open(settings.out), source=source, rig=rig, scene=scene,
+        planned=(*plan.coarse, *plan.full), described=described, load=load, weights_key=key, grid=grid, plan=plan,
+        notes=(*notes, *sealing, *band_notes, *vgg_notes, *label_notes), refused=refused,
+    )  # fmt: skip
+
+
+def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
+    """Give the simulated rig before a scene, with no effect on: `flows.survey.effect_choice` decides on them.
+
+    Where a rig takes the lines it stands for the plan of them alone: sizes, paths and memory.
+    """
+    pointing = _pointing(settings) if settings.source == "sim" else None
+    return SimulatedSource(scene, settings.simulated_rig, settings.seed, {}, name=settings.source, pointing=pointing)
+
+
+def _vgg_file(settings: Settings) -> VggFile | None:
+    if settings.vgg is None:
+        return None
+    return VggFile.found(Path(settings.vgg), trained=settings.policy == "vgg-trained")
+
+
+def _check_vgg(settings: Settings, load: Once[Weights] | None) -> tuple[str, ...]:
+    """Refuse a VGG19 that does not go with the weights (without these: one that is not there); say what was taken."""
+    file = _vgg_file(settings)
+    if file is None or load is None:
+        return ()
+    file.saliency(load())
+    return (f"VGG19 from {file.path.name}: {file.report()}",)
+
+
+def _pointing(settings: Settings) -> PointingErrors | None:
+    """What the simulated mirror gets wrong, where the settings allow it to: nothing otherwise."""
+    if not settings.pointing_px:
+        return None
+    return PointingErrors(offset_px=settings.pointing_px, jitter_px=0.0, seed=settings.seed)
+
+
+def _check_pose(settings: Settings, shape: tuple[int, int]) -> None:
+    """Refuse a pose from which there is no ground to map, before anything is captured."""
+    if settings.pose is not None:
+        view = GroundView(settings.pose, settings.camera.ifov_rad)
+        ground_grid(view, shape, epsg=settings.map.epsg, resolution_m=settings.map.resolution_m)
+
+
+def weights_path(settings: Settings) -> Path:
+    """Where the weights of a survey lie: those that come with the house for its own scenes.
+
+    Raises
+    ------
+    SettingsError : none were given for a scene of one's own.
+    """
+    if settings.weights is not None:
+        return Path(settings.weights)
+    if settings.scene not in BUILT_IN_SCENES:
+        raise SettingsError(
+            f"--weights is missing: the weights that come with SpectralZoom know the built-in farm only;"
+            f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
+        )
+    return Path(str(resources.files("models") / "shipped" / SHIPPED))
+
+
+def _check_bands(scene: RasterScene, weights: Description, path: Path) -> tuple[str, ...]:
+    _, reached = weights.basis.matrix(scene.wavelength_nm)
+    if not reached.any():
+        low, high = weights.basis.low_nm, weights.basis.high_nm
+        raise WeightsError(
+            f"the weights {path.name} are for {low:.0f}-{high:.0f} nm; the scene's bands lie at"
+            f" {scene.wavelength_nm.min():.0f}-{scene.wavelength_nm.max():.0f} nm: use weights trained on such data"
+        )
+    if reached.all():
+        return ()
+    return (f"the bands reach {reached.sum()} of the weights' {len(reached)} spectral columns: expect a poorer map",)
+
+
+def now() -> str:
+    """The time in ISO 8601, UTC."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())

@@ -1,0 +1,152 @@
+"""What a survey looks at: its scene, opened by the settings, with the labels and the mask that lie on its pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, timedelta
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.settings.keys import BUILT_IN_SCENES, RIG_FIELD
+from flows.settings.survey_settings import Settings
+from flows.survey.rig_run import field_before_rig
+from flows.training.data import scene_of_file, unpack_mask
+from models.weights import Description
+from pipeline.errors import SceneError, SettingsError
+from pipeline.grid import UNLABELLED
+from pipeline.once import Once
+from pipeline.simulator.farm_laws import FARM_SHAPE, built_in_farm, law_of_key
+from pipeline.simulator.raster import Light
+from pipeline.simulator.scene import RasterScene
+from storage.declared_sizes import machine_bytes
+from storage.raster_files import load_raster
+from storage.scene_files import load_scene_file
+
+# Peak of a survey of farm@2 without controls: 1.58 GB for 1280 x 1024 px, 4.12 GB for 2560 x 2560 px
+FARM_BYTES, FARM_BYTES_PER_PX = 1_000_000_000, 490
+SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and whoever rounds it [h]
+
+
+def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
+    """Open the settings' scene, and say what was assumed of it.
+
+    Raises
+    ------
+    SceneError, WavelengthError : the file cannot be used.
+    SettingsError : what was given does not go with a built-in scene.
+    """
+    if settings.scene == RIG_FIELD:
+        return field_before_rig(settings), ()
+    if settings.scene in BUILT_IN_SCENES:
+        return _open_farm(settings), _notes_of_moment(settings)
+    file = load_scene_file(
+        settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths
+    )
+    scene = scene_of_file(file, settings.camera)
+    return scene, (*file.provenance, *_gap_note(scene))
+
+
+def _gap_note(scene: RasterScene) -> tuple[str, ...]:
+    """What became of pixels that came without a value."""
+    if not scene.filled_px:
+        return ()
+    void = 0 if scene.missing is None else int(np.count_nonzero(scene.missing))
+    unclassed = f"; {void} without most of their bands have no class in the map" if void else ""
+    return (f"{scene.filled_px} pixels without a value were given their band's median{unclassed}",)
+
+
+def _open_farm(settings: Settings) -> RasterScene:
+    for name, value in {"labels": settings.labels, "wavelengths": settings.wavelengths}.items():
+        if value is not None:
+            raise SettingsError(f"--{name} is for scene files; the scene '{settings.scene}' brings its own")
+    farm = built_in_farm(
+        settings.scene, settings.seed, settings.shape or FARM_SHAPE,
+        camera=settings.camera, day=settings.day, hour=settings.hour,
+    )  # fmt: skip
+    return farm if settings.bands is None else _some_bands(farm, settings.bands)
+
+
+def _notes_of_moment(settings: Settings) -> tuple[str, ...]:
+    """Say where plants and shadows are not those of the moment at which the sky's light begins."""
+    started, moment = settings.sky.started, settings.moment
+    if started is None or moment is None:
+        return ()
+    sun = started.astimezone(UTC) + timedelta(hours=settings.sky.longitude_deg / 15)
+    day, hour = moment
+    at = sun.hour + sun.minute / 60
+    if day == sun.timetuple().tm_yday and abs(hour - at) < SAME_HOUR:
+        return ()
+    return (
+        f"plants and shadows are of day {day}, {hour:g} h, while the light drifts as from sky.started, day "
+        f"{sun.timetuple().tm_yday}, {at:.1f} h solar time",
+    )
+
+
+def farm_refusal(settings: Settings) -> str | None:
+    """Why this machine cannot hold the farm of the settings, before it tries; None where it can."""
+    if settings.scene not in BUILT_IN_SCENES or settings.shape is None:
+        return None
+    height, width = settings.shape
+    needed = FARM_BYTES + height * width * FARM_BYTES_PER_PX
+    there = machine_bytes()
+    if needed <= there:
+        return None
+    return (
+        f"--size {width}x{height}: a survey of such a farm takes about {needed / 1e9:.0f} GB of memory,"
+        f" this machine has {there / 1e9:.0f}; take a smaller one"
+    )
+
+
+def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
+    """The same field seen by a camera with some of the bands."""
+    count, chosen = len(scene.wavelength_nm), list(bands)
+    if not all(0 <= band < count for band in bands):
+        raise SettingsError(f"--bands {','.join(map(str, bands))}: the built-in farm has bands 0 to {count - 1}")
+    return replace(
+        scene,
+        key=f"{scene.key}/only={','.join(map(str, bands))}",
+        light=Once(lambda: Light(scene.electrons[:, chosen], scene.panel_electrons[chosen])),
+        panel=scene.panel[chosen],
+        wavelength_nm=scene.wavelength_nm[chosen],
+        fwhm_nm=None if scene.fwhm_nm is None else scene.fwhm_nm[chosen],
+    )
+
+
+def check_mask(mask: str, shape: tuple[int, int]) -> None:
+    """Refuse a mask file that is no image of this (y, x) size (SceneError)."""
+    values = load_raster(mask, dims=2).values
+    if values.shape[:2] != shape:
+        raise SceneError(f"--mask {mask} is {values.shape[:2]} px (y, x), the scene is {shape}; give one of its size")
+
+
+def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
+    """Refuse labels of classes that the weights do not know (SceneError); say what judging by the others is worth."""
+    if not scene.labelled:
+        return ()
+    missing = [name for name in scene.class_names if name not in weights.class_names]
+    if missing:
+        known = ", ".join(weights.class_names)
+        raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; use weights for these")
+    law, learnt = law_of_key(scene.key), law_of_key(str(weights.record.get("data")))
+    if None not in (law, learnt) and law != learnt:
+        return (f"the weights were trained on {learnt}, the scene is of {law}: expect a poorer map",)
+    split = weights.record.get("split", {})
+    if scene.key in split.get("pixels", {}):
+        return ("accuracy is counted on the labelled pixels that the weights were not trained on",)
+    if scene.key in split.get("train", {}).values():
+        return ("the weights were trained on this scene: its accuracy says nothing of other fields",)
+    return ()
+
+
+def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8] | None:
+    """Labels in the order of the weights' classes, without the pixels that the weights were trained on."""
+    if scene.labels is None:
+        return None
+    order = np.full(256, UNLABELLED, np.uint8)
+    order[: len(scene.class_names)] = [weights.class_names.index(name) for name in scene.class_names]
+    labels = order[scene.labels]
+    trained = weights.record.get("split", {}).get("pixels", {}).get(scene.key)
+    if trained is not None:
+        labels[unpack_mask(trained, scene.shape)] = UNLABELLED
+    return labels

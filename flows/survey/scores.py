@@ -1,0 +1,103 @@
+"""How good the map of a run is, read from its receipt: scores that may be compared, the worst class, false classes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from flows.terminal.figures import format_count, format_points
+
+SHOWN = "of shown"  # the column of the mean by the definition of before
+SHOWN_WORDS = f"{SHOWN.capitalize()}: the mean over all classes that truth or map show, as before."
+MAPS = {"this survey": None, "none": "none", "all": "all"}  # as they are called; where a receipt's accuracy has them
+
+
+class WorstClass(NamedTuple):
+    """The class of the truth that this map shows worst, and its IoU in the three maps; None for one not judged."""
+
+    name: str
+    none: float | None
+    this: float
+    all: float | None
+
+
+def score_of(receipt: Mapping[str, Any]) -> dict[str, float | None]:
+    """``miou`` and ``overall_accuracy`` of a run's map, 0..1; None where nothing was judged or it cannot be told.
+
+    Receipts of before hold the mean over the classes that map or truth show. Theirs is worked out anew from the IoU of
+    each class, so that runs of any age may be compared: a class that any of the three maps has right is in the truth,
+    one that neither the truth nor some map shows is not. Where a class is 0 in all maps nobody knows, and there is
+    no score.
+    """
+    accuracy = receipt.get("accuracy")
+    if not isinstance(accuracy, Mapping):
+        return {"miou": None, "overall_accuracy": None}
+    miou = _number(accuracy.get("miou")) if "miou_of_shown_classes" in accuracy else _miou_of_before(accuracy)
+    return {"miou": miou, "overall_accuracy": _number(accuracy.get("overall_accuracy"))}
+
+
+def _miou_of_before(accuracy: Mapping[str, Any]) -> float | None:
+    maps = [by_class for by_class in map(_by_class, judged_maps(accuracy).values()) if by_class]
+    if not maps:
+        return None
+    known: list[float] = []
+    for name, iou in maps[0].items():
+        each = [by_class.get(name) for by_class in maps]
+        if any(each):
+            known.append(iou or 0.0)
+        elif None not in each:
+            return None  # never right and never absent: the truth may have it or not
+    return sum(known) / len(known) if known else None
+
+
+def judged_maps(accuracy: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """This map, `none` and, where it was judged, `all`, under the names that readers see."""
+    found = {name: accuracy if key is None else accuracy.get(key) for name, key in MAPS.items()}
+    return {name: one for name, one in found.items() if isinstance(one, Mapping) and _by_class(one)}
+
+
+def _by_class(one: Mapping[str, Any]) -> dict[str, float | None]:
+    table = one.get("per_class_iou")
+    return {str(name): _number(iou) for name, iou in table.items()} if isinstance(table, Mapping) else {}
+
+
+def worst_class(accuracy: Mapping[str, Any]) -> WorstClass | None:
+    """The class of the truth with the lowest IoU in this map; None where no class was judged."""
+    this, none, every = (_by_class(one or {}) for one in (accuracy, accuracy.get("none"), accuracy.get("all")))
+    known = {name: iou for name, iou in this.items() if iou is not None}
+    if not known:
+        return None
+    name = min(known, key=lambda name: known[name])
+    return WorstClass(name, none.get(name), known[name], every.get(name))
+
+
+def worst_class_words(accuracy: Mapping[str, Any]) -> str:
+    """The worst class in a sentence; empty where there is none."""
+    worst = worst_class(accuracy)
+    if worst is None:
+        return ""
+    full = "" if worst.all is None else f", detail everywhere {format_points(worst.all)}"
+    return (
+        f"Its worst class is {worst.name.replace('_', ' ')} with {format_points(worst.this)}: the coarse look alone "
+        f"gives {format_points(worst.none)}{full}."
+    )
+
+
+def false_class_words(accuracy: Mapping[str, Any]) -> str:
+    """Classes that a map shows and the truth lacks, with their pixels; empty where there are none."""
+    told = []
+    for name, one in judged_maps(accuracy).items():
+        false = one.get("false_classes") or {}
+        if false:
+            pixels = ", ".join(f"{kind.replace('_', ' ')} {format_count(count)} px" for kind, count in false.items())
+            told.append(f"{name} {pixels}")
+    return f"Shown although the truth has none: {'; '.join(told)}." if told else ""
+
+
+def definitions_differ(rows: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether the mean over the classes that a map shows, which was the score before, is another for any row."""
+    return any(row.get("miou_of_shown_classes", row.get("miou")) != row.get("miou") for row in rows)
+
+
+def _number(value: object) -> float | None:
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None

@@ -1,0 +1,213 @@
+"""`spectralzoom train`: labelled scenes in, one file of weights out, with the split and the figures kept in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.training.data import TrainingData, open_training_data, pack_mask, trained_pixels
+from flows.training.figures import validate
+from flows.training.look import observe_scene
+from flows.training.start import joined_split, open_start, refuse_seen
+from models.checkpoint import read_checkpoint
+from models.examples import Observation, measured_normalisation, normalised
+from models.sizes import PRESETS, Positions, Preset, SegmenterConfig
+from models.spectral import SpectralBasis
+from models.training import Progress, TrainingSettings, train
+from models.weights import AnyWeights, save_weights, with_record
+from pipeline.camera import LineCamera
+from pipeline.errors import SceneError, SettingsError
+from pipeline.grid import SceneGrid
+from pipeline.simulator.farm_laws import FARM_NAMES
+from pipeline.simulator.scene import RasterScene
+
+FRAME_CROP, FARM_CROP = 384, 256  # px
+WHOLE_CROP = 1024  # px; the paper's network counts its places along the whole scene, a crop's would be others
+
+
+@dataclass(frozen=True)
+class TrainRequest:
+    """What to train on and how; ``patch`` and ``columns`` follow from the data where None."""
+
+    dataset: str
+    out: Path
+    hold_out: tuple[str, ...] = ()
+    validation: int | None = None
+    scenes: int | None = None  # of a built-in farm; by its law where None
+    patch: int | None = None
+    factor: int = 4
+    columns: int = 24
+    width: int = 24
+    positions: Positions = "2d"
+    preset: Preset = "two-scale"
+    tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads, mlp_ratio, where not the usual ones
+    init: Path | None = None  # weights to begin from
+    choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
+    settings: TrainingSettings = field(default_factory=TrainingSettings)
+    camera: LineCamera = field(default_factory=LineCamera)
+    command: str = ""
+
+
+Report = Callable[[str, float, str], None]  # what is done, how far 0..1, a figure
+
+
+def train_weights(request: TrainRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
+    """Train, validate and save; give the record that stands in the file.
+
+    Raises
+    ------
+    SceneError : no labels, one class only, or scenes whose bands or classes differ.
+    SettingsError : a folder to write to that does not exist, a folder in the place of a file, or sizes that do not fit.
+    """
+    checkpoint = request.out.with_name(request.out.name + ".checkpoint")
+    _check_places(request.out, checkpoint)
+    read_checkpoint(checkpoint)  # refuses a damaged one before minutes are spent
+    start = open_start(request.init, request.tokens, request.preset)
+    data = open_training_data(
+        request.dataset, request.validation, request.scenes, request.camera,
+        hold_out=request.hold_out, **request.choices,
+    )  # fmt: skip
+    refuse_seen(start, data)
+    seen, about = _observe_all(request, data, data.train, "looking at scenes", report)
+    normalisation = measured_normalisation(seen)
+    reached = np.ones(about.basis.columns, bool)
+    examples = [normalised(observation, normalisation, reached) for observation in seen]
+    config = _config(request, about)
+    begun = None
+    if start is not None:
+        config = replace(config, patch_kernel=start.patch_kernel)
+        begun = start.begin(config, about.basis, normalisation, about.names)
+    state = None if begun is None else begun.state
+
+    def progress(now: Progress) -> None:
+        report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
+
+    split = joined_split(_split(about, data), start)  # before validation scenes are looked at: what was trained on
+    model, summary = train(
+        config, examples, normalisation.gain_shift, request.settings, progress, start=state, checkpoint=checkpoint
+    )
+    weights = AnyWeights(model, about.basis, normalisation, about.names, about.colours)
+    kept, _ = _observe_all(request, data, data.validation, "looking at validation scenes", report, about)
+    frames = (normalised(one, normalisation, reached) for one in kept)
+    figures = validate(weights, frames, request.settings.seed, lambda row: report("validating", 0.0, row))
+    record = {
+        "command": request.command,
+        "data": data.law,
+        "split": split,
+        "settings": asdict(request.settings),
+        "camera": asdict(request.camera),
+        "training": summary,
+        "validation": figures,
+        **({} if begun is None else {"begun_from": begun.record}),
+    }
+    save_weights(with_record(weights, **record), request.out)
+    checkpoint.unlink(missing_ok=True)
+    return record
+
+
+def _check_places(out: Path, checkpoint: Path) -> None:
+    """Refuse places that the weights, or the state of the run beside them, cannot be written to."""
+    if not out.parent.is_dir():
+        raise SettingsError(f"-o {out}: the folder {out.parent} does not exist; make it first")
+    if out.is_dir():
+        raise SettingsError(f"-o {out} is a folder, expected a file; name the weights in it")
+    for path in (checkpoint, *(path.with_name(path.name + ".part") for path in (out, checkpoint))):
+        if path.is_dir():
+            raise SettingsError(
+                f"-o {out}: {path} is a folder, and training keeps a file of that name; move it away, or name other "
+                "weights"
+            )
+
+
+@dataclass
+class _About:
+    """What all scenes of a data set have in common, and what training saw of each."""
+
+    basis: SpectralBasis
+    names: tuple[str, ...]
+    colours: NDArray[np.uint8]
+    patch: int
+    wavelength_nm: NDArray[np.float64]
+    keys: dict[str, str] = field(default_factory=dict)  # scene -> identity of its light
+    pixels: dict[str, str] = field(default_factory=dict)  # identity -> trained pixels, where not all labelled ones
+
+
+def _split(about: _About, data: TrainingData) -> dict[str, Any]:
+    return {
+        "train": dict(about.keys),
+        "validation": list(data.validation),
+        "held_out": list(data.held_out),
+        "pixels": dict(about.pixels),
+    }
+
+
+def _observe_all(
+    request: TrainRequest, data: TrainingData, names: tuple[str, ...], what: str, report: Report,
+    about: _About | None = None,
+) -> tuple[list[Observation], _About]:  # fmt: skip
+    seen = []
+    for number, (name, scene) in enumerate(zip(names, data.scenes(names), strict=True)):
+        report(what, number / len(names), name)
+        known = about or _common(request, scene)
+        _check_alike(scene, known)
+        known.keys[name] = scene.key
+        mask = trained_pixels(scene)
+        if request.choices.get("train_mask") is not None:
+            known.pixels[scene.key] = pack_mask(mask)
+        about = known
+        grid = SceneGrid(*scene.shape, known.patch, request.factor)
+        rng = np.random.default_rng([request.settings.seed, 0x0B5, number])
+        seen.append(observe_scene(scene, request.camera, grid, known.basis, rng))
+    if about is None:
+        raise SceneError(f"{request.dataset} has no scene to train on")
+    return seen, about
+
+
+def _common(request: TrainRequest, scene: RasterScene) -> _About:
+    trained_pixels(scene)  # refuses a scene without labels
+    if len(scene.class_names) < 2:
+        raise SceneError(f"scene {scene.name} has {len(scene.class_names)} class; training needs two or more")
+    basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns)
+    patch = request.patch or suggested_patch(scene.shape, built_in=request.dataset in FARM_NAMES)
+    about = _About(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
+    _config(request, about)  # refuses sizes that do not fit before the first look
+    return about
+
+
+def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
+    """Patch size for scenes of this shape: 16 for the farm, 32 for frames, less where a scene would hold few seats."""
+    if built_in:
+        return 16
+    return 32 if min(shape) >= 512 else 16 if min(shape) >= 256 else 8
+
+
+def usual_crop(dataset: str, preset: Preset) -> int:
+    """Size of the crops to train on [px]: whole scenes for the paper's network, as far as they are square."""
+    return WHOLE_CROP if preset == "paper" else FARM_CROP if dataset in FARM_NAMES else FRAME_CROP
+
+
+def _check_alike(scene: RasterScene, about: _About) -> None:
+    if scene.class_names != about.names:
+        raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {about.names}")
+    if not np.array_equal(scene.wavelength_nm, about.wavelength_nm):
+        raise SceneError(f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera")
+
+
+def _config(request: TrainRequest, about: _About) -> SegmenterConfig:
+    try:
+        return SegmenterConfig(
+            classes=len(about.names),
+            columns=about.basis.columns,
+            patch=about.patch,
+            factor=request.factor,
+            width=request.width,
+            **request.tokens,
+            **{"positions": request.positions, **PRESETS[request.preset]},
+        )
+    except ValueError as error:
+        raise SettingsError(f"{error}; choose another --patch or --factor, --dim or --heads") from error
