@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from models.inference import CoarseLook, captured, check_seats, origin_of, readings_of
-from models.sizes import MOST_GAIN
-from models.weights import Weights
+from models.network.sizes import MOST_GAIN
+from models.reading.inference import CoarseLook, captured, check_seats, origin_of, readings_of
+from models.weights.files import Weights
 from pipeline.errors import ShapeError
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ def surprise(
     Parameters
     ----------
     patches
-        (seat, p, p, column) normalised columns of the fine pass, holes in them as in ``models.inference.segment``.
+        (seat, p, p, column) normalised columns of the fine pass, holes as in ``models.reading.inference.segment``.
     seats
         (seat,) their numbers on the grid of ``seen``, each once.
 
@@ -186,7 +186,7 @@ def _both_looks(
 ) -> Iterator[tuple[NDArray[np.int64], Tensor, Tensor]]:
     import torch
 
-    from models.batches import FineScene, read_fine_packed
+    from models.network.batches import FineScene, read_fine_packed
 
     if not len(seats):
         return

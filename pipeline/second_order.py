@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
-from pipeline.mirror import direction_to_normal, scene_to_direction
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
 
 _REST_INCIDENCE = float(np.sqrt(0.5))
 _STEEPEST, _SHALLOWEST = float(np.sin(np.deg2rad(20.0))), float(np.sin(np.deg2rad(70.0)))

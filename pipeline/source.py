@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
 
 AT_REST = Sweep("references", "fine", "x", 0.0, 0.0, 1)  # a line for references: the mirror at 0; 0, nothing summed
 

@@ -1,13 +1,13 @@
 """How fast the mirror must go: the right forms of the paper's equations 8 and 9, for whoever drives a rig.
 
-Frame period and imaging time (equation 10) are :class:`pipeline.camera.LineCamera`'s, the layout of the vector memory
-:mod:`pipeline.vector_memory`'s. The paper's own forms are in :mod:`pipeline.paper`.
+Frame period and imaging time (equation 10) are :class:`pipeline.geometry.camera.LineCamera`'s, the layout of the
+vector memory :mod:`pipeline.geometry.vector_memory`'s. The paper's own forms are in :mod:`pipeline.geometry.paper_equations`.
 """
 
 from __future__ import annotations
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
 
 
 def scene_speed(camera: LineCamera, distance_m: float) -> float:

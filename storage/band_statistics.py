@@ -16,8 +16,8 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
-from storage.block_work import THREADS, Crew, run_blocks
-from storage.layout import damage_named, open_group, read_array, read_bands
+from storage.arrays.layout import damage_named, open_group, read_array, read_bands
+from storage.parallel.block_work import THREADS, Crew, run_blocks
 from storage.value_bins import KEPT, count_bins, merge_bins, percentile
 
 PERCENTILES = (2.0, 50.0, 98.0)

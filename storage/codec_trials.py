@@ -12,7 +12,7 @@ from zarr.storage import MemoryStore
 
 from pipeline.errors import SettingsError
 from storage.archive_codec import pcodec
-from storage.layout import image_spec
+from storage.arrays.layout import image_spec
 
 BLOSC = {"lz4-5": ("lz4", 5), "zstd-1": ("zstd", 1), "zstd-3": ("zstd", 3), "zstd-5": ("zstd", 5)}
 PCODEC = {"pcodec-4": 4, "pcodec-8": 8, "pcodec-12": 12}  # 8: the archive tier

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED
 from storage.array_files import variable_names
 from storage.labels import Labels, load_labels
 from storage.raster_files import load_raster

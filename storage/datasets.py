@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED
 from storage.labels import load_codes
 from storage.raster_files import SCENE_ENDINGS, split_variable
 from storage.scene_files import SceneFile, load_scene_file, scene_number

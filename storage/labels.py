@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED
 from storage.raster_files import load_raster
 from storage.scene_toml import ClassValue, Colour
 

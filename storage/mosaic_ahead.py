@@ -30,21 +30,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
 from pipeline.checked_lines import read_checked, with_check
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.placed import PixelGrid, Placed, place
 from pipeline.rectify.tiles import Tile, lines_needed, plan_tiles
-from pipeline.scan import Sweep
 from pipeline.source import References
-from storage.block_work import Crew
-from storage.lookups import path_digest
-from storage.mosaic_work import MosaicWork
-from storage.mosaics import MosaicWriter
-from storage.plain_files import read_plain
-from storage.spool import read_spooled
-from storage.staging import remove_tree
-from storage.tile_work import OpenMosaic, Thumbnail, tile_budget
+from storage.archive.plain_files import read_plain
+from storage.archive.staging import remove_tree
+from storage.arrays.lookups import path_digest
+from storage.arrays.mosaic_work import MosaicWork
+from storage.arrays.mosaics import MosaicWriter
+from storage.arrays.spool import read_spooled
+from storage.arrays.tile_work import OpenMosaic, Thumbnail, tile_budget
+from storage.parallel.block_work import Crew
 
 MOSAIC, SEEN, RECORD = "mosaic.zarr", "seen.npy", "ahead.json"
 LOG = logging.getLogger(__name__)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ArchiveError
 from storage.archive_codec import PCODEC_NAME
-from storage.layout import SHARD_ROWS, ArraySpec, create_array, damage_named, open_group, read_array
+from storage.arrays.layout import SHARD_ROWS, ArraySpec, create_array, damage_named, open_group, read_array
 
 RAW_ARRAYS = ("dn", "values")  # of a captured sweep, of an ingested cube
 

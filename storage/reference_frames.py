@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import SceneError
-from pipeline.rectify.detector import BadElementCriteria, find_bad_elements
+from pipeline.rectify.calibration.detector import BadElementCriteria, find_bad_elements
 from pipeline.source import References
 from storage.envi_cubes import EnviCube, open_envi_cube
 
@@ -48,7 +48,7 @@ def load_reference_frames(
     saturated_dn
         Least DN of a saturated white frame; None where it is known not to be.
     criteria
-        Of :func:`pipeline.rectify.detector.find_bad_elements`, which marks bad elements.
+        Of :func:`pipeline.rectify.calibration.detector.find_bad_elements`, which marks bad elements.
 
     Raises
     ------

@@ -19,12 +19,11 @@ from typing import Any, Literal
 import numpy as np
 
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
-from storage.addresses import StageRef
-from storage.archive import Archive
-from storage.archive_codec import PCODEC_LEVEL, PCODEC_NAME
-from storage.folder_exchange import exchange
-from storage.lineage import RAW_STAGES, Catalogue
-from storage.manifests import (
+from storage.archive.addresses import StageRef
+from storage.archive.archive import Archive
+from storage.archive.folder_exchange import exchange
+from storage.archive.lineage import RAW_STAGES, Catalogue
+from storage.archive.manifests import (
     check_files,
     listed_bytes,
     manifest_sha256,
@@ -32,9 +31,10 @@ from storage.manifests import (
     read_manifest,
     write_manifest,
 )
+from storage.archive.records import Store
+from storage.archive.staging import PART_SUFFIX, files_below, refusals, remove_tree, take_lock
+from storage.archive_codec import PCODEC_LEVEL, PCODEC_NAME
 from storage.packed_arrays import is_packed, pack_array, raw_array
-from storage.records import Store
-from storage.staging import PART_SUFFIX, files_below, refusals, remove_tree, take_lock
 
 DAY_S = 86400.0
 IN_USE = "somebody is using the archive: run pack again when it is free"

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.readings import MOST_STEPS, MOST_VALUE, beyond_range, find_beyond
 from pipeline.simulator.scene import BRIGHT_PERCENTILE
+from storage.archive.staging import file_hash
 from storage.cube_sources import BLOCK_LINES, scene_lines
 from storage.dataset_layouts import find_layout
 from storage.declared_sizes import machine_bytes
@@ -25,7 +26,6 @@ from storage.raster_files import load_raster, split_variable
 from storage.rasters import Raster
 from storage.scan_files import is_scan, known_bands, open_cube_source
 from storage.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
-from storage.staging import file_hash
 from storage.wavelengths import settle_wavelengths
 
 _LOOKED_AT = 1 << 20  # values, evenly spread, by which the range of a scene is told

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import SceneError
-from storage.toml_files import read_toml
+from storage.archive.toml_files import read_toml
 
 SETTINGS_NAME = "scene.toml"
 KNOWN_KEYS = (

@@ -1,6 +1,6 @@
 """Cubes out of Zarr stores: those of this project, and arrays of anyone with dims y x and band, or band y x.
 
-What a store says of itself is judged before it is opened (:mod:`storage.zarr_metadata`).
+What a store says of itself is judged before it is opened (:mod:`storage.arrays.zarr_metadata`).
 """
 
 from __future__ import annotations
@@ -19,9 +19,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from storage.archive_codec import allow_pcodec
-from storage.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, ReadLines
-from storage.envi_header import MICROMETRES, NANOMETRES, UNSAID
-from storage.zarr_metadata import (
+from storage.arrays.zarr_metadata import (
     METADATA,
     check_blocks,
     check_links,
@@ -30,6 +28,8 @@ from storage.zarr_metadata import (
     check_size,
     open_options,
 )
+from storage.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, ReadLines
+from storage.envi_header import MICROMETRES, NANOMETRES, UNSAID
 
 ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing")
 COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitude", "easting")

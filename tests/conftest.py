@@ -17,9 +17,9 @@ from rich.console import Console
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.survey_settings import load_settings
-from models.segmenter import Segmenter, SegmenterConfig
-from models.spectral import Normalisation, SpectralBasis
-from models.weights import Weights, save_weights
+from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.spectral import Normalisation, SpectralBasis
+from models.weights.files import Weights, save_weights
 from storage.labels import default_colour
 from tests.object_server import bucket, machine, s3_server  # noqa: F401 - fixtures
 

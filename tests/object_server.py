@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from storage.object_archive import ObjectArchive
+    from storage.remote.object_archive import ObjectArchive
 
 BUCKET = "surveys"
 KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_REGION": "us-east-1"}
@@ -53,7 +53,7 @@ def bucket(s3_server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> s
 @pytest.fixture
 def machine(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., ObjectArchive]:
     """Open the bucket's archive as a machine, by its name, with a working copy of its own."""
-    from storage.object_archive import open_object_archive
+    from storage.remote.object_archive import open_object_archive
 
     def open_as(name: str, *, create: bool = True, write: bool = True) -> ObjectArchive:
         monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / name))

@@ -16,10 +16,10 @@ from flows.publish.receipt import to_json
 from flows.terminal.progress import StageProgress
 from flows.terminal.shown_text import on_stdout
 from pipeline.errors import SettingsError
-from storage.archive import Archive
-from storage.garbage import Removal, clear_up
-from storage.repair import Repaired, Rerun, put_back, repair
-from storage.verification import Finding
+from storage.archive.archive import Archive
+from storage.maintenance.garbage import Removal, clear_up
+from storage.maintenance.repair import Repaired, Rerun, put_back, repair
+from storage.maintenance.verification import Finding
 
 DONE, FAILED, PARTLY = 0, 1, 3
 
@@ -90,7 +90,7 @@ def run_verify(
 def _put_back(archive: Archive) -> None:
     """What a repair that was killed had set aside."""
     if archive.in_bucket:
-        from storage.object_repairs import put_back_objects
+        from storage.remote.object_repairs import put_back_objects
 
         put_back_objects(archive)
     else:

@@ -18,16 +18,16 @@ from flows.settings.keys import BUILT_IN_SCENES
 from flows.survey.scores import score_of
 from flows.terminal.shown_text import on_stdout
 from pipeline.errors import ArchiveError, SceneError, ShapeError
-from pipeline.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.simulator.farm_laws import law_of_key
-from storage.addresses import in_text
-from storage.archive import Archive
-from storage.changes import ABSENT, flatten
-from storage.class_maps import ClassMap, load_class_map
-from storage.lineage import Catalogue
-from storage.product_names import find_product
-from storage.records import Run
-from storage.whole_files import written_aside
+from storage.archive.addresses import in_text
+from storage.archive.archive import Archive
+from storage.archive.changes import ABSENT, flatten
+from storage.archive.lineage import Catalogue
+from storage.archive.product_names import find_product
+from storage.archive.records import Run
+from storage.archive.whole_files import written_aside
+from storage.arrays.class_maps import ClassMap, load_class_map
 
 LARGEST_PAIRS = 10
 NOT_ASKED = ("notes", "out")  # of a receipt's settings

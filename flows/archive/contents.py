@@ -9,13 +9,13 @@ from datetime import UTC, datetime
 from typing import Any
 
 from flows.survey.scores import score_of
-from storage.archive import Archive
-from storage.changes import changes_between, version_before
-from storage.lineage import Catalogue
-from storage.product_names import find_product
-from storage.records import Run, Store
-from storage.repair import plan_repair
-from storage.verification import Finding
+from storage.archive.archive import Archive
+from storage.archive.changes import changes_between, version_before
+from storage.archive.lineage import Catalogue
+from storage.archive.product_names import find_product
+from storage.archive.records import Run, Store
+from storage.maintenance.repair import plan_repair
+from storage.maintenance.verification import Finding
 
 DEEPEST = 60  # levels of a lineage that are shown
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flows.publish.panels import UNLABELLED_COLOUR, class_palette, class_rgb
 from flows.terminal.figures import format_count
-from pipeline.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED
 
 DPI, PANEL_IN, MOST_PX, MOST_PAIRS = 130, 4.6, 1200, 10
 SAME, OTHER = (0.96, 0.96, 0.95), (0.35, 0.36, 0.34)

@@ -23,16 +23,16 @@ from flows.archive.export_catalogue import (
 )
 from flows.archive.export_layers import map_layers, open_exported
 from pipeline.errors import ArchiveError, PipelineError
-from storage.archive import Archive
-from storage.cog_files import need_rasterio, write_cog
-from storage.cubes import open_raw_cube
-from storage.envi_writer import EnviFile, write_envi
-from storage.layout import SHARD_ROWS
-from storage.stac_fields import COG
-from storage.stac_items import check_owner, need_pystac, write_stac
-from storage.staging import take_lock
-from storage.stored_images import load_bands, open_image
-from storage.whole_files import remove_leftovers
+from storage.archive.archive import Archive
+from storage.archive.staging import take_lock
+from storage.archive.whole_files import remove_leftovers
+from storage.arrays.cubes import open_raw_cube
+from storage.arrays.layout import SHARD_ROWS
+from storage.arrays.stored_images import load_bands, open_image
+from storage.export.cog_files import need_rasterio, write_cog
+from storage.export.envi_writer import EnviFile, write_envi
+from storage.export.stac_fields import COG
+from storage.export.stac_items import check_owner, need_pystac, write_stac
 
 ENVI_NUMBERS = "application/octet-stream"
 

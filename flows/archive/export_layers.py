@@ -15,15 +15,15 @@ from odc.geo.geobox import GeoBox
 from flows.publish.receipt import Receipt, check_receipt
 from flows.survey.ground import coarse_colours
 from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
-from pipeline.grid import UNLABELLED
-from storage.archive import Archive, StageRef
-from storage.cog_files import ANGULAR, CogImage, Place
-from storage.georeference import load_geobox
-from storage.ground_maps import ClassLegend
-from storage.layout import grid_of
-from storage.records import RECEIPT, read_run
-from storage.stac_fields import classes
-from storage.stored_images import StoredImage, open_image
+from pipeline.geometry.grid import UNLABELLED
+from storage.archive.archive import Archive, StageRef
+from storage.archive.records import RECEIPT, read_run
+from storage.arrays.georeference import load_geobox
+from storage.arrays.ground_maps import ClassLegend
+from storage.arrays.layout import grid_of
+from storage.arrays.stored_images import StoredImage, open_image
+from storage.export.cog_files import ANGULAR, CogImage, Place
+from storage.export.stac_fields import classes
 
 Rows = Iterator[tuple[int, NDArray[Any]]]
 RGB = ("red", "green", "blue")

@@ -15,12 +15,12 @@ from flows.survey.run import SurveyRun, open_run
 from flows.survey.stages import VERSIONS
 from flows.survey.survey import STAGES, judge, survey
 from pipeline.errors import IncompleteStoreError, PipelineError
-from storage.addresses import store_at
-from storage.archive import Archive, StageRef, stage_key
-from storage.changes import Change, changes_between
-from storage.keys import plain
-from storage.lineage import Catalogue
-from storage.records import Store
+from storage.archive.addresses import store_at
+from storage.archive.archive import Archive, StageRef, stage_key
+from storage.archive.changes import Change, changes_between
+from storage.archive.keys import plain
+from storage.archive.lineage import Catalogue
+from storage.archive.records import Store
 
 State = Literal["cached", "to run", "blocked", "skipped"]
 

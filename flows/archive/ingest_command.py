@@ -12,11 +12,11 @@ from rich.markup import escape
 
 from flows.terminal.progress import StageProgress
 from pipeline.errors import SceneError
-from storage.archive import Archive, StageRef
+from storage.archive.archive import Archive, StageRef
+from storage.archive.staging import check_name, file_hash
 from storage.cube_sources import CubeSource
 from storage.ingested_cubes import Report, SourceFile, write_ingested_cube
 from storage.scan_files import open_cube_source, with_wavelengths
-from storage.staging import check_name, file_hash
 
 STAGE = "ingest"
 VERSION = 2

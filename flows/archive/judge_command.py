@@ -23,11 +23,11 @@ from flows.survey.run import SurveyRun, open_run
 from flows.survey.stages import VERSIONS
 from flows.survey.survey import TITLES, Products, StageRunner, judge
 from flows.terminal.progress import StageProgress
-from models.process import keep_freed_memory, use_one_thread
+from models.network.process import keep_freed_memory, use_one_thread
 from pipeline.errors import ArchiveError, SceneError, WeightsError
-from storage.archive import Archive, StageRef
-from storage.lineage import Catalogue
-from storage.records import Run
+from storage.archive.archive import Archive, StageRef
+from storage.archive.lineage import Catalogue
+from storage.archive.records import Run
 
 # products of a survey, and the stages that leave them; those of a second round come after the first
 MADE_BY = {

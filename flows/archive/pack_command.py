@@ -17,7 +17,7 @@ from flows.publish.receipt import to_json
 from flows.terminal.figures import DASH, format_bytes
 from flows.terminal.progress import StageProgress
 from flows.terminal.shown_text import on_stdout
-from storage.archive import Archive
+from storage.archive.archive import Archive
 from storage.repacking import Packed, Packing, pack, plan_packing
 
 DONE, PARTLY = 0, 3

@@ -34,11 +34,11 @@ from flows.survey.scores import score_of
 from flows.terminal.figures import format_points, format_seconds
 from pipeline.errors import PipelineError, SettingsError
 from pipeline.visible_text import visible
-from storage.archive import Archive
-from storage.block_work import THREADS, Crew
-from storage.lineage import Catalogue
-from storage.records import read_run
-from storage.whole_files import new_file, write_whole
+from storage.archive.archive import Archive
+from storage.archive.lineage import Catalogue
+from storage.archive.records import read_run
+from storage.archive.whole_files import new_file, write_whole
+from storage.parallel.block_work import THREADS, Crew
 
 Survey = Callable[[Settings, Console], Path]  # settings in, the folder of the published run out
 STATES = ("ran", "would run", "skipped", "failed")

@@ -10,11 +10,11 @@ from typing import Any
 from flows.survey.extent import Extent, Unit
 from flows.survey.run import SurveyRun
 from pipeline.errors import PipelineError
-from pipeline.grid import SceneGrid
-from storage.cubes import open_raw_cube
-from storage.lineage import Catalogue
-from storage.manifests import Cost
-from storage.records import Store
+from pipeline.geometry.grid import SceneGrid
+from storage.archive.lineage import Catalogue
+from storage.archive.manifests import Cost
+from storage.archive.records import Store
+from storage.arrays.cubes import open_raw_cube
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,12 @@ from flows.settings.survey_settings import OF_THE_MACHINE, Settings, of_this_ver
 from flows.survey.run import SHIPPED
 from flows.survey.stages import VERSIONS
 from flows.survey.survey import STAGES
-from models.weights import content_key
+from models.weights.files import content_key
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.simulator.farm_laws import USUAL_DAY, USUAL_HOUR, farm_law, has_days, law_of_key
-from storage.keys import canonical_json
-from storage.lineage import Catalogue
-from storage.records import Run
+from storage.archive.keys import canonical_json
+from storage.archive.lineage import Catalogue
+from storage.archive.records import Run
 
 # what the light of a field depends on; surveys that agree in these are generations of one
 OF_THE_LIGHT = (

@@ -19,11 +19,11 @@ from flows.terminal.figures import DASH, format_count
 from flows.terminal.progress import StageProgress
 from flows.terminal.shown_text import on_stdout
 from pipeline.errors import SettingsError
-from storage.archive import Archive
+from storage.archive.archive import Archive
+from storage.archive.lineage import Catalogue
+from storage.archive.product_names import find_product
 from storage.band_statistics import BandTable, cube_stores, product_statistics
-from storage.block_work import THREADS, Crew
-from storage.lineage import Catalogue
-from storage.product_names import find_product
+from storage.parallel.block_work import THREADS, Crew
 from storage.value_bins import RELATIVE_WIDTH
 
 SHOWN = 12  # bands, where there are more

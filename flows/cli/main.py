@@ -203,7 +203,7 @@ def train(
     """
     from flows.training.command import run_train
     from flows.training.train import TrainRequest, usual_crop
-    from models.training import TrainingSettings
+    from models.training.train import TrainingSettings
 
     size = crop if crop is not None else usual_crop(dataset, preset)
     choices = {

@@ -24,7 +24,7 @@ def seal(*weights: Path) -> int:
     weights
         Files of weights.
     """
-    from models.weights import seal_weights
+    from models.weights.files import seal_weights
 
     if not weights:
         raise SettingsError("seal needs files of weights: spectralzoom seal FILE ...")

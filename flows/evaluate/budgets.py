@@ -8,7 +8,7 @@ from typing import Any
 from flows.evaluate.equal_time import plan_name
 from flows.evaluate.rig_plans import BUDGETS, PLANNED, RANDOM, UNIFORM
 from flows.evaluate.series import Record, Row, Runs, by_seed, collect_row, difference, frame_names, mean_of
-from models.metrics import mean_iou, miou_of_shown_classes, overall_accuracy
+from models.evaluation.metrics import mean_iou, miou_of_shown_classes, overall_accuracy
 
 PLANS = (*PLANNED, UNIFORM, RANDOM)
 

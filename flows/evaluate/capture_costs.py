@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from flows.evaluate.frames import Look
 from flows.evaluate.rows import Trial, fine_samples, placings, wanted_rows
-from models.weights import Weights
-from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_full, coarse_sweeps
+from models.weights.files import Weights
 from pipeline.errors import PoseError
-from pipeline.planning import price_of_seats
-from pipeline.scan import CostModel
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import CostModel
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps
+from pipeline.planning.fine_pass import price_of_seats
 
 
 def capture_seconds(

@@ -27,10 +27,10 @@ from flows.evaluate.work import Judged, Work
 from flows.publish.receipt import to_json
 from flows.terminal.progress import StageProgress
 from flows.terminal.shown_text import on_stdout
-from models.bootstrap import LEVEL
-from models.metrics import agreement, false_pixels, iou_per_class
-from models.process import keep_freed_memory
-from models.weights import describe_weights, unsealed_note
+from models.evaluation.bootstrap import LEVEL
+from models.evaluation.metrics import agreement, false_pixels, iou_per_class
+from models.network.process import keep_freed_memory
+from models.weights.files import describe_weights, unsealed_note
 
 
 def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = False) -> dict[str, Any]:

@@ -13,13 +13,13 @@ import numpy as np
 
 from flows.evaluate.frames import Candidate, Sight, file_key
 from flows.evaluate.rows import Seats, Trial, cost_of, fine_samples, judge_map
-from models.control_maps import control_multiply_adds, draw_with_control
-from models.cost import MultiplyAdds, multiply_adds
-from models.inference import Glance
-from models.policies import score_seats
-from models.weights import AnyWeights, describe_weights
+from models.network.cost import MultiplyAdds, multiply_adds
+from models.policies.policies import score_seats
+from models.reading.control_maps import control_multiply_adds, draw_with_control
+from models.reading.inference import Glance
+from models.weights.files import AnyWeights, describe_weights
 from pipeline.errors import SettingsError
-from pipeline.selection import frame_seats
+from pipeline.planning.selection import frame_seats
 
 DENSE = "dense"  # the control that may be the baseline
 BUYS_SEATS = "paper"

@@ -16,16 +16,16 @@ from flows.evaluate.capture_costs import plan_seconds
 from flows.evaluate.frames import Look, look_at
 from flows.evaluate.rig_plans import BUDGETS, PLANNED
 from flows.evaluate.rows import Seats, Trial
-from models.inference import segment
-from models.metrics import confusion
-from models.policies import score_seats
-from models.weights import Weights
-from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_full, coarse_sweeps
+from models.evaluation.metrics import confusion
+from models.policies.policies import score_seats
+from models.reading.inference import segment
+from models.weights.files import Weights
 from pipeline.errors import PoseError
-from pipeline.planning import plan_fine
-from pipeline.scan import CostModel
-from pipeline.selection import frame_seats
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import CostModel
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps
+from pipeline.planning.fine_pass import plan_fine
+from pipeline.planning.selection import frame_seats
 from pipeline.simulator.scene import RasterScene
 
 ROUNDS = 3  # set-ups do not grow with the exposure, so that one step falls short; three settle it

@@ -11,7 +11,7 @@ from flows.evaluate.kept_results import writing
 from flows.evaluate.rows import Trial
 from flows.evaluate.work import Record, Work
 from flows.publish.receipt import to_json
-from models.metrics import mean_iou
+from models.evaluation.metrics import mean_iou
 
 SHOWN_SHARE = 0.10  # of the seats, or the nearest one tried: what the pictures show
 

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from flows.survey.scene import check_labels, judged_labels
 from flows.training.data import TrainingData, farm_test_data, open_training_data
 from flows.training.look import observe_scene
-from models.examples import normalised
-from models.holes import patches_of
-from models.inference import CoarseLook, Glance, glance_of_columns
-from models.weights import AnyWeights, Description, Weights, content_key, describe_weights, load_any_weights
-from pipeline.camera import LineCamera
+from models.network.dead_pixels import patches_of
+from models.reading.inference import CoarseLook, Glance, glance_of_columns
+from models.training.examples import normalised
+from models.weights.files import AnyWeights, Description, Weights, content_key, describe_weights, load_any_weights
 from pipeline.errors import PipelineError, SceneError, SettingsError, WeightsError
-from pipeline.grid import SceneGrid
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.farm_laws import FARM_NAMES
 from pipeline.simulator.scene import RasterScene
 

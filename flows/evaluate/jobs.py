@@ -13,7 +13,7 @@ from flows.evaluate.request import EvaluateRequest
 from flows.survey.scene import judged_labels
 from flows.training.data import TrainingData
 from pipeline.errors import SceneError, SettingsError
-from pipeline.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.simulator.scene import RasterScene
 
 Show = Callable[[str, float, str], None]

@@ -17,11 +17,11 @@ from flows.evaluate.rows import Trial, placings
 from flows.publish.colour_stretch import choose_bands, stretch
 from flows.publish.panels import INK, class_palette, class_rgb, outline
 from flows.terminal.figures import format_percent
-from models.inference import segment
-from models.metrics import confusion, mean_iou, overall_accuracy
-from models.weights import Weights
-from pipeline.grid import UNLABELLED
-from pipeline.selection import frame_seats
+from models.evaluation.metrics import confusion, mean_iou, overall_accuracy
+from models.reading.inference import segment
+from models.weights.files import Weights
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.planning.selection import frame_seats
 
 LONG_SIDE = 900  # of a panel [px]; larger frames are thinned
 

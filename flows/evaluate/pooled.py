@@ -14,10 +14,10 @@ import numpy as np
 from flows.evaluate.frames import Look
 from flows.evaluate.rows import cost_of_seats, judge_map, known_or_none
 from flows.evaluate.series import Record, Runs, seeds_of
-from models.inference import segment
-from models.policies import score_seats
-from models.weights import Weights
-from pipeline.selection import frame_seats, select_seats
+from models.policies.policies import score_seats
+from models.reading.inference import segment
+from models.weights.files import Weights
+from pipeline.planning.selection import frame_seats, select_seats
 
 POOLED = ("gain", "entropy")  # scores that mean the same on every frame [nat]
 _MARK = ", pooled"

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from models.bootstrap import DRAWS
-from models.policies import NETWORK_POLICIES, POLICIES
+from models.evaluation.bootstrap import DRAWS
+from models.policies.policies import NETWORK_POLICIES, POLICIES
 from pipeline.errors import SettingsError
-from pipeline.scan import CostModel
+from pipeline.geometry.scan import CostModel
 
 SHARES = (0.05, 0.10, 0.15, 0.20, 0.35)
 JUDGED = tuple(name for name in POLICIES if name not in ("mask", *NETWORK_POLICIES))  # these need a file of one's own

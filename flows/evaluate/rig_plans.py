@@ -9,18 +9,18 @@ import numpy as np
 
 from flows.evaluate.frames import Look
 from flows.evaluate.rows import Seats
-from models.controls import RANDOM_DRAWS
-from models.inference import segment
-from models.metrics import confusion
-from models.policies import score_seats
-from models.weights import Weights
-from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_full, coarse_sweeps
+from models.evaluation.metrics import confusion
+from models.policies.free_seats import RANDOM_DRAWS
+from models.policies.policies import score_seats
+from models.reading.inference import segment
+from models.weights.files import Weights
 from pipeline.errors import BudgetError, PoseError
-from pipeline.line_blocks import WIDTHS, line_blocks, most_shown
-from pipeline.planning import check_budget, plan_fine
-from pipeline.savings import count_lines
-from pipeline.scan import CostModel
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import CostModel
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps
+from pipeline.planning.fine_pass import check_budget, plan_fine
+from pipeline.planning.line_blocks import WIDTHS, line_blocks, most_shown
+from pipeline.planning.savings import count_lines
 
 BUDGETS = (0.35, 0.4, 0.5, 0.65, 0.8)  # of the full scan's seconds, coarse pass included
 PLANNED = ("gain", "entropy")

@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.evaluate.frames import Look, Sight
-from models.boundary import boundary_counts
-from models.controls import RANDOM_DRAWS
-from models.cost import MultiplyAdds, multiply_adds
-from models.inference import segment
-from models.metrics import confusion
-from models.placement_metrics import average_precision, gain_sums, oracle_gain, rank_correlation, top_seats
-from models.policies import score_seats
-from models.weights import Weights
-from pipeline.grid import UNLABELLED
-from pipeline.savings import BYTES_PER_SAMPLE
-from pipeline.selection import frame_seats
+from models.evaluation.boundary import boundary_counts
+from models.evaluation.metrics import confusion
+from models.evaluation.placement_metrics import average_precision, gain_sums, oracle_gain, rank_correlation, top_seats
+from models.network.cost import MultiplyAdds, multiply_adds
+from models.policies.free_seats import RANDOM_DRAWS
+from models.policies.policies import score_seats
+from models.reading.inference import segment
+from models.weights.files import Weights
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.planning.savings import BYTES_PER_SAMPLE
+from pipeline.planning.selection import frame_seats
 
 ORACLE = "oracle"
 Seats = NDArray[np.intp]

@@ -24,8 +24,8 @@ from flows.evaluate.series import (
     mean_of,
     mean_or_none,
 )
-from models.boundary import boundary_iou, mean_boundary_iou
-from models.metrics import (
+from models.evaluation.boundary import boundary_iou, mean_boundary_iou
+from models.evaluation.metrics import (
     average_accuracy,
     false_pixels,
     frequency_weighted_iou,
@@ -39,7 +39,7 @@ from models.metrics import (
     miou_over_frames,
     overall_accuracy,
 )
-from models.placement_metrics import captured_gain
+from models.evaluation.placement_metrics import captured_gain
 
 Key = tuple[str, float]
 ENDS = ("none", "all")

@@ -16,12 +16,12 @@ import numpy as np
 from flows.evaluate.controls import BUYS_SEATS, control_shares, score_by_image, seats_of_control
 from flows.evaluate.frames import Look, Sight
 from flows.evaluate.rows import Trial
-from models.control_maps import draw_with_control
-from models.inference import CoarseLook, glance_of_columns, segment
-from models.policies import score_seats
-from models.process import one_thread
-from models.weights import AnyWeights, Weights
-from pipeline.selection import frame_seats
+from models.network.process import one_thread
+from models.policies.policies import score_seats
+from models.reading.control_maps import draw_with_control
+from models.reading.inference import CoarseLook, glance_of_columns, segment
+from models.weights.files import AnyWeights, Weights
+from pipeline.planning.selection import frame_seats
 
 Part = tuple[str, str]  # what it is, and of which policy, share or control
 Works = dict[Part, Callable[[], object]]

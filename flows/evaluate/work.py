@@ -21,9 +21,9 @@ from flows.evaluate.rows import Trial, judge_frame
 from flows.evaluate.timing import Rounds, time_frame
 from flows.terminal.figures import format_seconds
 from flows.training.data import TrainingData
-from models.weights import AnyWeights, Weights
-from pipeline.camera import LineCamera
-from pipeline.line_blocks import WIDTHS
+from models.weights.files import AnyWeights, Weights
+from pipeline.geometry.camera import LineCamera
+from pipeline.planning.line_blocks import WIDTHS
 from pipeline.simulator.scene import RasterScene
 
 Record = dict[str, Any]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.quicklooks import picture_bands
+from storage.arrays.quicklooks import picture_bands
 
 MID_GREY = 0.42
 

@@ -15,12 +15,12 @@ from flows.survey.pointing import load_registration
 from flows.survey.run import SurveyRun
 from flows.survey.stages import load_plan, strange_pixels
 from flows.survey.survey import Products
-from pipeline.grid import UNLABELLED
-from pipeline.planning import FinePlan, joined_plan
-from storage.archive import StageRef
-from storage.attention import load_attention
-from storage.class_maps import load_class_map
-from storage.ground_maps import load_ground_map
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.planning.fine_pass import FinePlan, joined_plan
+from storage.archive.archive import StageRef
+from storage.arrays.attention import load_attention
+from storage.arrays.class_maps import load_class_map
+from storage.arrays.ground_maps import load_ground_map
 
 
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:

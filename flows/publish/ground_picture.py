@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from flows.publish.finding_words import area_words
-from pipeline.grid import UNLABELLED
-from storage.ground_maps import GroundMap
+from pipeline.geometry.grid import UNLABELLED
+from storage.arrays.ground_maps import GroundMap
 
 WIDTH_IN, DPI, MOST_PX = 9.0, 130, 1200
 

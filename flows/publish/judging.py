@@ -16,10 +16,10 @@ from flows.settings.survey_settings import OF_THE_MACHINE
 from flows.survey.run import SurveyRun
 from flows.survey.stages import VERSIONS, Build
 from flows.survey.survey import STAGES, Products, StageRunner, Step, judge
-from storage.archive import StageRef, stage_key
-from storage.keys import canonical_json
-from storage.records import Run, read_run
-from storage.run_folders import RunDraft
+from storage.archive.archive import StageRef, stage_key
+from storage.archive.keys import canonical_json
+from storage.archive.records import Run, read_run
+from storage.archive.run_folders import RunDraft
 
 NOT_ASKED = ("notes", "out", "engine", *OF_THE_MACHINE)  # of a receipt's settings: no byte depends on them
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from flows.publish.colour_stretch import choose_bands as choose_bands
 from flows.publish.colour_stretch import develop as develop
 from flows.publish.colour_stretch import stretch as stretch
-from pipeline.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED
 
 INK = "#22241f"
 MUTED = "#6a6d64"

@@ -36,8 +36,8 @@ from flows.publish.panels import (
     panel_inches,
     stretch,
 )
-from pipeline.grid import UNLABELLED
-from pipeline.scan import Axis
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.scan import Axis
 
 Box = tuple[int, int, int, int]
 

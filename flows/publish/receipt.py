@@ -50,7 +50,7 @@ class Savings(TypedDict):
 
 
 class Score(TypedDict):
-    """What one map scores, 0..1, over the classes that the truth has (`models.metrics`); receipts of before lack some.
+    """What one map scores, 0..1, over the classes that the truth has; receipts of before lack some.
 
     IoU is null for a class that the truth lacks; ``false_classes`` are those of them that the map shows, with pixels.
     """

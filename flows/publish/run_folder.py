@@ -42,21 +42,21 @@ from flows.survey.pointing import RECORD
 from flows.survey.run import SurveyRun, now
 from flows.survey.stages import SEATS_AT_ONCE, captured, load_plan
 from flows.survey.survey import Products, StageRunner
-from pipeline.coverage import on_scene
 from pipeline.errors import IncompleteStoreError
-from pipeline.planning import FinePlan, joined_plan
-from pipeline.rectify.calibrate import of_bands, reflectance
-from pipeline.savings import Entry, capture_savings
-from pipeline.scan import Sweep
-from storage.archive import StageRef
-from storage.attention import load_attention
-from storage.class_maps import ClassMap, load_class_map
-from storage.cubes import RawCube
-from storage.ground_maps import load_ground_map
-from storage.patches import open_patches
-from storage.records import read_run
-from storage.run_folders import RunDraft
-from storage.stored_images import open_image
+from pipeline.geometry.scan import Sweep
+from pipeline.planning.coverage import on_scene
+from pipeline.planning.fine_pass import FinePlan, joined_plan
+from pipeline.planning.savings import Entry, capture_savings
+from pipeline.rectify.calibration.calibrate import of_bands, reflectance
+from storage.archive.archive import StageRef
+from storage.archive.records import read_run
+from storage.archive.run_folders import RunDraft
+from storage.arrays.attention import load_attention
+from storage.arrays.class_maps import ClassMap, load_class_map
+from storage.arrays.cubes import RawCube
+from storage.arrays.ground_maps import load_ground_map
+from storage.arrays.patches import open_patches
+from storage.arrays.stored_images import open_image
 
 LIBRARIES = ("spectralzoom", "numpy", "torch", "zarr", "xarray", "prefect")
 

@@ -17,8 +17,8 @@ from flows.settings.survey_settings import Settings
 from flows.survey.run import SurveyRun, now, open_run
 from flows.survey.survey import TITLES, Products, StageRunner, Step, survey
 from flows.terminal.progress import StageProgress
-from models.process import keep_freed_memory, use_one_thread
-from storage.archive import Archive
+from models.network.process import keep_freed_memory, use_one_thread
+from storage.archive.archive import Archive
 
 Finish = Callable[[Step, Products], Published]  # what comes after the map, with what runs a stage
 

@@ -10,11 +10,11 @@ from typing import Any
 from flows.schedule.ledger_state import ENDINGS, read_moment
 from flows.survey.scores import score_of
 from pipeline.errors import ArchiveError
-from storage.archive import Archive
-from storage.class_maps import load_class_map, load_class_names
-from storage.ledger import Ledger, ledgers
-from storage.lineage import Catalogue
-from storage.records import Run
+from storage.archive.archive import Archive
+from storage.archive.ledger import Ledger, ledgers
+from storage.archive.lineage import Catalogue
+from storage.archive.records import Run
+from storage.arrays.class_maps import load_class_map, load_class_names
 
 
 @dataclass(frozen=True)

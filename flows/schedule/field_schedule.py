@@ -16,7 +16,7 @@ from typing import Any
 from flows.schedule.ledger_state import Ending, ScheduleState, moment_words, read_state
 from flows.schedule.times import Timetable
 from flows.schedule.wall_clock import WallClock
-from storage.ledger import Ledger
+from storage.archive.ledger import Ledger
 
 SET_BACK = timedelta(minutes=1)  # a clock that goes back by less is being put right
 MOST_LINES = 100  # due times that passed and have a line each; more have one together

@@ -20,10 +20,10 @@ from flows.schedule.wall_clock import SystemWallClock, WallClock
 from flows.settings.survey_settings import Settings, load_settings
 from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
 from pipeline.simulator.farm_laws import has_days
-from storage.archive import Archive
-from storage.ledger import Ledger
-from storage.staging import take_lock
-from storage.toml_files import read_toml
+from storage.archive.archive import Archive
+from storage.archive.ledger import Ledger
+from storage.archive.staging import take_lock
+from storage.archive.toml_files import read_toml
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from flows.archive.commands import check_outside
 from flows.schedule.field_history import FieldHistory, read_histories
 from flows.schedule.history_page import render_history, render_index, way_to
 from pipeline.errors import SettingsError
-from storage.archive import Archive
-from storage.whole_files import write_whole
+from storage.archive.archive import Archive
+from storage.archive.whole_files import write_whole
 
 
 def run_report(archive: str | Path, field: str | None, out: Path, console: Console) -> dict[str, Any]:

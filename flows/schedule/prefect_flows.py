@@ -29,8 +29,8 @@ from flows.schedule.served import read_served, served_archive, served_field, ser
 from flows.schedule.wall_clock import WallClock
 from flows.terminal.shown_text import on_stderr
 from pipeline.errors import PipelineError, RigError
-from storage.archive import Archive
-from storage.staging import take_lock
+from storage.archive.archive import Archive
+from storage.archive.staging import take_lock
 
 LIMIT = "rig"  # a Prefect concurrency limit that shows who waits; the kernel's lock decides
 REPROCESS_LOCK = "reprocess-flow.lock"

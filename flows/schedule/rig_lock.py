@@ -24,7 +24,7 @@ from pathlib import Path
 from flows.schedule.wall_clock import SystemWallClock, WallClock
 from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError, RigError
-from storage.staging import take_lock
+from storage.archive.staging import take_lock
 
 FIXED_FOLDER = Path("/tmp")  # not TMPDIR, of which each user may have another
 ASK_AGAIN_S = 1.0

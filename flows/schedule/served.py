@@ -16,7 +16,7 @@ from flows.schedule.fields import ServedField, load_field
 from flows.schedule.request import ServeRequest
 from flows.schedule.times import exact_words, parse_timetable
 from pipeline.errors import SettingsError
-from storage.whole_files import write_whole
+from storage.archive.whole_files import write_whole
 
 NAMED_BY = "SPECTRALZOOM_SERVED"  # the environment variable that names the file
 KEYS = ("files", "out", "cron", "every", "timezone", "late", "limit", "notify")

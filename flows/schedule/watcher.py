@@ -22,7 +22,7 @@ from flows.schedule.queue import FlowRuns
 from flows.schedule.request import ServeRequest
 from flows.schedule.rig_lock import RigLock
 from flows.schedule.times import Timetable
-from storage.staging import take_lock
+from storage.archive.staging import take_lock
 
 AHEAD, LEAST_AHEAD, MOST_AHEAD = timedelta(minutes=1), 2, 12  # due times to come that stand in Prefect
 UNHEARD = timedelta(minutes=2)

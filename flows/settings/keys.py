@@ -25,10 +25,10 @@ from flows.settings.values import (
     parse_wavelengths,
     parse_whole,
 )
-from pipeline.camera import LineCamera
-from pipeline.ground import LIMITS, RigPose
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import CostModel
+from pipeline.ground.view import LIMITS, RigPose
 from pipeline.rig.survey_rig import SurveyRig
-from pipeline.scan import CostModel
 from pipeline.simulator.farm_laws import FARM_NAMES
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Sky
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from flows.settings.device_table import MOST_PAIRS
 from flows.settings.keys import BUILT_IN_SCENES, RIG_FIELD, MapChoice
-from models.vgg_sizes import TRAINED_VGG_FROM, VGG_FROM
+from models.network.vgg_sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import SettingsError
 from pipeline.simulator.farm_laws import SEASON_LAW, has_days
 

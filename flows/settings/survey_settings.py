@@ -12,15 +12,15 @@ from typing import Any, Literal, cast
 from flows.settings.keys import BUILT_IN_SCENES, REPLACED, RIG_FIELD, SURVEY, TABLES, MapChoice, Parser
 from flows.settings.rules import check_together, place_of
 from flows.settings.values import Tolerance
-from pipeline.camera import LineCamera
 from pipeline.errors import PoseError, SettingsError
-from pipeline.ground import RigPose
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import CostModel
+from pipeline.ground.view import RigPose
 from pipeline.rig.survey_rig import SurveyRig
-from pipeline.scan import CostModel
 from pipeline.simulator.farm_laws import USUAL_DAY, USUAL_HOUR, has_days
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
-from storage.block_work import Crew
-from storage.toml_files import read_toml
+from storage.archive.toml_files import read_toml
+from storage.parallel.block_work import Crew
 
 OF_THE_MACHINE = ("scheduler", "workers")  # no byte depends on them; a cluster of that day need not be there today
 _PATHS = ("scene", "labels", "out", "mask", "vgg", "weights")

@@ -22,12 +22,12 @@ from flows.survey.scene import farm_refusal, open_scene
 from flows.survey.stages import VERSIONS, Build, capture_sweeps
 from flows.terminal.figures import format_bytes, format_seconds
 from flows.terminal.progress import StageProgress
-from models.process import keep_freed_memory, use_one_thread
+from models.network.process import keep_freed_memory, use_one_thread
 from pipeline.errors import ArchiveError, SceneError, SettingsError
-from pipeline.grid import SceneGrid
-from pipeline.scan import Sweep
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.manifest import UNIT_WORDS
-from storage.archive import Archive, StageRef
+from storage.archive.archive import Archive, StageRef
 from storage.scene_files import load_scene_file
 
 TITLES = {"effects": "effects that matter", "capture": "scan", "comparison": "the same with everything on"}

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from flows.publish.colour_stretch import choose_bands
 from flows.survey.effect_choice import chosen_effects, load_manifest, source_with
 from flows.survey.run import CaptureRun
-from pipeline.camera import bin_samples
 from pipeline.errors import BoundError
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import bin_samples
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.arithmetic import contrast_about, misplaced_electrons, misplaced_share
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import Effect
@@ -34,7 +34,7 @@ from pipeline.simulator.render import expected_light
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.simulator.stored_light import stored_mean, unit_at
 from pipeline.simulator.survey_clock import sweep_starts
-from storage.archive import StageRef
+from storage.archive.archive import StageRef
 
 MOST_S = 60.0  # of processor time for both ways together; beyond, not all lines are compared
 VIEW_PX = 160  # of the camera, along the line and along the scan

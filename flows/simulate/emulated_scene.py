@@ -13,7 +13,7 @@ from flows.simulate.command import open_simulation
 from flows.survey.effect_choice import choose_effects, source_with
 from flows.survey.stages import VERSIONS, Build
 from pipeline.simulator.simulated import SimulatedSource
-from storage.archive import Archive, StageRef
+from storage.archive.archive import Archive, StageRef
 
 
 @dataclass

@@ -22,20 +22,28 @@ from flows.survey.full_look import columns_of_all_seats
 from flows.survey.pointing import load_registration
 from flows.survey.run import SurveyRun
 from flows.survey.stages import Produce, digest, glance_at, patch_columns
-from models.controls import CONTROL_SHARE, Controls, run_controls
-from models.inference import CoarseLook, Glance, glance_of_columns, segment
-from models.metrics import agreement, average_accuracy, confusion, false_pixels, gap_closed, iou_per_class, kappa
-from models.policies import score_seats
+from models.evaluation.metrics import (
+    agreement,
+    average_accuracy,
+    confusion,
+    false_pixels,
+    gap_closed,
+    iou_per_class,
+    kappa,
+)
+from models.policies.free_seats import CONTROL_SHARE, Controls, run_controls
+from models.policies.policies import score_seats
+from models.reading.inference import CoarseLook, Glance, glance_of_columns, segment
 from models.second_look import surprise
-from pipeline.grid import UNLABELLED
-from pipeline.planning import price_of_seats
-from pipeline.savings import count_lines
-from pipeline.selection import frame_seats
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.planning.fine_pass import price_of_seats
+from pipeline.planning.savings import count_lines
+from pipeline.planning.selection import frame_seats
 from pipeline.simulator.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.simulated import SimulatedSource
-from storage.archive import StageRef
-from storage.class_maps import load_class_map
-from storage.stored_tables import read_table
+from storage.archive.archive import StageRef
+from storage.archive.stored_tables import read_table
+from storage.arrays.class_maps import load_class_map
 
 
 def evaluate(

@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flows.settings.survey_settings import Settings
-from pipeline.coverage import cheapest_full, coarse_sweeps, with_margin
 from pipeline.errors import SettingsError
-from pipeline.grid import SceneGrid
-from pipeline.planning import check_budget
-from pipeline.rectify.overlaps import LEAST_OVERLAP_PX
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Axis, Sweep
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps, with_margin
+from pipeline.planning.fine_pass import check_budget
 from pipeline.rectify.placed import PixelGrid, place
+from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
 from pipeline.rectify.tiles import plan_tiles
-from pipeline.scan import Axis, Sweep
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from pipeline.source import References
-from storage.layout import image_spec
-from storage.tile_work import MosaicWork, tile_budget
+from storage.arrays.layout import image_spec
+from storage.arrays.tile_work import MosaicWork, tile_budget
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,8 @@ from pipeline.simulator.stored_light import unit_at
 from pipeline.simulator.survey_clock import sweep_starts
 from pipeline.simulator.survey_probe import probe_survey
 from pipeline.simulator.verification import verify
-from storage.archive import StageRef
-from storage.stored_tables import read_table
+from storage.archive.archive import StageRef
+from storage.archive.stored_tables import read_table
 
 if TYPE_CHECKING:
     from flows.survey.stages import Produce

@@ -8,12 +8,12 @@ from math import ceil
 from typing import Literal
 
 from flows.survey.field_work import SHARD
-from models.cost import multiply_adds
-from models.regions import plan_regions, whole_field
-from models.sizes import SegmenterConfig
-from pipeline.camera import LineCamera
-from pipeline.grid import SceneGrid
-from pipeline.scan import Axis, CostModel
+from models.network.cost import multiply_adds
+from models.network.sizes import SegmenterConfig
+from models.reading.regions import plan_regions, whole_field
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Axis, CostModel
 
 Unit = Literal[
     "pixels", "coarse pixels", "scene values", "mosaic values", "coarse values", "fine values", "patch values",

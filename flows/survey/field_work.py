@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 
 from flows.survey.region_work import Comparing, Drawing, Scoring, Strange, WeightsFile
 from flows.survey.run import SurveyRun, weights_path
-from models.policies import IMAGE_POLICIES
-from models.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field
-from models.vgg_file import VggFile
-from models.vgg_sizes import saliency_bytes
+from models.network.vgg_sizes import saliency_bytes
+from models.policies.policies import IMAGE_POLICIES
+from models.policies.vgg_file import VggFile
+from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field
 from pipeline.errors import SettingsError
-from pipeline.grid import SceneGrid
-from storage.block_work import Crew, run_blocks
-from storage.layout import SHARD_COLUMNS, SHARD_ROWS
-from storage.mosaic_strips import mosaic_wavelengths
-from storage.patches import open_patches
-from storage.tile_work import RESERVED_BYTES
+from pipeline.geometry.grid import SceneGrid
+from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS
+from storage.arrays.mosaic_strips import mosaic_wavelengths
+from storage.arrays.patches import open_patches
+from storage.arrays.tile_work import RESERVED_BYTES
+from storage.parallel.block_work import Crew, run_blocks
 
 SHARD = (SHARD_ROWS, SHARD_COLUMNS)
 IMAGE_BYTES = 128  # a coarse pixel, of what a policy of the whole image holds at once beside the columns

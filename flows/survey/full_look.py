@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from models.weights import Weights
-from pipeline.grid import SceneGrid
+from models.weights.files import Weights
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Sweep
 from pipeline.rectify.region import read_seats
 from pipeline.rectify.resample import Kernel
-from pipeline.scan import Sweep
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 MEMORY_SHARE = 32  # a band of seats may take this part of the memory

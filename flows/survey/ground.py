@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from flows.publish.colour_stretch import choose_bands, develop, stretch
 from flows.survey.run import SurveyRun
 from flows.survey.stages import Produce
-from pipeline.ground import GroundView
-from pipeline.ground_grid import GroundGrid, classes_at, ground_grid, image_at, map_blocks
-from storage.archive import StageRef
-from storage.class_maps import ClassMap, load_class_map
-from storage.ground_maps import BLOCK, ClassLegend, GroundMapWriter
-from storage.layout import SHARD_ROWS, open_group, read_array, read_bands
+from pipeline.ground.map_grid import GroundGrid, classes_at, ground_grid, image_at, map_blocks
+from pipeline.ground.view import GroundView
+from storage.archive.archive import StageRef
+from storage.arrays.class_maps import ClassMap, load_class_map
+from storage.arrays.ground_maps import BLOCK, ClassLegend, GroundMapWriter
+from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
 
 STORE = "ground_map.zarr"
 

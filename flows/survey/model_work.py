@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from flows.survey.field_work import SHARD
 from flows.survey.run import SurveyRun
-from models.cost import MultiplyAdds, multiply_adds
-from models.policies import IMAGE_POLICIES, NETWORK_POLICIES, SEEING_POLICIES
-from models.regions import Region, plan_regions, whole_field
-from pipeline.planning import FinePlan, joined_plan
+from models.network.cost import MultiplyAdds, multiply_adds
+from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, SEEING_POLICIES
+from models.reading.regions import Region, plan_regions, whole_field
+from pipeline.planning.fine_pass import FinePlan, joined_plan
 
 
 def work_done(run: SurveyRun, plans: Sequence[FinePlan]) -> MultiplyAdds:

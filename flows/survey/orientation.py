@@ -8,12 +8,12 @@ from typing import Any
 
 from flows.survey.run import SurveyRun
 from flows.survey.stages import Produce, load_plan, write_json
-from pipeline.crop_rows import find_rows
-from pipeline.orientation import compare_orientations
-from storage.archive import StageRef
-from storage.attention import load_attention
-from storage.mosaic_strips import mosaic_brightness
-from storage.stored_tables import read_table
+from pipeline.planning.crop_rows import find_rows
+from pipeline.planning.orientation import compare_orientations
+from storage.archive.archive import StageRef
+from storage.archive.stored_tables import read_table
+from storage.arrays.attention import load_attention
+from storage.arrays.mosaic_strips import mosaic_brightness
 
 FILE = "orientation.json"
 

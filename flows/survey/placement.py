@@ -17,17 +17,17 @@ from pipeline.errors import ShapeError
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.placed import PixelGrid
 from pipeline.rectify.region import read_seats
-from pipeline.rectify.ties import TieTable
+from pipeline.rectify.tie_points import TieTable
 from pipeline.rectify.tracks import Track
-from storage.archive import StageRef
-from storage.layout import read_array
-from storage.lookups import path_digest, write_lookup
-from storage.mosaics import MosaicWriter
-from storage.patches import PatchStore, PatchWriter, open_patches
-from storage.quicklooks import stretched
-from storage.sightings import Sighted, sight_sweeps
-from storage.stored_tables import read_table
-from storage.tile_work import MosaicRecipe, write_mosaic
+from storage.archive.archive import StageRef
+from storage.archive.stored_tables import read_table
+from storage.arrays.layout import read_array
+from storage.arrays.located_sweeps import Sighted, sight_sweeps
+from storage.arrays.lookups import path_digest, write_lookup
+from storage.arrays.mosaics import MosaicWriter
+from storage.arrays.patches import PatchStore, PatchWriter, open_patches
+from storage.arrays.quicklooks import stretched
+from storage.arrays.tile_work import MosaicRecipe, write_mosaic
 
 CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the memory
 

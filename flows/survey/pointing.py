@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from flows.survey.placement import sighted
 from flows.survey.run import SurveyRun
 from flows.survey.stages import Produce, write_json
-from pipeline.rectify.alignment import SweepShift
-from pipeline.rectify.anchoring import Anchor, anchor_sweep
-from pipeline.rectify.illumination import overlap_light, solve_lights
-from pipeline.rectify.overlaps import BroadSweep, broad_bands
 from pipeline.rectify.placed import Placed
-from pipeline.rectify.seams import Registration, SeamWindow, register_sweeps
-from storage.archive import StageRef
-from storage.mosaics import load_mosaic
-from storage.stored_tables import read_table
+from pipeline.rectify.registration.alignment import SweepShift
+from pipeline.rectify.registration.anchoring import Anchor, anchor_sweep
+from pipeline.rectify.registration.illumination import overlap_light, solve_lights
+from pipeline.rectify.registration.overlaps import BroadSweep, broad_bands
+from pipeline.rectify.registration.seams import Registration, SeamWindow, register_sweeps
+from storage.archive.archive import StageRef
+from storage.archive.stored_tables import read_table
+from storage.arrays.mosaics import load_mosaic
 
 RECORD = "registration.json"
 

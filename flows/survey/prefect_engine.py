@@ -17,8 +17,8 @@ from flows.survey.survey import Products, StageRunner, Step, survey
 from flows.terminal.process_guard import end_with_us
 from flows.terminal.termination import terminable
 from pipeline.errors import PipelineError
-from storage.archive import StageRef
-from storage.staging import remove_tree, take_lock
+from storage.archive.archive import StageRef
+from storage.archive.staging import remove_tree, take_lock
 
 RETRIES = {
     "capture_coarse": 2,

@@ -15,14 +15,14 @@ from flows.survey.run import SurveyRun
 from pipeline.errors import PipelineError
 from pipeline.rectify.placed import PixelGrid
 from pipeline.source import Source
-from storage.addresses import ahead_of
-from storage.archive import StageRef
-from storage.lookups import path_digest
+from storage.archive.addresses import ahead_of
+from storage.archive.archive import StageRef
+from storage.arrays.located_sweeps import Sighted
+from storage.arrays.lookups import path_digest
+from storage.arrays.mosaic_work import MosaicWork
+from storage.arrays.mosaics import MosaicWriter
+from storage.arrays.tile_work import Thumbnail
 from storage.mosaic_ahead import AheadOf, MosaicAhead, PlannedLines, place_as_planned, take_over
-from storage.mosaic_work import MosaicWork
-from storage.mosaics import MosaicWriter
-from storage.sightings import Sighted
-from storage.tile_work import Thumbnail
 
 LOG = logging.getLogger(__name__)
 QUICKLOOK_PX = 512

@@ -12,18 +12,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from models.inference import CoarseLook, Glance, look_coarsely, read_glance, segment
-from models.policies import IMAGE_POLICIES, NETWORK_POLICIES, score_seats
-from models.regions import Region
+from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, score_seats
+from models.policies.vgg_file import VggFile
+from models.reading.inference import CoarseLook, Glance, look_coarsely, read_glance, segment
+from models.reading.regions import Region
 from models.second_look import surprise
-from models.vgg_file import VggFile
-from models.weights import Weights, content_key, load_weights
+from models.weights.files import Weights, content_key, load_weights
 from pipeline.errors import WeightsError
 from pipeline.readings import beyond_range, readings_alone
-from storage.class_maps import write_class_tile
-from storage.mosaic_strips import mosaic_strips, mosaic_wavelengths
-from storage.patches import PATCHES_A_SHARD, PatchStore, open_patches
-from storage.tile_work import let_tiles_go
+from storage.arrays.class_maps import write_class_tile
+from storage.arrays.mosaic_strips import mosaic_strips, mosaic_wavelengths
+from storage.arrays.patches import PATCHES_A_SHARD, PatchStore, open_patches
+from storage.arrays.tile_work import let_tiles_go
 
 Strange = tuple[int, int]  # coarse pixels, and fine ones, with a value that is no reading
 

@@ -8,11 +8,11 @@ from functools import partial
 from itertools import islice
 from threading import Semaphore
 
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.instrument import BLOCK_LINES
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Line, Source
-from storage.block_work import Crew, run_blocks
+from storage.parallel.block_work import Crew, run_blocks
 
 Take = Callable[[Line], None]
 

@@ -13,15 +13,15 @@ import numpy as np
 from flows.settings.keys import RIG_FIELD
 from flows.settings.survey_settings import Settings
 from pipeline.errors import SettingsError
-from pipeline.once import Once
+from pipeline.geometry.scan import Sweep
+from pipeline.lazy import Once
 from pipeline.rig.camera_limits import CameraLimits, check_times
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
 from pipeline.rig.kept_files import KeptInMemory
-from pipeline.scan import Sweep
 from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.scene import RasterScene
 from pipeline.source import Line, Source
-from storage.fetched_files import FetchedFiles
+from storage.arrays.fetched_files import FetchedFiles
 
 if TYPE_CHECKING:
     from flows.survey.run import CaptureRun

@@ -18,8 +18,8 @@ from flows.settings.survey_settings import Settings
 from flows.survey.capture_plan import CapturePlan, check_memory, plan_capture
 from flows.survey.rig_run import for_rig, rig_source
 from flows.survey.scene import check_labels, check_mask, farm_refusal, judged_labels, open_scene
-from models.vgg_file import VggFile
-from models.weights import (
+from models.policies.vgg_file import VggFile
+from models.weights.files import (
     Description,
     Weights,
     check_two_scale,
@@ -28,18 +28,18 @@ from models.weights import (
     load_weights,
     unsealed_note,
 )
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError, WeightsError
-from pipeline.grid import SceneGrid
-from pipeline.ground import GroundView
-from pipeline.ground_grid import ground_grid
-from pipeline.once import Once
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Sweep
+from pipeline.ground.map_grid import ground_grid
+from pipeline.ground.view import GroundView
+from pipeline.lazy import Once
 from pipeline.simulator.pointing import PointingErrors
 from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
-from storage.archive import Archive
-from storage.layout import AngularGrid
+from storage.archive.archive import Archive
+from storage.arrays.layout import AngularGrid
 from storage.raster_files import load_raster
 
 if TYPE_CHECKING:

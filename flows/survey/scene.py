@@ -12,10 +12,10 @@ from flows.settings.keys import BUILT_IN_SCENES, RIG_FIELD
 from flows.settings.survey_settings import Settings
 from flows.survey.rig_run import field_before_rig
 from flows.training.data import scene_of_file, unpack_mask
-from models.weights import Description
+from models.weights.files import Description
 from pipeline.errors import SceneError, SettingsError
-from pipeline.grid import UNLABELLED
-from pipeline.once import Once
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.lazy import Once
 from pipeline.simulator.farm_laws import FARM_SHAPE, built_in_farm, law_of_key
 from pipeline.simulator.raster import Light
 from pipeline.simulator.scene import RasterScene

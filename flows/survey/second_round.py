@@ -17,10 +17,10 @@ from flows.survey.placement import seen_shares
 from flows.survey.run import SurveyRun
 from flows.survey.stages import Produce, load_plan, write_plan
 from models.second_look import rescore
-from pipeline.planning import FinePlan, plan_fine
-from storage.archive import StageRef
-from storage.attention import Attention, load_attention, write_attention
-from storage.patches import open_patches
+from pipeline.planning.fine_pass import FinePlan, plan_fine
+from storage.archive.archive import StageRef
+from storage.arrays.attention import Attention, load_attention, write_attention
+from storage.arrays.patches import open_patches
 
 WHOLE = 1 - 1e-9  # of a seat's pixels on the scene, seen: nothing is left to look at
 

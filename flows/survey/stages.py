@@ -25,20 +25,20 @@ from flows.survey.region_work import look_at, seat_columns
 from flows.survey.rendered_lines import lines_again, take_lines
 from flows.survey.rig_run import RIG_RECORD, capture_source, held_lines, rig_record
 from flows.survey.run import CaptureRun, SurveyRun
-from models.inference import CoarseLook, Glance, read_glance
-from models.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_seats
-from models.regions import whole_field
-from pipeline.planning import FinePlan, plan_fine
-from pipeline.scan import Sweep
+from models.policies.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_seats
+from models.reading.inference import CoarseLook, Glance, read_glance
+from models.reading.regions import whole_field
+from pipeline.geometry.scan import Sweep
+from pipeline.planning.fine_pass import FinePlan, plan_fine
 from pipeline.simulator.survey_clock import sweep_starts
 from pipeline.source import Line, Source
-from storage.archive import StageRef, stage_key
-from storage.attention import Attention, write_attention
-from storage.class_maps import ClassNames, clear_classes, create_class_map
-from storage.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
-from storage.patches import open_patches
-from storage.spool import Spool
-from storage.stored_tables import read_table
+from storage.archive.archive import StageRef, stage_key
+from storage.archive.stored_tables import read_table
+from storage.arrays.attention import Attention, write_attention
+from storage.arrays.class_maps import ClassNames, clear_classes, create_class_map
+from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
+from storage.arrays.patches import open_patches
+from storage.arrays.spool import Spool
 
 VERSIONS = {
     "effects": 2, "capture": 4, "register": 2, "locate": 2, "rectify": 3, "attend": 7, "patches": 3, "segment": 5,

@@ -19,7 +19,7 @@ from flows.survey.orientation import compare_turned
 from flows.survey.pointing import register_coarse, register_fine
 from flows.survey.run import SurveyRun
 from flows.survey.second_round import attend_again
-from storage.archive import StageRef
+from storage.archive.archive import StageRef
 
 STAGES: dict[str, Callable[..., StageRef | None]] = {
     "choose_effects": choose_effects,

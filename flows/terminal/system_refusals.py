@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import resource
 
-from storage.staging import disk_advice
+from storage.archive.staging import disk_advice
 
 # Of exceptions that are no MemoryError: of torch and of threads; and, where memory is limited, of the loader.
 _OF_MEMORY = ("can't allocate memory", "not enough memory", "can't start new thread", "cannot allocate memory")

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from flows.survey.full_look import columns_of_all_seats
 from flows.tradeoff.entries import Setting, Tradeoff, register
 from flows.tradeoff.farm import FarmLook, look_at_farm
-from models.inference import ClassMap, Glance, glance, segment
-from models.metrics import confusion, mean_iou
-from models.policies import score_seats
-from pipeline.planning import FinePlan, plan_fine
-from pipeline.scan import CostModel
+from models.evaluation.metrics import confusion, mean_iou
+from models.policies.policies import score_seats
+from models.reading.inference import ClassMap, Glance, glance, segment
+from pipeline.geometry.scan import CostModel
+from pipeline.planning.fine_pass import FinePlan, plan_fine
 
 SHAPE = (768, 960)
 BUDGETS = (1.0, 0.8, 0.65, 0.5, 0.4, 0.33)

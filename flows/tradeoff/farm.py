@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.survey.run import SHIPPED
-from models.weights import Weights, load_weights
-from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_full, coarse_sweeps
-from pipeline.grid import SceneGrid
+from models.weights.files import Weights, load_weights
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Axis, CostModel, Sweep
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps
 from pipeline.rectify.region import mosaic_rows
-from pipeline.scan import Axis, CostModel, Sweep
 from pipeline.simulator.farm_laws import built_in_farm
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import RasterScene

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register
-from pipeline.camera import LineCamera
-from pipeline.mirror import direction_to_normal, scene_to_direction
-from pipeline.paper import LINE_MODELS, LineModel, line_points, unlimited_position
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
+from pipeline.geometry.paper_equations import LINE_MODELS, LineModel, line_points, unlimited_position
 
 FIELD_PX = 10240
 LINES_APART_PX = 80.0

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register
 from flows.tradeoff.resample import draw_waves
-from pipeline.rectify.registration import PairShift, pair_shift
+from pipeline.rectify.registration.shifts import PairShift, pair_shift
 
 LENGTH_PX = 256  # of the seam
 OVERLAPS_PX = (16, 32, 64, 128, 256)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register
-from pipeline.camera import LineCamera
+from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.resample import Kernel, resample
 
 SIDE, BANDS, POINTS = 256, 64, 40_000

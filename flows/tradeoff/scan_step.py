@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register
-from pipeline.camera import LineCamera
-from pipeline.rectify.calibrate import reflectance
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.rectify.calibration.calibrate import reflectance
 from pipeline.rectify.lookup import grid_lookup
 from pipeline.rectify.resample import resample
-from pipeline.scan import CostModel, Sweep
 from pipeline.simulator.farm_laws import built_in_farm
 from pipeline.simulator.instrument import QUIET
 from pipeline.simulator.rig_model import Rig

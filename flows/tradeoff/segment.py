@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register
 from flows.tradeoff.farm import FarmLook, look_at_farm
-from models.inference import ClassMap, CoarseLook, Precision, glance, look_coarsely, read_glance, segment
-from models.metrics import confusion, mean_iou
-from models.policies import score_seats
+from models.evaluation.metrics import confusion, mean_iou
+from models.policies.policies import score_seats
+from models.reading.inference import ClassMap, CoarseLook, Precision, glance, look_coarsely, read_glance, segment
+from pipeline.planning.selection import frame_seats
 from pipeline.rectify.region import read_seats
-from pipeline.selection import frame_seats
 from pipeline.simulator.simulated import SimulatedSweep
 
 SHAPE = (384, 480)
@@ -50,7 +50,7 @@ class Farm:
 
 
 def _prepare(seed: int) -> Farm:
-    from models.process import keep_freed_memory
+    from models.network.process import keep_freed_memory
 
     keep_freed_memory()  # as surveys do
     farm = look_at_farm(seed, SHAPE)

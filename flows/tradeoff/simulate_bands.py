@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flows.tradeoff.entries import Setting, Tradeoff, register
 from flows.tradeoff.simulate import FOOTPRINT, Seen, prepare_footprint
 from flows.tradeoff.simulated_lines import FarmLines, Light
-from pipeline.once import Once
+from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import Effect, Moments
 from pipeline.simulator.raster import Light as SceneLight
 from pipeline.simulator.render import expected_light

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register
 from flows.tradeoff.simulated_lines import look_at_lines
-from pipeline.camera import LineCamera
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.quantisation import QUANTISATION

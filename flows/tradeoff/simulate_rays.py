@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from flows.tradeoff.entries import Setting, register
 from flows.tradeoff.simulate import FOOTPRINT
 from flows.tradeoff.simulated_lines import Against, FarmLines, Light, look_at_lines
-from pipeline.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.once import Once
+from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
+from pipeline.lazy import Once
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.registry import RAYS
 from pipeline.simulator.effects.slit import SLIT

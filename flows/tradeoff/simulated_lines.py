@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tradeoff.entries import Level
-from pipeline.coverage import full_sweeps
-from pipeline.grid import SceneGrid
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.coverage import full_sweeps
 from pipeline.simulator.block import Block
 from pipeline.simulator.choice import decide
 from pipeline.simulator.effects.effect import OFF, Effect

@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 from flows.survey.run import SHIPPED
 from flows.tradeoff.entries import Setting, Tradeoff, register
-from models.inference import glance, segment
-from models.weights import Weights, load_weights
-from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_full, coarse_sweeps
-from pipeline.grid import SceneGrid
+from models.reading.inference import glance, segment
+from models.weights.files import Weights, load_weights
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps
 from pipeline.rectify.region import mosaic_rows
-from pipeline.scan import CostModel
 from pipeline.simulator.farm_laws import built_in_farm
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from storage.arrays.layout import round_bits
 from storage.codec_trials import CODECS, store_in_memory
-from storage.layout import round_bits
 
 SHAPE = (384, 640)
 RAW_LINES = 96

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register
-from pipeline.camera import LineCamera
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, line_positions, scene_to_sweep
 from pipeline.rectify.lookup import tie_table
 from pipeline.rectify.tracks import Track, make_tracks
-from pipeline.scan import Sweep, line_positions, scene_to_sweep
 
 SWEEP = Sweep("ties", "fine", "x", strip_px=2500.0, start_px=-2000.0, lines=620)  # turned by 13 to 15 deg
 ORIGIN_PX, SHAPE = (-1930.0, 2230.0), (480, 540)  # of a grid that the sweep covers

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, SettingsError
-from pipeline.grid import UNLABELLED
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.simulator.farm_laws import FARM_LAW, FARM_NAMES, SEASON_LAW, built_in_farm, farm_law, has_days
 from pipeline.simulator.scene import RasterScene, raster_from_values
 from storage.datasets import DataSet, load_data_set

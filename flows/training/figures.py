@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.control_maps import draw_with_control
-from models.controls import CONTROL_SHARE, RANDOM_DRAWS, Controls, Counts, agreement_of_draws, run_controls
-from models.examples import Example
-from models.holes import patches_of
-from models.inference import Glance, glance_of_columns
-from models.metrics import agreement, confusion
-from models.policies import score_seats
-from models.segmenter import Segmenter
-from models.weights import AnyWeights, Weights
-from pipeline.grid import SceneGrid
-from pipeline.selection import frame_seats
+from models.evaluation.metrics import agreement, confusion
+from models.network.dead_pixels import patches_of
+from models.network.segmenter import Segmenter
+from models.policies.free_seats import CONTROL_SHARE, RANDOM_DRAWS, Controls, Counts, agreement_of_draws, run_controls
+from models.policies.policies import score_seats
+from models.reading.control_maps import draw_with_control
+from models.reading.inference import Glance, glance_of_columns
+from models.training.examples import Example
+from models.weights.files import AnyWeights, Weights
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.selection import frame_seats
 
 Show = Callable[[str], None]
 Patches = NDArray[np.float32]  # (seat, p, p, column) of every seat of the padded grid

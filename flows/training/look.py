@@ -2,7 +2,7 @@
 
 Built-in farms are seen through the rig as a survey captures them: effects are chosen for each scene as surveys choose
 them by default, then the coarse pass and the scan of everything are rendered, calibrated and rectified. A camera has
-looked at scene files already: they pass the footprint and the noise alone, by `models.examples.observe`.
+looked at scene files already: they pass the footprint and the noise alone, by `models.training.examples.observe`.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from models.examples import Observation, observe
-from models.spectral import SpectralBasis, project
-from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_full, coarse_sweeps
+from models.network.spectral import SpectralBasis, project
+from models.training.examples import Observation, observe
 from pipeline.errors import SceneError
-from pipeline.grid import UNLABELLED, SceneGrid, pad_by_reflection
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
+from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps
 from pipeline.rectify.region import mosaic_rows
-from pipeline.scan import CostModel, Sweep
 from pipeline.simulator.choice import decide
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.farm_laws import law_of_key

@@ -9,8 +9,8 @@ from typing import Any
 from rich.console import Console
 
 from flows.training.data import TrainingData, either_mask
-from models.sizes import Preset, SegmenterConfig
-from models.start_weights import StartFile
+from models.network.sizes import Preset, SegmenterConfig
+from models.training.start_weights import StartFile
 from pipeline.errors import SettingsError, ShapeError
 
 Split = dict[str, Any]

@@ -14,15 +14,15 @@ from flows.training.data import TrainingData, open_training_data, pack_mask, tra
 from flows.training.figures import validate
 from flows.training.look import observe_scene
 from flows.training.start import joined_split, open_start, refuse_seen
-from models.checkpoint import read_checkpoint
-from models.examples import Observation, measured_normalisation, normalised
-from models.sizes import PRESETS, Positions, Preset, SegmenterConfig
-from models.spectral import SpectralBasis
-from models.training import Progress, TrainingSettings, train
-from models.weights import AnyWeights, save_weights, with_record
-from pipeline.camera import LineCamera
+from models.network.sizes import PRESETS, Positions, Preset, SegmenterConfig
+from models.network.spectral import SpectralBasis
+from models.training.checkpoint import read_checkpoint
+from models.training.examples import Observation, measured_normalisation, normalised
+from models.training.train import Progress, TrainingSettings, train
+from models.weights.files import AnyWeights, save_weights, with_record
 from pipeline.errors import SceneError, SettingsError
-from pipeline.grid import SceneGrid
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.farm_laws import FARM_NAMES
 from pipeline.simulator.scene import RasterScene
 

@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
-from pipeline.mirror import camera_slope, line_centre
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import camera_slope, line_centre
+from pipeline.geometry.scan import Axis
 from pipeline.rectify.tracks import Track
-from pipeline.scan import Axis
 
 NEWTON_ROUNDS = 4
 HALVINGS = 34  # from one knot to 1e-10 of it
@@ -172,7 +172,7 @@ def _miss(curve: KnotCurve, a: Floats, b: Floats, knot: Floats) -> tuple[Floats,
 
 
 def _centre_and_slope(a: Floats, b: Floats, c: Floats) -> tuple[Floats, Floats]:
-    """:func:`pipeline.mirror.line_centre` and its derivative by c."""
+    """:func:`pipeline.geometry.mirror.line_centre` and its derivative by c."""
     reach = 1 + a * a - (a - c) ** 2
     reach = np.where(reach > 0, reach, np.nan)
     root = np.sqrt(reach + b * b)

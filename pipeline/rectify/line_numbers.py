@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError, ShapeError
-from pipeline.mirror import direction_to_position, direction_to_scene, position_to_direction, scene_to_direction
+from pipeline.geometry.mirror import (
+    direction_to_position,
+    direction_to_scene,
+    position_to_direction,
+    scene_to_direction,
+)
 
 LATE_FRAMES = 0.25
 LEAST_FRAMES = 3  # below that none can be told to be the late one

@@ -1,7 +1,7 @@
 """Lookup: where on a sweep, in lines and samples, each point of the scene was seen. Exact rays.
 
 A straight even track has a closed form, any other is solved by Newton (:mod:`pipeline.rectify.knot_curve`). For whole
-grids :mod:`pipeline.rectify.ties` keeps the exact answer at every few pixels.
+grids :mod:`pipeline.rectify.tie_points` keeps the exact answer at every few pixels.
 """
 
 from __future__ import annotations
@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
 from pipeline.errors import PoseError, ShapeError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Axis
 from pipeline.rectify.knot_curve import KnotCurve, drop_unseen, grid_points, knots_of_points
-from pipeline.rectify.ties import TieTable as TieTable
-from pipeline.rectify.ties import tie_table as tie_table
+from pipeline.rectify.tie_points import TieTable as TieTable
+from pipeline.rectify.tie_points import tie_table as tie_table
 from pipeline.rectify.tracks import Track, line_centres, single_track
-from pipeline.scan import Axis
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.rectify.mosaic import Part, edge_distance, mosaic
-from pipeline.rectify.registration import PairShift, pair_shift
+from pipeline.rectify.registration.shifts import PairShift, pair_shift
 from pipeline.rectify.resample import Kernel, resample
 
 Floats = NDArray[np.float64]

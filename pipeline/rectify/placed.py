@@ -8,12 +8,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
 from pipeline.errors import ShapeError
-from pipeline.grid import SceneGrid
-from pipeline.rectify.elements import Elements, judge_elements
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.rectify.calibration.flat_field import Elements, judge_elements
 from pipeline.rectify.lookup import track_lookup
-from pipeline.rectify.ties import TieTable, tie_table
+from pipeline.rectify.tie_points import TieTable, tie_table
 from pipeline.rectify.tracks import Track, make_tracks
 from pipeline.source import SweepLines
 

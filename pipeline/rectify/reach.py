@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import points_of_scan
 from pipeline.rectify.placed import PixelGrid, Placed
 from pipeline.rectify.tracks import Track
-from pipeline.scan import points_of_scan
 
 PIECE_SAMPLES = 64
 MARGIN_PX = 2.0  # of the grid: half a pixel, half a sample, and rounding

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
-from pipeline.grid import SceneGrid
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
 from pipeline.rectify.line_cache import LineCache, Raw, ReadWindow
 from pipeline.rectify.mosaic import mosaic
 from pipeline.rectify.placed import PixelGrid as PixelGrid

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from pipeline.camera import LineCamera
+from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.line_cache import BLOCK_LINES, held_samples, line_blocks
 from pipeline.rectify.placed import PixelGrid, Placed
 from pipeline.rectify.reach import ColumnReach, TrackReach, member_lines

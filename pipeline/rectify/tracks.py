@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
 from pipeline.errors import PoseError, ShapeError
-from pipeline.mirror import RIM_SLACK, direction_to_scene, position_to_direction
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import RIM_SLACK, direction_to_scene, position_to_direction
 
 STANDING_STEPS = 1e-3  # a mirror that moves less than this stands still
 DWELL_STEPS = 0.25  # lines closer than this show the same place

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
-from pipeline.rectify.calibrate import calibrate
+from pipeline.geometry.camera import LineCamera
+from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.rectify.line_cache import Raw, ReadWindow
 from pipeline.rectify.mosaic import Part, edge_distance
 from pipeline.rectify.placed import Placed

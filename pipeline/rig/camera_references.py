@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import RigError, ShapeError
-from pipeline.rectify.detector import TO_SIGMA, BadElementCriteria, find_bad_elements
+from pipeline.rectify.calibration.detector import TO_SIGMA, BadElementCriteria, find_bad_elements
 from pipeline.source import References
 
 LEAST_LIT = 0.5  # share of the elements whose white is above their dark
@@ -76,7 +76,7 @@ def as_references(
     """Join dark and white into the references of a sweep, and say what was found.
 
     An element is bad where its dark frame is stuck, where either jumps amid its frames, or where
-    :func:`pipeline.rectify.detector.find_bad_elements` says so.
+    :func:`pipeline.rectify.calibration.detector.find_bad_elements` says so.
 
     Parameters
     ----------

@@ -15,9 +15,9 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from pipeline.checked_lines import read_checked, with_check
+from pipeline.geometry.scan import Sweep
 from pipeline.rig.kept_files import Kept
 from pipeline.rig.line_positions import CommandTimes, LinePositions
-from pipeline.scan import Sweep
 
 JOURNAL = "captures.jsonl"
 LOG = logging.getLogger(__name__)

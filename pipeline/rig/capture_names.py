@@ -12,8 +12,8 @@ import struct
 from dataclasses import dataclass
 from typing import Literal
 
+from pipeline.geometry.scan import Axis, Sweep
 from pipeline.rig.camera_limits import check_capture
-from pipeline.scan import Axis, Sweep
 
 REFERENCES = "references"  # prefix of a capture that is made for the dark and white frames in its folder
 _DIGITS = "0123456789abcdefghijklmnopqrstuv"

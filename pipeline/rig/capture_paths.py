@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, line_positions, sweep_positions
+from pipeline.geometry.vector_memory import memory_loads
 from pipeline.rig.line_positions import PlayedPath
 from pipeline.rig.steering import wire_positions
 from pipeline.rig.survey_rig import Pulses
-from pipeline.scan import Sweep, line_positions, sweep_positions
-from pipeline.vector_memory import memory_loads
 
 LEAD = 1  # cells before the first line's: a unit that waits for edges takes its first cell at the run command, assumed
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.camera import LineCamera
 from pipeline.errors import RigError
+from pipeline.geometry.camera import LineCamera
 from pipeline.rig.capture_journal import CaptureJournal, LoggedPath, Taken
 from pipeline.rig.capture_names import capture_prefix
 from pipeline.rig.capture_paths import LEAD, CapturePath

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
 from pipeline.errors import RigError
+from pipeline.geometry.camera import LineCamera
 from pipeline.rig.camera_cubes import CapturedLines
 from pipeline.rig.capture_journal import Taken, commands_of
 from pipeline.rig.capture_paths import CapturePath

@@ -10,9 +10,9 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.camera import LineCamera
 from pipeline.errors import RigError, ShapeError
-from pipeline.mirror import check_reach, direction_to_scene, position_to_direction
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import check_reach, direction_to_scene, position_to_direction
 from pipeline.rig.clock_fit import Bools, Floats, Ints, fit_clocks, match_edges
 from pipeline.rig.frame_times import FrameTimes, StampAt, mend_times, whole_numbers
 

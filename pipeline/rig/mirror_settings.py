@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 from pipeline.errors import SettingsError
+from pipeline.geometry.vector_memory import Ends
 from pipeline.rig.steering import ReadBack
 from pipeline.rig.wire import Patience
-from pipeline.vector_memory import Ends
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pipeline.errors import SettingsError
+from pipeline.geometry.vector_memory import Ends, device_range
 from pipeline.rig.links import ProLink
 from pipeline.rig.pro_payloads import Value, cell_int, get_value, get_values, read_values, set_values
 from pipeline.rig.registers import ChannelRegisters, Trigger, Unit, VectorRegister, X, Y
-from pipeline.vector_memory import Ends, device_range
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera, bin_samples
 from pipeline.errors import RigError
+from pipeline.geometry.camera import LineCamera, bin_samples
+from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera_files import NOT_LOGGED_IN
 from pipeline.rig.camera_references import as_references
 from pipeline.rig.capture_journal import CaptureJournal, Taken
@@ -37,7 +38,6 @@ from pipeline.rig.file_claims import FrameClaim
 from pipeline.rig.kept_files import Kept
 from pipeline.rig.refusals import DeviceRefused, StateUnknown
 from pipeline.rig.survey_rig import SurveyRig
-from pipeline.scan import Sweep
 from pipeline.simulator.instrument import check_binning
 from pipeline.source import Line, References
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import ShapeError
-from pipeline.mirror import check_reach
+from pipeline.geometry.mirror import check_reach
 from pipeline.rig.registers import Status, Trigger
 
 ReadBack = Literal["none", "sampled", "all"]

@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from pipeline.geometry.vector_memory import Ends
 from pipeline.rig.file_session import FileServer
 from pipeline.rig.mirror_settings import MirrorSettings
 from pipeline.rig.steering import ReadBack
-from pipeline.vector_memory import Ends
 
 if TYPE_CHECKING:
     from pipeline.rig.headwall_camera import CameraAddress

@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mirror import position_to_normal
-from pipeline.scan import Sweep, line_positions, sweep_positions
+from pipeline.geometry.mirror import position_to_normal
+from pipeline.geometry.scan import Sweep, line_positions, sweep_positions
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.streams import line_stream
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
-from pipeline.scan import scene_to_sweep
+from pipeline.geometry.scan import scene_to_sweep
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import Light
 from pipeline.simulator.stored_light import stored_mean

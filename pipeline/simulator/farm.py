@@ -30,9 +30,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SceneError
-from pipeline.once import Once
+from pipeline.geometry.camera import LineCamera
+from pipeline.lazy import Once
 from pipeline.simulator.farm_fields import CLASSES, SOWINGS, Canvas, Ground, Mixture, grass, hard_track, paint_parcel
 from pipeline.simulator.farm_laws import FARM_LAW
 from pipeline.simulator.farm_layout import (

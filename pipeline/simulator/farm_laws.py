@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from pipeline.errors import SceneError
 
 if TYPE_CHECKING:
-    from pipeline.camera import LineCamera
+    from pipeline.geometry.camera import LineCamera
     from pipeline.simulator.scene import RasterScene
 
 FARM_LAW, SEASON_LAW = "farm@1", "farm@2"

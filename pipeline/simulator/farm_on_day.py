@@ -19,8 +19,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
-from pipeline.once import Once
+from pipeline.geometry.camera import LineCamera
+from pipeline.lazy import Once
 from pipeline.simulator.farm import CLASS_COLOURS
 from pipeline.simulator.farm_fields import CLASSES, Ground
 from pipeline.simulator.farm_laws import SEASON_LAW, USUAL_DAY, USUAL_HOUR

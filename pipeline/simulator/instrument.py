@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera, bin_samples
 from pipeline.errors import SettingsError, ShapeError
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera, bin_samples
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.read_noise import READ_NOISE
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS

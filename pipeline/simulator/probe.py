@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
 
 Floats = NDArray[np.float64]
 Unit = Literal["sigma", "dn"]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.once import Once
+from pipeline.lazy import Once
 
 Drawn = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 _BINOMIAL = (np.array([1, 8, 28, 56, 70, 56, 28, 8, 1]) / 256).astype(np.float32)

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
-from pipeline.mirror import direction_to_scene, position_to_direction, position_to_normal
-from pipeline.scan import Sweep, line_positions, shifted_position
+from pipeline.geometry.mirror import direction_to_scene, position_to_direction, position_to_normal
+from pipeline.geometry.scan import Sweep, line_positions, shifted_position
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Effect, Moments
 from pipeline.simulator.effects.pupil import middle_normal

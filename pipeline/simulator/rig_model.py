@@ -12,8 +12,8 @@ from dataclasses import Field, dataclass, field, fields
 from datetime import UTC, datetime
 from typing import Any, Literal
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.coatings import Coating
 
 Source = Literal["measured", "data sheet", "assumed"]

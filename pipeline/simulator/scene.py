@@ -9,10 +9,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, ShapeError
-from pipeline.grid import UNLABELLED
-from pipeline.once import Once
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.lazy import Once
 from pipeline.readings import MOST_VALUE, find_beyond
 from pipeline.rectify.resample import gather
 from pipeline.simulator.raster import Light, Raster

@@ -14,9 +14,9 @@ from itertools import zip_longest
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera, footprint_kernel
 from pipeline.errors import SceneError
-from pipeline.scan import Sweep, scene_to_sweep
+from pipeline.geometry.camera import LineCamera, footprint_kernel
+from pipeline.geometry.scan import Sweep, scene_to_sweep
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene, Scene, to_bands
 
 Light = NDArray[np.float32]

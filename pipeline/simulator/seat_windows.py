@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
-from pipeline.grid import SceneGrid
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Sweep, scene_to_sweep
 from pipeline.rectify.reach import TAPS
 from pipeline.rectify.region import seat_pixels
-from pipeline.scan import Sweep, scene_to_sweep
 from pipeline.simulator.simulated import SimulatedSource
 
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
-from pipeline.scan import Sweep, line_positions
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.simulator.block import Block
 from pipeline.simulator.instrument import BLOCK_LINES, USUAL, check_binning, render_lines, sweep_block
 from pipeline.simulator.pointing import Pointing

@@ -23,8 +23,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
 from pipeline.errors import WavelengthError
+from pipeline.geometry.camera import LineCamera
 
 Spectrum = NDArray[np.float64]
 

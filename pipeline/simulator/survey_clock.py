@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pipeline.camera import LineCamera
-from pipeline.scan import CostModel, Sweep
-from pipeline.vector_memory import memory_loads
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.geometry.vector_memory import memory_loads
 
 
 def sweep_starts(

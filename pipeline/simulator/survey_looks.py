@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
-from pipeline.mirror import direction_to_normal, scene_to_direction
-from pipeline.scan import Sweep, scene_to_sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
+from pipeline.geometry.scan import Sweep, scene_to_sweep
 from pipeline.simulator.footprint import Footprint
 from pipeline.simulator.rays import Views, exact_views
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
-from pipeline.scan import CostModel, Sweep
+from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.simulator.band_differences import second_difference, steepest_difference
 from pipeline.simulator.effects.aberration import ABERRATION
 from pipeline.simulator.effects.defocus import DEFOCUS

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.defects import DEFECTS, dead_elements, hot_electrons
 from pipeline.simulator.effects.effect import OFF

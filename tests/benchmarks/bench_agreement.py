@@ -17,8 +17,8 @@ from rich.console import Console
 
 from flows.publish.survey_command import run_survey
 from flows.settings.survey_settings import load_settings
-from models.process import use_one_thread
-from storage.class_maps import load_class_map
+from models.network.process import use_one_thread
+from storage.arrays.class_maps import load_class_map
 
 SIZE, SEEDS, TOLERANCE = "640x512", (1, 2), 0.1
 NOISE_ALONE = "0.001"  # sigma: nothing but the variant of the shot noise fits

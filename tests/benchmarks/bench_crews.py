@@ -16,15 +16,15 @@ from bench_tiles import alone
 from measure import Row
 from paper_scale import CAMERA, write_raw
 
-from models.process import keep_freed_memory, use_one_thread
-from pipeline.coverage import full_sweeps
-from pipeline.grid import SceneGrid
+from models.network.process import keep_freed_memory, use_one_thread
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.coverage import full_sweeps
 from pipeline.rectify.placed import PixelGrid
 from pipeline.rectify.tiles import plan_tiles
+from storage.arrays.mosaics import MosaicWriter
+from storage.arrays.tile_work import MosaicRecipe, write_mosaic
 from storage.band_statistics import plan_strips
-from storage.block_work import Crew, run_blocks
-from storage.mosaics import MosaicWriter
-from storage.tile_work import MosaicRecipe, write_mosaic
+from storage.parallel.block_work import Crew, run_blocks
 
 SCENE, BANDS = SceneGrid(1024, 1280, 32, 4), 128
 LARGEST_PX, LARGEST_BANDS, MOST_TASKS = 10240, 270, 20_000

@@ -14,8 +14,8 @@ from detector_peer import PyxelChain
 from measure import Clock, Row, ratio, time_in_turn
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera, digitise
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera, digitise
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.dark_current import DARK_CURRENT
 from pipeline.simulator.effects.fixed_pattern import PRNU

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 from measure import Clock, Row, ratio, time_in_turn
 
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.block import Block
 from pipeline.simulator.chips import candidate_chips, worst_chips
 from pipeline.simulator.choice import Decision, decide

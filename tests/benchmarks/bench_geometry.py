@@ -8,8 +8,8 @@ import numpy as np
 from measure import Row, time_in_turn
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
-from pipeline.mirror import (
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import (
     direction_to_normal,
     direction_to_position,
     direction_to_scene,
@@ -18,7 +18,7 @@ from pipeline.mirror import (
     position_to_normal,
     reflect,
 )
-from pipeline.paper import paper_position, slope_rotation, straight_slope_rotation
+from pipeline.geometry.paper_equations import paper_position, slope_rotation, straight_slope_rotation
 
 COUNT = 200_000
 IFOV = LineCamera().ifov_rad

@@ -111,7 +111,7 @@ def _watched(moments: Moments) -> Iterator[None]:
     """Take the time of exposures, lines and the first path of a fine sweep; count what was made ahead."""
     from flows.survey import placement
     from pipeline.rig.capture_runner import CaptureRunner
-    from storage.spool import Spool
+    from storage.arrays.spool import Spool
 
     append, take, take_mosaic = Spool.append, CaptureRunner.take, placement.take_mosaic
 

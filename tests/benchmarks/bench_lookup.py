@@ -11,8 +11,8 @@ from measure import Clock, Row, ratio, time_in_turn
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pipeline.camera import LineCamera
-from pipeline.mirror import (
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import (
     direction_to_position,
     direction_to_scene,
     line_rotation,
@@ -20,10 +20,10 @@ from pipeline.mirror import (
     reflect,
     scene_to_direction,
 )
+from pipeline.geometry.scan import points_of_scan
 from pipeline.rectify.knot_curve import KnotCurve
 from pipeline.rectify.lookup import TieTable, tie_table, track_lookup
 from pipeline.rectify.tracks import Track, make_tracks
-from pipeline.scan import points_of_scan
 
 CAMERA = LineCamera()
 STRIP, LINES = 2450.0, 640

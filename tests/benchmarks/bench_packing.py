@@ -13,8 +13,8 @@ import numpy as np
 import zarr
 from measure import Row
 
-from storage.archive import Archive, StageRef
-from storage.layout import open_group, read_array
+from storage.archive.archive import Archive, StageRef
+from storage.arrays.layout import open_group, read_array
 from storage.packed_arrays import raw_array
 from storage.repacking import pack
 

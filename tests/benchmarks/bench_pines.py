@@ -27,13 +27,13 @@ import numpy as np  # noqa: E402 - after the number of threads is set
 from measure import Row, data_folder, not_run  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
-from models.metrics import average_accuracy, confusion, kappa, overall_accuracy  # noqa: E402
-from pipeline.grid import UNLABELLED  # noqa: E402
+from models.evaluation.metrics import average_accuracy, confusion, kappa, overall_accuracy  # noqa: E402
+from pipeline.geometry.grid import UNLABELLED  # noqa: E402
 
 if TYPE_CHECKING:
-    from models.inference import Glance
-    from models.training import TrainingSettings
-    from models.weights import Weights
+    from models.reading.inference import Glance
+    from models.training.train import TrainingSettings
+    from models.weights.files import Weights
     from pipeline.simulator.scene import RasterScene
 
 SCENE, MASK = "Indian_pines_corrected.npy", "indianpines_disjoint_dset.mat"
@@ -190,14 +190,14 @@ def _trained(folder: Path, out: Path) -> Path:
 
 
 def _settings() -> TrainingSettings:
-    from models.training import TrainingSettings
+    from models.training.train import TrainingSettings
 
     return TrainingSettings(steps=STEPS, minutes=120)
 
 
 def _scene(folder: Path) -> RasterScene:
     from flows.training.data import scene_of_file
-    from pipeline.camera import LineCamera
+    from pipeline.geometry.camera import LineCamera
     from storage.datasets import load_data_set
 
     return scene_of_file(load_data_set(folder / SCENE).load(Path(SCENE).stem), LineCamera())
@@ -205,8 +205,8 @@ def _scene(folder: Path) -> RasterScene:
 
 def _seen_by_camera(folder: Path) -> Values:
     """One fine exposure of the scene, (y, x, band), as training's fine look has it before its columns."""
-    from models.examples import electrons_of
-    from pipeline.camera import LineCamera, expose, footprint
+    from models.training.examples import electrons_of
+    from pipeline.geometry.camera import LineCamera, expose, footprint
 
     scene, camera = _scene(folder), LineCamera()
     electrons = electrons_of(scene, footprint(np.asarray(scene.planes, np.float32), camera), camera)
@@ -217,8 +217,8 @@ def _seen_by_camera(folder: Path) -> Values:
 def _through_camera(folder: Path, path: Path) -> list[Result]:
     """The segmenter that the command trained, with several shares of the seats."""
     from flows.evaluate.frames import look_at
-    from models.weights import load_weights
-    from pipeline.camera import LineCamera
+    from models.weights.files import load_weights
+    from pipeline.geometry.camera import LineCamera
 
     weights, scene = load_weights(path), _scene(folder)
     if scene.key not in weights.record.get("split", {}).get("pixels", {}):
@@ -229,14 +229,14 @@ def _through_camera(folder: Path, path: Path) -> list[Result]:
 
 def _of_the_file(folder: Path, split: Split) -> list[Result]:
     """The segmenter trained on the spectra of the file, coarse pixels being their means."""
-    from models.examples import Observation, measured_normalisation, normalised
-    from models.holes import patches_of
-    from models.inference import glance_of_columns
-    from models.segmenter import Segmenter, SegmenterConfig
-    from models.spectral import SpectralBasis
-    from models.training import train
-    from models.weights import Weights
-    from pipeline.grid import SceneGrid, pad_by_reflection
+    from models.network.dead_pixels import patches_of
+    from models.network.segmenter import Segmenter, SegmenterConfig
+    from models.network.spectral import SpectralBasis
+    from models.reading.inference import glance_of_columns
+    from models.training.examples import Observation, measured_normalisation, normalised
+    from models.training.train import train
+    from models.weights.files import Weights
+    from pipeline.geometry.grid import SceneGrid, pad_by_reflection
 
     scene = _scene(folder)
     (height, width), basis = split.train.shape, SpectralBasis.spanning(scene.wavelength_nm)
@@ -260,10 +260,10 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
 
 def _judged(source: str, weights: Weights, seen: Glance, fine: Values, labels: Labels) -> list[Result]:
     """The map with several shares of the seats, by entropy."""
-    from models.inference import glance_of_columns, segment
-    from models.policies import score_seats
-    from models.process import one_thread
-    from pipeline.selection import frame_seats
+    from models.network.process import one_thread
+    from models.policies.policies import score_seats
+    from models.reading.inference import glance_of_columns, segment
+    from pipeline.planning.selection import frame_seats
 
     training, valid, found = weights.record["training"], seen.grid.valid_share().ravel() > 0, []
     words = f"a map; training {training.get('processor_seconds', 0)} s CPU, {training['steps']} steps"

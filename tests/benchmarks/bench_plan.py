@@ -27,7 +27,7 @@ if __name__ == "__main__":  # as a command of its own; one thread, as the figure
 from measure import ROOT, Row
 
 if TYPE_CHECKING:
-    from storage.manifests import Cost
+    from storage.archive.manifests import Cost
 
 FIELD_PX, PART_PX = 10240, 1280
 SMALL_PX, LARGER_PX = (320, 640), 960
@@ -106,13 +106,13 @@ def _survey(archive: Path, side: int) -> dict[str, Cost]:
 def _plan(archive: Path, side: int, clock: str = "wall_s") -> dict[str, Any]:
     """The plan's content; its seconds by what the records say of one clock."""
     from flows.archive.plan_command import plan_content
-    from storage.manifests import cost_of
+    from storage.archive.manifests import cost_of
 
     def timed(manifest: dict[str, Any]) -> Cost | None:
         cost = cost_of(manifest)
         return None if cost is None else replace(cost, wall_s=getattr(cost, clock))
 
-    with patch("storage.records.cost_of", timed):
+    with patch("storage.archive.records.cost_of", timed):
         return plan_content(_settings(archive, side))
 
 
@@ -125,9 +125,9 @@ def _settings(archive: Path, side: int) -> Any:
 
 def _many_stores(archive: Path, like: Path) -> int:
     """Fill an archive with copies of another's stores, of other seeds; gives their number."""
-    from storage.archive import Archive
-    from storage.lineage import Catalogue
-    from storage.staging import MANIFEST_NAME
+    from storage.archive.archive import Archive
+    from storage.archive.lineage import Catalogue
+    from storage.archive.staging import MANIFEST_NAME
 
     catalogue, target = Catalogue.read(like), Archive.open(archive)
     rounds = -(-STORES // len(catalogue.stores))

@@ -11,15 +11,15 @@ import numpy as np
 from measure import Row, data_folder, not_run
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_full, coarse_sweeps, full_sweeps
-from pipeline.covering import Cover, Field
-from pipeline.grid import SceneGrid
-from pipeline.planning import check_budget, plan_fine, price_of_seats, prices_of
-from pipeline.runs import Prices
-from pipeline.scan import Axis, CostModel, Sweep
-from pipeline.spending import cheapest_cover, covers, spend
-from pipeline.strips import Views, look_from, strips_at_seats
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Axis, CostModel, Sweep
+from pipeline.planning.budget_search import cheapest_cover, covers, spend
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps
+from pipeline.planning.fine_pass import check_budget, plan_fine, price_of_seats, prices_of
+from pipeline.planning.line_cover import Cover, Field
+from pipeline.planning.scan_runs import Prices
+from pipeline.planning.strips import Views, look_from, strips_at_seats
 
 CAMERA, COST = LineCamera(), CostModel()
 SHARES = (0.5, 0.8, 0.9, 0.95)

@@ -25,18 +25,18 @@ from flows.settings.survey_settings import load_settings
 from flows.survey.field_work import SHARD, FieldWork
 from flows.survey.region_work import WeightsFile
 from flows.survey.run import SurveyRun, open_run
-from models.metrics import confusion, mean_iou
-from models.process import use_one_thread
-from models.regions import HALO_CELLS, Region, most_bytes, plan_regions
-from pipeline.grid import SceneGrid
-from pipeline.selection import frame_seats
+from models.evaluation.metrics import confusion, mean_iou
+from models.network.process import use_one_thread
+from models.reading.regions import HALO_CELLS, Region, most_bytes, plan_regions
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.selection import frame_seats
 from pipeline.simulator.spectra import MATERIALS, spectral_library
-from storage.block_work import Crew
-from storage.class_maps import ClassMap, ClassNames, create_class_map, load_class_map
-from storage.layout import SHARD_ROWS
-from storage.mosaics import MosaicWriter
-from storage.patches import PATCHES_A_SHARD, PatchWriter, open_patches
-from storage.tile_work import RESERVED_BYTES
+from storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, load_class_map
+from storage.arrays.layout import SHARD_ROWS
+from storage.arrays.mosaics import MosaicWriter
+from storage.arrays.patches import PATCHES_A_SHARD, PatchWriter, open_patches
+from storage.arrays.tile_work import RESERVED_BYTES
+from storage.parallel.block_work import Crew
 
 SEEDS, HALOS = (1, 2, 3), (0, 1, 2, 4)
 MOST_PX = (512, 640)  # of 1024 x 1280 px: four regions

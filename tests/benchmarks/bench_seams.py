@@ -11,7 +11,7 @@ from seam_pictures import RGBN, cut_and_join, given_neighbours, join_neighbours
 from seam_survey import LINES, SAMPLES, left_again, line_errors, make_survey, seam_offsets
 from seam_views import ROW_PX, row_views, wave_views
 
-from pipeline.rectify.registration import PairShift, pair_shift
+from pipeline.rectify.registration.shifts import PairShift, pair_shift
 
 Floats = NDArray[np.float64]
 Peer = Callable[[Floats, Floats], Floats]

@@ -14,9 +14,13 @@ import torch
 from measure import Clock, Row, ratio, time_in_turn
 from numpy.typing import NDArray
 
-from models.cost import multiply_adds
-from models.encoder import Encoder, Memory
-from models.inference import (
+from models.network.cost import multiply_adds
+from models.network.encoder import Encoder, Memory
+from models.network.process import keep_freed_memory, one_thread
+from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.spectral import Normalisation, SpectralBasis
+from models.policies.policies import score_seats
+from models.reading.inference import (
     ClassMap,
     CoarseLook,
     Glance,
@@ -26,13 +30,9 @@ from models.inference import (
     segment,
     segment_batch,
 )
-from models.policies import score_seats
-from models.process import keep_freed_memory, one_thread
-from models.segmenter import Segmenter, SegmenterConfig
-from models.spectral import Normalisation, SpectralBasis
-from models.weights import Weights
-from pipeline.grid import SceneGrid
-from pipeline.selection import frame_seats
+from models.weights.files import Weights
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.selection import frame_seats
 
 FRAMES, PADDED_AT_ONCE = 64, 8
 SIDES_PX, SHARES = (96, 480), (0.0, 0.05, 0.1, 0.2, 0.35)

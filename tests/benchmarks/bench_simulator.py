@@ -12,7 +12,7 @@ import numpy as np
 from measure import Clock, Row, ratio, time_in_turn
 from numpy.typing import NDArray
 
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.block import Block
 from pipeline.simulator.choice import CHEAP_SHARE, Decision, decide
 from pipeline.simulator.effects.aberration import ABERRATION

@@ -13,11 +13,11 @@ from measure import Row, ratio, time_in_turn
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
 
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
-from storage.cubes import RawCubeWriter, SweepHeader, open_raw_cube
-from storage.layout import SHARD_ROWS, image_spec
-from storage.spool import Spool
+from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
+from storage.arrays.layout import SHARD_ROWS, image_spec
+from storage.arrays.spool import Spool
 
 LINES, SAMPLES, BANDS = 256, 640, 270
 SPOOLED, RATE_HZ = 640, 100.0

@@ -13,14 +13,14 @@ from typing import TypeVar
 from measure import Row, ratio, time_in_turn
 from paper_scale import CAMERA, Spent, measured, rectify, write_raw
 
-from models.process import keep_freed_memory, use_one_thread
-from pipeline.coverage import full_sweeps
-from pipeline.grid import SceneGrid
+from models.network.process import keep_freed_memory, use_one_thread
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.coverage import full_sweeps
 from pipeline.rectify.line_cache import BLOCK_LINES
 from pipeline.rectify.placed import PixelGrid
-from storage.cubes import open_raw_cube
-from storage.layout import ArraySpec, create_array, create_group, image_spec
-from storage.mosaics import load_mosaic
+from storage.arrays.cubes import open_raw_cube
+from storage.arrays.layout import ArraySpec, create_array, create_group, image_spec
+from storage.arrays.mosaics import load_mosaic
 
 BANDS, SHAPE = 270, (128, 1200)
 FEW_BANDS, SIDES = 16, (1280, 2560)

@@ -19,17 +19,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from models.process import keep_freed_memory, use_one_thread
-from pipeline.camera import LineCamera
-from pipeline.coverage import full_sweeps
-from pipeline.grid import SceneGrid
+from models.network.process import keep_freed_memory, use_one_thread
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Sweep, line_positions
+from pipeline.planning.coverage import full_sweeps
 from pipeline.rectify.placed import PixelGrid, place
-from pipeline.scan import Sweep, line_positions
 from pipeline.source import Line, References
-from storage.block_work import Crew
-from storage.cubes import RawCubeWriter, SweepHeader, open_raw_cube
-from storage.mosaics import MosaicWriter
-from storage.tile_work import MosaicWork, write_mosaic
+from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
+from storage.arrays.mosaics import MosaicWriter
+from storage.arrays.tile_work import MosaicWork, write_mosaic
+from storage.parallel.block_work import Crew
 
 CAMERA = LineCamera()
 PATTERN_LINES = 512

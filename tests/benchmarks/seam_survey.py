@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
-from pipeline.coverage import full_sweeps
-from pipeline.grid import SceneGrid
-from pipeline.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.rectify.alignment import SweepShift, no_shifts
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
+from pipeline.geometry.scan import Sweep, shifted_position
+from pipeline.planning.coverage import full_sweeps
 from pipeline.rectify.lookup import track_lookup
-from pipeline.rectify.overlaps import LEAST_OVERLAP_PX, BroadSweep, PlacedImage
-from pipeline.rectify.seams import Registration, measure_windows, place_images, register_sweeps
-from pipeline.scan import Sweep, shifted_position
+from pipeline.rectify.registration.alignment import SweepShift, no_shifts
+from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX, BroadSweep, PlacedImage
+from pipeline.rectify.registration.seams import Registration, measure_windows, place_images, register_sweeps
 from pipeline.simulator.farm import farm_scene
 from pipeline.simulator.pointing import ACCURACY_PX, REPEATABILITY_PX, PointingErrors
 from pipeline.simulator.rig_model import Rig

@@ -18,9 +18,9 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from storage.archive import Archive
-from storage.garbage import clear_up
-from storage.staging import MANIFEST_NAME
+from storage.archive.archive import Archive
+from storage.archive.staging import MANIFEST_NAME
+from storage.maintenance.garbage import clear_up
 from tests.faults.fault_table import Clock, Row
 from tests.faults.nursery import Nursery
 from tests.faults.small_survey import (
@@ -129,7 +129,7 @@ def _date_files(out: Path) -> None:
 
 def _redate(folder: Path, shift_s: float) -> None:
     """Shift all dates of a store, also that in its manifest, which is sealed again."""
-    from storage.manifests import write_manifest
+    from storage.archive.manifests import write_manifest
 
     facts = json.loads((folder / MANIFEST_NAME).read_text())
     created = datetime.fromtimestamp(datetime.fromisoformat(facts["created"]).timestamp() + shift_s).astimezone()

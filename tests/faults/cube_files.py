@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from storage.envi_writer import EnviFile, write_envi
+from storage.export.envi_writer import EnviFile, write_envi
 
 SHAPE = (20, 12, 5)
 

@@ -9,7 +9,7 @@ import random
 import sys
 from pathlib import Path
 
-from storage.archive import Archive
+from storage.archive.archive import Archive
 
 
 def main(root: Path, flips: int, seed: int = 0) -> int:

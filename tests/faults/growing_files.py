@@ -20,12 +20,12 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.errors import PipelineError
+from pipeline.geometry.scan import Sweep
 from pipeline.rig.capture_journal import JOURNAL, CaptureJournal, Taken
 from pipeline.rig.kept_files import KeptInMemory
-from pipeline.scan import Sweep
-from storage.growing_checks import growing_problems
-from storage.ledger import Ledger
-from storage.spool import Spool
+from storage.archive.ledger import Ledger
+from storage.arrays.spool import Spool
+from storage.maintenance.growing_checks import growing_problems
 from tests.faults.fault_table import Clock, Row
 from tests.faults.lost_lines import BANDS, HEADER, SAMPLES, fill, line
 

@@ -24,7 +24,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.source import Line
-from storage.spool import SYNC_LINES, Spool
+from storage.arrays.spool import SYNC_LINES, Spool
 from tests.faults.fault_table import Clock, Row
 
 SAMPLES, BANDS = 20, 7
@@ -36,7 +36,7 @@ FATES = ("as written", "cut off", "cut short", "zeros", "other bytes", "some pag
 WRITER = """
 import os, sys
 from pathlib import Path
-from storage.spool import Spool
+from storage.arrays.spool import Spool
 from tests.faults.lost_lines import BANDS, HEADER, SAMPLES, line
 with Spool.open(Path(sys.argv[1]), SAMPLES, BANDS, header=HEADER) as spool:
     while True:

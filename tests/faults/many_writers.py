@@ -17,7 +17,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from storage.archive import Archive
+from storage.archive.archive import Archive
 from tests.faults.fault_table import Clock, Row
 from tests.faults.nursery import Ended, Nursery
 from tests.faults.small_survey import Stored, Subject, prepare, problems, stored, words

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from models.weights import save_weights
-from storage.archive import Archive
+from models.weights.files import save_weights
+from storage.archive.archive import Archive
 from tests.conftest import RGB_NM, patchy_scene, random_weights
 from tests.faults.injection import logged_calls
 from tests.faults.nursery import Ended, Nursery

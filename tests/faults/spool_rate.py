@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.source import Line
-from storage.spool import SYNC_LINES, Spool
+from storage.arrays.spool import SYNC_LINES, Spool
 from tests.faults.fault_table import Clock, Row
 
 SAMPLES, BANDS, RATE_HZ = 640, 270, 100.0

@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from flows.publish.receipt import comparable, is_pending
 from flows.terminal.termination import EXIT_CODE
-from storage.archive import Archive
+from storage.archive.archive import Archive
 from tests.faults.fault_table import Clock, Row
 from tests.faults.small_survey import problems
 

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from storage.archive import Archive
-from storage.spool import Spool
+from storage.archive.archive import Archive
+from storage.arrays.spool import Spool
 
 ROOT = Path(__file__).parents[2]
 KILLS = 6
 
 PUBLISH = """
 import sys
-from storage.archive import Archive
+from storage.archive.archive import Archive
 archive = Archive.open(sys.argv[1])
 made = 0
 for number in range(10**6):
@@ -36,7 +36,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from pipeline.source import Line
-from storage.spool import Spool
+from storage.arrays.spool import Spool
 spool = Spool.open(Path(sys.argv[1]), 64, 30, header={"sweep": "a"})
 print(spool.count, flush=True)
 for number in range(spool.count, 10**6):

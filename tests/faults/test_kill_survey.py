@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from storage.archive import Archive
-from storage.class_maps import load_class_map
+from storage.archive.archive import Archive
+from storage.arrays.class_maps import load_class_map
 from tests.faults.nursery import Nursery
 from tests.faults.small_survey import problems
 

@@ -16,8 +16,8 @@ import pytest
 
 from flows.publish.receipt import check_receipt, comparable, is_pending
 from flows.terminal.termination import EXIT_CODE
-from storage.archive import Archive
-from storage.spool import Spool
+from storage.archive.archive import Archive
+from storage.arrays.spool import Spool
 from tests.faults.nursery import Ended, Nursery
 from tests.faults.small_survey import Subject, prepare, problems, words, wrong_after_rerun
 from tests.flows.small_fields import write_field, write_weights
@@ -32,7 +32,7 @@ PLACES = {  # function and call before which a survey is stopped that has its ma
     "in the controls": ("flows.survey.accuracy:run_controls", 1, signal.SIGKILL),
     "stored and not added": ("flows.publish.judging:add_accuracy", 1, signal.SIGKILL),
     "drawn anew": ("flows.publish.run_folder:draw_quicklook", 1, signal.SIGTERM),
-    "after the run has changed": ("storage.run_folders:remove_tree", 1, signal.SIGKILL),
+    "after the run has changed": ("storage.archive.run_folders:remove_tree", 1, signal.SIGKILL),
 }
 ADDED = "after the run has changed"
 
@@ -59,7 +59,7 @@ def test_a_survey_that_is_terminated(subject: Subject, tmp_path: Path, sync: int
     """What was published verifies, no lock is held, and the same command ends as if nothing had been."""
     out = tmp_path / "archive"
     ended = subject.nursery.run(
-        words(out), "end_before", place="storage.manifests:sync_path", number=signal.SIGTERM, call=sync
+        words(out), "end_before", place="storage.archive.manifests:sync_path", number=signal.SIGTERM, call=sync
     )
     assert told(ended), (ended.code, ended.text)
     assert problems(out) == []
@@ -72,7 +72,7 @@ def test_a_capture_keeps_every_line(subject: Subject, tmp_path: Path) -> None:
     """Lines that were there when it came are in the spool, which was closed as at any end."""
     out = tmp_path / "archive"
     ended = subject.nursery.run(
-        words(out), "end_before", place="storage.spool:Spool.append", number=signal.SIGTERM, call=TAKEN + 1
+        words(out), "end_before", place="storage.arrays.spool:Spool.append", number=signal.SIGTERM, call=TAKEN + 1
     )
     assert told(ended), ended.text
     (index,) = out.glob("spool/*/*.index")
@@ -88,7 +88,7 @@ def test_training_goes_on(subject: Subject, tmp_path: Path) -> None:
     field, out = write_field(tmp_path / "field", (16, 16)), tmp_path / "w.safetensors"
     asked = ["train", str(field), "-o", str(out), "--validation", "0", "--steps", "4", "--crop", "16", "--patch", "8",
              "--factor", "2", "--dim", "16", "--layers", "1", "--batch", "1"]  # fmt: skip
-    ended = subject.nursery.run(asked, "end_before", place="models.training:_step", number=signal.SIGTERM, call=2)
+    ended = subject.nursery.run(asked, "end_before", place="models.training.train:_step", number=signal.SIGTERM, call=2)
     assert told(ended), ended.text
     assert not out.exists()
     assert subject.nursery.run(asked).code == 0

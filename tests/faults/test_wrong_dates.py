@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from storage import run_folders, staging
-from storage.archive import Archive, StageRef
-from storage.garbage import plan_clearance
-from storage.run_folders import date_of_store
+from storage.archive import run_folders, staging
+from storage.archive.archive import Archive, StageRef
+from storage.archive.run_folders import date_of_store
+from storage.maintenance.garbage import plan_clearance
 from tests.storage.small_archive import grow_old, small_survey
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from flows.schedule.field_schedule import FieldSchedule
 from flows.schedule.ledger_state import ENDINGS, read_moment, read_state
 from flows.schedule.times import Timetable, parse_timetable
-from storage.ledger import Ledger
+from storage.archive.ledger import Ledger
 
 NOON = datetime(2026, 6, 1, 12, tzinfo=UTC)
 

@@ -11,9 +11,9 @@ import numpy as np
 from PIL import Image
 
 from flows.evaluate.frames import Look, look_at, open_frames
-from models.sizes import PRESETS, Preset
-from models.weights import AnyWeights, Weights, load_weights, save_weights
-from pipeline.camera import LineCamera
+from models.network.sizes import PRESETS, Preset
+from models.weights.files import AnyWeights, Weights, load_weights, save_weights
+from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scene import RasterScene
 from tests.models.conftest import make_any_weights
 

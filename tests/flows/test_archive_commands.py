@@ -21,8 +21,8 @@ from flows.archive.contents import command, contents
 from flows.settings.survey_settings import load_settings
 from flows.terminal.figures import DASH
 from pipeline.errors import ArchiveError
-from storage.archive import Archive
-from storage.lineage import Catalogue
+from storage.archive.archive import Archive
+from storage.archive.lineage import Catalogue
 from tests.conftest import Survey
 from tests.storage.small_archive import flip, small_survey
 

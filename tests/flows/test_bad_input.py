@@ -20,8 +20,8 @@ import pytest
 from PIL import Image
 
 from flows.survey.survey import STAGES
-from storage.archive import Archive
-from storage.class_maps import load_class_map
+from storage.archive.archive import Archive
+from storage.arrays.class_maps import load_class_map
 
 ROOT = Path(__file__).parents[2]
 NM = "460,500,550,600,620,640"

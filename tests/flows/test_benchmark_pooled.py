@@ -19,8 +19,8 @@ from flows.evaluate.plot import evaluation_figure
 from flows.evaluate.pooled import buy_by_seed, buy_together, judge_pooled, pooled_policies, score_frame
 from flows.evaluate.request import EvaluateRequest
 from flows.evaluate.rows import Trial, judge_frame
-from models.policies import score_seats
-from pipeline.selection import seat_count
+from models.policies.policies import score_seats
+from pipeline.planning.selection import seat_count
 from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_field, write_weights
 
 POLICY = "entropy, pooled"

@@ -9,10 +9,10 @@ import pytest
 
 from flows.settings.survey_settings import parse_settings
 from flows.survey.capture_plan import plan_capture
-from pipeline.coverage import coarse_sweeps, full_sweeps, reach_px
 from pipeline.errors import SettingsError
-from pipeline.grid import SceneGrid
-from pipeline.scan import Sweep
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Sweep
+from pipeline.planning.coverage import coarse_sweeps, full_sweeps, reach_px
 
 GRID = SceneGrid(300, 1500, 16, 4)
 OFF = 20.0

@@ -15,11 +15,11 @@ from PIL import Image
 from flows.archive.compare_command import _classes, _confidence, _pair_of, find_run, run_compare
 from flows.archive.difference_picture import OTHER, SAME, MapPair, change_rgb, draw_difference, thin_changes
 from pipeline.errors import ArchiveError, SceneError, SettingsError, ShapeError
-from pipeline.grid import UNLABELLED
-from storage.archive import Archive
-from storage.class_maps import ClassMap
-from storage.lineage import Catalogue
-from storage.records import Run
+from pipeline.geometry.grid import UNLABELLED
+from storage.archive.archive import Archive
+from storage.archive.lineage import Catalogue
+from storage.archive.records import Run
+from storage.arrays.class_maps import ClassMap
 from tests.conftest import Survey, WeightsMaker
 from tests.storage.small_archive import flip
 

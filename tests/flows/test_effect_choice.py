@@ -17,7 +17,7 @@ from flows.survey.stages import VERSIONS
 from pipeline.errors import BoundError, IncompleteStoreError
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.scene import RasterScene
-from storage.archive import StageRef, stage_key
+from storage.archive.archive import StageRef, stage_key
 
 ASKED = "rotation,vignetting,shot,read-noise"
 Open = Callable[..., CaptureRun]

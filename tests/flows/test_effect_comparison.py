@@ -19,9 +19,9 @@ from flows.simulate.effect_picture import Words, draw_comparison
 from flows.survey.effect_choice import load_manifest
 from flows.survey.run import CaptureRun
 from pipeline.errors import BoundError
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.registry import BY_NAME
-from storage.archive import StageRef
+from storage.archive.archive import StageRef
 from tests.flows.test_effect_choice import choose
 
 ASKED = "rotation,vignetting,shot,read-noise"

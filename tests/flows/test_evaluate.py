@@ -26,11 +26,11 @@ from flows.evaluate.table import print_evaluation
 from flows.evaluate.timing import Rounds, cpu_seconds, row_seconds
 from flows.training.data import farm_test_data, pack_mask
 from flows.training.train import TrainRequest, train_weights
-from models.metrics import average_accuracy, kappa, mean_iou, overall_accuracy
-from models.training import TrainingSettings
-from models.weights import load_weights, save_weights
-from pipeline.camera import LineCamera
+from models.evaluation.metrics import average_accuracy, kappa, mean_iou, overall_accuracy
+from models.training.train import TrainingSettings
+from models.weights.files import load_weights, save_weights
 from pipeline.errors import SceneError, SettingsError, WeightsError
+from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.farm_fields import CLASSES
 from pipeline.simulator.instrument import USUAL
 from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_field, write_weights

@@ -18,7 +18,7 @@ from flows.evaluate.plot import evaluation_figure
 from flows.evaluate.request import EvaluateRequest
 from flows.evaluate.series import Row
 from flows.evaluate.summary import choose_baseline
-from models.weights import save_weights
+from models.weights.files import save_weights
 from pipeline.errors import SceneError, SettingsError
 from tests.flows.small_fields import FRAMES, QUICK, scene_at, write_field, write_weights
 from tests.models.conftest import make_any_weights

@@ -18,10 +18,10 @@ from flows.evaluate.frames import Look
 from flows.evaluate.rig_plans import BUDGETS, judge_rig
 from flows.evaluate.rig_plot import rig_figure
 from flows.evaluate.rows import Trial, judge_frame
-from models.metrics import mean_iou
-from models.weights import Weights
-from pipeline.camera import LineCamera
-from pipeline.scan import CostModel
+from models.evaluation.metrics import mean_iou
+from models.weights.files import Weights
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import CostModel
 from tests.flows.small_fields import looked_at, scene_at, write_field
 
 # a narrow line, so that small frames take several strips, and a rig that is quick to set up

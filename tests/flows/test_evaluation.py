@@ -13,15 +13,15 @@ import pytest
 from flows.survey import accuracy as evaluation
 from flows.survey import placement
 from flows.survey import pointing as pointing_stage
-from models.metrics import confusion
-from pipeline.camera import LineCamera
-from pipeline.grid import UNLABELLED
-from pipeline.rectify.illumination import LightRatio
+from models.evaluation.metrics import confusion
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.rectify.registration.illumination import LightRatio
 from pipeline.simulator.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
-from storage.archive import Archive, StageRef
+from storage.archive.archive import Archive, StageRef
 
 OFF = np.array([2.2, -1.4])  # along the line and the scan [px]
 

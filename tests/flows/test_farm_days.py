@@ -16,19 +16,19 @@ from flows.settings.survey_settings import Settings, parse_settings
 from flows.survey.scene import check_labels, farm_refusal, open_scene
 from flows.training.data import farm_data, farm_looks, farm_test_data, read_farm_name
 from flows.training.look import observe_scene
-from models.examples import observe
-from models.sizes import SegmenterConfig
-from models.spectral import SpectralBasis
-from models.weights import Description
-from pipeline.camera import LineCamera
+from models.network.sizes import SegmenterConfig
+from models.network.spectral import SpectralBasis
+from models.training.examples import observe
+from models.weights.files import Description
 from pipeline.errors import ArchiveError, SceneError, SettingsError
-from pipeline.grid import SceneGrid
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.farm_fields import CLASSES
 from pipeline.simulator.farm_laws import FARM_LAW, SEASON_LAW, built_in_farm
 from pipeline.simulator.farm_sun import sun_over_farm
 from pipeline.simulator.scene import RasterScene
-from storage.archive import Archive
-from storage.lineage import Catalogue
+from storage.archive.archive import Archive
+from storage.archive.lineage import Catalogue
 
 LINES = ("track", "water")  # classes of what no day moves
 BANDS = (20, 60, 110, 160, 210, 250)

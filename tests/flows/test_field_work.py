@@ -14,12 +14,12 @@ from flows.settings.survey_settings import load_settings
 from flows.survey.field_work import SHARD, FieldWork, region_params
 from flows.survey.region_work import Scoring, WeightsFile
 from flows.survey.run import SurveyRun, open_run
-from models.regions import Region, plan_regions
+from models.reading.regions import Region, plan_regions
 from pipeline.errors import SettingsError, WeightsError
-from pipeline.grid import SceneGrid
-from storage.attention import load_attention
-from storage.block_work import Crew
-from storage.class_maps import ClassNames, create_class_map, load_class_map
+from pipeline.geometry.grid import SceneGrid
+from storage.arrays.attention import load_attention
+from storage.arrays.class_maps import ClassNames, create_class_map, load_class_map
+from storage.parallel.block_work import Crew
 
 Survey = Callable[..., object]
 MOST_PX = (64, 640)  # of 96 x 128 px: two regions

@@ -20,7 +20,7 @@ from flows.survey.run import open_run
 from flows.survey.stages import VERSIONS
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.simulator.simulated import SimulatedSource
-from storage.archive import Archive
+from storage.archive.archive import Archive
 
 WAITS = {"locate": "capture_coarse", "rectify": "locate", "attend": "rectify", "capture_fine": "attend"}
 ON_REQUEST = ["register_coarse", "register_fine", "ground"]

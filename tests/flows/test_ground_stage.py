@@ -16,13 +16,13 @@ from flows.settings.survey_settings import Settings
 from flows.survey.ground import STORE, coarse_colours, ground, survey_grid
 from flows.survey.run import SurveyRun
 from pipeline.errors import PoseError
-from pipeline.grid import UNLABELLED, SceneGrid
-from pipeline.ground import RigPose, pixel_places
-from storage.archive import Archive, StageRef
-from storage.class_maps import ClassMap, write_class_map
-from storage.ground_maps import load_ground_map
-from storage.layout import AngularGrid
-from storage.mosaics import MosaicWriter
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.ground.view import RigPose, pixel_places
+from storage.archive.archive import Archive, StageRef
+from storage.arrays.class_maps import ClassMap, write_class_map
+from storage.arrays.ground_maps import load_ground_map
+from storage.arrays.layout import AngularGrid
+from storage.arrays.mosaics import MosaicWriter
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)

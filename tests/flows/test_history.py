@@ -13,9 +13,9 @@ import pytest
 from flows.publish.line_chart import line_chart
 from flows.schedule.field_history import FieldHistory, read_histories
 from flows.schedule.history_page import render_history, render_index, way_to
-from storage.archive import Archive
-from storage.class_maps import load_class_map
-from storage.ledger import Ledger
+from storage.archive.archive import Archive
+from storage.archive.ledger import Ledger
+from storage.arrays.class_maps import load_class_map
 
 BAD = '<script>alert("1")</script>&'
 

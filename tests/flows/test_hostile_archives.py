@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from flows.cli.main import main
-from storage.archive import Archive
-from storage.manifests import _seal, _text
-from storage.staging import file_hash
+from storage.archive.archive import Archive
+from storage.archive.manifests import _seal, _text
+from storage.archive.staging import file_hash
 from tests.storage.small_archive import Small, small_survey
 from tests.storage.test_no_files import CASES, Case
 

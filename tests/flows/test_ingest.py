@@ -23,7 +23,7 @@ from rich.console import Console
 import flows.archive.ingest_command
 from flows.archive.ingest_command import IngestRequest, run_ingest
 from pipeline.errors import ArchiveError, SceneError, WavelengthError
-from storage.archive import Archive
+from storage.archive.archive import Archive
 from storage.cube_sources import CubeSource
 from storage.scan_files import open_cube_source
 from storage.scene_files import load_scene_file

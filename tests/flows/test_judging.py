@@ -20,7 +20,7 @@ from flows.publish.receipt import check_receipt, comparable, is_pending
 from flows.survey import accuracy as evaluation
 from flows.survey import stages
 from flows.survey.survey import STAGES
-from storage.archive import Archive
+from storage.archive.archive import Archive
 from tests.conftest import WeightsMaker
 from tests.flows.conftest import CommandLine
 from tests.storage.small_archive import flip

@@ -9,8 +9,8 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.source import Line
-from storage.archive import Archive
-from storage.spool import Spool
+from storage.archive.archive import Archive
+from storage.arrays.spool import Spool
 from tests.storage.small_archive import flip
 
 BROKEN_AT = 21

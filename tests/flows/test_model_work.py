@@ -10,10 +10,10 @@ import pytest
 
 from flows.survey.model_work import work_done, work_of_map
 from flows.survey.run import SurveyRun
-from models.cost import multiply_adds
-from models.sizes import SegmenterConfig
-from pipeline.grid import SceneGrid
-from pipeline.planning import FinePlan
+from models.network.cost import multiply_adds
+from models.network.sizes import SegmenterConfig
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.fine_pass import FinePlan
 
 CONFIG, BANDS = SegmenterConfig(classes=4), 8
 

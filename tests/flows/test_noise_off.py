@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
-from pipeline.camera import LineCamera, footprint_kernel
+from pipeline.geometry.camera import LineCamera, footprint_kernel
 
 SLIT_PX = LineCamera().slit_px
 BOUND = 0.005  # of the scene's standard deviation

@@ -14,10 +14,10 @@ pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 from flows.publish.run_folder import Published
 from flows.survey.survey import OF_ROUND_TWO, STAGES
 from pipeline.errors import SceneError
-from storage.archive import Archive
-from storage.class_maps import load_class_map
-from storage.object_archive import ObjectArchive
-from storage.object_stores import Objects
+from storage.archive.archive import Archive
+from storage.arrays.class_maps import load_class_map
+from storage.remote.object_archive import ObjectArchive
+from storage.remote.object_stores import Objects
 from tests.conftest import Survey
 from tests.flows.conftest import CommandLine
 
@@ -171,7 +171,7 @@ def test_a_bucket_that_cannot_be_reached_is_one_error(
     missing = command_line("survey", "--out", "s3://no-such-bucket/x", *SMALL)
     assert missing.code == 1
     assert "there is no such bucket: create it" in missing.errors[0]
-    monkeypatch.setattr("storage.object_places.RETRIES", 0)
+    monkeypatch.setattr("storage.remote.object_places.RETRIES", 0)
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     silent = command_line("ls", bucket)
     assert silent.code == 1

@@ -17,9 +17,9 @@ from flows.publish.receipt import comparable
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.survey_settings import load_settings
-from storage.archive import Archive
-from storage.cubes import RawCube, open_raw_cube
-from storage.quicklooks import pictures_of
+from storage.archive.archive import Archive
+from storage.arrays.cubes import RawCube, open_raw_cube
+from storage.arrays.quicklooks import pictures_of
 from tests.flows.conftest import CommandLine
 
 

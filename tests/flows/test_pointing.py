@@ -15,13 +15,13 @@ from flows.publish.finding_words import sentences
 from flows.publish.survey_command import run_survey
 from flows.settings.survey_settings import load_settings
 from flows.survey.stages import patch_columns
-from models.inference import Glance
-from models.spectral import SpectralBasis
-from pipeline.grid import SceneGrid
+from models.network.spectral import SpectralBasis
+from models.reading.inference import Glance
+from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.pointing import PointingErrors
-from storage.archive import StageRef
-from storage.layout import open_group, read_array
-from storage.patches import PatchWriter
+from storage.archive.archive import StageRef
+from storage.arrays.layout import open_group, read_array
+from storage.arrays.patches import PatchWriter
 
 OFF_PX, SEED = 6.0, 0
 BANDS = ",".join(str(band) for band in range(4, 270, 9))  # the fewest that reach all the weights' columns

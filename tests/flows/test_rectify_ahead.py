@@ -16,13 +16,13 @@ from flows.survey import placement
 from flows.survey.run import open_run
 from flows.survey.survey import STAGES, StageRunner
 from pipeline.errors import RigError
+from pipeline.geometry.scan import Sweep
 from pipeline.rig.rig_source import RigSource
-from pipeline.scan import Sweep
 from pipeline.source import Line
-from storage.archive import Archive, StageRef
-from storage.garbage import plan_clearance
+from storage.archive.archive import Archive, StageRef
+from storage.arrays.mosaics import load_mosaic
+from storage.maintenance.garbage import plan_clearance
 from storage.mosaic_ahead import MosaicAhead
-from storage.mosaics import load_mosaic
 from tests.flows.test_survey_rig import QUIET, emulated, small_settings
 
 Tiles = list[Sequence[tuple[int, int]]]

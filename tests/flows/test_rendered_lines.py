@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from flows.survey.rendered_lines import rendering_crew, take_lines
-from pipeline.camera import LineCamera
 from pipeline.errors import RigError, SceneError
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator import instrument, render
 from pipeline.simulator.effects.registry import BY_NAME
 from pipeline.simulator.instrument import effects_on
@@ -21,8 +21,8 @@ from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Line
-from storage.block_work import Crew
-from storage.spool import Spool
+from storage.arrays.spool import Spool
+from storage.parallel.block_work import Crew
 
 CAMERA = LineCamera(samples=48)
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-35.0, lines=70)

@@ -20,11 +20,11 @@ from flows.archive import stale_runs as generations
 from flows.archive.commands import DONE, FAILED, PARTLY, run_verify
 from flows.archive.reprocess_command import ReprocessRequest, _survey, run_reprocess
 from flows.settings.survey_settings import Settings
-from models.weights import content_key
+from models.weights.files import content_key
 from pipeline.errors import ArchiveError, SettingsError, WeightsError
 from pipeline.simulator.farm import CLASSES
-from storage.archive import Archive
-from storage.lineage import Catalogue
+from storage.archive.archive import Archive
+from storage.archive.lineage import Catalogue
 from tests.conftest import Survey, WeightsMaker
 from tests.storage.small_archive import flip
 

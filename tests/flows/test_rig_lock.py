@@ -16,8 +16,8 @@ from flows.schedule import rig_lock as schedule_lock
 from flows.schedule.rig_lock import RigLock, rig_lock
 from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError, RigError
-from storage.ledger import Ledger
-from storage.staging import take_lock
+from storage.archive.ledger import Ledger
+from storage.archive.staging import take_lock
 
 ROOT = Path(__file__).parents[2]
 PORT = f"/dev/ttyTEST{os.getpid()}"  # two runs of these tests on one machine are two rigs

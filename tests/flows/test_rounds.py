@@ -20,11 +20,11 @@ from flows.publish.run_folder import Published
 from flows.settings.survey_settings import load_settings
 from flows.survey.run import open_run
 from flows.survey.survey import OF_ROUND_TWO, STAGES
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
-from pipeline.scan import CostModel, Sweep
-from storage.archive import Archive
-from storage.lineage import Catalogue
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import CostModel, Sweep
+from storage.archive.archive import Archive
+from storage.archive.lineage import Catalogue
 from tests.conftest import Survey
 
 # of a mirror that is reloaded fast: half of what a scene so small leaves then buys lines

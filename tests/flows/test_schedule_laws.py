@@ -18,7 +18,7 @@ from flows.schedule.field_schedule import FieldSchedule
 from flows.schedule.rig_lock import RigLock
 from flows.schedule.times import exact_words, parse_every, parse_timetable, read_timetable
 from pipeline.errors import RigError, SettingsError
-from storage.ledger import Ledger
+from storage.archive.ledger import Ledger
 from tests.flows.schedule_days import NOON, HandClock, accounted, field_schedule
 
 CRONS = ("*/20 * * * *", "0 * * * *", "30 2 * * *", "15 1-3 * * *", "0 6 * * 1", "0 0 1 * *")

@@ -20,7 +20,7 @@ from flows.schedule.field_schedule import NOT_SERVED, FieldSchedule
 from flows.schedule.rig_lock import RigLock, rig_lock
 from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError, RigError
-from storage.ledger import Ledger
+from storage.archive.ledger import Ledger
 from tests.flows.schedule_days import NOON, HandClock, accounted, field_schedule
 
 FIELDS = ("north", "south", "west")

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flows.survey.scores import definitions_differ, false_class_words, score_of, worst_class
-from models.metrics import agreement, confusion, iou_per_class, mean_iou, miou_of_shown_classes
+from models.evaluation.metrics import agreement, confusion, iou_per_class, mean_iou, miou_of_shown_classes
 from tests.flows.test_receipt import make_receipt
 
 NAMES = ("soil", "crop", "weed", "track")

@@ -16,8 +16,8 @@ from flows.evaluate.command import run_evaluate
 from flows.evaluate.request import EvaluateRequest
 from flows.settings.survey_settings import load_settings
 from flows.survey.run import open_run
-from models.sealed_files import SEAL, TENSORS
-from models.weights import UNSEALED, describe_weights
+from models.weights.files import UNSEALED, describe_weights
+from models.weights.sealed_files import SEAL, TENSORS
 from tests.flows.small_fields import write_field, write_weights
 
 SAID = "was made before weights had hashes: damage to its numbers cannot be told; to add them now: spectralzoom seal "

@@ -27,8 +27,8 @@ from flows.schedule.request import ServeRequest
 from flows.schedule.times import parse_timetable
 from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError
-from storage.archive import Archive
-from storage.ledger import Ledger
+from storage.archive.archive import Archive
+from storage.archive.ledger import Ledger
 from tests.flows.schedule_days import NOON, HandClock
 
 EVERY = parse_timetable(None, "20m", "UTC")

@@ -16,9 +16,9 @@ from flows.schedule.fields import load_fields
 from flows.schedule.ledger_state import moment_words
 from flows.schedule.served import KEYS, NAMED_BY
 from flows.schedule.times import parse_timetable
-from storage.archive import Archive
-from storage.ledger import Ledger
-from storage.staging import take_lock
+from storage.archive.archive import Archive
+from storage.archive.ledger import Ledger
+from storage.archive.staging import take_lock
 from tests.flows.schedule_days import NOON, HandClock
 
 

@@ -11,7 +11,7 @@ from flows.schedule.due_runs import Outcome
 from flows.schedule.plain_schedule import serve_plain
 from flows.schedule.rig_lock import RigLock
 from pipeline.errors import ArchiveError
-from storage.ledger import Ledger
+from storage.archive.ledger import Ledger
 from tests.flows.schedule_days import NOON, HandClock, field_schedule
 
 

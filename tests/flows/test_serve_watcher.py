@@ -23,9 +23,9 @@ from flows.schedule.request import ServeRequest
 from flows.schedule.times import parse_timetable
 from flows.schedule.watcher import Watcher
 from pipeline.errors import ArchiveError
-from storage.archive import Archive
-from storage.ledger import Ledger
-from storage.staging import take_lock
+from storage.archive.archive import Archive
+from storage.archive.ledger import Ledger
+from storage.archive.staging import take_lock
 from tests.flows.schedule_days import NOON, HandClock
 
 EVERY = parse_timetable(None, "20m", "UTC")

@@ -18,12 +18,12 @@ from flows.settings import keys as setting_keys
 from flows.settings.keys import MapChoice
 from flows.settings.survey_settings import Settings, load_settings, of_this_version, parse_settings
 from flows.settings.values import Tolerance
-from models import policies
-from pipeline.camera import LineCamera
+from models.policies import policies
 from pipeline.errors import BudgetError, SettingsError
-from pipeline.ground import RigPose
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import CostModel
+from pipeline.ground.view import RigPose
 from pipeline.rectify.resample import Kernel
-from pipeline.scan import CostModel
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.rig_model import Air, Detector, Optics, Rig, Sky
 

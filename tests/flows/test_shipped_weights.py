@@ -10,13 +10,13 @@ import pytest
 
 from flows.survey.full_look import columns_of_all_seats
 from flows.survey.run import SHIPPED
-from models.controls import Controls, run_controls
-from models.inference import glance
-from models.metrics import mean_iou
-from models.weights import Weights, content_key, describe_weights, load_weights
-from pipeline.camera import LineCamera
-from pipeline.coverage import coarse_sweeps, full_sweeps
-from pipeline.grid import SceneGrid
+from models.evaluation.metrics import mean_iou
+from models.policies.free_seats import Controls, run_controls
+from models.reading.inference import glance
+from models.weights.files import Weights, content_key, describe_weights, load_weights
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.coverage import coarse_sweeps, full_sweeps
 from pipeline.rectify.region import mosaic_rows
 from pipeline.simulator.farm_fields import CLASSES
 from pipeline.simulator.farm_laws import BUILT_IN_SCENE, built_in_farm

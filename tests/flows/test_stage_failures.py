@@ -25,9 +25,9 @@ from flows.schedule.times import parse_timetable
 from flows.survey import prefect_engine as engine
 from flows.survey.survey import OF_ROUND_TWO, STAGES
 from pipeline.errors import ArchiveError, RigError
-from storage.archive import Archive
-from storage.class_maps import load_class_map
-from storage.ledger import Ledger
+from storage.archive.archive import Archive
+from storage.archive.ledger import Ledger
+from storage.arrays.class_maps import load_class_map
 from tests.flows.conftest import Ended
 
 CAPTURES = ("capture_coarse", "capture_fine", "capture_again")

@@ -1,3 +1,4 @@
+# ruff: noqa: E501
 """A stage's code does not change without its version: what an archive holds would otherwise pass for the new result.
 
 After a change, either raise the stage's number in ``flows.survey.stages.VERSIONS`` (that of ingest in its command) or,
@@ -22,16 +23,16 @@ VERSIONS = {**stages.VERSIONS, ingest_command.STAGE: ingest_command.VERSION}
 
 ROOT = Path(__file__).parents[2]
 RECORD = Path(__file__).with_name("stage_digests.json")
-GEOMETRY = ("pipeline/camera.py", "pipeline/mirror.py", "pipeline/scan.py", "pipeline/coverage.py", "pipeline/grid.py",
-            "pipeline/vector_memory.py")  # fmt: skip
+GEOMETRY = ("pipeline/geometry/camera.py", "pipeline/geometry/mirror.py", "pipeline/geometry/scan.py", "pipeline/planning/coverage.py", "pipeline/geometry/grid.py",
+            "pipeline/geometry/vector_memory.py")  # fmt: skip
 RECTIFY = (*GEOMETRY, "pipeline/rectify")
-READ = ("models/spectral.py", "models/sizes.py", "models/tokens.py", "models/encoder.py", "models/patches.py",
-        "models/segmenter.py", "models/inference.py", "models/regions.py", "models/weights.py", "pipeline/grid.py",
-        "flows/survey/region_work.py", "storage/mosaic_strips.py")  # fmt: skip
-PLANNING = ("pipeline/planning.py", "pipeline/runs.py", "pipeline/covering.py", "pipeline/spending.py",
-            "pipeline/strips.py")  # fmt: skip
+READ = ("models/network/spectral.py", "models/network/sizes.py", "models/network/tokens.py", "models/network/encoder.py", "models/network/pixel_side.py",
+        "models/network/segmenter.py", "models/reading/inference.py", "models/reading/regions.py", "models/weights/files.py", "pipeline/geometry/grid.py",
+        "flows/survey/region_work.py", "storage/arrays/mosaic_strips.py")  # fmt: skip
+PLANNING = ("pipeline/planning/fine_pass.py", "pipeline/planning/scan_runs.py", "pipeline/planning/line_cover.py", "pipeline/planning/budget_search.py",
+            "pipeline/planning/strips.py")  # fmt: skip
 GATHER = ("pipeline/rectify/resample.py", "pipeline/rectify/kernels.py", "pipeline/rectify/line_table.py",
-          "pipeline/rectify/alignment.py")  # fmt: skip
+          "pipeline/rectify/registration/alignment.py")  # fmt: skip
 READERS = ("storage/scan_files.py", "storage/envi_header.py", "storage/envi_cubes.py", "storage/headwall_folders.py",
            "storage/frame_index_files.py", "storage/zarr_scenes.py", "storage/raster_files.py", "storage/rasters.py",
            "storage/tiff_files.py", "storage/array_files.py", "storage/mat_files.py", "storage/dataset_layouts.py",
@@ -39,23 +40,23 @@ READERS = ("storage/scan_files.py", "storage/envi_header.py", "storage/envi_cube
 SIMULATOR = ("pipeline/simulator", "pipeline/simulator/effects")
 SOURCES = {
     "effects": (*GEOMETRY, *GATHER, *SIMULATOR, "flows/survey/effect_choice.py"),
-    "capture": (*GEOMETRY, *GATHER, *SIMULATOR, "storage/cubes.py"),
-    "register": (*RECTIFY, "storage/sightings.py", "flows/survey/pointing.py"),
-    "locate": (*RECTIFY, "storage/sightings.py", "storage/lookups.py"),
-    "rectify": (*RECTIFY, "storage/sightings.py", "storage/mosaics.py", "storage/mosaic_work.py",
-                "storage/tile_work.py"),
+    "capture": (*GEOMETRY, *GATHER, *SIMULATOR, "storage/arrays/cubes.py"),
+    "register": (*RECTIFY, "storage/arrays/located_sweeps.py", "flows/survey/pointing.py"),
+    "locate": (*RECTIFY, "storage/arrays/located_sweeps.py", "storage/arrays/lookups.py"),
+    "rectify": (*RECTIFY, "storage/arrays/located_sweeps.py", "storage/arrays/mosaics.py", "storage/arrays/mosaic_work.py",
+                "storage/arrays/tile_work.py"),
     "attend": (*READ, *PLANNING, "flows/survey/field_work.py", "flows/survey/second_round.py", "models/second_look.py",
-               "models/policies.py", "models/saliency.py", "models/spacing.py", "models/vgg.py",
-               "models/vgg_saliency.py", "storage/attention.py"),
-    "patches": (*RECTIFY, "pipeline/strips.py", "storage/sightings.py", "storage/patches.py"),
-    "segment": (*READ, "flows/survey/field_work.py", "storage/class_maps.py"),
-    "turned": (*PLANNING, "pipeline/orientation.py", "pipeline/crop_rows.py", "storage/mosaic_strips.py",
-               "storage/attention.py", "flows/survey/orientation.py"),
-    "ground": ("pipeline/ground.py", "pipeline/ground_grid.py", "pipeline/projection.py", *GATHER,
-               "storage/georeference.py", "storage/ground_maps.py", "flows/survey/ground.py", "flows/publish/panels.py",
+               "models/policies/policies.py", "models/policies/saliency.py", "models/policies/spacing.py", "models/network/vgg.py",
+               "models/policies/vgg_saliency.py", "storage/arrays/attention.py"),
+    "patches": (*RECTIFY, "pipeline/planning/strips.py", "storage/arrays/located_sweeps.py", "storage/arrays/patches.py"),
+    "segment": (*READ, "flows/survey/field_work.py", "storage/arrays/class_maps.py"),
+    "turned": (*PLANNING, "pipeline/planning/orientation.py", "pipeline/planning/crop_rows.py", "storage/arrays/mosaic_strips.py",
+               "storage/arrays/attention.py", "flows/survey/orientation.py"),
+    "ground": ("pipeline/ground/view.py", "pipeline/ground/map_grid.py", "pipeline/ground/projection.py", *GATHER,
+               "storage/arrays/georeference.py", "storage/arrays/ground_maps.py", "flows/survey/ground.py", "flows/publish/panels.py",
                "flows/publish/colour_stretch.py"),
-    "evaluate": (*READ, *RECTIFY, *PLANNING, "models/controls.py", "models/metrics.py", "models/policies.py",
-                 "pipeline/savings.py", "pipeline/selection.py", "flows/survey/accuracy.py",
+    "evaluate": (*READ, *RECTIFY, *PLANNING, "models/policies/free_seats.py", "models/evaluation/metrics.py", "models/policies/policies.py",
+                 "pipeline/planning/savings.py", "pipeline/planning/selection.py", "flows/survey/accuracy.py",
                  "flows/survey/full_look.py"),
     "ingest": (*READERS, "storage/cube_sources.py", "storage/ingested_cubes.py"),
 }  # fmt: skip

@@ -10,10 +10,10 @@ from typing import get_args
 import pytest
 
 from flows.survey.extent import Extent, Unit
-from models.sizes import SegmenterConfig
-from pipeline.camera import LineCamera
-from pipeline.grid import SceneGrid
-from pipeline.scan import CostModel, Sweep
+from models.network.sizes import SegmenterConfig
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel, Sweep
 
 SMALL = Extent(
     SegmenterConfig(4, patch=16), SceneGrid(640, 1280, 16, 4), LineCamera(), CostModel(), "x", 30, 160, 200, 4

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models.weights import save_weights
+from models.weights.files import save_weights
 from pipeline.errors import SceneError
-from storage.class_maps import ClassMap, load_class_map
+from storage.arrays.class_maps import ClassMap, load_class_map
 from tests.conftest import CLASSES, RGB_NM, patchy_scene, random_weights
 
 GAP = np.s_[20:31, 40:60]  # of 64 x 96 px

@@ -20,14 +20,14 @@ from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.survey_settings import load_settings
 from flows.survey.scene import open_scene
-from models.inference import glance
-from models.weights import load_weights
-from pipeline.camera import LineCamera
-from pipeline.coverage import on_scene
-from pipeline.grid import SceneGrid
-from pipeline.scan import CostModel, Sweep
+from models.reading.inference import glance
+from models.weights.files import load_weights
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.planning.coverage import on_scene
 from pipeline.simulator.effects.registry import BY_NAME
-from storage.archive import Archive
+from storage.archive.archive import Archive
 
 STAGES = [
     "choose_effects", "capture_coarse", "locate", "rectify", "attend", "capture_fine", "cut_patches", "draw_map",

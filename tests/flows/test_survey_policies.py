@@ -17,11 +17,11 @@ from flows.settings.survey_settings import load_settings
 from flows.survey.field_work import SHARD, FieldWork
 from flows.survey.run import open_run
 from flows.survey.stages import attend
-from models.policies import IMAGE_POLICIES, NETWORK_POLICIES, POLICIES, SEEDED_POLICIES
-from models.regions import plan_regions
+from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, POLICIES, SEEDED_POLICIES
+from models.reading.regions import plan_regions
 from pipeline.errors import SettingsError
-from storage.archive import StageRef
-from storage.attention import load_attention
+from storage.archive.archive import StageRef
+from storage.arrays.attention import load_attention
 
 FREE = [policy for policy in POLICIES if policy not in ("mask", *NETWORK_POLICIES)]
 

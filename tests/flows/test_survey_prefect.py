@@ -18,7 +18,7 @@ from flows.survey import prefect_engine as engine
 from flows.survey.survey import STAGES
 from flows.terminal.termination import Terminated
 from pipeline.errors import RigError, SceneError
-from storage.archive import Archive
+from storage.archive.archive import Archive
 from tests.flows.conftest import CommandLine
 
 

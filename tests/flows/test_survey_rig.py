@@ -29,6 +29,7 @@ from flows.survey.effect_choice import chosen_effects
 from flows.survey.run import make_source
 from flows.survey.scene import open_scene
 from pipeline.errors import SettingsError
+from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera_references import mean_frame
 from pipeline.rig.capture_names import REFERENCES
 from pipeline.rig.capture_runner import RigDevices
@@ -43,14 +44,13 @@ from pipeline.rig.mirror_controller import MirrorController
 from pipeline.rig.pro_mode import Command
 from pipeline.rig.refusals import DeviceGone
 from pipeline.rig.transport import SerialTransport
-from pipeline.scan import Sweep
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.scene import RasterScene, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import References
-from storage.archive import Archive
-from storage.class_maps import load_class_map
-from storage.cubes import open_raw_cube
+from storage.archive.archive import Archive
+from storage.arrays.class_maps import load_class_map
+from storage.arrays.cubes import open_raw_cube
 from tests.conftest import patchy_scene
 from tests.flows.conftest import CommandLine
 

@@ -17,11 +17,11 @@ from flows.tradeoff.resample import RESAMPLE, draw_waves, noise_levels
 from flows.tradeoff.scan_step import SCAN_STEP
 from flows.tradeoff.store import BITS, CODEC, SIZE
 from flows.tradeoff.tie_spacing import TIE_SPACING
-from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_full
-from pipeline.grid import SceneGrid
-from pipeline.rectify.registration import PairShift
-from pipeline.scan import CostModel
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel
+from pipeline.planning.coverage import cheapest_full
+from pipeline.rectify.registration.shifts import PairShift
 
 
 def test_waves_are_what_they_claim():

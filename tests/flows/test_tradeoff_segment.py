@@ -10,9 +10,9 @@ from flows.tradeoff import farm as tradeoff_farm
 from flows.tradeoff import segment as tradeoff_segment
 from flows.tradeoff.entries import find_tradeoffs
 from flows.tradeoff.segment import AGREEMENT, BAND_COUNT, BANDS, PRECISION, PRECISIONS, SEATS, SHARES, Farm
-from models.segmenter import Segmenter, SegmenterConfig
-from models.spectral import Normalisation, SpectralBasis
-from models.weights import Weights
+from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.spectral import Normalisation, SpectralBasis
+from models.weights.files import Weights
 from pipeline.simulator.farm import farm_scene
 
 SHAPE = (128, 192)
@@ -34,7 +34,7 @@ def farm() -> Farm:
     weights = Weights(model, basis, flat, scene.class_names, np.asarray(scene.class_colours))
     kept: list[bool] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("models.process.keep_freed_memory", lambda: kept.append(True))
+        patch.setattr("models.network.process.keep_freed_memory", lambda: kept.append(True))
         patch.setattr(tradeoff_farm, "load_weights", lambda path: weights)
         patch.setattr(tradeoff_segment, "SHAPE", SHAPE)
         prepared: Farm = SEATS.prepare(0)

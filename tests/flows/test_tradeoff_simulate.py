@@ -23,7 +23,7 @@ from flows.tradeoff.simulate_noise import DIM_NOISE, NOISE, law_of_numbers
 from flows.tradeoff.simulate_rays import SUPERSAMPLING
 from flows.tradeoff.simulated_lines import Against, FarmLines, look_at_lines, with_variant
 from flows.tradeoff.table import print_tradeoff
-from pipeline.camera import LineCamera
+from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.keystone import KEYSTONE
 from pipeline.simulator.effects.shot import SHOT

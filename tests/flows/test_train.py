@@ -16,9 +16,9 @@ from flows.survey.run import open_run
 from flows.training import train as flow
 from flows.training.command import run_train
 from flows.training.train import TrainRequest, suggested_patch, train_weights, usual_crop
-from models.sizes import PRESETS, Preset
-from models.training import TrainingSettings
-from models.weights import load_any_weights, load_weights
+from models.network.sizes import PRESETS, Preset
+from models.training.train import TrainingSettings
+from models.weights.files import load_any_weights, load_weights
 from pipeline.errors import SceneError, SettingsError, WeightsError
 from tests.flows.small_fields import write_field
 

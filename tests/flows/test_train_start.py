@@ -17,9 +17,9 @@ from flows.training import train as flow
 from flows.training.data import pack_mask, unpack_mask
 from flows.training.start import joined_split
 from flows.training.train import TrainRequest, train_weights
-from models.start_weights import StartFile
-from models.training import TrainingSettings
-from models.weights import describe_weights, load_weights
+from models.training.start_weights import StartFile
+from models.training.train import TrainingSettings
+from models.weights.files import describe_weights, load_weights
 from pipeline.errors import SettingsError
 from tests.flows.small_fields import write_field
 

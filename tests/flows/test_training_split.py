@@ -13,10 +13,10 @@ from flows.settings.survey_settings import load_settings
 from flows.survey.run import open_run
 from flows.training.data import open_training_data, pack_mask, read_farm_name, unpack_mask
 from flows.training.train import TrainRequest, train_weights
-from models.training import TrainingSettings
-from models.weights import load_weights
-from pipeline.camera import LineCamera
+from models.training.train import TrainingSettings
+from models.weights.files import load_weights
 from pipeline.errors import SceneError
+from pipeline.geometry.camera import LineCamera
 
 TOML = """
 labels = "labels/{number}_labels.png"

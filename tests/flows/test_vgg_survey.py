@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from flows.settings.survey_settings import load_settings, parse_settings
-from models.vgg import VggFeatures
-from models.vgg_sizes import saliency_multiply_adds
-from models.weights import describe_weights
+from models.network.vgg import VggFeatures
+from models.network.vgg_sizes import saliency_multiply_adds
+from models.weights.files import describe_weights
 from pipeline.errors import SettingsError, WeightsError
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import RigError
-from storage.archive import Archive
+from storage.archive.archive import Archive
 
 
 # (1) What your flow does, as plain functions: arrays and files stay in here, an address and a key go out.

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 import torch
 
-from models.holes import fill_dead
-from models.inference import CoarseLook, Glance, glance, look_coarsely, segment
-from models.placement_metrics import oracle_gain
-from models.policies import score_seats
+from models.evaluation.placement_metrics import oracle_gain
+from models.network.dead_pixels import fill_dead
+from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.spectral import Normalisation, SpectralBasis
+from models.policies.policies import score_seats
+from models.reading.inference import CoarseLook, Glance, glance, look_coarsely, segment
 from models.second_look import surprise
-from models.segmenter import Segmenter, SegmenterConfig
-from models.spectral import Normalisation, SpectralBasis
-from models.weights import Weights
-from pipeline.grid import SceneGrid
+from models.weights.files import Weights
+from pipeline.geometry.grid import SceneGrid
 
 NM = np.linspace(400, 1000, 9)
 

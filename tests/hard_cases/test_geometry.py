@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import PoseError
-from pipeline.mirror import (
+from pipeline.geometry.mirror import (
     direction_to_normal,
     direction_to_position,
     direction_to_scene,
@@ -17,7 +17,7 @@ from pipeline.mirror import (
     position_to_normal,
     scene_to_direction,
 )
-from pipeline.paper import slope_rotation
+from pipeline.geometry.paper_equations import slope_rotation
 
 PRECISIONS = [np.float64, np.float32]
 

@@ -9,8 +9,8 @@ import pytest
 from pyproj import Proj
 
 from pipeline.errors import PoseError
-from pipeline.ground import GroundView, RigPose
-from pipeline.ground_grid import GroundGrid, ground_grid
+from pipeline.ground.map_grid import GroundGrid, ground_grid
+from pipeline.ground.view import GroundView, RigPose
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 IFOV = 7.4e-3 / 70

@@ -11,23 +11,23 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
-from models import training
-from models.encoder import Attention
-from models.examples import Example
-from models.inference import glance_of_columns
-from models.metrics import mean_iou
-from models.objective import map_loss, pixel_losses
-from models.patches import ChannelNorm
-from models.placement_metrics import captured_gain, gain_sums, oracle_gain
-from models.scorer import MOST_GAIN, scoring_loss
-from models.segmenter import Segmenter, SegmenterConfig
-from models.spectral import Normalisation, SpectralBasis
-from models.training import Trainer, TrainingSettings, train
-from models.weights import Weights
-from pipeline.camera import LineCamera
-from pipeline.grid import UNLABELLED, SceneGrid
-from pipeline.planning import plan_fine
-from pipeline.scan import CostModel
+from models.evaluation.metrics import mean_iou
+from models.evaluation.placement_metrics import captured_gain, gain_sums, oracle_gain
+from models.network.encoder import Attention
+from models.network.pixel_side import ChannelNorm
+from models.network.scorer import MOST_GAIN, scoring_loss
+from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.spectral import Normalisation, SpectralBasis
+from models.reading.inference import glance_of_columns
+from models.training import train as training
+from models.training.examples import Example
+from models.training.objective import map_loss, pixel_losses
+from models.training.train import Trainer, TrainingSettings, train
+from models.weights.files import Weights
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.scan import CostModel
+from pipeline.planning.fine_pass import plan_fine
 from storage.band_statistics import BandPart, tabulate
 
 SIZES: dict[str, Any] = {"classes": 2, "columns": 4, "patch": 8, "factor": 2, "width": 8, "coarse_width": 8, "dim": 16,

@@ -16,20 +16,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from models import training
-from models.encoder import Encoder
-from models.examples import Example
-from models.inference import Glance, check_seats, glance, glance_of_columns, segment
-from models.metrics import average_accuracy, confusion, iou_per_class, kappa, mean_iou, overall_accuracy
-from models.objective import class_weights, draw_seats, map_loss, phase_at, pixel_losses
-from models.policies import pixel_entropy, score_seats
-from models.segmenter import Segmenter, SegmenterConfig
-from models.spectral import Normalisation, SpectralBasis
-from models.tokens import code_1d, code_2d
-from models.training import TrainingSettings, train
-from models.weights import Weights, load_weights, save_weights
-from pipeline.grid import SceneGrid
-from pipeline.selection import frame_seats, select_seats
+from models.evaluation.metrics import average_accuracy, confusion, iou_per_class, kappa, mean_iou, overall_accuracy
+from models.network.encoder import Encoder
+from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.spectral import Normalisation, SpectralBasis
+from models.network.tokens import code_1d, code_2d
+from models.policies.policies import pixel_entropy, score_seats
+from models.reading.inference import Glance, check_seats, glance, glance_of_columns, segment
+from models.training import train as training
+from models.training.examples import Example
+from models.training.objective import class_weights, draw_seats, map_loss, phase_at, pixel_losses
+from models.training.train import TrainingSettings, train
+from models.weights.files import Weights, load_weights, save_weights
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.selection import frame_seats, select_seats
 
 SIZES: dict[str, Any] = {"classes": 3, "columns": 4, "patch": 8, "factor": 2, "width": 8, "coarse_width": 8, "dim": 16,
                          "heads": 2}  # fmt: skip

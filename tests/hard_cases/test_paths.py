@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
 from pipeline.errors import PoseError
-from pipeline.mirror import direction_to_position, scene_to_direction
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import direction_to_position, scene_to_direction
+from pipeline.geometry.scan import points_of_scan
 from pipeline.rectify.line_numbers import number_lines, positions_at
 from pipeline.rectify.lookup import grid_lookup, lookup, tie_table, track_lookup
 from pipeline.rectify.resample import merge_lines, resample
 from pipeline.rectify.tracks import Track, make_tracks
-from pipeline.scan import points_of_scan
 
 CAMERA = LineCamera()
 STRIP = 2600.0

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
-from pipeline.coverage import check_reach, full_sweeps
 from pipeline.errors import PoseError, SettingsError
-from pipeline.grid import SceneGrid
-from pipeline.planning import plan_fine, price_of_seats
-from pipeline.scan import CostModel, Sweep
-from pipeline.vector_memory import memory_loads
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.geometry.vector_memory import memory_loads
+from pipeline.planning.coverage import check_reach, full_sweeps
+from pipeline.planning.fine_pass import plan_fine, price_of_seats
 
 CAMERA, COST = LineCamera(), CostModel()
 GRID = SceneGrid(200, 900, 32, 4)

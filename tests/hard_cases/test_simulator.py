@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SceneError
+from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.aberration import ABERRATION
 from pipeline.simulator.effects.keystone import KEYSTONE

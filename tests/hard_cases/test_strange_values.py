@@ -13,17 +13,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from flows.survey.region_work import seat_columns
-from models.holes import MOST_COLUMN
-from models.inference import ClassMap, Glance, decide, glance, glance_of_columns, look_coarsely, segment
-from models.policies import score_seats
-from models.regions import whole_field
+from models.network.dead_pixels import MOST_COLUMN
+from models.policies.policies import score_seats
+from models.reading.inference import ClassMap, Glance, decide, glance, glance_of_columns, look_coarsely, segment
+from models.reading.regions import whole_field
 from models.second_look import rescore
-from models.weights import Weights
-from pipeline.camera import LineCamera
-from pipeline.grid import UNLABELLED, SceneGrid
-from pipeline.planning import FinePlan, plan_fine
+from models.weights.files import Weights
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.scan import CostModel
+from pipeline.planning.fine_pass import FinePlan, plan_fine
 from pipeline.readings import MOST_VALUE, beyond_range, find_beyond, readings_alone
-from pipeline.scan import CostModel
 from tests.models.conftest import make_weights
 
 WEIGHTS = make_weights(0)

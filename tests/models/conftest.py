@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from models.designs import build_network
-from models.segmenter import Segmenter, SegmenterConfig
-from models.sizes import PRESETS, Preset
-from models.spectral import Normalisation, SpectralBasis
-from models.weights import AnyWeights, Weights
+from models.baselines.designs import build_network
+from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.sizes import PRESETS, Preset
+from models.network.spectral import Normalisation, SpectralBasis
+from models.weights.files import AnyWeights, Weights
 
 Maker = Callable[..., Weights]
 

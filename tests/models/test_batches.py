@@ -11,12 +11,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models import batches, inference
-from models.batches import encode_packed, packs
-from models.inference import CoarseLook, Glance, glance_batch, read_glance, segment, segment_batch
-from models.weights import Weights
+from models.network import batches
+from models.network.batches import encode_packed, packs
+from models.reading import inference
+from models.reading.inference import CoarseLook, Glance, glance_batch, read_glance, segment, segment_batch
+from models.weights.files import Weights
 from pipeline.errors import ShapeError
-from pipeline.grid import SceneGrid
+from pipeline.geometry.grid import SceneGrid
 
 Maker = Callable[..., Weights]
 Scenes = tuple[list[CoarseLook], list[np.ndarray], list[np.ndarray]]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.bootstrap import paired_interval
-from models.metrics import mean_iou
+from models.evaluation.bootstrap import paired_interval
+from models.evaluation.metrics import mean_iou
 from pipeline.errors import ShapeError
 
 

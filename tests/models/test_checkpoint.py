@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from models.checkpoint import load_checkpoint, save_checkpoint
-from models.examples import Example
-from models.segmenter import SegmenterConfig
-from models.training import Progress, TrainingSettings, run_identity, train
+from models.network.segmenter import SegmenterConfig
+from models.training.checkpoint import load_checkpoint, save_checkpoint
+from models.training.examples import Example
+from models.training.train import Progress, TrainingSettings, run_identity, train
 from pipeline.errors import WeightsError
 
 CONFIG = SegmenterConfig(classes=2, columns=2, patch=8, factor=2, width=8, dim=16, layers=1, heads=2)

@@ -10,13 +10,13 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
-from models import control_maps
-from models.control_maps import control_multiply_adds, draw_with_control
-from models.inference import CoarseLook, look_coarsely
-from models.sizes import PRESETS
-from models.weights import AnyWeights
+from models.network.sizes import PRESETS
+from models.reading import control_maps
+from models.reading.control_maps import control_multiply_adds, draw_with_control
+from models.reading.inference import CoarseLook, look_coarsely
+from models.weights.files import AnyWeights
 from pipeline.errors import ShapeError
-from pipeline.grid import SceneGrid
+from pipeline.geometry.grid import SceneGrid
 
 Maker = Callable[..., AnyWeights]
 NM = np.linspace(400, 1000, 9)
@@ -120,7 +120,7 @@ def test_what_does_not_fit_is_refused(make_control: Maker, tiny: Maker):
     """Weights of two scales, seats given twice or off the grid, and patches of another shape."""
     weights = make_control("paper")
     look, fine = _look(weights, 24, 40)
-    with pytest.raises(ShapeError, match=r"of two scales; draw with models.inference.segment"):
+    with pytest.raises(ShapeError, match=r"of two scales; draw with models.reading.inference.segment"):
         draw_with_control(tiny(), look, fine[:1], np.array([0]))
     with pytest.raises(ShapeError, match="seat 3 is given more than once"):
         draw_with_control(weights, look, fine[:2], np.array([3, 3]))

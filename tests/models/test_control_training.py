@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from models.control_maps import draw_with_control
-from models.designs import build_network
-from models.examples import Batch, CropSampler, Example
-from models.inference import CoarseLook
-from models.objective import SHARES, batch_loss, class_weights, draw_paper_seats, phase_at
-from models.sizes import PRESETS, Preset, SegmenterConfig
-from models.training import TrainingSettings, run_identity, train
-from models.weights import (
+from models.baselines.designs import build_network
+from models.network.sizes import PRESETS, Preset, SegmenterConfig
+from models.reading.control_maps import draw_with_control
+from models.reading.inference import CoarseLook
+from models.training.examples import Batch, CropSampler, Example
+from models.training.objective import SHARES, batch_loss, class_weights, draw_paper_seats, phase_at
+from models.training.train import TrainingSettings, run_identity, train
+from models.weights.files import (
     AnyWeights,
     Weights,
     check_two_scale,
@@ -27,7 +27,7 @@ from models.weights import (
     save_weights,
 )
 from pipeline.errors import WeightsError
-from pipeline.grid import SceneGrid
+from pipeline.geometry.grid import SceneGrid
 
 Maker = Callable[..., AnyWeights]
 CONFIG = SegmenterConfig(classes=3, columns=2, patch=8, factor=2, width=8, dim=16, layers=1, heads=2)

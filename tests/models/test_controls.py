@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from models.controls import RANDOM_DRAWS, Controls, run_controls
-from models.inference import Glance, glance_of_columns, segment
-from models.metrics import agreement, confusion, mean_iou
-from models.weights import Weights
-from pipeline.grid import SceneGrid
+from models.evaluation.metrics import agreement, confusion, mean_iou
+from models.policies.free_seats import RANDOM_DRAWS, Controls, run_controls
+from models.reading.inference import Glance, glance_of_columns, segment
+from models.weights.files import Weights
+from pipeline.geometry.grid import SceneGrid
 
 Maker = Callable[..., Weights]
 

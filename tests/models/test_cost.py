@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
-from models.cost import multiply_adds
-from models.segmenter import Segmenter, SegmenterConfig
-from pipeline.grid import SceneGrid
+from models.network.cost import multiply_adds
+from models.network.segmenter import Segmenter, SegmenterConfig
+from pipeline.geometry.grid import SceneGrid
 
 
 def _attention(q: Any, k: Any, v: Any, *args: Any, out_shape: Any = None, **kwargs: Any) -> int:

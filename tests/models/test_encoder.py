@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.encoder import Attention, Encoder
+from models.network.encoder import Attention, Encoder
 from pipeline.errors import ShapeError
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from torch import Tensor
 
-from models.examples import CropSampler, Example, Observation, measured_normalisation, normalised, observe
-from models.spectral import SpectralBasis
-from pipeline.camera import LineCamera, look
+from models.network.spectral import SpectralBasis
+from models.training.examples import CropSampler, Example, Observation, measured_normalisation, normalised, observe
 from pipeline.errors import SceneError
-from pipeline.grid import SceneGrid
+from pipeline.geometry.camera import LineCamera, look
+from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.raster import Raster
 from pipeline.simulator.scene import RasterScene, raster_from_values
 

@@ -10,11 +10,11 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 
-from models import batches
-from models.inference import Glance, glance, look_coarsely, read_glance, segment
-from models.weights import Weights
+from models.network import batches
+from models.reading.inference import Glance, glance, look_coarsely, read_glance, segment
+from models.weights.files import Weights
 from pipeline.errors import ShapeError
-from pipeline.grid import SceneGrid
+from pipeline.geometry.grid import SceneGrid
 
 Maker = Callable[..., Weights]
 NM = np.linspace(400, 1000, 9)

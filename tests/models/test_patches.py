@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from models.patches import ChannelNorm, PatchHead, PatchStem, level_widths
+from models.network.pixel_side import ChannelNorm, PatchHead, PatchStem, level_widths
 from pipeline.errors import ShapeError
 
 

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.inference import glance_of_columns, segment
-from models.placement_metrics import (
+from models.evaluation.placement_metrics import (
     average_precision,
     captured_gain,
     gain_sums,
@@ -16,7 +15,8 @@ from models.placement_metrics import (
     rank_correlation,
     top_seats,
 )
-from pipeline.grid import SceneGrid
+from models.reading.inference import glance_of_columns, segment
+from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import Maker
 
 

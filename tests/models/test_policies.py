@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.inference import Glance
-from models.policies import NETWORK_POLICIES, POLICIES, pixel_entropy, score_seats
-from models.self_attention import TokenReading
+from models.network.self_attention import TokenReading
+from models.policies.policies import NETWORK_POLICIES, POLICIES, pixel_entropy, score_seats
+from models.reading.inference import Glance
 from pipeline.errors import SettingsError, ShapeError
-from pipeline.grid import SceneGrid
-from pipeline.selection import select_seats
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.selection import select_seats
 
 
 def _glance(height: int = 32, width: int = 48, patch: int = 8, factor: int = 2) -> Glance:

@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from models.pretrained import load_into, load_vgg
-from models.state_files import read_state
-from models.vgg import VggFeatures
-from models.vgg_sizes import VggSizes
+from models.network.vgg import VggFeatures
+from models.network.vgg_sizes import VggSizes
+from models.training.pretrained import load_into, load_vgg
+from models.weights.state_files import read_state
 from pipeline.errors import WeightsError
 
 NARROW = VggSizes(widths=(4, 6, 8, 10, 10))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.regions import REGION_PX, Box, plan_regions, region_bytes, whole_field
-from models.sizes import SegmenterConfig
+from models.network.sizes import SegmenterConfig
+from models.reading.regions import REGION_PX, Box, plan_regions, region_bytes, whole_field
 from pipeline.errors import ShapeError
-from pipeline.grid import SceneGrid
+from pipeline.geometry.grid import SceneGrid
 
 SHARD = (64, 640)
 FIELDS = [(700, 1300, 16, 4), (2561, 90, 32, 4), (1000, 2000, 8, 4), (130, 1921, 32, 2), (64, 641, 16, 1)]

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from models.inference import Glance, glance
-from models.policies import score_seats
-from models.scorer import SeatScorer, scoring_loss
-from models.sizes import SegmenterConfig
+from models.network.scorer import SeatScorer, scoring_loss
+from models.network.sizes import SegmenterConfig
+from models.policies.policies import score_seats
+from models.reading.inference import Glance, glance
 from pipeline.errors import SettingsError
-from pipeline.grid import SceneGrid
+from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import Maker
 
 CONFIG = SegmenterConfig(classes=3, columns=2, patch=8, factor=2, width=8, coarse_width=6, dim=16, layers=1, heads=2)

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models import batches
-from models.inference import CoarseLook, look_coarsely, read_glance
-from models.scorer import MOST_GAIN
+from models.network import batches
+from models.network.scorer import MOST_GAIN
+from models.reading.inference import CoarseLook, look_coarsely, read_glance
 from models.second_look import MOST_TIMES, rescore, surprise
-from models.weights import Weights
+from models.weights.files import Weights
 from pipeline.errors import ShapeError
-from pipeline.grid import SceneGrid
+from pipeline.geometry.grid import SceneGrid
 
 SHAPE = (9, 14)
 COUNT = SHAPE[0] * SHAPE[1]

@@ -10,8 +10,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor
 
-from models.segmenter import Segmenter, SegmenterConfig
-from models.weights import Weights
+from models.network.segmenter import Segmenter, SegmenterConfig
+from models.weights.files import Weights
 from pipeline.errors import ShapeError
 
 Maker = Callable[..., Weights]

@@ -10,13 +10,19 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from models.encoder import LAST_QUERIES
-from models.inference import CoarseLook, Glance, glance_of_columns, read_glance
-from models.policies import score_seats
-from models.self_attention import TokenReading, attention_of_seats, queries_kept, received_attention, token_image
-from models.weights import Weights
+from models.network.encoder import LAST_QUERIES
+from models.network.self_attention import (
+    TokenReading,
+    attention_of_seats,
+    queries_kept,
+    received_attention,
+    token_image,
+)
+from models.policies.policies import score_seats
+from models.reading.inference import CoarseLook, Glance, glance_of_columns, read_glance
+from models.weights.files import Weights
 from pipeline.errors import SettingsError, ShapeError
-from pipeline.grid import SceneGrid
+from pipeline.geometry.grid import SceneGrid
 
 Array = NDArray[np.float32]
 

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from models.spacing import centre_scores, random_scores, stratified_scores, uniform_scores
-from pipeline.grid import SceneGrid
-from pipeline.selection import select_seats
+from models.policies.spacing import centre_scores, random_scores, stratified_scores, uniform_scores
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.selection import select_seats
 
 Place = Callable[[SceneGrid, int], NDArray[np.float64]]
 even = pytest.mark.parametrize("place", [uniform_scores, stratified_scores])

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.spectral import Normalisation, SpectralBasis, band_widths, checked_wavelengths, project
+from models.network.spectral import Normalisation, SpectralBasis, band_widths, checked_wavelengths, project
 from pipeline.errors import WavelengthError
 
 BASIS = SpectralBasis(400.0, 1000.0, 24)

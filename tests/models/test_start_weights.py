@@ -12,12 +12,12 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from models.kernel_fits import mixed_channels, rgb_response
-from models.segmenter import Segmenter, SegmenterConfig
-from models.spectral import Normalisation, SpectralBasis
-from models.start_columns import column_change
-from models.start_weights import StartFile, TokenSizes
-from models.weights import Weights, save_weights, with_record
+from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.spectral import Normalisation, SpectralBasis
+from models.training.kernel_fits import mixed_channels, rgb_response
+from models.training.start_columns import column_change
+from models.training.start_weights import StartFile, TokenSizes
+from models.weights.files import Weights, save_weights, with_record
 from pipeline.errors import SettingsError, WeightsError
 
 DIM, HEADS = 128, 2

@@ -11,7 +11,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from models.state_files import Variant, read_state, read_variant, unwrap_state
+from models.weights.state_files import Variant, read_state, read_variant, unwrap_state
 from pipeline.errors import WeightsError
 
 STATE = {"blocks.0.weight": torch.arange(6.0).reshape(2, 3), "norm.bias": torch.ones(2)}

@@ -9,11 +9,21 @@ import pytest
 import torch
 from torch import Tensor
 
-from models import objective, training
-from models.examples import CropSampler, Example
-from models.objective import PHASES, SHARES, batch_loss, class_weights, draw_seats, map_loss, phase_at, pixel_losses
-from models.segmenter import Segmenter, SegmenterConfig
-from models.training import Progress, TrainingError, TrainingSettings, rate_at, train
+from models.network.segmenter import Segmenter, SegmenterConfig
+from models.training import objective
+from models.training import train as training
+from models.training.examples import CropSampler, Example
+from models.training.objective import (
+    PHASES,
+    SHARES,
+    batch_loss,
+    class_weights,
+    draw_seats,
+    map_loss,
+    phase_at,
+    pixel_losses,
+)
+from models.training.train import Progress, TrainingError, TrainingSettings, rate_at, train
 from pipeline.errors import PipelineError, WeightsError
 
 CONFIG = SegmenterConfig(classes=3, columns=2, patch=8, factor=2, width=8, dim=16, layers=1, heads=2)

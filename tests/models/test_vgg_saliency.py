@@ -9,17 +9,17 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from models import vgg_sizes
-from models.inference import CoarseLook, Glance
-from models.kernel_fits import rgb_response
-from models.policies import score_seats
-from models.vgg import VggFeatures
-from models.vgg_file import VggFile
-from models.vgg_saliency import VggSaliency, channels_of, close_ring, colours_of
-from models.vgg_sizes import VggSizes
-from models.weights import Weights
+from models.network import vgg_sizes
+from models.network.vgg import VggFeatures
+from models.network.vgg_sizes import VggSizes
+from models.policies.policies import score_seats
+from models.policies.vgg_file import VggFile
+from models.policies.vgg_saliency import VggSaliency, channels_of, close_ring, colours_of
+from models.reading.inference import CoarseLook, Glance
+from models.training.kernel_fits import rgb_response
+from models.weights.files import Weights
 from pipeline.errors import SettingsError, WeightsError
-from pipeline.grid import SceneGrid
+from pipeline.geometry.grid import SceneGrid
 
 
 @pytest.fixture

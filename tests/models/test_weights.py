@@ -16,9 +16,8 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from models.inference import glance
-from models.sealed_files import SEAL, TENSORS
-from models.weights import (
+from models.reading.inference import glance
+from models.weights.files import (
     FORMAT,
     UNSEALED,
     Weights,
@@ -30,8 +29,9 @@ from models.weights import (
     seal_weights,
     with_record,
 )
+from models.weights.sealed_files import SEAL, TENSORS
 from pipeline.errors import WeightsError
-from pipeline.grid import SceneGrid
+from pipeline.geometry.grid import SceneGrid
 
 Maker = Callable[..., Weights]
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError, ShapeError
-from pipeline.mirror import direction_to_scene, position_to_direction
-from pipeline.rectify.alignment import SweepShift, WindowShift, solve_sweeps
-from pipeline.scan import Sweep, line_positions, shifted_position
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import direction_to_scene, position_to_direction
+from pipeline.geometry.scan import Sweep, line_positions, shifted_position
+from pipeline.rectify.registration.alignment import SweepShift, WindowShift, solve_sweeps
 
 LINES = 3000
 NAMES = ("a", "b", "c", "d", "e")

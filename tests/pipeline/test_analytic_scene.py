@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
-from pipeline.coverage import on_scene
-from pipeline.rectify.calibrate import calibrate
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Axis, Sweep
+from pipeline.planning.coverage import on_scene
+from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.rectify.lookup import grid_lookup
 from pipeline.rectify.mosaic import Part, edge_distance, mosaic
 from pipeline.rectify.resample import Kernel, resample
-from pipeline.scan import Axis, Sweep
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource

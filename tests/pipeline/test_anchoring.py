@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
-from pipeline.grid import SceneGrid
-from pipeline.rectify.anchoring import Anchor, anchor_sweep
-from pipeline.rectify.overlaps import BroadSweep
-from pipeline.scan import Axis, Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Axis, Sweep
+from pipeline.rectify.registration.anchoring import Anchor, anchor_sweep
+from pipeline.rectify.registration.overlaps import BroadSweep
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.pointing import CommonOffset
 from pipeline.simulator.rig_model import Rig

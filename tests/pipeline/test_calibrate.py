@@ -12,9 +12,9 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from pipeline.errors import PoseError, ShapeError
-from pipeline.mirror import mirror_throughput
-from pipeline.rectify.calibrate import calibrate, of_bands, reflectance
-from pipeline.rectify.elements import judge_elements
+from pipeline.geometry.mirror import mirror_throughput
+from pipeline.rectify.calibration.calibrate import calibrate, of_bands, reflectance
+from pipeline.rectify.calibration.flat_field import judge_elements
 from pipeline.source import References
 
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from numpy.polynomial.legendre import leggauss
 from scipy import stats
 
-from pipeline.camera import LineCamera, bin_samples, digitise, expose, footprint_kernel, look
 from pipeline.errors import ShapeError
-from pipeline.scan import capture_options
+from pipeline.geometry.camera import LineCamera, bin_samples, digitise, expose, footprint_kernel, look
+from pipeline.geometry.scan import capture_options
 
 CAMERA = LineCamera()
 

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_full, coarse_sweeps, full_sweeps, on_scene, reach_px, with_margin
 from pipeline.errors import PoseError, SettingsError
-from pipeline.grid import SceneGrid
-from pipeline.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.scan import CostModel, Sweep, line_positions, scene_to_sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
+from pipeline.geometry.scan import CostModel, Sweep, line_positions, scene_to_sweep
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps, on_scene, reach_px, with_margin
 
 CAMERA, COST = LineCamera(), CostModel()
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.covering import Cover, Field, best_cover
-from pipeline.runs import Prices, Run
-from pipeline.scan import Sweep
-from pipeline.strips import Views
+from pipeline.geometry.scan import Sweep
+from pipeline.planning.line_cover import Cover, Field, best_cover
+from pipeline.planning.scan_runs import Prices, Run
+from pipeline.planning.strips import Views
 
 PRICES = Prices(line_s=1.0, run_s=3.0, reload_s=0.0, lines_per_reload=1500)
 

@@ -8,7 +8,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipeline.errors import RigError, ShapeError
-from pipeline.rectify.detector import BadElementCriteria, find_bad_elements, flat_from_lines, flat_from_white
+from pipeline.rectify.calibration.detector import (
+    BadElementCriteria,
+    find_bad_elements,
+    flat_from_lines,
+    flat_from_white,
+)
 
 Frame = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from pipeline.camera import LineCamera, look
 from pipeline.errors import SceneError, WavelengthError
+from pipeline.geometry.camera import LineCamera, look
 from pipeline.simulator.farm import FARM_LAW, farm_scene
 from pipeline.simulator.farm_layout import (
     Parcel,

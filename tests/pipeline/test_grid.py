@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import ShapeError
-from pipeline.grid import SceneGrid, pad_by_reflection
+from pipeline.geometry.grid import SceneGrid, pad_by_reflection
 
 sizes = st.integers(1, 200)
 

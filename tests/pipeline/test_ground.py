@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import PoseError, ShapeError
-from pipeline.ground import LEAST_SINK, LIMITS, GroundView, RigPose, pixel_places
+from pipeline.ground.view import LEAST_SINK, LIMITS, GroundView, RigPose, pixel_places
 
 IFOV = 7.4e-3 / 70
 

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from pyproj import Proj
 
 from pipeline.errors import PoseError, ShapeError
-from pipeline.grid import UNLABELLED
-from pipeline.ground import GroundView, RigPose, pixel_places
-from pipeline.ground_grid import (
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.ground.map_grid import (
     GroundGrid,
     classes_at,
     ground_grid,
@@ -23,6 +22,7 @@ from pipeline.ground_grid import (
     median_sink,
     round_step,
 )
+from pipeline.ground.view import GroundView, RigPose, pixel_places
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 IFOV = 7.4e-3 / 70

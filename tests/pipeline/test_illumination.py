@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
-from pipeline.coverage import full_sweeps
 from pipeline.errors import SettingsError, ShapeError
-from pipeline.grid import SceneGrid
-from pipeline.rectify.illumination import LightRatio, light_ratio, overlap_light, solve_lights
-from pipeline.rectify.overlaps import Window
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Axis, Sweep
+from pipeline.planning.coverage import full_sweeps
 from pipeline.rectify.region import PixelGrid, mosaic_tile, place
-from pipeline.scan import Axis, Sweep
+from pipeline.rectify.registration.illumination import LightRatio, light_ratio, overlap_light, solve_lights
+from pipeline.rectify.registration.overlaps import Window
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import raster_from_values

@@ -9,11 +9,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera, look
 from pipeline.errors import PoseError, ShapeError
-from pipeline.mirror import direction_to_scene, mirror_throughput, position_to_normal, reflect
-from pipeline.once import Once
-from pipeline.scan import Sweep, line_positions, sweep_positions
+from pipeline.geometry.camera import LineCamera, look
+from pipeline.geometry.mirror import direction_to_scene, mirror_throughput, position_to_normal, reflect
+from pipeline.geometry.scan import Sweep, line_positions, sweep_positions
+from pipeline.lazy import Once
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.instrument import USUAL, effects_on, render_lines, sweep_block
 from pipeline.simulator.pointing import CommonOffset

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
-from pipeline.grid import SceneGrid
-from pipeline.line_blocks import WIDTHS, LineBlocks, line_blocks, most_shown
-from pipeline.scan import Axis, CostModel
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Axis, CostModel
+from pipeline.planning.line_blocks import WIDTHS, LineBlocks, line_blocks, most_shown
 
 CAMERA, COST = LineCamera(samples=64), CostModel()
 

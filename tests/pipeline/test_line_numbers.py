@@ -7,9 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError, ShapeError
-from pipeline.mirror import direction_to_position, direction_to_scene, position_to_direction, scene_to_direction
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import (
+    direction_to_position,
+    direction_to_scene,
+    position_to_direction,
+    scene_to_direction,
+)
 from pipeline.rectify.line_numbers import number_lines, positions_at
 
 CAMERA = LineCamera()

@@ -9,14 +9,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.camera import LineCamera
 from pipeline.errors import PoseError, ShapeError
-from pipeline.mirror import direction_to_position, direction_to_scene, position_to_normal, reflect, scene_to_direction
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import (
+    direction_to_position,
+    direction_to_scene,
+    position_to_normal,
+    reflect,
+    scene_to_direction,
+)
+from pipeline.geometry.scan import Sweep, line_positions, points_of_scan, scene_to_sweep
 from pipeline.rectify.knot_curve import KnotCurve
 from pipeline.rectify.lookup import grid_lookup, lookup, track_lookup
 from pipeline.rectify.resample import resample
 from pipeline.rectify.tracks import Track, make_tracks
-from pipeline.scan import Sweep, line_positions, points_of_scan, scene_to_sweep
 
 CAMERA = LineCamera()
 places = st.floats(-4500, 4500)

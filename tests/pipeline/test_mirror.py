@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import PoseError, ShapeError
-from pipeline.mirror import (
+from pipeline.geometry.mirror import (
     REST_TANGENT,
     Slit,
     camera_slope,

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import PoseError, SettingsError
-from pipeline.mounting import Mounting, Signs
+from pipeline.geometry.mounting import Mounting, Signs
 
 SIGNED: list[Signs] = [
     ((1, 0), (0, 1)), ((-1, 0), (0, 1)), ((1, 0), (0, -1)), ((-1, 0), (0, -1)),

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from pipeline.once import Once
+from pipeline.lazy import Once
 
 
 def test_a_value_is_made_once_whoever_asks() -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
-from pipeline.coverage import coarse_sweeps
-from pipeline.crop_rows import CropRows
-from pipeline.grid import SceneGrid
-from pipeline.orientation import compare_orientations
-from pipeline.planning import plan_fine
-from pipeline.scan import CostModel
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel
+from pipeline.planning.coverage import coarse_sweeps
+from pipeline.planning.crop_rows import CropRows
+from pipeline.planning.fine_pass import plan_fine
+from pipeline.planning.orientation import compare_orientations
 
 CAMERA, COST = LineCamera(), CostModel()
 GRID = SceneGrid(640, 640, 32, 4)

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
-from pipeline.coverage import coarse_sweeps, full_sweeps
 from pipeline.errors import SettingsError
-from pipeline.grid import SceneGrid
-from pipeline.once import Once
-from pipeline.rectify.alignment import no_shifts
-from pipeline.rectify.overlaps import BroadSweep, PlacedImage, broad_bands, overlap_windows, places_seen
-from pipeline.rectify.seams import Registration, measure_windows, place_images, register_sweeps
-from pipeline.scan import Axis, Sweep, line_positions, points_of_scan, sweep_to_scene
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Axis, Sweep, line_positions, points_of_scan, sweep_to_scene
+from pipeline.lazy import Once
+from pipeline.planning.coverage import coarse_sweeps, full_sweeps
+from pipeline.rectify.registration.alignment import no_shifts
+from pipeline.rectify.registration.overlaps import BroadSweep, PlacedImage, broad_bands, overlap_windows, places_seen
+from pipeline.rectify.registration.seams import Registration, measure_windows, place_images, register_sweeps
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.pointing import PointingErrors
 from pipeline.simulator.raster import Light

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from models.tokens import paper_numbers
-from pipeline.camera import LineCamera
+from models.network.tokens import paper_numbers
 from pipeline.errors import SettingsError
-from pipeline.mirror import (
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import (
     REST_TANGENT,
     direction_to_normal,
     direction_to_position,
@@ -19,8 +19,8 @@ from pipeline.mirror import (
     position_to_direction,
     scene_to_direction,
 )
-from pipeline.mounting import Mounting
-from pipeline.paper import (
+from pipeline.geometry.mounting import Mounting
+from pipeline.geometry.paper_equations import (
     LINE_MODELS,
     line_points,
     mechanical_position,
@@ -38,9 +38,9 @@ from pipeline.paper import (
     straight_slope_rotation,
     unlimited_position,
 )
-from pipeline.scan import CostModel, Sweep
+from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.geometry.vector_memory import device_range, memory_loads
 from pipeline.timing import mirror_rates, sample_rate_hz, scene_speed
-from pipeline.vector_memory import device_range, memory_loads
 
 CAMERA = LineCamera()
 IFOV = CAMERA.ifov_rad

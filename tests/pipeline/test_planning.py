@@ -9,13 +9,13 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from pipeline.camera import LineCamera
-from pipeline.coverage import cheapest_full, coarse_sweeps, full_sweeps
 from pipeline.errors import BudgetError, SettingsError, ShapeError
-from pipeline.grid import SceneGrid
-from pipeline.planning import SeatsPrice, check_budget, joined_plan, least_budget, plan_fine, price_of_seats
-from pipeline.scan import CostModel
-from pipeline.strips import covered_seats
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps
+from pipeline.planning.fine_pass import SeatsPrice, check_budget, joined_plan, least_budget, plan_fine, price_of_seats
+from pipeline.planning.strips import covered_seats
 
 CAMERA, COST = LineCamera(), CostModel()
 GRID = SceneGrid(200, 900, 32, 4)

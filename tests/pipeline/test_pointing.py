@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
-from pipeline.scan import Sweep, line_positions
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.pointing import PointingErrors
 from pipeline.simulator.rig_model import Rig

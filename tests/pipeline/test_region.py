@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera, footprint
-from pipeline.coverage import coarse_sweeps, full_sweeps
-from pipeline.grid import SceneGrid
+from pipeline.geometry.camera import LineCamera, footprint
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Sweep
+from pipeline.planning.coverage import coarse_sweeps, full_sweeps
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.region import mosaic_rows, place, read_seats, seat_pixels
-from pipeline.scan import Sweep
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import RasterScene, raster_from_values

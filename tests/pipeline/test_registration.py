@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter1d
 
 from pipeline.errors import SettingsError, ShapeError
-from pipeline.rectify.registration import pair_shift
+from pipeline.rectify.registration.shifts import pair_shift
 
 Field = tuple[np.ndarray, np.ndarray]
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.runs import Prices, Run, Tables, best_chains, joined
+from pipeline.planning.scan_runs import Prices, Run, Tables, best_chains, joined
 
 LINES = 7
 PRICES = Prices(line_s=1.0, run_s=1.5, reload_s=2.0, lines_per_reload=5)

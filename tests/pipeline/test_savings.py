@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.camera import LineCamera
-from pipeline.coverage import coarse_sweeps, full_sweeps
-from pipeline.grid import SceneGrid
-from pipeline.savings import Entry, capture_savings, count_lines, count_samples, raw_bytes
-from pipeline.scan import CostModel, Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.planning.coverage import coarse_sweeps, full_sweeps
+from pipeline.planning.savings import Entry, capture_savings, count_lines, count_samples, raw_bytes
 
 CAMERA, COST = LineCamera(), CostModel()
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.camera import LineCamera
 from pipeline.errors import PoseError
-from pipeline.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.scan import (
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
+from pipeline.geometry.scan import (
     CostModel,
     Sweep,
     line_positions,

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, ShapeError
-from pipeline.once import Once
+from pipeline.geometry.camera import LineCamera
+from pipeline.lazy import Once
 from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.scene import RasterScene, raster_from_values
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
-from pipeline.paper import line_points
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.paper_equations import line_points
 from pipeline.second_order import (
     distance_error,
     line_stretch,

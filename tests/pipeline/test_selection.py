@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import BudgetError
-from pipeline.selection import frame_seats, seat_count, select_seats
+from pipeline.planning.selection import frame_seats, seat_count, select_seats
 
 scores = st.lists(st.sampled_from([0.0, 1.0, 2.0, -1.0, np.nan, np.inf, -np.inf]), min_size=1, max_size=30)
 

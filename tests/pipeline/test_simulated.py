@@ -8,10 +8,10 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError, ShapeError
-from pipeline.rectify.calibrate import calibrate
-from pipeline.scan import Sweep, line_positions
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, line_positions
+from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.simulator.effects.shot import SHOT
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig

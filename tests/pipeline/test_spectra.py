@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera, digitise
 from pipeline.errors import WavelengthError
+from pipeline.geometry.camera import LineCamera, digitise
 from pipeline.simulator.spectra import CANOPIES, FWHM_NM, MATERIALS, band_response, spectral_library
 
 

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from scipy import sparse
 from scipy.optimize import Bounds, LinearConstraint, milp
 
-from pipeline.covering import Field
-from pipeline.runs import Prices
-from pipeline.scan import Sweep
-from pipeline.spending import cheapest_cover, spend
-from pipeline.strips import Views
+from pipeline.geometry.scan import Sweep
+from pipeline.planning.budget_search import cheapest_cover, spend
+from pipeline.planning.line_cover import Field
+from pipeline.planning.scan_runs import Prices
+from pipeline.planning.strips import Views
 
 PRICES = Prices(line_s=0.1, run_s=0.9, reload_s=1.6, lines_per_reload=150)
 LINES = 8  # of a seat

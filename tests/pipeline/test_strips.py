@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.camera import LineCamera
-from pipeline.coverage import full_sweeps
 from pipeline.errors import PoseError, SettingsError, ShapeError
-from pipeline.grid import SceneGrid
-from pipeline.scan import Sweep, line_positions, scene_to_sweep
-from pipeline.strips import covered_seats, look_from, seat_lines, seats_near, strips_at_seats, within_reach
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Sweep, line_positions, scene_to_sweep
+from pipeline.planning.coverage import full_sweeps
+from pipeline.planning.strips import covered_seats, look_from, seat_lines, seats_near, strips_at_seats, within_reach
 
 CAMERA = LineCamera()
 GRID = SceneGrid(200, 900, 32, 4)

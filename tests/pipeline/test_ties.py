@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
-from pipeline.mirror import direction_to_position, scene_to_direction
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import direction_to_position, scene_to_direction
 from pipeline.rectify.lookup import tie_table, track_lookup
-from pipeline.rectify.ties import TieTable
+from pipeline.rectify.tie_points import TieTable
 from pipeline.rectify.tracks import Track, make_tracks
 
 CAMERA = LineCamera()

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rectify.kernels import kernel_taps
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.placed import PixelGrid, Placed, place
@@ -18,7 +19,6 @@ from pipeline.rectify.reach import TrackReach
 from pipeline.rectify.region import mosaic_tile
 from pipeline.rectify.tiles import cache_bytes, plan_tiles
 from pipeline.rectify.window import cut_runs
-from pipeline.scan import Sweep, line_positions
 from pipeline.source import References
 
 CAMERA = LineCamera(samples=160)

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.camera import LineCamera
 from pipeline.errors import PoseError, ShapeError
-from pipeline.mirror import direction_to_position, scene_to_direction
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import direction_to_position, scene_to_direction
 from pipeline.rectify.tracks import Track, line_centres, make_tracks, single_track
 
 CAMERA = LineCamera()

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
-from pipeline.scan import CostModel, Sweep
-from pipeline.vector_memory import count_loads, device_range, memory_loads
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.geometry.vector_memory import count_loads, device_range, memory_loads
 
 CAMERA, COST = LineCamera(), CostModel()
 

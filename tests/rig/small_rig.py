@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.camera import LineCamera
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
 from pipeline.rig.capture_runner import RigDevices
 from pipeline.rig.clock import ManualClock
 from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
@@ -20,7 +21,6 @@ from pipeline.rig.kept_files import Kept, KeptInMemory
 from pipeline.rig.mirror_controller import MirrorController
 from pipeline.rig.rig_source import RigSource, RigView
 from pipeline.rig.survey_rig import SurveyRig
-from pipeline.scan import Sweep
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import raster_from_values

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
+from pipeline.geometry.scan import Sweep
 from pipeline.rig.capture_runner import RigDevices
 from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
 from pipeline.rig.emulator.fault import Fault
@@ -25,7 +26,6 @@ from pipeline.rig.headwall_control import ControlPatience
 from pipeline.rig.kept_files import KeptInMemory
 from pipeline.rig.mirror_controller import MirrorController
 from pipeline.rig.registers import Status
-from pipeline.scan import Sweep
 from pipeline.source import Line
 from tests.rig.small_rig import SmallRig, small_rig, small_source
 from tests.rig.test_fault_suite import moves

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.camera_files import FileServer
 from pipeline.rig.capture_names import REFERENCES, capture_prefix
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
@@ -25,7 +26,6 @@ from pipeline.rig.mirror_settings import MirrorSettings
 from pipeline.rig.refusals import DeviceGone
 from pipeline.rig.registers import Trigger
 from pipeline.rig.socket_transport import SocketTransport
-from pipeline.scan import Sweep, sweep_positions
 from pipeline.simulator.instrument import QUIET
 from pipeline.simulator.simulated import SimulatedSource
 from tests.rig.camera_line import wait_for

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
 from pipeline.errors import RigError, ShapeError
+from pipeline.geometry.camera import LineCamera
 from pipeline.rig.frame_times import FrameTimes
 from pipeline.rig.line_positions import (
     CommandTimes,

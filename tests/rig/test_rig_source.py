@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
+from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rig.capture_journal import CaptureJournal
 from pipeline.rig.kept_files import KeptInMemory
 from pipeline.rig.pro_mode import Command
 from pipeline.rig.steering import wire_positions
-from pipeline.scan import Sweep, line_positions
 from pipeline.source import Line
 from tests.rig.small_rig import CAMERA, COARSE, FINE, small_rig, small_source
 

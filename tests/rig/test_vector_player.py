@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeline.geometry.vector_memory import Ends
 from pipeline.rig.emulator.vector_player import MOST_STEPS, VectorPlayer
 from pipeline.rig.registers import Trigger
-from pipeline.vector_memory import Ends
 
 
 def player(**settings: object) -> VectorPlayer:

@@ -9,9 +9,9 @@ from datetime import datetime
 from typing import Any
 
 from flows.schedule.ledger_state import ENDINGS, moment_words, read_moment
-from storage.archive import Archive
-from storage.garbage import clear_up
-from storage.lineage import Catalogue
+from storage.archive.archive import Archive
+from storage.archive.lineage import Catalogue
+from storage.maintenance.garbage import clear_up
 
 GONE = "process was gone"  # in the reason of a run that was killed and not begun again
 Line = Mapping[str, Any]

@@ -23,7 +23,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from flows.schedule.ledger_state import moment_words
-from storage.archive import Archive
+from storage.archive.archive import Archive
 from tests.faults.disk_full import can_mount, small_disk
 from tests.faults.fault_table import Clock, Row
 from tests.faults.nursery import ROOT

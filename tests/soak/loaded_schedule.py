@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from flows.schedule.ledger_state import read_moment
-from storage.ledger import ledgers
+from storage.archive.ledger import ledgers
 from tests.faults.fault_table import Clock, Row
 from tests.soak.prefect_schedule import free_port, serving
 

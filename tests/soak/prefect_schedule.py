@@ -23,8 +23,8 @@ from typing import Any
 from flows.schedule.field_schedule import FieldSchedule
 from flows.schedule.ledger_state import read_moment
 from flows.schedule.times import parse_timetable
-from storage.archive import Archive
-from storage.ledger import Ledger, ledgers
+from storage.archive.archive import Archive
+from storage.archive.ledger import Ledger, ledgers
 from tests.faults.fault_table import Clock, Row
 from tests.faults.nursery import ROOT
 from tests.flows.schedule_days import HandClock

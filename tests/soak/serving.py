@@ -20,7 +20,7 @@ from flows.schedule.due_runs import Outcome, run_all
 from flows.schedule.field_schedule import FieldSchedule
 from flows.schedule.fields import ServedField, load_fields, survey_field
 from flows.schedule.times import parse_timetable
-from storage.ledger import ledgers
+from storage.archive.ledger import ledgers
 from tests.flows.schedule_days import HandClock
 from tests.soak.pulled_rig import RigControl
 

@@ -15,7 +15,7 @@ from typing import cast
 import pytest
 
 from flows.schedule.ledger_state import moment_words
-from storage.archive import Archive
+from storage.archive.archive import Archive
 from tests.flows.schedule_days import NOON
 from tests.soak.accounts import Account, Leftovers, clear
 from tests.soak.day_of_surveys import Day

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from storage.archive import Archive, StageRef
+from storage.archive.archive import Archive, StageRef
 
 DAY_S = 86400
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from storage.addresses import StageRef
-from storage.archive import Archive
-from storage.object_archive import ObjectArchive
+from storage.archive.addresses import StageRef
+from storage.archive.archive import Archive
+from storage.remote.object_archive import ObjectArchive
 
 Machine = Callable[..., ObjectArchive]  # of the fixture: opens the archive, by the name of a machine
 FIRST, SECOND = "first", "second"  # two machines, by the folder of their working copies

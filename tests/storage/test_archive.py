@@ -14,8 +14,8 @@ from unittest.mock import Mock
 import pytest
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
-from storage.archive import Archive, stage_key
-from storage.staging import take_lock
+from storage.archive.archive import Archive, stage_key
+from storage.archive.staging import take_lock
 
 
 def _publish(archive: Archive, key: str = "abc", text: str = "content") -> Path:
@@ -259,7 +259,9 @@ def test_a_lock_let_go_twice_leaves_the_next_holder_alone(tmp_path: Path) -> Non
 
 def test_a_run_begins_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a killed run of the same second and name left is not published with the next."""
-    monkeypatch.setattr("storage.archive.datetime", Mock(now=Mock(return_value=datetime(2026, 5, 1, tzinfo=UTC))))
+    monkeypatch.setattr(
+        "storage.archive.archive.datetime", Mock(now=Mock(return_value=datetime(2026, 5, 1, tzinfo=UTC)))
+    )
     left = tmp_path / "runs" / "20260501T000000-a.part"
     left.mkdir(parents=True)
     (left / "torn.bin").write_bytes(b"x")

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from pipeline.errors import IncompleteStoreError, ShapeError
+from storage.arrays.mosaics import MosaicWriter
 from storage.band_statistics import (
     PERCENTILES,
     BandPart,
@@ -23,10 +24,9 @@ from storage.band_statistics import (
     product_statistics,
     tabulate,
 )
-from storage.block_work import Crew
 from storage.cube_sources import CubeSource, LineFacts
 from storage.ingested_cubes import write_ingested_cube
-from storage.mosaics import MosaicWriter
+from storage.parallel.block_work import Crew
 from storage.value_bins import RELATIVE_WIDTH, bins_of, edges_of
 
 SHAPE = (150, 700, 4)

@@ -17,14 +17,14 @@ import numpy as np
 import pytest
 from dask.distributed import LocalCluster
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError, ShapeError, WorkerError
+from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.placed import PixelGrid
 from pipeline.rectify.tiles import plan_tiles
-from storage import cluster_work, worker_facts
+from storage.arrays.mosaics import MosaicWriter
 from storage.band_statistics import plan_strips
-from storage.block_work import Crew, block_graph, count_cores, run_blocks
-from storage.mosaics import MosaicWriter
+from storage.parallel import cluster_work, worker_facts
+from storage.parallel.block_work import Crew, block_graph, count_cores, run_blocks
 
 PROCESSES = Crew("processes", 2)
 
@@ -271,8 +271,8 @@ GONE = """
 import subprocess, sys, time
 from contextlib import suppress
 from pipeline.errors import PipelineError, WorkerError
-from storage import cluster_work
-from storage.block_work import Crew, run_blocks
+from storage.parallel import cluster_work
+from storage.parallel.block_work import Crew, run_blocks
 from tests.storage.test_block_work import nap
 
 def dask(*words):
@@ -331,7 +331,7 @@ INTERRUPTED = """
 import signal, sys, time
 from functools import partial
 from pathlib import Path
-from storage.block_work import Crew, run_blocks
+from storage.parallel.block_work import Crew, run_blocks
 from tests.storage.test_block_work import touch_slowly
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs have it ignored
@@ -346,7 +346,7 @@ TERMINATED = """
 import os, signal, sys, threading
 from contextlib import suppress
 from pathlib import Path
-from storage.block_work import Crew, run_blocks
+from storage.parallel.block_work import Crew, run_blocks
 def children():
     return [child for task in Path("/proc/self/task").glob("*/children") for child in task.read_text().split()]
 def terminate():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
-from storage.class_maps import (
+from storage.arrays.class_maps import (
     ClassMap,
     ClassNames,
     clear_classes,
@@ -17,7 +17,7 @@ from storage.class_maps import (
     write_class_map,
     write_class_tile,
 )
-from storage.layout import AngularGrid
+from storage.arrays.layout import AngularGrid
 
 LEGEND = ClassNames(("crop", "weed"), np.array([[0, 255, 0], [255, 0, 0]], np.uint8))
 SHAPE = (150, 700)

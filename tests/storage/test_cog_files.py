@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError, ShapeError
-from pipeline.grid import UNLABELLED
-from storage.cog_files import ANGULAR, CogImage, Place, cog_problems, need_rasterio, write_cog
-from storage.ground_maps import ClassLegend
-from storage.layout import AngularGrid
+from pipeline.geometry.grid import UNLABELLED
+from storage.arrays.ground_maps import ClassLegend
+from storage.arrays.layout import AngularGrid
+from storage.export.cog_files import ANGULAR, CogImage, Place, cog_problems, need_rasterio, write_cog
 
 rasterio = pytest.importorskip("rasterio", reason="GeoTIFF is written with rasterio, of the extra [geo]")
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3

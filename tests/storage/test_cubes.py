@@ -11,16 +11,16 @@ import pytest
 import xarray as xr
 
 from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
-from pipeline.rectify.calibrate import calibrate
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
+from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.source import Line, References
-from storage.archive import Archive
-from storage.attention import Attention, load_attention, write_attention
-from storage.class_maps import ClassMap, load_class_map, write_class_map
-from storage.cubes import RawCubeWriter, SweepHeader, open_raw_cube, open_reflectance
-from storage.layout import AngularGrid, round_bits
-from storage.mosaics import Mosaic, MosaicWriter, load_mosaic
-from storage.patches import PatchWriter, open_patches
+from storage.archive.archive import Archive
+from storage.arrays.attention import Attention, load_attention, write_attention
+from storage.arrays.class_maps import ClassMap, load_class_map, write_class_map
+from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube, open_reflectance
+from storage.arrays.layout import AngularGrid, round_bits
+from storage.arrays.mosaics import Mosaic, MosaicWriter, load_mosaic
+from storage.arrays.patches import PatchWriter, open_patches
 
 GRID = AngularGrid(1.057e-4, (100, 70))
 

@@ -15,7 +15,7 @@ from odc.geo.geobox import GeoBox
 from pipeline.errors import PoseError, SceneError, ShapeError
 from storage.envi_cubes import open_envi_cube
 from storage.envi_header import INTERLEAVES
-from storage.envi_writer import EnviFile, header_text, write_envi
+from storage.export.envi_writer import EnviFile, header_text, write_envi
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 SHAPE = (70, 13, 5)

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import SettingsError
-from storage.archive import Archive
-from storage.garbage import IN_USE, Removal, clear_up, plan_clearance
+from storage.archive.archive import Archive
+from storage.maintenance.garbage import IN_USE, Removal, clear_up, plan_clearance
 from tests.storage.small_archive import flip, grow_old, small_survey
 
 
@@ -117,7 +117,7 @@ def test_what_does_not_let_itself_be_removed_is_not_told_as_gone(
     archive = Archive.open(tmp_path)
     (tmp_path / "stages/segment/aaaa.part").mkdir(parents=True)
     with monkeypatch.context() as broken:
-        broken.setattr("storage.garbage.remove_tree", lambda path: None)
+        broken.setattr("storage.maintenance.garbage.remove_tree", lambda path: None)
         assert clear_up(archive).removals == ()
     assert [removal.uri for removal in clear_up(archive).removals] == ["stages/segment/aaaa.part"]
 

@@ -10,9 +10,9 @@ import xarray as xr
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
-from pipeline.grid import UNLABELLED
-from storage.ground_maps import BLOCK, ClassLegend, GroundMapWriter, load_ground_map
-from storage.layout import SHARD_COLUMNS, SHARD_ROWS, create_group
+from pipeline.geometry.grid import UNLABELLED
+from storage.arrays.ground_maps import BLOCK, ClassLegend, GroundMapWriter, load_ground_map
+from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS, create_group
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 LEGEND = ClassLegend(("sugar beet", "bare soil"), np.array([[10, 200, 30], [120, 90, 60]], np.uint8))

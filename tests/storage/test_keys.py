@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import ArchiveError
-from pipeline.scan import Sweep
-from storage.keys import canonical_json, stage_key
+from pipeline.geometry.scan import Sweep
+from storage.archive.keys import canonical_json, stage_key
 
 PLAIN = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5),

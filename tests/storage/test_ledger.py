@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ArchiveError
-from storage.archive import Archive
-from storage.ledger import Ledger, ledgers
+from storage.archive.archive import Archive
+from storage.archive.ledger import Ledger, ledgers
 
 
 def test_lines_come_back_in_order(tmp_path: Path) -> None:

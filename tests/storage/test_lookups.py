@@ -11,12 +11,12 @@ import zarr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.camera import LineCamera
 from pipeline.errors import IncompleteStoreError, ShapeError
-from pipeline.mirror import direction_to_position, scene_to_direction
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import direction_to_position, scene_to_direction
 from pipeline.rectify.lookup import TieTable, tie_table
 from pipeline.rectify.tracks import Track, make_tracks
-from storage.lookups import open_lookup, path_digest, write_lookup
+from storage.arrays.lookups import open_lookup, path_digest, write_lookup
 
 CAMERA = LineCamera()
 

@@ -12,19 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
 from pipeline.checked_lines import with_check
 from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rectify.placed import PixelGrid, place
-from pipeline.scan import Sweep, line_positions
 from pipeline.source import Line, References
 from storage import mosaic_ahead
-from storage.lookups import path_digest
+from storage.arrays.lookups import path_digest
+from storage.arrays.mosaic_work import MosaicWork
+from storage.arrays.mosaics import MosaicWriter
+from storage.arrays.spool import Spool
+from storage.arrays.tile_work import Thumbnail, write_mosaic
 from storage.mosaic_ahead import AheadOf, MosaicAhead, PlannedLines, place_as_planned, take_over
-from storage.mosaic_work import MosaicWork
-from storage.mosaics import MosaicWriter
-from storage.spool import Spool
-from storage.tile_work import Thumbnail, write_mosaic
 from tests.storage.small_archive import flip
 
 CAMERA = LineCamera(samples=96)

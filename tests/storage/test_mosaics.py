@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ChunkError, ShapeError
-from storage.layout import round_bits
-from storage.mosaics import MosaicWriter, load_mosaic
+from storage.arrays.layout import round_bits
+from storage.arrays.mosaics import MosaicWriter, load_mosaic
 
 SHAPE = (100, 1300)
 

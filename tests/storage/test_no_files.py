@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
-from storage.archive import Archive
-from storage.garbage import clear_up
-from storage.records import read_run
+from storage.archive.archive import Archive
+from storage.archive.records import read_run
+from storage.maintenance.garbage import clear_up
 from tests.storage.small_archive import Small, small_survey
 
 ELSEWHERE = "elsewhere"  # beside the archive

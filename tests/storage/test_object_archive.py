@@ -17,14 +17,14 @@ import pytest
 pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
-from storage import object_places
-from storage.addresses import StageRef
-from storage.archive import Archive
-from storage.garbage import IN_USE, clear_up
-from storage.layout import create_group, write_image
-from storage.lineage import Catalogue
-from storage.object_places import UnreachableError, is_remote, parse_place
-from storage.object_stores import AT_ONCE, Objects, some_at_a_time
+from storage.archive.addresses import StageRef
+from storage.archive.archive import Archive
+from storage.archive.lineage import Catalogue
+from storage.arrays.layout import create_group, write_image
+from storage.maintenance.garbage import IN_USE, clear_up
+from storage.remote import object_places
+from storage.remote.object_places import UnreachableError, is_remote, parse_place
+from storage.remote.object_stores import AT_ONCE, Objects, some_at_a_time
 from tests.storage.small_archive import small_survey
 from tests.storage.small_bucket import FIRST, SECOND, Machine, make, object_of, problems, rot
 
@@ -90,8 +90,8 @@ def test_a_publisher_killed_before_the_manifest_leaves_nothing_visible(
     script = (
         "import os, signal, sys\n"
         "from pathlib import Path\n"
-        "from storage.archive import Archive\n"
-        "from storage.object_stores import Objects\n"
+        "from storage.archive.archive import Archive\n"
+        "from storage.remote.object_stores import Objects\n"
         "archive = Archive.open(sys.argv[1])\n"
         "Objects.claim = lambda *given: os.kill(os.getpid(), signal.SIGKILL)\n"
         "def build(path):\n"
@@ -230,7 +230,7 @@ def test_a_capture_goes_on_without_a_network(
     monkeypatch.setattr(object_places, "RETRIES", 0)
     place = parse_place(bucket)
     silent = object_places.ObjectPlace(place.bucket, place.prefix, "http://127.0.0.1:9")
-    monkeypatch.setattr("storage.object_archive.parse_place", lambda text: silent)
+    monkeypatch.setattr("storage.remote.object_archive.parse_place", lambda text: silent)
     with pytest.raises(UnreachableError, match=r"127\.0\.0\.1:9: it cannot be reached: check the network"):
         Archive.open(bucket)
     (silent.working_copy() / ".known").mkdir(parents=True)

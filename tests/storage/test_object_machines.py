@@ -16,15 +16,15 @@ import pytest
 pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
-from storage import object_copies, object_leases
-from storage.archive import Archive
-from storage.garbage import clear_up
-from storage.lineage import Catalogue
-from storage.object_archive import ObjectArchive
-from storage.object_places import UnreachableError
-from storage.object_repairs import put_back_objects, repair_objects
-from storage.object_stores import Objects
-from storage.verification import Finding
+from storage.archive.archive import Archive
+from storage.archive.lineage import Catalogue
+from storage.maintenance.garbage import clear_up
+from storage.maintenance.verification import Finding
+from storage.remote import object_copies, object_leases
+from storage.remote.object_archive import ObjectArchive
+from storage.remote.object_places import UnreachableError
+from storage.remote.object_repairs import put_back_objects, repair_objects
+from storage.remote.object_stores import Objects
 from tests.storage.small_archive import Small, small_survey
 from tests.storage.small_bucket import FIRST, SECOND, Machine, make, object_of, problems, rot
 
@@ -168,7 +168,7 @@ def _put_back_once(patch: pytest.MonkeyPatch) -> None:
         calls.append(archive)
         return put_back_objects(archive) if len(calls) == 1 else []
 
-    patch.setattr("storage.object_repairs.put_back_objects", put_back)
+    patch.setattr("storage.remote.object_repairs.put_back_objects", put_back)
 
 
 def test_a_run_that_lost_its_manifest_keeps_its_stores(machine: Machine) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from storage.plain_files import NotPlainError, kind_of, open_plain, plain_size, read_plain
+from storage.archive.plain_files import NotPlainError, kind_of, open_plain, plain_size, read_plain
 
 
 def make(kind: str, path: Path) -> None:

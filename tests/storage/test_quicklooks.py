@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import IncompleteStoreError
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
-from storage.cubes import RawCubeWriter, SweepHeader, open_raw_cube
-from storage.mosaics import MosaicWriter
-from storage.quicklooks import (
+from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
+from storage.arrays.mosaics import MosaicWriter
+from storage.arrays.quicklooks import (
     LineThumbnail,
     load_quicklook,
     picture_bands,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SceneError
-from pipeline.rectify.calibrate import calibrate
+from pipeline.rectify.calibration.calibrate import calibrate
 from storage.reference_frames import load_reference_frames
 
 SHAPE = (30, 6)  # sample, band

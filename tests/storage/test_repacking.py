@@ -23,16 +23,18 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
-from storage import folder_exchange, layout, manifests, packed_arrays, repacking
-from storage.archive import Archive, StageRef
+from storage import packed_arrays, repacking
+from storage.archive import folder_exchange, manifests
+from storage.archive.archive import Archive, StageRef
+from storage.archive.folder_exchange import exchange
 from storage.archive_codec import PCODEC_NAME
+from storage.arrays import layout
+from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.cube_sources import CubeSource, LineFacts
-from storage.cubes import RawCubeWriter, SweepHeader, open_raw_cube
-from storage.folder_exchange import exchange
-from storage.garbage import clear_up
 from storage.ingested_cubes import write_ingested_cube
+from storage.maintenance.garbage import clear_up
 from storage.packed_arrays import values_hash
 from storage.repacking import IN_USE, PACKED_ALREADY, Packing, pack, plan_packing
 from storage.scan_files import open_cube_source
@@ -142,7 +144,7 @@ def test_bits_that_flip_in_a_packed_store_are_found(archive: Archive) -> None:
 
 def _resealed(ref: StageRef, change: Callable[[dict[str, object]], None]) -> None:
     """Change a manifest by hand and seal it as if it were right."""
-    from storage.manifests import _seal, _text
+    from storage.archive.manifests import _seal, _text
 
     path = ref.path / "manifest.json"
     content = json.loads(path.read_text())

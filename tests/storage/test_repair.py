@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from pipeline.errors import ArchiveError, SceneError
-from storage.archive import Archive
-from storage.repair import Repaired, plan_repair, put_back, repair
+from storage.archive.archive import Archive
+from storage.maintenance.repair import Repaired, plan_repair, put_back, repair
 from tests.storage.small_archive import Small, flip, small_survey
 
 VERSIONS = {"capture": 1, "rectify": 1, "segment": 1}

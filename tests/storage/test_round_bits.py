@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from storage.layout import round_bits
+from storage.arrays.layout import round_bits
 
 FLOATS = hnp.arrays(np.float32, st.integers(1, 20), elements=st.floats(width=32))
 

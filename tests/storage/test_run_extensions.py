@@ -14,13 +14,13 @@ from typing import Any
 import pytest
 
 from pipeline.errors import ArchiveError
-from storage import manifests, run_folders
-from storage.archive import Archive
-from storage.garbage import clear_up
-from storage.lineage import Catalogue
-from storage.manifests import read_manifest, write_manifest
-from storage.records import read_run
-from storage.staging import PART_SUFFIX
+from storage.archive import manifests, run_folders
+from storage.archive.archive import Archive
+from storage.archive.lineage import Catalogue
+from storage.archive.manifests import read_manifest, write_manifest
+from storage.archive.records import read_run
+from storage.archive.staging import PART_SUFFIX
+from storage.maintenance.garbage import clear_up
 from tests.storage.small_archive import Small, small_survey
 from tests.storage.small_bucket import FIRST, SECOND, Machine, problems
 
@@ -28,8 +28,9 @@ ROOT = Path(__file__).parents[2]
 KILL_EVERYWHERE = """
 import os, shutil, sys
 from pathlib import Path
-from storage import manifests, run_folders
-from storage.archive import Archive
+from storage.archive import manifests
+from storage.archive import run_folders
+from storage.archive.archive import Archive
 from tests.faults.injection import end_at, logged_calls
 from tests.storage.test_run_extensions import extend, run_id
 
@@ -229,7 +230,7 @@ def test_stores_made_after_a_run_was_extended_are_dated_after_it(
 
 def test_verify_under_way_takes_an_extension_for_no_damage(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
     """The manifest was read before, the files after."""
-    from storage import verification
+    from storage.maintenance import verification
 
     name, broken = run_id(archive), verification.broken_files
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ArchiveError
-from storage.archive import Archive
+from storage.archive.archive import Archive
 
 
 @pytest.mark.parametrize("name", ["../receipt.json", "/tmp/receipt.json", "a/b", "", ".", "x.part"])

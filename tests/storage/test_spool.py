@@ -15,7 +15,7 @@ import pytest
 from pipeline.checked_lines import with_check
 from pipeline.errors import RigError
 from pipeline.source import Line
-from storage.spool import Spool, read_spooled
+from storage.arrays.spool import Spool, read_spooled
 from tests.storage.small_archive import flip
 
 HEADER = {"sweep": "fine-0", "seed": 3, "start_px": -40.25}

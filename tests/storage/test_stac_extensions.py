@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from storage.stac_items import write_stac
+from storage.export.stac_items import write_stac
 from tests.storage.stac_rules import extension_problems
 from tests.storage.test_stac_items import ABOUT, item
 

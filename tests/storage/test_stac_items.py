@@ -12,8 +12,8 @@ import pytest
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError
-from storage.ground_maps import ClassLegend
-from storage.stac_fields import (
+from storage.arrays.ground_maps import ClassLegend
+from storage.export.stac_fields import (
     COG,
     ZARR,
     angular,
@@ -25,7 +25,7 @@ from storage.stac_fields import (
     spectral_bands,
     wavelengths,
 )
-from storage.stac_items import COLLECTION, Collection, Item, need_pystac, stac_problems, write_stac
+from storage.export.stac_items import COLLECTION, Collection, Item, need_pystac, stac_problems, write_stac
 
 pystac = pytest.importorskip("pystac", reason="STAC is written with pystac, of the extra [geo]")
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import IncompleteStoreError
-from storage.archive import Archive
-from storage.stored_tables import read_table
+from storage.archive.archive import Archive
+from storage.archive.stored_tables import read_table
 
 
 @pytest.fixture

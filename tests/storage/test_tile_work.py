@@ -13,17 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.tiles import plan_tiles
-from pipeline.scan import Sweep, line_positions
 from pipeline.source import Line, References
-from storage import tile_work
-from storage.block_work import Crew
-from storage.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
-from storage.mosaics import MosaicWriter, load_mosaic
-from storage.tile_work import (
+from storage.arrays import tile_work
+from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
+from storage.arrays.mosaics import MosaicWriter, load_mosaic
+from storage.arrays.tile_work import (
     MosaicRecipe,
     MosaicWork,
     Thumbnail,
@@ -32,6 +31,7 @@ from storage.tile_work import (
     tile_budget,
     write_mosaic,
 )
+from storage.parallel.block_work import Crew
 
 CAMERA = LineCamera()
 BANDS = np.array([500.0, 600.0, 700.0])
@@ -191,7 +191,7 @@ def test_a_worker_killed_between_tiles_changes_nothing(
     folder = tmp_path / "key.part"
     write_mosaic(recipe_of(cubes), MosaicWriter(tmp_path / "a.zarr", GRID.shape, BANDS), memory=PLENTY, crew=ONE)
     kill = KillOnce((1, 1), (0,), str(folder))
-    monkeypatch.setattr("storage.tile_work.ThumbnailCut", lambda *about: kill)
+    monkeypatch.setattr("storage.arrays.tile_work.ThumbnailCut", lambda *about: kill)
     writer = MosaicWriter(folder / "m.zarr", GRID.shape, BANDS)
     write_mosaic(recipe_of(cubes), writer, memory=PLENTY, crew=processes, seen=Thumbnail(GRID.shape, [0], 900))
     assert (folder / "killed").exists()

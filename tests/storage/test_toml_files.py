@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import SceneError
+from storage.archive.toml_files import MOST_BYTES, read_toml
 from storage.scene_toml import load_scene_settings
-from storage.toml_files import MOST_BYTES, read_toml
 
 
 @pytest.mark.parametrize(

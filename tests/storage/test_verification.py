@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from pipeline.errors import IncompleteStoreError
-from storage.archive import Archive, StageRef
-from storage.layout import create_group, open_group, read_array, write_image, write_small
-from storage.manifests import _seal, _text
-from storage.records import MANIFEST_HASH
-from storage.shard_names import find_shard, name_damage
+from storage.archive.archive import Archive, StageRef
+from storage.archive.manifests import _seal, _text
+from storage.archive.records import MANIFEST_HASH
+from storage.arrays.layout import create_group, open_group, read_array, write_image, write_small
+from storage.maintenance.shard_names import find_shard, name_damage
 from tests.storage.small_archive import flip, small_survey
 
 FLIPS = 80

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ArchiveError
-from storage import whole_files
-from storage.whole_files import new_file, remove_leftovers, write_whole, written_aside
+from storage.archive import whole_files
+from storage.archive.whole_files import new_file, remove_leftovers, write_whole, written_aside
 
 
 def _files(folder: Path) -> dict[str, str]:

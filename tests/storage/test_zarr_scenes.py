@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, ZstdCodec
 
 from pipeline.errors import SceneError
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
-from storage.cubes import RawCubeWriter, SweepHeader
-from storage.mosaics import MosaicWriter
+from storage.arrays.cubes import RawCubeWriter, SweepHeader
+from storage.arrays.mosaics import MosaicWriter
 from storage.scan_files import open_cube_source
 from storage.scene_files import load_scene_file
 

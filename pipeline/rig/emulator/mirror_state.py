@@ -13,11 +13,11 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.geometry.vector_memory import Ends
 from pipeline.rig.clock import Clock
 from pipeline.rig.emulator.mirror_motion import AxisMotion, Stiffness
 from pipeline.rig.emulator.vector_player import VectorPlayer
 from pipeline.rig.registers import CHANNELS, ChannelRegisters, Status, Unit
-from pipeline.vector_memory import Ends
 
 RIM_SLACK = 1e-6  # of float32 cells
 STABLE_WITHIN = 1e-4  # of the disk's radius; about 1 px of the view

@@ -19,10 +19,10 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mirror import direction_to_scene, position_to_direction
+from pipeline.geometry.mirror import direction_to_scene, position_to_direction
+from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.capture_names import Announced
 from pipeline.rig.steering import wire_positions
-from pipeline.scan import Sweep, sweep_positions
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.instrument import render_lines

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scan import points_of_scan
+from pipeline.geometry.scan import points_of_scan
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Bound, Light
 from pipeline.simulator.gain_range import GainRange

@@ -9,8 +9,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mirror import position_to_normal
-from pipeline.scan import line_positions
+from pipeline.geometry.mirror import position_to_normal
+from pipeline.geometry.scan import line_positions
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.effects.line_ends import end_gains

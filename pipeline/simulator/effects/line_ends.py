@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
-from pipeline.scan import Sweep, points_of_scan
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, points_of_scan
 
 Floats = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.mirror import direction_to_normal, scene_to_direction
-from pipeline.scan import Sweep
+from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
 

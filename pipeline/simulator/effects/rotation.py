@@ -8,8 +8,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
-from pipeline.scan import Sweep, points_of_scan
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, points_of_scan
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.effects.turned import MARGIN, UPRIGHT, beside_plan_px
 from pipeline.simulator.probe import Probe

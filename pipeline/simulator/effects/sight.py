@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scan import points_of_scan
+from pipeline.geometry.scan import points_of_scan
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.parallax import closeness
 from pipeline.simulator.rig_model import Rig

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.effects.lag import transient

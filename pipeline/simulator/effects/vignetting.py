@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
+from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.gain_range import GainRange

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr
 
-from pipeline.mirror import position_to_normal
+from pipeline.geometry.mirror import position_to_normal
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.pupil import middle_normal
 from pipeline.simulator.rays import exact_views

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import j1
 
-from pipeline.camera import LineCamera
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.probe import Probe
 
 Floats = NDArray[np.float64]

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from pipeline.camera import LineCamera
-from pipeline.once import Once
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
+from pipeline.lazy import Once
 from pipeline.simulator.block import Block
 from pipeline.simulator.coatings import Coating
 from pipeline.simulator.probe import Probe

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
-from pipeline.once import Once
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
+from pipeline.lazy import Once
 from pipeline.simulator.band_differences import second_difference, steepest_difference
 from pipeline.simulator.block import Block
 from pipeline.simulator.probe import Probe, Unit

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.arithmetic import ROUNDING, contrast_about, misplaced_electrons, misplaced_share
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.aberration import ABERRATION

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.brdf import BRDF, HOT_SPOT_RAD
 from tests.pipeline.simulator.outdoors import SWEEP, block_of, measured, probe_of, rig_with
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import ShapeError
-from pipeline.scan import Sweep, sweep_to_scene
+from pipeline.geometry.scan import Sweep, sweep_to_scene
 from pipeline.simulator.block import Block
 from pipeline.simulator.chips import MOST_CANDIDATES, candidate_chips, worst_chips
 from pipeline.simulator.effects.effect import Light

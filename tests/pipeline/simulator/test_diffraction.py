@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.special import j0, j1
 
-from pipeline.once import Once
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
+from pipeline.lazy import Once
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.aberration import ABERRATION
 from pipeline.simulator.effects.diffraction import (

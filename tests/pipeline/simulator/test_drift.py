@@ -7,7 +7,7 @@ from datetime import datetime
 import numpy as np
 import pytest
 
-from pipeline.once import Once
+from pipeline.lazy import Once
 from pipeline.simulator.effects.drift import DRIFT, daylight_range
 from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.render import expected_light

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SceneError
+from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.farm import farm_scene
 from pipeline.simulator.farm_laws import (
     BUILT_IN_SCENE,

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, WavelengthError
+from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.farm import CLASS_COLOURS, farm_scene
 from pipeline.simulator.farm_fields import CLASSES
 from pipeline.simulator.farm_layout import parcel_pixels

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.hysteresis import HYSTERESIS, THERMAL_DRIFT, pointing_field, scan_sign
 from pipeline.simulator.probe import Probe

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.scan import Sweep
+from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
+from pipeline.geometry.scan import Sweep
 from pipeline.second_order import pointing_error
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.jitter import JITTER, tilt_to_scene

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.once import Once
+from pipeline.lazy import Once
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.keystone import KEYSTONE, keystone_shift
 from pipeline.simulator.effects.slit import SLIT

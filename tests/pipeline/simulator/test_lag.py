@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from pipeline.camera import LineCamera
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.lag import LAG, responses, transient
 from pipeline.simulator.probe import Probe

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
-from pipeline.scan import Sweep, points_of_scan
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, points_of_scan
 from pipeline.simulator.effects.line_ends import at_line_ends, end_gains
 
 CAMERA = LineCamera()

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
-from pipeline.once import Once
-from pipeline.scan import Sweep, sweep_to_scene
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, sweep_to_scene
+from pipeline.lazy import Once
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.hysteresis import HYSTERESIS, THERMAL_DRIFT
 from pipeline.simulator.effects.jitter import JITTER

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.mirror import scene_to_direction
-from pipeline.scan import Sweep, sweep_to_scene
+from pipeline.geometry.mirror import scene_to_direction
+from pipeline.geometry.scan import Sweep, sweep_to_scene
 from pipeline.second_order import relief_error
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.parallax import PARALLAX, closeness

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.camera import LineCamera
-from pipeline.coverage import full_sweeps
-from pipeline.grid import SceneGrid
-from pipeline.once import Once
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.lazy import Once
+from pipeline.planning.coverage import full_sweeps
 from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.path_radiance import PATH_RADIANCE, extinction_per_m, rayleigh_per_m
 from pipeline.simulator.gain_range import fixed_variance

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pipeline.mirror import direction_to_normal, position_to_normal, scene_to_direction
-from pipeline.scan import Sweep
+from pipeline.geometry.mirror import direction_to_normal, position_to_normal, scene_to_direction
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.pupil import (
     REST_NORMAL,
     middle_normal,

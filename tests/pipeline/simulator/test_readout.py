@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, ShapeError
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.dark_current import DARK_CURRENT
 from pipeline.simulator.effects.defects import DEFECTS, dead_elements, hot_electrons

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.camera import LineCamera
+from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.effects.dark_current import DARK_CURRENT
 from pipeline.simulator.effects.defects import DEFECTS, dead_elements, hot_electrons
 from pipeline.simulator.effects.quantisation import QUANTISATION

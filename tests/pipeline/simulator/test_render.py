@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
-from pipeline.once import Once
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
+from pipeline.lazy import Once
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import Moments
 from pipeline.simulator.effects.rotation import ROTATION

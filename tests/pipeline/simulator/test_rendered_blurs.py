@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.once import Once
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
+from pipeline.lazy import Once
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.aberration import ABERRATION
 from pipeline.simulator.effects.defocus import DEFOCUS

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
-from pipeline.mirror import line_rotation, position_to_direction
-from pipeline.scan import Sweep, line_positions
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import line_rotation, position_to_direction
+from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.rotation import ROTATION
 from pipeline.simulator.effects.slit import SLIT

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.crop_rows import find_rows
+from pipeline.planning.crop_rows import find_rows
 from pipeline.simulator.farm_fields import Ground
 from pipeline.simulator.farm_layout import Parcel, parcel_pixels, stripes
 from pipeline.simulator.farm_on_day import farm_on_day

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
-from pipeline.coverage import coarse_sweeps, full_sweeps
-from pipeline.grid import SceneGrid
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Axis
+from pipeline.planning.coverage import coarse_sweeps, full_sweeps
 from pipeline.rectify.region import read_seats
-from pipeline.scan import Axis
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import raster_from_values

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera, footprint_kernel
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera, footprint_kernel
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.slit import SLIT, box_of, box_parts
 from pipeline.simulator.effects.turned import MARGIN

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.scan import Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.second_order import staircase_jitter
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.staircase import STAIRCASE, beside_plan

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.camera import LineCamera, bin_samples
+from pipeline.geometry.camera import LineCamera, bin_samples
 from pipeline.simulator.rig_model import Detector, Rig
 from pipeline.simulator.stored_light import noise_electrons, stored_mean, unit_at
 

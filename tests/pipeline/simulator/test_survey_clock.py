@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.camera import LineCamera
-from pipeline.scan import CostModel, Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig, Sky
 from pipeline.simulator.scene import raster_from_values

@@ -9,9 +9,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
-from pipeline.once import Once
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
+from pipeline.lazy import Once
 from pipeline.simulator.block import Block
 from pipeline.simulator.chips import candidate_chips, worst_chips
 from pipeline.simulator.choice import Decision, decide

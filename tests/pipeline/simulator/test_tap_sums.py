@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
-from pipeline.once import Once
-from pipeline.scan import Sweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
+from pipeline.lazy import Once
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.aberration import ABERRATION
 from pipeline.simulator.effects.diffraction import DIFFRACTION

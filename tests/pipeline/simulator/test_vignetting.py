@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.mirror import mirror_throughput
-from pipeline.scan import Sweep, line_positions
+from pipeline.geometry.mirror import mirror_throughput
+from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.vignetting import MOST_BEND, VIGNETTING
 from pipeline.simulator.render import expected_light

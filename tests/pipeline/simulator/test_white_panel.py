@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
-from pipeline.once import Once
-from pipeline.rectify.calibrate import calibrate
-from pipeline.scan import Sweep, line_positions
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, line_positions
+from pipeline.lazy import Once
+from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.simulator.effects.dark_current import dark_electrons
 from pipeline.simulator.effects.defects import dead_elements, hot_electrons
 from pipeline.simulator.effects.fixed_pattern import response_gain, stripe_gain

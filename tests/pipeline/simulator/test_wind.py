@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.camera import LineCamera
-from pipeline.scan import Sweep, sweep_to_scene
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, sweep_to_scene
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.wind import WIND, line_to_line_px, sway_px, within_exposure_px
 from pipeline.simulator.probe import Probe

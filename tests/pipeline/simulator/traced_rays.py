@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.camera import LineCamera
-from pipeline.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.scan import Sweep, sweep_positions
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
+from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene, to_bands
 
 

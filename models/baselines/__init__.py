@@ -1,0 +1,1 @@
+"""Networks that the two-scale segmenter is compared with."""

@@ -1,0 +1,144 @@
+"""Agreement of a class map with labels: confusion counts and what follows from them.
+
+A mean over classes is over those that the labels have among the pixels judged (the mean IU of Long et al., arXiv
+1411.4038, with the classes of the truth for its n_cl), so that all maps judged by the same labels share one set of
+classes, whatever they show. A class that a map shows and the labels lack is a false class: it has no IoU of its own,
+`false_pixels` counts it, and each of its pixels is one that the class below it has missed.
+
+Before, the mean was over the classes that labels or map show (`miou_of_shown_classes`): a single stray pixel of a
+false class was another IoU of 0 in the mean of the map that has it, and none in the mean of the map beside it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import ShapeError
+from pipeline.geometry.grid import UNLABELLED
+
+
+def confusion(labels: NDArray[np.integer], predicted: NDArray[np.integer], classes: int) -> NDArray[np.int64]:
+    """Count pixels by label (row) and prediction (column), (classes, classes) int64.
+
+    Labels of 255 are left out before counting; counts of parts add up to the count of the whole.
+
+    Raises
+    ------
+    ShapeError : different shapes, or a label or prediction outside 0..classes-1 (255 allowed in labels).
+    """
+    if labels.shape != predicted.shape:
+        raise ShapeError(f"labels are {labels.shape}, the class map is {predicted.shape}; they must be equal")
+    counted = labels != UNLABELLED
+    truth, guess = labels[counted].astype(np.int64), predicted[counted].astype(np.int64)
+    for name, values in (("label", truth), ("prediction", guess)):
+        if values.size and (values.min() < 0 or values.max() >= classes):
+            wrong = values[(values < 0) | (values >= classes)][0]
+            raise ShapeError(f"{name} {wrong} is none of the {classes} classes 0..{classes - 1}")
+    return np.bincount(truth * classes + guess, minlength=classes**2).reshape(classes, classes)
+
+
+def labelled_classes(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Which classes the labels have among the pixels judged, (..., class, class) -> (..., class)."""
+    held: NDArray[np.bool_] = counts.sum(axis=-1) > 0
+    return held
+
+
+def false_pixels(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Pixels of each class that the map shows although the labels have none of it; 0 for a class that they have."""
+    return np.where(labelled_classes(counts), 0, counts.sum(axis=0))
+
+
+def iou_per_class(counts: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Intersection over union of each class, (..., class, class) -> (..., class); NaN for one that the labels lack."""
+    hit = np.diagonal(counts, axis1=-2, axis2=-1).astype(np.float64)
+    union = counts.sum(axis=-2) + counts.sum(axis=-1) - hit
+    iou: NDArray[np.float64] = np.divide(hit, union, out=np.full(hit.shape, np.nan), where=labelled_classes(counts))
+    return iou
+
+
+def mean_iou(counts: NDArray[np.integer]) -> float:
+    """Mean IoU over the classes that the labels have, whatever the map shows; NaN when nothing is labelled."""
+    return float(mean_iou_of_each(counts))
+
+
+def mean_iou_of_each(counts: NDArray[np.integer]) -> NDArray[np.float64]:
+    """`mean_iou` of many confusion counts at once, (..., class, class) -> (...)."""
+    held = labelled_classes(counts)
+    total, number = np.where(held, iou_per_class(counts), 0).sum(axis=-1), held.sum(axis=-1)
+    mean: NDArray[np.float64] = np.divide(total, number, out=np.full(number.shape, np.nan), where=number > 0)
+    return mean
+
+
+def miou_of_shown_classes(counts: NDArray[np.int64]) -> float:
+    """Mean IoU over the classes that labels or map show, false ones as 0: the definition of before; NaN without any.
+
+    Of two maps the one whose every class is better may have the lower mean: not to be compared, kept for old figures.
+    """
+    held = labelled_classes(counts)
+    shown = held | (counts.sum(axis=0) > 0)
+    return mean_iou(counts) * float(held.sum() / shown.sum()) if shown.any() else float("nan")
+
+
+def agreement(counts: NDArray[np.int64]) -> dict[str, float]:
+    """Give the figures that stand side by side wherever a map is scored: mIoU, by both definitions, and the pixels'."""
+    return {
+        "miou": mean_iou(counts),
+        "miou_of_shown_classes": miou_of_shown_classes(counts),
+        "overall_accuracy": overall_accuracy(counts),
+    }
+
+
+def overall_accuracy(counts: NDArray[np.int64]) -> float:
+    """Share of labelled pixels with the right class; NaN when nothing is labelled."""
+    total = counts.sum()
+    return float(np.trace(counts) / total) if total else float("nan")
+
+
+def average_accuracy(counts: NDArray[np.int64]) -> float:
+    """Mean over the labelled classes of the share of their pixels found."""
+    support = counts.sum(axis=1)
+    present = support > 0
+    return float((np.diag(counts)[present] / support[present]).mean()) if present.any() else float("nan")
+
+
+def kappa(counts: NDArray[np.int64]) -> float:
+    """Cohen's kappa: agreement beyond what the class shares alone would give."""
+    total = counts.sum()
+    if not total:
+        return float("nan")
+    agreed = np.trace(counts) / total
+    chance = float((counts.sum(axis=0) / total) @ (counts.sum(axis=1) / total))
+    return float((agreed - chance) / (1 - chance)) if chance < 1 else float("nan")
+
+
+def gap_closed(reached: float, none: float, all_seats: float) -> float | None:
+    """Share of the way from no fine seat to every fine seat; None where that way is not one point up or more."""
+    way = all_seats - none
+    return (reached - none) / way if way >= 0.01 else None  # NaN is None too
+
+
+def frequency_weighted_iou(counts: NDArray[np.int64]) -> float:
+    """Mean of the classes' IoU by how many pixels carry their label; NaN when nothing is labelled."""
+    support = counts.sum(axis=1)
+    held = support > 0
+    return float(np.average(iou_per_class(counts)[held], weights=support[held])) if held.any() else float("nan")
+
+
+def miou_over_frames(frames: NDArray[np.int64]) -> float:
+    """`miou_i`: each frame's own mean IoU, then the mean over frames that have one, (frame, class, class) counts."""
+    return _mean_of_known(np.array([mean_iou(counts) for counts in frames]))
+
+
+def miou_over_frame_classes(frames: NDArray[np.int64]) -> float:
+    """`miou_c`: each class's mean IoU over the frames whose labels have it, then over classes; (frame, class, class).
+
+    A large object counts as much as a small one, which the counts of the whole data set do not allow for.
+    """
+    each = np.array([iou_per_class(counts) for counts in frames]).reshape(len(frames), -1)
+    return _mean_of_known(np.array([_mean_of_known(column) for column in each.T]))
+
+
+def _mean_of_known(values: NDArray[np.float64]) -> float:
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if known.size else float("nan")

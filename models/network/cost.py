@@ -1,0 +1,139 @@
+"""Multiply-adds of the segmenter by stage, in closed form: what a plan costs before and after it is run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+from models.network.sizes import BOTTOM, SCORER_WIDTH, SegmenterConfig, level_widths, scorer_inputs
+from models.network.vgg_sizes import saliency_multiply_adds
+from pipeline.geometry.grid import SceneGrid
+
+
+@dataclass(frozen=True)
+class MultiplyAdds:
+    """Multiply-adds of one survey's segmentation. Norms, activations, softmax and interpolation count as 0."""
+
+    glance: int  # the coarse pass read alone, its part of the map with it
+    score: int  # the policy
+    encode: int  # fine patches to tokens, and the transformer over these (a control's: over all that it reads)
+    decode: int  # the map at captured seats (a control's: all of it)
+
+    @property
+    def total(self) -> int:
+        """Everything together."""
+        return self.glance + self.score + self.encode + self.decode
+
+
+SCORE_PER_PIXEL = {  # per coarse pixel; entropy also per class
+    "entropy": 2, "margin": 4, "sobel": 19, "saliency": 75, "spectral-residual": 120,
+    "random": 0, "stratified": 0, "centre": 0, "uniform": 0, "mask": 0,
+}  # fmt: skip
+AVERAGED = {"sobel": 1, "saliency": 2, "spectral-residual": 1}  # how often these go through all columns
+
+
+def multiply_adds(
+    config: SegmenterConfig, grid: SceneGrid, seats: int, bands: int, policy: str | None, *, channels: int = 3
+) -> MultiplyAdds:
+    """Count a survey with ``seats`` fine patches of ``bands`` bands; ``policy=None`` counts no score.
+
+    ``channels`` are those that VGG19 reads, for the policies through it.
+
+    The glance is the reading of the coarse pass, counted once: fine patches read what is kept of it.
+    """
+    p, s = config.patch, config.factor
+    rows, columns = (size // (p * s) for size in grid.padded_shape)
+    cells, side = rows * columns, config.token_side**2
+    basis = p * p * bands * config.columns
+    glance = cells * (basis + _stem(config, config.coarse_width) + _coarse_decoder(config))
+    glance += _transformer(config, cells * side, 0)
+    encode = seats * (basis + _stem(config, config.width)) + _transformer(config, seats * side, cells * side)
+    decode = seats * _fine_decoder(config)
+    if policy is None:
+        return MultiplyAdds(glance, 0, encode, decode)
+    return MultiplyAdds(glance, _score(config, policy, (rows * p, columns * p), channels), encode, decode)
+
+
+def control_multiply_adds(config: SegmenterConfig, grid: SceneGrid, seats: int, bands: int) -> MultiplyAdds:
+    """Count the map of one scene drawn by a control; ``seats`` fine patches are for the paper's network alone.
+
+    A dense network reads every valid seat, whatever was asked for. A policy is not counted.
+    """
+    p, s = config.patch, config.factor
+    cells = grid.padded_shape[0] // (p * s) * (grid.padded_shape[1] // (p * s))
+    if config.design == "paper":
+        tokens = cells + seats
+        patch = p * p * (bands * config.columns + config.columns * config.dim)
+        return MultiplyAdds(0, 0, tokens * patch + _transformer(config, tokens, 0), cells * config.dim * config.classes)
+    step = 2 if config.sight == "halved" else 1
+    patches = -(-grid.height // (p * step)) * -(-grid.width // (p * step))
+    looked_at = cells if config.sight == "coarse" else patches
+    encode = looked_at * p * p * bands * config.columns + patches * _stem(config, config.width)
+    encode += _transformer(config, patches * config.token_side**2, 0)
+    last = p * p * (9 * config.width**2 + config.width * config.classes)
+    return MultiplyAdds(0, 0, encode, patches * (_head(config, config.width) + last))
+
+
+def _score(config: SegmenterConfig, policy: str, coarse: tuple[int, int], channels: int) -> int:
+    """The policy over (y, x) coarse pixels; VGG19 reads some more around them."""
+    if policy in ("vgg-static", "vgg-trained"):
+        return saliency_multiply_adds(coarse, config.columns, channels)
+    if policy == "self-attention":
+        return _received_attention(config, coarse)
+    if policy == "gain":
+        return _scorer(config, coarse)
+    per_pixel = SCORE_PER_PIXEL[policy] + (config.classes if policy == "entropy" else 0)
+    per_pixel += AVERAGED.get(policy, 0) * config.columns
+    return per_pixel * coarse[0] * coarse[1]
+
+
+def _received_attention(config: SegmenterConfig, coarse: tuple[int, int]) -> int:
+    """The weights of one layer once more, and their sum over heads and queries."""
+    tokens = coarse[0] * coarse[1] // config.patch**2 * config.token_side**2
+    return tokens**2 * (config.dim + config.heads)
+
+
+def _scorer(config: SegmenterConfig, coarse: tuple[int, int]) -> int:
+    """Entropy and pooling per coarse pixel, then the network per seat."""
+    cells, width = config.patch // config.factor, SCORER_WIDTH
+    per_pixel = 2 + config.classes + scorer_inputs(config)
+    per_seat = width * (scorer_inputs(config) + 9 + width + 1) + 1
+    return coarse[0] * coarse[1] * per_pixel + coarse[0] // cells * (coarse[1] // cells) * per_seat
+
+
+def _levels(config: SegmenterConfig, width: int) -> list[tuple[int, int]]:
+    """(channels, pixels) of each level of a patch."""
+    return [(channels, (config.patch >> i) ** 2) for i, channels in enumerate(level_widths(width, config.patch))]
+
+
+def _stem(config: SegmenterConfig, width: int) -> int:
+    levels = _levels(config, width)
+    enter = config.columns * levels[0][0] * levels[0][1]
+    blocks = sum(9 * channels * channels * pixels for channels, pixels in levels)
+    down = sum(4 * upper * lower * pixels for (upper, _), (lower, pixels) in pairwise(levels))
+    kernel = config.columns * config.patch**2 * config.dim if config.patch_kernel else 0
+    return enter + blocks + down + levels[-1][0] * BOTTOM**2 * config.dim + kernel
+
+
+def _head(config: SegmenterConfig, width: int) -> int:
+    levels = _levels(config, width)
+    blocks = sum(9 * channels * channels * pixels for channels, pixels in levels[:-1])
+    up = sum(4 * upper * lower * pixels for (upper, _), (lower, pixels) in pairwise(levels))
+    return blocks + up + levels[-1][0] * BOTTOM**2 * config.dim
+
+
+def _transformer(config: SegmenterConfig, tokens: int, before: int) -> int:
+    """Closed form L ((4 + 2 r) d^2 N + 2 N (M + N) d) of N tokens that read M others and each other."""
+    d, r = config.dim, config.mlp_ratio
+    return config.layers * ((4 + 2 * r) * d * d * tokens + 2 * tokens * (before + tokens) * d)
+
+
+def _coarse_decoder(config: SegmenterConfig) -> int:
+    pixels, width = config.patch**2, config.coarse_width
+    return _head(config, width) + pixels * (9 * width * width + width * config.classes)
+
+
+def _fine_decoder(config: SegmenterConfig) -> int:
+    pixels, width = config.patch**2, config.width
+    under = (config.patch // config.factor + 2) ** 2 * config.coarse_width * width
+    return _head(config, width) + under + pixels * (2 * width * width + 9 * width * width + width * config.classes)

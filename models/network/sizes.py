@@ -1,0 +1,121 @@
+"""Sizes of a segmenter: everything needed to build it again, and to count what it costs, without building it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from numbers import Integral
+from typing import Any, Literal, get_args
+
+from pipeline.errors import ShapeError
+
+Positions = Literal["2d", "paper"]
+Design = Literal["two-scale", "dense", "paper"]
+Sight = Literal["fine", "coarse", "halved"]
+Preset = Literal["two-scale", "paper", "dense", "upsampled", "coarser"]
+
+# What a preset fixes. The two-scale network is the product; the others are trained to be compared with it.
+PRESETS: dict[Preset, dict[str, Any]] = {
+    "two-scale": {},
+    "paper": {"design": "paper", "positions": "paper"},
+    "dense": {"design": "dense"},
+    "upsampled": {"design": "dense", "sight": "coarse"},
+    "coarser": {"design": "dense", "sight": "halved"},
+}
+
+MOST_CLASSES = 255  # maps are uint8 and 255 stands for unlabelled
+# What nobody builds: sizes beyond these are damage, or an attempt to have memory filled.
+MOST = {
+    "columns": 4096, "patch": 1024, "factor": 1024, "width": 4096, "coarse_width": 4096, "dim": 16384, "layers": 256,
+    "heads": 1024, "mlp_ratio": 64,
+}  # fmt: skip
+BOTTOM = 4  # pixels a side at the lowest level of a patch
+PATCHES_AT_ONCE = 64  # their features fit the caches; larger chunks go to memory and back at every layer
+TOKEN_PX = 16  # a token stands for at most so many pixels a side
+SCORER_WIDTH = 16  # channels of the network that scores seats
+MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
+
+
+def level_widths(width: int, patch: int) -> list[int]:
+    """Channels of each level, from full patch resolution down to ``BOTTOM`` px: width, 2 width, then 3 width."""
+    levels = (patch // BOTTOM).bit_length()
+    if patch < BOTTOM or patch != BOTTOM << (levels - 1):
+        raise ShapeError(f"a patch must be {BOTTOM} px times a power of two, got {patch}; choose 8, 16 or 32")
+    return [width * min(level + 1, 3) for level in range(levels)]
+
+
+@dataclass(frozen=True)
+class SegmenterConfig:
+    """Sizes of a segmenter; everything needed to build it again. Raises ShapeError for sizes that do not fit."""
+
+    classes: int
+    columns: int = 24
+    patch: int = 16
+    factor: int = 4
+    width: int = 24  # channels of fine pixels
+    coarse_width: int = 16  # channels of coarse pixels
+    dim: int = 128
+    layers: int = 4
+    heads: int = 4
+    mlp_ratio: int = 3
+    positions: Positions = "2d"
+    patch_kernel: bool = False  # columns also go straight to tokens, as in a vision transformer that was begun from
+    design: Design = "two-scale"  # which network; see models.baselines.designs
+    sight: Sight = "fine"  # what a dense network reads: the fine image, the coarse one brought up, or 2 x 2 means
+
+    def __post_init__(self) -> None:
+        for name in ("classes", *MOST):
+            if isinstance(getattr(self, name), bool) or not isinstance(getattr(self, name), Integral):
+                raise ShapeError(f"{name} of a segmenter must be a whole number, got {getattr(self, name)!r}")
+        if not 2 <= self.classes <= MOST_CLASSES:
+            raise ShapeError(f"a segmenter needs 2 to {MOST_CLASSES} classes, got {self.classes}")
+        for name, most in MOST.items():
+            if not 1 <= getattr(self, name) <= most:
+                least = f"{name} of a segmenter must be at least 1"
+                raise ShapeError(f"{least} and at most {most}, got {getattr(self, name)}")
+        level_widths(self.width, self.patch)  # refuses a patch that cannot be halved down to the lowest level
+        if self.patch % self.factor:
+            raise ShapeError(f"patch {self.patch} must divide by the factor {self.factor}")
+        if self.dim % 4 or self.dim % self.heads:
+            raise ShapeError(f"token width {self.dim} must divide by 4 and by its {self.heads} heads")
+        self._check_design()
+
+    def _check_design(self) -> None:
+        chosen = {"design": self.design, "positions": self.positions, "sight": self.sight}
+        known = {"design": get_args(Design), "positions": get_args(Positions), "sight": get_args(Sight)}
+        for name, value in chosen.items():
+            if value not in known[name]:
+                raise ShapeError(f"{name} of a segmenter is one of {', '.join(known[name])}, got {value!r}")
+        if self.design != "dense" and self.sight != "fine":
+            raise ShapeError(f"only a dense network may read the {self.sight} image, this one is {self.design}")
+        if self.design != "two-scale" and self.positions != ("paper" if self.design == "paper" else "2d"):
+            raise ShapeError(f"a {self.design} network cannot have {self.positions} positions")
+        if self.sight == "halved" and self.factor % 2:
+            raise ShapeError(f"a grid coarser by 2 needs an even factor, got {self.factor}")
+
+    @property
+    def preset(self) -> Preset:
+        """Name of the kind of network: ``two-scale``, or which control it is."""
+        return next(
+            name
+            for name, fixed in PRESETS.items()
+            if (self.design, self.sight) == (fixed.get("design", "two-scale"), fixed.get("sight", "fine"))
+        )
+
+    @property
+    def token_side(self) -> int:
+        """Tokens a side of a patch: one for every 16 px, so 2 of a patch of 32 px and 1 of smaller ones."""
+        return max(1, self.patch // TOKEN_PX)
+
+    def as_dict(self) -> dict[str, int | str]:
+        """Plain values for a checkpoint; a two-scale network's do not name its design, as they never did."""
+        values = asdict(self)
+        if self.design == "two-scale":
+            del values["design"], values["sight"]
+        if not self.patch_kernel:
+            del values["patch_kernel"]
+        return values
+
+
+def scorer_inputs(config: SegmenterConfig) -> int:
+    """Numbers that are known of a seat: mean and greatest feature and entropy, and mean probabilities."""
+    return 2 * config.coarse_width + config.classes + 2

@@ -1,0 +1,1 @@
+"""Attention policies: which seats a fine look is worth, by the model, by saliency, or by nothing."""

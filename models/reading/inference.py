@@ -1,0 +1,388 @@
+"""Use of a trained segmenter on one scene: glance at the coarse pass, then go on from there with the fine patches."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.network.dead_pixels import all_alive, dead_pixels, fill_dead, patches_of, readable
+from models.network.self_attention import TokenReading, queries_kept, token_reading
+from models.network.sizes import PATCHES_AT_ONCE as PATCHES_AT_ONCE
+from models.network.sizes import SegmenterConfig
+from models.weights.files import AnyWeights, Weights
+from pipeline.errors import ShapeError
+from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
+from pipeline.readings import beyond_range
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from models.network.segmenter import CoarseReading, Segmenter
+
+Precision = Literal["float32", "bfloat16"]
+
+
+@dataclass(frozen=True)
+class CoarseLook:
+    """The coarse pass of a scene, or of a region of a field, on the padded coarse grid."""
+
+    grid: SceneGrid
+    columns: NDArray[np.float32]  # (y, x, column) normalised
+    origin: tuple[int, int] = field(default=(0, 0), kw_only=True)  # row and column of the field's seat it begins at
+    living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) which are read; None: all
+    strange: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) of the scene: a value is no reading
+
+
+@dataclass(frozen=True)
+class Read:
+    """A reading of a coarse look, by whom and of what: the fine patches go on from there."""
+
+    by: Segmenter
+    columns: NDArray[np.float32]
+    origin: tuple[int, int]
+    reading: CoarseReading
+    precision: Precision = "float32"
+    living: NDArray[np.bool_] | None = None
+
+    def fits(self, weights: Weights, look: CoarseLook, precision: Precision) -> bool:
+        """Whether these weights would read the same from this look."""
+        whose = self.by is weights.segmenter and self.columns is look.columns
+        return whose and self.living is look.living and (self.origin, self.precision) == (look.origin, precision)
+
+
+@dataclass(frozen=True)
+class Glance(CoarseLook):
+    """What the coarse pass alone says of a scene, on the padded coarse grid."""
+
+    probability: NDArray[np.float32]  # (y, x, class)
+    gain: NDArray[np.float32] | None = field(default=None, kw_only=True)  # (seat_y, seat_x) expected [nat per px]
+    read: Read | None = field(default=None, kw_only=True, repr=False, compare=False)
+    tokens: TokenReading | None = field(default=None, kw_only=True, repr=False, compare=False)
+
+
+@dataclass(frozen=True)
+class ClassMap:
+    """The map of a scene: class of each pixel and the probability given to it."""
+
+    classes: NDArray[np.uint8]  # (y, x), 255 where nothing can be said
+    confidence: NDArray[np.float32]  # (y, x), NaN there
+
+
+def glance(
+    weights: Weights, coarse: NDArray[np.floating], wavelength_nm: NDArray[np.floating], grid: SceneGrid
+) -> Glance:
+    """Read the coarse mosaic alone.
+
+    Parameters
+    ----------
+    coarse
+        (y, x, band) scene values of the coarse pass, shape ``grid.coarse_shape``; NaN where nothing was captured. What
+        is no reading by the weights' `most_value` counts as NaN.
+
+    Raises
+    ------
+    ShapeError : the mosaic does not fit the grid, or the grid the weights.
+    """
+    return read_glance(weights, look_coarsely(weights, [coarse], wavelength_nm, grid))
+
+
+def look_coarsely(
+    weights: AnyWeights,
+    strips: Iterable[NDArray[np.floating]],
+    wavelength_nm: NDArray[np.floating],
+    grid: SceneGrid,
+    *,
+    origin: tuple[int, int] = (0, 0),
+) -> CoarseLook:
+    """Bring the coarse mosaic to the spectral columns of the weights, some rows at a time.
+
+    Parameters
+    ----------
+    strips
+        (y, x, band) parts of the mosaic from the top down; together of the shape ``grid.coarse_shape``.
+    origin
+        Row and column of the seat of a larger field in which the grid begins.
+
+    Raises
+    ------
+    ShapeError : the mosaic does not fit the grid, or the grid the weights.
+    """
+    _check_grid(weights, grid)
+    columns, filled = np.empty((*grid.coarse_shape, weights.config.columns), np.float32), 0
+    strange: NDArray[np.bool_] | None = None
+    for strip in strips:
+        last = filled + len(strip)
+        if strip.shape[1] != grid.coarse_shape[1] or last > grid.coarse_shape[0]:
+            raise ShapeError(
+                f"the coarse mosaic is {(last, strip.shape[1])}, the scene grid expects {grid.coarse_shape}"
+            )
+        columns[filled:last] = weights.columns(strip, wavelength_nm)
+        if (wild := beyond_range(strip, weights.normalisation.most_value)) is not None:
+            strange = np.zeros(grid.coarse_shape, np.bool_) if strange is None else strange
+            strange[filled:last] = wild.any(axis=-1)
+        filled = last
+    if filled != grid.coarse_shape[0]:
+        raise ShapeError(
+            f"the coarse mosaic is {(filled, grid.coarse_shape[1])}, the scene grid expects {grid.coarse_shape}"
+        )
+    y, x = grid.padded_shape
+    padded = pad_by_reflection(columns, (y // grid.factor, x // grid.factor))
+    columns = np.ascontiguousarray(padded, np.float32)
+    living = _mend(columns, weights.config)
+    return CoarseLook(grid, columns, origin=origin, living=living, strange=strange)
+
+
+def _mend(columns: NDArray[np.float32], config: SegmenterConfig) -> NDArray[np.bool_] | None:
+    """Fill dead pixels of coarse columns from their patch, in place, and tell which tokens live (None: all)."""
+    dead = dead_pixels(columns)
+    if not dead.any():
+        return None
+    p, holes = config.patch, patches_of(dead, config.patch)
+    for number in np.flatnonzero(holes.any(axis=(1, 2))):  # one by one: a copy of a field may not fit the memory
+        y, x = (p * int(at) for at in divmod(number, columns.shape[1] // p))
+        columns[y : y + p, x : x + p] = fill_dead(columns[None, y : y + p, x : x + p], holes[number][None])[0]
+    return readable(holes, config.token_side).ravel()
+
+
+def glance_of_columns(weights: Weights, columns: NDArray[np.generic], grid: SceneGrid) -> Glance:
+    """Read normalised columns of the padded coarse grid, (y, x, column); dead ones count as in a mosaic."""
+    given = np.ascontiguousarray(columns, np.float32)
+    mended = given if all_alive(given) else given.copy()
+    return read_glance(weights, CoarseLook(grid, mended, living=_mend(mended, weights.config)))
+
+
+def read_glance(weights: Weights, look: CoarseLook, *, precision: Precision = "float32") -> Glance:
+    """Read a coarse look alone."""
+    return glance_batch(weights, [look], precision=precision)[0]
+
+
+def glance_batch(weights: Weights, looks: Sequence[CoarseLook], *, precision: Precision = "float32") -> list[Glance]:
+    """Read coarse looks of any sizes, each alone, their patches packed; as ``read_glance`` one by one, but faster."""
+    import torch
+
+    from models.network.batches import packs
+
+    seen: list[Glance] = []
+    with torch.inference_mode(), _computing_in(precision):
+        for part in packs([_patches_in(look) for look in looks]):
+            with queries_kept() as queries:
+                readings = _read_coarse(weights, looks[part])
+            asked = torch.split(queries[-1], [reading.memory[-1][0].shape[2] for reading in readings], dim=2)
+            seen += [
+                _glance(weights, look, reading, [own], precision)
+                for look, reading, own in zip(looks[part], readings, asked, strict=True)
+            ]
+    return seen
+
+
+def _glance(
+    weights: Weights, look: CoarseLook, reading: CoarseReading, queries: list[Tensor], precision: Precision
+) -> Glance:
+    probability = np.ascontiguousarray(reading.logits[0].float().softmax(dim=0).permute(1, 2, 0).numpy())
+    gain = weights.segmenter.score(reading)[0].float().numpy()
+    tokens = token_reading(weights.segmenter, reading, queries, look.living)
+    read = Read(weights.segmenter, look.columns, look.origin, reading, precision, look.living)
+    return Glance(
+        look.grid,
+        look.columns,
+        probability,
+        origin=look.origin,
+        living=look.living,
+        gain=gain,
+        read=read,
+        tokens=tokens,
+    )
+
+
+def segment(
+    weights: Weights, seen: CoarseLook, patches: NDArray[np.floating], seats: NDArray[np.integer],
+    *, precision: Precision = "float32",
+) -> ClassMap:  # fmt: skip
+    """Draw the class map from the coarse look and the fine patches.
+
+    Parameters
+    ----------
+    patches
+        (seat, p, p, column) normalised columns of the fine pass. A dead pixel (see `models.network.dead_pixels`) counts
+        as the mean of its patch; a patch of which more than half is dead counts as not captured.
+    seats
+        (seat,) their numbers on the grid, each once.
+    precision
+        Of convolutions and matrix products; norms, softmax and the decision are float32.
+
+    Returns
+    -------
+    Maps of the scene's own size. Without a seat this is the glance brought up to the fine grid.
+
+    Raises
+    ------
+    ShapeError : a seat given twice or outside the grid, or patches of another shape.
+    """
+    return segment_batch(weights, [seen], [patches], [seats], precision=precision)[0]
+
+
+def segment_batch(
+    weights: Weights, seen: Sequence[CoarseLook], patches: Sequence[NDArray[np.floating]],
+    seats: Sequence[NDArray[np.integer]], *, precision: Precision = "float32",
+) -> list[ClassMap]:  # fmt: skip
+    """Draw the maps of scenes of any sizes and numbers of seats together, as ``segment`` one by one, but faster.
+
+    Fine patches of all scenes are packed, nothing is padded. For the rest see ``segment``.
+    """
+    import torch
+
+    from models.network.batches import packs
+
+    scenes = [
+        (look, own, np.asarray(numbers, np.int64)) for look, own, numbers in zip(seen, patches, seats, strict=True)
+    ]
+    for look, own, numbers in scenes:
+        check_seats(numbers, look.grid)
+        expected = (len(numbers), look.grid.patch, look.grid.patch, weights.config.columns)
+        if own.shape != expected:
+            raise ShapeError(f"expected patches of shape {expected} (seat, y, x, column), got {own.shape}")
+    scenes = [(look, *captured(own, numbers)) for look, own, numbers in scenes]
+    with torch.inference_mode(), _computing_in(precision):
+        counts = [_patches_in(look) + len(numbers) for look, _, numbers in scenes]
+        return [drawn for part in packs(counts) for drawn in _draw_pack(weights, scenes[part], precision)]
+
+
+def _draw_pack(
+    weights: Weights, pack: Sequence[tuple[CoarseLook, NDArray[np.floating], NDArray[np.int64]]], precision: Precision
+) -> Iterator[ClassMap]:
+    """Maps of scenes that are read together."""
+    import torch
+
+    from models.network.batches import FineScene, read_fine_packed
+
+    looks = [look for look, _, _ in pack]
+    readings = readings_of(weights, looks, precision=precision)
+    padded = [draw_coarse(reading.logits.float(), look.grid) for reading, look in zip(readings, looks, strict=True)]
+    places = ((drawn, place) for drawn, (look, _, seats) in zip(padded, pack, strict=True)
+              for place in look.grid.seat_origin(seats))  # fmt: skip
+    scenes = [
+        FineScene(reading, own, torch.from_numpy(seats), origin_of(look))
+        for reading, (look, own, seats) in zip(readings, pack, strict=True)
+    ]
+    p = weights.config.patch
+    for logits in read_fine_packed(weights.segmenter.eval(), scenes):
+        confidence, classes = (part.numpy() for part in decide(logits.float(), dim=1))
+        for sure, values, (drawn, (y, x)) in zip(confidence, classes, places, strict=False):
+            drawn.classes[y : y + p, x : x + p] = values
+            drawn.confidence[y : y + p, x : x + p] = sure
+    for drawn, look in zip(padded, looks, strict=True):
+        scene = np.s_[: look.grid.height, : look.grid.width]
+        yield ClassMap(drawn.classes[scene].copy(), drawn.confidence[scene].copy())
+
+
+def captured(patches: NDArray[np.floating], seats: NDArray[np.int64]) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
+    """Keep the patches that show something of their seats, dead pixels filled, and these seats."""
+    dead = dead_pixels(patches)
+    if not dead.any():
+        return patches, seats
+    shown = readable(dead)[:, 0]
+    return fill_dead(patches[shown], dead[shown]), seats[shown]
+
+
+def check_seats(seats: NDArray[np.int64], grid: SceneGrid) -> None:
+    """Refuse numbers that are none of the grid's seats, or given twice (ShapeError)."""
+    count = grid.seat_shape[0] * grid.seat_shape[1]
+    if outside := seats[(seats < 0) | (seats >= count)].tolist():
+        raise ShapeError(f"seat {outside[0]} is none of the {count} seats of the scene, 0..{count - 1}")
+    distinct, times = np.unique(seats, return_counts=True)
+    if repeated := distinct[times > 1].tolist():
+        raise ShapeError(f"seat {repeated[0]} is given more than once; give each seat one patch")
+
+
+def _check_grid(weights: AnyWeights, grid: SceneGrid) -> None:
+    config = weights.config
+    if (grid.patch, grid.factor) != (config.patch, config.factor):
+        raise ShapeError(
+            f"the weights read patches of {config.patch} px at a factor of {config.factor},"
+            f" the grid has {grid.patch} px and {grid.factor}"
+        )
+
+
+def _patches_in(look: CoarseLook) -> int:
+    """Coarse patches of a look."""
+    rows, columns = look.grid.seat_shape
+    return rows * columns // look.grid.factor**2
+
+
+@contextmanager
+def _computing_in(precision: Precision) -> Iterator[None]:
+    """Let convolutions and matrix products compute in a precision."""
+    import torch
+
+    if precision == "float32":
+        yield
+        return
+    with torch.autocast("cpu", dtype=torch.bfloat16), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Mismatch dtype between input and weight")  # slower, not less exact
+        yield
+
+
+def readings_of(
+    weights: Weights, looks: Sequence[CoarseLook], *, precision: Precision = "float32"
+) -> list[CoarseReading]:
+    """Readings of coarse looks. Nothing flows back from fine patches, so one that a glance kept is not made twice."""
+    kept = [_kept(weights, look, precision) for look in looks]
+    unread = [look for look, reading in zip(looks, kept, strict=True) if reading is None]
+    fresh = iter(_read_coarse(weights, unread))
+    return [next(fresh) if reading is None else reading for reading in kept]
+
+
+def _kept(weights: Weights, look: CoarseLook, precision: Precision) -> CoarseReading | None:
+    """The reading that a glance kept, if these weights would read the same."""
+    read = look.read if isinstance(look, Glance) else None
+    return read.reading if read is not None and read.fits(weights, look, precision) else None
+
+
+def _read_coarse(weights: Weights, looks: Sequence[CoarseLook]) -> list[CoarseReading]:
+    import torch
+
+    from models.network.batches import read_coarse_packed
+
+    images = [torch.from_numpy(look.columns).permute(2, 0, 1)[None] for look in looks]
+    living = [None if look.living is None else torch.from_numpy(look.living) for look in looks]
+    return read_coarse_packed(weights.segmenter.eval(), images, [origin_of(look) for look in looks], living)
+
+
+def origin_of(look: CoarseLook) -> Tensor | None:
+    """Seat of the field in which a look begins, (1, 2); None at the field's own corner."""
+    import torch
+
+    return torch.tensor([look.origin]) if any(look.origin) else None
+
+
+def draw_coarse(logits: Tensor, grid: SceneGrid) -> ClassMap:
+    """Bring coarse logits up to the padded fine grid and decide, in strips of rows."""
+    import torch
+    import torch.nn.functional as F  # noqa: N812 - its usual name
+
+    y, x = grid.padded_shape
+    drawn = ClassMap(np.empty((y, x), np.uint8), np.empty((y, x), np.float32))
+    cell = grid.patch
+    padded = F.pad(logits, (0, 0, 1, 1), mode="replicate").contiguous(memory_format=torch.channels_last)
+    for top in range(0, y // grid.factor, cell):
+        strip = F.interpolate(
+            padded[:, :, top : top + cell + 2], scale_factor=grid.factor, mode="bilinear", align_corners=False
+        )[0, :, grid.factor : -grid.factor]
+        confidence, classes = decide(strip, dim=0)
+        rows = slice(top * grid.factor, (top + cell) * grid.factor)
+        drawn.classes[rows], drawn.confidence[rows] = classes.numpy(), confidence.numpy()
+    return drawn
+
+
+def decide(logits: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    """The greatest probability and its class, uint8; NaN and 255 where a logit is not finite: that is no class."""
+    import torch
+
+    confidence, classes = logits.softmax(dim=dim).max(dim=dim)
+    return confidence, torch.where(confidence.isnan(), UNLABELLED, classes).to(torch.uint8)

@@ -1,0 +1,1 @@
+"""Training: examples, objective, steps, checkpoints, and weights to start from."""

@@ -1,0 +1,177 @@
+"""What a training step asks for: seats drawn, the map with them and without, and what the scorer said of them.
+
+A crop is read twice: with no fine seat, and with a share of the seats drawn from ``SHARES``. What the loss falls by at
+a captured seat is what the scorer learns to tell; a seat without a label tells it nothing. Three phases follow each
+other: seats are placed at random and by the entropy of the first reading; then also by the scorer; then in larger
+crops, of which fewer make a batch, as far as the scenes have larger ones.
+
+A control (``models.baselines.designs``) has one map and no scorer: it is asked for that map's loss alone, from the
+same crops.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812 - its usual name
+from torch import Tensor
+
+from models.baselines.designs import Control, Network
+from models.network.scorer import scoring_loss
+from models.network.segmenter import Segmenter, SegmenterConfig
+from models.training.examples import Batch, Example
+from pipeline.geometry.grid import UNLABELLED
+
+GLANCE_WEIGHT, SCORER_WEIGHT = 0.4, 1.0  # of the map without a seat, and of the scorer, beside the map with seats
+SHARES = ((0.05, 0.15), (0.1, 0.25), (0.2, 0.25), (0.35, 0.15), (0.5, 0.1), (1.0, 0.1))  # (of the seats, how often)
+WITHOUT_SEATS = 0.1  # how often the paper's network, which has no map of a glance beside, gets no seat at all
+
+
+@dataclass(frozen=True)
+class Phase:
+    """How seats are placed, by odds, and how large crops are beside those of the settings, up to a part of the run."""
+
+    until: float
+    random: float
+    entropy: float
+    gain: float
+    larger: int = 1  # crops have so many times the area, batches so much fewer of them
+
+
+PHASES = (Phase(0.5, 0.5, 0.5, 0.0), Phase(0.7, 0.3, 0.35, 0.35), Phase(1.0, 0.2, 0.4, 0.4, larger=2))
+
+
+def phase_at(done: float) -> Phase:
+    """Give the phase of a run that is ``done`` so far (0..1)."""
+    return next((phase for phase in PHASES if done < phase.until), PHASES[-1])
+
+
+def class_weights(examples: list[Example], classes: int, cap: float) -> Tensor:
+    """Weights 1 / sqrt(frequency), mean 1 over the labelled pixels' classes, capped; 0 for a class without a pixel."""
+    counts = np.zeros(classes)
+    for example in examples:
+        counts += np.bincount(example.labels[example.labels != UNLABELLED], minlength=classes)
+    share = counts / max(counts.sum(), 1)
+    weight = np.divide(1, np.sqrt(share), out=np.zeros(classes), where=share > 0)
+    weight /= max((weight * share).sum(), 1e-12)
+    return torch.from_numpy(np.minimum(weight, cap).astype(np.float32))
+
+
+def batch_loss(
+    model: Network,
+    batch: Batch,
+    weight: Tensor,
+    rng: np.random.Generator,
+    phase: Phase,
+    *,
+    soft_dice: bool,
+) -> Tensor:
+    """Loss of one batch: the map with a drawn share of seats, the glance alone, and what the scorer said of them."""
+    if not isinstance(model, Segmenter):
+        return control_loss(model, batch, weight, rng, soft_dice=soft_dice)
+    reading = model.read_coarse(batch.coarse, batch.origin)
+    score = model.score(reading).flatten(1)
+    seats = draw_seats(reading.logits.detach(), score.detach(), model.config, rng, phase)
+    fine = batch.fine.gather(1, seats[:, :, None, None, None].expand(-1, -1, *batch.fine.shape[2:]))
+    patches = model.read_fine(reading, fine, seats, batch.origin)
+    empty, nothing = seats[:, :0], patches[:, :0]
+    drawn = model.composite(reading.logits, patches, seats), model.composite(reading.logits, nothing, empty)
+    with_seats, without = (pixel_losses(logits, batch.labels) for logits in drawn)
+    gain = F.avg_pool2d((without - with_seats).detach()[:, None], model.config.patch).flatten(1)
+    known = F.max_pool2d((batch.labels != UNLABELLED).float()[:, None], model.config.patch).flatten(1) > 0
+    scoring = scoring_loss(score.gather(1, seats), gain.gather(1, seats), known.gather(1, seats))
+    maps = [
+        map_loss(logits, losses, batch.labels, weight, soft_dice=soft_dice)
+        for logits, losses in zip(drawn, (with_seats, without), strict=True)
+    ]
+    return maps[0] + GLANCE_WEIGHT * maps[1] + SCORER_WEIGHT * scoring
+
+
+def control_loss(model: Control, batch: Batch, weight: Tensor, rng: np.random.Generator, *, soft_dice: bool) -> Tensor:
+    """Loss of a control's map of one batch, drawn with some of the seats where it asks for them, else with each one."""
+    count, every = batch.fine.shape[:2]
+    if model.uses_seats:
+        seats = draw_paper_seats(batch.coarse, every, model.config, rng)
+        fine = batch.fine.gather(1, seats[:, :, None, None, None].expand(-1, -1, *batch.fine.shape[2:]))
+    else:
+        seats, fine = torch.arange(every).expand(count, -1), batch.fine
+    logits = model.draw(batch.coarse, fine, seats, batch.origin)
+    return map_loss(logits, pixel_losses(logits, batch.labels), batch.labels, weight, soft_dice=soft_dice)
+
+
+def draw_paper_seats(coarse: Tensor, every: int, config: SegmenterConfig, rng: np.random.Generator) -> Tensor:
+    """Draw seats for the paper's network, (B, K): half the time where the coarse image has edges, else at random.
+
+    Edges are those of the policy ``sobel``, the paper's ED; the shares are those of the two-scale segmenter.
+
+    Parameters
+    ----------
+    coarse
+        (B, J, H/s, W/s) normalised columns.
+    every
+        How many seats a scene has.
+    """
+    shares, odds = zip(*SHARES, strict=True)
+    share = 0.0 if rng.random() < WITHOUT_SEATS else float(rng.choice(shares, p=odds))
+    worth = torch.from_numpy(rng.random((len(coarse), every))).float()
+    if rng.random() < 0.5:
+        edges = F.avg_pool2d(_edges(coarse), config.patch // config.factor).flatten(1)
+        worth = edges + 0.1 * edges.mean() * worth
+    return worth.argsort(dim=1, descending=True, stable=True)[:, : round(share * every)]
+
+
+def _edges(coarse: Tensor) -> Tensor:
+    """Size of Sobel's gradient of the mean column, (B, J, y, x) -> (B, 1, y, x)."""
+    down = coarse.new_tensor([[-1.0, -2.0, -1.0], [0.0, 0.0, 0.0], [1.0, 2.0, 1.0]])
+    kernels = torch.stack([down, down.T])[:, None]
+    gradient = F.conv2d(F.pad(coarse.mean(dim=1, keepdim=True), (1, 1, 1, 1), mode="replicate"), kernels)
+    return gradient.square().sum(dim=1, keepdim=True).sqrt()
+
+
+def draw_seats(
+    glance: Tensor, score: Tensor, config: SegmenterConfig, rng: np.random.Generator, phase: Phase
+) -> Tensor:
+    """Draw how many seats and which: (B, K) distinct seat numbers. By entropy or gain they are placed with some chance.
+
+    Parameters
+    ----------
+    glance, score
+        Logits of the coarse pixels (B, classes, H/s, W/s), and gain of the seats (B, seats).
+    """
+    shares, odds = zip(*SHARES, strict=True)
+    count = max(1, round(float(rng.choice(shares, p=odds)) * score.shape[1]))
+    chance = torch.from_numpy(rng.random(score.shape)).to(score.dtype)
+    placed = rng.choice(3, p=(phase.random, phase.entropy, phase.gain))
+    if placed == 1:
+        entropy = torch.special.entr(glance.float().softmax(dim=1)).sum(dim=1)
+        score = F.avg_pool2d(entropy[:, None], config.patch // config.factor).flatten(1)
+    worth = chance if placed == 0 else score + 0.1 * score.abs().mean() * chance
+    return worth.argsort(dim=1, descending=True, stable=True)[:, :count]
+
+
+def pixel_losses(logits: Tensor, labels: Tensor) -> Tensor:
+    """Cross-entropy of each pixel, (B, classes, y, x) and (B, y, x) -> (B, y, x) float32; 0 where unlabelled."""
+    return F.cross_entropy(logits.float(), labels, ignore_index=UNLABELLED, reduction="none")
+
+
+def map_loss(logits: Tensor, losses: Tensor, labels: Tensor, weight: Tensor, *, soft_dice: bool) -> Tensor:
+    """Class-weighted mean of the ``losses`` of labelled pixels, plus half the soft Dice loss where asked.
+
+    0, with a gradient of 0, where no pixel is labelled or every label has weight 0.
+    """
+    labelled = labels != UNLABELLED
+    weights = torch.where(labelled, weight[labels.where(labelled, 0)], 0.0)
+    total = weights.sum()
+    if not total > 0:
+        return logits.sum() * 0.0
+    loss = (losses * weights).sum() / total
+    if not soft_dice:
+        return loss
+    probability = logits.float().softmax(dim=1) * labelled[:, None]
+    truth = F.one_hot(labels.where(labelled, 0), logits.shape[1]).permute(0, 3, 1, 2) * labelled[:, None]
+    both = (probability * truth).sum(dim=(0, 2, 3))
+    size = probability.sum(dim=(0, 2, 3)) + truth.sum(dim=(0, 2, 3))
+    present = truth.sum(dim=(0, 2, 3)) > 0
+    return loss + 0.5 * (1 - 2 * both[present] / (size[present] + 1)).mean()

@@ -1,0 +1,300 @@
+"""Training of a network on crops, the two-scale segmenter or a control: steps, averages, checkpoints."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from models.baselines.designs import Network, build_network
+from models.network.process import keep_freed_memory
+from models.network.sizes import SegmenterConfig
+from models.training.checkpoint import load_checkpoint, save_checkpoint
+from models.training.examples import Batch, CropSampler, Example
+from models.training.objective import PHASES, batch_loss, class_weights, phase_at
+from pipeline.errors import PipelineError, WeightsError
+from pipeline.geometry.grid import UNLABELLED
+
+KEEP_EVERY_S = 120.0  # between checkpoints
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How long and how to train. ``minutes`` ends the run early, with the learning rate brought down in time."""
+
+    steps: int = 2000
+    batch: int = 4
+    crop: int = 256
+    learning_rate: float = 1.5e-3
+    weight_decay: float = 0.02
+    minutes: float = 36.0
+    seed: int = 0
+    average: float = 0.998  # decay of the averaged weights
+    noise: float = 0.3  # most that crops of shorter exposures get [spreads of the columns]
+    weight_cap: float = 5.0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """State after a step, for a progress bar."""
+
+    step: int
+    steps: int
+    done: float  # 0..1, by steps or by time, whichever is further
+    loss: float
+
+
+class TrainingError(PipelineError, RuntimeError):
+    """The loss was not finite three steps in a row."""
+
+
+@dataclass
+class Course:
+    """How far a run has come; plain numbers, kept in its checkpoint."""
+
+    step: int = 0
+    seconds: float = 0.0  # of earlier processes, up to the last checkpoint
+    processor_seconds: float = 0.0  # the same
+    skipped: int = 0
+    unlabelled: int = 0  # steps whose crops had no label
+    in_a_row: int = 0
+    loss: float = math.nan  # smoothed
+
+
+class Trainer:
+    """A training run: where it stands, and one step further at a time."""
+
+    def __init__(
+        self,
+        config: SegmenterConfig,
+        examples: list[Example],
+        gain_shift: NDArray[np.float32],
+        settings: TrainingSettings,
+        start: Mapping[str, Tensor] | None = None,
+    ) -> None:
+        self.settings, self.gain_shift = settings, gain_shift
+        self.rng = np.random.default_rng([settings.seed, 0x7EA])
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(settings.seed)
+            self.model = build_network(config)
+        if start is not None:
+            strange = self.model.load_state_dict(start, strict=False).unexpected_keys
+            if strange:
+                raise WeightsError(f"{config.preset} has no place for {len(strange)} tensors, the first {strange[0]}")
+        self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.averaged = copy.deepcopy(self.model).eval()
+        groups = _parameter_groups(self.model, settings.weight_decay)
+        self.optimiser = torch.optim.AdamW(groups, settings.learning_rate)
+        self.samplers = {}
+        for larger in {phase.larger for phase in PHASES}:
+            crop = round(settings.crop * math.sqrt(larger))
+            self.samplers[larger] = CropSampler(examples, config.patch, config.factor, crop, noise=settings.noise)
+        self.weight = class_weights(examples, config.classes, settings.weight_cap)
+        self.course = Course()
+        self.batch: Batch | None = None  # of the last step
+        self._started, self._worked = time.monotonic(), time.process_time()
+
+    @property
+    def done(self) -> float:
+        """How far the run is, 0..1, by steps or by time, whichever is further."""
+        seconds = self.course.seconds + time.monotonic() - self._started
+        return max(self.course.step / self.settings.steps, seconds / (60 * self.settings.minutes))
+
+    def step(self, done: float) -> None:
+        """Take one step of a run that is ``done`` so far (0..1): the learning rate follows from it.
+
+        Raises
+        ------
+        TrainingError : the loss or its gradient was not finite three steps in a row.
+        """
+        course = self.course
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.settings.learning_rate * rate_at(done)
+        phase = phase_at(done)
+        sampler = self.samplers[phase.larger]
+        fewer = phase.larger if sampler.size > self.samplers[1].size else 1  # small scenes have no larger crops
+        count = max(1, self.settings.batch // fewer)
+        self.batch = batch = sampler.draw(count, self.rng, self.gain_shift)
+        if not (batch.labels != UNLABELLED).any():  # nothing to learn; decay and momentum would move the weights
+            course.step, course.unlabelled = course.step + 1, course.unlabelled + 1
+            return
+        loss = batch_loss(self.model, batch, self.weight, self.rng, phase, soft_dice=done > 0.3)
+        course.step += 1
+        course.in_a_row = 0 if _step(self.model, self.optimiser, loss) else course.in_a_row + 1
+        course.skipped += course.in_a_row > 0
+        if course.in_a_row == 3:
+            last = course.step
+            raise TrainingError(f"the loss was not finite in steps {last - 2} to {last}; lower the learning rate")
+        _average(self.averaged, self.model, min(self.settings.average, course.step / (course.step + 20)))
+        value = float(loss.detach())
+        if math.isfinite(value):
+            course.loss = value if math.isnan(course.loss) else 0.97 * course.loss + 0.03 * value
+
+    def keep(self, path: Path, identity: str) -> None:
+        """Write a checkpoint."""
+        now, worked = time.monotonic(), time.process_time()
+        self.course.seconds, self._started = self.course.seconds + now - self._started, now
+        self.course.processor_seconds, self._worked = self.course.processor_seconds + worked - self._worked, worked
+        tensors = {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
+        tensors |= {f"averaged.{name}": tensor for name, tensor in self.averaged.state_dict().items()}
+        for number, moments in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"optimiser.{number}.{name}": tensor for name, tensor in moments.items()}
+        save_checkpoint(path, identity, {"course": asdict(self.course), "rng": self.rng.bit_generator.state}, tensors)
+
+    def keep_batch(self, path: Path) -> None:
+        """Write the last batch and the weights as they are, to find out what failed."""
+        tensors = {f"model.{name}": tensor for name, tensor in self.model.state_dict().items()}
+        if self.batch is not None:
+            tensors |= vars(self.batch)
+        save_checkpoint(path, "batch", {"course": asdict(self.course)}, tensors)
+
+    def go_on(self, path: Path, identity: str) -> bool:
+        """Go on from a checkpoint of the same run; False where there is none, or one of a network of other shapes."""
+        found = load_checkpoint(path, identity)
+        if found is None:
+            return False
+        about, tensors = found
+        state: dict[int, dict[str, Tensor]] = {}
+        parts: dict[str, dict[str, Tensor]] = {"model": {}, "averaged": {}}
+        for name, tensor in tensors.items():
+            part, _, rest = name.partition(".")
+            if part == "optimiser":
+                number, _, moment = rest.partition(".")
+                state.setdefault(int(number), {})[moment] = tensor
+            else:
+                parts[part][rest] = tensor
+        own = {name: tensor.shape for name, tensor in self.model.state_dict().items()}
+        if any({name: tensor.shape for name, tensor in part.items()} != own for part in parts.values()):
+            return False
+        self.model.load_state_dict(parts["model"])
+        self.averaged.load_state_dict(parts["averaged"])
+        groups = self.optimiser.state_dict()["param_groups"]
+        self.optimiser.load_state_dict({"state": state, "param_groups": groups})
+        self.rng.bit_generator.state = about["rng"]
+        self.course, self._started, self._worked = Course(**about["course"]), time.monotonic(), time.process_time()
+        return True
+
+    def summary(self) -> dict[str, float | int]:
+        """Steps, skipped steps, the last smoothed loss, and seconds by the clock and of the processor."""
+        course = self.course
+        seconds = round(course.seconds + time.monotonic() - self._started)
+        worked = round(course.processor_seconds + time.process_time() - self._worked)
+        return {
+            "steps": course.step,
+            "skipped_steps": course.skipped,
+            "unlabelled_steps": course.unlabelled,
+            "last_loss": round(course.loss, 5),
+            "seconds": seconds,
+            "processor_seconds": worked,
+        }
+
+
+def train(
+    config: SegmenterConfig,
+    examples: list[Example],
+    gain_shift: NDArray[np.float32],
+    settings: TrainingSettings,
+    report: Callable[[Progress], None] = lambda progress: None,
+    *,
+    start: Mapping[str, Tensor] | None = None,
+    checkpoint: Path | None = None,
+    keep_every_s: float = KEEP_EVERY_S,
+) -> tuple[Network, dict[str, float | int]]:
+    """Train the network that ``config`` names; give its averaged weights and a summary (steps, last loss, seconds).
+
+    The same settings and examples start from the same weights and draw the same crops and seats. What follows is equal
+    to rounding only: sums differ in their last bit with where memory lies, and ``minutes`` may end the run elsewhere.
+
+    Parameters
+    ----------
+    start
+        Named tensors that the network begins with; others are drawn.
+    checkpoint
+        File that the state is kept in; a killed run of the same settings and examples goes on from it.
+
+    Raises
+    ------
+    TrainingError : the loss or its gradient was not finite three steps in a row; the last batch is kept beside the
+        checkpoint.
+    WeightsError : a tensor of ``start`` that the network has no place for.
+    """
+    keep_freed_memory()
+    trainer = Trainer(config, examples, gain_shift, settings, start)
+    identity = run_identity(config, examples, settings, start)
+    if checkpoint is not None:
+        trainer.go_on(checkpoint, identity)
+    kept = time.monotonic()
+    while (done := trainer.done) < 1:
+        try:
+            trainer.step(done)
+        except TrainingError as error:
+            if checkpoint is None:
+                raise
+            failed = checkpoint.with_name(checkpoint.name + ".batch")
+            trainer.keep_batch(failed)
+            raise TrainingError(f"{error}; the last batch and the weights that it met are in {failed}") from error
+        report(Progress(trainer.course.step, settings.steps, done, trainer.course.loss))
+        if checkpoint is not None and time.monotonic() - kept >= keep_every_s:
+            trainer.keep(checkpoint, identity)
+            kept = time.monotonic()
+    return trainer.averaged, trainer.summary()
+
+
+def run_identity(
+    config: SegmenterConfig,
+    examples: list[Example],
+    settings: TrainingSettings,
+    start: Mapping[str, Tensor] | None = None,
+) -> str:
+    """Hash of all that makes a run what it is: a checkpoint of another run is not gone on from."""
+    digest = hashlib.sha256(json.dumps([config.as_dict(), asdict(settings)], sort_keys=True).encode())
+    for example in examples:
+        digest.update(example.name.encode())
+        digest.update(np.ascontiguousarray(example.coarse).tobytes())
+        digest.update(np.ascontiguousarray(example.labels).tobytes())
+    for name, tensor in (start or {}).items():
+        digest.update(name.encode())
+        digest.update(tensor.numpy().tobytes())
+    return digest.hexdigest()[:20]
+
+
+def rate_at(done: float) -> float:
+    """Learning rate over the run as a share of the highest: 5 % warm-up, then a cosine down to 1 %."""
+    if done < 0.05:
+        return 0.05 + 0.95 * done / 0.05
+    return float(0.01 + 0.99 * 0.5 * (1 + np.cos(np.pi * (done - 0.05) / 0.95)))
+
+
+def _step(model: nn.Module, optimiser: torch.optim.Optimizer, loss: Tensor) -> bool:
+    """Take one optimiser step; False, and no step, when the loss or the gradient is not finite."""
+    optimiser.zero_grad(set_to_none=True)
+    if not torch.isfinite(loss):
+        return False
+    loss.backward()  # type: ignore[no-untyped-call]
+    if not torch.isfinite(torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)):
+        return False
+    optimiser.step()
+    return True
+
+
+def _parameter_groups(model: nn.Module, decay: float) -> list[dict[str, object]]:
+    """Matrices and kernels decay, gains and shifts do not."""
+    matrices = [p for p in model.parameters() if p.ndim > 1]
+    rest = [p for p in model.parameters() if p.ndim <= 1]
+    return [{"params": matrices, "weight_decay": decay}, {"params": rest, "weight_decay": 0.0}]
+
+
+@torch.no_grad()
+def _average(averaged: nn.Module, model: nn.Module, keep: float) -> None:
+    for slow, quick in zip(averaged.parameters(), model.parameters(), strict=True):
+        slow.lerp_(quick, 1 - keep)

@@ -1,0 +1,1 @@
+"""Files of tensors: our own sealed weights, and other people's, read without running anything."""

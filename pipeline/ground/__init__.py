@@ -1,0 +1,1 @@
+"""The ground under a posed rig: scene to metres, to map coordinates, and the map's pixels."""

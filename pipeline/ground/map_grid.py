@@ -1,0 +1,233 @@
+"""The map's pixels: a grid in a projected CRS over the field's footprint, and what each shows of the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import PoseError, ShapeError
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.ground.projection import MapFrame, map_crs
+from pipeline.ground.view import LEAST_SINK, ROWS_AT_ONCE, GroundView, pixel_places
+from pipeline.rectify.resample import resample
+
+if TYPE_CHECKING:  # half a second to import, for maps alone
+    from odc.geo.geobox import GeoBox
+
+Floats = NDArray[np.float64]
+
+FAR_PIXELS = 8.0  # pixels of the scene whose footprint has more than so many times the median's side are left out
+MOST_GROWTH = 64  # a map may have so many times the scene's pixels,
+USUAL_GROWTH = 8  # and so many where its resolution is not asked for
+TIE = 32  # map pixels between exact places
+ROUND_STEPS = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+SAMPLES = 129  # places a side at which the median footprint is taken
+EDGE_POINTS = 33  # on each side of the footprint: straight on the ground, bent on the map
+
+
+@dataclass(frozen=True)
+class GroundGrid:
+    """A map's grid and the field that it shows. Made by ``ground_grid``."""
+
+    frame: MapFrame
+    scene_shape: tuple[int, int]  # (y, x) [px]
+    geobox: GeoBox
+    least_sink: float  # rays that sink less meet the ground too far away to be mapped
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(y, x) of the map."""
+        rows, columns = self.geobox.shape
+        return int(rows), int(columns)
+
+    def scene_pixels(self, rows: slice, columns: slice) -> Floats:
+        """Give where map pixels lie in the scene's image, (row, column, 2); integers are centres of its pixels.
+
+        NaN where the field does not show the ground, or shows it beyond the map's reach.
+        """
+        size = np.array(self.scene_shape, np.float64)
+        points = self.frame.view.ground_to_scene(self.ground_m(rows, columns))
+        inside: NDArray[np.bool_] = np.all(np.abs(points) <= size / 2, axis=-1)
+        inside &= self.frame.view.sink(np.where(inside[..., None], points, 0.0)) >= self.least_sink
+        return np.where(inside[..., None], points + (size - 1) / 2, np.nan)
+
+    def ground_m(self, rows: slice, columns: slice) -> Floats:
+        """Give the ground under the centres of map pixels, (row, column, 3) east, north and up of the foot [m].
+
+        Exact every ``TIE`` pixels and linear between. A map bends against the ground's plane by about the earth's
+        radius, so that this is off by TIE^2 resolution / 8 R of a pixel: 1e-6 at 5 cm, 2e-5 at 1 m (tested).
+        """
+        affine, (row, column) = self.geobox.affine, (_ties(part) for part in (rows, columns))
+        x, y = np.meshgrid(affine.c + affine.a * column, affine.f + affine.e * row)
+        exact = self.frame.map_to_ground(np.stack([x, y], axis=-1))
+        return _between(_between(exact, columns, 1), rows, 0)
+
+    def counts(self) -> dict[str, int]:
+        """Scene pixels that the map shows, that meet the ground beyond its reach, and that meet none."""
+        view, total = self.frame.view, self.scene_shape[0] * self.scene_shape[1]
+        near, ground = (view.count_ground(self.scene_shape, sink) for sink in (self.least_sink, LEAST_SINK))
+        return {"mapped_px": near, "beyond_reach_px": ground - near, "no_ground_px": total - ground}
+
+    def class_areas_m2(self, classes: NDArray[np.uint8], count: int) -> Floats:
+        """Sum the ground under the scene's pixels by class, level share, (count,) [m2].
+
+        Of the pixels that the map shows, and from their footprints: counting the map's pixels would be off by as many
+        as lie on borders between classes.
+
+        Raises
+        ------
+        ShapeError : the class map is not the scene's.
+        """
+        if classes.shape != self.scene_shape:
+            raise ShapeError(f"expected the classes of a scene of {self.scene_shape} px (y, x), got {classes.shape}")
+        view, (y, x) = self.frame.view, pixel_places(self.scene_shape)
+        areas = np.zeros(UNLABELLED + 1)
+        for first in range(0, len(y), ROWS_AT_ONCE):
+            rows = slice(first, first + ROWS_AT_ONCE)
+            points = np.stack(np.meshgrid(y[rows], x, indexing="ij"), axis=-1)
+            seen = np.where(view.sink(points) > self.least_sink, view.area_m2(points), 0.0)
+            areas += np.bincount(classes[rows].ravel(), seen.ravel(), len(areas))
+        return areas[:count]
+
+
+def ground_grid(
+    view: GroundView,
+    scene_shape: tuple[int, int],
+    *,
+    epsg: int | None = None,
+    resolution_m: float | None = None,
+) -> GroundGrid:
+    """Lay a map's grid over the footprint of a field of (y, x) px. Its pixels start at multiples of their side.
+
+    Parameters
+    ----------
+    epsg
+        Code of a projected CRS in metres; None for the rig's UTM zone.
+    resolution_m
+        Side of the map's pixels; None for the median side of a scene pixel's footprint, rounded, or more where a long
+        and narrow footprint would need a far larger map than the scene.
+
+    Raises
+    ------
+    PoseError : no ray of the field meets the ground, the CRS does not suit the place, or the grid would have far more
+        pixels than the scene.
+    """
+    from odc.geo.geobox import GeoBox
+
+    frame = MapFrame(view, map_crs(view.pose, epsg))
+    if not view.count_ground(scene_shape):
+        raise PoseError(
+            f"no ray of the field meets the ground from the pose {view.pose}; tilt it further down, or check roll_deg "
+            "and slope_deg"
+        )
+    least = max(median_sink(view, scene_shape) / FAR_PIXELS ** (2 / 3), LEAST_SINK)  # a footprint's area goes as w^-3
+    left, bottom, right, top = _bounds(frame, view.outline_px(scene_shape, least))
+    growth = USUAL_GROWTH if resolution_m is None else MOST_GROWTH
+    finest = float(np.sqrt((right - left) * (top - bottom) / (growth * scene_shape[0] * scene_shape[1])))
+    median = median_footprint_m(view, scene_shape)
+    step = round_step(max(median, finest)) if resolution_m is None else resolution_m
+    if resolution_m is not None and step < finest:
+        raise PoseError(
+            f"at resolution_m = {step:g} the map would have more than {MOST_GROWTH} times the scene's {scene_shape} "
+            f"pixels; use {1.1 * finest:.2g} or more (the median pixel of the scene sees {median:.2g} m)"
+        )
+    geobox = GeoBox.from_bbox((left, bottom, right, top), crs=frame.crs, resolution=step)
+    return GroundGrid(frame, scene_shape, geobox, least)
+
+
+def median_sink(view: GroundView, scene_shape: tuple[int, int]) -> float:
+    """Give the median by which the rays of a field that meet the ground sink; NaN if none does."""
+    y, x = (np.linspace(places[0], places[-1], min(len(places), SAMPLES)) for places in pixel_places(scene_shape))
+    sink = view.sink(np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1))
+    # w is linear, so that one of the corners, which are among the samples, sinks the most
+    met = sink[sink > LEAST_SINK]
+    return float(np.median(met)) if met.size else float("nan")
+
+
+def median_footprint_m(view: GroundView, scene_shape: tuple[int, int]) -> float:
+    """Side of the square that is as large as the median pixel's footprint, of the pixels that meet the ground."""
+    return float(view.height_m * view.ifov_rad * median_sink(view, scene_shape) ** -1.5)
+
+
+def round_step(step_m: float) -> float:
+    """The nearest of 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8 times a power of ten, by ratio."""
+    power = int(np.floor(np.log10(step_m)))
+    ratios = np.abs(np.log(np.array(ROUND_STEPS) * 10.0**power / step_m))
+    return float(f"{ROUND_STEPS[int(np.argmin(ratios))]:g}e{power}")
+
+
+def _bounds(frame: MapFrame, outline: Floats) -> tuple[float, float, float, float]:
+    """Box on the map around part of a scene, given by its corners [px]; lines of the scene are lines on the ground."""
+    share = np.linspace(0, 1, EDGE_POINTS)[:, None, None]
+    sides = outline + share * (np.roll(outline, -1, axis=0) - outline)
+    places = frame.ground_to_map(frame.view.scene_to_ground(sides.reshape(-1, 2)))
+    if not np.isfinite(places).all():
+        raise PoseError(f"the field's footprint does not fit on the map {frame.crs.name} (pose {frame.view.pose})")
+    left, bottom = places.min(axis=0).tolist()
+    right, top = places.max(axis=0).tolist()
+    return left, bottom, right, top
+
+
+def _ties(pixels: slice) -> Floats:
+    """Edges of pixels at which the ground is exact, from the first to the last."""
+    return np.linspace(pixels.start, pixels.stop, -(-(pixels.stop - pixels.start) // TIE) + 1)
+
+
+def _between(exact: Floats, pixels: slice, axis: int) -> Floats:
+    """Interpolate values at ties linearly to the centres of the pixels along one axis."""
+    count, last = pixels.stop - pixels.start, exact.shape[axis] - 1
+    place = (np.arange(count) + 0.5) * (last / count)
+    index = np.minimum(place.astype(np.intp), last - 1)
+    share = np.expand_dims(place - index, [other for other in range(exact.ndim) if other != axis])
+    lower, upper = np.take(exact, index, axis), np.take(exact, index + 1, axis)
+    between: Floats = lower + share * (upper - lower)
+    return between
+
+
+def map_blocks(shape: tuple[int, int], block: tuple[int, int]) -> Iterator[tuple[slice, slice]]:
+    """Cut a map of (y, x) px into blocks of at most ``block`` px, row by row."""
+    for top in range(0, shape[0], block[0]):
+        for left in range(0, shape[1], block[1]):
+            yield slice(top, min(top + block[0], shape[0])), slice(left, min(left + block[1], shape[1]))
+
+
+def classes_at(classes: NDArray[np.uint8], pixels: Floats) -> NDArray[np.uint8]:
+    """Read a class map (y, x) at image places (row, column, 2): the nearest pixel's class, 255 where NaN."""
+    known: NDArray[np.bool_] = np.all(np.isfinite(pixels), axis=-1)
+    last = np.array(classes.shape) - 1
+    index = np.clip(np.floor(np.where(known[..., None], pixels, 0) + 0.5).astype(np.intp), 0, last)
+    return np.where(known, classes[index[..., 0], index[..., 1]], np.uint8(UNLABELLED))
+
+
+def image_at(image: NDArray[np.float32], pixels: Floats, *, factor: int = 1) -> NDArray[np.float32]:
+    """Read an image bilinearly at places of the scene.
+
+    Parameters
+    ----------
+    image
+        (y, x, band) float32 of pixels ``factor`` scene px wide; NaN is left out, as in ``resample``.
+    pixels
+        (row, column, 2) places in the scene's image, NaN for none. [px]
+
+    Returns
+    -------
+    (row, column, band) float32; NaN where there is no place or no value.
+    """
+    if image.ndim != 3:
+        raise ShapeError(f"an image has axes (y, x, band), got shape {image.shape}")
+    out = np.full((*pixels.shape[:2], image.shape[2]), np.nan, np.float32)
+    places = (pixels + 0.5) / factor - 0.5
+    known: NDArray[np.bool_] = np.all(np.isfinite(places), axis=-1)
+    if not known.any():
+        return out
+    inside = np.clip(places[known], 0, np.array(image.shape[:2]) - 1)  # the border pixels' outer halves
+    first = np.floor(inside.min(axis=0)).astype(int)
+    last = np.ceil(inside.max(axis=0)).astype(int) + 1
+    window = np.ascontiguousarray(image[first[0] : last[0], first[1] : last[1]])
+    valid: NDArray[np.bool_] = np.all(np.isfinite(window), axis=2)
+    out[known] = resample(np.where(valid[..., None], window, 0), valid, inside - first, "bilinear")[0]
+    return out

@@ -1,0 +1,226 @@
+"""The most worth for a budget of seconds, and the least seconds for all worth: covers at falling prices of a second.
+
+Covers are made without regard to the budget, from the dearest second down, and either fit or do not; so a bigger budget
+chooses among more of them and never buys less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.planning.line_cover import NEGLIGIBLE, Cover, Field, Floats, best_cover
+from pipeline.planning.scan_runs import Run, joined
+
+HALVINGS = 4
+PEELS = 8
+MOST_STEPS = 40
+RATE_SLACK = 1e-9
+STEP = 0.88  # from one price of a second to the next
+WIDE_STEP = 0.7
+LEAST_RATE = 1e-10  # of the total worth over the price of all lines, to stand for "whatever it costs"
+
+
+def spend(field: Field, budget_s: float, floor: float = 0.0) -> Cover:
+    """Choose the runs with the most worth found whose true price is at most ``budget_s``.
+
+    Between the two covers that the budget lies between, the price of a second is halved down; what then is left goes
+    to one run more, or to one run made longer. ``worth`` counts what was bought for its worth, at least.
+
+    With a ``floor`` [worth/s] the price of a second never falls below it, and nothing is bought merely to use up the
+    time. A lower floor, or with the same one a bigger budget, never buys less.
+    """
+    low, low_rate = Cover(), np.inf
+    best = low
+    for high, rate in covers(field):
+        if high.seconds(field.prices) > budget_s or rate < floor:
+            return _better(best, _between(field, (low, high), (low_rate, rate), budget_s, floor))
+        low, low_rate, best = high, rate, _better(best, high)
+    return best
+
+
+def full_scan_pays(field: Field, full_s: float, floor: float) -> bool:
+    """Whether what each cover cheaper than a full scan leaves out is worth the rest of its seconds at the floor.
+
+    The covers asked do not depend on the floor: a full scan that pays at one floor does at every lower one.
+    """
+    return not floor or all(
+        field.total - cover.worth >= floor * (full_s - seconds)
+        for cover, seconds in ((cover, cover.seconds(field.prices)) for cover, _ in covers(field))
+        if seconds < full_s
+    )
+
+
+def _better(one: Cover, other: Cover) -> Cover:
+    return other if other.worth > one.worth else one
+
+
+def _between(
+    field: Field, covers: tuple[Cover, Cover], rates: tuple[float, float], budget_s: float, floor: float
+) -> Cover:
+    """Narrow down the edge from a cover that budget and floor allow to one that they do not.
+
+    No cover is taken that is worth more than a dearer one: with a bigger budget only the dearer one is looked at.
+    """
+    (low, high), (low_rate, high_rate) = covers, rates
+    best = low
+    for _ in range(HALVINGS):
+        rate = float(np.sqrt(low_rate * high_rate)) if np.isfinite(low_rate) else high_rate / STEP
+        middle = best_cover(field, low.runs, rate)
+        prices = [cover.seconds(field.prices) for cover in (low, middle, high)]
+        if not (low.worth < middle.worth < high.worth and prices[0] < prices[1] < prices[2]):
+            break
+        if prices[1] <= budget_s and rate >= floor:
+            low, low_rate, best = middle, rate, _better(best, middle)
+        else:
+            high, high_rate = middle, rate
+    for cover in (low, *_peeled(field, high)):
+        for found in (cover,) if floor else (cover, _one_more(field, cover, budget_s)):
+            if found.seconds(field.prices) <= budget_s and _pays(found, low, floor):
+                best = _better(best, replace(found, worth=min(found.worth, high.worth)))
+    return best
+
+
+def _pays(found: Cover, low: Cover, floor: float) -> bool:
+    """Whether what a cover has beyond another is worth its seconds at the floor; without a floor everything is."""
+    return not floor or found.worth - low.worth >= floor * (found.even_s - low.even_s)
+
+
+def _peeled(field: Field, cover: Cover) -> Iterator[Cover]:
+    """Covers with ever less of one: whole runs or their ends go, those first that are worth least per second."""
+    for _ in range(PEELS):
+        seats, times = np.unique(np.concatenate([field.shown_seats(run) for run in cover.runs]), return_counts=True)
+        own = np.zeros(len(field.worth))
+        own[seats[times == 1]] = field.worth[seats[times == 1]]
+        cuts = [(cut, place) for place, run in enumerate(cover.runs) for cut in _cuts(field, run, own)]
+        (_, rest), place = min(cuts, key=lambda cut: cut[0][0])
+        cover = field.cover([*cover.runs[:place], *rest, *cover.runs[place + 1 :]])
+        if not cover.runs:
+            return
+        yield cover
+
+
+def _cuts(field: Field, run: Run, own: Floats) -> list[tuple[float, list[Run]]]:
+    """Best way to shorten a run from its start, from its end, and to drop it: worth lost per second, what remains."""
+    views, prices = field.shown(run), field.prices
+    worth = own[field.views.seat[views]]
+    whole = prices.even_seconds(run.stop - run.first, 1)
+    found: list[tuple[float, list[Run]]] = [(float(worth.sum()) / whole, [])]
+    for from_start in (True, False):
+        away = field.views.first[views] - run.first if from_start else run.stop - field.views.stop[views]
+        order = np.argsort(away, kind="stable")
+        saved, lost = away[order][1:], np.cumsum(worth[order])[:-1]  # without the views before each one
+        if not np.any(saved > 0):
+            continue
+        density = np.where(saved > 0, lost / np.maximum(saved * prices.even_line_s, prices.line_s), np.inf)
+        best = int(density.argmin())
+        cut = int(saved[best])
+        rest = replace(run, first=run.first + cut) if from_start else replace(run, stop=run.stop - cut)
+        found.append((float(density[best]), [rest]))
+    return found
+
+
+def cheapest_cover(field: Field) -> Cover:
+    """Find the least seconds for all seats that are worth something.
+
+    Begun from strips side by side, from each seat on its own, and by the falling prices; the cheapest end is taken.
+    """
+    if field.total <= 0:
+        return Cover()
+    rate, starts = _least_rate(field), ((), tuple(_completed(field, ())))
+    ends = [best_cover(field, start, rate) for start in starts]
+    for cover, _ in covers(field):
+        last = cover
+    found = [field.cover(_completed(field, cover.runs)) for cover in (last, *ends, field.cover(starts[1]))]
+    return min(found, key=lambda cover: cover.seconds(field.prices))
+
+
+def covers(field: Field) -> Iterator[tuple[Cover, float]]:
+    """Covers and the price of a second [worth/s] they are best for, falling; the last shows all seats."""
+    cover = Cover()
+    if field.total <= 0:
+        return
+    step = STEP if len(field.windows) == 1 else WIDE_STEP
+    rate, least, still = _first_rate(field), _least_rate(field), 0
+    while rate > least and cover.worth < field.total * (1 - NEGLIGIBLE):
+        found = best_cover(field, cover.runs, rate)
+        still = still + 1 if found.runs == cover.runs else 0
+        cover = found
+        if not still:
+            yield cover, rate
+        rate *= step ** (2**still)
+    if cover.worth < field.total * (1 - NEGLIGIBLE):
+        yield field.cover(_completed(field, cover.runs)), rate
+
+
+def _first_rate(field: Field) -> float:
+    """The most worth per second that a single run has: where the first of them pays (Dinkelbach, 1967)."""
+    tables, prices = field.tables(field.worth), field.prices
+    seconds = prices.even_line_s * tables.unit * np.arange(tables.closed.shape[1])
+    rate = 0.0
+    for _ in range(MOST_STEPS):
+        toll = tables.begun - rate * seconds
+        net = tables.closed - rate * seconds - np.minimum.accumulate(toll, axis=1)
+        strip, stop = (int(at) for at in np.unravel_index(int(net.argmax()), net.shape))
+        if net[strip, stop] <= 0:
+            break
+        first = int(toll[strip, : stop + 1].argmin())
+        if first == stop:  # nothing but rounding is left to gain
+            break
+        worth = float(tables.closed[strip, stop] - tables.begun[strip, first])
+        density = worth / float(seconds[stop] - seconds[first] + prices.run_s)
+        if density <= rate * (1 + RATE_SLACK):
+            break
+        rate = density
+    return rate
+
+
+def _least_rate(field: Field) -> float:
+    """A rate at which no seat is too dear."""
+    every = field.prices.even_seconds(field.views.lines * len(field.side_by_side), len(field.side_by_side))
+    lowest = float(field.worth[field.worth > 0].min(initial=field.total))
+    return max(LEAST_RATE * field.total, lowest / 2) / max(every, field.prices.line_s)
+
+
+def _one_more(field: Field, cover: Cover, budget_s: float) -> Cover:
+    """Spend what a cover leaves on a run more or a run made longer, whichever shows more."""
+    prices, views, runs = field.prices, field.views, list(cover.runs)
+    tables = field.tables(field.left(runs))
+    options: list[tuple[float, list[Run]]] = []
+    cells = (prices.most_lines(budget_s, len(runs) + 1) - cover.lines) // tables.unit
+    if cells > 0:
+        cells = min(cells, tables.closed.shape[1] - 1)
+        gain = tables.closed[:, cells:] - tables.begun[:, : tables.begun.shape[1] - cells]
+        strip, at = (int(place) for place in np.unravel_index(int(gain.argmax()), gain.shape))
+        new = Run(strip, at * tables.unit, (at + cells) * tables.unit)
+        options.append((float(gain[strip, at]), [*runs, new]))
+    lines = prices.most_lines(budget_s, len(runs)) - cover.lines
+    for place, run in enumerate(runs if lines > 0 else []):
+        for grown in (Run(run.strip, run.first, run.stop + lines), Run(run.strip, run.first - lines, run.stop)):
+            first, stop = max(grown.first, 0), min(grown.stop, views.lines)
+            at, end = -(-first // tables.unit), stop // tables.unit
+            gained = float(tables.closed[run.strip, end] - tables.begun[run.strip, at])
+            options.append((gained, [*runs[:place], Run(run.strip, first, stop), *runs[place + 1 :]]))
+    if not options:
+        return cover
+    gained, chosen = max(options, key=lambda option: option[0])
+    if gained <= NEGLIGIBLE * field.total:
+        return cover
+    chosen = field.trimmed(joined(chosen, 0), field.worth)
+    found = field.cover(chosen)
+    return Cover(found.runs, cover.worth + gained, found.even_s)
+
+
+def _completed(field: Field, runs: Sequence[Run]) -> list[Run]:
+    """Add, for each seat that no run shows, the shortest run that does."""
+    views, found = field.views, list(runs)
+    lengths = views.stop - views.first
+    order = np.lexsort((np.arange(len(lengths)), lengths, views.seat))
+    shortest = order[np.unique(views.seat[order], return_index=True)[1]]
+    left = field.left(found)
+    for view in shortest[left[views.seat[shortest]] > 0].tolist():
+        strip = int(np.searchsorted(views.edges, view, side="right")) - 1
+        found.append(Run(strip, int(views.first[view]), int(views.stop[view])))
+    return joined(found, field.gap)

@@ -1,0 +1,219 @@
+"""Sweeps that cover a whole scene: how many strips, where they lie, how far each has to scan, and what falls beside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import PoseError, SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import (
+    Axis,
+    CostModel,
+    Sweep,
+    points_of_scan,
+    scan_of_points,
+    sweep_positions,
+    sweep_to_scene,
+)
+
+TAPS_BEFORE, TAPS_AFTER = 1, 2  # lines that the resampling kernel reads beside the one at or before a point
+ROUNDING_PX = 1e-6
+_PROBES = 65  # scan positions at which a strip's reach is taken; it changes by 1e-3 px between two
+
+
+def full_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis, *, overlap_px: float = 0) -> list[Sweep]:
+    """Cover the whole scene at full resolution with the fewest strips of lines along one axis.
+
+    Parameters
+    ----------
+    overlap_px
+        Least width that neighbouring strips share, and half of it beyond either end of the field. [px]
+
+    Raises
+    ------
+    PoseError : the field is beyond the mirror's range.
+    SettingsError : an overlap that is negative or leaves nothing of a line.
+    """
+    return _cover(grid, camera, along, step=1, overlap_px=overlap_px)
+
+
+def coarse_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis, *, overlap_px: float = 0) -> list[Sweep]:
+    """Cover the whole scene with lines of ``grid.factor`` held positions and as many samples summed.
+
+    Parameters
+    ----------
+    overlap_px
+        As of :func:`full_sweeps`, in px of the full resolution.
+
+    Raises
+    ------
+    SettingsError : the sum of ``grid.factor`` samples does not fit 16 bits, or a line has fewer samples; or the
+        overlap is negative or leaves nothing of a line.
+    PoseError : the field is beyond the mirror's range.
+    """
+    most = min(camera.most_binning, camera.samples)
+    if grid.factor > most:
+        raise SettingsError(
+            f"the coarse factor must be at most {most} for {camera.bits}-bit lines of {camera.samples} samples "
+            f"(samples are summed in 16 bits), got {grid.factor}"
+        )
+    return _cover(grid, camera, along, step=grid.factor, overlap_px=overlap_px)
+
+
+def cheapest_full(
+    grid: SceneGrid, camera: LineCamera, cost: CostModel, *, overlap_px: float = 0
+) -> tuple[Axis, list[Sweep], float]:
+    """Choose the orientation of the full scan that takes the least time: axis of the lines, sweeps, seconds.
+
+    Parameters
+    ----------
+    overlap_px
+        As of :func:`full_sweeps`.
+
+    Raises
+    ------
+    PoseError : neither orientation is within the mirror's range.
+    """
+    found: list[tuple[Axis, list[Sweep], float]] = []
+    refused: PoseError | None = None
+    axes: tuple[Axis, Axis] = ("x", "y")
+    for along in axes:
+        try:
+            sweeps = full_sweeps(grid, camera, along, overlap_px=overlap_px)
+        except PoseError as error:
+            refused = error
+            continue
+        found.append((along, sweeps, cost.seconds(sweeps, camera)))
+    if not found:
+        assert refused is not None
+        raise refused
+    return min(found, key=lambda option: option[2])
+
+
+def with_margin(sweeps: Sequence[Sweep], camera: LineCamera, margin_px: float) -> list[Sweep]:
+    """Begin every sweep so much earlier and end it so much later, for a mirror that may look beside the plan.
+
+    Raises
+    ------
+    PoseError : a sweep then leaves the mirror's range.
+    """
+    more = [-(-margin_px // sweep.step) for sweep in sweeps]
+    grown = [
+        replace(sweep, start_px=sweep.start_px - count * sweep.step, lines=sweep.lines + 2 * int(count))
+        for sweep, count in zip(sweeps, more, strict=True)
+    ]
+    check_reach(grown, camera)
+    return grown
+
+
+def on_scene(shape: tuple[int, int], camera: LineCamera, sweep: Sweep) -> NDArray[np.bool_]:
+    """Tell which (binned) samples of a sweep look at a pixel of a (y, x) scene, by their rays at mid exposure.
+
+    Rays are exact: line rotation and stretch included.
+
+    Returns
+    -------
+    (line, sample) bool.
+    """
+    height, width = shape
+    across, scan = (width, height) if sweep.along == "x" else (height, width)
+    along_px, scan_px = sweep_to_scene(sweep, camera)
+    inside = np.ones(along_px.shape, bool)
+    for place, size in ((along_px, across), (scan_px, scan)):
+        # Half open: a sample on the border between two pixels falls into the second, and rounding has no say in it.
+        pixel = np.floor(place + size / 2 + ROUNDING_PX)
+        inside &= (pixel >= 0) & (pixel < size)
+    return inside
+
+
+def field_px(grid: SceneGrid, along: Axis) -> tuple[int, int]:
+    """Give the scene's size along the line and along the scan [px]."""
+    return (grid.width, grid.height) if along == "x" else (grid.height, grid.width)
+
+
+def _cover(grid: SceneGrid, camera: LineCamera, along: Axis, *, step: int, overlap_px: float) -> list[Sweep]:
+    if not 0 <= overlap_px < camera.samples // step * step:
+        raise SettingsError(
+            f"strips of lines of {camera.samples} samples can overlap by 0 px or more and less than a line, "
+            f"got {overlap_px} px; choose a smaller overlap"
+        )
+    across, scan = field_px(grid, along)
+    cells = -(-across // step)
+    low, high = -across / 2, cells * step - across / 2
+    kind: Literal["coarse", "fine"] = "fine" if step == 1 else "coarse"
+    name = "full" if step == 1 else "coarse"
+    sweeps = []
+    for number, strip in enumerate(_strip_centres((low, high), scan, camera, step, overlap_px)):
+        ends = strip + reach_px(strip, scan, camera, step)
+        seen = np.clip(ends, low + step / 2, high - step / 2)
+        start, lines = _scan_range(float(strip), seen, scan, camera, step)
+        sweeps.append(Sweep(f"{name}-{number}", kind, along, float(strip), start, lines, step, step))
+    check_reach(sweeps, camera)
+    return sweeps
+
+
+def _strip_centres(
+    field: tuple[float, float], scan: int, camera: LineCamera, binning: int, least_overlap: float
+) -> NDArray[np.float64]:
+    """Place the fewest strips that cover ``field``, all overlaps equal and half as much beyond either end.
+
+    A strip's reach depends on where it lies (the line's image is stretched, more so away from the axis), hence the
+    fixed point; it moves strips by less than 1 % and settles at once.
+    """
+    low, high = field
+    count = 0
+    while True:
+        count += 1
+        centres = low + (np.arange(count) + 0.5) * (high - low) / count
+        for _ in range(8):
+            reach = np.stack([reach_px(float(centre), scan, camera, binning) for centre in centres])
+            width = reach[:, 1] - reach[:, 0]
+            overlap = (width.sum() - (high - low)) / count
+            if overlap < least_overlap - ROUNDING_PX:
+                break
+            starts = low - overlap / 2 + np.concatenate([[0.0], np.cumsum(width - overlap)[:-1]])
+            centres = starts - reach[:, 0]
+        else:
+            return centres
+
+
+def reach_px(strip: float, scan: int, camera: LineCamera, binning: int) -> NDArray[np.float64]:
+    """Tell how far the outer edges of a line's samples lie from its centre, at least: (2,) below and above 0 [px]."""
+    count = camera.samples // binning
+    edges = np.array([-camera.samples / 2, count * binning - camera.samples / 2]) * camera.ifov_rad
+    probes = np.append(np.linspace(-scan / 2, scan / 2, _PROBES), 0.0)
+    along, _ = points_of_scan(strip, camera, probes[:, None], edges)
+    return np.array([along[:, 0].max(), along[:, 1].min()]) - strip
+
+
+def _scan_range(strip: float, seen: NDArray[np.float64], scan: int, camera: LineCamera, step: int) -> tuple[float, int]:
+    """First held position [px] and number of lines that show all rows of ``seen``, rotation and taps included.
+
+    Lines stand on the scene's own rows, so that a strip through the axis needs no interpolation along the scan.
+    """
+    origin = (step - 1 - (scan - 1)) / 2  # centre of the first (coarse) row
+    rows = origin + step * np.array([0, -(-scan // step) - 1])
+    centres, _ = scan_of_points(strip, camera, seen[:, None], rows)
+    # The line through a point moves one way with either coordinate, so the corners hold the extremes.
+    first = int(np.floor((centres.min() - origin) / step + ROUNDING_PX)) - TAPS_BEFORE
+    last = int(np.floor((centres.max() - origin) / step + ROUNDING_PX)) + TAPS_AFTER
+    return -(scan - 1) / 2 + first * step, last - first + 1
+
+
+def check_reach(sweeps: Sequence[Sweep], camera: LineCamera) -> None:
+    """Raise PoseError, naming the sweep, if one of its held positions is beyond the mirror's disk."""
+    for sweep in sweeps:
+        try:
+            sweep_positions(sweep, camera)
+        except PoseError as error:
+            end = float(np.abs(sweep.held_px()).max())
+            raise PoseError(
+                f"sweep {sweep.name} needs lines centred at {sweep.strip_px:.0f} px along and up to {end:.0f} px "
+                f"across, beyond the mirror's range: {error}; use a smaller scene or a smaller angle per pixel"
+            ) from error

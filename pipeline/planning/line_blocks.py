@@ -1,0 +1,141 @@
+"""Two ways to spend seconds on lines that need no model: blocks evenly spaced over the field, or placed at random.
+
+A block is as wide as some rows of seats need, taps and the line's rotation included, so that all it shows is used. Wide
+blocks waste fewer lines and set-ups, narrow ones are spread better and leave fewer of the seconds unspent: the width
+that shows most seats for the seconds is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Axis, CostModel, Sweep
+from pipeline.planning.strips import Views, covered_seats, look_from, strips_at_seats
+
+WIDTHS = (1, 2, 3, 4, 6, 8, 16)  # rows of seats in a block
+
+
+@dataclass(frozen=True)
+class Block:
+    """Lines ``first`` to ``stop`` of one strip: what rows of its seats need."""
+
+    strip: int
+    first: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Lines of the fine pass and the seats they show, ascending."""
+
+    sweeps: list[Sweep]
+    seats: NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class LineBlocks:
+    """All blocks of a field, strip by strip in the order of the scan, and what they cost."""
+
+    grid: SceneGrid
+    camera: LineCamera
+    cost: CostModel
+    strips: tuple[Sweep, ...]
+    blocks: tuple[Block, ...]
+
+    def sweeps(self, chosen: Sequence[Block]) -> list[Sweep]:
+        """Blocks as sweeps; those closer than a second set-up takes are scanned through."""
+        setup = self.cost.setup_seconds(self.camera) / (self.camera.frame_ms * 1e-3)
+        runs: list[Block] = []
+        for block in sorted(chosen, key=lambda one: (one.strip, one.first)):
+            if runs and runs[-1].strip == block.strip and block.first - runs[-1].stop <= setup:
+                runs[-1] = replace(runs[-1], stop=max(runs[-1].stop, block.stop))
+            else:
+                runs.append(block)
+        return [
+            replace(
+                self.strips[run.strip],
+                name=f"block-{run.strip}-{run.first:05d}",
+                start_px=self.strips[run.strip].start_px + run.first,
+                lines=run.stop - run.first,
+            )
+            for run in runs
+        ]
+
+    def seconds(self, chosen: Sequence[Block]) -> float:
+        """Price of some blocks [s]."""
+        return self.cost.seconds(self.sweeps(chosen), self.camera)
+
+    def seats(self, chosen: Sequence[Block]) -> NDArray[np.intp]:
+        """Give the seats that blocks show, ascending."""
+        return covered_seats(self.grid, self.camera, self.sweeps(chosen))
+
+    def evenly(self, budget_s: float) -> list[Block]:
+        """Choose the most evenly spaced blocks that the seconds pay for."""
+        total = len(self.blocks)
+
+        def spaced(count: int) -> list[Block]:
+            return [self.blocks[int((number + 0.5) * total / count)] for number in range(count)]
+
+        for count in range(total, 0, -1):
+            if self.seconds(spaced(count)) <= budget_s:
+                return spaced(count)
+        return []
+
+    def at_random(self, budget_s: float, rng: np.random.Generator) -> list[Block]:
+        """Choose blocks in a random order, leaving out those that the seconds do not pay for any more."""
+        chosen: list[Block] = []
+        for number in rng.permutation(len(self.blocks)):
+            grown = [*chosen, self.blocks[number]]
+            if self.seconds(grown) <= budget_s:
+                chosen = grown
+        return chosen
+
+
+def most_shown(options: Sequence[LineBlocks], choose: Callable[[LineBlocks], list[Block]]) -> Lines:
+    """Choose blocks of every width, and give the lines of the one that shows the most seats."""
+    chosen = [Lines(blocks.sweeps(some), blocks.seats(some)) for blocks in options for some in [choose(blocks)]]
+    return max(chosen, key=lambda lines: len(lines.seats))
+
+
+def line_blocks(grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis, rows: int = 1) -> LineBlocks:
+    """Cut the field into blocks of ``rows`` rows of seats, on the fewest strips that show every seat that can be."""
+    valid = grid.valid_share().ravel() > 0
+    views = look_from(grid, camera, strips_at_seats(grid, camera, along), valid)
+    across = _places_across(grid, along)
+    strips = _fewest_strips(views, across)
+    down = np.arange(len(valid)) // grid.seat_shape[1] if along == "x" else np.arange(len(valid)) % grid.seat_shape[1]
+    blocks = []
+    for number, strip in enumerate(strips):
+        own = slice(views.edges[strip], views.edges[strip + 1])
+        row, first, stop = down[views.seat[own]] // rows, views.first[own], views.stop[own]
+        blocks += [Block(number, int(first[row == at].min()), int(stop[row == at].max())) for at in np.unique(row)]
+    return LineBlocks(grid, camera, cost, tuple(views.strips[strip] for strip in strips), tuple(blocks))
+
+
+def _places_across(grid: SceneGrid, along: Axis) -> NDArray[np.intp]:
+    """Place of each seat along the line, (seat,)."""
+    row, column = np.divmod(np.arange(int(np.prod(grid.seat_shape))), grid.seat_shape[1])
+    return column if along == "x" else row
+
+
+def _fewest_strips(views: Views, across: NDArray[np.intp]) -> list[int]:
+    """Go along the line: of the strips that show the first seats not shown yet, take the one that shows farthest."""
+    shown = [
+        np.unique(across[views.seat[views.edges[number] : views.edges[number + 1]]])
+        for number in range(len(views.strips))
+    ]
+    left = set(np.concatenate(shown).tolist()) if shown else set()
+    chosen: list[int] = []
+    while left:
+        first = min(left)
+        able = [number for number, places in enumerate(shown) if first in places]
+        best = max(able, key=lambda number: len(left & set(shown[number].tolist())))
+        chosen.append(best)
+        left -= set(shown[best].tolist())
+    return chosen

@@ -1,0 +1,238 @@
+"""Which runs of which strips are worth their price, when a second costs so much worth and strips lie at any offset.
+
+Strips overlap, so a seat is seen from several and counts once. A plan is several chains of runs, one run after the
+other along the scan; each chain in turn is chosen anew over all offsets, exactly, with the others held, until none
+gets better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.planning.scan_runs import Prices, Run, Tables, best_chains, joined
+from pipeline.planning.strips import Views
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+MOST_ROUNDS, WIDE_ROUNDS = 6, 2
+LEAST_BLOCK = 4
+TABLE_CELLS = 1_000_000
+NEGLIGIBLE = 1e-12  # of the total worth
+
+
+@dataclass(frozen=True)
+class Cover:
+    """Runs, what the seats they show are worth together, and their additive price."""
+
+    runs: tuple[Run, ...] = ()
+    worth: float = 0.0
+    even_s: float = 0.0
+
+    @property
+    def lines(self) -> int:
+        """Lines of all runs."""
+        return sum(run.stop - run.first for run in self.runs)
+
+    def seconds(self, prices: Prices) -> float:
+        """True price, whole reloads [s]."""
+        return prices.seconds(self.lines, len(self.runs))
+
+
+@dataclass(frozen=True)
+class Field:
+    """What can be seen from where, what it is worth, and what lines cost."""
+
+    views: Views
+    worth: Floats  # (seat,), 0 for seats that are not wanted
+    column: Ints  # (seat,) place along the line: strips that share none are planned apart
+    prices: Prices
+
+    @cached_property
+    def total(self) -> float:
+        """Worth of all seats that some strip shows."""
+        return float(self.worth[np.unique(self.views.seat)].sum())
+
+    @property
+    def gap(self) -> int:
+        """Lines between two runs of a strip that cost no more than a second set-up."""
+        return int(self.prices.run_s / self.prices.even_line_s)
+
+    @cached_property
+    def unit(self) -> int:
+        """Lines between two borders of the tables: 1 unless the field is too large for that."""
+        return max(-(-(self.views.lines + 1) * len(self.views.strips) // TABLE_CELLS), 1)
+
+    @cached_property
+    def _cells(self) -> tuple[int, Ints, Ints]:
+        """Borders along the scan, and the flat table cells of the views' stops (rounded up) and first lines (down)."""
+        borders = -(-self.views.lines // self.unit) + 1
+        row = self.views.strip * borders
+        begun = np.minimum(self.views.first // self.unit + 1, borders - 1)
+        return borders, row - (-self.views.stop // self.unit), row + begun
+
+    def tables(self, left: Floats) -> Tables:
+        """Cumulate what is left to show, (seat,), over the lines of every strip."""
+        borders, *places = self._cells
+        weight, shape = left[self.views.seat], (len(self.views.strips), borders)
+        closed, begun = (np.bincount(at, weight, shape[0] * borders).reshape(shape) for at in places)
+        length = int((self.views.stop - self.views.first).min(initial=self.views.lines))
+        block = max(length // self.unit, LEAST_BLOCK)
+        return Tables(np.cumsum(closed, axis=1), np.cumsum(begun, axis=1), self.unit, block)
+
+    def shown(self, run: Run) -> Ints:
+        """Numbers of the views that lie in a run, (view,)."""
+        low, high = self.views.edges[run.strip : run.strip + 2]
+        inside = (self.views.first[low:high] >= run.first) & (self.views.stop[low:high] <= run.stop)
+        shown: Ints = low + np.flatnonzero(inside)
+        return shown
+
+    def shown_seats(self, run: Run) -> Ints:
+        """Seats that lie in a run, (seat,)."""
+        seats: Ints = self.views.seat[self.shown(run)]
+        return seats
+
+    def left(self, runs: Sequence[Run]) -> Floats:
+        """Worth of each seat that no run shows, 0 for the others, (seat,)."""
+        left = self.worth.copy()
+        for run in runs:
+            left[self.shown_seats(run)] = 0.0
+        return left
+
+    def cover(self, runs: Sequence[Run]) -> Cover:
+        """Price runs and count what they show."""
+        seats = self._seats(runs)
+        return Cover(tuple(runs), float(self.worth[seats].sum()), self._even_seconds(runs))
+
+    def net(self, runs: Sequence[Run], left: Floats, rate: float) -> float:
+        """Worth less price of runs, given what is left to show and that a second costs ``rate``."""
+        return float(left[self._seats(runs)].sum()) - rate * self._even_seconds(runs)
+
+    def _seats(self, runs: Sequence[Run]) -> Ints:
+        return np.unique(np.concatenate([np.zeros(0, np.intp), *map(self.shown_seats, runs)]))
+
+    def _even_seconds(self, runs: Sequence[Run]) -> float:
+        return self.prices.even_seconds(sum(run.stop - run.first for run in runs), len(runs))
+
+    def trimmed(self, runs: Sequence[Run], left: Floats) -> list[Run]:
+        """Shorten runs to the views that each adds to what is left, one after the other; drop those that add none."""
+        left, kept = left.copy(), []
+        for run in runs:
+            views = self.shown(run)
+            views = views[left[self.views.seat[views]] > 0]
+            if len(views):
+                first, stop = int(self.views.first[views].min()), int(self.views.stop[views].max())
+                kept.append(replace(run, first=first, stop=stop))
+                left[self.views.seat[views]] = 0.0
+        return kept
+
+    @cached_property
+    def windows(self) -> tuple[Ints, ...]:
+        """Sets of windows, (window, strip) each, that together hold every strip; those of a set share no seat column.
+
+        One window of all strips where the field is up to about three of them wide.
+        """
+        low, high = self._spans
+        count, width = len(low), int((high - low).max(initial=0)) + 1
+        if count <= 2 * width + 2:
+            return (np.arange(count)[None, :],)
+        sets = []
+        for start in range(0, 2 * width, width):
+            rows, at = [], start
+            while at < count:
+                rows.append(np.minimum(np.arange(at, at + width), count - 1))
+                at = max(int(np.searchsorted(low, high[rows[-1][-1]], side="right")), at + width)
+            sets.append(np.stack(rows))
+        return tuple(sets)
+
+    @cached_property
+    def side_by_side(self) -> Ints:
+        """Strips that share no seat column, from the lower end up, (window, 1): the layout of a full scan."""
+        low, high = self._spans
+        found, last = [0], len(low) - 1
+        while high[found[-1]] < high[-1]:
+            found.append(min(max(int(np.searchsorted(low, high[found[-1]], side="right")), found[-1] + 1), last))
+        return np.array(found)[:, None]
+
+    @cached_property
+    def _spans(self) -> tuple[Ints, Ints]:
+        """First and last column of the seats that each strip shows, made ascending."""
+        column, count = self.column[self.views.seat], len(self.views.strips)
+        low, high = np.full(count, int(column.max(initial=0))), np.zeros(count, np.intp)
+        np.minimum.at(low, self.views.strip, column)
+        np.maximum.at(high, self.views.strip, column)
+        return np.minimum.accumulate(low[::-1])[::-1], np.maximum.accumulate(high)
+
+
+def best_cover(field: Field, start: Sequence[Run], rate: float) -> Cover:
+    """Find the runs with the most worth less price when a second costs ``rate`` of worth.
+
+    The search goes from ``start``, and from the strips of a full scan where the field is up to about three of them wide
+    or ``start`` has no runs; each step is better than the one before, and it ends where no chain can be bettered.
+    """
+    starts = [list(start)]
+    if len(field.windows) == 1 or not start:
+        side = best_chains(field.tables(field.worth), field.side_by_side, *_priced(field, rate))
+        starts.append(field.trimmed([run for chain in side for run in chain], field.worth))
+    found = [field.cover(_settle(field, runs, rate)) for runs in starts]
+    return max(found, key=lambda cover: cover.worth - rate * cover.even_s)
+
+
+def _settle(field: Field, start: Sequence[Run], rate: float) -> list[Run]:
+    """Choose chain after chain anew until a round changes none."""
+    runs = joined(start, field.gap)
+    for _ in range(MOST_ROUNDS if len(field.windows) == 1 else WIDE_ROUNDS):
+        before = runs
+        for windows in field.windows:
+            runs = _round(field, runs, windows, rate)
+        if runs == before:
+            break
+    return runs
+
+
+def _round(field: Field, runs: list[Run], windows: Ints, rate: float) -> list[Run]:
+    """Choose each chain of each window anew, and try one chain more."""
+    members = [set(window.tolist()) for window in windows]
+    layer, layers = 0, 1
+    while layer < layers:
+        chains = [_chains([run for run in runs if run.strip in strips]) for strips in members]
+        layers = max(map(len, chains)) + 1
+        chosen = [chain[layer] if layer < len(chain) else [] for chain in chains]
+        runs = _again(field, runs, windows, chosen, rate)
+        layer += 1
+    return runs
+
+
+def _chains(runs: Sequence[Run]) -> list[list[Run]]:
+    """Share runs among as few chains as it takes."""
+    chains: list[list[Run]] = []
+    for run in sorted(runs, key=lambda run: (run.first, run.strip)):
+        home = next((chain for chain in chains if chain[-1].stop <= run.first), None)
+        if home is None:
+            chains.append([run])
+        else:
+            home.append(run)
+    return chains
+
+
+def _again(field: Field, runs: list[Run], windows: Ints, chosen: list[list[Run]], rate: float) -> list[Run]:
+    """Choose one chain of each window anew, the other runs held; keep the old one where it is not bettered."""
+    old = {run for chain in chosen for run in chain}
+    kept = [run for run in runs if run not in old]
+    left = field.left(kept)
+    found = best_chains(field.tables(left), windows, *_priced(field, rate))
+    for new, chain in zip(found, chosen, strict=True):
+        trimmed = field.trimmed(new, left)
+        better = field.net(trimmed, left, rate) > field.net(chain, left, rate) + NEGLIGIBLE * field.total
+        kept += trimmed if better else chain
+    return joined(kept, field.gap)
+
+
+def _priced(field: Field, rate: float) -> tuple[float, float]:
+    """Line and set-up in units of worth."""
+    return rate * field.prices.even_line_s, rate * field.prices.run_s

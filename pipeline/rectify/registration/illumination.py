@@ -1,0 +1,201 @@
+"""Illumination: how much brighter each sweep was lit than the others, per band, from what overlaps show twice."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SettingsError, ShapeError
+from pipeline.geometry.camera import LineCamera
+from pipeline.rectify.placed import PixelGrid, Placed
+from pipeline.rectify.region import mosaic_tile
+from pipeline.rectify.registration.overlaps import Window
+
+Floats = NDArray[np.float64]
+
+ORDER = 3  # of the polynomial in wavelength: daylight drifts by colour, not by line
+ERROR_FLOOR = 1e-3  # of a log ratio
+SIGMA_OF_MEDIAN = 1.4826  # standard deviation of a normal law over its median absolute deviation
+MEDIAN_LOSS = 1.2533  # standard error of a median over that of a mean
+PROBE_ROWS = 96  # at the middle of every window
+GROUP_PX = 16  # side of the squares whose sums are compared: some periods of crop rows
+LEAST_GROUPS = 5
+
+
+@dataclass(frozen=True)
+class LightRatio:
+    """How much brighter one sweep was than another where both saw the same ground."""
+
+    reference: int  # number of the sweep
+    moving: int
+    log_ratio: Floats  # (band,) of moving over reference; NaN where too little was seen
+    error: Floats  # (band,) standard error, infinite where the ratio is NaN
+
+
+@dataclass(frozen=True)
+class SweepLights:
+    """Light of every sweep relative to the geometric mean of those that overlaps join."""
+
+    light: NDArray[np.float32]  # (sweep, band), 1 on average
+    residual: Floats  # (ratio, band) measured less modelled log ratio
+    untied: tuple[int, ...]  # sweeps in no ratio: left at 1
+
+    def gain(self, sweep: int) -> NDArray[np.float32]:
+        """Give what a sweep's values are to be multiplied by, (band,): one over its light."""
+        one: NDArray[np.float32] = 1 / self.light[sweep]
+        return one
+
+
+def light_ratio(
+    reference_values: NDArray[np.floating], moving_values: NDArray[np.floating], *, pair: tuple[int, int]
+) -> LightRatio:
+    """Compare two sweeps over the same points.
+
+    The points come in groups (squares of pixels). The ratio is the median over groups of the ratio of their sums: sums
+    first, so that noise has no say in the sign of a pixel; the median, so that what moved between the sweeps has none.
+
+    Parameters
+    ----------
+    reference_values, moving_values
+        (group, point, band) calibrated values; NaN where not seen.
+    pair
+        Numbers of the two sweeps.
+
+    Raises
+    ------
+    ShapeError : the two differ in shape or are not (group, point, band).
+    """
+    if reference_values.ndim != 3 or reference_values.shape != moving_values.shape:
+        raise ShapeError(
+            f"expected two arrays (group, point, band) of the same points, got {reference_values.shape} and "
+            f"{moving_values.shape}"
+        )
+    both = np.isfinite(reference_values) & np.isfinite(moving_values)
+    sums = [np.where(both, values, 0).sum(axis=1, dtype=np.float64) for values in (reference_values, moving_values)]
+    usable = (sums[0] > 0) & (sums[1] > 0)
+    each = np.full(usable.shape, np.nan)
+    each[usable] = np.log(sums[1][usable] / sums[0][usable])
+    ratio, error = np.full(each.shape[1], np.nan), np.full(each.shape[1], np.inf)
+    count = usable.sum(axis=0)
+    for band in np.flatnonzero(count >= LEAST_GROUPS):
+        known = each[usable[:, band], band]
+        ratio[band] = np.median(known)
+        spread = SIGMA_OF_MEDIAN * np.median(np.abs(known - ratio[band]))
+        error[band] = MEDIAN_LOSS * spread / np.sqrt(len(known))
+    return LightRatio(*pair, ratio, error)
+
+
+def solve_lights(
+    ratios: Sequence[LightRatio], sweeps: int, wavelength_nm: Floats, *, order: int = ORDER
+) -> SweepLights:
+    """Find the light of every sweep from the ratios of all pairs.
+
+    Least squares of log ratios, each weighted by its error, with the log light of a sweep a polynomial in wavelength.
+    Overlaps see ratios only: the mean log light of sweeps that they join is 0 at every wavelength.
+
+    Parameters
+    ----------
+    sweeps
+        How many there are.
+    wavelength_nm
+        (band,) in any order. [nm]
+
+    Raises
+    ------
+    SettingsError : the order is negative.
+    ShapeError : a ratio has another number of bands, or names a sweep that is not there.
+    """
+    bands = len(wavelength_nm)
+    if order < 0:
+        raise SettingsError(f"the order in wavelength must be 0 or more, got {order}")
+    for ratio in ratios:
+        if ratio.log_ratio.shape != (bands,) or not {ratio.reference, ratio.moving} <= set(range(sweeps)):
+            raise ShapeError(
+                f"a ratio of sweeps {ratio.reference} and {ratio.moving} has {len(ratio.log_ratio)} bands; "
+                f"there are {sweeps} sweeps of {bands} bands"
+            )
+    known = [ratio for ratio in ratios if np.isfinite(ratio.log_ratio).any()]
+    basis = _basis(wavelength_nm, order)
+    answer = np.zeros((sweeps, basis.shape[1]))
+    if known:
+        rows, wanted = zip(*(_equations(ratio, sweeps, basis) for ratio in known), strict=True)
+        # The least solution: what no ratio sees, the mean of joined sweeps, is 0.
+        solved, *_ = np.linalg.lstsq(np.vstack(rows), np.concatenate(wanted), rcond=1e-10)
+        answer = solved.reshape(sweeps, -1)
+    log_light = answer @ basis.T
+    residual = [r.log_ratio - log_light[r.moving] + log_light[r.reference] for r in ratios]
+    seen = {number for ratio in known for number in (ratio.reference, ratio.moving)}
+    return SweepLights(
+        np.exp(log_light).astype(np.float32),
+        np.array(residual).reshape(len(ratios), bands),
+        tuple(number for number in range(sweeps) if number not in seen),
+    )
+
+
+def overlap_light(placed: Sequence[Placed], camera: LineCamera, windows: Sequence[Window]) -> list[LightRatio]:
+    """Read both sweeps of every pair at the middle rows of their windows, and compare them band by band.
+
+    A window takes 96 rows from either sweep, every pixel of them, summed in squares of 16 px: single rows, or every
+    few pixels, would meet crop rows always at one place between two plants, which two sweeps do not blur alike, and
+    their ratio would pass for light.
+
+    Parameters
+    ----------
+    placed
+        Sweeps where registration has put them, without a gain.
+    windows
+        Of registration, wide enough ones.
+
+    Returns
+    -------
+    One ratio for every pair in ``windows``.
+    """
+    ratios = []
+    for pair in sorted({(window.reference, window.moving) for window in windows}):
+        here = [window for window in windows if (window.reference, window.moving) == pair]
+        sides = [[_probe(placed[number], camera, window) for window in here] for number in pair]
+        rows, columns = (min(GROUP_PX, *(values.shape[axis] for values in sides[0])) for axis in (0, 1))
+        both = (np.concatenate([_squares(values, rows, columns) for values in side]) for side in sides)
+        ratios.append(light_ratio(*both, pair=pair))
+    return ratios
+
+
+def _probe(placed: Placed, camera: LineCamera, window: Window) -> NDArray[np.float32]:
+    """Values of one sweep in a window, (row along the scan, column along the line, band)."""
+    sweep = placed.lines.sweep
+    spacing = sweep.step
+    middle = sum(window.scan_px) / 2
+    rows = min(PROBE_ROWS, int((window.scan_px[1] - window.scan_px[0]) // spacing) + 1)
+    columns = int((window.along_px[1] - window.along_px[0]) // spacing) + 1
+    start = middle - (rows - 1) / 2 * spacing, window.along_px[0]
+    turned = sweep.along == "y"
+    grid = PixelGrid(start[::-1] if turned else start, spacing, (columns, rows) if turned else (rows, columns))
+    values, _ = mosaic_tile([placed], camera, grid, slice(0, grid.shape[0]), slice(0, grid.shape[1]), kernel="bilinear")
+    return values.swapaxes(0, 1) if turned else values
+
+
+def _squares(values: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float32]:
+    """Cut (row, column, band) into groups of neighbours, (group, point, band); what is left at the ends falls away."""
+    down, across, bands = values.shape[0] // rows, values.shape[1] // columns, values.shape[2]
+    whole = values[: down * rows, : across * columns].reshape(down, rows, across, columns, bands)
+    return whole.swapaxes(1, 2).reshape(down * across, rows * columns, bands)
+
+
+def _basis(wavelength_nm: Floats, order: int) -> Floats:
+    """Legendre polynomials over the range of the wavelengths, (band, order + 1); no more than there are bands."""
+    low, high = float(np.min(wavelength_nm)), float(np.max(wavelength_nm))
+    place = (2 * np.asarray(wavelength_nm, np.float64) - low - high) / max(high - low, 1e-9)
+    different = len(np.unique(wavelength_nm))
+    return np.polynomial.legendre.legvander(place, min(order, different - 1)).astype(np.float64)
+
+
+def _equations(ratio: LightRatio, sweeps: int, basis: Floats) -> tuple[Floats, Floats]:
+    known = np.isfinite(ratio.log_ratio)
+    weight = 1 / np.hypot(ratio.error[known], ERROR_FLOOR)
+    rows = np.zeros((int(known.sum()), sweeps, basis.shape[1]))
+    rows[:, ratio.moving] += basis[known]
+    rows[:, ratio.reference] -= basis[known]
+    return rows.reshape(len(rows), -1) * weight[:, None], ratio.log_ratio[known] * weight

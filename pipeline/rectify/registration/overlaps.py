@@ -1,0 +1,235 @@
+"""Overlaps of neighbouring sweeps: broad-band images of sweeps, and the windows in which two of them can be compared.
+
+Places are (along, scan) in px from the undeflected direction, as in ``pipeline.geometry.scan``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
+from pipeline.geometry.scan import Axis, Sweep, shifted_position
+from pipeline.rectify.calibration.calibrate import calibrate
+from pipeline.rectify.lookup import track_lookup
+from pipeline.rectify.resample import resample
+from pipeline.rectify.tracks import Track, make_tracks
+from pipeline.source import References, SweepLines
+
+Floats = NDArray[np.float64]
+
+LEAST_OVERLAP_PX = 64.0  # of the smaller side of a window, after the largest shift; below it errors grow fast
+BROAD_BANDS = 16
+BLOCK_LINES = 64
+EDGE_LINES = 16  # every how many lines a sweep's edges are taken; they bend by 1e-3 px between
+
+
+@dataclass(frozen=True)
+class BroadSweep:
+    """A sweep as its registration sees it: one image, the mean of a few bands, 4 bytes a sample."""
+
+    sweep: Sweep
+    position: Floats  # (line, 2) mirror X and Y as reported
+    usable: NDArray[np.bool_]  # (line,)
+    image: NDArray[np.float32]  # (line, sample), NaN where a band is not valid
+
+    @classmethod
+    def read(
+        cls,
+        lines: SweepLines,
+        camera: LineCamera,
+        *,
+        bands: int = BROAD_BANDS,
+        usable: NDArray[np.bool_] | None = None,
+    ) -> BroadSweep:
+        """Read and calibrate a sweep's lines, 64 at a time, keeping the mean of ``bands`` bands spread over all.
+
+        Parameters
+        ----------
+        usable
+            (line,) lines whose position may be believed; None takes ``lines.valid_line``.
+        """
+        chosen = broad_bands(lines.references, bands)
+        references = _of_bands(lines.references, chosen)
+        total = len(lines.valid_line)
+        image = np.full((total, references.dark.shape[0]), np.nan, np.float32)
+        saturated = camera.full_scale_dn * lines.sweep.binning
+        position = np.asarray(lines.position, np.float64)
+        usable = (lines.valid_line if usable is None else usable) & np.isfinite(position).all(axis=1)
+        for first in range(0, total, BLOCK_LINES):
+            part = slice(first, min(first + BLOCK_LINES, total))
+            raw = np.ascontiguousarray(lines.read(part.start, part.stop)[..., chosen])
+            at = np.where(usable[part, None], position[part], np.nan)
+            values, valid = calibrate(raw, references, saturated_dn=saturated, position=at)
+            whole = valid if valid.ndim == 2 else valid.all(axis=2)
+            image[part] = np.where(whole & usable[part, None], values.mean(axis=2), np.nan)
+        return cls(lines.sweep, position, usable, image)
+
+    def tracks(self, camera: LineCamera, shift_px: Floats | None = None) -> tuple[Track, ...]:
+        """Where the lines lie, with a correction (line, 2) of their centres."""
+        return make_tracks(
+            self.position, camera, usable=self.usable, shift_px=shift_px,
+            binning=self.sweep.binning, step_px=self.sweep.step,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PlacedImage:
+    """A broad-band image and where its lines lie after correction."""
+
+    broad: BroadSweep
+    camera: LineCamera
+    shift_px: Floats  # (line, 2)
+
+    @cached_property
+    def position(self) -> Floats:
+        """(usable line, 2) corrected mirror positions."""
+        usable = self.broad.usable
+        return shifted_position(self.broad.position[usable], self.shift_px[usable], self.camera)
+
+    @cached_property
+    def tracks(self) -> tuple[tuple[Track, NDArray[np.float32]], ...]:
+        """Every track with its image, (knot, sample): lines that show one place are averaged."""
+        return tuple(
+            (track, _knot_image(track, self.broad.image)) for track in self.broad.tracks(self.camera, self.shift_px)
+        )
+
+    def seen_at(self, along_px: Floats, scan_px: Floats) -> NDArray[np.float32]:
+        """Rectify a window, (scan, along) float32; NaN where nothing was seen."""
+        points = _points(along_px, scan_px, self.broad.sweep.along)
+        seen = np.full(len(points), np.nan, np.float32)
+        for track, image in self.tracks:
+            at = track_lookup(
+                track, self.camera, points, along=self.broad.sweep.along, binning=self.broad.sweep.binning
+            )
+            values, _ = resample(image[..., None], np.isfinite(image), at)
+            seen = np.where(np.isnan(seen), values[:, 0], seen)
+        return seen.reshape(len(scan_px), len(along_px))
+
+    def line_and_turn(self, along_px: float, scan_px: float) -> tuple[float, Floats] | None:
+        """The line that sees a place, and how the place moves with that line's centre, (2, 2); None off the sweep."""
+        points = _points(np.array([along_px]), np.array([scan_px]), self.broad.sweep.along)
+        for track, _ in self.tracks:
+            (at,) = track_lookup(
+                track, self.camera, points, along=self.broad.sweep.along, binning=self.broad.sweep.binning
+            )
+            if np.isfinite(at).all():
+                line = int(track.lines[track.starts[int(np.clip(np.rint(at[0]), 0, len(track.scan) - 1))]])
+                return float(line), self._turn(line, float(at[1]))
+        return None
+
+    @cached_property
+    def turn_at_middle(self) -> Floats:
+        """How the place that the middle sample of the middle usable line sees moves with the line's centre, (2, 2)."""
+        usable = np.flatnonzero(self.broad.usable)
+        return self._turn(int(usable[len(usable) // 2]), (self.broad.image.shape[1] - 1) / 2)
+
+    def _turn(self, line: int, sample: float) -> Floats:
+        slope = (sample + 0.5) * self.broad.sweep.binning - self.camera.samples / 2
+        steps = np.array([[0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]])
+        position = shifted_position(self.broad.position[line], self.shift_px[line] + steps, self.camera)
+        seen = places_seen(position, np.array([slope]) * self.camera.ifov_rad, self.camera)[:, 0]
+        return np.stack([seen[0] - seen[1], seen[2] - seen[3]], axis=1)
+
+    @cached_property
+    def edges(self) -> Floats:
+        """Places of both ends of every 16th line, (end, line, 2) along and scan, by ascending scan [px]."""
+        count = len(self.position)
+        lines = np.unique(np.append(np.arange(0, count, EDGE_LINES), max(count - 1, 0)))[:count]
+        half = self.camera.samples // self.broad.sweep.binning * self.broad.sweep.binning
+        ends = (np.array([0.0, half]) - self.camera.samples / 2) * self.camera.ifov_rad
+        seen = places_seen(self.position[lines], ends, self.camera).swapaxes(0, 1)
+        return np.stack([end[np.argsort(end[:, 1], kind="stable")] for end in seen])
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle that two sweeps should both have seen, after the shift that is possible."""
+
+    reference: int
+    moving: int
+    along_px: tuple[float, float]
+    scan_px: tuple[float, float]
+
+    @property
+    def width_px(self) -> float:
+        """The smaller side."""
+        return min(self.along_px[1] - self.along_px[0], self.scan_px[1] - self.scan_px[0])
+
+
+def places_seen(position: Floats, slopes: Floats, camera: LineCamera) -> Floats:
+    """Places along and scan that rays of some slopes meet from some mirror positions, (position, slope, 2) [px]."""
+    rays = np.stack([np.zeros_like(slopes), slopes, np.ones_like(slopes)], axis=-1)
+    return direction_to_scene(reflect(rays, position_to_normal(position)[:, None])) / camera.ifov_rad
+
+
+def overlap_windows(images: Sequence[PlacedImage], *, window_px: float) -> list[Window]:
+    """Cut the overlaps of all pairs of sweeps into windows of at most ``window_px`` along the scan.
+
+    A window is as wide as both sweeps reach all along it. Which of them are wide enough is for the caller to say.
+    """
+    if not window_px >= LEAST_OVERLAP_PX:
+        raise SettingsError(f"windows must be at least {LEAST_OVERLAP_PX:.0f} px long, got {window_px} px")
+    seen = [number for number, image in enumerate(images) if image.broad.usable.any()]
+    return [
+        window
+        for place, one in enumerate(seen)
+        for other in seen[place + 1 :]
+        if images[one].broad.sweep.along == images[other].broad.sweep.along
+        for window in _pair_windows(images, one, other, window_px)
+    ]
+
+
+def _pair_windows(images: Sequence[PlacedImage], one: int, other: int, window_px: float) -> Iterator[Window]:
+    edges = [images[number].edges for number in (one, other)]
+    low = max(float(edge[..., 1].min()) for edge in edges)
+    high = min(float(edge[..., 1].max()) for edge in edges)
+    count = int(np.ceil((high - low) / window_px))
+    cuts = np.linspace(low, high, max(count, 0) + 1)
+    for start, stop in zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True):
+        probes = np.linspace(start, stop, 5)
+        reach = [[np.interp(probes, end[:, 1], end[:, 0]) for end in edge] for edge in edges]
+        left = max(float(ends[0].max()) for ends in reach)
+        right = min(float(ends[1].min()) for ends in reach)
+        if right > left:
+            yield Window(one, other, (left, right), (start, stop))
+
+
+def _points(along_px: Floats, scan_px: Floats, along: Axis) -> Floats:
+    """Places of a window row by row, (n, 2) y and x [px]."""
+    scan, line = (values.ravel() for values in np.meshgrid(scan_px, along_px, indexing="ij"))
+    points: Floats = np.stack([scan, line] if along == "x" else [line, scan], axis=-1)
+    return points
+
+
+def _knot_image(track: Track, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    values: NDArray[np.float32] = image[track.lines]
+    count = np.diff(track.starts, append=len(track.lines))
+    if len(track.starts) < len(track.lines):
+        values = (np.add.reduceat(values, track.starts, axis=0) / count[:, None]).astype(np.float32)
+    return np.where(track.seen[:, None], values, np.float32(np.nan))
+
+
+def broad_bands(references: References, bands: int = BROAD_BANDS) -> NDArray[np.intp]:
+    """Choose the bands of a broad-band image: spread over those that nine samples in ten are calibrated in."""
+    good = references.white > references.dark
+    if references.bad is not None:
+        good = good & ~references.bad
+    known = np.flatnonzero(good.mean(axis=0) >= 0.9)
+    if not len(known):
+        known = np.arange(len(references.panel))
+    return known[np.unique(np.linspace(0, len(known) - 1, max(bands, 1)).round().astype(np.intp))]
+
+
+def _of_bands(references: References, chosen: NDArray[np.intp]) -> References:
+    bad, flat = references.bad, references.flat
+    return replace(
+        references, dark=references.dark[:, chosen], white=references.white[:, chosen], panel=references.panel[chosen],
+        bad=None if bad is None else bad[:, chosen], flat=None if flat is None else flat[:, chosen],
+    )  # fmt: skip

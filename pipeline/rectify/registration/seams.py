@@ -1,0 +1,215 @@
+"""Registration of one pass: the pointing of its sweeps, from the overlaps of neighbours."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.rectify.registration.alignment import (
+    SweepShift,
+    SweepShifts,
+    WindowShift,
+    no_shifts,
+    solve_sweeps,
+    tied_to,
+)
+from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX, BroadSweep, PlacedImage, Window, overlap_windows
+from pipeline.rectify.registration.shifts import PairShift, pair_shift
+
+Floats = NDArray[np.float64]
+
+WINDOW_PX = 512.0
+SETTLED_PRIOR_PX = 3.0  # once the first round has brought the sweeps together
+
+
+@dataclass(frozen=True)
+class SeamWindow:
+    """One window of one overlap: where it lies and what was found there."""
+
+    window: Window
+    found: PairShift | None  # in pixels of the pass, rows along the scan; None: too narrow to tell
+    measured: WindowShift | None  # in scene px; None unless found
+    residual_px: Floats  # (2,) along and scan: what the correction leaves; NaN unless found
+
+
+@dataclass(frozen=True)
+class NarrowOverlap:
+    """Two neighbours whose overlap is too narrow to be registered."""
+
+    reference: str
+    moving: str
+    width_px: float
+    needed_px: float
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Corrections of all sweeps of a pass, and what they rest on."""
+
+    shifts: tuple[SweepShift, ...]
+    reference: str | None  # the sweep that was held; None without sweeps
+    untied: tuple[str, ...]  # sweeps that no accepted window joins to it: left where they were, on average
+    narrow: tuple[NarrowOverlap, ...]  # where they leave sweeps apart
+    windows: tuple[SeamWindow, ...]  # of the last round
+
+    def of(self, name: str) -> SweepShift:
+        """Give the correction of one sweep."""
+        return next(shift for shift in self.shifts if shift.name == name)
+
+
+def register_sweeps(
+    sweeps: Sequence[BroadSweep],
+    camera: LineCamera,
+    *,
+    prior_px: float,
+    window_px: float = WINDOW_PX,
+    rounds: int = 2,
+    reference: int | None = None,
+) -> Registration:
+    """Find where the lines of all sweeps of one pass lie, relative to one of them.
+
+    Neighbours are rectified where they should overlap, compared window by window, and one offset and drift per sweep
+    is solved for from all windows. The second round rectifies again with these corrections and looks within 3 px: a
+    line turns with its centre, and the first round cannot see by how much. No pixel is shifted twice: the corrections
+    go into ``place(shift_px=...)``, which makes the lookup again.
+
+    Parameters
+    ----------
+    prior_px
+        How far any sweep may look beside the position that it reports, in either axis; a pair may be apart by twice
+        that. Overlaps need 64 px beyond. [px]
+    window_px
+        Length of the windows along the scan. [px]
+    reference
+        Number of the sweep that is held; by default the middle one of the largest group that overlaps join.
+
+    Raises
+    ------
+    SettingsError : the prior is negative or not finite, no rounds, or windows that are too short.
+    PoseError : a corrected position is beyond the mirror's rim.
+    """
+    if not (np.isfinite(prior_px) and prior_px >= 0 and rounds >= 1):
+        raise SettingsError(
+            f"expected a finite prior >= 0 px and one round or more, got {prior_px} px, {rounds} rounds"
+        )
+    shifts, among = no_shifts([one.sweep.name for one in sweeps]), frozenset(range(len(sweeps)))
+    made: list[tuple[list[SeamWindow], SweepShifts]] = []
+    for number in range(rounds):
+        reach = 2 * prior_px if number == 0 else min(SETTLED_PRIOR_PX, 2 * prior_px)
+        images = place_images(sweeps, shifts, camera)
+        seen = measure_windows(images, reach_px=reach, window_px=window_px, among=among)
+        solved = _solve(seen, sweeps, reference)
+        shifts = tuple(old.plus(new) for old, new in zip(shifts, solved.shifts, strict=True))
+        reference, among = solved.reference, among - set(solved.untied)
+        made.append((_with_residuals(seen, solved.residual), solved))
+    return _registration(sweeps, shifts, made, 2 * prior_px)
+
+
+def place_images(
+    sweeps: Sequence[BroadSweep], shifts: Sequence[SweepShift], camera: LineCamera
+) -> tuple[PlacedImage, ...]:
+    """Put broad-band images where corrections say that their lines lie."""
+    return tuple(
+        PlacedImage(one, camera, shift.of_lines(len(one.position))) for one, shift in zip(sweeps, shifts, strict=True)
+    )
+
+
+def measure_windows(
+    images: Sequence[PlacedImage],
+    *,
+    reach_px: float,
+    window_px: float = WINDOW_PX,
+    among: Collection[int] | None = None,
+) -> list[SeamWindow]:
+    """Compare all neighbours window by window, as they are placed; residuals are what was found.
+
+    Parameters
+    ----------
+    reach_px
+        Largest shift of a pair. [px]
+    among
+        Numbers of the sweeps to be compared; None takes all.
+    """
+    seen = []
+    for window in overlap_windows(images, window_px=window_px):
+        if among is not None and not {window.reference, window.moving} <= set(among):
+            continue
+        if window.width_px < LEAST_OVERLAP_PX + reach_px:
+            seen.append(SeamWindow(window, None, None, np.full(2, np.nan)))
+            continue
+        found = _compare(window, images, reach_px)
+        measured = _measured(window, found, images)
+        seen.append(SeamWindow(window, found, measured, np.full(2, np.nan) if measured is None else measured.shift))
+    return seen
+
+
+def _compare(window: Window, images: Sequence[PlacedImage], reach_px: float) -> PairShift:
+    """Rectify both sweeps in a window, at the distance of the pass's lines, and register them."""
+    one, other = images[window.reference], images[window.moving]
+    pitch = one.broad.sweep.step
+    along, scan = (np.arange(low, high, pitch) for low, high in (window.along_px, window.scan_px))
+    return pair_shift(one.seen_at(along, scan), other.seen_at(along, scan), prior_px=reach_px / pitch)
+
+
+def _measured(window: Window, found: PairShift, images: Sequence[PlacedImage]) -> WindowShift | None:
+    """What a window says of its two sweeps, in scene px; None unless something was found."""
+    if found.status != "found":
+        return None
+    middle = [(low + high) / 2 for low, high in (window.along_px, window.scan_px)]
+    both = [images[number].line_and_turn(*middle) for number in (window.reference, window.moving)]
+    if both[0] is None or both[1] is None:
+        return None
+    pitch = images[window.reference].broad.sweep.step
+    return WindowShift(
+        reference=window.reference,
+        moving=window.moving,
+        line=(both[0][0], both[1][0]),
+        turn=np.stack([both[0][1], both[1][1]]),
+        shift=found.shift[::-1] * pitch,
+        error_px=found.error_px[::-1] * pitch,
+    )
+
+
+def _solve(seen: Sequence[SeamWindow], sweeps: Sequence[BroadSweep], reference: int | None) -> SweepShifts:
+    measured = [each.measured for each in seen if each.measured is not None]
+    names, lines = [one.sweep.name for one in sweeps], [len(one.position) for one in sweeps]
+    return solve_sweeps(measured, names, lines, reference=reference)
+
+
+def _with_residuals(seen: Sequence[SeamWindow], residual: Floats) -> list[SeamWindow]:
+    left = iter(residual)
+    return [each if each.measured is None else replace(each, residual_px=next(left)) for each in seen]
+
+
+def _registration(
+    sweeps: Sequence[BroadSweep],
+    shifts: tuple[SweepShift, ...],
+    made: Sequence[tuple[list[SeamWindow], SweepShifts]],
+    reach_px: float,
+) -> Registration:
+    names = [one.sweep.name for one in sweeps]
+    first, solved = made[0]
+    return Registration(
+        shifts=shifts,
+        reference=names[solved.reference] if names else None,
+        untied=tuple(names[number] for number in solved.untied),
+        narrow=tuple(_narrow(first, names, reach_px)),
+        windows=tuple(made[-1][0]),
+    )
+
+
+def _narrow(seen: Sequence[SeamWindow], names: Sequence[str], reach_px: float) -> Iterator[NarrowOverlap]:
+    """Pairs none of whose windows was wide enough, unless other overlaps join the two."""
+    measured = [each.measured for each in seen if each.measured is not None]
+    for (one, other), group in groupby(seen, key=lambda each: (each.window.reference, each.window.moving)):
+        windows = list(group)
+        apart = other not in tied_to(measured, one, len(names))
+        if apart and all(each.found is None for each in windows):
+            width = max(each.window.width_px for each in windows)
+            yield NarrowOverlap(names[one], names[other], width, LEAST_OVERLAP_PX + reach_px)

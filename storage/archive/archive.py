@@ -1,0 +1,400 @@
+"""The archive: immutable stores, one for each stage and key, and one folder for each run.
+
+::
+
+    stages/<stage>/<key>/     what a stage made, with manifest.json
+    runs/<run id>/            receipt.json, report.html, quicklook.png
+    spool/<key>/              lines of a capture under way
+    spool/<key>-mosaic/       tiles made while these arrive
+    schedule/<field>.jsonl    what became of every due run of a field
+    .aside/<stage>/<key>/     what a repair under way puts back where it cannot be remade
+    .locks/                   held while something is made
+
+A folder whose name ends in ``.part`` is not finished: whoever makes the same thing next removes it. An archive in a
+bucket (`storage.remote.object_archive`) has the same addresses.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import ArchiveError
+from storage.archive.addresses import StageRef, in_text, published_runs, published_stores, store_at, without_manifest
+from storage.archive.folder import is_folder_archive, open_folder
+from storage.archive.keys import plain, stage_key
+from storage.archive.lineage import rests_on
+from storage.archive.manifests import (
+    Cost,
+    Stopwatch,
+    check_files,
+    cost_of,
+    made_bytes,
+    manifest_sha256,
+    read_manifest,
+    write_manifest,
+)
+from storage.archive.run_folders import RunDraft, date_of_store, finish_extensions
+from storage.archive.staging import (
+    PART_SUFFIX,
+    bytes_below,
+    check_name,
+    refusals,
+    remove_tree,
+    rename_into_place,
+    retire,
+    take_lock,
+)
+from storage.maintenance.verification import Finding, Progress, verify_everything
+from storage.remote.object_places import is_remote, need_obstore
+
+__all__ = ["Archive", "Cost", "Finding", "RunDraft", "StageRef", "StagedStore", "stage_key"]
+
+
+@dataclass(frozen=True)
+class StagedStore:
+    """A store being made. ``done`` says that another run published it while this one waited: nothing is to be made."""
+
+    path: Path  # folder to write into
+    ref: StageRef
+    done: bool
+
+
+class Archive:
+    """A folder of immutable stores. Kill the process anywhere: what has a final name is whole."""
+
+    in_bucket = False  # whether `root` is a working copy alone
+
+    def __init__(self, root: Path, *, writes: bool = True) -> None:
+        self.root, self.writes = root, writes
+
+    @classmethod
+    def open(cls, root: str | Path, *, create: bool = True, write: bool = True) -> Archive:
+        """Open an archive, a folder or ``s3://bucket/prefix``, or make it where ``create``.
+
+        Raises
+        ------
+        ArchiveError : the path is a file, is not there, or does not let itself be written to (``write``).
+        SettingsError : an address on S3 that is none.
+        """
+        if is_remote(root):
+            need_obstore(root)
+            from storage.remote.object_archive import open_object_archive
+
+            return open_object_archive(root, create=create, write=write)
+        path = Path(root).absolute()
+        open_folder(path, create=create, write=write)
+        if write:
+            with refusals(path, "write to the archive"):
+                finish_extensions(path)
+        return cls(path, writes=write)
+
+    @staticmethod
+    def is_there(root: str | Path) -> bool:
+        """Whether there is something to open: an archive, or a file that will be refused."""
+        if is_remote(root):
+            need_obstore(root)
+            from storage.remote.object_archive import is_object_archive
+
+            return is_object_archive(root)
+        return is_folder_archive(Path(root))
+
+    @property
+    def name(self) -> str:
+        """What a person gives to open it again."""
+        return str(self.root)
+
+    @property
+    def around(self) -> Path:
+        """Folder in which what belongs beside the archive is put."""
+        return self.root.parent
+
+    # --- stages -------------------------------------------------------------------------------------------------------
+
+    def ref(self, stage: str, key: str) -> StageRef:
+        """Address of a store, whether it is there or not."""
+        return store_at(self.root, stage, key)
+
+    def locate(self, address: str) -> Path:
+        """Where on this machine a product lies by its address relative to the archive, as a receipt gives it.
+
+        Raises
+        ------
+        IncompleteStoreError : its store is not there, or a file of it is missing, cut short, a link or no file at all.
+        """
+        uri = in_text(address)
+        if uri is not None:
+            check_files(self.root / uri, hashes=False)
+        return self.root / address
+
+    def find(self, stage: str, key: str) -> StageRef | None:
+        """The published store, or None. Sizes are compared with the manifest, content only by :meth:`verify`.
+
+        Raises
+        ------
+        IncompleteStoreError : it is there, but its manifest or a file is missing, or has another size.
+        """
+        ref = store_at(self.root, stage, key)
+        if not os.path.lexists(ref.path):
+            return None
+        check_files(ref.path, hashes=False)
+        return ref
+
+    @contextmanager
+    def publish(
+        self,
+        stage: str,
+        key: str,
+        *,
+        version: int | str = 1,
+        params: Mapping[str, Any] | None = None,
+        inputs: Sequence[str] | Mapping[str, str] = (),
+        work: float | None = None,
+    ) -> Iterator[StagedStore]:
+        """Give a folder to write into, and publish it when the block ends well.
+
+        One process at a time makes a key; the others wait and then find ``done``. When the block fails, the folder
+        is removed and the archive is as before. The manifest says what the block took, with ``work``, how much it had
+        to do in units of the stage's own: from these the cost of the next one is estimated.
+
+        Raises
+        ------
+        ArchiveError : the disk refuses; the message names the path and what to do.
+        """
+        ref = self.ref(stage, key)
+        final = self.root / ref.uri
+        facts = {"stage": stage, "key": key, "version": version, "params": plain(params or {}), "inputs": plain(inputs)}
+        with refusals(self.root, "write to the archive"), self._locked(f"{stage}-{key}"):
+            done = self.find(stage, key) is not None
+            part = final.with_name(key + PART_SUFFIX)
+            remove_tree(part)
+            part.mkdir(parents=True)
+            try:
+                watch = Stopwatch()
+                yield StagedStore(part, ref, done)
+                if not done:
+                    facts |= {"cost": watch.cost(work), "created": date_of_store(self.root, ref.uri)}
+                    write_manifest(part, facts)
+                    self._put_in_place(part, final)
+            finally:
+                remove_tree(part)
+
+    def _put_in_place(self, part: Path, final: Path) -> None:
+        rename_into_place(part, final)
+
+    def produce(
+        self,
+        stage: str,
+        build: Callable[[Path], None],
+        *,
+        version: int | str,
+        params: Mapping[str, Any],
+        inputs: Sequence[str] | Mapping[str, str] = (),
+        work: float | None = None,
+    ) -> tuple[StageRef, bool]:
+        """Find the store of these facts, or have ``build`` write it; the second value says whether it was built.
+
+        ``work`` has no part in the key: it is what `cost` tells later, beside the time that ``build`` took.
+        """
+        key = stage_key(stage, version, params, inputs)
+        found = self.find(stage, key)
+        if found is not None:
+            return found, False
+        with self.publish(stage, key, version=version, params=params, inputs=inputs, work=work) as staged:
+            if not staged.done:
+                build(staged.path)
+        return staged.ref, not staged.done
+
+    def manifest(self, ref: StageRef) -> dict[str, Any]:
+        """What is known of a store: stage, key, version, params, inputs, cost, created, libraries, files."""
+        return read_manifest(self.root / ref.uri)
+
+    def stored_bytes(self, ref: StageRef) -> int:
+        """Size of a store's files by its manifest, as they were made: the same before it was packed and after."""
+        return made_bytes(self.manifest(ref))
+
+    def cost(self, ref: StageRef) -> Cost | None:
+        """What the making of a store took, by its manifest; None for stores of before this was recorded."""
+        return cost_of(self.manifest(ref))
+
+    def manifest_hash(self, ref: StageRef) -> str:
+        """SHA-256 of a store's manifest.json, and so of every byte of the store."""
+        return manifest_sha256(self.root / ref.uri)
+
+    def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
+        """`manifest_hash` by address, of stores and of all they rest on, for ``RunDraft.publish(rests_on=...)``."""
+        plain = [store_at(self.root, ref.stage, ref.key) for ref in refs]
+        return {ref.uri: manifest_sha256(ref.path) for ref in rests_on(self.root, plain)}
+
+    def refs(self, stage: str | None = None) -> list[StageRef]:
+        """Every published store (of one stage), by stage and key."""
+        return published_stores(self.root, stage)
+
+    def discard(self, ref: StageRef, *, wait: bool = True) -> bool:
+        """Take one store away, for good; a key that is asked for again is made again.
+
+        False where another process works on it and ``wait`` is false.
+        """
+        with refusals(self.root, "remove from the archive"):
+            release = take_lock(self._lock_path(f"{ref.stage}-{ref.key}"), wait=wait)
+            if release is None:
+                return False
+            try:
+                retire(ref.path)
+            finally:
+                release()
+        return True
+
+    @contextmanager
+    def in_use(self, *, alone: bool = False) -> Iterator[bool]:
+        """Keep others from clearing stores away while the block runs; many may do so at a time.
+
+        With ``alone`` ask to be the only one: gives False, at once, where somebody uses the archive.
+        """
+        with refusals(self.root, "write to the archive"):
+            release = take_lock(self._lock_path("use"), wait=not alone, shared=not alone)
+        try:
+            yield release is not None
+        finally:
+            if release is not None:
+                release()
+
+    # --- verification and clearing up ---------------------------------------------------------------------------------
+
+    def verify(self, ref: StageRef) -> None:
+        """Read every byte of one store again.
+
+        Raises
+        ------
+        IncompleteStoreError : names the first file that is missing, changed or not listed.
+        """
+        check_files(ref.path, hashes=True)
+
+    def verify_all(self, progress: Progress | None = None) -> list[Finding]:
+        """Check every store and every run; each file and shard that is broken has a finding of its own."""
+        return verify_everything(self.root, progress)
+
+    def reclaim(self) -> list[str]:
+        """Remove unfinished folders that no living process works on; gives their addresses."""
+        removed: list[str] = []
+        with refusals(self.root, "clear up the archive"):
+            finish_extensions(self.root)
+            for part in sorted((*self.root.glob(f"stages/*/*{PART_SUFFIX}"), *self.root.glob(f"runs/*{PART_SUFFIX}"))):
+                release = take_lock(self._lock_path(f"{part.parent.name}-{part.stem}"), wait=False)
+                if release is not None:
+                    remove_tree(part)
+                    removed.append(part.relative_to(self.root).as_posix())
+                    release()
+        return removed
+
+    def now(self) -> datetime:
+        """Time by the clock that tells how old stores are."""
+        return datetime.now(UTC)
+
+    def size_of(self, uri: str) -> int:
+        """Bytes of all files of a store."""
+        return bytes_below(self.root / uri)
+
+    def lost_runs(self) -> list[str]:
+        """Addresses of runs whose manifest is gone, so that nothing tells what they name."""
+        return [
+            f"runs/{path.name}" for path in without_manifest(self.root) if path.parent.name == "runs" and path.is_dir()
+        ]
+
+    def leftovers(self, keep_days: float) -> dict[str, int]:
+        """What broken-off uploads left in a bucket for ``keep_days``: address and bytes; nothing in a folder."""
+        return {}
+
+    def drop_leftover(self, uri: str) -> None:
+        """Remove one of `leftovers`."""
+
+    # --- runs and spools ----------------------------------------------------------------------------------------------
+
+    def new_run(self, name: str) -> RunDraft:
+        """Begin the folder of one run; nothing of it is seen under ``runs`` before :meth:`RunDraft.publish`."""
+        clean = re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")[:60] or "run"
+        stem = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{clean}"
+        run_id, number = stem, 1
+        with refusals(self.root, "write to the archive"):
+            while (draft := self._begin_run(run_id)) is None:  # another run of the same second takes the next number
+                number += 1
+                run_id = f"{stem}-{number}"
+        return draft
+
+    def _begin_run(self, run_id: str) -> RunDraft | None:
+        """Take a run's name and make its folder, empty; None where the name is taken."""
+        folder = self.root / "runs" / (run_id + PART_SUFFIX)
+        release = take_lock(self._lock_path(f"runs-{run_id}"), wait=False)
+        if release is None:
+            return None
+        try:
+            if folder.with_name(run_id).exists():
+                release()
+                return None
+            remove_tree(folder)  # of a run that was killed within this second
+            folder.mkdir(parents=True)
+        except OSError:
+            release()
+            raise
+        return RunDraft(run_id, folder, self.root, release)
+
+    def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
+        """Begin to add to a published run; it stays as it is until :meth:`RunDraft.publish` of what is given.
+
+        One process at a time does so; None where another does and ``wait`` is false.
+
+        Raises
+        ------
+        ArchiveError : there is no run of this name.
+        """
+        check_name(run_id)
+        folder = self.root / "runs" / (run_id + PART_SUFFIX)
+        with refusals(self.root, "write to the archive"):
+            release = take_lock(self._lock_path(f"runs-{run_id}"), wait=wait)
+            if release is None:
+                return None
+            try:
+                if not folder.with_name(run_id).is_dir():
+                    raise ArchiveError(f"there is no run {run_id} in {self.name}; see ls")
+                remove_tree(folder)  # of a process that was killed
+                folder.mkdir()
+            except BaseException:
+                release()
+                raise
+        return RunDraft(run_id, folder, self.root, release, extends=True)
+
+    def runs(self) -> list[Path]:
+        """Folders of the published runs, oldest first."""
+        return published_runs(self.root)
+
+    def spool_folder(self, key: str) -> Path:
+        """Folder for the lines of a capture under way; it outlives the process, unlike a staged store."""
+        check_name(key)
+        folder = self.root / "spool" / key
+        with refusals(self.root, "write to the archive"):
+            folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    def drop_spool(self, key: str) -> None:
+        """Remove a spool whose lines are published; an archive opened for reading keeps it."""
+        check_name(key)
+        if self.writes:
+            remove_tree(self.root / "spool" / key)
+
+    def _lock_path(self, name: str) -> Path:
+        return self.root / ".locks" / f"{name}.lock"
+
+    @contextmanager
+    def _locked(self, name: str) -> Iterator[None]:
+        release = take_lock(self._lock_path(name))
+        try:
+            yield
+        finally:
+            if release is not None:
+                release()

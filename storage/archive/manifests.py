@@ -1,0 +1,327 @@
+"""Manifests: the facts of a published folder, the hash and size of every file, and a seal over the manifest itself.
+
+The seal is the SHA-256 of the manifest's text without it, so that a bit that flips in the manifest is found by the
+manifest alone. Manifests of before (no ``format``, no ``seal``) still open; their sizes and hashes count as ever.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import math
+import os
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from pipeline.errors import ArchiveError, IncompleteStoreError
+from storage.archive.plain_files import NotPlainError, kind_of, plain_size, read_plain
+from storage.archive.staging import MANIFEST_NAME, file_hash, files_below, sync_path
+
+FORMAT = 2
+PACKED = "packed"  # what a store was before its numbers went into a smaller codec
+EXTENDED = "extended"  # what a run was before something was added to it
+CURE = "restore it from a copy, or run verify --repair on the archive"
+_DISTRIBUTIONS = ("spectralzoom", "numpy", "torch", "xarray", "zarr", "numcodecs")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What the making of one store took. ``work`` is in units of the stage's own, None where it gave none."""
+
+    wall_s: float
+    cpu_s: float
+    work: float | None
+    size: int  # of the store's files as they were made [bytes]
+
+
+class Stopwatch:
+    """Wall and CPU seconds of this process since it was made."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def cost(self, work: float | None) -> dict[str, Any]:
+        """The entry ``cost`` of a manifest.
+
+        Raises
+        ------
+        ArchiveError : ``work`` is no amount.
+        """
+        if work is not None and not (math.isfinite(work) and work >= 0):
+            raise ArchiveError(f"work is {work}, expected a number of units of work, 0 or more, or None")
+        times = {"wall_s": time.perf_counter() - self._wall, "cpu_s": time.process_time() - self._cpu}
+        return {name: round(value, 6) for name, value in times.items()} | (
+            {} if work is None else {"work": float(work)}
+        )
+
+
+def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
+    """Sync every file of a staged folder and write ``manifest.json`` with their hashes and sizes beside ``facts``.
+
+    When it was made and with which libraries are those of now, where ``facts`` does not say them.
+    """
+    files: dict[str, dict[str, Any]] = {}
+    for path in files_below(folder):
+        sync_path(path)
+        files[path.relative_to(folder).as_posix()] = {"sha256": file_hash(path), "size": path.stat().st_size}
+    known = {"created": datetime.now(UTC).isoformat(timespec="milliseconds"), "libraries": library_versions()}
+    content = {**known, **facts, "files": files, "format": FORMAT}
+    manifest = folder / MANIFEST_NAME
+    manifest.write_text(_text(content | {"seal": _seal(content)}), encoding="utf-8")
+    sync_path(manifest)
+    for inner in sorted(path for path in folder.rglob("*") if path.is_dir()):
+        sync_path(inner)
+    sync_path(folder)
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Content of a published folder's manifest.
+
+    Raises
+    ------
+    IncompleteStoreError : there is none, it cannot be read, its own seal says that it has changed, or it lists what
+        cannot be a file of this folder.
+    """
+    content, problem = try_manifest(folder)
+    if problem is not None:
+        raise IncompleteStoreError(f"{folder} has no valid {MANIFEST_NAME} ({problem}); {CURE}")
+    return content
+
+
+def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
+    """Content of a published folder's manifest and None, or nothing and what is wrong with it."""
+    if folder.is_symlink():
+        return {}, f"{folder.name} is a link, which is not followed: put there what it leads to"
+    try:
+        return parse_manifest(read_plain(folder / MANIFEST_NAME))
+    except FileNotFoundError:
+        return {}, "it is missing"
+    except OSError as error:
+        return {}, error.strerror or str(error)
+
+
+def parse_manifest(written: bytes) -> tuple[dict[str, Any], str | None]:
+    """Content of a manifest as it was written and None, or nothing and what is wrong with it."""
+    try:
+        text = written.decode()
+        content = json.loads(text)
+        if not isinstance(content, dict) or not isinstance(content.get("files"), dict):
+            raise TypeError("it lists no files")
+        _check_seal(text, content)
+        for name, entry in content["files"].items():
+            _check_entry(name, entry)
+    except RecursionError:
+        return {}, "it is nested too deeply"
+    except (ValueError, TypeError) as error:
+        return {}, str(error)
+    return content, None
+
+
+def is_sealed(manifest: Mapping[str, Any]) -> bool:
+    """Whether a manifest vouches for itself; those of before do not."""
+    return "seal" in manifest or "format" in manifest
+
+
+def manifest_sha256(folder: Path) -> str:
+    """SHA-256 of a published folder's manifest.json: what a run records of each store that it rests on.
+
+    Raises
+    ------
+    IncompleteStoreError : there is none.
+    """
+    try:
+        return file_hash(folder / MANIFEST_NAME)
+    except OSError as error:
+        raise IncompleteStoreError(f"{folder / MANIFEST_NAME} cannot be read: {error.strerror}; {CURE}") from error
+
+
+def cost_of(manifest: Mapping[str, Any]) -> Cost | None:
+    """What the making took; None where the manifest does not tell."""
+    cost = manifest.get("cost")
+    if not isinstance(cost, Mapping):
+        return None
+    wall, cpu, work = (_amount(cost.get(name)) for name in ("wall_s", "cpu_s", "work"))
+    return None if wall is None or cpu is None else Cost(wall, cpu, work, made_bytes(manifest))
+
+
+def listed_bytes(manifest: Mapping[str, Any]) -> int:
+    """Size of all files that a manifest lists."""
+    return sum(entry["size"] for entry in manifest["files"].values())
+
+
+def made_bytes(manifest: Mapping[str, Any]) -> int:
+    """Size of all files as they were first published: what packing saved later is no merit of the making."""
+    size = _packed(manifest).get("bytes_before")
+    return size if isinstance(size, int) and not isinstance(size, bool) else listed_bytes(manifest)
+
+
+def packed_facts(before: Mapping[str, Any], sha256: str, values: Mapping[str, str], codec: str) -> dict[str, Any]:
+    """Facts for the manifest of a store that holds the numbers of another in a smaller codec.
+
+    Parameters
+    ----------
+    before, sha256
+        The other's manifest, and the SHA-256 of its file, by which runs may know the store.
+    values
+        Hash of the decoded numbers, which both have, by the name of each cube.
+    """
+    kept = {name: value for name, value in before.items() if name not in ("files", "format", "seal", PACKED)}
+    entry = {
+        "manifests": [*packed_from(before), sha256],
+        "values": {**packed_values(before), **values},
+        "bytes_before": made_bytes(before),
+        "codec": codec,
+        "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
+    }
+    return kept | {PACKED: entry}
+
+
+def packed_from(manifest: Mapping[str, Any]) -> list[str]:
+    """SHA-256 of the manifests that a store had before it was packed, oldest first; none where it never was."""
+    found = _packed(manifest).get("manifests")
+    return [one for one in found if isinstance(one, str)] if isinstance(found, list) else []
+
+
+def packed_values(manifest: Mapping[str, Any]) -> dict[str, str]:
+    """Hash of the decoded numbers by the name of each cube that was packed."""
+    found = _packed(manifest).get("values")
+    return {name: str(value) for name, value in found.items()} if isinstance(found, dict) else {}
+
+
+def _packed(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
+    return _table(manifest.get(PACKED))
+
+
+def _table(value: object) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def extended_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
+    """Facts for the manifest of a run that something is added to; it stays a run of the time at which it was published.
+
+    ``before`` and ``sha256`` are the manifest that it has until then, and the SHA-256 of its file.
+    """
+    at = datetime.now(UTC).isoformat(timespec="milliseconds")
+    created = {} if "created" not in before else {"created": before["created"]}
+    return created | {EXTENDED: {"at": at, "manifests": [*extended_from(before), sha256]}}
+
+
+def extended_from(manifest: Mapping[str, Any]) -> list[str]:
+    """SHA-256 of the manifests that a run had before something was added to it, oldest first."""
+    found = _table(manifest.get(EXTENDED)).get("manifests")
+    return [one for one in found if isinstance(one, str)] if isinstance(found, list) else []
+
+
+def extended_at(manifest: Mapping[str, Any]) -> str:
+    """When something was last added to a run, ISO 8601 in UTC; empty where nothing was."""
+    found = _table(manifest.get(EXTENDED)).get("at")
+    return found if isinstance(found, str) else ""
+
+
+def check_files(folder: Path, *, hashes: bool) -> None:
+    """Compare a published folder with its manifest: names and sizes, and every byte where ``hashes``.
+
+    Raises
+    ------
+    IncompleteStoreError : names the first file that is missing, has another size or content, or is not listed.
+    """
+    for name, problem in broken_files(folder, read_manifest(folder), hashes=hashes):
+        raise IncompleteStoreError(f"{folder / name} {problem}; {CURE}")
+
+
+def broken_files(folder: Path, manifest: Mapping[str, Any], *, hashes: bool) -> Iterator[tuple[str, str]]:
+    """Give name and problem of every file that is not as the manifest lists it; with ``hashes`` also extra ones."""
+    listed = manifest["files"]
+    links = _linked_folders(folder, listed)
+    for name, entry in listed.items():
+        link = next((one for one in links if one in PurePosixPath(name).parents), None)
+        problem = file_problem(folder / name, entry, hashes=hashes) if link is None else _below_link(link)
+        if problem is not None:
+            yield name, problem
+    if hashes:
+        for name in sorted(_no_folders(folder) - set(listed) - {MANIFEST_NAME}):
+            kind = kind_of(folder / name)
+            yield name, f"is {kind if kind != 'a file' else 'not in the manifest'}: take it out of the archive"
+
+
+def _linked_folders(folder: Path, names: Iterable[str]) -> list[PurePosixPath]:
+    """Which of the folders that files lie in are links, the outer ones first."""
+    inner = {parent for name in names for parent in PurePosixPath(name).parents}
+    return sorted(one for one in inner if (folder / one).is_symlink())
+
+
+def _below_link(link: PurePosixPath) -> str:
+    return f"cannot be read: {link if link.parts else 'its store'} is a link, which is not followed"
+
+
+def _no_folders(folder: Path) -> set[str]:
+    """Names of all that lies in a folder, however deep, and is no folder; no link is followed."""
+    found = set[str]()
+    for place, folders, files in os.walk(folder):
+        links = [name for name in folders if Path(place, name).is_symlink()]
+        found.update(Path(place, name).relative_to(folder).as_posix() for name in (*links, *files))
+    return found
+
+
+def file_problem(path: Path, entry: Mapping[str, Any], *, hashes: bool) -> str | None:
+    """What is not as the manifest's ``entry`` says of a file, in words that follow its name; None where it is whole."""
+    try:
+        size = plain_size(path)
+        if size != entry["size"]:
+            return f"has {size} bytes, expected {entry['size']}"
+        if hashes and file_hash(path) != entry["sha256"]:
+            return "has changed since it was published (its SHA-256 differs)"
+    except FileNotFoundError:
+        return "cannot be read: it is missing"
+    except NotPlainError as error:
+        return str(error.strerror).removeprefix("it ")
+    except OSError as error:
+        return f"cannot be read: {error.strerror}"
+    return None
+
+
+def _text(content: Mapping[str, Any]) -> str:
+    return json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n"
+
+
+def _seal(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(_text(content).encode()).hexdigest()
+
+
+def _check_seal(text: str, content: dict[str, Any]) -> None:
+    """Every byte is either covered by the seal, or is not as it would be written."""
+    if not is_sealed(content):
+        return
+    rest = {name: value for name, value in content.items() if name != "seal"}
+    if content.get("seal") != _seal(rest) or text != _text(content):
+        raise ValueError("it has changed since it was published: its seal does not fit")
+
+
+def _check_entry(name: str, entry: object) -> None:
+    parts = PurePosixPath(name).parts
+    if not parts or name.startswith("/") or ".." in parts or "\0" in name:
+        raise ValueError(f"it lists {name!r}, which is no file of this folder")
+    size, digest = (entry.get("size"), entry.get("sha256")) if isinstance(entry, dict) else (None, None)
+    if isinstance(size, bool) or not isinstance(size, int) or not isinstance(digest, str):
+        raise ValueError(f"it gives no size and hash of {name!r}")
+
+
+def _amount(value: object) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
+        return None
+    return float(value)
+
+
+def library_versions() -> dict[str, str]:
+    """Versions of the libraries that a stored result may depend on, as installed."""
+    found: dict[str, str] = {}
+    for name in _DISTRIBUTIONS:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found

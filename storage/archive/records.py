@@ -1,0 +1,181 @@
+"""What one store or run has to say for itself: its manifest and receipt, read without trust.
+
+A damaged manifest is a record with a problem; whatever else a file says where something was expected counts as nothing.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from storage.archive.addresses import StageRef, in_text
+from storage.archive.manifests import Cost, cost_of, extended_at, listed_bytes, try_manifest
+from storage.archive.plain_files import read_plain
+from storage.archive.staging import MANIFEST_NAME, file_hash
+
+RECEIPT = "receipt.json"
+MANIFEST_HASH = "manifest_sha256"  # in a receipt's stages: SHA-256 of the manifest.json of the store that each left
+RESTS_ON = "rests_on"  # in a run's manifest: address of a store -> SHA-256 of its manifest.json
+
+
+@dataclass(frozen=True)
+class Store:
+    """One store by its manifest; where that is damaged, ``problem`` says so and the rest is empty."""
+
+    ref: StageRef
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    problem: str | None = None
+
+    @property
+    def version(self) -> str:
+        """Version of the stage that made it."""
+        return str(self.facts.get("version", ""))
+
+    @property
+    def params(self) -> dict[str, Any]:
+        """Parameters that it was made with."""
+        return _table(self.facts.get("params"))
+
+    @property
+    def libraries(self) -> dict[str, Any]:
+        """Libraries that it was made with, and their versions."""
+        return _table(self.facts.get("libraries"))
+
+    @property
+    def inputs(self) -> list[str]:
+        """Keys of the stores that it was made of, in order."""
+        inputs = self.facts.get("inputs", [])
+        values = inputs.values() if isinstance(inputs, dict) else inputs if isinstance(inputs, list) else []
+        return [value for value in values if isinstance(value, str)]
+
+    @property
+    def created(self) -> str:
+        """When it was published, ISO 8601 in UTC; empty where that is not known."""
+        return _text(self.facts.get("created"))
+
+    @property
+    def cost(self) -> Cost | None:
+        """What its making took."""
+        return cost_of(self.facts) if self.facts else None
+
+    @property
+    def size(self) -> int:
+        """Bytes of its files."""
+        return listed_bytes(self.facts) if self.facts else 0
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run. ``receipt`` is empty where it is damaged; ``names`` are the stores that it or its manifest names."""
+
+    folder: Path
+    facts: Mapping[str, Any]  # of its manifest
+    receipt: Mapping[str, Any]
+    problem: str | None
+    names: frozenset[str]
+
+    @property
+    def uri(self) -> str:
+        """Address relative to the archive."""
+        return f"runs/{self.folder.name}"
+
+    @property
+    def recorded(self) -> dict[str, str]:
+        """SHA-256 of the manifests that it rests on, as it knew them: by its stages, and by its own manifest."""
+        told = {_text(row.get("key")): row.get(MANIFEST_HASH) for row in self.stages}
+        by_stage = {uri: told[key] for uri in self.names if (key := uri.rpartition("/")[2]) in told}
+        found = {**by_stage, **_table(self.receipt.get(RESTS_ON)), **_table(self.facts.get(RESTS_ON))}
+        return {uri: value for uri, value in found.items() if isinstance(value, str) and in_text(uri) == uri}
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the survey was asked for; from its manifest where that says so."""
+        return _table(self.facts.get("settings")) or _table(self.receipt.get("settings"))
+
+    @property
+    def products(self) -> dict[str, str]:
+        """Names of what it left, and their addresses."""
+        return {name: uri for name, uri in _table(self.receipt.get("products")).items() if isinstance(uri, str)}
+
+    @property
+    def stages(self) -> list[dict[str, Any]]:
+        """Its stages, each with name, key, state and what it took."""
+        rows = self.receipt.get("stages")
+        return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+
+    @property
+    def created(self) -> str:
+        """When it was published, ISO 8601 in UTC."""
+        return _text(self.facts.get("created")) or _text(self.receipt.get("finished"))
+
+    @property
+    def sealed(self) -> str:
+        """When its manifest was written: at its publication, or when something was last added to it; ISO 8601."""
+        return extended_at(self.facts) or self.created
+
+    @property
+    def simulated(self) -> bool:
+        """Whether its light came from the simulator, and so can be had again."""
+        return self.settings.get("source") == "sim"
+
+
+def read_store(ref: StageRef) -> Store:
+    """One store by its manifest, damaged or not."""
+    facts, problem = try_manifest(ref.path)
+    return Store(ref, facts, problem and f"{MANIFEST_NAME} cannot be believed: {problem}")
+
+
+def read_run(folder: Path, by_key: Mapping[str, list[str]]) -> Run:
+    """One run by its manifest and receipt, damaged or not; ``by_key`` says which stores there are."""
+    facts, broken = try_manifest(folder)
+    problem = broken and f"{MANIFEST_NAME} cannot be believed: {broken}"
+    receipt: dict[str, Any] = {}
+    if broken is None:
+        receipt, problem = _receipt(folder, facts)
+        if problem is not None and try_manifest(folder)[0] not in ({}, facts):  # something was added to it meanwhile
+            return read_run(folder, by_key)
+    texts = list(_texts([receipt, {name: facts[name] for name in facts if name != "files"}]))
+    names = {uri for text in texts if (uri := in_text(text)) is not None}
+    stages = receipt.get("stages")
+    for row in stages if isinstance(stages, list) else []:
+        names.update(by_key.get(_text(row.get("key")), []) if isinstance(row, dict) else [])
+    return Run(folder, facts, receipt, problem, frozenset(names))
+
+
+def _receipt(folder: Path, facts: Mapping[str, Any]) -> tuple[dict[str, Any], str | None]:
+    """The receipt, if every byte of it is as published, or what is wrong; a folder without one is a run without one."""
+    entry = facts["files"].get(RECEIPT)
+    if entry is None:
+        return {}, None
+    path = folder / RECEIPT
+    try:
+        if file_hash(path) != entry["sha256"]:
+            return {}, f"{RECEIPT} has changed since it was published (its SHA-256 differs)"
+        return _table(json.loads(read_plain(path))), None
+    except (OSError, ValueError, RecursionError) as error:
+        words = error.strerror if isinstance(error, OSError) else error
+        return {}, f"{RECEIPT} cannot be read: {words}"
+
+
+def _texts(value: object) -> Iterator[str]:
+    """Every text in nested lists and tables, names of tables included."""
+    waiting = [value]
+    while waiting:
+        one = waiting.pop()
+        if isinstance(one, str):
+            yield one
+        elif isinstance(one, Mapping):
+            waiting += [*one.keys(), *one.values()]
+        elif isinstance(one, list):
+            waiting += one
+
+
+def _table(value: object) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _text(value: object) -> str:
+    return value if isinstance(value, str) else ""

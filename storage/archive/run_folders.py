@@ -1,0 +1,164 @@
+"""The folder of one run: receipt, report and pictures, published together, and again as a whole with what is added.
+
+What a run says may grow once its accuracy is known: then a new folder takes the place of the old one in one step, under
+the same name and date, and its manifest says which one it had before. Killed anywhere, one of the two lies there whole.
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from storage.archive.addresses import published_runs
+from storage.archive.folder_exchange import try_exchange
+from storage.archive.keys import plain
+from storage.archive.manifests import (
+    extended_facts,
+    extended_from,
+    manifest_sha256,
+    read_manifest,
+    try_manifest,
+    write_manifest,
+)
+from storage.archive.records import read_run
+from storage.archive.staging import (
+    MANIFEST_NAME,
+    PART_SUFFIX,
+    check_name,
+    refusals,
+    remove_tree,
+    rename_into_place,
+    sync_path,
+    take_lock,
+)
+
+
+def date_of_store(root: Path, uri: str) -> str:
+    """When a store is made: now, or just after the last run that knows one of this address, if the clock was set back.
+
+    By its date `verify` tells a store that was made anew from one whose manifest somebody wrote.
+    """
+    now = datetime.now(UTC)
+    folders = published_runs(root)
+    if any((folder / MANIFEST_NAME).lstat().st_mtime >= now.timestamp() for folder in folders):
+        runs = (read_run(folder, {}) for folder in folders)
+        for known in (run.sealed for run in runs if uri in run.recorded):
+            try:
+                now = max(now, datetime.fromisoformat(known) + timedelta(milliseconds=1))
+            except (ValueError, TypeError, OverflowError):
+                continue  # it does not say when it was published
+    return now.isoformat(timespec="milliseconds")
+
+
+class RunDraft:
+    """The folder of one run while it is written. Published as a whole, or abandoned.
+
+    With ``extends`` the run is published already, and stays as it is unless `publish` is called.
+    """
+
+    def __init__(
+        self, run_id: str, folder: Path, root: Path, release: Callable[[], None], *, extends: bool = False
+    ) -> None:
+        self.id = run_id
+        self.folder = folder
+        self.extends = extends
+        self._root = root
+        self._release = release
+
+    @property
+    def published(self) -> Path:
+        """Where the run lies once it is published."""
+        return self.folder.with_name(self.id)
+
+    def __enter__(self) -> RunDraft:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if isinstance(error, OSError):  # of a file that the block wrote by itself
+                with refusals(self._root, "write to the archive"):
+                    raise error
+            if kind is None and not self.extends and self.folder.exists():
+                self.publish()
+        finally:
+            self.abandon()
+
+    def write_file(self, name: str, content: str | bytes) -> Path:
+        """Write one file of the run, such as ``receipt.json``, and give its path."""
+        check_name(name)
+        with refusals(self._root, "write to the archive"):
+            path = self.folder / name
+            path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return path
+
+    def publish(self, *, rests_on: Mapping[str, str] | None = None, **facts: Any) -> Path:
+        """Make the run seen under ``runs``; gives its folder. ``facts`` go into the manifest.
+
+        ``rests_on`` is what `Archive.manifest_hashes` gives of the run's products: by it `verify` knows that their
+        manifests, too, are as they were, and `gc` what to keep, even where the receipt is damaged.
+        """
+        final = self.published
+        content = {"run": self.id, "rests_on": dict(rests_on or {}), **plain(facts)}
+        with refusals(self._root, "write to the archive"):
+            if self.extends:
+                write_manifest(self.folder, content | extended_facts(read_manifest(final), manifest_sha256(final)))
+                _take_its_place(self.folder, final)
+            else:
+                write_manifest(self.folder, content)
+                rename_into_place(self.folder, final)
+        self._release()
+        return final
+
+    def abandon(self) -> None:
+        """Remove what is not published; harmless afterwards."""
+        remove_tree(self.folder)
+        self._release()
+
+
+def _take_its_place(part: Path, final: Path) -> None:
+    """Put a whole folder in the place of another, which goes.
+
+    Where the file system cannot exchange two folders there is a moment in which only the unfinished name leads to the
+    run: killed in it, `finish_extensions` has the rest to do.
+    """
+    sync_path(final.parent)
+    away = part
+    if not try_exchange(part, final):
+        away = final.with_name(f"{final.name}-{secrets.token_hex(4)}{PART_SUFFIX}")
+        try:
+            final.rename(away)
+            part.rename(final)
+        except BaseException:
+            if not final.exists():
+                away.rename(final)
+            raise
+        sync_path(final.parent)
+    remove_tree(away)
+
+
+def unfinished_extensions(root: Path) -> Iterator[Path]:
+    """Whole folders that were about to take the place of a run, whose own name leads to nothing any more."""
+    for part in sorted((root / "runs").glob(f"*{PART_SUFFIX}")):
+        facts, problem = try_manifest(part)
+        named = part.name.removesuffix(PART_SUFFIX)
+        whole = problem is None and bool(extended_from(facts)) and facts.get("run") == named
+        if whole and not (root / "runs" / named).exists():
+            yield part
+
+
+def finish_extensions(root: Path) -> None:
+    """Give the runs of `unfinished_extensions` their names back, unless a living process is about to."""
+    for part in unfinished_extensions(root):
+        release = take_lock(root / ".locks" / f"runs-{part.stem}.lock", wait=False)
+        if release is not None:
+            try:
+                if part.exists() and not part.with_suffix("").exists():
+                    rename_into_place(part, part.with_suffix(""))
+            finally:
+                release()

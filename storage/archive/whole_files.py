@@ -1,0 +1,75 @@
+"""Files that people take away: written aside, synced, and given their names only when they are whole."""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from pipeline.errors import ArchiveError
+from storage.archive.staging import PART_SUFFIX, refusals, remove_tree, sync_path
+
+_PREFIX = ".export-"
+
+
+@contextmanager
+def written_aside(folder: Path, names: Sequence[str]) -> Iterator[Path]:
+    """Give an empty folder to write ``names`` into; when the block ends well they replace those in ``folder``.
+
+    What belongs together is never mixed: old files of all names but the first go before the first is replaced, and
+    the last one to appear vouches for the others. When the block fails, ``folder`` is as before.
+
+    Raises
+    ------
+    ArchiveError : the folder is or lies below a file, or the disk refuses; the message names it and what to do.
+    """
+    with refusals(folder, "export to"):
+        make_folder(folder)
+        with tempfile.TemporaryDirectory(prefix=_PREFIX, suffix=PART_SUFFIX, dir=folder) as aside:
+            yield Path(aside)
+            for name in names:
+                sync_path(Path(aside) / name)
+            for name in names[1:]:
+                (folder / name).unlink(missing_ok=True)
+            for name in names:
+                (Path(aside) / name).replace(folder / name)
+            sync_path(folder)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder to export to, if it is not there (ArchiveError: it is or lies below a file)."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise ArchiveError(f"{folder} is or lies below a file, expected a folder; choose another --out") from error
+
+
+def new_file(folder: Path, stem: str, suffix: str) -> Path:
+    """Take a name that nothing in ``folder`` has: ``stem``, or ``stem-2`` and so on; an empty file keeps it.
+
+    Raises
+    ------
+    ArchiveError : the folder is or lies below a file, or the disk refuses.
+    """
+    with refusals(folder, "export to"):
+        make_folder(folder)
+        for number in itertools.count(1):
+            path = folder / f"{stem}{f'-{number}' if number > 1 else ''}{suffix}"
+            with suppress(FileExistsError):
+                path.touch(exist_ok=False)
+                return path
+    raise AssertionError("numbers do not end")
+
+
+def write_whole(path: Path, content: str) -> None:
+    """Write one text file as a whole."""
+    with written_aside(path.parent, [path.name]) as aside:
+        (aside / path.name).write_text(content, encoding="utf-8")
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what killed writers left in a folder; nobody may be writing there."""
+    for part in folder.glob(f"{_PREFIX}*{PART_SUFFIX}"):
+        remove_tree(part)

@@ -1,0 +1,172 @@
+"""The class map: class, confidence, names and colours, as CF flags."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from pipeline.errors import ChunkError, ShapeError
+from pipeline.geometry.grid import UNLABELLED
+from storage.arrays.layout import (
+    AngularGrid,
+    create_array,
+    create_group,
+    damage_named,
+    grid_of,
+    grid_record,
+    image_spec,
+    open_group,
+    read_array,
+)
+
+
+@dataclass(frozen=True)
+class ClassMap:
+    """Class of every pixel."""
+
+    classes: NDArray[np.uint8]  # (y, x) index into ``names``, 255 = none
+    confidence: NDArray[np.float32]  # (y, x) in 0..1, NaN where there is no class
+    names: tuple[str, ...]
+    colours: NDArray[np.uint8]  # (class, 3)
+    grid: AngularGrid | None = None
+
+
+@dataclass(frozen=True)
+class ClassNames:
+    """What the classes of a map are called, and how they are drawn."""
+
+    names: tuple[str, ...]
+    colours: NDArray[np.uint8]  # (class, 3)
+
+
+def write_class_map(path: Path, found: ClassMap) -> None:
+    """Store classes with their names and colours, and the confidence.
+
+    Raises
+    ------
+    ShapeError : sizes differ, or a pixel has a class without a name.
+    """
+    create_class_map(path, found.classes.shape, ClassNames(found.names, found.colours), grid=found.grid)
+    write_class_tile(path, (0, 0), found.classes, found.confidence)
+
+
+def create_class_map(
+    path: Path, shape: tuple[int, ...], legend: ClassNames, *, grid: AngularGrid | None = None
+) -> None:
+    """Begin a class map of (y, x) ``shape`` in which no pixel has a class yet.
+
+    Raises
+    ------
+    ShapeError : there are not as many colours as names.
+    """
+    if len(legend.colours) != len(legend.names):
+        raise ShapeError(
+            f"{len(legend.names)} names and {len(legend.colours)} colours do not fit; give each class both"
+        )
+    y, x = shape
+    place = {} if grid is None else grid.attributes((y, x))
+    names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
+    group = create_group(path, "class map", {**place, **grid_record(grid), **names})
+    about = {**class_flags(legend.names, legend.colours), **place}
+    create_array(group, "classes", image_spec(("y", "x"), shape, "|u1"), about)
+    about = {"long_name": "probability of the class given", "units": "1", "valid_range": [0.0, 1.0], **place}
+    create_array(group, "confidence", image_spec(("y", "x"), shape, "<f4"), about)
+
+
+def write_class_tile(
+    path: Path, origin: tuple[int, int], classes: NDArray[np.integer], confidence: NDArray[np.floating]
+) -> None:
+    """Store (y, x) classes and confidence of whole shards from row and column ``origin`` on.
+
+    Threads and processes may write different tiles of one map at once.
+
+    Raises
+    ------
+    ShapeError : sizes differ, the tile does not fit the map, or a pixel has a class without a name.
+    ChunkError : the tile splits a shard.
+    IncompleteStoreError : there is no map.
+    """
+    with damage_named(str(path)):
+        group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
+        arrays = [array for name in ("classes", "confidence") if isinstance(array := group[name], zarr.Array)]
+        count = len(group.attrs["class_names"])  # type: ignore[arg-type]
+    used = classes[classes != UNLABELLED]
+    if used.size and used.max() >= count:
+        raise ShapeError(f"class {int(used.max())} is in the map, but only {count} classes have names")
+    place = _place_of(origin, classes.shape, arrays[0])
+    if classes.shape != confidence.shape:
+        raise ShapeError(
+            f"classes {classes.shape} and confidence {confidence.shape} do not fit; give both of each pixel"
+        )
+    for array, values in zip(arrays, (classes, confidence), strict=True):
+        array[place] = np.asarray(values, array.dtype)
+
+
+def clear_classes(path: Path, where: NDArray[np.bool_]) -> None:
+    """Take the class from some pixels of a stored map: 255, and a confidence of NaN.
+
+    ``where`` is (y, x), True for those pixels. Raises IncompleteStoreError where there is no map.
+    """
+    group = open_group(path)
+    array = group["classes"]
+    assert isinstance(array, zarr.Array)
+    steps = array.shards or array.shape
+    rows, columns = (range(0, size, step) for size, step in zip(array.shape, steps, strict=True))
+    for top, left in product(rows, columns):
+        place = np.s_[top : top + steps[0], left : left + steps[1]]
+        if where[place].any():
+            classes = np.where(where[place], UNLABELLED, read_array(group, "classes", place))
+            confidence = np.where(where[place], np.nan, read_array(group, "confidence", place))
+            write_class_tile(path, (top, left), classes, confidence)
+
+
+def _place_of(origin: tuple[int, int], shape: tuple[int, ...], array: zarr.Array[Any]) -> tuple[slice, ...]:
+    """Where a tile lies in the map, checked against the map's size and shards."""
+    place = tuple(slice(first, first + size) for first, size in zip(origin, shape, strict=True))
+    for word, part, size, shard in zip(("rows", "columns"), place, array.shape, array.shards or (), strict=True):
+        if part.start < 0 or part.stop > size:
+            raise ShapeError(f"{word} {part.start}:{part.stop} are not all in the class map of {array.shape} (y, x)")
+        if part.start % shard or (part.stop % shard and part.stop != size):
+            raise ChunkError(
+                f"{word} {part.start}:{part.stop} split the class map's shards of {shard} {word}; start and end at "
+                "their multiples"
+            )
+    return place
+
+
+def class_flags(names: Sequence[str], colours: NDArray[np.uint8]) -> dict[str, Any]:
+    """CF's flag attributes of an image of class indices."""
+    return {
+        "long_name": "class",
+        "_FillValue": UNLABELLED,
+        "flag_values": list(range(len(names))),
+        "flag_meanings": " ".join("_".join(name.split()) for name in names),
+        "flag_colors": " ".join("#{:02x}{:02x}{:02x}".format(*colour) for colour in colours.tolist()),
+    }
+
+
+def load_class_names(path: Path) -> ClassNames:
+    """Read what the classes of a map are called, and their colours. Raises IncompleteStoreError where there is none."""
+    attributes: dict[str, Any] = dict(open_group(path).attrs)
+    colours = np.array(attributes.get("class_colours", ()), np.uint8).reshape(-1, 3)
+    return ClassNames(tuple(attributes.get("class_names", ())), colours)
+
+
+def load_class_map(path: Path) -> ClassMap:
+    """Read a class map. Raises IncompleteStoreError where it is missing or damaged."""
+    group = open_group(path)
+    attributes: dict[str, Any] = dict(group.attrs)
+    return ClassMap(
+        classes=read_array(group, "classes"),
+        confidence=read_array(group, "confidence"),
+        names=tuple(attributes.get("class_names", ())),
+        colours=np.array(attributes.get("class_colours", ()), np.uint8).reshape(-1, 3),
+        grid=grid_of(attributes),
+    )

@@ -1,0 +1,304 @@
+"""The raw cube of one sweep: (line, sample, band) uint16, with what is known of every line and a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from pipeline.errors import IncompleteStoreError, ShapeError
+from pipeline.geometry.scan import Sweep
+from pipeline.rectify.calibration.calibrate import calibrate
+from pipeline.source import Line, References
+from storage.arrays.layout import (
+    SHARD_ROWS,
+    create_array,
+    create_group,
+    damage_named,
+    image_spec,
+    open_group,
+    read_array,
+    read_bands,
+    write_bands,
+    write_small,
+)
+from storage.arrays.quicklooks import LineThumbnail, Quicklook, quicklook_of, write_quicklook
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_LINE_COORDINATES = "time mirror_x mirror_y exposure_ms valid_line"
+_NO_VALUES = np.empty((0, 0, 0), np.float32)
+
+
+@dataclass(frozen=True)
+class SweepHeader:
+    """What is known of a sweep before its first line."""
+
+    sweep: Sweep
+    references: References
+    wavelength_nm: NDArray[np.float64]  # (band,)
+    fwhm_nm: NDArray[np.float64] | None = None
+    source: str = ""  # what the source calls itself
+    started: str | None = None  # ISO 8601; None leaves ``time`` counted from the start of the sweep
+    simulation: Mapping[str, Any] | None = None  # what was simulated and what left out; None of a rig
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(line, sample, band) of the cube."""
+        return self.sweep.lines, self.references.dark.shape[0], len(self.wavelength_nm)
+
+    def __post_init__(self) -> None:
+        frame = self.references.dark.shape
+        bands = len(self.wavelength_nm)
+        if frame != self.references.white.shape or len(frame) != 2 or frame[1] != bands:
+            raise ShapeError(
+                f"sweep {self.sweep.name}: dark {frame} and white {self.references.white.shape} must both be "
+                f"(sample, band) with {bands} bands; calibrate with the sweep's own binning"
+            )
+        if self.references.panel.shape != (bands,):
+            raise ShapeError(f"sweep {self.sweep.name}: panel has shape {self.references.panel.shape}, not ({bands},)")
+        for name in ("bad", "flat"):
+            extra = getattr(self.references, name)
+            if extra is not None and extra.shape != frame:
+                raise ShapeError(f"sweep {self.sweep.name}: {name} has shape {extra.shape}, the dark frame {frame}")
+
+
+class RawCubeWriter:
+    """Write a sweep's lines as they come, 64 at a time, each into one shard. Use as a context manager."""
+
+    def __init__(self, path: Path, header: SweepHeader) -> None:
+        self._header = header
+        self._group = create_group(path, f"raw sweep {header.sweep.name}", _attributes(header))
+        bands = write_bands(self._group, header.wavelength_nm, header.fwhm_nm)
+        about = {"long_name": "raw numbers of the camera", "units": "1", "coordinates": f"{bands} {_LINE_COORDINATES}"}
+        spec = image_spec(("line", "sample", "band"), header.shape, "<u2")
+        self._dn = create_array(self._group, "dn", spec, about)
+        known = header.references
+        _write_references(self._group, known)
+        self._seen = LineThumbnail(
+            header.shape, header.wavelength_nm, dark=known.dark, white=known.white, panel=known.panel
+        )
+        self._waiting: list[Line] = []
+        self._facts: list[tuple[float, float, float, float, bool]] = []
+
+    def __enter__(self) -> RawCubeWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+
+    def write(self, lines: Sequence[Line]) -> None:
+        """Take the next lines; any number, in order.
+
+        Raises
+        ------
+        ShapeError : a line is out of order, too many, or of another size than the references.
+        """
+        for line in lines:
+            number = len(self._facts)
+            if line.number != number or number >= self._header.sweep.lines:
+                raise ShapeError(
+                    f"sweep {self._header.sweep.name}: got line {line.number}, expected line {number} of "
+                    f"{self._header.sweep.lines}; lines come in order"
+                )
+            if line.data.shape != self._header.shape[1:]:
+                raise ShapeError(
+                    f"sweep {self._header.sweep.name}, line {number}: shape {line.data.shape}, the references have "
+                    f"{self._header.shape[1:]} (sample, band)"
+                )
+            self._waiting.append(line)
+            self._facts.append((line.time_s, line.mirror_x, line.mirror_y, line.exposure_ms, line.valid))
+            if len(self._waiting) == SHARD_ROWS:
+                self._flush()
+
+    def close(self) -> None:
+        """Write what waits, the lines' coordinates and the picture.
+
+        Raises
+        ------
+        IncompleteStoreError : lines are missing.
+        """
+        if len(self._facts) != self._header.sweep.lines:
+            raise IncompleteStoreError(
+                f"sweep {self._header.sweep.name} has {len(self._facts)} of {self._header.sweep.lines} lines; "
+                f"capture the rest before closing the cube"
+            )
+        self._flush()
+        _write_line_facts(self._group, self._facts, self._header.started)
+        write_quicklook(self._group, self._seen.finish())
+
+    def _flush(self) -> None:
+        if self._waiting:
+            first = self._waiting[0].number
+            block = np.stack([line.data for line in self._waiting])
+            self._dn[first : first + len(block)] = block
+            self._seen.add(first, block, np.array([line.valid for line in self._waiting], np.bool_))
+            self._waiting.clear()
+
+
+def _attributes(header: SweepHeader) -> dict[str, Any]:
+    started = {} if header.started is None else {"started": header.started}
+    mirror = {"by_mirror": True} if header.references.by_mirror else {}
+    simulated = {} if header.simulation is None else {"simulation": dict(header.simulation)}
+    return {"sweep": asdict(header.sweep), "source": header.source, **started, **mirror, **simulated}
+
+
+def _write_references(group: zarr.Group, references: References) -> None:
+    for name, values in (("dark", references.dark), ("white", references.white)):
+        about = {"long_name": f"{name} reference frame", "units": "1", "coordinates": "wavelength"}
+        write_small(group, name, ("sample", "band"), np.asarray(values, np.float32), about)
+    about = {"long_name": "scene value of the white panel", "units": "1", "coordinates": "wavelength"}
+    write_small(group, "panel", ("band",), np.asarray(references.panel, np.float32), about)
+    about = {"units": "1", "coordinates": "wavelength"}
+    if references.bad is not None:
+        named = {"long_name": "bad elements of the detector", **about}
+        write_small(group, "bad", ("sample", "band"), np.asarray(references.bad, np.bool_), named)
+    if references.flat is not None:
+        named = {"long_name": "relative response left over by the white frame", **about}
+        write_small(group, "flat", ("sample", "band"), np.asarray(references.flat, np.float32), named)
+
+
+def _read_references(group: zarr.Group) -> References:
+    """What :func:`_write_references` stored; cubes of before bad elements and flats have neither."""
+    dark, white, panel = (read_array(group, name) for name in ("dark", "white", "panel"))
+    bad, flat = (read_array(group, name) if name in group else None for name in ("bad", "flat"))
+    return References(dark, white, panel, bad, flat, bool(group.attrs.get("by_mirror", False)))
+
+
+def _write_line_facts(
+    group: zarr.Group, facts: Sequence[tuple[float, float, float, float, bool]], started: str | None
+) -> None:
+    times, x, y, exposures, valid = (np.array(column) for column in zip(*facts, strict=True))
+    since = {"units": "s"} if started is None else {"units": f"seconds since {started}", "standard_name": "time"}
+    about_time = {"long_name": "mid exposure, since the start of the sweep", **since}
+    position = {"long_name": "mirror position at mid exposure", "units": "1", "valid_range": [-1.0, 1.0]}
+    write_small(group, "time", ("line",), times.astype(np.float64), about_time)
+    write_small(group, "mirror_x", ("line",), x.astype(np.float64), position)
+    write_small(group, "mirror_y", ("line",), y.astype(np.float64), position)
+    write_small(group, "exposure_ms", ("line",), exposures.astype(np.float64), {"units": "ms"})
+    write_small(group, "valid_line", ("line",), valid.astype(np.bool_), {"long_name": "line can be used"})
+
+
+@dataclass(frozen=True)
+class RawCube:
+    """A stored sweep, opened. What belongs to lines and bands is in memory; numbers are read when asked for."""
+
+    sweep: Sweep
+    references: References
+    wavelength_nm: NDArray[np.float64]  # (band,)
+    fwhm_nm: NDArray[np.float64] | None
+    position: NDArray[np.float64]  # (line, 2) mirror X and Y at mid exposure
+    time_s: NDArray[np.float64]  # (line,) since the start of the sweep
+    exposure_ms: NDArray[np.float64]  # (line,)
+    valid_line: NDArray[np.bool_]  # (line,)
+    source: str
+    started: str | None
+    group: zarr.Group
+
+    @property
+    def simulation(self) -> Mapping[str, Any] | None:
+        """What was simulated and what left out, as its attributes tell; None of a rig's lines."""
+        found = dict(self.group.attrs).get("simulation")
+        return found if isinstance(found, Mapping) else None
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(line, sample, band)."""
+        return len(self.time_s), self.references.dark.shape[0], len(self.wavelength_nm)
+
+    def read(self, start: int = 0, stop: int | None = None) -> NDArray[np.uint16]:
+        """Raw numbers of the lines ``start`` to ``stop``, (line, sample, band) uint16; fastest on multiples of 64."""
+        return read_array(self.group, "dn", slice(start, stop))
+
+    def read_window(self, lines: slice, samples: slice) -> NDArray[np.uint16]:
+        """Raw numbers of some lines and samples, (line, sample, band) uint16; decodes the chunks that hold them."""
+        return read_array(self.group, "dn", (lines, samples))
+
+    def quicklook(self) -> Quicklook | None:
+        """A small picture of the sweep, its values over the white panel; None where it was stored without one."""
+        return quicklook_of(self.group)
+
+
+def open_raw_cube(path: Path) -> RawCube:
+    """Open a sweep that :class:`RawCubeWriter` stored.
+
+    Raises
+    ------
+    IncompleteStoreError : there is none, it was not closed, or it is damaged.
+    """
+    group = open_group(path)
+    wavelength, fwhm = read_bands(group)
+    with damage_named(str(path)):
+        sweep = Sweep(**dict(group.attrs)["sweep"])  # type: ignore[arg-type]
+    return RawCube(
+        sweep=sweep,
+        references=_read_references(group),
+        wavelength_nm=wavelength,
+        fwhm_nm=fwhm,
+        position=np.stack([read_array(group, "mirror_x"), read_array(group, "mirror_y")], axis=-1),
+        time_s=read_array(group, "time"),
+        exposure_ms=read_array(group, "exposure_ms"),
+        valid_line=read_array(group, "valid_line"),
+        source=str(group.attrs.get("source", "")),
+        started=None if "started" not in group.attrs else str(group.attrs["started"]),
+        group=group,
+    )
+
+
+def open_reflectance(path: Path, *, saturated_dn: float) -> xr.DataArray:
+    """Open a sweep in scene values, calibrated 64 lines at a time when a part is asked for.
+
+    The file keeps the raw numbers: nothing is stored twice, and other references give other values.
+
+    Parameters
+    ----------
+    saturated_dn
+        Least DN that counts as saturated, as of :func:`pipeline.rectify.calibration.calibrate.calibrate`.
+
+    Returns
+    -------
+    (line, sample, band) float32 backed by dask, in the unit of the panel's values; NaN where a sample is not valid.
+    Coordinates: wavelength, fwhm, time, mirror_x, mirror_y, exposure_ms, valid_line.
+
+    Raises
+    ------
+    IncompleteStoreError : there is no sweep, it was not closed, or it is damaged; on computing, where a chunk is.
+    """
+    import dask.array as da
+    import xarray as xr
+
+    cube = open_raw_cube(path)
+    lines, samples, bands = cube.shape
+    starts = range(0, lines, SHARD_ROWS)
+    chunks = (tuple(min(SHARD_ROWS, lines - start) for start in starts), (samples,), (bands,))
+    values = da.map_blocks(  # type: ignore[no-untyped-call]
+        _reflectance_block, cube, saturated_dn, chunks=chunks, dtype=np.float32, meta=_NO_VALUES
+    )
+    with xr.open_zarr(path, consolidated=False, chunks=None) as stored:
+        coordinates = stored["dn"].coords.to_dataset().load().coords
+    about = {"long_name": "scene value", "units": "1"}
+    return xr.DataArray(values, coordinates, ("line", "sample", "band"), "reflectance", about)
+
+
+def _reflectance_block(
+    cube: RawCube, saturated_dn: float, block_info: Mapping[Any, Any] | None = None
+) -> NDArray[np.float32]:
+    """One block of lines, NaN where not valid; dask says which."""
+    assert block_info is not None
+    start, stop = block_info[None]["array-location"][0]
+    usable = cube.valid_line[start:stop]
+    position = np.where(usable[:, None], cube.position[start:stop], np.nan)  # of other lines it may be beyond the rim
+    values, valid = calibrate(cube.read(start, stop), cube.references, saturated_dn=saturated_dn, position=position)
+    values[~valid] = np.nan
+    values[~usable] = np.nan
+    return values

@@ -1,0 +1,248 @@
+"""Camera files on their way here, in a folder: what has come stays, whatever ends the transfer, and goes on there.
+
+A file of the camera is named by its whole path there, notes about the files by a name alone. Bytes are written at the
+end and nowhere else; a file that came damaged goes as a whole. Notes are on the disk when ``append`` returns; of files
+so is all but the last ``SYNC_BYTES``, since the camera still has them. What is held is compared when a transfer goes
+on.
+
+::
+
+    <name>          the bytes of a file of the camera, or of notes, which have checksums of their own
+    <name>%sums     one JSON object a line: how far the file reached, and the CRC-32 of its bytes up to there
+
+What an earlier process left of a file is compared with its sums once, and cut off from where they do not fit: the
+camera is asked for it again.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+from urllib.parse import quote
+
+from pipeline.checked_lines import read_checked, with_check
+from pipeline.rig.refusals import NotKept
+from storage.archive.plain_files import open_plain, plain_reader, plain_size, read_plain
+from storage.archive.staging import sync_path
+
+SYNC_BYTES = 1 << 24
+SUMS = "%sums"  # which no quoted name ends with
+LOG = logging.getLogger(__name__)
+_APPEND = os.O_WRONLY | os.O_APPEND | os.O_CREAT
+_BLOCK = 1 << 20
+_LONGEST = 240  # of a file's name, in most file systems 255
+
+
+@dataclass
+class _Sums:
+    """How far a file is known to be as it was fetched: bytes, their CRC-32, and how long its sums are."""
+
+    reached: int = 0
+    crc32: int = 0
+    length: int = 0
+
+
+class FetchedFiles:
+    """A :class:`pipeline.rig.kept_files.Kept` in a folder, which is made when the first bytes come."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._unsynced: dict[str, int] = {}
+        self._sums: dict[str, _Sums] = {}
+
+    def size(self, name: str) -> int:
+        """Bytes held of a file; 0 of one that is not there.
+
+        Raises
+        ------
+        NotKept : the disk does not give them, here or in other calls.
+        """
+        path = self._path(name)
+        try:
+            self._compare(name, path)
+            return plain_size(path)
+        except FileNotFoundError:
+            return 0
+        except OSError as error:
+            raise _unread(path, error) from error
+
+    def read(self, name: str, start: int, stop: int) -> bytes:
+        """Some of the bytes held."""
+        path = self._path(name)
+        try:
+            self._compare(name, path)
+            with plain_reader(path) as file:
+                file.seek(start)
+                return file.read(max(stop - start, 0))
+        except FileNotFoundError:
+            return b""
+        except OSError as error:
+            raise _unread(path, error) from error
+
+    def append(self, name: str, data: bytes) -> None:
+        """Add bytes at the end.
+
+        Raises
+        ------
+        NotKept : the disk refuses; a part that was written is taken away again.
+        """
+        path = self._path(name)
+        before = self.size(name)
+        try:
+            if not before:
+                self.folder.mkdir(parents=True, exist_ok=True)
+            with os.fdopen(open_plain(path, _APPEND), "ab", buffering=0) as file:
+                _write_all(file.fileno(), data)
+                waiting = self._unsynced.get(name, 0) + len(data)
+                if _is_note(name) or waiting >= SYNC_BYTES:
+                    os.fdatasync(file.fileno())
+                    waiting = 0
+                self._unsynced[name] = waiting
+            if data and not _is_note(name):
+                self._sum_up(name, path, data)
+            if not before:
+                sync_path(self.folder)
+        except OSError as error:
+            _cut(path, before)
+            raise NotKept(
+                f"cannot keep byte {before} of {name} in {self.folder}: {error.strerror or error}; free space or "
+                f"rights and run again: the {before} bytes before it are kept, and the camera still has the file"
+            ) from error
+
+    def drop(self, name: str) -> None:
+        """Hold no byte of a file any more.
+
+        Raises
+        ------
+        NotKept : the disk refuses.
+        """
+        path = self._path(name)
+        try:
+            path.unlink(missing_ok=True)
+            _sums_of(path).unlink(missing_ok=True)
+            self._unsynced.pop(name, None)
+            self._sums.pop(name, None)
+        except OSError as error:
+            raise NotKept(
+                f"cannot remove {path}: {error.strerror or error}; mend the disk and run again: the camera still has it"
+            ) from error
+
+    def _sum_up(self, name: str, path: Path, data: bytes) -> None:
+        """Take down how far a file reaches now. What the disk takes half of is cut off when the file is compared."""
+        known = self._sums[name]
+        reached, crc32 = known.reached + len(data), zlib.crc32(data, known.crc32)
+        text, sums = _sum_line(reached, crc32), _sums_of(path)
+        try:
+            with os.fdopen(open_plain(sums, _APPEND), "ab", buffering=0) as file:
+                _write_all(file.fileno(), text)
+        except OSError:
+            _cut(sums, known.length)
+            raise
+        self._sums[name] = _Sums(reached, crc32, known.length + len(text))
+
+    def _compare(self, name: str, path: Path) -> None:
+        """Cut off what an earlier process left and no sum vouches for; notes vouch for themselves."""
+        if name in self._sums or _is_note(name):
+            return
+        found, whole = _vouched_for(path)
+        if not whole:
+            LOG.warning("%s: what follows byte %d is not as it was fetched, or was not all kept", path, found.reached)
+            _cut(path, found.reached)
+            text = _sum_line(found.reached, found.crc32)
+            _sums_of(path).unlink(missing_ok=True)
+            with os.fdopen(open_plain(_sums_of(path), _APPEND), "ab") as file:
+                file.write(text)
+            found.length = len(text)
+        self._sums[name] = found
+
+    def _path(self, name: str) -> Path:
+        named = quote(name.strip("/"), safe="")
+        if not named or len(named) > _LONGEST:
+            raise NotKept(f"the camera's file {name!r:.300} cannot be kept under its name; use a shorter prefix")
+        return self.folder / ("%2E" + named[1:] if named.startswith(".") else named)
+
+
+def first_unlike(path: Path) -> int | None:
+    """From which byte on a fetched file is not as its sums say; None where all of it is. What is torn is no change.
+
+    Raises
+    ------
+    OSError : one of both cannot be read.
+    """
+    found, _ = _vouched_for(path)
+    sums = list(read_checked(read_plain(_sums_of(path))))
+    last = max((line.content["reached"] for line in sums if line.content is not None), default=0)
+    changed = any(line.state == "changed" for line in sums)
+    return found.reached if changed or found.reached < last else None
+
+
+def _is_note(name: str) -> bool:
+    return "/" not in name
+
+
+def _sums_of(path: Path) -> Path:
+    return path.with_name(path.name + SUMS)
+
+
+def _vouched_for(path: Path) -> tuple[_Sums, bool]:
+    """How far the sums of a file fit its bytes, and whether nothing is left of either that they do not say.
+
+    Each sum is of all bytes before it, so one that is lost is passed over.
+    """
+    found = _Sums()
+    if not os.path.lexists(path) and not os.path.lexists(_sums_of(path)):
+        return found, True
+    try:
+        text = read_plain(_sums_of(path))
+        found.length = len(text)
+        with plain_reader(path) as file:
+            whole, end = _follow(file, text, found), plain_size(path)
+    except FileNotFoundError:
+        return found, not os.path.lexists(path) or plain_size(path) == 0
+    return found, whole and found.reached == end
+
+
+def _follow(file: BinaryIO, sums: bytes, found: _Sums) -> bool:
+    """Take down in ``found`` how far bytes and sums agree; whether all of the sums do."""
+    reached = crc32 = 0
+    lines = list(read_checked(sums))
+    for line in lines:
+        if line.content is None or line.state != "whole":
+            continue
+        while reached < line.content["reached"]:
+            data = file.read(min(line.content["reached"] - reached, _BLOCK))
+            if not data:
+                return False
+            reached, crc32 = reached + len(data), zlib.crc32(data, crc32)
+        if crc32 != line.content["crc32"]:
+            return False
+        found.reached, found.crc32 = reached, crc32
+    return all(line.state == "whole" for line in lines)
+
+
+def _sum_line(reached: int, crc32: int) -> bytes:
+    return with_check(json.dumps({"reached": reached, "crc32": crc32}).encode())
+
+
+def _unread(path: Path, error: OSError) -> NotKept:
+    return NotKept(
+        f"cannot read {path}: {error.strerror or error}; mend the disk and run again: the camera still has it"
+    )
+
+
+def _write_all(file: int, data: bytes) -> None:
+    view = memoryview(data)
+    while view:
+        view = view[os.write(file, view) :]
+
+
+def _cut(path: Path, size: int) -> None:
+    try:
+        os.truncate(path, size)
+    except OSError:
+        return  # what is held is compared when the transfer goes on

@@ -1,0 +1,172 @@
+"""Quicklooks: a small picture stored beside every cube, so that nobody has to read a cube to show it.
+
+::
+
+    <cube>.zarr/quicklook     (y, x, 3) uint8: every 4th line and sample, three bands, 2-98 % of each; 0 where missing
+
+It is gathered while lines are written, from three bands of those lines alone. Attributes say which bands they are, the
+step between its pixels, and the values that 0 and 255 stand for: one scale for all three where frames make scene values
+of them and they are near red, green and blue, else one each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from storage.arrays.layout import open_group, read_array, write_image
+
+ARRAY = "quicklook"
+DIMS = ("quicklook_y", "quicklook_x", "rgb")
+STEP, LEAST_PX, MOST_PX = 4, 128, 1024  # of the longer side; small cubes are thinned less
+RGB_NM = (640.0, 550.0, 460.0)
+FAR_NM = 60.0
+
+Kind = Literal["true colour", "false colour", "grey", "by number"]
+
+
+def picture_bands(wavelength_nm: NDArray[np.floating] | None, count: int) -> tuple[tuple[int, int, int], Kind]:
+    """Bands to show as red, green and blue: those nearest 640, 550 and 460 nm, where they are near.
+
+    Else the longest, the middle and the shortest wavelength; without wavelengths at 3, 2 and 1 quarters of ``count``.
+    """
+    if wavelength_nm is None or not np.isfinite(wavelength_nm).all():
+        red, green, blue = ((count - 1) * share // 4 for share in (3, 2, 1))
+        return (red, green, blue), "by number"
+    waves = np.asarray(wavelength_nm, np.float64)
+    red, green, blue = (int(np.argmin(np.abs(waves - target))) for target in RGB_NM)
+    off = max(abs(waves[band] - target) for band, target in zip((red, green, blue), RGB_NM, strict=True))
+    if len({red, green, blue}) == 3 and off <= FAR_NM:
+        return (red, green, blue), "true colour"
+    order = np.argsort(waves, kind="stable")
+    if len(waves) == 1:
+        return (0, 0, 0), "grey"
+    return (int(order[-1]), int(order[(len(order) - 1) // 2]), int(order[0])), "false colour"
+
+
+def picture_step(shape: tuple[int, ...]) -> int:
+    """Lines and samples a pixel of a (line, sample, ...) cube's picture; at most 1024 px come of the longer side."""
+    longest = max(shape[:2])
+    return max(-(-longest // MOST_PX), min(STEP, longest // LEAST_PX), 1)
+
+
+@dataclass(frozen=True)
+class Quicklook:
+    """A picture and what it stands for. ``low`` and ``high`` are the values of 0 and 255; empty where not known."""
+
+    image: NDArray[np.uint8]  # (y, x, 3)
+    low: tuple[float, ...] = ()  # (3,)
+    high: tuple[float, ...] = ()  # (3,)
+    step: int = 1  # lines and samples a pixel
+    bands: tuple[int, ...] = ()  # (3,) of the cube
+
+    def values(self) -> NDArray[np.float32]:
+        """The cube's values as far as 8 bits between ``low`` and ``high`` tell them, (y, x, 3)."""
+        low, high = (np.array(ends, np.float32) for ends in (self.low, self.high))
+        values: NDArray[np.float32] = low + self.image.astype(np.float32) / np.float32(255) * (high - low)
+        return values
+
+
+def stretched(
+    image: NDArray[np.floating], *, step: int = 1, bands: tuple[int, ...] = (), together: bool = False
+) -> Quicklook:
+    """Each band's 2nd to 98th percentile as 0..255, (y, x, band) in and out; what is not finite becomes 0.
+
+    With ``together`` all bands have one scale, from the least to the greatest of these: colours stay true.
+    """
+    ends = np.array([_ends(image[..., band]) for band in range(image.shape[-1])])
+    low, high = (ends[:, 0], ends[:, 1])
+    if together:
+        low, high = np.full_like(low, low.min()), np.full_like(high, high.max())
+    out = np.zeros(image.shape, np.uint8)
+    for band in range(image.shape[-1]):
+        plane = image[..., band]
+        known = np.isfinite(plane)
+        span = high[band] - low[band] if high[band] > low[band] else ends.dtype.type(1)
+        scaled = np.clip((np.where(known, plane, low[band]) - low[band]) / span, 0, 1) * 255
+        out[..., band] = np.where(known, scaled, 0).astype(np.uint8)
+    return Quicklook(out, tuple(low.tolist()), tuple(high.tolist()), step, bands)
+
+
+def _ends(plane: NDArray[np.floating]) -> NDArray[np.floating]:
+    """2nd and 98th percentile of what is known of a band; zeros where nothing is."""
+    known = plane[np.isfinite(plane)]
+    return np.percentile(known, (2, 98)) if known.size else np.zeros(2, plane.dtype)
+
+
+class LineThumbnail:
+    """Every n-th line and sample of three bands, gathered as lines pass, over the white panel where it is known."""
+
+    def __init__(
+        self,
+        shape: tuple[int, int, int],
+        wavelength_nm: NDArray[np.floating] | None,
+        *,
+        dark: NDArray[np.floating] | None = None,
+        white: NDArray[np.floating] | None = None,
+        panel: NDArray[np.floating] | None = None,
+    ) -> None:
+        self._step = picture_step(shape)
+        self._bands, kind = picture_bands(wavelength_nm, shape[2])
+        chosen = list(self._bands)
+        self._frames: tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None = None
+        if dark is not None and white is not None:
+            level, light = (np.asarray(frame[:: self._step][:, chosen], np.float32) for frame in (dark, white))
+            value = np.ones(3, np.float32) if panel is None else np.asarray(panel[chosen], np.float32)
+            self._frames = level, light, value
+        self._together = self._frames is not None and kind == "true colour"
+        self._rows: list[NDArray[np.float32]] = []
+
+    def add(self, start: int, lines: NDArray[Any], valid: NDArray[np.bool_]) -> None:
+        """Take what it needs of (line, sample, band) ``lines`` from line ``start`` on; those not valid become black."""
+        rows = slice(-start % self._step, None, self._step)
+        part = np.asarray(lines[rows, :: self._step][..., list(self._bands)], np.float32)
+        if self._frames is not None:
+            level, light, value = self._frames
+            with np.errstate(divide="ignore", invalid="ignore"):
+                part = (part - level) / (light - level) * value
+        part[~valid[rows]] = np.nan
+        self._rows.append(part)
+
+    def finish(self) -> Quicklook:
+        """The picture of all lines taken so far."""
+        return stretched(np.concatenate(self._rows), step=self._step, bands=self._bands, together=self._together)
+
+
+def write_quicklook(group: zarr.Group, found: Quicklook) -> None:
+    """Store a picture beside its cube."""
+    about: dict[str, Any] = {"long_name": "picture for viewers, red green blue"}
+    if found.bands:
+        about |= {"bands": list(found.bands), "step": found.step, "low": list(found.low), "high": list(found.high)}
+    write_image(group, ARRAY, DIMS, found.image, about)
+
+
+def load_quicklook(path: Path) -> Quicklook | None:
+    """The picture of the cube or mosaic stored at ``path``, None where it has none; see `quicklook_of`."""
+    return quicklook_of(open_group(path))
+
+
+def quicklook_of(group: zarr.Group) -> Quicklook | None:
+    """The picture of an opened cube or mosaic, None where it has none (stores of before). The cube is not read.
+
+    Raises
+    ------
+    IncompleteStoreError : the picture is damaged.
+    """
+    if ARRAY not in group:
+        return None
+    image = read_array(group, ARRAY)
+    about: dict[str, Any] = dict(group[ARRAY].attrs)
+    low, high, bands = (tuple(about.get(name, ())) for name in ("low", "high", "bands"))
+    return Quicklook(image, low, high, int(about.get("step", 1)), bands)
+
+
+def pictures_of(store: Path) -> dict[str, NDArray[np.uint8]]:
+    """Pictures (y, x, 3) of a published store by the names of its cubes, in their order; those without are left out."""
+    found = {path.stem: load_quicklook(path) for path in sorted(store.glob("*.zarr"))}
+    return {name: seen.image for name, seen in found.items() if seen is not None}

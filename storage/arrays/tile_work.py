@@ -1,0 +1,228 @@
+"""Making a mosaic on disk from sweeps on disk: tile by tile, several at a time, within a bound of memory.
+
+A tile is a shard of the mosaic and a task of dask: whoever makes it writes files that nobody else touches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SettingsError
+from pipeline.rectify.line_cache import LineCache
+from pipeline.rectify.region import Reaches, column_reach, mosaic_tile
+from pipeline.rectify.tiles import Tile, cache_bytes, plan_tiles, tile_bytes
+from storage.arrays.mosaic_work import MosaicRecipe as MosaicRecipe
+from storage.arrays.mosaic_work import MosaicWork as MosaicWork
+from storage.arrays.mosaics import MosaicWriter
+from storage.parallel.block_work import THREADS, Crew, run_blocks
+
+RESERVED_BYTES = 512 * 2**20  # a process before its first tile: interpreter, torch, zarr
+
+
+@dataclass(frozen=True)
+class ThumbnailCut:
+    """Which pixels and bands of a tile a thumbnail shows. Goes to whoever makes tiles."""
+
+    steps: tuple[int, ...]  # (y, x) [px]
+    bands: tuple[int, ...]
+
+    def __call__(self, rows: slice, columns: slice, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What falls on the thumbnail's pixels, (y, x, band), of the (y, x, band) values of a tile."""
+        part = values[-rows.start % self.steps[0] :: self.steps[0], -columns.start % self.steps[1] :: self.steps[1]]
+        return part[..., list(self.bands)]
+
+
+class Thumbnail:
+    """Every n-th pixel of a mosaic in a few bands, filled as tiles are made: ``write_mosaic(..., seen=thumbnail)``."""
+
+    def __init__(self, shape: tuple[int, int], bands: Sequence[int], most_px: int) -> None:
+        self.cut = ThumbnailCut(tuple(-(-size // most_px) for size in shape), tuple(bands))
+        size = [-(-side // step) for side, step in zip(shape, self.cut.steps, strict=True)]
+        self.image: NDArray[np.float32] = np.full((*size, len(bands)), np.nan, np.float32)  # (y, x, band)
+
+    def put(self, rows: slice, columns: slice, part: NDArray[np.float32]) -> None:
+        """Take what ``cut`` gave for a tile."""
+        y, x = (-(-one.start // step) for one, step in zip((rows, columns), self.cut.steps, strict=True))
+        self.image[y : y + part.shape[0], x : x + part.shape[1]] = part
+
+
+@dataclass(frozen=True)
+class TileBudget:
+    """How many tiles are made at a time, and the memory that this takes [bytes]."""
+
+    workers: int
+    cache: int  # raw lines kept; by each process where there are several
+    tile: int  # one tile in the making
+    processes: bool = False
+
+    @property
+    def projected(self) -> int:
+        """Highest memory of the process, of all processes together where there are several [bytes]."""
+        if self.processes:
+            return RESERVED_BYTES + self.workers * (RESERVED_BYTES + self.cache + self.tile)
+        return RESERVED_BYTES + self.cache + self.workers * self.tile
+
+
+def write_mosaic(
+    work: MosaicWork | MosaicRecipe,
+    writer: MosaicWriter,
+    *,
+    memory: int,
+    crew: Crew = THREADS,
+    seen: Thumbnail | None = None,
+    there: Collection[tuple[int, int]] = (),
+    report: Callable[[float], None] = lambda done: None,
+) -> TileBudget:
+    """Rectify and blend sweeps into a stored mosaic. Whoever makes the tiles, the same bytes come out.
+
+    Parameters
+    ----------
+    work
+        A recipe, which every crew can follow; opened sweeps for threads alone.
+    memory
+        What this process, with those that it starts, may take, not workers of a scheduler elsewhere. [bytes]
+    crew
+        Who makes tiles, and how many at a time; fewer are made where memory holds fewer.
+    seen
+        Filled with the pixels that it shows.
+    there
+        First row and column of tiles that are written already: they are left as they are, and ``seen`` without them.
+    report
+        Called with the share of the others done after each tile, from the calling thread.
+
+    Returns
+    -------
+    How it was done.
+
+    Raises
+    ------
+    SettingsError : not even one tile at a time fits the memory, or the crew cannot work here.
+    WorkerError : processes that made tiles were lost.
+    TypeError : opened sweeps for a crew of processes.
+    """
+    opened = work.open() if isinstance(work, MosaicRecipe) else work
+    tiles = plan_tiles(opened.placed, opened.camera, opened.grid, writer.tile_shape)
+    budget = tile_budget(opened, tiles, writer.tile_shape, memory=memory, crew=crew)
+    tiles = [tile for tile in tiles if (tile.rows.start, tile.columns.start) not in there]
+
+    def show(rows: slice, columns: slice, part: NDArray[np.float32] | None) -> None:
+        if seen is not None and part is not None:
+            seen.put(rows, columns, part)
+
+    cut = None if seen is None else seen.cut
+    if crew.shares_memory:
+        made = OpenMosaic(opened, writer, LineCache(budget.cache), cut)
+        run_blocks(
+            made.tile, tiles, Crew(workers=budget.workers), keep=False, report=report,
+            each=lambda tile, part: show(tile.rows, tile.columns, part),
+        )  # fmt: skip
+        return budget
+    if not isinstance(work, MosaicRecipe):
+        raise TypeError(f"crew {crew.scheduler!r} needs a MosaicRecipe, whose paths each process opens; got MosaicWork")
+    maker = TileMaker(work, writer.path.absolute(), budget.cache, cut)
+    fewer = not crew.elsewhere and budget.workers < min(crew.count, len(tiles))
+    run_blocks(
+        maker, [(tile.rows, tile.columns) for tile in tiles], Crew(crew.scheduler, budget.workers) if fewer else crew,
+        keep=False, report=report, paths=[*work.folders, maker.out],
+        each=lambda place, part: show(*place, part),
+    )  # fmt: skip
+    return budget
+
+
+@dataclass(frozen=True)
+class TileMaker:
+    """Makes tiles in any process: opens recipe and mosaic once there, and keeps raw lines from tile to tile."""
+
+    recipe: MosaicRecipe
+    out: Path  # the mosaic, begun
+    cache: int  # bytes of raw lines kept
+    cut: ThumbnailCut | None = None
+
+    def __call__(self, place: tuple[slice, slice]) -> NDArray[np.float32] | None:
+        """Make and write the tile of some rows and columns; gives what a thumbnail shows of it."""
+        return _opened(self).at(*place)
+
+
+class OpenMosaic:
+    """A mosaic in the making: what is read, what is written, and the raw lines between."""
+
+    def __init__(self, work: MosaicWork, writer: MosaicWriter, cache: LineCache, cut: ThumbnailCut | None) -> None:
+        self._work, self._writer, self._cache, self._cut = work, writer, cache, cut
+
+        @lru_cache(maxsize=2)  # tiles go down the columns; a method of this object would keep it alive
+        def reach(start: int, stop: int) -> Reaches:
+            return column_reach(work.placed, work.camera, work.grid, slice(start, stop))
+
+        self._reach = reach
+
+    def tile(self, tile: Tile) -> NDArray[np.float32] | None:
+        """Make and write a planned tile."""
+        return self._make(tile.rows, tile.columns, tile.reach)
+
+    def at(self, rows: slice, columns: slice) -> NDArray[np.float32] | None:
+        """Make and write the tile there; what sweeps show of the columns is found once for all rows."""
+        return self._make(rows, columns, self._reach(columns.start, columns.stop))
+
+    def _make(self, rows: slice, columns: slice, reach: Reaches) -> NDArray[np.float32] | None:
+        work = self._work
+        values, coverage = mosaic_tile(
+            work.placed, work.camera, work.grid, rows, columns, kernel=work.kernel, cache=self._cache, reach=reach
+        )
+        part = None if self._cut is None else self._cut(rows, columns, values).copy()
+        self._writer.write_tile(rows.start, columns.start, values, coverage)
+        return part
+
+
+def let_tiles_go() -> None:
+    """Give back the memory of the last mosaic's raw lines in this process, whose work goes on with something else."""
+    _opened.cache_clear()
+
+
+@lru_cache(maxsize=1)
+def _opened(maker: TileMaker) -> OpenMosaic:
+    """What a maker needs, opened once in this process; the one before it is let go."""
+    return OpenMosaic(maker.recipe.open(), MosaicWriter.reopen(maker.out), LineCache(maker.cache), maker.cut)
+
+
+def tile_budget(
+    work: MosaicWork,
+    tiles: Sequence[Tile],
+    tile_shape: tuple[int, int],
+    *,
+    memory: int,
+    crew: Crew = THREADS,
+) -> TileBudget:
+    """Choose how many tiles to make at a time: as many as are allowed and memory holds; elsewhere memory is no matter.
+
+    Raises
+    ------
+    SettingsError : not even one tile at a time fits the memory.
+    """
+    processes = not crew.shares_memory
+    most = max(1, min(1 if crew.elsewhere else crew.count, len(tiles)))
+    bands = len(work.placed[0].lines.references.panel) if work.placed else 1
+    one = tile_bytes(tile_shape, bands)
+    budgets = (
+        TileBudget(count, cache_bytes(work.placed, tiles, 1 if processes else count), one, processes)
+        for count in range(most, 0, -1)
+    )
+    for budget in budgets:
+        if crew.elsewhere or budget.projected <= memory:
+            return budget
+    least = budget
+    raise SettingsError(
+        f"projected memory {_mib(least.projected)} exceeds --memory {_mib(memory)}: one tile of {tile_shape[0]} x "
+        f"{tile_shape[1]} px and {bands} bands takes {_mib(one)}, the raw lines behind it {_mib(least.cache)}, "
+        f"{'each of two processes' if processes else 'the process itself'} {_mib(RESERVED_BYTES)}; give at least "
+        f"--memory {_mib(least.projected)}"
+    )
+
+
+def _mib(size: int) -> str:
+    return f"{-(-size // 2**20)} MiB"

@@ -1,0 +1,203 @@
+"""Cloud-optimised GeoTIFFs: images for map programs, written by GDAL and read back before they get their names."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+
+from pipeline.errors import ArchiveError, ShapeError
+from storage.archive.whole_files import written_aside
+from storage.arrays.georeference import map_attributes
+from storage.arrays.ground_maps import ClassLegend
+from storage.arrays.layout import AngularGrid
+
+LARGEST_GHOST = 1024  # bytes that GDAL's note of the layout may take before the first directory
+TILE = 512  # px: rasters within one tile need no overviews
+ROWS_AT_ONCE = 512
+ANGULAR = (
+    "angular grid of the camera: x and y are tangents of the angle from the undeflected direction [rad], y grows "
+    "downwards; there is no CRS"
+)
+
+Blocks = Iterable[tuple[int, NDArray[Any]]]  # first row, (row, x) or (row, x, band) values
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an image's pixels lie. Without a CRS the transform gives tangents of angles [rad]."""
+
+    transform: tuple[float, ...]  # a, b, c, d, e, f: pixel corners to x = a column + b row + c, y = d ... + f
+    crs_wkt: str | None = None
+
+    @classmethod
+    def on_map(cls, geobox: GeoBox) -> Place:
+        """Of an image on a map, as its Zarr store says it (PoseError: the grid has no CRS)."""
+        place = map_attributes(geobox)
+        return cls(tuple(place["spatial:transform"]), place["proj:wkt2"])
+
+    @classmethod
+    def on_angles(cls, grid: AngularGrid, shape: tuple[int, int]) -> Place:
+        """Of an image of (y, x) px on the camera's angular grid."""
+        return cls(tuple(grid.attributes(shape)["spatial:transform"]))
+
+
+@dataclass(frozen=True)
+class CogImage:
+    """What one file is to hold."""
+
+    shape: tuple[int, int]  # (y, x) [px]
+    dtype: str
+    place: Place
+    bands: tuple[str, ...]  # their descriptions
+    nodata: float
+    legend: ClassLegend | None = None  # of an image of classes: overviews take the commonest, not the mean
+    tags: Mapping[str, str] = field(default_factory=dict)
+
+
+def need_rasterio() -> Any:
+    """The module rasterio; ArchiveError saying how to get it where it is not installed."""
+    try:
+        return importlib.import_module("rasterio")
+    except ImportError as error:
+        raise ArchiveError(
+            "export writes GeoTIFF, which needs rasterio, and it is not installed; pip install 'spectralzoom[geo]'"
+        ) from error
+
+
+def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
+    """Write one file, replacing what was there as a whole. Blocks come in order; memory: one block, not the image.
+
+    Classes get a colour table, their names as tags of the band, and as GDAL's category names in ``NAME.aux.xml``.
+
+    Raises
+    ------
+    ShapeError : the blocks do not fill the image.
+    ArchiveError : rasterio is not installed, the disk refuses, or what was written does not read back the same.
+    """
+    rasterio = need_rasterio()
+    copy = importlib.import_module("rasterio.shutil").copy
+    sidecar = f"{path.name}.aux.xml"
+    with written_aside(path.parent, [path.name] if image.legend is None else [path.name, sidecar]) as aside:
+        plain, made = aside / "plain.tif", aside / path.name
+        try:
+            _write_plain(rasterio, plain, image, blocks)
+            copy(str(plain), str(made), driver="COG", **_options(image))
+            problems = [*cog_problems(made), *_differences(rasterio, plain, made)]
+        except rasterio.errors.RasterioError as error:
+            raise ArchiveError(f"{path} cannot be written: {error}; is there space on the disk?") from error
+        if problems:
+            raise ArchiveError(f"{path} did not come out as written: {problems[0]}; is the disk full? run again")
+        if image.legend is not None:
+            _write_categories(aside / sidecar, image.legend)
+
+
+def _options(image: CogImage) -> dict[str, str]:
+    return {
+        "COMPRESS": "DEFLATE",  # every reader has it; not every build of GDAL has zstd
+        "PREDICTOR": "NO" if image.legend is not None else "YES",  # neighbouring class numbers have no slope
+        "OVERVIEW_RESAMPLING": "AVERAGE" if image.legend is None else "MODE",
+        "BLOCKSIZE": str(TILE),
+        "NUM_THREADS": "1",
+    }
+
+
+def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> None:
+    """An uncompressed TIFF in strips, block by block, from which GDAL makes the other."""
+    y, x = image.shape
+    profile = {
+        "driver": "GTiff", "height": y, "width": x, "count": len(image.bands), "dtype": image.dtype,
+        "nodata": image.nodata, "transform": rasterio.Affine(*image.place.transform), "crs": image.place.crs_wkt,
+        "BIGTIFF": "IF_SAFER",
+    }  # fmt: skip
+    with rasterio.open(path, "w", **profile) as file:
+        file.descriptions = image.bands
+        file.update_tags(**image.tags)
+        if image.legend is not None:
+            file.update_tags(1, **class_tags(image.legend))
+            file.write_colormap(1, colour_table(image.legend))
+        reached = 0
+        for first, values in blocks:
+            planes = np.moveaxis(values.reshape(*values.shape[:2], -1), -1, 0)
+            if first != reached or planes.shape != (len(image.bands), planes.shape[1], x):
+                raise ShapeError(f"{path.name}: rows from {first} with shape {values.shape} do not follow {reached}")
+            file.write(planes.astype(image.dtype, copy=False), window=((first, first + planes.shape[1]), (0, x)))
+            reached += planes.shape[1]
+    if reached != y:
+        raise ShapeError(f"{path.name}: {reached} of {y} rows were given")
+
+
+def class_tags(legend: ClassLegend) -> dict[str, str]:
+    """Names of the classes as tags: ``CLASS_0`` and so on, and all of them as CF's ``flag_meanings``."""
+    meanings = " ".join("_".join(name.split()) for name in legend.names)
+    values = ", ".join(str(number) for number in range(len(legend.names)))
+    each = {f"CLASS_{number}": name for number, name in enumerate(legend.names)}
+    return {**each, "flag_values": values, "flag_meanings": meanings}
+
+
+def colour_table(legend: ClassLegend) -> dict[int, tuple[int, int, int, int]]:
+    """Red, green, blue and opacity of every class."""
+    return {number: (red, green, blue, 255) for number, (red, green, blue) in enumerate(legend.colours.tolist())}
+
+
+def _write_categories(path: Path, legend: ClassLegend) -> None:
+    root = ElementTree.Element("PAMDataset")
+    names = ElementTree.SubElement(ElementTree.SubElement(root, "PAMRasterBand", band="1"), "CategoryNames")
+    for name in legend.names:
+        ElementTree.SubElement(names, "Category").text = name
+    ElementTree.ElementTree(root).write(path, encoding="utf-8")
+
+
+def _differences(rasterio: Any, plain: Path, made: Path) -> list[str]:
+    """Where two files do not hold the same numbers, transform, CRS or nodata."""
+    with rasterio.open(plain) as wanted, rasterio.open(made) as found:
+        for name in ("shape", "count", "dtypes", "crs", "transform"):
+            if getattr(wanted, name) != getattr(found, name):
+                return [f"its {name} is {getattr(found, name)}, not {getattr(wanted, name)}"]
+        if not np.array_equal(wanted.nodata, found.nodata, equal_nan=True):
+            return [f"its nodata is {found.nodata}, not {wanted.nodata}"]
+        for first in range(0, wanted.height, ROWS_AT_ONCE):
+            window = ((first, min(first + ROWS_AT_ONCE, wanted.height)), (0, wanted.width))
+            pair = wanted.read(window=window), found.read(window=window)
+            if not np.array_equal(*pair, equal_nan=pair[0].dtype.kind == "f"):
+                return [f"its numbers differ from row {first} on"]
+    return []
+
+
+def cog_problems(path: Path) -> list[str]:
+    """What keeps a file from being a cloud-optimised GeoTIFF; empty where nothing does.
+
+    Checked: GDAL's own note of the layout, tiles (or a single one), overviews down to one tile, halving from level to
+    level, all directories before all pixels with the full image's first, and overviews' pixels before the image's.
+    """
+    rasterio = need_rasterio()
+    with rasterio.open(path) as file:
+        problems = [] if file.tags(ns="IMAGE_STRUCTURE").get("LAYOUT") == "COG" else ["GDAL does not call it a COG"]
+        levels = file.overviews(1)
+        if not file.profile.get("tiled") and max(file.shape) > TILE:
+            problems.append(f"it is not tiled, its blocks are {file.block_shapes[0]}")
+        if max(file.shape) > TILE and (not levels or max(file.shape) / levels[-1] > TILE):
+            problems.append(f"its overviews {levels} do not reach down to one tile of {TILE} px")
+        if any(later != 2 * earlier for earlier, later in zip([1, *levels], levels, strict=False)):
+            problems.append(f"its overviews {levels} do not halve from level to level")
+        directories = _offsets(file, "IFD_OFFSET", len(levels))
+        pixels = _offsets(file, "BLOCK_OFFSET_0_0", len(levels))
+    if sorted(directories) != directories or directories[0] > LARGEST_GHOST or max(directories) > min(pixels):
+        problems.append(f"its directories lie at {directories}, its pixels from {min(pixels)} on")
+    if sorted(pixels, reverse=True) != pixels:
+        problems.append(f"its overviews' pixels do not precede the image's: {pixels}")
+    return problems
+
+
+def _offsets(file: Any, name: str, levels: int) -> list[int]:
+    """Where something lies in the file, for the image and its overviews; blocks that are not stored are left out."""
+    found = [file.get_tag_item(name, "TIFF", bidx=1)]
+    found += [file.get_tag_item(name, "TIFF", bidx=1, ovr=level) for level in range(levels)]
+    return [int(offset) for offset in found if offset is not None] or [0]

@@ -1,0 +1,174 @@
+"""STAC: one item a run, one collection a folder of exports, with relative links and nothing that needs a server."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import ArchiveError
+from storage.archive.whole_files import write_whole
+from storage.export.stac_fields import SCHEMAS, bounds
+
+COLLECTION = "collection.json"
+_EVERYWHERE = [-180.0, -90.0, 180.0, 90.0]
+
+
+@dataclass(frozen=True)
+class Item:
+    """What one run's item says. Addresses of assets are relative to the item's folder."""
+
+    id: str
+    started: str  # ISO 8601
+    finished: str
+    properties: Mapping[str, Any]
+    assets: Mapping[str, Mapping[str, Any]]  # STAC's asset objects by key
+    footprint: Mapping[str, Any] | None = None  # GeoJSON geometry; None where the place is not known
+
+
+@dataclass(frozen=True)
+class Collection:
+    """What the collection of a folder says."""
+
+    id: str
+    title: str
+    description: str
+    summaries: Mapping[str, Any] = field(default_factory=dict)
+
+
+def need_pystac() -> Any:
+    """The module pystac; ArchiveError saying how to get it where it is not installed."""
+    try:
+        return importlib.import_module("pystac")
+    except ImportError as error:
+        raise ArchiveError(
+            "export describes its files with pystac, and it is not installed; pip install 'spectralzoom[geo]'"
+        ) from error
+
+
+def write_stac(folder: Path, collection: Collection, item: Item) -> tuple[Path, Path]:
+    """Write ``ID/ID.json`` and the collection of all items that lie in ``folder``; gives both paths.
+
+    Raises
+    ------
+    ArchiveError : pystac is not installed, the folder is another collection's, one of its items cannot be read, or
+        what would be written does not fit STAC's own schemas.
+    """
+    pystac = need_pystac()
+    check_owner(folder, collection.id)
+    root = pystac.Collection(
+        collection.id, collection.description, _extent(pystac, []), title=collection.title, license="other",
+        catalog_type=pystac.CatalogType.SELF_CONTAINED,
+    )  # fmt: skip
+    mine = _item(pystac, item)
+    others = [other for other in _items_there(pystac, folder) if other.id != item.id]
+    items = sorted([mine, *others], key=lambda one: (str(one.datetime), one.id))
+    root.add_items(items)
+    root.extent = _extent(pystac, items)
+    root.summaries = pystac.Summaries(_summaries(items) | dict(collection.summaries))
+    root.normalize_hrefs(str(folder))
+    paths = folder / item.id / f"{item.id}.json", folder / COLLECTION
+    contents = [made.to_dict(include_self_link=False) for made in (mine, root)]
+    for path, content in zip(paths, contents, strict=True):
+        if problems := stac_problems(content):
+            raise ArchiveError(f"{path} would be no valid STAC: {problems[0]}; this is a defect, please report it")
+    for path, content in zip(paths, contents, strict=True):
+        write_whole(path, json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    return paths
+
+
+def check_owner(folder: Path, collection_id: str) -> None:
+    """Refuse a folder whose collection has another id (ArchiveError)."""
+    path = folder / COLLECTION
+    if path.exists() and (found := _load(path).get("id")) != collection_id:
+        raise ArchiveError(
+            f"{path} is the collection {found!r} of another archive, expected {collection_id!r}; choose another --out"
+        )
+
+
+def _load(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(content, dict):
+            raise TypeError("it holds no table")
+    except (OSError, ValueError, TypeError) as error:
+        raise ArchiveError(f"{path} cannot be read as STAC: {error}; remove it and export again") from error
+    return content
+
+
+def _items_there(pystac: Any, folder: Path) -> list[Any]:
+    """Items of earlier exports, each in the folder of its own name."""
+    found = []
+    for path in sorted(folder.glob("*/*.json")):
+        if path.stem == path.parent.name:
+            try:
+                found.append(pystac.Item.from_dict(_load(path), href=str(path), preserve_dict=False))
+            except (pystac.STACError, pystac.STACTypeError, KeyError, TypeError, ValueError) as error:
+                raise ArchiveError(f"{path} is no STAC item: {error}; remove its folder and export again") from error
+    return found
+
+
+def _item(pystac: Any, item: Item) -> Any:
+    start, end = (datetime.fromisoformat(text) for text in (item.started, item.finished))
+    made = pystac.Item(
+        item.id, None if item.footprint is None else dict(item.footprint), None, start, dict(item.properties),
+        start_datetime=start, end_datetime=end,
+    )  # fmt: skip
+    if item.footprint is not None:
+        made.bbox = bounds(item.footprint)
+    for key, about in item.assets.items():
+        made.add_asset(key, pystac.Asset.from_dict(dict(about)))
+    names = {*item.properties, *(name for about in item.assets.values() for name in _names(about))}
+    made.stac_extensions = [SCHEMAS[prefix] for prefix in SCHEMAS if any(n.startswith(f"{prefix}:") for n in names)]
+    return made
+
+
+def _names(about: Mapping[str, Any]) -> Iterable[str]:
+    yield from about
+    for band in about.get("bands", ()):
+        yield from band
+
+
+def _extent(pystac: Any, items: Sequence[Any]) -> Any:
+    """Around all items; everywhere where no item says where it is, which STAC has no other word for."""
+    boxes = np.array([item.bbox for item in items if item.bbox is not None])
+    box = [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()] if len(boxes) else _EVERYWHERE
+    times = [(item.common_metadata.start_datetime, item.common_metadata.end_datetime) for item in items]
+    interval = [min(start for start, _ in times), max(end for _, end in times)] if times else [None, None]
+    return pystac.Extent(pystac.SpatialExtent([box]), pystac.TemporalExtent([interval]))
+
+
+def _summaries(items: Sequence[Any]) -> dict[str, Any]:
+    """What the items' CRS and wavelengths have between them."""
+    found: dict[str, Any] = {}
+    codes = sorted({item.properties["proj:code"] for item in items if item.properties.get("proj:code")})
+    if codes:
+        found["proj:code"] = codes
+    for name in ("hsi:wavelength_min", "hsi:wavelength_max"):
+        values = [item.properties[name] for item in items if name in item.properties]
+        if values:
+            found[name] = {"minimum": min(values), "maximum": max(values)}
+    return found
+
+
+def stac_problems(content: Mapping[str, Any]) -> list[str]:
+    """What STAC's own schemas say of an item or a collection, without a network; empty where nothing.
+
+    Checked: the core schemas of STAC 1.1 that pystac brings, and GeoJSON's. Not checked: the extensions' schemas,
+    which lie on a server.
+    """
+    jsonschema = importlib.import_module("jsonschema")
+    registry = importlib.import_module("referencing").Registry
+    resource = importlib.import_module("referencing").Resource
+    schemas = importlib.import_module("pystac.validation.local_validator").get_local_schema_cache()
+    known = registry().with_resources([(name, resource.from_contents(schema)) for name, schema in schemas.items()])
+    kind = "collection" if content.get("type") == "Collection" else "item"
+    schema = schemas[f"https://schemas.stacspec.org/v1.1.0/{kind}-spec/json-schema/{kind}.json"]
+    errors = jsonschema.Draft7Validator(schema, registry=known).iter_errors(content)
+    return [f"{error.json_path}: {error.message}" for error in errors]

@@ -1,0 +1,226 @@
+"""Clearing an archive up: what no run names goes, what a run names or rests on never does.
+
+Stores go before those that they were made of, each in one step, so that an archive is whole wherever this is killed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+from pipeline.errors import SettingsError
+from storage.archive.addresses import AHEAD_SUFFIX, StageRef
+from storage.archive.archive import Archive
+from storage.archive.lineage import Catalogue
+from storage.archive.records import Store
+from storage.archive.run_folders import unfinished_extensions
+from storage.archive.staging import (
+    MANIFEST_NAME,
+    PART_SUFFIX,
+    bytes_below,
+    check_name,
+    refusals,
+    remove_tree,
+    take_lock,
+)
+
+DAY_S = 86400.0
+IN_USE = "somebody is using the archive: run gc again when it is free"
+What = Literal["store", "spool", "unfinished", "upload"]
+
+
+@dataclass(frozen=True)
+class Removal:
+    """Something that can go: its address, what it is, its size [bytes] and why."""
+
+    uri: str
+    what: What
+    size: int
+    why: str
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """What can go, in that order; ``kept`` is what no run names and stays nevertheless, with the reason.
+
+    ``obstacle`` says why no store goes, or is None.
+    """
+
+    removals: tuple[Removal, ...]
+    kept: dict[str, str]
+    obstacle: str | None
+
+    @property
+    def size(self) -> int:
+        """Bytes of all removals."""
+        return sum(removal.size for removal in self.removals)
+
+
+def clear_up(
+    archive: Archive,
+    *,
+    keep_days: float = 1.0,
+    raw_too: bool = False,
+    dry_run: bool = False,
+    progress: Callable[[Removal, float], None] | None = None,
+) -> Clearance:
+    """Remove what `plan_clearance` finds; what another process holds stays, and is not among the removals given.
+
+    Raises
+    ------
+    ArchiveError : the disk refuses.
+    """
+    if dry_run:
+        with refusals(archive.root, "clear up the archive"):
+            return plan_clearance(archive, keep_days=keep_days, raw_too=raw_too)
+    with archive.in_use(alone=True) as alone, refusals(archive.root, "clear up the archive"):
+        plan = plan_clearance(archive, keep_days=keep_days, raw_too=raw_too)
+        obstacle = plan.obstacle if alone else IN_USE
+        gone: list[Removal] = []
+        for number, removal in enumerate(plan.removals):
+            if progress is not None:
+                progress(removal, number / len(plan.removals))
+            held = (removal.what == "store" and obstacle is not None) or (removal.what == "upload" and not alone)
+            if not held and _remove(archive, removal):
+                gone.append(removal)
+    return Clearance(tuple(gone), plan.kept, obstacle)
+
+
+def plan_clearance(
+    archive: Archive, *, keep_days: float = 1.0, raw_too: bool = False, now: datetime | None = None
+) -> Clearance:
+    """Find what can go: stores that no run names, spools of published captures, and what a dead process left.
+
+    Parameters
+    ----------
+    keep_days
+        Stores younger than this stay, and so does what they rest on: a survey may be about to name them.
+    raw_too
+        Also raw lines of a rig (or that were ingested) that no run names; they cannot be had again.
+
+    Raises
+    ------
+    SettingsError : ``keep_days`` is negative or no number.
+    """
+    if not (math.isfinite(keep_days) and keep_days >= 0):
+        raise SettingsError(f"--keep-days {keep_days}: expected a number of days, 0 or more")
+    catalogue = Catalogue.read(archive.root)
+    named = set[str]().union(*(catalogue.named_and_below[run.uri] for run in catalogue.runs))
+    spared = _spared(catalogue, named, keep_days, raw_too, now or archive.now())
+    below = catalogue.ancestors(spared) & set(catalogue.stores) - named
+    kept = dict.fromkeys(below, "what stays was made of it") | spared
+    obstacle = _obstacle(archive, catalogue, named | set(kept))
+    gone = [] if obstacle else [uri for uri in catalogue.stores if uri not in named and uri not in kept]
+    removals = [
+        Removal(uri, "store", archive.size_of(uri), "no run names it") for uri in reversed(catalogue.inputs_first(gone))
+    ]
+    uploads = [
+        Removal(uri, "upload", size, "it was never published") for uri, size in archive.leftovers(keep_days).items()
+    ]
+    rest = (*_spools(archive, catalogue), *_unfinished(archive.root))
+    return Clearance((*removals, *uploads, *rest), kept, obstacle)
+
+
+def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bool, now: datetime) -> dict[str, str]:
+    """Stores that no run names and that stay for their own sake, with the reason."""
+    kept: dict[str, str] = {}
+    for uri, store in catalogue.stores.items():
+        if uri in named:
+            continue
+        if _age_days(store, now) < keep_days:
+            kept[uri] = f"younger than {keep_days:g} days"
+        elif not raw_too and catalogue.is_only_copy(uri):
+            kept[uri] = "raw lines that cannot be had again; --raw-too removes them"
+    # What was made of them is younger still: by its dates it can be older only where the clock was set back.
+    younger = [uri for uri, store in catalogue.stores.items() if _age_days(store, now) < keep_days]
+    for uri in catalogue.dependents(younger) - named:
+        kept.setdefault(uri, f"made of what is younger than {keep_days:g} days")
+    return kept
+
+
+def _age_days(store: Store, now: datetime) -> float:
+    """Days since a store was made or copied, by whichever clock is the later; negative where one runs ahead."""
+    made = (store.ref.path / MANIFEST_NAME).lstat().st_mtime
+    try:
+        created = datetime.fromisoformat(store.created)
+        made = max(made, (created if created.tzinfo else created.replace(tzinfo=UTC)).timestamp())
+    except (ValueError, OverflowError):
+        pass  # damaged, or of another time: the file's own date stands
+    return (now.timestamp() - made) / DAY_S
+
+
+def _obstacle(archive: Archive, catalogue: Catalogue, staying: set[str]) -> str | None:
+    """Why it cannot be told what may go, where a receipt or a manifest that would tell is damaged or gone."""
+    for uri in archive.lost_runs():
+        return f"no store is removed: {uri} has lost its {MANIFEST_NAME} and does not tell what it names"
+    for run in catalogue.runs:
+        if run.problem is not None and not run.recorded:
+            return f"no store is removed: {run.uri} does not tell what it rests on ({run.problem})"
+    told = set[str]().union(*(run.recorded for run in catalogue.runs))  # with all that these were made of
+    for uri in sorted(staying - told):
+        store = catalogue.stores.get(uri)
+        problem = "it is not there" if store is None else store.problem
+        if problem is not None:
+            return f"no store is removed: {uri} does not tell what it was made of ({problem}); run verify --repair"
+    return None
+
+
+def _spools(archive: Archive, catalogue: Catalogue) -> list[Removal]:
+    """Spools whose lines are published, and mosaics made ahead of these."""
+    published = {store.ref.key for store in catalogue.stores.values() if store.problem is None}
+    return [
+        Removal(f"spool/{path.name}", "spool", bytes_below(path), "its lines are published")
+        for path in sorted((archive.root / "spool").glob("*"))
+        if path.name.removesuffix(AHEAD_SUFFIX) in published
+    ]
+
+
+def _unfinished(root: Path) -> list[Removal]:
+    parts = [*root.glob(f"stages/*/*{PART_SUFFIX}"), *root.glob(f"runs/*{PART_SUFFIX}")]
+    return [
+        Removal(path.relative_to(root).as_posix(), "unfinished", bytes_below(path), "whoever made it is gone")
+        for path in sorted(set(parts) - set(unfinished_extensions(root)))
+        if _is_free(root, path)
+    ]
+
+
+def _is_free(root: Path, part: Path) -> bool:
+    lock = _lock_of(root, part)
+    if not lock.exists():
+        return True
+    release = take_lock(lock, wait=False)
+    if release is not None:
+        release()
+    return release is not None
+
+
+def _lock_of(root: Path, part: Path) -> Path:
+    return root / ".locks" / f"{part.parent.name}-{part.stem}.lock"
+
+
+def _remove(archive: Archive, removal: Removal) -> bool:
+    """Take one thing away; False where another process holds it."""
+    if removal.what == "store":
+        _, stage, key = removal.uri.split("/")
+        return archive.discard(StageRef(stage, key, archive.root / removal.uri), wait=False)
+    if removal.what == "upload":
+        archive.drop_leftover(removal.uri)
+        return True
+    path = archive.root / removal.uri
+    if removal.what == "spool":
+        check_name(path.name)
+        lock = archive.root / ".locks" / f"capture-{path.name.removesuffix(AHEAD_SUFFIX)}.lock"
+    else:
+        lock = _lock_of(archive.root, path)
+    release = take_lock(lock, wait=False)
+    if release is None:
+        return False
+    try:
+        remove_tree(path)
+    finally:
+        release()
+    return not path.exists()  # what does not let itself be removed is not gone

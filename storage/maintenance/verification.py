@@ -1,0 +1,207 @@
+"""Reading a whole archive again: every byte against its manifest, every manifest against its seal and its runs.
+
+What is no file where one should be, such as a link or a pipe, is told and never opened.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pipeline.errors import IncompleteStoreError
+from storage.archive.addresses import without_manifest
+from storage.archive.ledger import FOLDER
+from storage.archive.lineage import Catalogue
+from storage.archive.manifests import (
+    broken_files,
+    extended_from,
+    is_sealed,
+    listed_bytes,
+    manifest_sha256,
+    packed_from,
+    packed_values,
+    try_manifest,
+)
+from storage.archive.plain_files import kind_of
+from storage.archive.records import Run, Store
+from storage.archive.run_folders import unfinished_extensions
+from storage.archive.staging import MANIFEST_NAME
+from storage.archive_codec import MissingCodecError
+from storage.maintenance.growing_checks import SPOOLS, growing_problems
+from storage.maintenance.shard_names import name_damage
+from storage.packed_arrays import values_hash
+
+ASIDE = ".aside"
+Kind = Literal["whole", "broken", "missing", "stray", "growing"]
+Progress = Callable[[str, float], None]  # address of what is being read, how far of all bytes, 0..1
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What ``verify`` says of one store or run; ``problem`` is None where every byte is as published.
+
+    ``missing``: something names or rests on a store that is not there. ``stray``: what is no part of the archive.
+    ``growing``: something of a spool or a ledger that cannot be believed; the rest of it is used.
+    """
+
+    uri: str
+    problem: str | None
+    kind: Kind = "whole"
+
+
+def verify_everything(
+    root: Path, progress: Progress | None = None, problems_of: Callable[[Path], Iterator[str]] | None = None
+) -> list[Finding]:
+    """Check every store and run of an archive; a finding for each that is whole, and for each thing that is not.
+
+    ``problems_of`` reads one published folder again where its files lie elsewhere.
+    """
+    read_again = problems_of or _problems
+    catalogue = Catalogue.read(root)
+    places = [(uri, store.ref.path, store.size) for uri, store in catalogue.stores.items()]
+    places += [(run.uri, run.folder, _bytes(run)) for run in catalogue.runs]
+    total, done = sum(size for *_, size in places) or 1, 0
+    found: list[Finding] = []
+    for uri, path, size in places:
+        if progress is not None:
+            progress(uri, done / total)
+        done += size
+        if not os.path.lexists(path) and not catalogue.named_by(uri):
+            continue  # gc or a repair has cleared it away since
+        problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
+        if problems and _changed_since(catalogue, uri):  # its files and its manifest changed together
+            catalogue = Catalogue.read(root)
+            problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
+        found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
+    misplaced, growing = _misplaced_runs(catalogue), verify_growing(root)
+    return [*found, *misplaced, *_lost(root), *_missing(catalogue), *_left_aside(root), *_half_extended(root), *growing]
+
+
+def verify_growing(root: Path) -> Iterator[Finding]:
+    """Findings about spools, ledgers and what lies beside them; none where all is as it was written."""
+    yield from (Finding(uri, problem, "growing") for uri, problem in growing_problems(root))
+    for name in (SPOOLS, FOLDER):
+        if kind_of(root / name) not in (None, "a folder"):
+            yield Finding(name, f"is {kind_of(root / name)}, expected a folder; take it out of the archive", "stray")
+        for place, folders, files in os.walk(root / name):
+            for path in (Path(place, one) for one in (*folders, *files)):
+                if (kind := kind_of(path)) not in (None, "a file", "a folder"):
+                    uri = path.relative_to(root).as_posix()
+                    yield Finding(uri, f"is {kind}, expected a file; take it out of the archive", "stray")
+
+
+def _changed_since(catalogue: Catalogue, uri: str) -> bool:
+    """Whether a store was packed, or something added to a run, after the catalogue was read."""
+    store = catalogue.stores.get(uri)
+    if store is not None:
+        return packed_from(try_manifest(store.ref.path)[0]) != packed_from(store.facts)
+    run = next((run for run in catalogue.runs if run.uri == uri), None)
+    return run is not None and extended_from(try_manifest(run.folder)[0]) != extended_from(run.facts)
+
+
+def _bytes(run: Run) -> int:
+    return listed_bytes(run.facts) if run.facts else 0
+
+
+def _problems(folder: Path) -> Iterator[str]:
+    """What is wrong with one published folder, file by file."""
+    manifest, problem = try_manifest(folder)
+    if problem is not None:
+        yield f"{MANIFEST_NAME} cannot be believed: {problem}"
+        return
+    whole = True
+    for name, problem in broken_files(folder, manifest, hashes=True):
+        whole = False
+        yield f"{name} {problem}{name_damage(folder, name) if name in manifest['files'] else ''}"
+    if whole:
+        yield from _number_problems(folder, manifest)
+
+
+def _number_problems(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
+    """Cubes of a packed store whose numbers are not those that they had before (a missing codec raises)."""
+    for name, expected in packed_values(manifest).items():
+        try:
+            listed = any(file.startswith(f"{name}/") for file in manifest["files"])
+            if not listed or values_hash(folder / name) != expected:
+                yield f"{name} has other numbers than it had before it was packed"
+        except IncompleteStoreError as error:
+            if isinstance(error.__cause__, MissingCodecError):
+                raise
+            yield f"{name} cannot be read: {error}"
+
+
+def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
+    """Whether a store is the one that its place and the runs say."""
+    store = catalogue.stores.get(uri)
+    if store is None or store.problem is not None or kind_of(store.ref.path / MANIFEST_NAME) != "a file":
+        return  # which is told of already
+    stated = f"stages/{store.facts.get('stage')}/{store.facts.get('key')}"
+    if stated != uri:
+        yield f"its {MANIFEST_NAME} is that of {stated}; move it back, or take it out of the archive"
+    doubter = _doubter(catalogue, store)
+    if doubter is not None:
+        yield f"its {MANIFEST_NAME} has changed since {doubter.uri} was published (its SHA-256 differs)"
+
+
+def _doubter(catalogue: Catalogue, store: Store) -> Run | None:
+    """A run that knows another manifest, unless a run knows this one, or one that the store had before it was packed.
+
+    Nor is a store doubted that was made anew since.
+    """
+    knowing = [run for run in catalogue.runs if store.ref.uri in run.recorded]
+    if not knowing:
+        return None
+    own = {manifest_sha256(store.ref.path), *packed_from(store.facts)}
+    if any(run.recorded[store.ref.uri] in own for run in knowing):
+        return None
+    anew = is_sealed(store.facts) and all(store.created > run.sealed for run in knowing)
+    return None if anew else knowing[-1]
+
+
+def _misplaced_runs(catalogue: Catalogue) -> Iterator[Finding]:
+    """Folders of runs that say that they are another: copies, or renamed."""
+    there = {run.folder.name for run in catalogue.runs}
+    for run in catalogue.runs:
+        stated = run.facts.get("run", run.folder.name)
+        if stated != run.folder.name:
+            do = "it is a copy: take it out of the archive" if stated in there else "give it its name back"
+            yield Finding(run.uri, f"its {MANIFEST_NAME} is that of runs/{stated}; {do}", "stray")
+
+
+def _lost(root: Path) -> Iterator[Finding]:
+    """What lies among stores and runs without a manifest."""
+    for path in without_manifest(root):
+        uri = path.relative_to(root).as_posix()
+        kind = kind_of(path)
+        if kind != "a folder" or len(path.relative_to(root).parts) < 2:
+            yield Finding(uri, f"is {kind}, expected a folder with a manifest; take it out of the archive", "stray")
+        else:
+            yield Finding(uri, f"{MANIFEST_NAME} is missing", "broken")
+
+
+def _missing(catalogue: Catalogue) -> Iterator[Finding]:
+    """What runs name and stores rest on, and is not there."""
+    there, told = set(catalogue.stores), set[str]()
+    for run in catalogue.runs:
+        for uri in sorted(run.names - there - told):
+            told.add(uri)
+            yield Finding(uri, f"is not there, but {run.uri} names it", "missing")
+    for uri in catalogue.stores:
+        for given in catalogue.inputs_of(uri):
+            if given not in there | told:
+                told.add(given)
+                yield Finding(given, f"is not there, but {uri} was made of it", "missing")
+
+
+def _half_extended(root: Path) -> Iterator[Finding]:
+    for part in unfinished_extensions(root):
+        words = "what was added to it lacks its last step, a name; any command that writes into the archive gives it"
+        yield Finding(f"runs/{part.stem}", words, "stray")
+
+
+def _left_aside(root: Path) -> Iterator[Finding]:
+    for path in sorted((root / ASIDE).glob("*/*")):
+        yield Finding(path.relative_to(root).as_posix(), "a repair was broken off; run verify --repair again", "stray")

@@ -1,0 +1,1 @@
+"""Blocks of work on threads, processes and clusters, to the same bytes."""

@@ -1,0 +1,276 @@
+"""Blocks on other processes: a cluster of this machine, started for the work, or one that a dask scheduler leads."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, contextmanager, suppress
+from multiprocessing import resource_tracker
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from uuid import uuid4
+
+import dask
+
+from pipeline.errors import SettingsError, WorkerError
+from storage.parallel.block_work import Crew, check_sendable
+from storage.parallel.worker_facts import ONE_THREAD, about_here, check_facts, versions_here
+
+ANSWER_S = 5.0  # a scheduler that is there answers at once
+LOOK_S, MOST_WAIT_S = 0.02, 60.0  # how often, and how long at most, blocks are waited for that nobody wants any more
+AHEAD = 2  # blocks sent to a worker: one in the making, one waiting
+# one thread of arithmetic a worker, and freed memory kept: large arrays cost more page faults than arithmetic
+_ENVIRONMENT = {
+    **ONE_THREAD,
+    "MALLOC_MMAP_THRESHOLD_": f"{2**30}", "MALLOC_TRIM_THRESHOLD_": f"{2**31 - 1}", "MALLOC_TOP_PAD_": f"{2**26}",
+}  # fmt: skip
+_QUIET = {
+    "distributed.nanny.pre-spawn-environ": _ENVIRONMENT,
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+    "distributed.scheduler.work-stealing": False,
+    "distributed.worker.memory.target": False,  # what blocks take is known before: nothing is spilled
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": False,
+    "distributed.worker.profile.enabled": False,
+}
+
+
+class Team:
+    """Workers that blocks can be sent to. Close it."""
+
+    def __init__(self, client: Any, name: str, closing: ExitStack) -> None:
+        self._client, self._name, self._closing = client, name, closing
+
+    def close(self) -> None:
+        """Let the workers go; those of a cluster started here end."""
+        self._closing.close()
+
+    def run(self, make: Callable[[Any], Any], items: Sequence[Any], ended: Callable[[int, Any], None]) -> None:
+        """Send blocks a few ahead of the oldest unfinished one, and give each result to ``ended``.
+
+        Raises
+        ------
+        WorkerError : workers died while they made the same block again and again, or all of them left.
+        """
+        from dask.distributed import wait
+
+        waited: Callable[..., Any] = wait
+        window, name = AHEAD * self._threads(), f"block-{uuid4().hex}-"
+        running: dict[Any, int] = {}
+        sent = 0
+        try:
+            while running or sent < len(items):
+                while sent < len(items) and sent - min(running.values(), default=sent) < window:
+                    check_sendable("item", items[sent])
+                    running[self._client.submit(make, items[sent], key=f"{name}{sent}")] = sent
+                    sent += 1
+                try:
+                    with self._client.as_current():
+                        done = waited(list(running), timeout=ANSWER_S, return_when="FIRST_COMPLETED").done
+                except TimeoutError:
+                    self._threads()  # a block may take long; a team without workers never ends one
+                    continue
+                except CancelledError:
+                    raise self._gone() from None
+                for future in sorted(done, key=running.__getitem__):
+                    ended(running[future], self._result(future))
+                    del running[future]
+        except BaseException as error:
+            self._take_back(list(running), name, wait=isinstance(error, Exception))
+            raise
+
+    def _take_back(self, futures: Sequence[Any], name: str, *, wait: bool) -> None:
+        """Cancel blocks, and ``wait`` until nobody makes one of them any more and could write."""
+        end = time.monotonic() + MOST_WAIT_S * wait
+        with suppress(OSError, RuntimeError, CancelledError):  # nobody is there any more
+            self._client.cancel(futures, force=True)
+            while time.monotonic() < end and any(self._client.run(is_making, name).values()):
+                time.sleep(LOOK_S)
+
+    def _gone(self) -> WorkerError:
+        return WorkerError(f"{self._name}: the scheduler is gone; the same command goes on once it is there again")
+
+    def _result(self, future: Any) -> Any:
+        """What a block gave, or why it did not."""
+        from dask.distributed import KilledWorker
+
+        try:
+            return future.result()
+        except KilledWorker as error:
+            raise WorkerError(
+                f"{self._name}: workers died {error.args[-1] if error.args else 'several'} times in the same block; "
+                "were they out of memory? use fewer --workers, or --scheduler threads"
+            ) from None
+        except CancelledError:
+            raise self._gone() from None
+
+    def _threads(self) -> int:
+        """Blocks that can be made at a time."""
+        workers = self._client.scheduler_info(n_workers=-1)["workers"]
+        if not workers:
+            try:
+                self._client.wait_for_workers(1, timeout=ANSWER_S)
+            except TimeoutError:
+                raise WorkerError(
+                    f"{self._name} has no workers: expected at least one; start "
+                    f"`dask worker {self._client.scheduler.address}`"
+                ) from None
+            workers = self._client.scheduler_info(n_workers=-1)["workers"]
+        return max(1, sum(int(one["nthreads"]) for one in workers.values()))
+
+    def check(self, paths: Sequence[Path]) -> None:
+        """Ask the scheduler and every worker for their versions, and workers for their threads and some folders.
+
+        Raises
+        ------
+        SettingsError : one differs from this process; names it, both values and what to do.
+        WorkerError : a worker was lost meanwhile.
+        """
+        self._threads()
+        folders = [str(path.absolute()) for path in paths]
+        try:
+            leader: Mapping[str, str] = self._client.run_on_scheduler(versions_here)
+            theirs: Mapping[str, Mapping[str, str]] = self._client.run(about_here, folders)
+        except OSError as error:
+            raise WorkerError(f"{self._name}: a worker was lost ({error}); the same command goes on") from None
+        except Exception as error:  # of any type: what cannot be unpickled there comes back as text
+            raise SettingsError(
+                f"{self._name}: the scheduler or a worker cannot import SpectralZoom ({error}); install the same "
+                "version there, or use --scheduler processes"
+            ) from None
+        check_facts(f"{self._name}: the scheduler", leader, versions_here())
+        for worker, facts in theirs.items():
+            check_facts(f"{self._name}: worker {worker}", facts, {**about_here(folders), **ONE_THREAD})
+
+
+def is_making(name: str, dask_worker: Any) -> bool:
+    """Whether a worker, which dask gives, is at a block whose key begins like this."""
+    return any(str(task.key).startswith(name) for task in dask_worker.state.executing)
+
+
+def start(workers: int) -> Team:
+    """Start a cluster of one-thread processes on this machine.
+
+    Raises
+    ------
+    WorkerError : the processes do not start.
+    """
+    from dask.distributed import Client, LocalCluster
+
+    name = f"{workers} worker processes"
+    with ExitStack() as closing:
+        closing.enter_context(_quiet_logs())
+        closing.enter_context(_environment_restored())
+        closing.enter_context(dask.config.set(_QUIET))
+        scratch = closing.enter_context(TemporaryDirectory(prefix="spectralzoom-", ignore_cleanup_errors=True))
+        try:
+            with _termination_held(), _interrupts_held():
+                cluster = closing.enter_context(
+                    LocalCluster(  # type: ignore[no-untyped-call]
+                        n_workers=workers,
+                        threads_per_worker=1,
+                        memory_limit=0,
+                        local_directory=scratch,
+                        silence_logs=logging.CRITICAL,
+                        scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
+                    )
+                )
+            client = closing.enter_context(Client(cluster, set_as_default=False))  # type: ignore[no-untyped-call]
+        except (OSError, RuntimeError, TimeoutError) as error:
+            raise WorkerError(f"{name} do not start: {error}; use --scheduler threads") from error
+        return Team(client, name, closing.pop_all())
+    raise AssertionError("an exit stack swallows nothing")
+
+
+def connect(crew: Crew) -> Team:
+    """Find the scheduler of a crew that is elsewhere.
+
+    Raises
+    ------
+    SettingsError : none answers there.
+    """
+    from dask.distributed import Client
+
+    with ExitStack() as closing:
+        closing.enter_context(_quiet_logs())
+        try:
+            client = closing.enter_context(
+                Client(crew.scheduler, timeout=ANSWER_S, set_as_default=False)  # type: ignore[no-untyped-call]
+            )
+        except (OSError, TimeoutError, ValueError) as error:
+            raise SettingsError(
+                f"--scheduler {crew.scheduler}: expected a dask scheduler there, none answered within {ANSWER_S:g} s "
+                f"({type(error).__name__}); start `dask scheduler`, or use --scheduler processes"
+            ) from None
+        return Team(client, f"--scheduler {crew.scheduler}", closing.pop_all())
+    raise AssertionError("an exit stack swallows nothing")
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Let threads and processes that begin meanwhile never see Ctrl-C: this process hears it, and ends them."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # where it starts later it lets signals through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _termination_held() -> Iterator[None]:
+    """Have this process hear SIGTERM once its workers have begun: half a cluster cannot be ended in silence.
+
+    It is not blocked, for that they would inherit, and they are to be ended by it.
+    """
+    heard = signal.getsignal(signal.SIGTERM)
+    if threading.current_thread() is not threading.main_thread() or not callable(heard):
+        yield
+        return
+    came: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, frame: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, heard)
+        if came:
+            signal.raise_signal(signal.SIGTERM)
+
+
+@contextmanager
+def _environment_restored() -> Iterator[None]:
+    """Put back the variables that starting workers sets in this process."""
+    before = {name: os.environ.get(name) for name in _ENVIRONMENT}
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _quiet_logs() -> Iterator[None]:
+    """Hold back what dask logs of lost connections: it is said once, by an error."""
+    loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client")]  # each has a level of its own
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
