@@ -1,7 +1,8 @@
 """How fast the mirror must go: the right forms of the paper's equations 8 and 9, for whoever drives a rig.
 
 Frame period and imaging time (equation 10) are :class:`pipeline.geometry.camera.LineCamera`'s, the layout of the
-vector memory :mod:`pipeline.geometry.vector_memory`'s. The paper's own forms are in :mod:`pipeline.geometry.paper_equations`.
+vector memory :mod:`pipeline.geometry.vector_memory`'s. The paper's own forms are in
+:mod:`pipeline.geometry.paper_equations`.
 """
 
 from __future__ import annotations

@@ -56,8 +56,8 @@ def calibrate(
     """Turn raw lines into scene values and say which of them may be used.
 
     Out are what :func:`pipeline.rectify.calibration.flat_field.judge_elements` puts out, saturated elements, and filled
-    ones whose neighbours are saturated. A band that no sample is calibrated in (no light at all) puts nothing out: it stays NaN
-    everywhere, on its own. Where every band is like that nothing is valid.
+    ones whose neighbours are saturated. A band that no sample is calibrated in (no light at all) puts nothing out: it
+    stays NaN everywhere, on its own. Where every band is like that nothing is valid.
 
     Of a sum of n samples (the coarse pass) DN tell less than of one. Let F be full scale: at n F all of them were
     saturated, above n (F - 1) one of them at least was, below F none was, and between nothing can be known. By how
