@@ -1,7 +1,7 @@
 """A stage's code does not change without its version: what an archive holds would otherwise pass for the new result.
 
-After a change, either raise the stage's number in ``flows.survey.stages.VERSIONS`` (that of ingest in its command) or, where
-the change has no effect on what the stage writes, keep it; then record the code as it is:
+After a change, either raise the stage's number in ``flows.survey.stages.VERSIONS`` (that of ingest in its command) or,
+where the change has no effect on what the stage writes, keep it; then record the code as it is:
 
     python tests/flows/test_stage_versions.py
 """
