@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from storage.arrays.layout import damage_named, open_group, read_array, read_bands
-from storage.parallel.block_work import THREADS, Crew, run_blocks
+from storage.parallel.block_work import run_blocks
+from storage.parallel.crew import THREADS, Crew
 from storage.value_bins import KEPT, count_bins, merge_bins, percentile
 
 PERCENTILES = (2.0, 50.0, 98.0)

@@ -44,7 +44,7 @@ from storage.arrays.mosaic_work import MosaicWork
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.spool import read_spooled
 from storage.arrays.tile_work import OpenMosaic, Thumbnail, tile_budget
-from storage.parallel.block_work import Crew
+from storage.parallel.crew import Crew
 
 MOSAIC, SEEN, RECORD = "mosaic.zarr", "seen.npy", "ahead.json"
 LOG = logging.getLogger(__name__)

@@ -38,7 +38,7 @@ from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.records import read_run
 from storage.archive.whole_files import new_file, write_whole
-from storage.parallel.block_work import THREADS, Crew
+from storage.parallel.crew import THREADS, Crew
 
 Survey = Callable[[Settings, Console], Path]  # settings in, the folder of the published run out
 STATES = ("ran", "would run", "skipped", "failed")

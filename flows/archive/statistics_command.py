@@ -23,7 +23,7 @@ from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.product_names import find_product
 from storage.band_statistics import BandTable, cube_stores, product_statistics
-from storage.parallel.block_work import THREADS, Crew
+from storage.parallel.crew import THREADS, Crew
 from storage.value_bins import RELATIVE_WIDTH
 
 SHOWN = 12  # bands, where there are more

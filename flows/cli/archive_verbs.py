@@ -197,7 +197,7 @@ def statistics(
         Show every band, not a dozen of them.
     """
     from flows.archive.statistics_command import run_statistics
-    from storage.parallel.block_work import Crew
+    from storage.parallel.crew import Crew
 
     crew = Crew(scheduler, workers)
     return run_statistics(archive, product, stderr, crew=crew, every_band=every_band, as_json=as_json)
@@ -263,7 +263,7 @@ def reprocess(
         Folder for the summary, reprocess-TIME.json; without one beside the archive, where anything was to be done.
     """
     from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
-    from storage.parallel.block_work import Crew
+    from storage.parallel.crew import Crew
 
     crew = Crew(scheduler, workers)
     request = ReprocessRequest(archive, since, stage, field, failed, weights, dry_run, out, crew)

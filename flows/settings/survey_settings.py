@@ -20,7 +20,7 @@ from pipeline.rig.survey_rig import SurveyRig
 from pipeline.simulator.farm_laws import USUAL_DAY, USUAL_HOUR, has_days
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from storage.archive.toml_files import read_toml
-from storage.parallel.block_work import Crew
+from storage.parallel.crew import Crew
 
 OF_THE_MACHINE = ("scheduler", "workers")  # no byte depends on them; a cluster of that day need not be there today
 _PATHS = ("scene", "labels", "out", "mask", "vgg", "weights")

@@ -12,7 +12,7 @@ from pipeline.simulator.choice import named_effects
 from pipeline.simulator.effects.registry import BY_NAME
 from pipeline.simulator.probe import Unit
 from storage.archive.staging import is_name
-from storage.parallel.block_work import Crew
+from storage.parallel.crew import Crew
 
 RENAMED = {"throughput": "vignetting", "read": "read-noise"}  # effects as settings of before called them
 LEAST_MEMORY = 256 * 1024**2

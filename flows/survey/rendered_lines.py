@@ -12,7 +12,8 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator.instrument import BLOCK_LINES
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Line, Source
-from storage.parallel.block_work import Crew, run_blocks
+from storage.parallel.block_work import run_blocks
+from storage.parallel.crew import Crew
 
 Take = Callable[[Line], None]
 

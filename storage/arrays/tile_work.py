@@ -20,7 +20,8 @@ from pipeline.rectify.tiles import Tile, cache_bytes, plan_tiles, tile_bytes
 from storage.arrays.mosaic_work import MosaicRecipe as MosaicRecipe
 from storage.arrays.mosaic_work import MosaicWork as MosaicWork
 from storage.arrays.mosaics import MosaicWriter
-from storage.parallel.block_work import THREADS, Crew, run_blocks
+from storage.parallel.block_work import run_blocks
+from storage.parallel.crew import THREADS, Crew
 
 RESERVED_BYTES = 512 * 2**20  # a process before its first tile: interpreter, torch, zarr
 

@@ -6,87 +6,21 @@ bytes do not depend on who made them. What processes and clusters need of their 
 
 from __future__ import annotations
 
-import os
-import pickle
-import re
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import dask.threaded
 from dask.callbacks import Callback
 
-from pipeline.errors import SettingsError, WorkerError
+from pipeline.errors import WorkerError
 from storage.archive.staging import PART_SUFFIX
-
-if TYPE_CHECKING:
-    from storage.parallel.cluster_work import Team
-
-MOST_SENT = 2**18  # bytes that work or one of its items may take on its way to another process: paths, not arrays
-_ADDRESS = re.compile(r"(tcp|tls)://[^\s/:]+:\d+|(tcp|tls)://\[[0-9a-fA-F:]+\]:\d+")
+from storage.parallel.crew import THREADS, Crew, Team, check_sendable
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Report = Callable[[float], None]  # share done, 0..1, from the thread that asked
-
-
-@dataclass(frozen=True)
-class Crew:
-    """Who makes blocks: ``threads``, ``processes``, or the workers of a dask scheduler at ``tcp://host:port``."""
-
-    scheduler: str = "threads"
-    workers: int | None = None  # at a time; None is one a core. A scheduler elsewhere has workers of its own
-
-    def __post_init__(self) -> None:
-        if self.scheduler not in ("threads", "processes") and not _ADDRESS.fullmatch(self.scheduler):
-            raise SettingsError(
-                f"scheduler must be threads, processes, or the address of a dask scheduler such as "
-                f"tcp://192.168.1.5:8786; got {self.scheduler!r}"
-            )
-        if self.workers is not None and self.workers < 1:
-            raise SettingsError(f"workers must be at least 1, got {self.workers}")
-
-    @property
-    def elsewhere(self) -> bool:
-        """Whether the workers belong to a scheduler that somebody else started."""
-        return "://" in self.scheduler
-
-    @property
-    def shares_memory(self) -> bool:
-        """Whether work may hold open files and arrays; otherwise it holds paths and is pickled."""
-        return self.scheduler == "threads"
-
-    @property
-    def count(self) -> int:
-        """Blocks at a time on this machine."""
-        return count_cores() if self.workers is None else self.workers
-
-    @contextmanager
-    def open(self) -> Iterator[Crew]:
-        """Keep this crew's workers from one `run_blocks` to the next until the block ends.
-
-        Costs nothing by itself: they are started by the first `run_blocks` that needs them. May be nested.
-        """
-        with _guard:
-            held = _kept.setdefault(self, _Kept())
-            held.users += 1
-        try:
-            yield self
-        finally:
-            with _guard:
-                held.users -= 1
-                team = held.team if held.users == 0 else None
-                if held.users == 0:
-                    del _kept[self]
-            if team is not None:
-                team.close()
-
-
-THREADS = Crew()
 
 
 def run_blocks(
@@ -137,10 +71,13 @@ def run_blocks(
         return ended.results
     check_sendable("work", make)
     with crew.open():
+        team = crew.team(_start)
+        if crew.elsewhere:
+            team.check(paths)
         try:
-            _team_of(crew, paths).run(make, items, ended)
+            team.run(make, items, ended)
         except WorkerError:
-            _dismiss(crew)
+            crew.dismiss()
             raise
     for folder in paths:
         if any(part.endswith(PART_SUFFIX) for part in folder.parts):
@@ -208,68 +145,13 @@ def _awaited(number: int, workers: int) -> range:
     return range(max(number - 2 * workers + 1, 0), number - workers + 1)
 
 
-def check_sendable(what: str, value: object) -> None:
-    """Refuse what cannot travel to another process.
-
-    Raises
-    ------
-    TypeError : it cannot be pickled, or is so large that it must hold arrays.
-    """
-    try:
-        size = len(pickle.dumps(value))
-    except Exception as error:
-        raise TypeError(
-            f"the {what} of blocks cannot be sent to other processes: expected a function of a module, or a dataclass "
-            f"of paths and settings; got {type(value).__name__} ({error})"
-        ) from None
-    if size > MOST_SENT:
-        raise TypeError(
-            f"the {what} of blocks takes {size} bytes on its way to another process, at most {MOST_SENT} are allowed; "
-            f"give {type(value).__name__} paths to open instead of arrays"
-        )
-
-
 def _remove_unfinished(folder: Path) -> None:
     """Remove files beside those that they were to become: zarr gives a shard its name when it is whole."""
     for file in folder.rglob("*.partial"):
         file.unlink(missing_ok=True)
 
 
-def count_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _start(crew: Crew) -> Team:
+    from storage.parallel import cluster_work  # loads dask.distributed
 
-
-@dataclass
-class _Kept:
-    """A crew that is open, and its workers once they were needed."""
-
-    users: int = 0
-    team: Team | None = None
-
-
-_guard = threading.RLock()
-_kept: dict[Crew, _Kept] = {}
-
-
-def _team_of(crew: Crew, paths: Sequence[Path]) -> Team:
-    """The workers of an open crew, started now where nobody needed them before."""
-    from storage.parallel import cluster_work
-
-    with _guard:
-        held = _kept[crew]
-        if held.team is None:
-            held.team = cluster_work.connect(crew) if crew.elsewhere else cluster_work.start(crew.count)
-        team = held.team
-    if crew.elsewhere:
-        team.check(paths)
-    return team
-
-
-def _dismiss(crew: Crew) -> None:
-    """Let workers go that cannot be relied on any more: whoever needs the open crew next gets others."""
-    with _guard:
-        held = _kept[crew]
-        team, held.team = held.team, None
-    if team is not None:
-        team.close()
+    return cluster_work.connect(crew) if crew.elsewhere else cluster_work.start(crew.count)

@@ -19,7 +19,7 @@ from uuid import uuid4
 import dask
 
 from pipeline.errors import SettingsError, WorkerError
-from storage.parallel.block_work import Crew, check_sendable
+from storage.parallel.crew import Crew, check_sendable
 from storage.parallel.worker_facts import ONE_THREAD, about_here, check_facts, versions_here
 
 ANSWER_S = 5.0  # a scheduler that is there answers at once
@@ -43,7 +43,7 @@ _QUIET = {
 }
 
 
-class Team:
+class ProcessTeam:
     """Workers that blocks can be sent to. Close it."""
 
     def __init__(self, client: Any, name: str, closing: ExitStack) -> None:
@@ -156,7 +156,7 @@ def is_making(name: str, dask_worker: Any) -> bool:
     return any(str(task.key).startswith(name) for task in dask_worker.state.executing)
 
 
-def start(workers: int) -> Team:
+def start(workers: int) -> ProcessTeam:
     """Start a cluster of one-thread processes on this machine.
 
     Raises
@@ -186,11 +186,11 @@ def start(workers: int) -> Team:
             client = closing.enter_context(Client(cluster, set_as_default=False))  # type: ignore[no-untyped-call]
         except (OSError, RuntimeError, TimeoutError) as error:
             raise WorkerError(f"{name} do not start: {error}; use --scheduler threads") from error
-        return Team(client, name, closing.pop_all())
+        return ProcessTeam(client, name, closing.pop_all())
     raise AssertionError("an exit stack swallows nothing")
 
 
-def connect(crew: Crew) -> Team:
+def connect(crew: Crew) -> ProcessTeam:
     """Find the scheduler of a crew that is elsewhere.
 
     Raises
@@ -210,7 +210,7 @@ def connect(crew: Crew) -> Team:
                 f"--scheduler {crew.scheduler}: expected a dask scheduler there, none answered within {ANSWER_S:g} s "
                 f"({type(error).__name__}); start `dask scheduler`, or use --scheduler processes"
             ) from None
-        return Team(client, f"--scheduler {crew.scheduler}", closing.pop_all())
+        return ProcessTeam(client, f"--scheduler {crew.scheduler}", closing.pop_all())
     raise AssertionError("an exit stack swallows nothing")
 
 

@@ -36,7 +36,7 @@ from storage.arrays.layout import SHARD_ROWS
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.patches import PATCHES_A_SHARD, PatchWriter, open_patches
 from storage.arrays.tile_work import RESERVED_BYTES
-from storage.parallel.block_work import Crew
+from storage.parallel.crew import Crew
 
 SEEDS, HALOS = (1, 2, 3), (0, 1, 2, 4)
 MOST_PX = (512, 640)  # of 1024 x 1280 px: four regions

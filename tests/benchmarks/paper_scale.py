@@ -29,7 +29,7 @@ from pipeline.source import Line, References
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.tile_work import MosaicWork, write_mosaic
-from storage.parallel.block_work import Crew
+from storage.parallel.crew import Crew
 
 CAMERA = LineCamera()
 PATTERN_LINES = 512

@@ -19,7 +19,7 @@ from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from storage.arrays.attention import load_attention
 from storage.arrays.class_maps import ClassNames, create_class_map, load_class_map
-from storage.parallel.block_work import Crew
+from storage.parallel.crew import Crew
 
 Survey = Callable[..., object]
 MOST_PX = (64, 640)  # of 96 x 128 px: two regions

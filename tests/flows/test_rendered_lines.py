@@ -22,7 +22,7 @@ from pipeline.simulator.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Line
 from storage.arrays.spool import Spool
-from storage.parallel.block_work import Crew
+from storage.parallel.crew import Crew
 
 CAMERA = LineCamera(samples=48)
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-35.0, lines=70)

@@ -26,7 +26,7 @@ from storage.band_statistics import (
 )
 from storage.cube_sources import CubeSource, LineFacts
 from storage.ingested_cubes import write_ingested_cube
-from storage.parallel.block_work import Crew
+from storage.parallel.crew import Crew
 from storage.value_bins import RELATIVE_WIDTH, bins_of, edges_of
 
 SHAPE = (150, 700, 4)

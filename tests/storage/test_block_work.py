@@ -24,7 +24,8 @@ from pipeline.rectify.tiles import plan_tiles
 from storage.arrays.mosaics import MosaicWriter
 from storage.band_statistics import plan_strips
 from storage.parallel import cluster_work, worker_facts
-from storage.parallel.block_work import Crew, block_graph, count_cores, run_blocks
+from storage.parallel.block_work import block_graph, run_blocks
+from storage.parallel.crew import Crew, count_cores
 
 PROCESSES = Crew("processes", 2)
 
@@ -272,7 +273,8 @@ import subprocess, sys, time
 from contextlib import suppress
 from pipeline.errors import PipelineError, WorkerError
 from storage.parallel import cluster_work
-from storage.parallel.block_work import Crew, run_blocks
+from storage.parallel.block_work import run_blocks
+from storage.parallel.crew import Crew
 from tests.storage.test_block_work import nap
 
 def dask(*words):
@@ -331,7 +333,8 @@ INTERRUPTED = """
 import signal, sys, time
 from functools import partial
 from pathlib import Path
-from storage.parallel.block_work import Crew, run_blocks
+from storage.parallel.block_work import run_blocks
+from storage.parallel.crew import Crew
 from tests.storage.test_block_work import touch_slowly
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs have it ignored
@@ -346,7 +349,8 @@ TERMINATED = """
 import os, signal, sys, threading
 from contextlib import suppress
 from pathlib import Path
-from storage.parallel.block_work import Crew, run_blocks
+from storage.parallel.block_work import run_blocks
+from storage.parallel.crew import Crew
 def children():
     return [child for task in Path("/proc/self/task").glob("*/children") for child in task.read_text().split()]
 def terminate():

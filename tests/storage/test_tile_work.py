@@ -31,7 +31,7 @@ from storage.arrays.tile_work import (
     tile_budget,
     write_mosaic,
 )
-from storage.parallel.block_work import Crew
+from storage.parallel.crew import Crew
 
 CAMERA = LineCamera()
 BANDS = np.array([500.0, 600.0, 700.0])
