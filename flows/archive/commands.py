@@ -18,15 +18,16 @@ from flows.terminal.shown_text import on_stdout
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
 from storage.maintenance.garbage import Removal, clear_up
-from storage.maintenance.repair import Repaired, Rerun, put_back, repair
+from storage.maintenance.repair import Repaired, Rerun
 from storage.maintenance.verification import Finding
+from storage.remote.opening import open_archive, put_back_archive, repair_archive
 
 DONE, FAILED, PARTLY = 0, 1, 3
 
 
 def run_ls(archive: str | Path, *, as_json: bool = False) -> int:
     """List runs and stores of an archive on stdout."""
-    content = contents(Archive.open(archive, create=False, write=False))
+    content = contents(open_archive(archive, create=False, write=False))
     _put_out(content, show_contents, as_json=as_json)
     return DONE
 
@@ -36,7 +37,7 @@ def run_gc(
     as_json: bool = False,
 ) -> int:  # fmt: skip
     """Remove what no run names; progress on ``console``, what went (or would go) on stdout."""
-    opened = Archive.open(archive, create=False, write=not dry_run)
+    opened = open_archive(archive, create=False, write=not dry_run)
     with StageProgress(console, {"gc": "clearing up"}) as bars:
 
         def progress(removal: Removal, done: float) -> None:
@@ -57,7 +58,7 @@ def run_gc(
 
 def run_explain(archive: str | Path, product: str, *, as_json: bool = False) -> int:
     """Tell on stdout how a product came about, and what changed since the version before."""
-    opened = Archive.open(archive, create=False, write=False)
+    opened = open_archive(archive, create=False, write=False)
     _put_out(explanation(opened, product), show_explanation, as_json=as_json)
     return DONE
 
@@ -66,11 +67,11 @@ def run_verify(
     archive: str | Path, console: Console, *, remake: bool = False, rerun: Rerun | None = None, as_json: bool = False
 ) -> int:
     """Read an archive again; with ``remake`` have what is broken made anew by ``rerun`` (settings in, a run out)."""
-    opened = Archive.open(archive, create=False, write=remake)
+    opened = open_archive(archive, create=False, write=remake)
     if remake:
         with opened.in_use(alone=True) as alone:
             if alone:
-                _put_back(opened)
+                put_back_archive(opened)
     findings = _read_again(opened, console)
     bad = [finding for finding in findings if finding.problem is not None]
     content = verdict(opened, findings, _versions() if bad else {})
@@ -78,23 +79,13 @@ def run_verify(
     if bad and remake:
         if not as_json:
             show_verdict(content, console)
-        done = repair(opened, bad, rerun or _survey_again(opened, console), versions=_versions())
+        done = repair_archive(opened, bad, rerun or _survey_again(opened, console), versions=_versions())
         content["repair"] = _repaired(done)
     _put_out(content, show_verdict if done is None else show_repair, as_json=as_json)
     if done is None:
         return FAILED if bad else DONE
     stray = any(finding.kind in ("stray", "growing") for finding in bad)
     return DONE if done.complete and not stray else PARTLY if done.remade or done.dropped else FAILED
-
-
-def _put_back(archive: Archive) -> None:
-    """What a repair that was killed had set aside."""
-    if archive.in_bucket:
-        from storage.remote.object_repairs import put_back_objects
-
-        put_back_objects(archive)
-    else:
-        put_back(archive.root)
 
 
 def check_outside(out: Path, archive: Archive) -> Path:

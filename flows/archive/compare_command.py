@@ -28,6 +28,7 @@ from storage.archive.product_names import find_product
 from storage.archive.records import Run
 from storage.archive.whole_files import written_aside
 from storage.arrays.class_maps import ClassMap, load_class_map
+from storage.remote.opening import open_archive
 
 LARGEST_PAIRS = 10
 NOT_ASKED = ("notes", "out")  # of a receipt's settings
@@ -42,7 +43,7 @@ def run_compare(archive: str | Path, old: str, new: str, out: Path | None = None
     SceneError, ShapeError : the runs are of different fields.
     SettingsError : ``out`` lies in the archive.
     """
-    opened = Archive.open(archive, create=False, write=False)
+    opened = open_archive(archive, create=False, write=False)
     folder = opened.around if out is None else check_outside(out, opened)
     catalogue = Catalogue.read(opened.root)
     runs = (find_run(catalogue, old), find_run(catalogue, new))

@@ -23,7 +23,6 @@ from flows.archive.export_catalogue import (
 )
 from flows.archive.export_layers import map_layers, open_exported
 from pipeline.errors import ArchiveError, PipelineError
-from storage.archive.archive import Archive
 from storage.archive.staging import take_lock
 from storage.archive.whole_files import remove_leftovers
 from storage.arrays.cubes import open_raw_cube
@@ -33,6 +32,7 @@ from storage.export.cog_files import need_rasterio, write_cog
 from storage.export.envi_writer import EnviFile, write_envi
 from storage.export.stac_fields import COG
 from storage.export.stac_items import check_owner, need_pystac, write_stac
+from storage.remote.opening import open_archive
 
 ENVI_NUMBERS = "application/octet-stream"
 
@@ -52,7 +52,7 @@ def run_export(archive: str | Path, run: str | None, out: Path, envi: bool, cons
     """
     need_rasterio()
     need_pystac()
-    opened = open_exported(Archive.open(archive, create=False, write=False), run)
+    opened = open_exported(open_archive(archive, create=False, write=False), run)
     out = check_outside(out, opened.archive)
     about = describe_collection(opened)
     with _writing(out), _alone_in(out):

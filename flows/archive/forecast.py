@@ -21,6 +21,7 @@ from storage.archive.changes import Change, changes_between
 from storage.archive.keys import plain
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Store
+from storage.remote.opening import is_archive, open_archive
 
 State = Literal["cached", "to run", "blocked", "skipped"]
 
@@ -82,8 +83,8 @@ def _opened(settings: Settings) -> Iterator[SurveyRun]:
     """The survey's context on its archive as it is; where there is none yet, on an empty one that goes away again."""
     with tempfile.TemporaryDirectory(prefix="spectralzoom-plan-") as empty:
         archive = Archive(Path(empty), writes=False)
-        if Archive.is_there(settings.out):
-            archive = Archive.open(settings.out, create=False, write=False)
+        if is_archive(settings.out):
+            archive = open_archive(settings.out, create=False, write=False)
         run = open_run(replace(settings, out=empty), planning=True)
         yield replace(run, settings=settings, archive=archive)
 

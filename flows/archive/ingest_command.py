@@ -16,6 +16,7 @@ from storage.archive.archive import Archive, StageRef
 from storage.archive.staging import check_name, file_hash
 from storage.cube_sources import CubeSource
 from storage.ingested_cubes import Report, SourceFile, write_ingested_cube
+from storage.remote.opening import open_archive
 from storage.scan_files import open_cube_source, with_wavelengths
 
 STAGE = "ingest"
@@ -50,7 +51,7 @@ def run_ingest(request: IngestRequest, console: Console) -> dict[str, Any]:
         check_name(request.name)
     with console.status("opening the source"):
         source = _opened(request)
-        archive = Archive.open(request.archive)
+        archive = open_archive(request.archive)
         archive.reclaim()  # what a killed ingest left half made
     with archive.in_use(), StageProgress(console, TITLES) as progress:
         before = _stamps(source)

@@ -28,6 +28,7 @@ from pipeline.errors import ArchiveError, SceneError, WeightsError
 from storage.archive.archive import Archive, StageRef
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
+from storage.remote.opening import open_archive
 
 # products of a survey, and the stages that leave them; those of a second round come after the first
 MADE_BY = {
@@ -67,7 +68,7 @@ def run_judge(request: JudgeRequest, console: Console) -> Receipt:
     ArchiveError : there is no such run, it is damaged, or lacks what is needed.
     SceneError, WeightsError : scene, labels or weights are not those of the run, or there are no labels.
     """
-    opened = Archive.open(request.archive, create=False)
+    opened = open_archive(request.archive, create=False)
     catalogue = Catalogue.read(opened.root)
     found = find_run(catalogue, request.run)
     receipt = load_receipt(found.folder)

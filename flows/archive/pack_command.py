@@ -18,6 +18,7 @@ from flows.terminal.figures import DASH, format_bytes
 from flows.terminal.progress import StageProgress
 from flows.terminal.shown_text import on_stdout
 from storage.archive.archive import Archive
+from storage.remote.opening import open_archive
 from storage.repacking import Packed, Packing, pack, plan_packing
 
 DONE, PARTLY = 0, 3
@@ -33,7 +34,7 @@ def run_pack(
     -------
     Exit code: 3 where the archive is in use, or a store is damaged.
     """
-    opened = Archive.open(archive, create=False, write=not dry_run)
+    opened = open_archive(archive, create=False, write=not dry_run)
     done = (
         _pack(opened, console, older_than)
         if not dry_run

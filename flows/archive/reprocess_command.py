@@ -34,11 +34,11 @@ from flows.survey.scores import score_of
 from flows.terminal.figures import format_points, format_seconds
 from pipeline.errors import PipelineError, SettingsError
 from pipeline.visible_text import visible
-from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.records import read_run
 from storage.archive.whole_files import new_file, write_whole
 from storage.parallel.crew import THREADS, Crew
+from storage.remote.opening import open_archive
 
 Survey = Callable[[Settings, Console], Path]  # settings in, the folder of the published run out
 STATES = ("ran", "would run", "skipped", "failed")
@@ -72,7 +72,7 @@ def run_reprocess(
     SettingsError : a date or stage that is none, no field is called so, or ``out`` lies in the archive.
     ArchiveError : the archive cannot be read or written, or there is no room for the summary.
     """
-    opened = Archive.open(request.archive, create=False, write=not request.dry_run)
+    opened = open_archive(request.archive, create=False, write=not request.dry_run)
     folder = opened.around if request.out is None else check_outside(request.out, opened)
     catalogue = Catalogue.read(opened.root)
     wanted = _chosen(catalogue, request, opened.name)

@@ -24,6 +24,7 @@ from storage.archive.lineage import Catalogue
 from storage.archive.product_names import find_product
 from storage.band_statistics import BandTable, cube_stores, product_statistics
 from storage.parallel.crew import THREADS, Crew
+from storage.remote.opening import open_archive
 from storage.value_bins import RELATIVE_WIDTH
 
 SHOWN = 12  # bands, where there are more
@@ -48,7 +49,7 @@ def run_statistics(
     SettingsError : it is a run, or holds no cube.
     IncompleteStoreError : it is damaged.
     """
-    opened = Archive.open(archive, create=False, write=False)
+    opened = open_archive(archive, create=False, write=False)
     uri, stores = _stores_of(opened, product)
     with StageProgress(console, {"statistics": "statistics"}) as bars:
         table = product_statistics(stores, crew, report=lambda done: bars.show("statistics", done))

@@ -20,10 +20,10 @@ from flows.schedule.wall_clock import SystemWallClock, WallClock
 from flows.settings.survey_settings import Settings, load_settings
 from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
 from pipeline.simulator.farm_laws import has_days
-from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger
 from storage.archive.staging import take_lock
 from storage.archive.toml_files import read_toml
+from storage.remote.opening import open_archive
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class ServedField:
     @property
     def archive(self) -> Path:
         """Folder of the archive, or of its working copy."""
-        return Archive.open(self.settings.out).root
+        return open_archive(self.settings.out).root
 
     def schedule(self, timetable: Timetable, late: float, clock: WallClock | None = None) -> FieldSchedule:
         """The field's schedule and ledger."""

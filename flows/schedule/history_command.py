@@ -14,6 +14,7 @@ from flows.schedule.history_page import render_history, render_index, way_to
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
 from storage.archive.whole_files import write_whole
+from storage.remote.opening import open_archive
 
 
 def run_report(archive: str | Path, field: str | None, out: Path, console: Console) -> dict[str, Any]:
@@ -24,7 +25,7 @@ def run_report(archive: str | Path, field: str | None, out: Path, console: Conso
     SettingsError : ``out`` is a folder, or lies in the archive.
     ArchiveError : no field is called so, or a file cannot be read or written.
     """
-    opened = Archive.open(archive, create=False, write=False)
+    opened = open_archive(archive, create=False, write=False)
     page = check_outside(out, opened)
     if page.is_dir():
         raise SettingsError(f"--out {out} is a folder, expected the file to write, such as {out}/history.html")

@@ -29,8 +29,8 @@ from flows.schedule.served import read_served, served_archive, served_field, ser
 from flows.schedule.wall_clock import WallClock
 from flows.terminal.shown_text import on_stderr
 from pipeline.errors import PipelineError, RigError
-from storage.archive.archive import Archive
 from storage.archive.staging import take_lock
+from storage.remote.opening import open_archive
 
 LIMIT = "rig"  # a Prefect concurrency limit that shows who waits; the kernel's lock decides
 REPROCESS_LOCK = "reprocess-flow.lock"
@@ -162,7 +162,7 @@ def reprocess_archive(
         served = read_served()
         archive = served_archive(served, archive)
         request = ReprocessRequest(archive, since, stage, field, failed, served_weights(served, weights), dry_run)
-        lock = Archive.open(archive, create=False, write=False).root / ".locks" / REPROCESS_LOCK
+        lock = open_archive(archive, create=False, write=False).root / ".locks" / REPROCESS_LOCK
         release = take_lock(lock, wait=False)
         if release is None:  # it may be but the watcher's look
             time.sleep(A_LOOK_S)

@@ -27,7 +27,8 @@ from pipeline.errors import ArchiveError, SceneError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.manifest import UNIT_WORDS
-from storage.archive.archive import Archive, StageRef
+from storage.archive.archive import StageRef
+from storage.remote.opening import open_archive
 from storage.scene_files import load_scene_file
 
 TITLES = {"effects": "effects that matter", "capture": "scan", "comparison": "the same with everything on"}
@@ -146,7 +147,7 @@ def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[Captur
         raise SceneError(_gap(settings))
     _, coarse_pass, full = lay_out_sweeps(settings, SceneGrid(*scene.shape, PATCH, FACTOR))
     run = CaptureRun(
-        settings=settings, archive=Archive.open(settings.out), source=make_source(scene, settings), scene=scene,
+        settings=settings, archive=open_archive(settings.out), source=make_source(scene, settings), scene=scene,
         planned=(*coarse_pass, *full),
     )  # fmt: skip
     return run, coarse_pass if coarse else full, notes

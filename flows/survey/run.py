@@ -41,6 +41,7 @@ from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
 from storage.arrays.layout import AngularGrid
 from storage.raster_files import load_raster
+from storage.remote.opening import open_archive
 
 if TYPE_CHECKING:
     from pipeline.rig.rig_source import RigSource
@@ -158,7 +159,7 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     _check_pose(settings, scene.shape)
     key = content_key(path)
     return SurveyRun(
-        settings=settings, archive=Archive.open(settings.out), source=source, rig=rig, scene=scene,
+        settings=settings, archive=open_archive(settings.out), source=source, rig=rig, scene=scene,
         planned=(*plan.coarse, *plan.full), described=described, load=load, weights_key=key, grid=grid, plan=plan,
         notes=(*notes, *sealing, *band_notes, *vgg_notes, *label_notes), refused=refused,
     )  # fmt: skip

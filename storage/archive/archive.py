@@ -27,7 +27,7 @@ from typing import Any
 
 from pipeline.errors import ArchiveError
 from storage.archive.addresses import StageRef, in_text, published_runs, published_stores, store_at, without_manifest
-from storage.archive.folder import is_folder_archive, open_folder
+from storage.archive.folder import open_folder
 from storage.archive.keys import plain, stage_key
 from storage.archive.lineage import rests_on
 from storage.archive.manifests import (
@@ -52,7 +52,6 @@ from storage.archive.staging import (
     take_lock,
 )
 from storage.maintenance.verification import Finding, Progress, verify_everything
-from storage.remote.object_places import is_remote, need_obstore
 
 __all__ = ["Archive", "Cost", "Finding", "RunDraft", "StageRef", "StagedStore", "stage_key"]
 
@@ -76,34 +75,18 @@ class Archive:
 
     @classmethod
     def open(cls, root: str | Path, *, create: bool = True, write: bool = True) -> Archive:
-        """Open an archive, a folder or ``s3://bucket/prefix``, or make it where ``create``.
+        """Open the archive in a folder, or make it where ``create``; `storage.remote.opening` knows buckets as well.
 
         Raises
         ------
         ArchiveError : the path is a file, is not there, or does not let itself be written to (``write``).
-        SettingsError : an address on S3 that is none.
         """
-        if is_remote(root):
-            need_obstore(root)
-            from storage.remote.object_archive import open_object_archive
-
-            return open_object_archive(root, create=create, write=write)
         path = Path(root).absolute()
         open_folder(path, create=create, write=write)
         if write:
             with refusals(path, "write to the archive"):
                 finish_extensions(path)
         return cls(path, writes=write)
-
-    @staticmethod
-    def is_there(root: str | Path) -> bool:
-        """Whether there is something to open: an archive, or a file that will be refused."""
-        if is_remote(root):
-            need_obstore(root)
-            from storage.remote.object_archive import is_object_archive
-
-            return is_object_archive(root)
-        return is_folder_archive(Path(root))
 
     @property
     def name(self) -> str:

@@ -95,10 +95,6 @@ def repair(
     ------
     ArchiveError : somebody else uses the archive, or the disk refuses.
     """
-    if archive.in_bucket:
-        from storage.remote.object_repairs import repair_objects
-
-        return repair_objects(archive, findings, rerun, versions=versions)
     with archive.in_use(alone=True) as alone, refusals(archive.root, "repair the archive"):
         if not alone:
             raise ArchiveError(f"{archive.root} is in use; run verify --repair again when the survey there has ended")

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from storage.remote.opening import open_archive
+
 pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
 from flows.publish.run_folder import Published
@@ -46,9 +48,9 @@ def test_a_rerun_makes_nothing_and_moves_next_to_nothing(
     start = Objects.__init__
     monkeypatch.setattr(Objects, "__init__", lambda self, *given: (start(self, *given), opened.append(self))[0])
     first = survey_png(bucket)
-    stored = sum(Archive.open(bucket).stored_bytes(ref) for ref in Archive.open(bucket).refs())
-    beside = map_of(Archive.open(tmp_path / "folder"), survey_png(tmp_path / "folder"))
-    np.testing.assert_array_equal(map_of(Archive.open(bucket), first), beside)
+    stored = sum(open_archive(bucket).stored_bytes(ref) for ref in open_archive(bucket).refs())
+    beside = map_of(open_archive(tmp_path / "folder"), survey_png(tmp_path / "folder"))
+    np.testing.assert_array_equal(map_of(open_archive(bucket), first), beside)
     opened.clear()
     again = survey_png(bucket)
     assert states(again.receipt) <= CACHED
@@ -62,7 +64,7 @@ def test_a_rerun_makes_nothing_and_moves_next_to_nothing(
     elsewhere = survey_png(bucket)
     assert states(elsewhere.receipt) <= CACHED
     assert elsewhere.folder != again.folder
-    np.testing.assert_array_equal(map_of(Archive.open(bucket), elsewhere), beside)
+    np.testing.assert_array_equal(map_of(open_archive(bucket), elsewhere), beside)
 
 
 def test_verbs_read_an_archive_in_a_bucket(
@@ -97,7 +99,7 @@ def test_verbs_read_an_archive_in_a_bucket(
 
 def rot_mosaic(address: str) -> None:
     """Let a bit of the mosaic's numbers flip in the bucket."""
-    archive = Archive.open(address)
+    archive = open_archive(address)
     assert isinstance(archive, ObjectArchive)
     name = next(name for name in archive.objects.listing("stages/rectify") if "/values/c/" in name)
     content = bytearray(archive.objects.read(name) or b"")
@@ -124,7 +126,7 @@ def test_a_broken_store_is_made_again_where_no_copy_is(
 ) -> None:
     """Another machine surveys again what it lacks; where that fails, all is put back as it was."""
     published = survey_png(bucket)
-    before = map_of(Archive.open(bucket), published)
+    before = map_of(open_archive(bucket), published)
     rot_mosaic(bucket)
     monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "elsewhere"))
     with monkeypatch.context() as patch:
@@ -136,7 +138,7 @@ def test_a_broken_store_is_made_again_where_no_copy_is(
     assert repaired.code == 0
     assert json.loads(repaired.out)["repair"]["complete"]
     assert command_line("verify", bucket).code == 0
-    np.testing.assert_array_equal(map_of(Archive.open(bucket), published), before)
+    np.testing.assert_array_equal(map_of(open_archive(bucket), published), before)
 
 
 def _refuse(*given: object, **more: object) -> None:

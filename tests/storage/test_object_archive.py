@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from storage.remote.opening import is_archive, open_archive
+
 pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from storage.archive.addresses import StageRef
-from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.arrays.layout import create_group, write_image
 from storage.maintenance.garbage import IN_USE, clear_up
@@ -80,7 +81,7 @@ def test_a_store_without_conditional_puts_is_refused(bucket: str, monkeypatch: p
     """Where a put that must not overwrite does, two surveys would destroy each other's: no archive is begun."""
     monkeypatch.setattr(Objects, "create", lambda self, name, content: True)
     with pytest.raises(ArchiveError, match="ignores conditional puts"):
-        Archive.open(bucket)
+        open_archive(bucket)
 
 
 def test_a_publisher_killed_before_the_manifest_leaves_nothing_visible(
@@ -90,9 +91,9 @@ def test_a_publisher_killed_before_the_manifest_leaves_nothing_visible(
     script = (
         "import os, signal, sys\n"
         "from pathlib import Path\n"
-        "from storage.archive.archive import Archive\n"
+        "from storage.remote.opening import open_archive\n"
         "from storage.remote.object_stores import Objects\n"
-        "archive = Archive.open(sys.argv[1])\n"
+        "archive = open_archive(sys.argv[1])\n"
         "Objects.claim = lambda *given: os.kill(os.getpid(), signal.SIGKILL)\n"
         "def build(path):\n"
         "    (path / 'deep').mkdir()\n"
@@ -232,14 +233,14 @@ def test_a_capture_goes_on_without_a_network(
     silent = object_places.ObjectPlace(place.bucket, place.prefix, "http://127.0.0.1:9")
     monkeypatch.setattr("storage.remote.object_archive.parse_place", lambda text: silent)
     with pytest.raises(UnreachableError, match=r"127\.0\.0\.1:9: it cannot be reached: check the network"):
-        Archive.open(bucket)
+        open_archive(bucket)
     (silent.working_copy() / ".known").mkdir(parents=True)
-    archive = Archive.open(bucket)
+    archive = open_archive(bucket)
     assert "going on in" in caplog.text
     with pytest.raises(UnreachableError, match="the same command uploads it"), archive.in_use():
         assert make(archive, seed=3)[1]
     with pytest.raises(UnreachableError, match="cannot be reached"):
-        Archive.open(bucket, create=False)
+        open_archive(bucket, create=False)
 
 
 def test_gc_takes_what_no_run_names_and_broken_off_uploads(machine: Machine) -> None:
@@ -348,10 +349,10 @@ def test_endpoints_that_cannot_be_used_are_refused(endpoint: str, words: str, mo
 def test_a_missing_bucket_or_archive_is_one_clear_error(bucket: str) -> None:
     """The message says what is missing and what to do."""
     with pytest.raises(ArchiveError, match=r"s3://no-such-bucket/x at http://.*: there is no such bucket: create it"):
-        Archive.open("s3://no-such-bucket/x")
+        open_archive("s3://no-such-bucket/x")
     with pytest.raises(ArchiveError, match="is not there; check the name"):
-        Archive.open(f"{bucket}-none", create=False)
-    assert not Archive.is_there(f"{bucket}-none")
+        open_archive(f"{bucket}-none", create=False)
+    assert not is_archive(f"{bucket}-none")
 
 
 @pytest.mark.parametrize("text", ["gs://bucket/x", "http://host/x", "S3://bucket/x"])
@@ -359,9 +360,9 @@ def test_addresses_of_other_kinds_are_no_folders(text: str, tmp_path: Path, monk
     """They are refused, and no folder is made that is called so."""
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SettingsError, match=r"expected a folder, or s3://bucket/prefix"):
-        Archive.open(text)
+        open_archive(text)
     with pytest.raises(SettingsError, match=r"expected a folder, or s3://bucket/prefix"):
-        Archive.is_there(text)
+        is_archive(text)
     assert not list(tmp_path.iterdir())
 
 
@@ -390,10 +391,10 @@ def test_what_has_another_mark_is_no_archive(bucket: str, machine: Machine, crea
     """Such as a network's page for guests, which answers everything, or an archive of a later version."""
     machine(FIRST).objects.write("archive.json", b"<html>welcome</html>")
     with pytest.raises(ArchiveError, match=r"archive\.json is not as expected"):
-        Archive.open(bucket, create=create)
+        open_archive(bucket, create=create)
 
 
 def test_no_archive_is_made_among_the_stores_of_another(bucket: str) -> None:
     """What lies there would be taken for the other's, and cleared away."""
     with pytest.raises(SettingsError, match="lies in an archive's folder stages"):
-        Archive.open(f"{bucket}/stages")
+        open_archive(f"{bucket}/stages")
