@@ -26,7 +26,6 @@ from models.controls import CONTROL_SHARE, Controls, run_controls
 from models.inference import CoarseLook, Glance, glance_of_columns, segment
 from models.metrics import agreement, average_accuracy, confusion, false_pixels, gap_closed, iou_per_class, kappa
 from models.policies import score_seats
-from models.second_look import surprise
 from pipeline.grid import UNLABELLED
 from pipeline.planning import price_of_seats
 from pipeline.savings import count_lines
@@ -167,8 +166,7 @@ def _controls_mode(run: SurveyRun, seen: Glance, controls: Controls) -> dict[str
 def _segment_seconds(run: SurveyRun, seen: Glance, patches: StageRef, columns: NDArray[np.float32]) -> dict[str, float]:
     """Wall time of the model from spectral columns to the map, the better of two each [s].
 
-    As captured: glance, scores and map; of two rounds the second look as well, at all patches, which are more than it
-    had. With every seat there is nothing to choose: the map alone.
+    As captured: glance, scores and map. With every seat there is nothing to choose: the map alone.
     """
     (seats, own), settings = patch_columns(run, patches, seen), run.settings
     valid = run.grid.valid_seats()
@@ -178,8 +176,6 @@ def _segment_seconds(run: SurveyRun, seen: Glance, patches: StageRef, columns: N
     def look_choose_draw() -> None:
         looked = glance_of_columns(run.weights, seen.columns, run.grid)
         score_seats(settings.policy, looked, seed=settings.seed, mask=run.mask, network=network)
-        if settings.rounds > 1:
-            surprise(run.weights, looked, own, seats)
         segment(run.weights, looked, own, seats)
 
     return {

@@ -70,7 +70,7 @@ class ExportedRun:
 
     def sweeps(self) -> list[Path]:
         """Stores of the raw sweeps, coarse ones first."""
-        refs = [self.store(product) for product in ("raw_coarse", "raw_fine", "raw_again")]
+        refs = [self.store(product) for product in ("raw_coarse", "raw_fine", "raw_again")]  # the last of earlier runs
         return [path for ref in refs if ref is not None for path in sorted(ref.path.glob("*.zarr"))]
 
     @cached_property

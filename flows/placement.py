@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from storage.archive import StageRef
 from storage.layout import read_array
 from storage.lookups import path_digest, write_lookup
 from storage.mosaics import MosaicWriter
-from storage.patches import PatchStore, PatchWriter, open_patches
+from storage.patches import PatchWriter, open_patches
 from storage.quicklooks import stretched
 from storage.sightings import Sighted, sight_sweeps
 from storage.stored_tables import read_table
@@ -117,71 +117,6 @@ def cut_patches(
 
     params = {"grid": asdict(run.grid), "kernel": run.settings.kernel}
     return produce("patches", build, params, [attention, raw, *registration])
-
-
-def cut_again(
-    run: SurveyRun, produce: Produce, attention: StageRef, raw: StageRef, patches: StageRef, *registration: StageRef
-) -> StageRef:
-    """Bring the seats of the second round onto the grid and store them with those of the first.
-
-    A pixel that the first round saw keeps its value; what a mirror off the plan left unseen is filled in.
-    """
-
-    def build(path: Path) -> None:
-        """Read the seats of this round, and put those of the first beside them."""
-        kept, wanted = _Kept.of(patches), load_plan(attention).seats
-        ordered = _along_scan(run, np.union1d(kept.store.seats, wanted))
-        bands, patch = run.scene.wavelength_nm, run.grid.patch
-        writer = PatchWriter(
-            path / "patches.zarr", ordered, run.grid.seat_origin(ordered), patch,
-            bands, fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(),
-        )  # fmt: skip
-        sweeps = [one.placed(run.camera) for one in sighted(run, raw, _only(registration))]
-        cache = LineCache(run.settings.memory // CACHE_SHARE)
-        for first in range(0, len(ordered), SEATS_AT_ONCE):
-            seats = ordered[first : first + SEATS_AT_ONCE]
-            values, valid = kept.read(seats, len(bands), patch)
-            new = np.flatnonzero(np.isin(seats, wanted))
-            if len(new):
-                seen = read_seats(sweeps, run.camera, run.grid, seats[new], run.settings.kernel, cache=cache)
-                _fill(values, valid, new, *seen)
-            writer.write(first, values, valid)
-            run.report((first + len(seats)) / len(ordered))
-
-    params: dict[str, Any] = {"round": 2, "kernel": run.settings.kernel}
-    return produce("patches", build, params, [attention, raw, patches, *registration])
-
-
-def _fill(
-    values: NDArray[np.float32], valid: NDArray[np.bool_], at: NDArray[np.intp],
-    seen: NDArray[np.floating], there: NDArray[np.bool_],
-) -> None:  # fmt: skip
-    """Put what the second round saw where the first saw nothing, in place."""
-    missing = ~valid[at]
-    values[at] = np.where(missing[..., None], seen, values[at])
-    valid[at] |= there
-
-
-@dataclass(frozen=True)
-class _Kept:
-    """Patches of the first round, by seat."""
-
-    store: PatchStore
-    valid: NDArray[np.bool_]  # (patch, y, x)
-
-    @staticmethod
-    def of(patches: StageRef) -> _Kept:
-        store = open_patches(patches.path / "patches.zarr")
-        return _Kept(store, read_array(store.group, "valid"))
-
-    def read(self, seats: NDArray[np.integer], bands: int, patch: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Values (seat, y, x, band) and validity of seats in the order of the store; NaN where there is none."""
-        values = np.full((len(seats), patch, patch, bands), np.nan, np.float32)
-        valid = np.zeros(values.shape[:3], np.bool_)
-        order, there = np.argsort(self.store.seats, kind="stable"), np.isin(seats, self.store.seats)
-        entries = order[np.searchsorted(self.store.seats[order], seats[there])]
-        values[there], valid[there] = self.store.pick(entries), self.valid[entries]
-        return values, valid
 
 
 def seen_shares(run: SurveyRun, patches: StageRef) -> NDArray[np.float64]:

@@ -63,12 +63,6 @@ def capture_fine(run: SurveyRun, produce: Produce, attention: StageRef, effects:
     return capture_sweeps(run, produce, load_plan(attention).sweeps, [attention, effects], begins_s=run.plan.coarse_s)
 
 
-def capture_again(run: SurveyRun, produce: Produce, attention: StageRef, effects: StageRef) -> StageRef:
-    """Go back a second time, for what the second plan chose; the first has had its half of the seconds."""
-    begins = run.plan.coarse_s + run.plan.fine_s / run.settings.rounds
-    return capture_sweeps(run, produce, load_plan(attention).sweeps, [attention, effects], begins_s=begins)
-
-
 def capture_sweeps(
     run: CaptureRun, produce: Produce, sweeps: list[Sweep], inputs: list[StageRef], *, begins_s: float = 0.0,
     follow: Follow = lambda source, key: nullcontext(lambda name, count: None),
@@ -149,21 +143,24 @@ def glance_at(run: SurveyRun, mosaic: StageRef) -> Glance:
 
 
 def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
-    """Score every seat by the coarse mosaic, and plan the sweeps that show the most score in the time left.
-
-    With two rounds half of that time is planned; see `flows.second_round`.
-    """
+    """Score every seat by the coarse mosaic, and plan the sweeps that show the most score in the time left."""
     settings = run.settings
-    budget_s = run.plan.fine_s / settings.rounds
 
     def build(path: Path) -> None:
         """Score the seats, and refuse a plan whose map would not fit the memory."""
         work = FieldWork.of(run)
         scores = _scores(run, work, mosaic)
         plan = plan_fine(
-            run.grid, run.camera, settings.cost, run.plan.along, scores, budget_s=budget_s,
-            margin_px=run.plan.margin_px, full=run.plan.full, threshold=settings.threshold,
-        )  # fmt: skip
+            run.grid,
+            run.camera,
+            settings.cost,
+            run.plan.along,
+            scores,
+            budget_s=run.plan.fine_s,
+            margin_px=run.plan.margin_px,
+            full=run.plan.full,
+            threshold=settings.threshold,
+        )
         work.check_memory(plan.seats, len(run.scene.wavelength_nm))  # before the rig goes back, not after
         rank = np.full(scores.shape, -1, np.int32)
         rank[plan.seats[np.argsort(-scores[plan.seats], kind="stable")]] = np.arange(len(plan.seats))
@@ -186,7 +183,6 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
         **(region_params(run.grid) if settings.policy in SEEING_POLICIES else {}),
         **({} if run.vgg is None else {"vgg": run.vgg.key}),
         **({} if settings.threshold is None else {"threshold": settings.threshold}),
-        **({} if settings.rounds == 1 else {"rounds": settings.rounds}),
     }
     return produce("attend", build, params, [mosaic])
 

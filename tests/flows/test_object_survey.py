@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
 from flows.publish import Published
-from flows.survey import OF_ROUND_TWO, STAGES
+from flows.survey import STAGES
 from pipeline.errors import SceneError
 from storage.archive import Archive
 from storage.class_maps import load_class_map
@@ -29,7 +29,7 @@ def states(receipt: dict[str, object]) -> set[str]:
     """What became of the stages."""
     rows = receipt["stages"]
     assert isinstance(rows, list)
-    assert len(rows) == len(STAGES) - len(OF_ROUND_TWO)
+    assert len(rows) == len(STAGES)
     return {row["state"] for row in rows}
 
 

@@ -43,9 +43,8 @@ SOURCES = {
     "locate": (*RECTIFY, "storage/sightings.py", "storage/lookups.py"),
     "rectify": (*RECTIFY, "storage/sightings.py", "storage/mosaics.py", "storage/mosaic_work.py",
                 "storage/tile_work.py"),
-    "attend": (*READ, *PLANNING, "flows/field_work.py", "flows/second_round.py", "models/second_look.py",
-               "models/policies.py", "models/saliency.py", "models/spacing.py", "models/vgg.py",
-               "models/vgg_saliency.py", "storage/attention.py"),
+    "attend": (*READ, *PLANNING, "flows/field_work.py", "models/policies.py", "models/saliency.py", "models/spacing.py",
+               "models/vgg.py", "models/vgg_saliency.py", "storage/attention.py"),
     "patches": (*RECTIFY, "pipeline/strips.py", "storage/sightings.py", "storage/patches.py"),
     "segment": (*READ, "flows/field_work.py", "storage/class_maps.py"),
     "turned": (*PLANNING, "pipeline/orientation.py", "pipeline/crop_rows.py", "storage/mosaic_strips.py",
@@ -61,7 +60,7 @@ STAGES_FILE, PLACEMENT = "flows/stages.py", "flows/placement.py"
 FUNCTIONS: dict[str, dict[str, tuple[str, ...]]] = {  # of files that several stages share
     "effects": {},
     "capture": {
-        STAGES_FILE: ("capture_coarse", "capture_fine", "capture_again", "capture_sweeps", "_capture_sweep"),
+        STAGES_FILE: ("capture_coarse", "capture_fine", "capture_sweeps", "_capture_sweep"),
         "flows/effect_choice.py": ("chosen_effects", "source_with"),
     },
     "register": {PLACEMENT: ("sighted",), STAGES_FILE: ("captured",)},
@@ -69,7 +68,7 @@ FUNCTIONS: dict[str, dict[str, tuple[str, ...]]] = {  # of files that several st
     "rectify": {PLACEMENT: ("rectify", "_record")},
     "attend": {STAGES_FILE: ("attend", "_scores", "write_plan", "load_plan")},
     "patches": {
-        PLACEMENT: ("sighted", "cut_patches", "cut_again", "_fill", "_Kept", "_along_scan", "seen_shares"),
+        PLACEMENT: ("sighted", "cut_patches", "_along_scan"),
         STAGES_FILE: ("load_plan", "captured"),
     },
     "segment": {STAGES_FILE: ("draw_map",)},
