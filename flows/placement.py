@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.rectify_ahead import begin_mosaic, drop_ahead, mosaic_picture, take_mosaic
 from flows.run import SurveyRun
-from flows.stages import SEATS_AT_ONCE, VERSIONS, Produce, captured, load_plan, write_json
+from flows.stages import SEATS_AT_ONCE, Produce, captured, load_plan, write_json
+from flows.tones import choose_bands
 from pipeline.errors import ShapeError
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.placed import PixelGrid
@@ -27,8 +27,9 @@ from storage.patches import PatchWriter, open_patches
 from storage.quicklooks import stretched
 from storage.sightings import Sighted, sight_sweeps
 from storage.stored_tables import read_table
-from storage.tile_work import MosaicRecipe, write_mosaic
+from storage.tile_work import MosaicRecipe, Thumbnail, write_mosaic
 
+QUICKLOOK_PX = 512
 CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the memory
 
 
@@ -75,25 +76,32 @@ def rectify(run: SurveyRun, produce: Produce, raw: StageRef, lookup: StageRef, *
     """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
 
     def build(path: Path) -> None:
-        """Make the tiles that were not made while lines arrived, and the picture."""
+        """Make the tiles, and the picture."""
         grid = PixelGrid.of_scene(run.grid, run.grid.factor)
         recipe = MosaicRecipe(
-            raw.path, run.camera, grid, run.settings.kernel,
-            lookup=lookup.path / "lookup.zarr", registration=_record(_only(registration)),
-        )  # fmt: skip
-        out, settings, picture = path / "mosaic.zarr", run.settings, mosaic_picture(run)
-        there = take_mosaic(run, VERSIONS["rectify"], raw, out, recipe.sweeps(), picture)
-        writer = MosaicWriter.reopen(out) if there else begin_mosaic(run, out, captured(raw)[0].simulation)
-        write_mosaic(
-            recipe, writer, memory=settings.memory, crew=settings.crew, seen=picture, there=there, report=run.report
+            raw.path,
+            run.camera,
+            grid,
+            run.settings.kernel,
+            lookup=lookup.path / "lookup.zarr",
+            registration=_record(_only(registration)),
         )
+        writer = MosaicWriter(
+            path / "mosaic.zarr",
+            grid.shape,
+            run.scene.wavelength_nm,
+            fwhm_nm=run.scene.fwhm_nm,
+            grid=run.angular_grid(run.grid.factor),
+            simulation=captured(raw)[0].simulation,
+        )
+        colours, _ = choose_bands(run.scene.wavelength_nm)
+        settings, picture = run.settings, Thumbnail(grid.shape, colours, QUICKLOOK_PX)
+        write_mosaic(recipe, writer, memory=settings.memory, crew=settings.crew, seen=picture, report=run.report)
         writer.write_quicklook(stretched(picture.image).image)
         write_json(path / "lines.json", {one.cube.sweep.name: one.facts() for one in recipe.sweeps()})
 
     params = {"grid": asdict(run.grid), "kernel": run.settings.kernel}
-    ref = produce("rectify", build, params, [raw, lookup, *registration])
-    drop_ahead(run, raw)
-    return ref
+    return produce("rectify", build, params, [raw, lookup, *registration])
 
 
 def cut_patches(

@@ -205,8 +205,8 @@ def of_this_version(stored: Mapping[str, Any]) -> dict[str, Any]:
     """
     if stored.get("rounds", 1) != 1:
         raise SettingsError(
-            f"its survey had {stored['rounds']} rounds of detail, which never paid and were removed: survey the field "
-            "again by hand, without 'rounds'; light and mosaic of the coarse pass are found in the archive"
+            f"its survey had {stored['rounds']} rounds of detail, which never paid and were removed: survey the "
+            "field by hand, without 'rounds'; what both share is in the archive; take what is damaged out first"
         )
     known = {key: value for key, value in stored.items() if key in SURVEY}
     return {

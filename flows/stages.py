@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,6 @@ from numpy.typing import NDArray
 
 from flows.effect_choice import load_manifest, source_with
 from flows.field_work import FieldWork, region_params
-from flows.rectify_ahead import Arrived, rectifying_ahead
 from flows.region_work import look_at, seat_columns
 from flows.rendered_lines import lines_again, take_lines
 from flows.rig_run import RIG_RECORD, capture_source, held_lines, rig_record
@@ -48,14 +46,12 @@ SEATS_AT_ONCE = 64
 STRANGE = "strange.json"  # beside a map, where values were no readings
 
 Build = Callable[[Path], None]
-Follow = Callable[[Source, str], AbstractContextManager[Arrived]]  # of the source of a capture, and its key
 Produce = Callable[[str, Build, dict[str, Any], Sequence[StageRef]], StageRef]
 
 
 def capture_coarse(run: SurveyRun, produce: Produce, effects: StageRef) -> StageRef:
-    """Sweep the whole field once, fast; its mosaic is begun meanwhile."""
-    ahead = partial(rectifying_ahead, run, VERSIONS["rectify"])
-    return capture_sweeps(run, produce, run.plan.coarse, [effects], follow=ahead)
+    """Sweep the whole field once, fast."""
+    return capture_sweeps(run, produce, run.plan.coarse, [effects])
 
 
 def capture_fine(run: SurveyRun, produce: Produce, attention: StageRef, effects: StageRef) -> StageRef:
@@ -64,13 +60,9 @@ def capture_fine(run: SurveyRun, produce: Produce, attention: StageRef, effects:
 
 
 def capture_sweeps(
-    run: CaptureRun, produce: Produce, sweeps: list[Sweep], inputs: list[StageRef], *, begins_s: float = 0.0,
-    follow: Follow = lambda source, key: nullcontext(lambda name, count: None),
-) -> StageRef:  # fmt: skip
-    """Take some sweeps, one after the other from ``begins_s`` on, with the effects of the last of the inputs.
-
-    ``follow`` is told of each line that is in the spool.
-    """
+    run: CaptureRun, produce: Produce, sweeps: list[Sweep], inputs: list[StageRef], *, begins_s: float = 0.0
+) -> StageRef:
+    """Take some sweeps, one after the other from ``begins_s`` on, with the effects of the last of the inputs."""
     clock = sweep_starts(sweeps, run.camera, run.settings.cost, after_s=begins_s)
     params = {**run.source_key(), "sweeps": [asdict(sweep) for sweep in sweeps], "starts_s": list(clock.values())}
     key = stage_key("capture", VERSIONS["capture"], params, [ref.key for ref in inputs])
@@ -80,9 +72,9 @@ def capture_sweeps(
         """Take the sweeps one after the other, each into a cube of its own."""
         before, manifest = 0, load_manifest(inputs[-1])
         lit = replace(run, source=source_with(run.source, inputs[-1], clock))
-        with capture_source(lit, key) as source, follow(source, key) as arrived:
+        with capture_source(lit, key) as source:
             for sweep in sweeps:
-                done = partial(_report_lines, run, arrived, sweep.name, before / total, total)
+                done = partial(_report_lines, run, before / total, total)
                 _capture_sweep(lit, source, sweep, path, key=key, report=done, effects=manifest)
                 before += sweep.lines
             if run.rig is not None:
@@ -93,8 +85,7 @@ def capture_sweeps(
     return ref
 
 
-def _report_lines(run: CaptureRun, arrived: Arrived, name: str, before: float, total: int, lines: int) -> None:
-    arrived(name, lines)
+def _report_lines(run: CaptureRun, before: float, total: int, lines: int) -> None:
     run.report(before + lines / total)
 
 
