@@ -177,7 +177,9 @@ def command(settings: Mapping[str, Any], out: str) -> str:
         if value != usual and not isinstance(value, dict) and value is not None:
             words += _flag(name.replace("_", "-"), value)
     tables = [name for name, value in settings.items() if isinstance(value, dict) and value != defaults.get(name)]
-    return shlex.join(words) + (f"  (with [{'], ['.join(tables)}] as in its receipt)" if tables else "")
+    more = [f"with [{'], ['.join(tables)}] as in its receipt"] if tables else []
+    more += ["it had two rounds of detail, which are no more"] if "rounds" in settings else []
+    return shlex.join(words) + (f"  ({'; '.join(more)})" if more else "")
 
 
 def _flag(name: str, value: object) -> list[str]:

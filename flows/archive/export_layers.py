@@ -70,7 +70,7 @@ class ExportedRun:
 
     def sweeps(self) -> list[Path]:
         """Stores of the raw sweeps, coarse ones first."""
-        refs = [self.store(product) for product in ("raw_coarse", "raw_fine", "raw_again")]
+        refs = [self.store(product) for product in ("raw_coarse", "raw_fine", "raw_again")]  # the last of earlier runs
         return [path for ref in refs if ref is not None for path in sorted(ref.path.glob("*.zarr"))]
 
     @cached_property
@@ -192,11 +192,10 @@ def _layer(
 
 def _attention(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
     """Scores of the seats, on the angular grid that their size in pixels gives."""
-    stored, ref = open_image(run.path("attention"), "score"), run.store("attention")
+    stored, patch = open_image(run.path("attention"), "score"), open_image(run.path("patches"), "valid").shape[1]
     scene = grid_of(open_image(run.path("class_map"), "classes").about)
-    if ref is None or scene is None:
+    if scene is None:
         raise IncompleteStoreError(f"the class map of run {run.id} does not say its grid; run its survey again")
-    patch = int(run.archive.manifest(ref)["params"]["grid"]["patch"])
     shape = (stored.shape[0], stored.shape[1])
     place = Place.on_angles(replace(scene, factor=patch), shape)
     policy = str(stored.about.get("policy", ""))

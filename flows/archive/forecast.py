@@ -74,7 +74,7 @@ def forecast(settings: Settings) -> Forecast:
     """
     with _opened(settings) as run:
         planner = Planner(run, Catalogue.read(run.archive.root))
-        judge(planner, survey(planner, settings.rounds))
+        judge(planner, survey(planner))
     return Forecast(planner.rows, run.refused)
 
 
@@ -138,8 +138,8 @@ class Planner:
         """Find the store of these facts, or say why there is none."""
         keys = [ref.key for ref in refs]
         key = stage_key(name, VERSIONS[name], params, keys)
-        if stage in ("capture_fine", "capture_again"):
-            self._costs.plan_fine(stage, sum(sweep["lines"] for sweep in params["sweeps"]))
+        if stage == "capture_fine":
+            self._costs.plan_fine(sum(sweep["lines"] for sweep in params["sweeps"]))
         found = self.run.archive.find(name, key)
         if found is not None:
             return StageForecast(stage, "cached", key, "stored"), found

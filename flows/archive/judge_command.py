@@ -30,18 +30,14 @@ from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
 from storage.remote.opening import open_archive
 
-# products of a survey, and the stages that leave them; those of a second round come after the first
+# products of a survey, and the stages that leave them
 MADE_BY = {
     "effects": "choose_effects", "raw_coarse": "capture_coarse", "coarse_pointing": "register_coarse",
     "lookup": "locate", "mosaic": "rectify", "attention": "attend", "raw_fine": "capture_fine",
     "fine_pointing": "register_fine", "patches": "cut_patches", "class_map": "draw_map", "turned": "compare_turned",
     "ground_map": "ground",
 }  # fmt: skip
-MADE_AGAIN_BY = {
-    "first_patches": "cut_patches", "attention_again": "attend_again", "raw_again": "capture_again",
-    "pointing_again": "register_again", "patches": "cut_again",
-}  # fmt: skip
-MAY_BE_MISSING = ("coarse_pointing", "fine_pointing", "pointing_again", "ground_map")
+MAY_BE_MISSING = ("coarse_pointing", "fine_pointing", "ground_map")
 
 
 @dataclass(frozen=True)
@@ -118,9 +114,8 @@ def _has(receipt: Receipt, settings: Settings, request: JudgeRequest) -> bool:
 def _products(catalogue: Catalogue, found: Run, run: SurveyRun) -> Products:
     """What the run's survey left, each whole by its manifest and of the present version of its stage."""
     keys = {str(row.get("name")): str(row.get("key") or "") for row in found.stages}
-    made_by = MADE_BY | (MADE_AGAIN_BY if run.settings.rounds > 1 else {})
     refs: dict[str, StageRef | None] = {}
-    for product, stage in made_by.items():
+    for product, stage in MADE_BY.items():
         key = keys.get(stage, "")
         if not key and product in MAY_BE_MISSING:
             refs[product] = None

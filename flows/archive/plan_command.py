@@ -42,7 +42,6 @@ def plan_content(settings: Settings) -> dict[str, Any]:
     ahead = [row for row in rows if row.state in ("to run", "blocked")]
     return {
         "archive": settings.out,
-        **({} if settings.rounds == 1 else {"rounds": settings.rounds}),
         "stages": [_row(row) for row in rows],
         "to_make": len(ahead),
         "estimated": sum(row.seconds is not None for row in ahead),
@@ -86,8 +85,7 @@ def _sentence(content: dict[str, Any]) -> str:
         return "everything is stored: the survey would only publish a run"
     if not known:
         return f"{count} stages to make; the archive has no record of what such stages took"
-    of_rounds = f" for {content['rounds']} rounds of detail" if "rounds" in content else ""
-    about = f"about {format_seconds(content['seconds'])} and {format_bytes(content['bytes'])}{of_rounds}"
+    about = f"about {format_seconds(content['seconds'])} and {format_bytes(content['bytes'])}"
     rest = "" if known == count else f" without {count - known} stages of which there is no record"
     return f"{count} stages to make, {about} by the archive's own records{rest}"
 

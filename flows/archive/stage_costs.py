@@ -38,17 +38,11 @@ PARTS = {
     "capture_fine": Part("capture", "fine values", fine=True),
     "register_fine": Part("register", "fine values", 2),
     "cut_patches": Part("patches", "patch values"),
-    "attend_again": Part("attend", "operations of the map", 3),
-    "capture_again": Part("capture", "fine values", fine=True),
-    "register_again": Part("register", "fine values", 2),
-    "cut_again": Part("patches", "patch values"),
     "draw_map": Part("segment", "operations of the map", size="pixels"),
     "compare_turned": Part("turned", "pixels"),
     "ground": Part("ground", "pixels"),
     "evaluate": Part("evaluate", "operations of a glance", size="surveys"),
 }
-OF_ONE_ROUND = ("attend", "capture_fine", "register_fine", "cut_patches", "attend_again", "capture_again",
-                "register_again")  # fmt: skip
 MOST_RECORDS = 5  # of a stage that are looked into
 APART = 2.0  # times the work of another: then the two tell what starting takes
 CONTROLS_UNIT: Unit = "scene values"  # judging with controls scans the whole field
@@ -63,11 +57,11 @@ class PastCosts:
             run.described.config, run.grid, run.camera, run.settings.cost, run.plan.along,
             len(run.scene.wavelength_nm), sum(sweep.lines for sweep in run.plan.coarse),
         )  # fmt: skip
-        self._fine_lines: dict[str, int] = {}
+        self._fine_lines: int | None = None
 
-    def plan_fine(self, stage: str, lines: int) -> None:
-        """Take note of how many lines a fine pass has; before that they are what its seconds are likely to buy."""
-        self._fine_lines[stage] = lines
+    def plan_fine(self, lines: int) -> None:
+        """Take note of how many lines the fine pass has; before that they are what its seconds are likely to buy."""
+        self._fine_lines = lines
 
     def stored(self, stage: str) -> list[Store]:
         """Whole stores of a stage, newest first."""
@@ -107,8 +101,8 @@ class PastCosts:
         known = self._known(sorted(records, key=lambda store: not self.of_scene(store)), unit)
         if not known:
             return None, None, f"{records[0].ref.uri} does not tell how much work it was"
-        seconds = self._line(stage, known, unit, [cost.wall_s for _, cost, _ in known])
-        size = self._line(stage, known, PARTS[stage].size or unit, [cost.size for _, cost, _ in known])
+        seconds = self._line(known, unit, [cost.wall_s for _, cost, _ in known])
+        size = self._line(known, PARTS[stage].size or unit, [cost.size for _, cost, _ in known])
         address, first, _ = known[0]
         rest = "" if len(known) == 1 else f", and {known[1][0]}"
         times = seconds / first.wall_s if first.wall_s else 0.0
@@ -129,37 +123,28 @@ class PastCosts:
                 break
         return known
 
-    def _line(self, stage: str, known: Sequence[tuple[str, Cost, Extent]], unit: Unit, took: Sequence[float]) -> float:
+    def _line(self, known: Sequence[tuple[str, Cost, Extent]], unit: Unit, took: Sequence[float]) -> float:
         """What this run takes: the first record by its work, less what starting took where two records tell it."""
         works = [then.work(unit) for _, _, then in known]
-        return scaled_cost(works, took, self._extent_like(stage, known[0][2]).work(unit))
+        return scaled_cost(works, took, self._extent_like(known[0][2]).work(unit))
 
     def _alike(self, store: Store) -> bool:
         """Controls are many times the work of judging a map alone."""
         return store.ref.stage != "evaluate" or store.params.get("controls") == self._run.settings.controls
 
-    def _extent_like(self, stage: str, then: Extent) -> Extent:
-        """This run, with a fine pass's lines as planned, else as many as its seconds buy in runs as long as then.
-
-        A stage of one of several rounds has the lines of that one, as it is planned; half of the seconds are its own.
-        """
-        plan, rounds, of_one = self._run.plan, self._run.settings.rounds, stage in OF_ONE_ROUND
-        passes = ["capture_fine", "capture_again"][:rounds]
-        if of_one:
-            passes = ["capture_again" if stage.endswith("_again") and stage != "attend_again" else "capture_fine"]
-        if all(name in self._fine_lines for name in passes):
-            return replace(self._extent, fine_lines=sum(self._fine_lines[name] for name in passes))
+    def _extent_like(self, then: Extent) -> Extent:
+        """This run, with the fine pass's lines as planned, else as many as its seconds buy in runs as long as then."""
+        if self._fine_lines is not None:
+            return replace(self._extent, fine_lines=self._fine_lines)
+        plan = self._run.plan
         most = sum(sweep.lines for sweep in plan.full)
-        seconds = plan.fine_s / rounds if of_one else plan.fine_s
-        return self._extent.buying(seconds, run_lines=then.run_lines, most=most)
+        return self._extent.buying(plan.fine_s, run_lines=then.run_lines, most=most)
 
     def _extent_then(self, record: Store) -> Extent:
         """How much a survey was, as far as a store and those that it rests on tell by their parameters."""
         below = self._below(record)
         captures = {_is_fine(store): store for store in below if store.ref.stage == "capture"}
         passes = [store for store in below if store.ref.stage == "capture" and _is_fine(store)]
-        if record.ref.stage in ("capture", "register"):  # of a second round: the first is none of its work
-            passes = [store for store in passes if store.ref.key in (record.ref.key, *record.inputs)]
         own = self._extent
         if record.ref.stage == "effects":  # looks at a few places of a scene, whatever its size
             return own

@@ -9,7 +9,7 @@ import traceback
 from pathlib import Path
 from typing import Literal
 
-from cyclopts import CycloptsError
+from cyclopts import CycloptsError, UnknownOptionError
 
 import flows.cli.archive_verbs
 import flows.cli.model_verbs
@@ -263,8 +263,14 @@ def _run(arguments: list[str]) -> int:
 
 def _usage(error: CycloptsError) -> str:
     """What was wrong with the words of a command, and where its right ones stand."""
+    from flows.settings.keys import REPLACED
+
     what = str(error).partition(" Available commands:")[0]  # cut off in the middle: the help has them all
     verb = " ".join(("spectralzoom", *(error.command_chain or ())))
+    if isinstance(error, UnknownOptionError):
+        word = (error.token.keyword or error.token.value).partition("=")[0]
+        gone = REPLACED.get(word.removeprefix("--"))
+        what = what if gone is None else f"Unknown option: {word}; {gone}"
     return f"{what.rstrip('.')}; see {verb} --help"
 
 

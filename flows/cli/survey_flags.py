@@ -42,8 +42,6 @@ class SurveyFlags:
     """Weights of VGG19, for the policies vgg-static and vgg-trained."""
     weights: str | None = None
     """Model weights (.safetensors); those for `farm` are built in."""
-    rounds: str | None = None
-    """Rounds of detail: 1 (default), or 2: half of the time first, the rest where that showed more than expected."""
     threshold: str | None = None
     """Least gain that a second of the fine pass is spent for [nat per px, summed over seats], as the receipt's
     score_per_second; none by default. For the policies gain and entropy."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from flows.terminal.figures import counted, format_percent
+from flows.terminal.figures import format_percent
 
 LEAST_HECTARES = 0.1  # smaller areas are told in square metres
 
@@ -37,14 +37,8 @@ def _plan_words(plan: Mapping[str, Any]) -> list[str]:
         words.append(f"{plan['out_of_reach']} places worth a second look lie beyond the mirror's range.")
     if plan.get("spared_s"):
         words.append(_spared_words(plan))
-    rounds = plan.get("rounds", [])
-    if rounds:
-        words.append(_round_words(rounds, plan["second_move_s"]))
-    turned = plan["orientation"]["sentence"]
-    if rounds and rounds[0]["lines"]:
-        words.append(_sentence(f"in the first round, {turned}"))
-    elif plan["lines"]:
-        words.append(_sentence(turned))
+    if plan["lines"]:
+        words.append(_sentence(plan["orientation"]["sentence"]))
     return words
 
 
@@ -54,18 +48,6 @@ def _spared_words(plan: Mapping[str, Any]) -> str:
         f"The threshold of {plan['threshold']:g} a second left {plan['spared_s']:.1f} s{share} unspent: no further run "
         f"of lines pays."
     )
-
-
-def _round_words(rounds: Sequence[Mapping[str, Any]], move_s: float) -> str:
-    parts = [
-        f"{counted(one['seats'], 'seat')} in {counted(one['sweeps'], 'run')} of {counted(one['lines'], 'line')} for "
-        f"{one['seconds']:.1f} s"
-        if one["lines"]
-        else "nothing"
-        for one in rounds
-    ]
-    again = f"; to go back a second time took {move_s:.1f} s of them" if all(one["lines"] for one in rounds) else ""
-    return f"The first round showed {parts[0]}, the second {parts[1]}{again}."
 
 
 def _sentence(text: str) -> str:

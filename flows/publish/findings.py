@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,9 +14,8 @@ from flows.survey.run import SurveyRun
 from flows.survey.stages import load_plan, strange_pixels
 from flows.survey.survey import Products
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.planning.fine_pass import FinePlan, joined_plan
+from pipeline.planning.fine_pass import FinePlan
 from storage.archive.archive import StageRef
-from storage.arrays.attention import load_attention
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.ground_maps import load_ground_map
 
@@ -29,9 +26,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     These are ``pointing``, ``ground``, ``pixels`` and ``lines``.
     """
     found: dict[str, Any] = {"plan": _plan(run, products)}
-    passes = {
-        "coarse": products.coarse_pointing, "fine": products.fine_pointing, "second fine": products.pointing_again,
-    }  # fmt: skip
+    passes = {"coarse": products.coarse_pointing, "fine": products.fine_pointing}
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
     if "fine" in pointing:
         pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_shares(run, products.patches) < 1))
@@ -61,15 +56,8 @@ def _pixels(run: SurveyRun, class_map: StageRef) -> dict[str, int]:
 
 
 def _plan(run: SurveyRun, products: Products) -> dict[str, Any]:
-    """How the fine pass was laid out, and what the other orientation would have shown.
-
-    Of two rounds the score is that of the first look, and the other orientation that of the first round.
-    """
-    attention = products.attention
-    plans, turned = [load_plan(attention) for attention in products.attentions], load_orientation(products.turned)
-    plan = joined_plan(plans)
-    if len(plans) > 1:
-        plan = replace(plan, worth=_worth_by_first_look(plan, attention))
+    """How the fine pass was laid out, and what the other orientation would have shown."""
+    plan = load_plan(products.attention)
     return {
         "kind": plan.kind,
         "reason": plan.reason,
@@ -79,54 +67,24 @@ def _plan(run: SurveyRun, products: Products) -> dict[str, Any]:
         "score_per_second": plan.worth_per_second,
         "full_seconds": plan.full_seconds,
         "out_of_reach": plan.out_of_reach,
-        "orientation": turned,
-        **_spared(run, plans),
-        **_rounds(run, plans),
+        "orientation": load_orientation(products.turned),
+        **_spared(run, plan),
     }
 
 
-def _worth_by_first_look(plan: FinePlan, attention: StageRef) -> float:
-    """What all seats that were shown were worth by the scores of the first look: no more than was wanted."""
-    score = load_attention(attention.path / "attention.zarr").score.ravel()[plan.seats]
-    return min(float(score[score > 0].sum()), plan.wanted_worth)
-
-
-def _spared(run: SurveyRun, plans: Sequence[FinePlan]) -> dict[str, Any]:
+def _spared(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
     """What the threshold left: seconds, their share of the full scan's, and the score that was not worth more of them.
 
-    Nothing without a threshold. Seconds are those of the last round: an earlier one leaves its own to the next.
+    Nothing without a threshold.
     """
-    last = plans[-1]
-    if last.threshold is None:
+    if plan.threshold is None:
         return {}
     return {
-        "threshold": last.threshold,
-        "spared_s": last.spared_s,
-        "spared_share": None if last.spared_s is None else last.spared_s / run.plan.full_s,
-        "spared_score": last.wanted_worth - last.worth,
+        "threshold": plan.threshold,
+        "spared_s": plan.spared_s,
+        "spared_share": None if plan.spared_s is None else plan.spared_s / run.plan.full_s,
+        "spared_score": plan.wanted_worth - plan.worth,
     }
-
-
-def _rounds(run: SurveyRun, plans: Sequence[FinePlan]) -> dict[str, Any]:
-    """What each of several rounds bought, and what going back a second time cost; nothing of a single one.
-
-    ``second_move_s``: both rounds as they were priced, less the same sweeps in one go.
-    """
-    if len(plans) == 1:
-        return {}
-    apart, together = sum(plan.seconds for plan in plans), [sweep for plan in plans for sweep in plan.sweeps]
-    rows = [
-        {
-            "seats": len(plan.seats),
-            "lines": plan.lines,
-            "sweeps": len(plan.sweeps),
-            "seconds": plan.seconds,
-            "score": plan.worth,
-            "score_share": plan.worth / plan.wanted_worth if plan.wanted_worth else None,
-        }
-        for plan in plans
-    ]
-    return {"rounds": rows, "second_move_s": apart - run.settings.cost.seconds(together, run.camera)}
 
 
 def _pointing(ref: StageRef) -> dict[str, Any]:

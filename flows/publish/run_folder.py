@@ -6,7 +6,6 @@ Once the map is judged they are made again with its accuracy, and take the place
 from __future__ import annotations
 
 import platform
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -45,7 +44,7 @@ from flows.survey.survey import Products, StageRunner
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import on_scene
-from pipeline.planning.fine_pass import FinePlan, joined_plan
+from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.savings import Entry, capture_savings
 from pipeline.rectify.calibration.calibrate import of_bands, reflectance
 from storage.archive.archive import StageRef
@@ -73,7 +72,7 @@ class Published:
 def publish_run(runner: StageRunner, products: Products, started: str) -> Published:
     """Write receipt.json, quicklook.png and report.html into a run folder and publish it as a whole."""
     run = runner.run
-    plan = _whole_plan(products)
+    plan = load_plan(products.attention)
     with run.archive.new_run(run.name) as draft:
         receipt = make_receipt(runner, products, plan, started, f"runs/{draft.id}")
         return _publish(run, draft, products, plan, receipt)
@@ -93,7 +92,7 @@ def add_accuracy(run: SurveyRun, draft: RunDraft, products: Products, stage: Sta
         before, load_accuracy(products.accuracy), stage, accuracy_address(products.accuracy),
         settings={name: asked[name] for name in names}, judged=now(),
     )  # fmt: skip
-    return _publish(run, draft, products, _whole_plan(products), receipt)
+    return _publish(run, draft, products, load_plan(products.attention), receipt)
 
 
 def load_receipt(folder: Path) -> Receipt:
@@ -122,10 +121,6 @@ def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan
         survey=receipt["survey"], settings=receipt["settings"], rests_on=run.archive.manifest_hashes(named)
     )
     return Published(receipt, folder, looked_twice)
-
-
-def _whole_plan(products: Products) -> FinePlan:
-    return joined_plan([load_plan(attention) for attention in products.attentions])
 
 
 def _pictures(products: Products) -> list[Picture]:
@@ -186,16 +181,13 @@ def _addresses(products: Products, folder: str) -> dict[str, str]:
         "raw_coarse": products.raw_coarse.uri,
         "lookup": f"{products.lookup.uri}/lookup.zarr",
         "mosaic": f"{products.mosaic.uri}/mosaic.zarr",
-        "attention": f"{products.attentions[-1].uri}/attention.zarr",
+        "attention": f"{products.attention.uri}/attention.zarr",
         "plan": f"{products.attention.uri}/plan.json",
         "raw_fine": products.raw_fine.uri,
         "patches": f"{products.patches.uri}/patches.zarr",
         "class_map": f"{products.class_map.uri}/class_map.zarr",
     }
-    if products.attention_again is not None and products.raw_again is not None:
-        named |= {"raw_again": products.raw_again.uri, "plan_again": f"{products.attention_again.uri}/plan.json"}
-    pointing = {name: getattr(products, name) for name in ("coarse_pointing", "fine_pointing", "pointing_again")}
-    for name, ref in pointing.items():
+    for name, ref in {"coarse_pointing": products.coarse_pointing, "fine_pointing": products.fine_pointing}.items():
         if ref is not None:
             named[name] = f"{ref.uri}/{RECORD}"
     if products.ground_map is not None:
@@ -210,9 +202,9 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
     bands = len(run.scene.wavelength_nm)
     done = [*run.plan.coarse, *plan.sweeps]
     entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
-    stored = [run.archive.stored_bytes(ref) for ref in (products.raw_coarse, *products.raws_fine)]
+    stored = [run.archive.stored_bytes(ref) for ref in (products.raw_coarse, products.raw_fine)]
     # Fine lines compress like the full scan's would; without any, the coarse ones have to stand for them.
-    like, kept = (plan.sweeps, sum(stored[1:])) if plan.sweeps else (run.plan.coarse, stored[0])
+    like, kept = (plan.sweeps, stored[1]) if plan.sweeps else (run.plan.coarse, stored[0])
     of_these = capture_savings(like, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
     full_stored = entries["bytes_raw"].full * kept / of_these["bytes_raw"].done
     config, valid = run.weights.config, len(run.grid.valid_seats())
@@ -222,13 +214,13 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
         "capture_s": Entry(run.plan.coarse_s + plan.seconds, run.plan.full_s, "predicted").as_dict(),
         "bytes_stored": Entry(sum(stored), round(full_stored), "predicted").as_dict(),
         "tokens": Entry(each * (cells + len(plan.seats)), each * (cells + valid), "predicted").as_dict(),
-        "multiply_adds": _multiply_adds(run, [load_plan(attention) for attention in products.attentions]),
+        "multiply_adds": _multiply_adds(run, plan),
     }
 
 
-def _multiply_adds(run: SurveyRun, plans: Sequence[FinePlan]) -> dict[str, Any]:
+def _multiply_adds(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
     """What the model did, beside the map of a full scan."""
-    done, full = work_done(run, plans), work_of_map(run, run.grid.valid_seats())
+    done, full = work_done(run, plan.seats), work_of_map(run, run.grid.valid_seats())
     return {**Entry(done.total, full.total, "predicted").as_dict(), **asdict(done)}
 
 
@@ -236,7 +228,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     """Gather what the four panels show, three bands of it."""
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
-    attention = load_attention(products.attentions[-1].path / "attention.zarr")
+    attention = load_attention(products.attention.path / "attention.zarr")
     found: ClassMap = load_class_map(products.class_map.path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")
     accuracy = receipt.get("accuracy")

@@ -82,4 +82,4 @@ def _run(runner: StageRunner, engine: str, console: Console, finish: Finish) -> 
             return survey_with_prefect(runner, finish)
         except EngineUnavailable as error:
             console.print(f"[yellow]{escape(str(error))}; going on with --engine plain[/]", highlight=False)
-    return finish(runner, survey(runner, runner.run.settings.rounds))
+    return finish(runner, survey(runner))

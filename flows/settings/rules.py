@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from flows.settings.survey_settings import Settings
 
 IN_NAT = ("gain", "entropy")  # policies whose scores are gains, or the most that these can be
-UNMOVED = ("random", "stratified", "centre", "uniform", "mask")  # policies by place: nothing seen changes them
 _VGG_FROM = {"vgg-static": VGG_FROM, "vgg-trained": TRAINED_VGG_FROM}  # policies that read a file of VGG19
 
 
@@ -80,17 +79,12 @@ def _check_devices(settings: Settings) -> None:
 
 
 def _check_spending(settings: Settings) -> None:
-    """Thresholds and rounds that the policy gives no meaning to."""
+    """A threshold that the policy gives no meaning to."""
     policy = settings.policy
     if settings.threshold is not None and policy not in IN_NAT:
         raise SettingsError(
             f"threshold is a gain [nat], and policy {policy!r} scores in a unit of its own: leave --threshold out, or "
             f"take --policy {' or '.join(IN_NAT)} (entropy is the most that a look can gain)"
-        )
-    if settings.rounds > 1 and policy in UNMOVED:
-        raise SettingsError(
-            f"a second round goes where the first showed more than was expected, and policy {policy!r} expects "
-            f"nothing: take --rounds 1, or a policy that looks, such as gain"
         )
 
 

@@ -43,7 +43,6 @@ class Settings:
     mask: str | None = None
     vgg: str | None = None  # VGG19's weights, for policies vgg-static and vgg-trained
     weights: str | None = None
-    rounds: int = 1  # of detail: with 2 half of the seconds are spent first, the rest by what they showed
     threshold: float | None = None  # least expected gain per second of fine capture [nat per px, summed over seats]
     seed: int = 0
     effects: str = "auto"  # of the simulated rig: auto, all, none, or names with commas
@@ -198,7 +197,17 @@ def _refuse_key(full: str, known: Mapping[str, Parser], prefix: str, origin: str
 
 
 def of_this_version(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Give what a receipt says of settings that there are: keys of before are left out, in tables too."""
+    """Give what a receipt says of settings that there are: keys of before are left out, in tables too.
+
+    Raises
+    ------
+    SettingsError : the survey had two rounds of detail, of which this version would make but one.
+    """
+    if stored.get("rounds", 1) != 1:
+        raise SettingsError(
+            f"its survey had {stored['rounds']} rounds of detail, which never paid and were removed: survey the "
+            "field by hand, without 'rounds'; what both share is in the archive; take what is damaged out first"
+        )
     known = {key: value for key, value in stored.items() if key in SURVEY}
     return {
         key: {name: item for name, item in value.items() if name in TABLES[key][1]}

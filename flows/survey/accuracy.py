@@ -34,7 +34,6 @@ from models.evaluation.metrics import (
 from models.policies.free_seats import CONTROL_SHARE, Controls, run_controls
 from models.policies.policies import score_seats
 from models.reading.inference import CoarseLook, Glance, glance_of_columns, segment
-from models.second_look import surprise
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.planning.fine_pass import price_of_seats
 from pipeline.planning.savings import count_lines
@@ -175,8 +174,7 @@ def _controls_mode(run: SurveyRun, seen: Glance, controls: Controls) -> dict[str
 def _segment_seconds(run: SurveyRun, seen: Glance, patches: StageRef, columns: NDArray[np.float32]) -> dict[str, float]:
     """Wall time of the model from spectral columns to the map, the better of two each [s].
 
-    As captured: glance, scores and map; of two rounds the second look as well, at all patches, which are more than it
-    had. With every seat there is nothing to choose: the map alone.
+    As captured: glance, scores and map. With every seat there is nothing to choose: the map alone.
     """
     (seats, own), settings = patch_columns(run, patches, seen), run.settings
     valid = run.grid.valid_seats()
@@ -186,8 +184,6 @@ def _segment_seconds(run: SurveyRun, seen: Glance, patches: StageRef, columns: N
     def look_choose_draw() -> None:
         looked = glance_of_columns(run.weights, seen.columns, run.grid)
         score_seats(settings.policy, looked, seed=settings.seed, mask=run.mask, network=network)
-        if settings.rounds > 1:
-            surprise(run.weights, looked, own, seats)
         segment(run.weights, looked, own, seats)
 
     return {

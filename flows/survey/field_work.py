@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.region_work import Comparing, Drawing, Scoring, Strange, WeightsFile
+from flows.survey.region_work import Drawing, Scoring, Strange, WeightsFile
 from flows.survey.run import SurveyRun, weights_path
 from models.network.vgg_sizes import saliency_bytes
 from models.policies.policies import IMAGE_POLICIES
@@ -87,22 +87,6 @@ class FieldWork:
         work = Scoring(self.weights, mosaic, policy)
         (scores,) = run_blocks(work, [whole_field(grid)], crew, report=report, paths=[mosaic])
         return np.asarray(scores, np.float64)
-
-    def compare(self, mosaic: Path, patches: Path, report: Callable[[float], None]) -> NDArray[np.float64]:
-        """Tell how much each captured seat changed the map, (seat,) [nat per px], NaN for the others.
-
-        Raises
-        ------
-        SettingsError : not even one region at a time fits the memory.
-        """
-        store = open_patches(patches)
-        crew = self.crew_for(store.seats, len(store.wavelength_nm))
-        paths = mosaic.resolve(), patches.resolve()
-        parts = run_blocks(Comparing(self.weights, *paths), self.regions, crew, report=report, paths=paths)
-        found = np.full(self.regions[0].field.seat_shape, np.nan)
-        for region, part in zip(self.regions, parts, strict=True):
-            found[region.kept_seats.rows, region.kept_seats.columns] = part
-        return found.ravel()
 
     def draw(self, mosaic: Path, patches: Path, out: Path, report: Callable[[float], None]) -> Strange:
         """Draw the class map into the store that was created at ``out``; count pixels that were left out.

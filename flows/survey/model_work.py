@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import astuple, replace
 
 import numpy as np
@@ -13,23 +12,19 @@ from flows.survey.run import SurveyRun
 from models.network.cost import MultiplyAdds, multiply_adds
 from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, SEEING_POLICIES
 from models.reading.regions import Region, plan_regions, whole_field
-from pipeline.planning.fine_pass import FinePlan, joined_plan
 
 
-def work_done(run: SurveyRun, plans: Sequence[FinePlan]) -> MultiplyAdds:
-    """Count the scores of the field, those of a second round, and the map.
+def work_done(run: SurveyRun, seats: NDArray[np.integer]) -> MultiplyAdds:
+    """Count the scores of the field, and the map drawn with fine patches at these seats.
 
-    Stages keep nothing of the model for each other, so that each reads the coarse look anew: ``glance`` holds what the
-    map and the first scores took for it. A second round's scores, their own reading among it, are in ``score``.
+    Stages keep nothing of the model for each other, so that each reads the coarse look anew: ``glance`` holds what map
+    and scores took for it.
     """
     policy, regions = run.settings.policy, plan_regions(run.grid, SHARD)
-    drawn = work_of_map(run, joined_plan(plans).seats)
+    drawn = work_of_map(run, seats)
     looks = 2 if policy in SEEING_POLICIES and policy not in NETWORK_POLICIES else 1
     scored = [whole_field(run.grid)] if policy in IMAGE_POLICIES else regions
     score = sum(_of_region(run, region, 0, policy).score for region in scored)
-    if len(plans) > 1:  # regions without a patch are not read for it
-        seats = [(region, _count(region, plans[0].seats)) for region in regions]
-        score += sum(_of_region(run, region, count, None).total for region, count in seats if count)
     return replace(drawn, glance=looks * drawn.glance, score=score)
 
 

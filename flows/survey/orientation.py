@@ -19,17 +19,25 @@ FILE = "orientation.json"
 
 
 def compare_turned(run: SurveyRun, produce: Produce, mosaic: StageRef, attention: StageRef) -> StageRef:
-    """Plan the first round's scores with lines along the other axis, and find which way crop rows run."""
+    """Plan the scores with lines along the other axis, and find which way crop rows run."""
     settings = run.settings
-    budget_s = run.plan.fine_s / settings.rounds
 
     def build(path: Path) -> None:
         scores = load_attention(attention.path / "attention.zarr").score.ravel()
         rows = find_rows(mosaic_brightness(mosaic.path / "mosaic.zarr"))
         turned = compare_orientations(
-            run.grid, run.camera, settings.cost, run.plan.along, scores, budget_s=budget_s, plan=load_plan(attention),
-            rows=rows, overlap_px=run.plan.overlap_px, margin_px=run.plan.margin_px, threshold=settings.threshold,
-        )  # fmt: skip
+            run.grid,
+            run.camera,
+            settings.cost,
+            run.plan.along,
+            scores,
+            budget_s=run.plan.fine_s,
+            plan=load_plan(attention),
+            rows=rows,
+            overlap_px=run.plan.overlap_px,
+            margin_px=run.plan.margin_px,
+            threshold=settings.threshold,
+        )
         write_json(path / FILE, asdict(turned) | {"sentence": turned.sentence})
 
     return produce("turned", build, {}, [mosaic, attention])  # all it depends on are parameters of attention

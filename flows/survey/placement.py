@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.rectify_ahead import begin_mosaic, drop_ahead, mosaic_picture, take_mosaic
+from flows.publish.colour_stretch import choose_bands
 from flows.survey.run import SurveyRun
-from flows.survey.stages import SEATS_AT_ONCE, VERSIONS, Produce, captured, load_plan, write_json
+from flows.survey.stages import SEATS_AT_ONCE, Produce, captured, load_plan, write_json
 from pipeline.errors import ShapeError
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.placed import PixelGrid
@@ -25,10 +25,11 @@ from storage.arrays.layout import read_array
 from storage.arrays.located_sweeps import Sighted, sight_sweeps
 from storage.arrays.lookups import path_digest, write_lookup
 from storage.arrays.mosaics import MosaicWriter
-from storage.arrays.patches import PatchStore, PatchWriter, open_patches
+from storage.arrays.patches import PatchWriter, open_patches
 from storage.arrays.quicklooks import stretched
-from storage.arrays.tile_work import MosaicRecipe, write_mosaic
+from storage.arrays.tile_work import MosaicRecipe, Thumbnail, write_mosaic
 
+QUICKLOOK_PX = 512
 CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the memory
 
 
@@ -75,25 +76,32 @@ def rectify(run: SurveyRun, produce: Produce, raw: StageRef, lookup: StageRef, *
     """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
 
     def build(path: Path) -> None:
-        """Make the tiles that were not made while lines arrived, and the picture."""
+        """Make the tiles, and the picture."""
         grid = PixelGrid.of_scene(run.grid, run.grid.factor)
         recipe = MosaicRecipe(
-            raw.path, run.camera, grid, run.settings.kernel,
-            lookup=lookup.path / "lookup.zarr", registration=_record(_only(registration)),
-        )  # fmt: skip
-        out, settings, picture = path / "mosaic.zarr", run.settings, mosaic_picture(run)
-        there = take_mosaic(run, VERSIONS["rectify"], raw, out, recipe.sweeps(), picture)
-        writer = MosaicWriter.reopen(out) if there else begin_mosaic(run, out, captured(raw)[0].simulation)
-        write_mosaic(
-            recipe, writer, memory=settings.memory, crew=settings.crew, seen=picture, there=there, report=run.report
+            raw.path,
+            run.camera,
+            grid,
+            run.settings.kernel,
+            lookup=lookup.path / "lookup.zarr",
+            registration=_record(_only(registration)),
         )
+        writer = MosaicWriter(
+            path / "mosaic.zarr",
+            grid.shape,
+            run.scene.wavelength_nm,
+            fwhm_nm=run.scene.fwhm_nm,
+            grid=run.angular_grid(run.grid.factor),
+            simulation=captured(raw)[0].simulation,
+        )
+        colours, _ = choose_bands(run.scene.wavelength_nm)
+        settings, picture = run.settings, Thumbnail(grid.shape, colours, QUICKLOOK_PX)
+        write_mosaic(recipe, writer, memory=settings.memory, crew=settings.crew, seen=picture, report=run.report)
         writer.write_quicklook(stretched(picture.image).image)
         write_json(path / "lines.json", {one.cube.sweep.name: one.facts() for one in recipe.sweeps()})
 
     params = {"grid": asdict(run.grid), "kernel": run.settings.kernel}
-    ref = produce("rectify", build, params, [raw, lookup, *registration])
-    drop_ahead(run, raw)
-    return ref
+    return produce("rectify", build, params, [raw, lookup, *registration])
 
 
 def cut_patches(
@@ -117,71 +125,6 @@ def cut_patches(
 
     params = {"grid": asdict(run.grid), "kernel": run.settings.kernel}
     return produce("patches", build, params, [attention, raw, *registration])
-
-
-def cut_again(
-    run: SurveyRun, produce: Produce, attention: StageRef, raw: StageRef, patches: StageRef, *registration: StageRef
-) -> StageRef:
-    """Bring the seats of the second round onto the grid and store them with those of the first.
-
-    A pixel that the first round saw keeps its value; what a mirror off the plan left unseen is filled in.
-    """
-
-    def build(path: Path) -> None:
-        """Read the seats of this round, and put those of the first beside them."""
-        kept, wanted = _Kept.of(patches), load_plan(attention).seats
-        ordered = _along_scan(run, np.union1d(kept.store.seats, wanted))
-        bands, patch = run.scene.wavelength_nm, run.grid.patch
-        writer = PatchWriter(
-            path / "patches.zarr", ordered, run.grid.seat_origin(ordered), patch,
-            bands, fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(),
-        )  # fmt: skip
-        sweeps = [one.placed(run.camera) for one in sighted(run, raw, _only(registration))]
-        cache = LineCache(run.settings.memory // CACHE_SHARE)
-        for first in range(0, len(ordered), SEATS_AT_ONCE):
-            seats = ordered[first : first + SEATS_AT_ONCE]
-            values, valid = kept.read(seats, len(bands), patch)
-            new = np.flatnonzero(np.isin(seats, wanted))
-            if len(new):
-                seen = read_seats(sweeps, run.camera, run.grid, seats[new], run.settings.kernel, cache=cache)
-                _fill(values, valid, new, *seen)
-            writer.write(first, values, valid)
-            run.report((first + len(seats)) / len(ordered))
-
-    params: dict[str, Any] = {"round": 2, "kernel": run.settings.kernel}
-    return produce("patches", build, params, [attention, raw, patches, *registration])
-
-
-def _fill(
-    values: NDArray[np.float32], valid: NDArray[np.bool_], at: NDArray[np.intp],
-    seen: NDArray[np.floating], there: NDArray[np.bool_],
-) -> None:  # fmt: skip
-    """Put what the second round saw where the first saw nothing, in place."""
-    missing = ~valid[at]
-    values[at] = np.where(missing[..., None], seen, values[at])
-    valid[at] |= there
-
-
-@dataclass(frozen=True)
-class _Kept:
-    """Patches of the first round, by seat."""
-
-    store: PatchStore
-    valid: NDArray[np.bool_]  # (patch, y, x)
-
-    @staticmethod
-    def of(patches: StageRef) -> _Kept:
-        store = open_patches(patches.path / "patches.zarr")
-        return _Kept(store, read_array(store.group, "valid"))
-
-    def read(self, seats: NDArray[np.integer], bands: int, patch: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Values (seat, y, x, band) and validity of seats in the order of the store; NaN where there is none."""
-        values = np.full((len(seats), patch, patch, bands), np.nan, np.float32)
-        valid = np.zeros(values.shape[:3], np.bool_)
-        order, there = np.argsort(self.store.seats, kind="stable"), np.isin(seats, self.store.seats)
-        entries = order[np.searchsorted(self.store.seats[order], seats[there])]
-        values[there], valid[there] = self.store.pick(entries), self.valid[entries]
-        return values, valid
 
 
 def seen_shares(run: SurveyRun, patches: StageRef) -> NDArray[np.float64]:

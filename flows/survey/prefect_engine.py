@@ -23,7 +23,6 @@ from storage.archive.staging import remove_tree, take_lock
 RETRIES = {
     "capture_coarse": 2,
     "capture_fine": 2,
-    "capture_again": 2,
 }  # a device may answer the second time; the spool goes on
 RETRY_DELAY_S = 2.0
 PASSWORD = f"spectralzoom:{secrets.token_urlsafe(24)}"  # of the ephemeral server that this process starts
@@ -122,7 +121,7 @@ def _task_step(runner: StageRunner) -> Step:
 def _survey(runner: StageRunner, finish: Callable[[Step, Products], Left]) -> Left:
     """Run the stages as tasks of the flow that this is called in."""
     step = _task_step(runner)
-    return finish(step, survey(step, runner.run.settings.rounds))
+    return finish(step, survey(step))
 
 
 def _run_flow(runner: StageRunner, finish: Callable[[Step, Products], Left]) -> Left:

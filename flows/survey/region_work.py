@@ -16,7 +16,6 @@ from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, score_sea
 from models.policies.vgg_file import VggFile
 from models.reading.inference import CoarseLook, Glance, look_coarsely, read_glance, segment
 from models.reading.regions import Region
-from models.second_look import surprise
 from models.weights.files import Weights, content_key, load_weights
 from pipeline.errors import WeightsError
 from pipeline.readings import beyond_range, readings_alone
@@ -88,25 +87,6 @@ class Drawing:
         write_class_tile(self.out, origin, region.crop(drawn.classes), region.crop(drawn.confidence))
         coarse = 0 if seen.strange is None else int(np.count_nonzero(region.crop_coarse(seen.strange)))
         return coarse, int(region.crop_seats(strange).sum())
-
-
-@dataclass(frozen=True)
-class Comparing:
-    """Tells what the fine patches of a region said beyond the glance: what a worker needs for that."""
-
-    weights: WeightsFile
-    mosaic: Path
-    patches: Path
-
-    def __call__(self, region: Region) -> NDArray[np.float64]:
-        """How much each captured seat changed the map [nat per px], NaN for others, (seat_y, seat_x) of those kept."""
-        let_tiles_go()
-        weights, store = self.weights.load(), open_patches(self.patches)
-        seen = look_at(weights, self.mosaic, region)
-        seats, columns = seat_columns(weights, store, store.wavelength_nm, seen, region)
-        found = np.full(region.grid.seat_shape, np.nan).ravel()
-        found[seats] = surprise(weights, seen, columns, seats)
-        return region.crop_seats(found)
 
 
 def unread(look: CoarseLook) -> Glance:

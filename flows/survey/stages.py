@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,6 @@ from numpy.typing import NDArray
 
 from flows.survey.effect_choice import load_manifest, source_with
 from flows.survey.field_work import FieldWork, region_params
-from flows.survey.rectify_ahead import Arrived, rectifying_ahead
 from flows.survey.region_work import look_at, seat_columns
 from flows.survey.rendered_lines import lines_again, take_lines
 from flows.survey.rig_run import RIG_RECORD, capture_source, held_lines, rig_record
@@ -48,14 +46,12 @@ SEATS_AT_ONCE = 64
 STRANGE = "strange.json"  # beside a map, where values were no readings
 
 Build = Callable[[Path], None]
-Follow = Callable[[Source, str], AbstractContextManager[Arrived]]  # of the source of a capture, and its key
 Produce = Callable[[str, Build, dict[str, Any], Sequence[StageRef]], StageRef]
 
 
 def capture_coarse(run: SurveyRun, produce: Produce, effects: StageRef) -> StageRef:
-    """Sweep the whole field once, fast; its mosaic is begun meanwhile."""
-    ahead = partial(rectifying_ahead, run, VERSIONS["rectify"])
-    return capture_sweeps(run, produce, run.plan.coarse, [effects], follow=ahead)
+    """Sweep the whole field once, fast."""
+    return capture_sweeps(run, produce, run.plan.coarse, [effects])
 
 
 def capture_fine(run: SurveyRun, produce: Produce, attention: StageRef, effects: StageRef) -> StageRef:
@@ -63,20 +59,10 @@ def capture_fine(run: SurveyRun, produce: Produce, attention: StageRef, effects:
     return capture_sweeps(run, produce, load_plan(attention).sweeps, [attention, effects], begins_s=run.plan.coarse_s)
 
 
-def capture_again(run: SurveyRun, produce: Produce, attention: StageRef, effects: StageRef) -> StageRef:
-    """Go back a second time, for what the second plan chose; the first has had its half of the seconds."""
-    begins = run.plan.coarse_s + run.plan.fine_s / run.settings.rounds
-    return capture_sweeps(run, produce, load_plan(attention).sweeps, [attention, effects], begins_s=begins)
-
-
 def capture_sweeps(
-    run: CaptureRun, produce: Produce, sweeps: list[Sweep], inputs: list[StageRef], *, begins_s: float = 0.0,
-    follow: Follow = lambda source, key: nullcontext(lambda name, count: None),
-) -> StageRef:  # fmt: skip
-    """Take some sweeps, one after the other from ``begins_s`` on, with the effects of the last of the inputs.
-
-    ``follow`` is told of each line that is in the spool.
-    """
+    run: CaptureRun, produce: Produce, sweeps: list[Sweep], inputs: list[StageRef], *, begins_s: float = 0.0
+) -> StageRef:
+    """Take some sweeps, one after the other from ``begins_s`` on, with the effects of the last of the inputs."""
     clock = sweep_starts(sweeps, run.camera, run.settings.cost, after_s=begins_s)
     params = {**run.source_key(), "sweeps": [asdict(sweep) for sweep in sweeps], "starts_s": list(clock.values())}
     key = stage_key("capture", VERSIONS["capture"], params, [ref.key for ref in inputs])
@@ -86,9 +72,9 @@ def capture_sweeps(
         """Take the sweeps one after the other, each into a cube of its own."""
         before, manifest = 0, load_manifest(inputs[-1])
         lit = replace(run, source=source_with(run.source, inputs[-1], clock))
-        with capture_source(lit, key) as source, follow(source, key) as arrived:
+        with capture_source(lit, key) as source:
             for sweep in sweeps:
-                done = partial(_report_lines, run, arrived, sweep.name, before / total, total)
+                done = partial(_report_lines, run, before / total, total)
                 _capture_sweep(lit, source, sweep, path, key=key, report=done, effects=manifest)
                 before += sweep.lines
             if run.rig is not None:
@@ -99,8 +85,7 @@ def capture_sweeps(
     return ref
 
 
-def _report_lines(run: CaptureRun, arrived: Arrived, name: str, before: float, total: int, lines: int) -> None:
-    arrived(name, lines)
+def _report_lines(run: CaptureRun, before: float, total: int, lines: int) -> None:
     run.report(before + lines / total)
 
 
@@ -149,21 +134,24 @@ def glance_at(run: SurveyRun, mosaic: StageRef) -> Glance:
 
 
 def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
-    """Score every seat by the coarse mosaic, and plan the sweeps that show the most score in the time left.
-
-    With two rounds half of that time is planned; see `flows.survey.second_round`.
-    """
+    """Score every seat by the coarse mosaic, and plan the sweeps that show the most score in the time left."""
     settings = run.settings
-    budget_s = run.plan.fine_s / settings.rounds
 
     def build(path: Path) -> None:
         """Score the seats, and refuse a plan whose map would not fit the memory."""
         work = FieldWork.of(run)
         scores = _scores(run, work, mosaic)
         plan = plan_fine(
-            run.grid, run.camera, settings.cost, run.plan.along, scores, budget_s=budget_s,
-            margin_px=run.plan.margin_px, full=run.plan.full, threshold=settings.threshold,
-        )  # fmt: skip
+            run.grid,
+            run.camera,
+            settings.cost,
+            run.plan.along,
+            scores,
+            budget_s=run.plan.fine_s,
+            margin_px=run.plan.margin_px,
+            full=run.plan.full,
+            threshold=settings.threshold,
+        )
         work.check_memory(plan.seats, len(run.scene.wavelength_nm))  # before the rig goes back, not after
         rank = np.full(scores.shape, -1, np.int32)
         rank[plan.seats[np.argsort(-scores[plan.seats], kind="stable")]] = np.arange(len(plan.seats))
@@ -186,7 +174,6 @@ def attend(run: SurveyRun, produce: Produce, mosaic: StageRef) -> StageRef:
         **(region_params(run.grid) if settings.policy in SEEING_POLICIES else {}),
         **({} if run.vgg is None else {"vgg": run.vgg.key}),
         **({} if settings.threshold is None else {"threshold": settings.threshold}),
-        **({} if settings.rounds == 1 else {"rounds": settings.rounds}),
     }
     return produce("attend", build, params, [mosaic])
 

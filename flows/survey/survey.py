@@ -18,7 +18,6 @@ from flows.survey.ground import ground
 from flows.survey.orientation import compare_turned
 from flows.survey.pointing import register_coarse, register_fine
 from flows.survey.run import SurveyRun
-from flows.survey.second_round import attend_again
 from storage.archive.archive import StageRef
 
 STAGES: dict[str, Callable[..., StageRef | None]] = {
@@ -31,16 +30,11 @@ STAGES: dict[str, Callable[..., StageRef | None]] = {
     "capture_fine": stages.capture_fine,
     "register_fine": register_fine,
     "cut_patches": placement.cut_patches,
-    "attend_again": attend_again,
-    "capture_again": stages.capture_again,
-    "register_again": register_fine,
-    "cut_again": placement.cut_again,
     "draw_map": stages.draw_map,
     "compare_turned": compare_turned,
     "ground": ground,
     JUDGING: evaluate,
 }
-OF_ROUND_TWO = ("attend_again", "capture_again", "register_again", "cut_again")
 TITLES = {
     "choose_effects": "effects that matter",
     "capture_coarse": "coarse sweep",
@@ -51,10 +45,6 @@ TITLES = {
     "capture_fine": "fine sweeps",
     "register_fine": "fine sweeps on the mosaic",
     "cut_patches": "fine patches",
-    "attend_again": "attention to what is left",
-    "capture_again": "fine sweeps, second round",
-    "register_again": "these sweeps on the mosaic",
-    "cut_again": "fine patches of both rounds",
     "draw_map": "class map",
     "compare_turned": "what lines turned by 90° would show",
     "ground": "map on the ground",
@@ -72,10 +62,7 @@ class Step(Protocol):
 
 @dataclass(frozen=True)
 class Products:
-    """The stores that a survey leaves; None where a stage had nothing to do.
-
-    ``patches`` are those of all rounds, ``attention``, ``raw_fine`` and ``fine_pointing`` of the first.
-    """
+    """The stores that a survey leaves; None where a stage had nothing to do."""
 
     effects: StageRef
     raw_coarse: StageRef
@@ -90,26 +77,12 @@ class Products:
     turned: StageRef
     ground_map: StageRef | None
     accuracy: StageRef | None = None  # once the map is judged
-    first_patches: StageRef | None = None  # these and those below: only with two rounds
-    attention_again: StageRef | None = None
-    raw_again: StageRef | None = None
-    pointing_again: StageRef | None = None
-
-    @property
-    def attentions(self) -> list[StageRef]:
-        """Scores and plan of each round."""
-        return [self.attention, *_there(self.attention_again)]
-
-    @property
-    def raws_fine(self) -> list[StageRef]:
-        """The fine sweeps of each round."""
-        return [self.raw_fine, *_there(self.raw_again)]
 
 
-def survey(step: Step, rounds: int = 1) -> Products:
+def survey(step: Step) -> Products:
     """Sweep the field coarsely, decide where detail changes the map, look there again, and draw the map.
 
-    With two rounds the second goes where the first showed that more is to be found. How good the map is `judge` tells.
+    How good the map is `judge` tells.
     """
     effects = _needed(step("choose_effects"))
     raw = _needed(step("capture_coarse", effects))
@@ -120,21 +93,12 @@ def survey(step: Step, rounds: int = 1) -> Products:
     fine = _needed(step("capture_fine", attention, effects))
     fine_pointing = step("register_fine", fine, mosaic)
     patches = _needed(step("cut_patches", attention, fine, *_there(fine_pointing)))
-    second: dict[str, StageRef | None] = {}
-    if rounds > 1:
-        again = _needed(step("attend_again", mosaic, attention, patches))
-        raw_again = _needed(step("capture_again", again, effects))
-        pointing_again = step("register_again", raw_again, mosaic)
-        second = {"first_patches": patches, "attention_again": again, "raw_again": raw_again,
-                  "pointing_again": pointing_again}  # fmt: skip
-        patches = _needed(step("cut_again", again, raw_again, patches, *_there(pointing_again)))
     class_map = _needed(step("draw_map", mosaic, patches))
     turned = _needed(step("compare_turned", mosaic, attention))
     ground_map = step("ground", class_map, mosaic)
     return Products(
         effects, raw, coarse_pointing, lookup, mosaic, attention, fine, fine_pointing, patches, class_map, turned,
         ground_map,
-        **second,
     )  # fmt: skip
 
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from models.network.sizes import MOST_GAIN
-from models.reading.inference import Glance
-from models.second_look import both_looks
+from models.reading.inference import CoarseLook, Glance, captured, origin_of, readings_of
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Values = NDArray[np.floating]
 
@@ -29,16 +34,40 @@ def oracle_gain(
     labels
         (y, x) class indices of the scene's own size, 255 unlabelled.
     """
+    import torch
+
     grid, p = seen.grid, seen.grid.patch
     full = np.full(grid.padded_shape, UNLABELLED, np.uint8)
     full[: grid.height, : grid.width] = labels
     rows, columns = grid.seat_shape
     truth = full.reshape(rows, p, columns, p).swapaxes(1, 2).reshape(-1, p, p)
     gain, valid = np.zeros(len(truth)), grid.valid_seats()
-    for seats, before, after in both_looks(weights, seen, fine[valid], valid):
-        lower = _losses(before.numpy(), truth[seats]) - _losses(after.numpy(), truth[seats])
-        gain[seats] = lower.sum(axis=(1, 2)) / p**2
+    with torch.inference_mode():
+        for seats, before, after in _both_looks(weights, seen, fine[valid], valid):
+            lower = _losses(before.numpy(), truth[seats]) - _losses(after.numpy(), truth[seats])
+            gain[seats] = lower.sum(axis=(1, 2)) / p**2
     return np.clip(gain, -MOST_GAIN, MOST_GAIN)
+
+
+def _both_looks(
+    weights: Weights, seen: CoarseLook, patches: NDArray[np.floating], seats: NDArray[np.int64]
+) -> Iterator[tuple[NDArray[np.int64], Tensor, Tensor]]:
+    """Seats, some at a time, and class logits (seat, class, p, p) by the glance alone and by the patches too.
+
+    A patch that shows too little to be read is left out, as in the map.
+    """
+    import torch
+
+    from models.network.batches import FineScene, read_fine_packed
+
+    patches, seats = captured(patches, seats)
+    if not len(seats):
+        return
+    model, (reading,), first = weights.segmenter.eval(), readings_of(weights, [seen]), 0
+    for after in read_fine_packed(model, [FineScene(reading, patches, torch.from_numpy(seats), origin_of(seen))]):
+        some = seats[first : first + len(after)]
+        yield some, model.seat_windows(reading.logits, torch.from_numpy(some)[None]), after
+        first += len(after)
 
 
 def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np.float64]:

@@ -246,28 +246,6 @@ def _cut(strip: Sweep, run: Run) -> Sweep:
     return replace(strip, name=name, start_px=strip.start_px + run.first, lines=run.stop - run.first)
 
 
-def joined_plan(plans: Sequence[FinePlan]) -> FinePlan:
-    """Give the plan of several rounds, one after the other, as one; each stays priced by itself.
-
-    ``worth`` and ``wanted_worth`` are those of the first: later ones are in scores that were made anew.
-
-    Raises
-    ------
-    ShapeError : there is none.
-    """
-    if not plans:
-        raise ShapeError("expected the plans of one round or more, got none")
-    if len(plans) == 1:
-        return plans[0]
-    return replace(
-        plans[0],
-        sweeps=[sweep for plan in plans for sweep in plan.sweeps],
-        seats=np.unique(np.concatenate([plan.seats for plan in plans])),
-        seconds=sum(plan.seconds for plan in plans),
-        spared_s=plans[-1].spared_s,
-    )
-
-
 def _scale(scores: NDArray[np.floating]) -> float:
     """What very large and very small scores are divided by, a power of two: their plan is that of usual ones, exactly.
 

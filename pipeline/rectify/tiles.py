@@ -50,32 +50,17 @@ def cache_bytes(placed: Sequence[Placed], tiles: Sequence[Tile], at_once: int) -
     return max((sum({key: size for part in run for key, size in part.items()}.values()) for run in runs), default=0)
 
 
-def lines_needed(placed: Sequence[Placed], tile: Tile) -> list[int]:
-    """How many lines each sweep must have before a tile can be made, in whole blocks of raw lines; 0 where none."""
-    needed = [0] * len(placed)
-    for sweep, lines, _ in _behind(placed, tile):
-        stop = line_blocks(lines).stop * BLOCK_LINES
-        needed[sweep] = max(needed[sweep], min(stop, len(placed[sweep].lines.valid_line)))
-    return needed
-
-
-def _behind(placed: Sequence[Placed], tile: Tile) -> Iterator[tuple[int, slice, slice]]:
-    """Raw lines and samples behind a tile: number of the sweep, lines, and samples of each track that shows there."""
+def _blocks_of(placed: Sequence[Placed], tile: Tile) -> dict[tuple[int, int, int, int], int]:
+    """Sizes of the blocks of raw lines behind a tile, by sweep, block and samples."""
+    blocks = {}
     for sweep, (one, tracks) in enumerate(zip(placed, tile.reach, strict=True)):
+        bands = len(one.lines.references.panel)
         for (track, _), near in zip(one.tracks, tracks, strict=True):
             knots = slice(0, 0) if near is None else near.knots(tile.rows)
             if near is None or knots.start == knots.stop:
                 continue
             members = member_lines(track, knots)
-            yield sweep, slice(int(members.min()), int(members.max()) + 1), near.samples
-
-
-def _blocks_of(placed: Sequence[Placed], tile: Tile) -> dict[tuple[int, int, int, int], int]:
-    """Sizes of the blocks of raw lines behind a tile, by sweep, block and samples."""
-    blocks = {}
-    for sweep, lines, samples in _behind(placed, tile):
-        bands = len(placed[sweep].lines.references.panel)
-        held = held_samples(placed[sweep].lines, samples)
-        for number in line_blocks(lines):
-            blocks[sweep, number, held.start, held.stop] = BLOCK_LINES * (held.stop - held.start) * bands * 2
+            held = held_samples(one.lines, near.samples)
+            for number in line_blocks(slice(int(members.min()), int(members.max()) + 1)):
+                blocks[sweep, number, held.start, held.stop] = BLOCK_LINES * (held.stop - held.start) * bands * 2
     return blocks

@@ -79,16 +79,6 @@ def path_of(sweep: Sweep, lines: tuple[int, int], camera: LineCamera, *, trigger
     return CapturePath(sweep, *lines, cells, middle, sweep.step * 1000 / camera.frame_ms, triggered)
 
 
-def planned_positions(sweep: Sweep, camera: LineCamera) -> NDArray[np.float32]:
-    """(line, 2) mirror positions at mid exposure that lines tied by pulses come with: the plan's, as sent.
-
-    Raises
-    ------
-    PoseError : a position is beyond the mirror's disk.
-    """
-    return wire_positions(line_positions(sweep, camera))
-
-
 def can_trigger(pulses: Pulses, sweep: Sweep) -> bool:
     """Whether the pulses at the mirror's input step through this sweep: one a position is needed."""
     return pulses == "position" or (pulses == "frame" and sweep.step == 1)

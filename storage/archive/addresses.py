@@ -10,7 +10,6 @@ from pathlib import Path
 from storage.archive.staging import MANIFEST_NAME, PART_SUFFIX, check_name, is_name
 
 STORE_URI = re.compile(r"stages/([^/\s]+)/([^/\s]+)")
-AHEAD_SUFFIX = "-mosaic"
 SECOND = len("20261120T101701")  # of a run's name: when it was begun
 
 
@@ -33,11 +32,6 @@ def store_at(root: Path, stage: str, key: str) -> StageRef:
     check_name(stage)
     check_name(key)
     return StageRef(stage, key, root / "stages" / stage / key)
-
-
-def ahead_of(key: str) -> str:
-    """Name of the spool folder for what is made of a capture's lines while they arrive."""
-    return key + AHEAD_SUFFIX
 
 
 def published_stores(root: Path, stage: str | None = None) -> list[StageRef]:

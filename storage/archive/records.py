@@ -92,8 +92,12 @@ class Run:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the survey was asked for; from its manifest where that says so."""
-        return _table(self.facts.get("settings")) or _table(self.receipt.get("settings"))
+        """What the survey was asked for; from its manifest where that says so.
+
+        Without ``rounds = 1``, which earlier versions told: there is no other number by now.
+        """
+        told = _table(self.facts.get("settings")) or _table(self.receipt.get("settings"))
+        return {name: value for name, value in told.items() if (name, value) != ("rounds", 1)}
 
     @property
     def products(self) -> dict[str, str]:

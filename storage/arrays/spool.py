@@ -337,18 +337,6 @@ def line_words(numbers: Sequence[int]) -> str:
     return f"line{'s' if len(numbers) > 1 else ''} {named}{more}"
 
 
-def read_spooled(folder: Path, name: str, shape: tuple[int, int], lines: slice) -> NDArray[np.uint16]:
-    """Raw numbers of some lines of a spool, (line, sample, band), also while more are appended.
-
-    ``shape`` is (sample, band) of a line. What is read was written by the same process: no CRC is compared.
-    """
-    samples, bands = shape
-    count = (lines.stop - lines.start) * samples * bands
-    with plain_reader(folder / f"{name}.bil") as file:
-        numbers = np.fromfile(file, "<u2", count, offset=lines.start * samples * bands * 2)
-    return np.ascontiguousarray(numbers.reshape(-1, bands, samples).transpose(0, 2, 1), np.uint16)
-
-
 @contextmanager
 def _refusals(path: Path, lines: int) -> Iterator[None]:
     """Turn a disk's refusal into a RigError that says how many lines are safe."""

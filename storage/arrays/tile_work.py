@@ -5,7 +5,7 @@ A tile is a shard of the mosaic and a task of dask: whoever makes it writes file
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,16 +14,79 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.line_cache import LineCache
+from pipeline.rectify.placed import PixelGrid, Placed
 from pipeline.rectify.region import Reaches, column_reach, mosaic_tile
+from pipeline.rectify.resample import Kernel
+from pipeline.rectify.tie_points import TieTable
 from pipeline.rectify.tiles import Tile, cache_bytes, plan_tiles, tile_bytes
-from storage.arrays.mosaic_work import MosaicRecipe as MosaicRecipe
-from storage.arrays.mosaic_work import MosaicWork as MosaicWork
+from pipeline.rectify.tracks import Track
+from storage.arrays.cubes import open_raw_cube
+from storage.arrays.located_sweeps import Sighted, sight_sweeps
+from storage.arrays.lookups import open_lookup
 from storage.arrays.mosaics import MosaicWriter
 from storage.parallel.block_work import run_blocks
 from storage.parallel.crew import THREADS, Crew
 
+Tables = Mapping[str, Sequence[tuple[Track, TieTable]]]
+
 RESERVED_BYTES = 512 * 2**20  # a process before its first tile: interpreter, torch, zarr
+
+
+@dataclass(frozen=True)
+class MosaicWork:
+    """What a mosaic is made of, and with what."""
+
+    placed: Sequence[Placed]
+    camera: LineCamera
+    grid: PixelGrid
+    kernel: Kernel = "catmull-rom"
+
+
+@dataclass(frozen=True)
+class MosaicRecipe:
+    """The same by absolute paths: small, hashable, and good in every process that sees them."""
+
+    raw: Path  # folder of raw cubes
+    camera: LineCamera
+    grid: PixelGrid
+    kernel: Kernel = "catmull-rom"
+    lookup: Path | None = None  # tables of the sweeps; None looks lines up directly
+    registration: Path | None = None  # record of the corrections
+
+    @property
+    def folders(self) -> list[Path]:
+        """What has to be seen by whoever makes tiles."""
+        given = (self.raw, self.lookup, None if self.registration is None else self.registration.parent)
+        return [path for path in given if path is not None]
+
+    def sweeps(self) -> list[Sighted]:
+        """Open the sweeps, in the order of their names.
+
+        Raises
+        ------
+        IncompleteStoreError : one is missing or damaged.
+        """
+        cubes = [open_raw_cube(path) for path in sorted(self.raw.glob("*.zarr"))]
+        return sight_sweeps(cubes, self.registration, self.camera)
+
+    def open(self) -> MosaicWork:
+        """Open the sweeps and find where their lines lie, from stored tables where there are some.
+
+        Raises
+        ------
+        IncompleteStoreError : a sweep or the tables are missing or damaged.
+        """
+        tables: Tables = {} if self.lookup is None else open_lookup(self.lookup)
+        placed = [_with_tables(one, self.camera, tables) for one in self.sweeps()]
+        return MosaicWork(placed, self.camera, self.grid, self.kernel)
+
+
+def _with_tables(one: Sighted, camera: LineCamera, tables: Tables) -> Placed:
+    """A sweep with its stored tables; without, where its lines lie too unevenly for one."""
+    stored = tables.get(one.cube.sweep.name)
+    return Placed(one.cube, tuple(stored), one.gain) if stored else one.placed(camera)
 
 
 @dataclass(frozen=True)
@@ -77,7 +140,6 @@ def write_mosaic(
     memory: int,
     crew: Crew = THREADS,
     seen: Thumbnail | None = None,
-    there: Collection[tuple[int, int]] = (),
     report: Callable[[float], None] = lambda done: None,
 ) -> TileBudget:
     """Rectify and blend sweeps into a stored mosaic. Whoever makes the tiles, the same bytes come out.
@@ -92,10 +154,8 @@ def write_mosaic(
         Who makes tiles, and how many at a time; fewer are made where memory holds fewer.
     seen
         Filled with the pixels that it shows.
-    there
-        First row and column of tiles that are written already: they are left as they are, and ``seen`` without them.
     report
-        Called with the share of the others done after each tile, from the calling thread.
+        Called with the share done after each tile, from the calling thread.
 
     Returns
     -------
@@ -110,7 +170,6 @@ def write_mosaic(
     opened = work.open() if isinstance(work, MosaicRecipe) else work
     tiles = plan_tiles(opened.placed, opened.camera, opened.grid, writer.tile_shape)
     budget = tile_budget(opened, tiles, writer.tile_shape, memory=memory, crew=crew)
-    tiles = [tile for tile in tiles if (tile.rows.start, tile.columns.start) not in there]
 
     def show(rows: slice, columns: slice, part: NDArray[np.float32] | None) -> None:
         if seen is not None and part is not None:

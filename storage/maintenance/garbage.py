@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from pipeline.errors import SettingsError
-from storage.archive.addresses import AHEAD_SUFFIX, StageRef
+from storage.archive.addresses import StageRef
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Store
@@ -30,6 +30,7 @@ from storage.archive.staging import (
 
 DAY_S = 86400.0
 IN_USE = "somebody is using the archive: run gc again when it is free"
+_MADE_AHEAD = "-mosaic"  # after the key: tiles that earlier versions made of a spool's lines while they came
 What = Literal["store", "spool", "unfinished", "upload"]
 
 
@@ -170,12 +171,12 @@ def _obstacle(archive: Archive, catalogue: Catalogue, staying: set[str]) -> str 
 
 
 def _spools(archive: Archive, catalogue: Catalogue) -> list[Removal]:
-    """Spools whose lines are published, and mosaics made ahead of these."""
+    """Spools whose lines are published, and what earlier versions made of these beside them."""
     published = {store.ref.key for store in catalogue.stores.values() if store.problem is None}
     return [
         Removal(f"spool/{path.name}", "spool", bytes_below(path), "its lines are published")
         for path in sorted((archive.root / "spool").glob("*"))
-        if path.name.removesuffix(AHEAD_SUFFIX) in published
+        if path.name.removesuffix(_MADE_AHEAD) in published
     ]
 
 
@@ -213,7 +214,7 @@ def _remove(archive: Archive, removal: Removal) -> bool:
     path = archive.root / removal.uri
     if removal.what == "spool":
         check_name(path.name)
-        lock = archive.root / ".locks" / f"capture-{path.name.removesuffix(AHEAD_SUFFIX)}.lock"
+        lock = archive.root / ".locks" / f"capture-{path.name.removesuffix(_MADE_AHEAD)}.lock"
     else:
         lock = _lock_of(archive.root, path)
     release = take_lock(lock, wait=False)

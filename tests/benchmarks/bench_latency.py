@@ -1,7 +1,6 @@
 """How long a rig waits between its last coarse line and the first position of the fine pass, on one emulated here.
 
-Run alone, python tests/benchmarks/bench_latency.py [--px 2560] [--after] prints where the time goes; with --after no
-tile of the mosaic is made while lines arrive.
+Run alone, python tests/benchmarks/bench_latency.py [--px 2560] prints where the time goes.
 """
 
 from __future__ import annotations
@@ -29,12 +28,10 @@ from measure import Row
 
 if TYPE_CHECKING:
     from flows.settings.survey_settings import Settings
-    from flows.survey.run import SurveyRun
     from pipeline.rig.capture_runner import RigDevices
     from pipeline.rig.emulator.emulated_rig import EmulatedRig
 
 PX, MOST_S = 2560, 5.0
-NOTHING_AHEAD = "nothing rectified while lines arrive"
 
 
 @dataclass
@@ -45,7 +42,6 @@ class Moments:
     last_line: float = 0.0
     first_request: float = 0.0
     stages: dict[str, float] = field(default_factory=dict)
-    tiles_ahead: int = 0
     coarse_s: float = 0.0
 
     @property
@@ -60,30 +56,21 @@ class Moments:
 
 
 def rows() -> list[Row]:
-    """The wait with tiles made ahead, and without; each in a process of its own, as surveys are."""
-    ahead, after = (_in_a_process(*flags) for flags in ((), ("--after",)))
-    what = f"rig, {PX} x {PX} x 270: last coarse line to first patch request"
-    share = f"{ahead.waited_s / ahead.coarse_s:.1%} of the coarse pass's {ahead.coarse_s:.0f} s"
-    told = f"{ahead.waited_s:.2f} s ({share})"
-    return [
-        Row(what, told, f"<= {MOST_S:g} s", ahead.waited_s <= MOST_S, f"{after.waited_s:.2f} s with {NOTHING_AHEAD}"),
-        Row(
-            "the same: last exposure to last coarse line (files over FTP, this machine)", f"{ahead.read_s:.2f} s",
-            peers=f"{after.read_s:.2f} s with {NOTHING_AHEAD}",
-        ),
-    ]  # fmt: skip
-
-
-def _in_a_process(*flags: str) -> Moments:
-    words = [sys.executable, __file__, "--json", *flags]
+    """The wait, in a process of its own, as surveys are."""
+    words = [sys.executable, __file__, "--json"]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
-    return Moments(**json.loads(done.stdout.splitlines()[-1]))
+    found = Moments(**json.loads(done.stdout.splitlines()[-1]))
+    what = f"rig, {PX} x {PX} x 270: last coarse line to first patch request"
+    share = f"{found.waited_s / found.coarse_s:.1%} of the coarse pass's {found.coarse_s:.0f} s"
+    return [
+        Row(what, f"{found.waited_s:.2f} s ({share})", f"<= {MOST_S:g} s", found.waited_s <= MOST_S),
+        Row("the same: last exposure to last coarse line (files over FTP, this machine)", f"{found.read_s:.2f} s"),
+    ]
 
 
-def measure(px: int, *, ahead: bool) -> Moments:
+def measure(px: int) -> Moments:
     """Survey a farm through an emulated rig as far as the first fine position."""
     from flows.settings.survey_settings import load_settings
-    from flows.survey import stages
 
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         told = {"size": f"{px}x{px}", "source": "rig", "visit": "first", "out": name, "engine": "plain",
@@ -91,15 +78,8 @@ def measure(px: int, *, ahead: bool) -> Moments:
         settings = load_settings(None, told)
         moments = Moments()
         stack.enter_context(_watched(moments))
-        if not ahead:
-            stack.enter_context(patch.object(stages, "rectifying_ahead", _nothing_ahead))
         _survey(stack, settings, moments)
         return moments
-
-
-@contextmanager
-def _nothing_ahead(run: SurveyRun, version: int, source: Any, key: str) -> Iterator[Any]:
-    yield lambda name, count: None
 
 
 class _AskedError(Exception):
@@ -108,12 +88,11 @@ class _AskedError(Exception):
 
 @contextmanager
 def _watched(moments: Moments) -> Iterator[None]:
-    """Take the time of exposures, lines and the first path of a fine sweep; count what was made ahead."""
-    from flows.survey import placement
+    """Take the time of exposures, lines and the first path of a fine sweep."""
     from pipeline.rig.capture_runner import CaptureRunner
     from storage.arrays.spool import Spool
 
-    append, take, take_mosaic = Spool.append, CaptureRunner.take, placement.take_mosaic
+    append, take = Spool.append, CaptureRunner.take
 
     def appended(spool: Spool, line: Any) -> None:
         append(spool, line)
@@ -127,16 +106,7 @@ def _watched(moments: Moments) -> Iterator[None]:
         moments.last_exposure = time.perf_counter()
         return done
 
-    def counted(*given: Any) -> Any:
-        there = take_mosaic(*given)
-        moments.tiles_ahead = len(there)
-        return there
-
-    with (
-        patch.object(Spool, "append", appended),
-        patch.object(CaptureRunner, "take", taken),
-        patch.object(placement, "take_mosaic", counted),
-    ):
+    with patch.object(Spool, "append", appended), patch.object(CaptureRunner, "take", taken):
         yield
 
 
@@ -187,16 +157,14 @@ def main() -> int:
     """Print one measurement, stage by stage."""
     parser = argparse.ArgumentParser(description="The wait between the coarse and the fine pass.")
     parser.add_argument("--px", type=int, default=PX)
-    parser.add_argument("--after", action="store_true", help="rectify nothing while lines arrive")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
     asked = parser.parse_args()
-    found = measure(asked.px, ahead=not asked.after)
+    found = measure(asked.px)
     if asked.json:
         print(json.dumps(asdict(found)))
         return 0
     for stage, seconds in found.stages.items():
         print(f"{stage:18} {seconds:8.2f} s")
-    print(f"tiles made ahead   {found.tiles_ahead}")
     print(f"last exposure to last line {found.read_s:.2f} s")
     print(f"last line to first patch request {found.waited_s:.2f} s, {found.waited_s / found.coarse_s:.2%} of the pass")
     return 0

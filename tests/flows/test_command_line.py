@@ -66,10 +66,15 @@ def test_every_flag_says_what_it_is(verb: str) -> None:
     [
         (["survy"], 'Unknown command "survy". Did you mean "survey"?; see spectralzoom --help'),
         (["survey", "--budgt", "1"], "Unknown option: --budgt. Did you mean --budget?; see spectralzoom survey --help"),
+        (
+            ["plan", "--rounds=2"],
+            "Unknown option: --rounds; there is one round of detail: a second never paid (README, Limits) and was "
+            "removed; leave it out; see spectralzoom plan --help",
+        ),
     ],
 )
 def test_a_wrong_word_is_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """With the nearest right one, and where all of them stand; no list that is cut off."""
+    """With the nearest right one, or why it went, and where all of them stand; no list that is cut off."""
     with pytest.raises(SystemExit) as ended:
         cli.main(words)
     assert ended.value.code == 2

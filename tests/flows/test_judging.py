@@ -253,15 +253,6 @@ def test_labels_may_come_later(
     assert comparable(receipt)["accuracy"] == survey().receipt["accuracy"]
 
 
-def test_a_second_round_is_judged_too(survey: Callable[..., Any], out: Path, command_line: CommandLine) -> None:
-    """All patches of both rounds count."""
-    survey(rounds="2", accuracy=False)
-    assert command_line("evaluate", out, "latest").code == 0
-    (receipt,) = receipts(out)
-    assert receipt["accuracy"] == survey(rounds="2").receipt["accuracy"]
-    assert problems(out) == []
-
-
 def _other_scene(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
     with Image.open(scene / "scene.png") as image:
         image.transpose(Image.Transpose.ROTATE_180).save(scene / "scene.png")

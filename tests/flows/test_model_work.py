@@ -13,7 +13,6 @@ from flows.survey.run import SurveyRun
 from models.network.cost import multiply_adds
 from models.network.sizes import SegmenterConfig
 from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.fine_pass import FinePlan
 
 CONFIG, BANDS = SegmenterConfig(classes=4), 8
 
@@ -27,29 +26,15 @@ def _run(side: int, policy: str) -> SurveyRun:
     return cast("SurveyRun", made)
 
 
-def _plan(seats: list[int]) -> FinePlan:
-    return FinePlan([], np.array(seats, np.intp), 1.0, 1.0)
-
-
 @pytest.mark.parametrize(
     ("policy", "looks"), [("gain", 2), ("sobel", 2), ("random", 1), ("saliency", 1), ("vgg-static", 1)]
 )
 def test_a_policy_that_asks_the_glance_reads_the_coarse_look_once_more(policy: str, looks: int) -> None:
     """The map reads it anyway, from what is stored; scores of the glance read it before that."""
     run = _run(256, policy)
-    done, closed = work_done(run, [_plan([3, 8])]), multiply_adds(CONFIG, run.grid, 2, BANDS, policy)
+    done, closed = work_done(run, np.array([3, 8])), multiply_adds(CONFIG, run.grid, 2, BANDS, policy)
     assert done.glance == looks * closed.glance
     assert (done.score, done.encode, done.decode) == (closed.score, closed.encode, closed.decode)
-
-
-def test_a_second_rounds_scores_read_the_coarse_look_and_the_first_patches() -> None:
-    """They are counted with the scores; where the first round captured nothing there is nothing to read."""
-    run = _run(256, "gain")
-    one, two, none = (work_done(run, plans) for plans in ([_plan([3, 8])], [_plan([3]), _plan([8])],
-                                                          [_plan([]), _plan([3, 8])]))  # fmt: skip
-    assert two.score == one.score + multiply_adds(CONFIG, run.grid, 1, BANDS, None).total
-    assert (two.glance, two.encode, two.decode) == (one.glance, one.encode, one.decode)
-    assert none == one
 
 
 def test_a_large_field_is_counted_region_by_region() -> None:

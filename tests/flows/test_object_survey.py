@@ -14,7 +14,7 @@ from storage.remote.opening import open_archive
 pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
 from flows.publish.run_folder import Published
-from flows.survey.survey import OF_ROUND_TWO, STAGES
+from flows.survey.survey import STAGES
 from pipeline.errors import SceneError
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
@@ -31,7 +31,7 @@ def states(receipt: dict[str, object]) -> set[str]:
     """What became of the stages."""
     rows = receipt["stages"]
     assert isinstance(rows, list)
-    assert len(rows) == len(STAGES) - len(OF_ROUND_TWO)
+    assert len(rows) == len(STAGES)
     return {row["state"] for row in rows}
 
 

@@ -180,8 +180,8 @@ def test_memory_reads_units(text, count):
         ({"memory": "4"}, "at least 256MiB"),
         ({"scheduler": "dask"}, "'scheduler': .* threads, processes, or the address of a dask scheduler such as tcp:"),
         ({"workers": 0}, "a whole number from 1 to 1024, got 0; one process or thread each"),
-        ({"rounds": 3}, "rounds' must be a whole number from 1 to 2, got 3; one coarse look"),
-        ({"rounds": 2, "policy": "random"}, "policy 'random' expects nothing: take --rounds 1"),
+        ({"rounds": 1}, r"unknown setting 'rounds'; there is one round of detail: .* was removed; leave it out$"),
+        ({"rounds": 2}, r"unknown setting 'rounds'; there is one round of detail: .* was removed; leave it out$"),
         ({"threshold": -1}, "threshold' must be a number from 0 to 1e\\+09 nat per second, got -1"),
         ({"threshold": 1, "policy": "sobel"}, "policy 'sobel' scores in a unit of its own: leave --threshold out"),
         ({"seed": -1}, "whole number from 0"),
@@ -286,9 +286,12 @@ def test_a_rig_is_read_from_its_tables(toml):
 def test_receipts_of_before_are_read():
     """Keys that there are no longer are left out of a receipt's settings, in its tables too; the others stay."""
     now = Settings(seed=3, optics=Optics(smile_nm=1.0)).to_dict()
-    before = now | {"patch": 16, "optics": {**now["optics"], "polarisation": 0.02}, "rig": {**now["rig"], "old": 1}}
+    before = now | {"patch": 16, "rounds": 1, "rig": {**now["rig"], "old": 1}}
+    before["optics"] = {**now["optics"], "polarisation": 0.02}
     assert of_this_version(before) == now
     assert parse_settings(of_this_version(before)) == Settings(seed=3, optics=Optics(smile_nm=1.0))
+    with pytest.raises(SettingsError, match=r"its survey had 2 rounds of detail, .* survey the field by hand"):
+        of_this_version(before | {"rounds": 2})
 
 
 @pytest.mark.parametrize(

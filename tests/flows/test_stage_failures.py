@@ -23,14 +23,14 @@ from flows.schedule.fields import load_fields
 from flows.schedule.ledger_state import moment_words
 from flows.schedule.times import parse_timetable
 from flows.survey import prefect_engine as engine
-from flows.survey.survey import OF_ROUND_TWO, STAGES
+from flows.survey.survey import STAGES
 from pipeline.errors import ArchiveError, RigError
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger
 from storage.arrays.class_maps import load_class_map
 from tests.flows.conftest import Ended
 
-CAPTURES = ("capture_coarse", "capture_fine", "capture_again")
+CAPTURES = ("capture_coarse", "capture_fine")
 NO_REPLY = "no reply from the camera after 2 s; is it on?"
 FULL_DISK = "cannot write to the archive: no space left; make room"
 
@@ -97,12 +97,12 @@ class Walk:
 def walk(tmp_path_factory: pytest.TempPathFactory, survey_png: Any, scene_files: Path, weights: Path) -> Walk:
     """The same command again and again, each stage in turn failing by a bug and then by its words."""
     folder = tmp_path_factory.mktemp("failures")
-    receipt = survey_png(folder / "undisturbed", rounds="2").receipt
+    receipt = survey_png(folder / "undisturbed").receipt
     keys = {stage["name"]: stage["key"] for stage in receipt["stages"] if stage["state"] == "ran"}
     found = Walk(folder / "undisturbed", folder / "archive", keys, {}, {}, Counter(), {})
     words = [
         "survey", "--scene", scene_files / "scene.png", "--labels", scene_files / "labels.png", "--weights", weights,
-        "--engine", "plain", "--budget", "0.8", "--no-controls", "--rounds", "2", "--out", found.out,
+        "--engine", "plain", "--budget", "0.8", "--no-controls", "--out", found.out,
     ]  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tempfile, "tempdir", str(folder))
@@ -115,7 +115,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory, survey_png: Any, scene_files:
                     ended = command(words)
                 stores = frozenset(ref.key for ref in Archive.open(found.out).refs())
                 trials[stage] = Trial(ended, stores, problems(found.out))
-        receipt = survey_png(found.out, rounds="2").receipt
+        receipt = survey_png(found.out).receipt
         found.last.update({stage["name"]: stage["state"] for stage in receipt["stages"]})
     return found
 
@@ -178,7 +178,6 @@ def test_what_was_made_before_is_published(stage: str, walk: Walk) -> None:
 def test_the_survey_goes_on_as_if_nothing_had_been(walk: Walk) -> None:
     """Each store was begun three times, twice to fail; the run at last reads all but the last, and draws the map."""
     assert walk.builds == dict.fromkeys(walk.keys, 3)
-    assert set(OF_ROUND_TWO) - {"register_again"} <= walk.keys.keys()
     assert {name for name, state in walk.last.items() if state == "ran"} == {"evaluate"}
     np.testing.assert_array_equal(class_map(walk.out), class_map(walk.undisturbed))
     archive = Archive.open(walk.out)
@@ -200,9 +199,9 @@ def test_a_run_that_cannot_be_drawn_is_not_published(
     with monkeypatch.context() as broken:
         broken.setattr(publish, "draw_quicklook", refuse)
         with pytest.raises(ArchiveError, match="no space left"):
-            survey_png(out, rounds="2")
+            survey_png(out)
     assert (Archive.open(out).runs(), problems(out)) == (before, [])
-    states = {stage["state"] for stage in survey_png(out, rounds="2").receipt["stages"]}
+    states = {stage["state"] for stage in survey_png(out).receipt["stages"]}
     assert states == {"cached", "skipped"}
     assert (len(Archive.open(out).runs()), problems(out)) == (len(before) + 1, [])
 
@@ -248,8 +247,7 @@ def test_a_stage_that_fails_by_prefect(
     with pytest.raises(type(error), match=str(error)[:20]):
         survey_png(tmp_path, engine="prefect")
     run, tasks = newest_run("survey")
-    before = [name for name in STAGES if name not in OF_ROUND_TWO]
-    before = before[: before.index(stage)]
+    before = list(STAGES)[: list(STAGES).index(stage)]
     assert (run.name, run.state.type.value) == ("survey-scene", "FAILED")
     assert str(error) in run.state.message
     assert tasks.keys() == {f"{name}-scene" for name in (*before, stage)}

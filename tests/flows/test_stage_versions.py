@@ -28,12 +28,12 @@ RECORD = Path(__file__).with_name("stage_digests.json")
 SCENES = ("built_in_farm", "raster_from_values", "make_source")  # what runs bring: no stage names where they come from
 ROOTS = {
     "effects": ("choose_effects", *SCENES),
-    "capture": ("capture_coarse", "capture_fine", "capture_again", *SCENES, "rig_source"),
+    "capture": ("capture_coarse", "capture_fine", *SCENES, "rig_source"),
     "register": ("register_coarse", "register_fine"),
     "locate": ("placement.locate",),
     "rectify": ("placement.rectify",),
-    "attend": ("stages.attend", "attend_again"),
-    "patches": ("cut_patches", "cut_again"),
+    "attend": ("stages.attend",),
+    "patches": ("cut_patches",),
     "segment": ("draw_map",),
     "turned": ("compare_turned",),
     "ground": ("ground.ground",),

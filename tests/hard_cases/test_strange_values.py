@@ -17,7 +17,6 @@ from models.network.dead_pixels import MOST_COLUMN
 from models.policies.policies import score_seats
 from models.reading.inference import ClassMap, Glance, decide, glance, glance_of_columns, look_coarsely, segment
 from models.reading.regions import whole_field
-from models.second_look import rescore
 from models.weights.files import Weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
@@ -184,17 +183,6 @@ def test_infinite_scores_lead_huge_ones() -> None:
     assert np.isfinite(plan.worth)
     zeroed = np.where(np.isnan(scores) | (scores < 0), 0.0, scores)
     assert _plan(zeroed).sweeps == plan.sweeps
-
-
-@pytest.mark.parametrize("power", [0, 300, 990, 1020])
-def test_a_second_look_at_huge_scores_is_that_at_usual_ones(power: int) -> None:
-    """What is found scales with what was expected: the order of the seats that are left stays."""
-    scores, seats = np.minimum(SCORES[:48], 1.0), np.arange(0, 48, 2)
-    scores[seats] = 1.0
-    found = np.linspace(0.2, 1.0, len(seats))
-    usual = rescore(scores, seats, found, (6, 8))
-    scaled = rescore(np.ldexp(scores, power), seats, np.ldexp(found, power), (6, 8))
-    np.testing.assert_allclose(np.ldexp(scaled, -power), usual, rtol=1e-12)
 
 
 # --- the rule itself --------------------------------------------------------------------------------------------------

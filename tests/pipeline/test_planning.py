@@ -14,7 +14,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps
-from pipeline.planning.fine_pass import SeatsPrice, check_budget, joined_plan, least_budget, plan_fine, price_of_seats
+from pipeline.planning.fine_pass import SeatsPrice, check_budget, least_budget, plan_fine, price_of_seats
 from pipeline.planning.strips import covered_seats
 
 CAMERA, COST = LineCamera(), CostModel()
@@ -353,19 +353,3 @@ def test_thresholds_that_cannot_be_are_refused(threshold: float):
     """A threshold is a finite score of 0 or more."""
     with pytest.raises(BudgetError, match="threshold must be a finite score of 0 or more, got"):
         plan_fine(GRID, CAMERA, COST, "x", drawn(GRID), budget_s=9.0, threshold=threshold)
-
-
-def test_rounds_are_joined_as_they_were_priced():
-    """Sweeps one after the other, seconds added, every seat once, also one that both rounds show."""
-    scores = drawn(GRID)
-    first = plan_fine(GRID, CAMERA, COST, "x", scores, budget_s=12.0)
-    left = scores.copy()
-    left[first.seats] = 0.0
-    second = plan_fine(GRID, CAMERA, COST, "x", left, budget_s=12.0)
-    both = joined_plan([first, second])
-    assert both.sweeps == [*first.sweeps, *second.sweeps]
-    assert both.seconds == first.seconds + second.seconds
-    assert both.seats.tolist() == sorted({*first.seats.tolist(), *second.seats.tolist()})
-    assert joined_plan([first]) is first
-    with pytest.raises(ShapeError, match="one round or more, got none"):
-        joined_plan([])

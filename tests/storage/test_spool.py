@@ -15,7 +15,7 @@ import pytest
 from pipeline.checked_lines import with_check
 from pipeline.errors import RigError
 from pipeline.source import Line
-from storage.arrays.spool import Spool, read_spooled
+from storage.arrays.spool import Spool
 from tests.storage.small_archive import flip
 
 HEADER = {"sweep": "fine-0", "seed": 3, "start_px": -40.25}
@@ -67,16 +67,6 @@ def test_an_interrupted_capture_goes_on(tmp_path: Path) -> None:
     with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
         assert spool.count == 12
         assert _same([line for block in spool.blocks(5) for line in block])
-
-
-def test_lines_are_read_while_more_are_appended(tmp_path: Path) -> None:
-    """Any range of what is there, across the lines that the disk was waited for."""
-    with Spool.open(tmp_path, 6, 4, header=HEADER, name="coarse-0") as spool:
-        for number in range(90):
-            spool.append(_line(number))
-        for lines in (slice(0, 1), slice(3, 7), slice(70, 90)):
-            found = read_spooled(tmp_path, "coarse-0", (6, 4), lines)
-            np.testing.assert_array_equal(found, [_line(number).data for number in range(lines.start, lines.stop)])
 
 
 def test_the_spool_is_an_envi_file(tmp_path: Path) -> None:
