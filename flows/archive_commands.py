@@ -83,7 +83,7 @@ def run_verify(
     _put_out(content, show_verdict if done is None else show_repair, as_json=as_json)
     if done is None:
         return FAILED if bad else DONE
-    stray = any(finding.kind in ("stray", "growing") for finding in bad)
+    stray = any(finding.kind in ("stray", "growing", "unreadable") for finding in bad)
     return DONE if done.complete and not stray else PARTLY if done.remade or done.dropped else FAILED
 
 

@@ -90,31 +90,6 @@ def gc(
 
 
 @app.command
-def pack(
-    archive: ArchiveName,
-    *,
-    older_than: float = 30.0,
-    dry_run: Switch = False,
-    as_json: AsJson = False,
-) -> int:
-    """Store old raw sweeps in fewer bytes: the same numbers, in a codec that takes longer to write.
-
-    The codec (pcodec) is no part of the Zarr specification: zarr-python reads it where numcodecs and pcodec are
-    installed, other Zarr programs may not.
-
-    Parameters
-    ----------
-    older_than
-        Only sweeps and ingested cubes that were stored so many days ago.
-    dry_run
-        Only say what would be packed.
-    """
-    from flows.pack_command import run_pack
-
-    return run_pack(archive, stderr, older_than=older_than, dry_run=dry_run, as_json=as_json)
-
-
-@app.command
 def export(
     archive: ArchiveName,
     run: str | None = None,

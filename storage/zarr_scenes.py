@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 import zarr
+from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.archive_codec import allow_pcodec
 from storage.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, ReadLines
 from storage.envi_header import MICROMETRES, NANOMETRES, UNSAID
+from storage.layout import missing_codec
 from storage.zarr_metadata import (
     METADATA,
     check_blocks,
@@ -75,7 +76,6 @@ def open_zarr_cube(path: Path, variable: str | None = None) -> CubeSource:
     with _named(path):
         check_links(path)
         check_metadata(path)
-        allow_pcodec()
         node = zarr.open(path, mode="r", **open_options(path))
         group = node if isinstance(node, zarr.Group) else None
         arrays: dict[str, Any] = dict(node.arrays()) if isinstance(node, zarr.Group) else {"": node}
@@ -96,6 +96,8 @@ def _named(path: Path) -> Iterator[None]:
         yield
     except SceneError:
         raise
+    except UnknownCodecError as error:
+        raise SceneError(missing_codec(str(path), error.codec_id)) from error
     except Exception as error:  # codecs and parsers raise anything at all on damaged bytes
         raise SceneError(f"{path} cannot be read as Zarr: {type(error).__name__}: {error}; is it damaged?") from error
 
