@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from flows.app import (
     ArchiveName,
@@ -150,32 +147,6 @@ def ingest(
     if as_json:
         print_json(record)
     return 0
-
-
-@app.command
-def statistics(
-    archive: ArchiveName,
-    product: str = "mosaic",
-    *,
-    every_band: Annotated[bool, Parameter(name="--all", negative="")] = False,
-    scheduler: Scheduler = "threads",
-    workers: Workers = None,
-    as_json: AsJson = False,
-) -> int:
-    """Count every band of a stored cube: finite share, extremes, percentiles, mean and standard deviation.
-
-    Parameters
-    ----------
-    product
-        Its address, a key or its beginning, or a product's name in the newest run (mosaic, raw_coarse).
-    every_band
-        Show every band, not a dozen of them.
-    """
-    from flows.statistics_command import run_statistics
-    from storage.block_work import Crew
-
-    crew = Crew(scheduler, workers)
-    return run_statistics(archive, product, stderr, crew=crew, every_band=every_band, as_json=as_json)
 
 
 @app.command
