@@ -1,7 +1,12 @@
-"""ENVI cubes, lazily: the numbers stay in their file until a part of the view is read."""
+"""ENVI files: headers read leniently and refused where they say too little, cubes lazily.
+
+The numbers stay in their file until a part of the view is read.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,10 +15,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.envi_header import EnviHeader, load_envi_header
+from pipeline.rig.envi_fields import finite_number, listed_numbers, split_header, wavelengths_nm
 
+LARGEST_HEADER = 1 << 22  # bytes; the largest seen holds 33 thousand
+INTERLEAVES = ("bil", "bip", "bsq")
+# data type codes of the format's description
+DATA_TYPES = {
+    1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 6: "c8", 9: "c16", 12: "u2", 13: "u4", 14: "i8", 15: "u8",
+}  # fmt: skip
+# of these a header describes another kind of file than plain numbers
+OTHER_FILES = ("tiff", "jpeg", "jp2", "png", "bmp", "hdf", "netcdf", "nitf", "virtual", "meta")
 # where a data file's name may differ from its header's
 DATA_ENDINGS = ("", ".bin", ".dat", ".img", ".raw", ".bil", ".bip", ".bsq", ".cube")
+
+
+@dataclass(frozen=True)
+class EnviHeader:
+    """What one header says; what it leaves out is None, and what was made of it stands in ``notes``."""
+
+    where: str  # the header's path, for messages
+    samples: int
+    lines: int | None  # None: as many as the data file holds
+    bands: int
+    dtype: np.dtype[np.generic]  # with its byte order
+    interleave: str  # bil, bip or bsq
+    offset: int  # bytes before the numbers
+    kind: str  # file type, such as ENVI Standard or ENVI Spectral Library
+    wavelength_nm: NDArray[np.float64] | None  # (band,)
+    fwhm_nm: NDArray[np.float64] | None  # (band,)
+    band_names: tuple[str, ...]
+    nodata: float | None
+    fields: Mapping[str, str]  # all of them as written, keys in lower case, the outer braces taken off
+    settings: Mapping[str, str]  # of the lines that begin with ;
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -104,3 +138,121 @@ def _view(path: Path, header: EnviHeader, lines: int, held: int) -> NDArray[Any]
     }[header.interleave]
     content = np.memmap(path, np.uint8, mode="r")
     return np.ndarray((held, samples, bands), header.dtype, content, header.offset, strides)
+
+
+def load_envi_header(path: Path) -> EnviHeader:
+    """Read one header file.
+
+    Raises
+    ------
+    SceneError : there is no such file, or it is no ENVI header that can be used; the message says why.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            raise SceneError(f"{path} is no file; name an ENVI header")
+        if path.stat().st_size > LARGEST_HEADER:
+            raise SceneError(f"{path} has {path.stat().st_size} bytes, too many for a header; name the .hdr file")
+        content = path.read_bytes()
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read: {error}; name an ENVI header") from error
+    if b"\0" in content:
+        raise SceneError(f"{path} holds binary data, expected the text of an ENVI header; name the .hdr file")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    return parse_envi_header(text, str(path))
+
+
+def parse_envi_header(text: str, where: str = "the header") -> EnviHeader:
+    """Read a header's text.
+
+    Wavelengths come out in nm. Without a unit they are read as nm or micrometres by their size, and a note says so;
+    wavelengths that do not fit the bands are left out with a note.
+
+    Parameters
+    ----------
+    where
+        What messages call it.
+
+    Raises
+    ------
+    SceneError : it does not begin with ENVI (ArcGIS headers do not), a size, type or interleave is missing or
+        impossible, or it says that its file holds more than plain numbers (compressed, with bytes between frames).
+    """
+    notes: list[str] = []
+    fields, settings = split_header(text, where, notes)
+    samples, bands = (_whole(fields, key, where, least=1) for key in ("samples", "bands"))
+    kind = fields.get("file type", "ENVI Standard")
+    _refuse_layouts(fields, kind, where)
+    channels = samples if "spectral library" in kind.lower() else bands
+    wavelength, scale = wavelengths_nm(fields, channels, notes)
+    return EnviHeader(
+        where=where,
+        samples=samples,
+        lines=_whole(fields, "lines", where, least=0) if "lines" in fields else None,
+        bands=bands,
+        dtype=_data_type(fields, where, notes),
+        interleave=_interleave(fields, bands, where, notes),
+        offset=_whole(fields, "header offset", where, least=0) if "header offset" in fields else 0,
+        kind=kind,
+        wavelength_nm=wavelength,
+        fwhm_nm=None if wavelength is None else _widths(fields, channels, scale, notes),
+        band_names=tuple(name.strip() for name in fields["band names"].split(",")) if "band names" in fields else (),
+        nodata=finite_number(fields.get("data ignore value", "")),
+        fields=fields,
+        settings=settings,
+        notes=tuple(notes),
+    )
+
+
+def _whole(fields: Mapping[str, str], key: str, where: str, *, least: int) -> int:
+    if key not in fields:
+        raise SceneError(f"{where} does not say {key}; add the line '{key} = ...'")
+    number = finite_number(fields[key])
+    if number is None or number != int(number) or number < least:
+        raise SceneError(f"{where}: {key} = {fields[key]!r}, expected a whole number from {least}; correct it")
+    return int(number)
+
+
+def _data_type(fields: Mapping[str, str], where: str, notes: list[str]) -> np.dtype[np.generic]:
+    code = _whole(fields, "data type", where, least=1)
+    if code not in DATA_TYPES:
+        raise SceneError(f"{where}: data type = {code} is none of ENVI's {', '.join(map(str, DATA_TYPES))}; correct it")
+    if "byte order" not in fields and np.dtype(DATA_TYPES[code]).itemsize > 1:
+        notes.append("the byte order is not said, taken as little endian")
+    order = _whole(fields, "byte order", where, least=0) if "byte order" in fields else 0
+    if order > 1:
+        raise SceneError(f"{where}: byte order = {order}, expected 0 (little endian) or 1 (big endian); correct it")
+    return np.dtype(("<", ">")[order] + DATA_TYPES[code])
+
+
+def _refuse_layouts(fields: Mapping[str, str], kind: str, where: str) -> None:
+    """Refuse files whose numbers do not simply follow each other: they would be read as other numbers."""
+    if finite_number(fields.get("file compression", "0")) != 0:
+        raise SceneError(f"{where}: file compression = {fields['file compression']!r}, expected 0; unpack the file")
+    for key in ("major frame offsets", "minor frame offsets"):
+        words = [word for word in re.split(r"[,\s]+", fields.get(key, "")) if word]
+        if any(finite_number(word) != 0 for word in words):
+            raise SceneError(
+                f"{where}: {key} = {fields[key]!r} puts bytes between frames, which is not read; store them without"
+            )
+    other = next((word for word in OTHER_FILES if word in kind.lower()), None)
+    if other is not None:
+        raise SceneError(f"{where}: file type = {kind!r}, expected plain numbers (ENVI Standard); name the file itself")
+
+
+def _interleave(fields: Mapping[str, str], bands: int, where: str, notes: list[str]) -> str:
+    if "interleave" not in fields and bands == 1:
+        notes.append("the interleave is not said, and with one band does not matter")
+        return "bsq"
+    found = fields.get("interleave", "").strip().lower()
+    if found not in INTERLEAVES:
+        says = f"interleave = {found!r}" if found else "no interleave"
+        raise SceneError(f"{where}: {says}, expected one of {', '.join(INTERLEAVES)}; correct it")
+    return found
+
+
+def _widths(fields: Mapping[str, str], channels: int, scale: float, notes: list[str]) -> NDArray[np.float64] | None:
+    values = listed_numbers(fields, "fwhm", channels, notes)
+    return None if values is None or not (values > 0).all() else values * scale

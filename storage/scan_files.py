@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from storage.cube_sources import Bands, CubeSource, LineFacts, check_cube_source
 from storage.dataset_layouts import find_layout
-from storage.envi_cubes import DATA_ENDINGS, find_envi_pair, open_envi_cube
-from storage.envi_header import EnviHeader
+from storage.envi_cubes import DATA_ENDINGS, EnviHeader, find_envi_pair, open_envi_cube
 from storage.headwall_folders import PartedCube, find_reference, is_headwall_folder, one_part, open_parts
 from storage.raster_files import SCENE_ENDINGS, load_raster, split_variable
 from storage.scene_toml import SceneSettings, find_scene_settings

@@ -19,8 +19,8 @@ from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
+from pipeline.rig.envi_fields import MICROMETRES, NANOMETRES, UNSAID
 from storage.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, ReadLines
-from storage.envi_header import MICROMETRES, NANOMETRES, UNSAID
 from storage.layout import missing_codec
 from storage.zarr_metadata import (
     METADATA,

@@ -31,10 +31,11 @@ PLANNING = ("pipeline/planning.py", "pipeline/runs.py", "pipeline/covering.py", 
             "pipeline/strips.py")  # fmt: skip
 GATHER = ("pipeline/rectify/resample.py", "pipeline/rectify/kernels.py", "pipeline/rectify/line_table.py",
           "pipeline/rectify/alignment.py")  # fmt: skip
-READERS = ("storage/scan_files.py", "storage/envi_header.py", "storage/envi_cubes.py", "storage/headwall_folders.py",
+READERS = ("storage/scan_files.py", "storage/envi_cubes.py", "storage/headwall_folders.py",
            "storage/frame_index_files.py", "storage/zarr_scenes.py", "storage/raster_files.py", "storage/rasters.py",
            "storage/tiff_files.py", "storage/array_files.py", "storage/mat_files.py", "storage/dataset_layouts.py",
-           "storage/wavelengths.py", "storage/scene_toml.py", "pipeline/rig/frame_index.py")  # fmt: skip
+           "storage/wavelengths.py", "storage/scene_toml.py", "pipeline/rig/frame_index.py",
+           "pipeline/rig/envi_fields.py")  # fmt: skip
 SIMULATOR = ("pipeline/simulator", "pipeline/simulator/effects")
 SOURCES = {
     "effects": (*GEOMETRY, *GATHER, *SIMULATOR, "flows/effect_choice.py"),

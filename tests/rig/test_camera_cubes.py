@@ -49,6 +49,15 @@ def test_header_by_hand() -> None:
     assert values[0, 0, 1] == 0x0B0A
 
 
+def test_wavelengths_come_out_in_nm() -> None:
+    """Whatever their unit; a list that does not fit the bands is left out."""
+    text = HEADER.format(lines=1).replace("400.5,\n500,\n600", "0.4, 0.5, 0.6\n} \nwavelength units = {um")
+    found = parse_cube_header(text, "h").wavelength_nm
+    assert found is not None
+    assert found.tolist() == [400, 500, 600]
+    assert parse_cube_header(text.replace("0.4, ", ""), "h").wavelength_nm is None
+
+
 def test_big_endian_with_an_offset() -> None:
     """Byte order and header offset are followed."""
     text = HEADER.format(lines=2).replace("byte order = 0", "byte order = 1").replace("offset = 0", "offset = 7")
@@ -62,7 +71,7 @@ def test_big_endian_with_an_offset() -> None:
         ("ENVI", "EVNI", "begins with 'EVNI"), ("bil", "bsq", "expected bil and 12"),
         ("type = 12", "type = 4", "expected bil and 12"), ("samples = 5", "samples = x", "samples = 'x', expected"),
         ("samples = 5\n", "", "samples = None"), ("order = 0", "order = 2", "expected 0 or 1"),
-        ("bands = 3", "bands = 0", "at least one of each"),
+        ("bands = 3", "bands = 0", "at least one of each"), ("\n}\n", "\n", "never closed; .* fetch it again"),
     ],
 )  # fmt: skip
 def test_headers_that_cameras_do_not_write(old: str, new: str, words: str) -> None:

@@ -12,8 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.envi_cubes import EnviCube, open_envi_cube
-from storage.envi_header import DATA_TYPES, INTERLEAVES
+from storage.envi_cubes import DATA_TYPES, INTERLEAVES, EnviCube, open_envi_cube
 from storage.envi_writer import EnviFile, write_envi
 from storage.scan_files import open_cube_source
 

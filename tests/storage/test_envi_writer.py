@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import PoseError, SceneError, ShapeError
-from storage.envi_cubes import open_envi_cube
-from storage.envi_header import INTERLEAVES
+from storage.envi_cubes import INTERLEAVES, open_envi_cube
 from storage.envi_writer import EnviFile, header_text, write_envi
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
