@@ -13,9 +13,9 @@ from rich.markup import escape
 from flows.progress import StageProgress
 from pipeline.errors import SceneError
 from storage.archive import Archive, StageRef
-from storage.cube_sources import CubeSource
-from storage.ingested_cubes import Report, SourceFile, write_ingested_cube
-from storage.scan_files import open_cube_source, with_wavelengths
+from storage.readers.cube_sources import CubeSource
+from storage.readers.ingested_cubes import Report, SourceFile, write_ingested_cube
+from storage.readers.scan_files import open_cube_source, with_wavelengths
 from storage.staging import check_name, file_hash
 
 STAGE = "ingest"

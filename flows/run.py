@@ -40,7 +40,7 @@ from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive import Archive
 from storage.layout import AngularGrid
-from storage.raster_files import load_raster
+from storage.readers.raster_files import load_raster
 
 if TYPE_CHECKING:
     from pipeline.rig.rig_source import RigSource

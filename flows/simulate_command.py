@@ -28,7 +28,7 @@ from pipeline.grid import SceneGrid
 from pipeline.scan import Sweep
 from pipeline.simulator.manifest import UNIT_WORDS
 from storage.archive import Archive, StageRef
-from storage.scene_files import load_scene_file
+from storage.readers.scene_files import load_scene_file
 
 TITLES = {"effects": "effects that matter", "capture": "scan", "comparison": "the same with everything on"}
 PATCH, FACTOR = 16, 4  # of the weights that come with the house: scans are those of its surveys

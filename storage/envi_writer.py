@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import PoseError, ShapeError
-from storage.envi_cubes import DATA_TYPES, INTERLEAVES
+from storage.readers.envi_cubes import DATA_TYPES, INTERLEAVES
 from storage.whole_files import written_aside
 
 Blocks = Iterable[tuple[int, NDArray[Any]]]  # first line, (line, sample, band) values

@@ -20,7 +20,7 @@ from flows.survey_command import run_survey
 from models.segmenter import Segmenter, SegmenterConfig
 from models.spectral import Normalisation, SpectralBasis
 from models.weights import Weights, save_weights
-from storage.labels import default_colour
+from storage.readers.labels import default_colour
 from tests.object_server import bucket, machine, s3_server  # noqa: F401 - fixtures
 
 RGB_NM = (640.0, 550.0, 460.0)

@@ -1,7 +1,7 @@
 """Bytes of a capture's files to lines: ENVI cubes as the camera writes them, with their frames' numbers and times.
 
 What the camera itself writes is read strictly here, for the loop that waits for it; folders from anywhere are read by
-``storage.headwall_folders``.
+``storage.readers.headwall_folders``.
 """
 
 from __future__ import annotations

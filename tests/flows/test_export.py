@@ -23,7 +23,7 @@ from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.ground import RigPose
 from storage.archive import Archive
 from storage.cog_files import cog_problems
-from storage.envi_cubes import open_envi_cube
+from storage.readers.envi_cubes import open_envi_cube
 from storage.stac_items import stac_problems
 from tests.storage.stac_rules import extension_problems
 

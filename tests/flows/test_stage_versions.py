@@ -31,11 +31,7 @@ PLANNING = ("pipeline/planning.py", "pipeline/runs.py", "pipeline/covering.py", 
             "pipeline/strips.py")  # fmt: skip
 GATHER = ("pipeline/rectify/resample.py", "pipeline/rectify/kernels.py", "pipeline/rectify/line_table.py",
           "pipeline/rectify/alignment.py")  # fmt: skip
-READERS = ("storage/scan_files.py", "storage/envi_cubes.py", "storage/headwall_folders.py",
-           "storage/frame_index_files.py", "storage/zarr_scenes.py", "storage/raster_files.py", "storage/rasters.py",
-           "storage/tiff_files.py", "storage/array_files.py", "storage/mat_files.py", "storage/dataset_layouts.py",
-           "storage/wavelengths.py", "storage/scene_toml.py", "pipeline/rig/frame_index.py",
-           "pipeline/rig/envi_fields.py")  # fmt: skip
+READERS = ("storage/readers", "pipeline/rig/frame_index.py", "pipeline/rig/envi_fields.py")
 SIMULATOR = ("pipeline/simulator", "pipeline/simulator/effects")
 SOURCES = {
     "effects": (*GEOMETRY, *GATHER, *SIMULATOR, "flows/effect_choice.py"),
@@ -56,7 +52,7 @@ SOURCES = {
                "flows/tones.py"),
     "evaluate": (*READ, *RECTIFY, *PLANNING, "models/controls.py", "models/metrics.py", "models/policies.py",
                  "pipeline/savings.py", "pipeline/selection.py", "flows/evaluation.py", "flows/full_look.py"),
-    "ingest": (*READERS, "storage/cube_sources.py", "storage/ingested_cubes.py"),
+    "ingest": READERS,
 }  # fmt: skip
 STAGES_FILE, PLACEMENT = "flows/stages.py", "flows/placement.py"
 FUNCTIONS: dict[str, dict[str, tuple[str, ...]]] = {  # of files that several stages share

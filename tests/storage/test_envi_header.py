@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SceneError
-from storage.envi_cubes import load_envi_header, parse_envi_header
+from storage.readers.envi_cubes import load_envi_header, parse_envi_header
 
 PLAIN = "ENVI\nsamples = 4\nlines = 3\nbands = 2\ndata type = 12\ninterleave = bil\nbyte order = 0\n"
 

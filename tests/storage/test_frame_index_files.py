@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SceneError
-from storage.frame_index_files import load_frame_index, times_of_lines
+from storage.readers.frame_index_files import load_frame_index, times_of_lines
 
 
 def _index(folder: Path, text: str) -> Path:

@@ -20,7 +20,7 @@ from pipeline.source import Line, References
 from storage.archive import Archive, StageRef
 from storage.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.manifests import listed_bytes, manifest_sha256, read_manifest, write_manifest
-from storage.scan_files import open_cube_source
+from storage.readers.scan_files import open_cube_source
 from tests.storage.small_archive import flip
 
 LINES = np.random.default_rng(1).poisson(400, (37, 40, 6)).astype(np.uint16)

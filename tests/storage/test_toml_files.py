@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import SceneError
-from storage.scene_toml import load_scene_settings
+from storage.readers.scene_toml import load_scene_settings
 from storage.toml_files import MOST_BYTES, read_toml
 
 

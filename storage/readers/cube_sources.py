@@ -1,6 +1,6 @@
 """What a cube gives that is to be stored or looked at, wherever it comes from: its lines when asked, and what is known.
 
-Those who open one (:mod:`storage.scan_files`, :mod:`storage.zarr_scenes`) fill it in; whoever stores it asks for 64
+Those who open one (:mod:`storage.readers.scan_files`, :mod:`storage.readers.zarr_scenes`) fill it in; whoever stores it asks for 64
 lines at a time.
 """
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from pipeline.errors import SceneError
-from storage.declared_sizes import DEFLATE_RATIO, check_memory
+from storage.readers.declared_sizes import DEFLATE_RATIO, check_memory
 
 LOOK = 18  # bytes: the longest beginning
 CHECKSUMS = {"crc32", "crc32c", "adler32", "fletcher32", "jenkins_lookup3"}

@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.readings import MOST_STEPS, MOST_VALUE, beyond_range, find_beyond
 from pipeline.simulator.scene import BRIGHT_PERCENTILE
-from storage.cube_sources import BLOCK_LINES, scene_lines
-from storage.dataset_layouts import find_layout
-from storage.declared_sizes import machine_bytes
-from storage.labels import Labels, load_labels
-from storage.raster_files import load_raster, split_variable
-from storage.rasters import Raster
-from storage.scan_files import is_scan, known_bands, open_cube_source
-from storage.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
+from storage.readers.cube_sources import BLOCK_LINES, scene_lines
+from storage.readers.dataset_layouts import find_layout
+from storage.readers.declared_sizes import machine_bytes
+from storage.readers.labels import Labels, load_labels
+from storage.readers.raster_files import load_raster, split_variable
+from storage.readers.rasters import Raster
+from storage.readers.scan_files import is_scan, known_bands, open_cube_source
+from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
+from storage.readers.wavelengths import settle_wavelengths
 from storage.staging import file_hash
-from storage.wavelengths import settle_wavelengths
 
 _LOOKED_AT = 1 << 20  # values, evenly spread, by which the range of a scene is told
 

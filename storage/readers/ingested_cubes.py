@@ -23,9 +23,9 @@ import zarr
 from numpy.typing import NDArray
 from PIL import Image
 
-from storage.cube_sources import BLOCK_LINES, CubeSource
 from storage.layout import create_array, create_group, image_spec, write_bands, write_small
 from storage.quicklooks import LineThumbnail, write_quicklook
+from storage.readers.cube_sources import BLOCK_LINES, CubeSource
 
 KIND = "ingested cube"
 LONGEST_HEADER = 1 << 16  # characters of a header's text that are kept

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.grid import UNLABELLED
-from storage.array_files import variable_names
-from storage.labels import Labels, load_labels
-from storage.raster_files import load_raster
-from storage.rasters import NEAR_INFRARED_NM, RGB_NM, Raster
-from storage.wavelengths import BandWavelengths
+from storage.readers.array_files import variable_names
+from storage.readers.labels import Labels, load_labels
+from storage.readers.raster_files import load_raster
+from storage.readers.rasters import NEAR_INFRARED_NM, RGB_NM, Raster
+from storage.readers.wavelengths import BandWavelengths
 
 HYKO_LABELS = "label_Semantic Classes for Urban Scenes"
 HYKO_CLASSES = {

@@ -16,8 +16,8 @@ from typing import Any
 import zarr
 
 from pipeline.errors import SceneError
-from storage.declared_sizes import MOST_RATIO, check_memory
-from storage.zarr_chunks import check_chunks
+from storage.readers.declared_sizes import MOST_RATIO, check_memory
+from storage.readers.zarr_chunks import check_chunks
 
 METADATA = ("zarr.json", ".zarray", ".zgroup")
 LARGEST_METADATA = 1 << 24  # bytes

@@ -1,6 +1,6 @@
 """Cubes out of Zarr stores: those of this project, and arrays of anyone with dims y x and band, or band y x.
 
-What a store says of itself is judged before it is opened (:mod:`storage.zarr_metadata`).
+What a store says of itself is judged before it is opened (:mod:`storage.readers.zarr_metadata`).
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.rig.envi_fields import MICROMETRES, NANOMETRES, UNSAID
-from storage.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, ReadLines
 from storage.layout import missing_codec
-from storage.zarr_metadata import (
+from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, ReadLines
+from storage.readers.zarr_metadata import (
     METADATA,
     check_blocks,
     check_links,

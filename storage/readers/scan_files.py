@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.cube_sources import Bands, CubeSource, LineFacts, check_cube_source
-from storage.dataset_layouts import find_layout
-from storage.envi_cubes import DATA_ENDINGS, EnviHeader, find_envi_pair, open_envi_cube
-from storage.headwall_folders import PartedCube, find_reference, is_headwall_folder, one_part, open_parts
-from storage.raster_files import SCENE_ENDINGS, load_raster, split_variable
-from storage.scene_toml import SceneSettings, find_scene_settings
-from storage.tiff_files import TIFF_ENDINGS, TiffRows, open_tiff_rows
-from storage.wavelengths import BandWavelengths, settle_wavelengths
-from storage.zarr_scenes import find_zarr_store, open_zarr_cube
+from storage.readers.cube_sources import Bands, CubeSource, LineFacts, check_cube_source
+from storage.readers.dataset_layouts import find_layout
+from storage.readers.envi_cubes import DATA_ENDINGS, EnviHeader, find_envi_pair, open_envi_cube
+from storage.readers.headwall_folders import PartedCube, find_reference, is_headwall_folder, one_part, open_parts
+from storage.readers.raster_files import SCENE_ENDINGS, load_raster, split_variable
+from storage.readers.scene_toml import SceneSettings, find_scene_settings
+from storage.readers.tiff_files import TIFF_ENDINGS, TiffRows, open_tiff_rows
+from storage.readers.wavelengths import BandWavelengths, settle_wavelengths
+from storage.readers.zarr_scenes import find_zarr_store, open_zarr_cube
 
 _EXPOSURE = "exposure (ms)"  # a setting in the comments of Headwall's headers
 
@@ -44,7 +44,7 @@ def open_cube_source(
     ----------
     address
         ENVI header or data file, Headwall folder, Zarr store (``STORE:ARRAY``), or a file that
-        :func:`storage.raster_files.load_raster` reads.
+        :func:`storage.readers.raster_files.load_raster` reads.
     dark, white
         ENVI or .npy files of reference frames, averaged over their lines; they win over those in a Headwall folder.
 

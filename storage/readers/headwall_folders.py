@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.cube_sources import MOST_MISSING
-from storage.envi_cubes import EnviCube, find_envi_pair, open_envi_cube
-from storage.frame_index_files import LineTimes, load_frame_index, times_of_lines
+from storage.readers.cube_sources import MOST_MISSING
+from storage.readers.envi_cubes import EnviCube, find_envi_pair, open_envi_cube
+from storage.readers.frame_index_files import LineTimes, load_frame_index, times_of_lines
 
 _PART = re.compile(r"raw_(\d{1,12})(\.[A-Za-z]{1,4})?", re.IGNORECASE)
 _INDEX = re.compile(r"frameindex_(\d{1,12})\.txt", re.IGNORECASE)

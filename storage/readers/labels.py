@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.grid import UNLABELLED
-from storage.raster_files import load_raster
-from storage.scene_toml import ClassValue, Colour
+from storage.readers.raster_files import load_raster
+from storage.readers.scene_toml import ClassValue, Colour
 
 MOST_FOUND_CLASSES = 64
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.wavelengths import BandWavelengths
+from storage.readers.wavelengths import BandWavelengths
 
 RGB_NM = (640.0, 550.0, 460.0)
 NEAR_INFRARED_NM = 800.0

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import SceneError
-from storage.array_files import NAMED_ENDINGS, load_named, load_npy
-from storage.declared_sizes import DEFLATE_RATIO, check_claim, check_memory
-from storage.envi_cubes import open_envi_cube
-from storage.rasters import GREY_NM, RGB_NM, Raster
-from storage.tiff_files import TIFF_ENDINGS, read_tiff
-from storage.wavelengths import BandWavelengths
+from storage.readers.array_files import NAMED_ENDINGS, load_named, load_npy
+from storage.readers.declared_sizes import DEFLATE_RATIO, check_claim, check_memory
+from storage.readers.envi_cubes import open_envi_cube
+from storage.readers.rasters import GREY_NM, RGB_NM, Raster
+from storage.readers.tiff_files import TIFF_ENDINGS, read_tiff
+from storage.readers.wavelengths import BandWavelengths
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")
 SCENE_ENDINGS = (*IMAGE_ENDINGS, *TIFF_ENDINGS, ".npy", *NAMED_ENDINGS, ".hdr")
