@@ -32,9 +32,14 @@ def run_ls(archive: str | Path, *, as_json: bool = False) -> int:
 
 
 def run_gc(
-    archive: str | Path, console: Console, *, keep_days: float = 1.0, raw_too: bool = False, dry_run: bool = False,
+    archive: str | Path,
+    console: Console,
+    *,
+    keep_days: float = 1.0,
+    raw_too: bool = False,
+    dry_run: bool = False,
     as_json: bool = False,
-) -> int:  # fmt: skip
+) -> int:
     """Remove what no run names; progress on ``console``, what went (or would go) on stdout."""
     opened = Archive.open(archive, create=False, write=not dry_run)
     with StageProgress(console, {"gc": "clearing up"}) as bars:
@@ -131,9 +136,13 @@ def _read_again(archive: Archive, console: Console) -> list[Finding]:
 
 def _repaired(done: Repaired) -> dict[str, Any]:
     return {
-        "remade": done.remade, "dropped": done.dropped, "put_back": done.put_back, "failed": done.failed,
-        "hopeless": done.plan.hopeless, "complete": done.complete,
-    }  # fmt: skip
+        "remade": done.remade,
+        "dropped": done.dropped,
+        "put_back": done.put_back,
+        "failed": done.failed,
+        "hopeless": done.plan.hopeless,
+        "complete": done.complete,
+    }
 
 
 def _put_out(content: dict[str, Any], show: Callable[[dict[str, Any], Console], None], *, as_json: bool) -> None:

@@ -27,9 +27,13 @@ def store_in_memory(values: NDArray[Any], codec: str) -> tuple[int, NDArray[Any]
     held: dict[str, Any] = {}
     spec = image_spec(("y", "x", "band"), values.shape, values.dtype.str)
     array = zarr.create_array(
-        MemoryStore(store_dict=held), shape=spec.shape, dtype=values.dtype, chunks=spec.chunk, shards=spec.shard,
+        MemoryStore(store_dict=held),
+        shape=spec.shape,
+        dtype=values.dtype,
+        chunks=spec.chunk,
+        shards=spec.shard,
         compressors=(*_compressors(codec, values.dtype.itemsize), Crc32cCodec()),
-    )  # fmt: skip
+    )
     array[...] = values
     size = sum(len(part) for name, part in held.items() if not name.endswith("zarr.json"))
     return size, np.asarray(array[...])

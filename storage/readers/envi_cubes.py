@@ -20,9 +20,8 @@ from pipeline.rig.envi_fields import finite_number, listed_numbers, split_header
 LARGEST_HEADER = 1 << 22  # bytes; the largest seen holds 33 thousand
 INTERLEAVES = ("bil", "bip", "bsq")
 # data type codes of the format's description
-DATA_TYPES = {
-    1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 6: "c8", 9: "c16", 12: "u2", 13: "u4", 14: "i8", 15: "u8",
-}  # fmt: skip
+_CODES = (1, 2, 3, 4, 5, 6, 9, 12, 13, 14, 15)
+DATA_TYPES = dict(zip(_CODES, ("u1", "i2", "i4", "f4", "f8", "c8", "c16", "u2", "u4", "i8", "u8"), strict=True))
 # of these a header describes another kind of file than plain numbers
 OTHER_FILES = ("tiff", "jpeg", "jp2", "png", "bmp", "hdf", "netcdf", "nitf", "virtual", "meta")
 # where a data file's name may differ from its header's

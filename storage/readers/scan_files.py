@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,14 +157,10 @@ def _parted_source(
         lines=_line_facts(whole),
         bands=bands,
         nodata=first.nodata,
-        headers={header.name: _text(header) for header in headers},
+        headers={header.name: header.read_bytes().decode("utf-8", errors="replace") for header in headers},
         notes=whole.notes,
         by_names=whole.by_names,
     )
-
-
-def _text(header: Path) -> str:
-    return header.read_bytes().decode("utf-8", errors="replace")
 
 
 def _line_facts(whole: PartedCube) -> LineFacts:
@@ -210,13 +205,13 @@ def _raster_source(address: str | Path) -> CubeSource:
     values = raster.values[..., None] if raster.values.ndim == 2 else raster.values
     if values.ndim != 3:
         raise SceneError(f"{path} holds shape {values.shape}; expected (y, x, band), or (y, x) for one band")
-    files = tuple(raster.files) or (path,)
+    native = values.dtype.newbyteorder("=")
     return CubeSource(
         name=path.name,
         shape=(values.shape[0], values.shape[1], values.shape[2]),
-        dtype=values.dtype.newbyteorder("="),
-        read=_reader(values),
-        files=files,
+        dtype=native,
+        read=lambda start, stop: np.asarray(values[start:stop], native),
+        files=tuple(raster.files) or (path,),
         lines=LineFacts(np.ones(values.shape[0], np.bool_)),
         bands=_raster_bands(path, raster.assumed_nm, raster.known, values.shape[2]),
         nodata=raster.nodata,
@@ -236,11 +231,6 @@ def _tiff_source(rows: TiffRows) -> CubeSource:
         nodata=rows.nodata,
         notes=rows.notes,
     )
-
-
-def _reader(values: NDArray[Any]) -> Any:
-    native = values.dtype.newbyteorder("=")
-    return lambda start, stop: np.asarray(values[start:stop], native)
 
 
 def _raster_bands(path: Path, assumed_nm: Sequence[float] | None, known: BandWavelengths | None, count: int) -> Bands:

@@ -37,8 +37,8 @@ COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitu
 BANDS = ("band", "bands", "wavelength", "wavelengths", "channel", "channels", "spectral")
 WAVELENGTHS = ("wavelength", "wavelengths", "radiation_wavelength")
 METRES = {"m", "meter", "meters", "metre", "metres"}
-SMALL = ("fwhm", "dark", "white", "panel", "bad", "flat", "mirror_x", "mirror_y", "valid_line", "time", "exposure_ms",
-         "frame")  # fmt: skip
+FRAMES = ("dark", "white", "panel", "bad", "flat")
+OF_LINES = ("mirror_x", "mirror_y", "valid_line", "time", "exposure_ms", "frame")
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def open_zarr_cube(path: Path, variable: str | None = None) -> CubeSource:
         arrays: dict[str, Any] = dict(node.arrays()) if isinstance(node, zarr.Group) else {"": node}
         name = _chosen(arrays, variable, path)
         array = arrays[name]
-        for used in [name, *sorted({*SMALL, *WAVELENGTHS, *_dims(array)} & set(arrays) - {name})]:
+        for used in [name, *sorted({"fwhm", *FRAMES, *OF_LINES, *WAVELENGTHS, *_dims(array)} & set(arrays) - {name})]:
             check_size(arrays[used], path, used)
             check_packing(arrays[used], path, used)
         order, notes = _axes(array, path)
@@ -140,9 +140,13 @@ def _dims(array: zarr.Array[Any]) -> list[str]:
 
 
 def _source(
-    path: Path, array: zarr.Array[Any], order: tuple[int, ...], arrays: Mapping[str, Any], attributes: dict[str, Any],
+    path: Path,
+    array: zarr.Array[Any],
+    order: tuple[int, ...],
+    arrays: Mapping[str, Any],
+    attributes: dict[str, Any],
     notes: tuple[str, ...],
-) -> CubeSource:  # fmt: skip
+) -> CubeSource:
     shape = tuple(array.shape[axis] for axis in order) + ((1,) if len(order) == 2 else ())
     packing = _packing(array)
     kind = np.dtype(np.float32) if not packing.plain else array.dtype.newbyteorder("=")

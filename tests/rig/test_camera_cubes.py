@@ -68,12 +68,16 @@ def test_big_endian_with_an_offset() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("ENVI", "EVNI", "begins with 'EVNI"), ("bil", "bsq", "expected bil and 12"),
-        ("type = 12", "type = 4", "expected bil and 12"), ("samples = 5", "samples = x", "samples = 'x', expected"),
-        ("samples = 5\n", "", "samples = None"), ("order = 0", "order = 2", "expected 0 or 1"),
-        ("bands = 3", "bands = 0", "at least one of each"), ("\n}\n", "\n", "never closed; .* fetch it again"),
+        ("ENVI", "EVNI", "begins with 'EVNI"),
+        ("bil", "bsq", "expected bil and 12"),
+        ("type = 12", "type = 4", "expected bil and 12"),
+        ("samples = 5", "samples = x", "samples = 'x', expected"),
+        ("samples = 5\n", "", "samples = None"),
+        ("order = 0", "order = 2", "expected 0 or 1"),
+        ("bands = 3", "bands = 0", "at least one of each"),
+        ("\n}\n", "\n", "never closed; .* fetch it again"),
     ],
-)  # fmt: skip
+)
 def test_headers_that_cameras_do_not_write(old: str, new: str, words: str) -> None:
     """Anything else than 16-bit lines is refused with what stands there."""
     with pytest.raises(RigError, match=words):
@@ -83,10 +87,14 @@ def test_headers_that_cameras_do_not_write(old: str, new: str, words: str) -> No
 def test_parts_in_order() -> None:
     """Parts follow each other by their first frames, with times by their indices in both layouts."""
     names, read = folder(
-        raw_4=bil(numbers(2, 4)), raw_4__hdr=header(2), frameIndex_4__txt=b"Frame Timestamp\r\n4 140\r\n5 150\r\n",
-        raw_0=bil(numbers(4)), raw_0__hdr=header(4), frameIndex_0__txt=b"Frame\tTime\n0\t100\n1\t110\n1\t115\n3\t130\n",
+        raw_4=bil(numbers(2, 4)),
+        raw_4__hdr=header(2),
+        frameIndex_4__txt=b"Frame Timestamp\r\n4 140\r\n5 150\r\n",
+        raw_0=bil(numbers(4)),
+        raw_0__hdr=header(4),
+        frameIndex_0__txt=b"Frame\tTime\n0\t100\n1\t110\n1\t115\n3\t130\n",
         imu_gps__txt=b"Roll\n",
-    )  # fmt: skip
+    )
     found = read_capture(names, read)
     np.testing.assert_array_equal(found.values, numbers(6))
     assert found.times.frame.tolist() == [0, 1, -1, 3, 4, 5]
@@ -124,8 +132,12 @@ def test_lines_between_parts_in_no_file() -> None:
         ({"raw_0": b"", "raw_0__hdr": header(0)}, "no whole line in raw_0, raw_0.hdr"),
         ({"raw_0": bil(numbers(1))}, "has no header raw_0.hdr"),
         (
-            {"raw_0": bil(numbers(1)), "raw_0__hdr": header(1), "raw_1": bil(numbers(1)),
-             "raw_1__hdr": header(1).replace(b"samples = 5\nbands = 3", b"samples = 3\nbands = 5")},
+            {
+                "raw_0": bil(numbers(1)),
+                "raw_0__hdr": header(1),
+                "raw_1": bil(numbers(1)),
+                "raw_1__hdr": header(1).replace(b"samples = 5\nbands = 3", b"samples = 3\nbands = 5"),
+            },
             "they are of several captures",
         ),
         (
@@ -134,7 +146,7 @@ def test_lines_between_parts_in_no_file() -> None:
             "899999 lines before raw_900000",
         ),
     ],
-)  # fmt: skip
+)
 def test_captures_that_are_none(files: dict[str, bytes], words: str) -> None:
     """What cannot be put together is refused with what is wrong."""
     with pytest.raises(RigError, match=words):

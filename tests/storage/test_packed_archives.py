@@ -62,15 +62,26 @@ def _pack(ref: StageRef) -> None:
     assert isinstance(old, zarr.Array)
     dims, attributes, values = old.metadata.dimension_names, old.attrs.asdict(), old[...]  # type: ignore[union-attr]
     packed = group.create_array(
-        "dn", shape=old.shape, dtype=old.dtype, chunks=old.chunks, shards=old.shards, dimension_names=dims,
-        attributes=attributes, serializer=PCodec(level=8), compressors=(Crc32cCodec(),), overwrite=True,
-    )  # fmt: skip
+        "dn",
+        shape=old.shape,
+        dtype=old.dtype,
+        chunks=old.chunks,
+        shards=old.shards,
+        dimension_names=dims,
+        attributes=attributes,
+        serializer=PCodec(level=8),
+        compressors=(Crc32cCodec(),),
+        overwrite=True,
+    )
     packed[...] = values
     facts = {name: value for name, value in before.items() if name not in ("files", "format", "seal")}
     entry = {
-        "manifests": [sha256], "values": {"fine-0.zarr": "not looked at"}, "bytes_before": listed_bytes(before),
-        "codec": "numcodecs.pcodec level 8", "at": "2026-11-20T00:00:00.000+00:00",
-    }  # fmt: skip
+        "manifests": [sha256],
+        "values": {"fine-0.zarr": "not looked at"},
+        "bytes_before": listed_bytes(before),
+        "codec": "numcodecs.pcodec level 8",
+        "at": "2026-11-20T00:00:00.000+00:00",
+    }
     write_manifest(ref.path, facts | {"packed": entry})
 
 
