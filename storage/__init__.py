@@ -1,1 +1,1 @@
-"""Everything on disk: the archive and its stages, Zarr layouts, the line spool, scene files and data sets."""
+"""Everything on disk: the archive and its stages, Zarr layouts, the line spool, what people bring (``readers``)."""

@@ -11,12 +11,10 @@ from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec, ZstdCodec
 from zarr.storage import MemoryStore
 
 from pipeline.errors import SettingsError
-from storage.archive_codec import pcodec
 from storage.arrays.layout import image_spec
 
 BLOSC = {"lz4-5": ("lz4", 5), "zstd-1": ("zstd", 1), "zstd-3": ("zstd", 3), "zstd-5": ("zstd", 5)}
-PCODEC = {"pcodec-4": 4, "pcodec-8": 8, "pcodec-12": 12}  # 8: the archive tier
-CODECS = ("none", *BLOSC, *PCODEC, "zstd-3 bytes in order")
+CODECS = ("none", *BLOSC, "zstd-3 bytes in order")
 
 
 def store_in_memory(values: NDArray[Any], codec: str) -> tuple[int, NDArray[Any]]:
@@ -29,17 +27,20 @@ def store_in_memory(values: NDArray[Any], codec: str) -> tuple[int, NDArray[Any]
     held: dict[str, Any] = {}
     spec = image_spec(("y", "x", "band"), values.shape, values.dtype.str)
     array = zarr.create_array(
-        MemoryStore(store_dict=held), shape=spec.shape, dtype=values.dtype, chunks=spec.chunk, shards=spec.shard,
-        serializer=pcodec(PCODEC[codec]) if codec in PCODEC else "auto",
+        MemoryStore(store_dict=held),
+        shape=spec.shape,
+        dtype=values.dtype,
+        chunks=spec.chunk,
+        shards=spec.shard,
         compressors=(*_compressors(codec, values.dtype.itemsize), Crc32cCodec()),
-    )  # fmt: skip
+    )
     array[...] = values
     size = sum(len(part) for name, part in held.items() if not name.endswith("zarr.json"))
     return size, np.asarray(array[...])
 
 
 def _compressors(codec: str, size: int) -> tuple[Any, ...]:
-    if codec == "none" or codec in PCODEC:
+    if codec == "none":
         return ()
     if codec == "zstd-3 bytes in order":
         return (ZstdCodec(level=3),)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.errors import SceneError
 from pipeline.rectify.calibration.detector import BadElementCriteria, find_bad_elements
 from pipeline.source import References
-from storage.envi_cubes import EnviCube, open_envi_cube
+from storage.readers.envi_cubes import EnviCube, open_envi_cube
 
 LEAST_ABOVE_DARK = 0.5  # share of the elements; with less the frames are swapped, or the lamp was off
 LEVEL_DN = 2.0  # by which the frames' levels may differ where no light falls

@@ -20,7 +20,7 @@ from flows.settings.survey_settings import load_settings
 from models.network.segmenter import Segmenter, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.weights.files import Weights, save_weights
-from storage.labels import default_colour
+from storage.readers.labels import default_colour
 from tests.object_server import bucket, machine, s3_server  # noqa: F401 - fixtures
 
 RGB_NM = (640.0, 550.0, 460.0)

@@ -33,9 +33,14 @@ def run_ls(archive: str | Path, *, as_json: bool = False) -> int:
 
 
 def run_gc(
-    archive: str | Path, console: Console, *, keep_days: float = 1.0, raw_too: bool = False, dry_run: bool = False,
+    archive: str | Path,
+    console: Console,
+    *,
+    keep_days: float = 1.0,
+    raw_too: bool = False,
+    dry_run: bool = False,
     as_json: bool = False,
-) -> int:  # fmt: skip
+) -> int:
     """Remove what no run names; progress on ``console``, what went (or would go) on stdout."""
     opened = open_archive(archive, create=False, write=not dry_run)
     with StageProgress(console, {"gc": "clearing up"}) as bars:
@@ -84,7 +89,7 @@ def run_verify(
     _put_out(content, show_verdict if done is None else show_repair, as_json=as_json)
     if done is None:
         return FAILED if bad else DONE
-    stray = any(finding.kind in ("stray", "growing") for finding in bad)
+    stray = any(finding.kind in ("stray", "growing", "unreadable") for finding in bad)
     return DONE if done.complete and not stray else PARTLY if done.remade or done.dropped else FAILED
 
 
@@ -122,9 +127,13 @@ def _read_again(archive: Archive, console: Console) -> list[Finding]:
 
 def _repaired(done: Repaired) -> dict[str, Any]:
     return {
-        "remade": done.remade, "dropped": done.dropped, "put_back": done.put_back, "failed": done.failed,
-        "hopeless": done.plan.hopeless, "complete": done.complete,
-    }  # fmt: skip
+        "remade": done.remade,
+        "dropped": done.dropped,
+        "put_back": done.put_back,
+        "failed": done.failed,
+        "hopeless": done.plan.hopeless,
+        "complete": done.complete,
+    }
 
 
 def _put_out(content: dict[str, Any], show: Callable[[dict[str, Any], Console], None], *, as_json: bool) -> None:

@@ -142,7 +142,7 @@ def _number(value: object) -> float | None:
 def verdict(archive: Archive, findings: list[Finding], versions: Mapping[str, int]) -> dict[str, Any]:
     """What verification found, and for what is broken what a repair would do."""
     bad = [finding for finding in findings if finding.problem is not None]
-    places = {finding.uri for finding in findings if finding.kind in ("whole", "broken")}
+    places = {finding.uri for finding in findings if finding.kind in ("whole", "broken", "unreadable")}
     broken = {finding.uri for finding in bad if finding.kind == "broken"}
     content: dict[str, Any] = {
         "archive": archive.name,

@@ -14,10 +14,10 @@ from flows.terminal.progress import StageProgress
 from pipeline.errors import SceneError
 from storage.archive.archive import Archive, StageRef
 from storage.archive.staging import check_name, file_hash
-from storage.cube_sources import CubeSource
-from storage.ingested_cubes import Report, SourceFile, write_ingested_cube
+from storage.readers.cube_sources import CubeSource
+from storage.readers.ingested_cubes import Report, SourceFile, write_ingested_cube
+from storage.readers.scan_files import open_cube_source, with_wavelengths
 from storage.remote.opening import open_archive
-from storage.scan_files import open_cube_source, with_wavelengths
 
 STAGE = "ingest"
 VERSION = 2

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from flows.cli.app import (
     ArchiveName,
@@ -90,31 +87,6 @@ def gc(
 
 
 @app.command
-def pack(
-    archive: ArchiveName,
-    *,
-    older_than: float = 30.0,
-    dry_run: Switch = False,
-    as_json: AsJson = False,
-) -> int:
-    """Store old raw sweeps in fewer bytes: the same numbers, in a codec that takes longer to write.
-
-    The codec (pcodec) is no part of the Zarr specification: zarr-python reads it where numcodecs and pcodec are
-    installed, other Zarr programs may not.
-
-    Parameters
-    ----------
-    older_than
-        Only sweeps and ingested cubes that were stored so many days ago.
-    dry_run
-        Only say what would be packed.
-    """
-    from flows.archive.pack_command import run_pack
-
-    return run_pack(archive, stderr, older_than=older_than, dry_run=dry_run, as_json=as_json)
-
-
-@app.command
 def export(
     archive: ArchiveName,
     run: str | None = None,
@@ -175,32 +147,6 @@ def ingest(
     if as_json:
         print_json(record)
     return 0
-
-
-@app.command
-def statistics(
-    archive: ArchiveName,
-    product: str = "mosaic",
-    *,
-    every_band: Annotated[bool, Parameter(name="--all", negative="")] = False,
-    scheduler: Scheduler = "threads",
-    workers: Workers = None,
-    as_json: AsJson = False,
-) -> int:
-    """Count every band of a stored cube: finite share, extremes, percentiles, mean and standard deviation.
-
-    Parameters
-    ----------
-    product
-        Its address, a key or its beginning, or a product's name in the newest run (mosaic, raw_coarse).
-    every_band
-        Show every band, not a dozen of them.
-    """
-    from flows.archive.statistics_command import run_statistics
-    from storage.parallel.crew import Crew
-
-    crew = Crew(scheduler, workers)
-    return run_statistics(archive, product, stderr, crew=crew, every_band=every_band, as_json=as_json)
 
 
 @app.command

@@ -28,8 +28,8 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.manifest import UNIT_WORDS
 from storage.archive.archive import StageRef
+from storage.readers.scene_files import load_scene_file
 from storage.remote.opening import open_archive
-from storage.scene_files import load_scene_file
 
 TITLES = {"effects": "effects that matter", "capture": "scan", "comparison": "the same with everything on"}
 PATCH, FACTOR = 16, 4  # of the weights that come with the house: scans are those of its surveys

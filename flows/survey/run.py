@@ -40,7 +40,7 @@ from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
 from storage.arrays.layout import AngularGrid
-from storage.raster_files import load_raster
+from storage.readers.raster_files import load_raster
 from storage.remote.opening import open_archive
 
 if TYPE_CHECKING:

@@ -19,9 +19,9 @@ from pipeline.lazy import Once
 from pipeline.simulator.farm_laws import FARM_SHAPE, built_in_farm, law_of_key
 from pipeline.simulator.raster import Light
 from pipeline.simulator.scene import RasterScene
-from storage.declared_sizes import machine_bytes
-from storage.raster_files import load_raster
-from storage.scene_files import load_scene_file
+from storage.readers.declared_sizes import machine_bytes
+from storage.readers.raster_files import load_raster
+from storage.readers.scene_files import load_scene_file
 
 # Peak of a survey of farm@2 without controls: 1.58 GB for 1280 x 1024 px, 4.12 GB for 2560 x 2560 px
 FARM_BYTES, FARM_BYTES_PER_PX = 1_000_000_000, 490

@@ -16,8 +16,8 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.simulator.farm_laws import FARM_LAW, FARM_NAMES, SEASON_LAW, built_in_farm, farm_law, has_days
 from pipeline.simulator.scene import RasterScene, raster_from_values
-from storage.datasets import DataSet, load_data_set
-from storage.scene_files import SceneFile
+from storage.readers.datasets import DataSet, load_data_set
+from storage.readers.scene_files import SceneFile
 
 FARM_SCENES, FARM_VALIDATION = {FARM_LAW: 24, SEASON_LAW: 48}, 3
 FARM_SHAPE = (512, 640)  # of a training scene [px]

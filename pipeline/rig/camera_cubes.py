@@ -1,7 +1,7 @@
 """Bytes of a capture's files to lines: ENVI cubes as the camera writes them, with their frames' numbers and times.
 
 What the camera itself writes is read strictly here, for the loop that waits for it; folders from anywhere are read by
-``storage.headwall_folders``.
+``storage.readers.headwall_folders``.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import RigError, SceneError
+from pipeline.rig.envi_fields import split_header, wavelengths_nm
 from pipeline.rig.frame_index import LineTimes, parse_frame_index, times_of_lines
 
-_FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z ]*?)\s*=\s*(\{[^}]*\}|[^\r\n]*)", re.MULTILINE)
 _PART = re.compile(r"raw_(\d{1,12})", re.IGNORECASE)
 _INDEX = re.compile(r"frameindex_(\d{1,12})\.txt", re.IGNORECASE)
 _REFERENCE = re.compile(r"(dark|white)[A-Za-z_]*", re.IGNORECASE)
@@ -69,11 +69,14 @@ def parse_cube_header(text: str, where: str) -> CubeHeader:
 
     Raises
     ------
-    RigError : it is no ENVI header, a size is missing, or the numbers are not 16-bit BIL.
+    RigError : it is no whole ENVI header, a size is missing, or the numbers are not 16-bit BIL.
     """
     if not text.lstrip("\ufeff \r\n").upper().startswith("ENVI"):
         raise RigError(f"{where} begins with {text[:40]!r}, expected ENVI; fetch it again")
-    fields = {key.lower(): value.strip() for key, value in _FIELD.findall(text)}
+    try:
+        fields, _ = split_header(text, where, [])
+    except SceneError as error:
+        raise RigError(f"{error}; fetch it again") from error
     layout = (fields.get("interleave", "").lower(), fields.get("data type", ""))
     if layout != ("bil", "12"):
         raise RigError(
@@ -88,7 +91,8 @@ def parse_cube_header(text: str, where: str) -> CubeHeader:
     if order > 1:
         raise RigError(f"{where}: byte order = {order}, expected 0 or 1")
     offset = _whole(fields | {"header offset": fields.get("header offset", "0")}, "header offset", where)
-    return CubeHeader(samples, lines, bands, np.dtype(("<u2", ">u2")[order]), offset, _wavelengths(fields, bands))
+    wavelength, _ = wavelengths_nm(fields, bands, [])
+    return CubeHeader(samples, lines, bands, np.dtype(("<u2", ">u2")[order]), offset, wavelength)
 
 
 def cube_lines(header: CubeHeader, data: bytes) -> CubeLines:
@@ -236,12 +240,3 @@ def _whole(fields: Mapping[str, str], key: str, where: str) -> int:
     if not re.fullmatch(r"\d{1,12}", fields.get(key, "")):
         raise RigError(f"{where}: {key} = {fields.get(key)!r}, expected a whole number; fetch it again")
     return int(fields[key])
-
-
-def _wavelengths(fields: Mapping[str, str], bands: int) -> NDArray[np.float64] | None:
-    words = [word for word in re.split(r"[{},\s]+", fields.get("wavelength", "")) if word]
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError:
-        return None
-    return values if len(values) == bands and np.isfinite(values).all() else None

@@ -24,7 +24,7 @@ from storage.archive.plain_files import NotPlainError, kind_of, plain_size, read
 from storage.archive.staging import MANIFEST_NAME, file_hash, files_below, sync_path
 
 FORMAT = 2
-PACKED = "packed"  # what a store was before its numbers went into a smaller codec
+PACKED = "packed"  # what a store was before an earlier version of this program packed its numbers with pcodec
 EXTENDED = "extended"  # what a run was before something was added to it
 CURE = "restore it from a copy, or run verify --repair on the archive"
 _DISTRIBUTIONS = ("spectralzoom", "numpy", "torch", "xarray", "zarr", "numcodecs")
@@ -157,45 +157,14 @@ def listed_bytes(manifest: Mapping[str, Any]) -> int:
 
 def made_bytes(manifest: Mapping[str, Any]) -> int:
     """Size of all files as they were first published: what packing saved later is no merit of the making."""
-    size = _packed(manifest).get("bytes_before")
+    size = _table(manifest.get(PACKED)).get("bytes_before")
     return size if isinstance(size, int) and not isinstance(size, bool) else listed_bytes(manifest)
-
-
-def packed_facts(before: Mapping[str, Any], sha256: str, values: Mapping[str, str], codec: str) -> dict[str, Any]:
-    """Facts for the manifest of a store that holds the numbers of another in a smaller codec.
-
-    Parameters
-    ----------
-    before, sha256
-        The other's manifest, and the SHA-256 of its file, by which runs may know the store.
-    values
-        Hash of the decoded numbers, which both have, by the name of each cube.
-    """
-    kept = {name: value for name, value in before.items() if name not in ("files", "format", "seal", PACKED)}
-    entry = {
-        "manifests": [*packed_from(before), sha256],
-        "values": {**packed_values(before), **values},
-        "bytes_before": made_bytes(before),
-        "codec": codec,
-        "at": datetime.now(UTC).isoformat(timespec="milliseconds"),
-    }
-    return kept | {PACKED: entry}
 
 
 def packed_from(manifest: Mapping[str, Any]) -> list[str]:
     """SHA-256 of the manifests that a store had before it was packed, oldest first; none where it never was."""
-    found = _packed(manifest).get("manifests")
+    found = _table(manifest.get(PACKED)).get("manifests")
     return [one for one in found if isinstance(one, str)] if isinstance(found, list) else []
-
-
-def packed_values(manifest: Mapping[str, Any]) -> dict[str, str]:
-    """Hash of the decoded numbers by the name of each cube that was packed."""
-    found = _packed(manifest).get("values")
-    return {name: str(value) for name, value in found.items()} if isinstance(found, dict) else {}
-
-
-def _packed(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
-    return _table(manifest.get(PACKED))
 
 
 def _table(value: object) -> Mapping[str, Any]:

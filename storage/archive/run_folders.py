@@ -6,6 +6,9 @@ the same name and date, and its manifest says which one it had before. Killed an
 
 from __future__ import annotations
 
+import ctypes
+import errno
+import os
 import secrets
 from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
@@ -14,7 +17,6 @@ from types import TracebackType
 from typing import Any
 
 from storage.archive.addresses import published_runs
-from storage.archive.folder_exchange import try_exchange
 from storage.archive.keys import plain
 from storage.archive.manifests import (
     extended_facts,
@@ -35,6 +37,10 @@ from storage.archive.staging import (
     sync_path,
     take_lock,
 )
+
+_AT_FDCWD = -100  # names are absolute, or of the working folder
+_RENAME_EXCHANGE = 2
+_UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
 
 
 def date_of_store(root: Path, uri: str) -> str:
@@ -140,6 +146,31 @@ def _take_its_place(part: Path, final: Path) -> None:
             raise
         sync_path(final.parent)
     remove_tree(away)
+
+
+def try_exchange(one: Path, other: Path) -> bool:
+    """Give two folders of one file system each other's name in one step, and have the disk know it.
+
+    Linux does that (renameat2) on its local file systems; where it cannot, as on most network file systems, nothing is
+    changed and the answer is False.
+    """
+    error = _renameat2(one, other)
+    if error in _UNSUPPORTED:
+        return False
+    if error:
+        raise OSError(error, os.strerror(error), str(one))
+    for parent in {one.parent, other.parent}:
+        sync_path(parent)
+    return True
+
+
+def _renameat2(one: Path, other: Path) -> int:
+    """0, or the error's number."""
+    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if call is None:
+        return errno.ENOSYS
+    failed = call(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), ctypes.c_uint(_RENAME_EXCHANGE))
+    return ctypes.get_errno() if failed else 0
 
 
 def unfinished_extensions(root: Path) -> Iterator[Path]:

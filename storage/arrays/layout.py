@@ -10,22 +10,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import zarr
+from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
 
 from pipeline.errors import IncompleteStoreError, ShapeError, WavelengthError
-from storage.archive_codec import MissingCodecError, allow_pcodec, missing_codec, pcodec
 
 CHUNK_PX = 32
 SHARD_ROWS = 64
 SHARD_COLUMNS = 640
 KEPT_BITS = 11
-
-Tier = Literal["live", "archive"]  # blosc: fast to write; pcodec: smaller, for what is seldom read
 
 _SPATIAL_CONVENTION = {
     "uuid": "689b58e2-cf7b-45e0-9fff-9cfc0883d6b4",
@@ -106,14 +104,10 @@ def _whole_chunks(size: int, chunk: int) -> int:
     return -(-size // chunk) * chunk
 
 
-def create_array(
-    group: zarr.Group, name: str, spec: ArraySpec, attributes: Mapping[str, Any], *, tier: Tier = "live"
-) -> zarr.Array[Any]:
-    """Add an empty array: NaN where floating, 0 or ``_FillValue`` where not. Its numbers go through the tier's codecs.
-
-    The tier ``archive`` takes numbers of 16 bits and more.
-    """
+def create_array(group: zarr.Group, name: str, spec: ArraySpec, attributes: Mapping[str, Any]) -> zarr.Array[Any]:
+    """Add an empty array: NaN where floating, 0 or ``_FillValue`` where not; a chunk's checksum comes last."""
     kind = np.dtype(spec.dtype)
+    blosc = BloscCodec(cname="zstd", clevel=3, shuffle=BloscShuffle.bitshuffle, typesize=kind.itemsize)
     fill: Any = np.nan if kind.kind == "f" else attributes.get("_FillValue", 0)
     return group.create_array(
         name,
@@ -124,16 +118,8 @@ def create_array(
         fill_value=bool(fill) if kind.kind == "b" else fill,
         dimension_names=spec.dims,
         attributes=dict(attributes),
-        **_codecs(tier, kind),
+        compressors=(blosc, Crc32cCodec()),
     )
-
-
-def _codecs(tier: Tier, kind: np.dtype[Any]) -> dict[str, Any]:
-    """What makes bytes of a chunk; its checksum always comes last."""
-    if tier == "archive":
-        return {"serializer": pcodec(), "compressors": (Crc32cCodec(),)}
-    blosc = BloscCodec(cname="zstd", clevel=3, shuffle=BloscShuffle.bitshuffle, typesize=kind.itemsize)
-    return {"compressors": (blosc, Crc32cCodec())}
 
 
 def write_small(
@@ -176,7 +162,6 @@ def open_group(path: Path) -> zarr.Group:
     ------
     IncompleteStoreError : there is none, or its metadata is damaged.
     """
-    allow_pcodec()
     try:
         return zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -190,13 +175,6 @@ def read_array(group: zarr.Group, name: str, selection: Any = ...) -> NDArray[An
     ------
     IncompleteStoreError : there is no such array, or a checksum says that its bytes have changed.
     """
-    try:
-        return _read_array(group, name, selection)
-    except IncompleteStoreError:  # perhaps the store was packed between its description and its numbers
-        return _read_array(group, name, selection)
-
-
-def _read_array(group: zarr.Group, name: str, selection: Any) -> NDArray[Any]:
     with damage_named(f"{group.store_path}/{name}"):
         array = group[name]
         if not isinstance(array, zarr.Array):
@@ -214,10 +192,17 @@ def damage_named(where: str) -> Iterator[None]:
     """Turn what decoders raise on damaged bytes into an IncompleteStoreError that names the array."""
     try:
         yield
-    except MissingCodecError as error:
-        raise missing_codec(where, error) from error
+    except UnknownCodecError as error:
+        raise IncompleteStoreError(missing_codec(where, error.codec_id)) from error
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, IndexError) as error:
         raise IncompleteStoreError(f"{where} cannot be read: {error}; run verify on the archive") from error
+
+
+def missing_codec(where: str, codec: str) -> str:
+    """What to say of an array whose codec is not installed; its bytes may well be whole."""
+    name = codec.strip("'")  # numcodecs gives it in quotes
+    once = ", as earlier versions of SpectralZoom packed raw lines," if name == "pcodec" else ","
+    return f"{where} is packed with {name}{once} which is not installed; pip install {name} (nothing is damaged)"
 
 
 def round_bits(values: NDArray[np.floating], kept: int = KEPT_BITS) -> NDArray[np.float32]:

@@ -14,7 +14,7 @@ from odc.geo.geobox import GeoBox
 
 from pipeline.errors import PoseError, ShapeError
 from storage.archive.whole_files import written_aside
-from storage.envi_header import DATA_TYPES, INTERLEAVES
+from storage.readers.envi_cubes import DATA_TYPES, INTERLEAVES
 
 Blocks = Iterable[tuple[int, NDArray[Any]]]  # first line, (line, sample, band) values
 

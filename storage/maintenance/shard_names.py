@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import zarr
+from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
 
 from storage.archive.plain_files import kind_of, read_plain
-from storage.archive_codec import allow_pcodec
 
 WORDS = {"y": "rows", "x": "columns", "line": "lines", "sample": "samples", "band": "bands", "patch": "patches"}
 MOST_NAMED = 3
@@ -49,7 +49,6 @@ class Shard:
 
     def unreadable(self) -> list[tuple[slice, ...]]:
         """Chunks that fail their checksum or cannot be decoded; all of them where the file's index is damaged."""
-        allow_pcodec()
         array: zarr.Array[Any] = zarr.open_array(self.array, mode="r", zarr_format=3)
         return [box for box in self.chunks() if not _can_be_read(array, box)]
 
@@ -129,11 +128,13 @@ def _inner_chunk(about: dict[str, Any], sizes: list[int]) -> tuple[int, ...]:
 
 
 def _can_be_read(array: zarr.Array[Any], box: tuple[slice, ...]) -> bool:
-    """Whether one chunk decodes. Whatever a decoder says of damaged bytes, the answer is no."""
+    """Whether one chunk decodes. Whatever a decoder says of damaged bytes, the answer is no (no codec: it raises)."""
     if math.prod(part.stop - part.start for part in box) <= 0:
         return True
     try:
         array[box]
+    except UnknownCodecError:
+        raise
     except Exception:
         return False
     return True

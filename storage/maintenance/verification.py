@@ -6,12 +6,13 @@ What is no file where one should be, such as a link or a pipe, is told and never
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from pipeline.errors import IncompleteStoreError
+from numcodecs.registry import codec_registry  # type: ignore[import-untyped]
+
 from storage.archive.addresses import without_manifest
 from storage.archive.ledger import FOLDER
 from storage.archive.lineage import Catalogue
@@ -22,20 +23,18 @@ from storage.archive.manifests import (
     listed_bytes,
     manifest_sha256,
     packed_from,
-    packed_values,
     try_manifest,
 )
 from storage.archive.plain_files import kind_of
 from storage.archive.records import Run, Store
 from storage.archive.run_folders import unfinished_extensions
 from storage.archive.staging import MANIFEST_NAME
-from storage.archive_codec import MissingCodecError
+from storage.arrays.layout import missing_codec
 from storage.maintenance.growing_checks import SPOOLS, growing_problems
 from storage.maintenance.shard_names import name_damage
-from storage.packed_arrays import values_hash
 
 ASIDE = ".aside"
-Kind = Literal["whole", "broken", "missing", "stray", "growing"]
+Kind = Literal["whole", "broken", "missing", "stray", "growing", "unreadable"]
 Progress = Callable[[str, float], None]  # address of what is being read, how far of all bytes, 0..1
 
 
@@ -45,6 +44,7 @@ class Finding:
 
     ``missing``: something names or rests on a store that is not there. ``stray``: what is no part of the archive.
     ``growing``: something of a spool or a ledger that cannot be believed; the rest of it is used.
+    ``unreadable``: whole, but in a codec that is not installed.
     """
 
     uri: str
@@ -75,7 +75,7 @@ def verify_everything(
         if problems and _changed_since(catalogue, uri):  # its files and its manifest changed together
             catalogue = Catalogue.read(root)
             problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
-        found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
+        found += [Finding(uri, problem, "broken") for problem in problems] or [_whole(catalogue.stores.get(uri), uri)]
     misplaced, growing = _misplaced_runs(catalogue), verify_growing(root)
     return [*found, *misplaced, *_lost(root), *_missing(catalogue), *_left_aside(root), *_half_extended(root), *growing]
 
@@ -93,11 +93,15 @@ def verify_growing(root: Path) -> Iterator[Finding]:
                     yield Finding(uri, f"is {kind}, expected a file; take it out of the archive", "stray")
 
 
+def _whole(store: Store | None, uri: str) -> Finding:
+    """A store or run of which every byte is as published; whether its numbers can be read is another question."""
+    if store is None or not packed_from(store.facts) or "pcodec" in codec_registry:
+        return Finding(uri, None)
+    return Finding(uri, missing_codec("every byte of it is as published, but it", "pcodec"), "unreadable")
+
+
 def _changed_since(catalogue: Catalogue, uri: str) -> bool:
-    """Whether a store was packed, or something added to a run, after the catalogue was read."""
-    store = catalogue.stores.get(uri)
-    if store is not None:
-        return packed_from(try_manifest(store.ref.path)[0]) != packed_from(store.facts)
+    """Whether something was added to a run after the catalogue was read."""
     run = next((run for run in catalogue.runs if run.uri == uri), None)
     return run is not None and extended_from(try_manifest(run.folder)[0]) != extended_from(run.facts)
 
@@ -112,25 +116,8 @@ def _problems(folder: Path) -> Iterator[str]:
     if problem is not None:
         yield f"{MANIFEST_NAME} cannot be believed: {problem}"
         return
-    whole = True
     for name, problem in broken_files(folder, manifest, hashes=True):
-        whole = False
         yield f"{name} {problem}{name_damage(folder, name) if name in manifest['files'] else ''}"
-    if whole:
-        yield from _number_problems(folder, manifest)
-
-
-def _number_problems(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
-    """Cubes of a packed store whose numbers are not those that they had before (a missing codec raises)."""
-    for name, expected in packed_values(manifest).items():
-        try:
-            listed = any(file.startswith(f"{name}/") for file in manifest["files"])
-            if not listed or values_hash(folder / name) != expected:
-                yield f"{name} has other numbers than it had before it was packed"
-        except IncompleteStoreError as error:
-            if isinstance(error.__cause__, MissingCodecError):
-                raise
-            yield f"{name} cannot be read: {error}"
 
 
 def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:

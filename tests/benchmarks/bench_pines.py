@@ -109,7 +109,7 @@ def _choices(folder: Path) -> dict[str, Any]:
 
 
 def _open(folder: Path) -> Split:
-    from storage.datasets import load_data_set
+    from storage.readers.datasets import load_data_set
 
     files = load_data_set(folder / SCENE, **_choices(folder))
     (_, train), (_, test) = next(files.train()), next(files.test())
@@ -198,7 +198,7 @@ def _settings() -> TrainingSettings:
 def _scene(folder: Path) -> RasterScene:
     from flows.training.data import scene_of_file
     from pipeline.geometry.camera import LineCamera
-    from storage.datasets import load_data_set
+    from storage.readers.datasets import load_data_set
 
     return scene_of_file(load_data_set(folder / SCENE).load(Path(SCENE).stem), LineCamera())
 

@@ -72,8 +72,8 @@ def _shares(values: list[float]) -> str:
 
 def _vegetation(folder: Path) -> tuple[SceneGrid, list[Worth]]:
     """The grid of the frames, and which seats hold a pixel of crop or weed, 1 or 0 (seat,) a frame."""
-    from storage.labels import load_labels
-    from storage.scene_toml import load_scene_settings
+    from storage.readers.labels import load_labels
+    from storage.readers.scene_toml import load_scene_settings
 
     stated = load_scene_settings(folder / "scene.toml")
     seats = []

@@ -16,7 +16,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.errors import PipelineError
-from storage.envi_header import parse_envi_header
+from storage.readers.envi_cubes import parse_envi_header
 from tests.faults.reading import try_reading
 
 LARGEST_DATA = 200_000  # bytes

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FrameType
 
 from pipeline.errors import PipelineError
-from storage.scan_files import open_cube_source
+from storage.readers.scan_files import open_cube_source
 
 LONGEST_S = 30  # then it counts as hanging
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import SceneError
-from storage.envi_header import LARGEST_HEADER, parse_envi_header
-from storage.scan_files import open_cube_source
+from storage.readers.envi_cubes import LARGEST_HEADER, parse_envi_header
+from storage.readers.scan_files import open_cube_source
 from tests.faults.mutated_headers import HAND_MADE, real_headers, try_headers
 
 PLAIN = HAND_MADE[0]

@@ -22,9 +22,9 @@ from flows.settings.survey_settings import load_settings
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.ground.view import RigPose
 from storage.archive.archive import Archive
-from storage.envi_cubes import open_envi_cube
 from storage.export.cog_files import cog_problems
 from storage.export.stac_items import stac_problems
+from storage.readers.envi_cubes import open_envi_cube
 from tests.storage.stac_rules import extension_problems
 
 rasterio = pytest.importorskip("rasterio", reason="exports are written with rasterio, of the extra [geo]")

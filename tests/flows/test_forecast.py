@@ -170,7 +170,7 @@ def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
     monkeypatch.setattr("pipeline.simulator.farm._draw", refuse)
     monkeypatch.setattr("pipeline.simulator.farm._light", refuse)
     monkeypatch.setattr(
-        "storage.declared_sizes.os.sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**21}[name]
+        "storage.readers.declared_sizes.os.sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**21}[name]
     )
     asked = replace(settings, scene="farm", size=(10240, 10240), labels=None, weights=None, out=str(tmp_path / "a"))
     found = forecast(asked)

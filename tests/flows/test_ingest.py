@@ -24,9 +24,9 @@ import flows.archive.ingest_command
 from flows.archive.ingest_command import IngestRequest, run_ingest
 from pipeline.errors import ArchiveError, SceneError, WavelengthError
 from storage.archive.archive import Archive
-from storage.cube_sources import CubeSource
-from storage.scan_files import open_cube_source
-from storage.scene_files import load_scene_file
+from storage.readers.cube_sources import CubeSource
+from storage.readers.scan_files import open_cube_source
+from storage.readers.scene_files import load_scene_file
 
 NM = "wavelength units = um\nwavelength = {0.45, 0.55, 0.65}\nfwhm = {0.01, 0.01, 0.02}\n"
 KINDS = {"u1": 1, "i2": 2, "i4": 3, "f4": 4, "f8": 5, "u2": 12}

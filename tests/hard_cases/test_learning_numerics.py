@@ -28,7 +28,6 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.fine_pass import plan_fine
-from storage.band_statistics import BandPart, tabulate
 
 SIZES: dict[str, Any] = {"classes": 2, "columns": 4, "patch": 8, "factor": 2, "width": 8, "coarse_width": 8, "dim": 16,
                          "heads": 2, "layers": 1}  # fmt: skip
@@ -102,31 +101,6 @@ def test_14_two_classes_learn():
     assert model.coarse_classes.weight.grad is not None
     assert all(row.abs().max() > 1e-4 for row in model.coarse_classes.weight.grad)
     assert logits[0, :, 0].unique().numel() > 2
-
-
-@pytest.mark.parametrize("value", [4096.1, 1e-3, 1e7])
-def test_16_a_constant_has_no_variance_in_any_parts(value: float):
-    """The spread of a constant in float32, merged over parts, is 0 to rounding and never of a negative square."""
-    values = np.full((1000, 3), value, np.float32)
-    part = BandPart.of(values[:1])
-    for first in range(1, 1000, 333):
-        part = part.merged(BandPart.of(values[first : first + 333]))
-    assert (part.squares >= 0).all()
-    assert tabulate(part, np.arange(3.0)).std == pytest.approx(0, abs=1e-9)
-
-
-@pytest.mark.parametrize("parts", [2, 7, 100])
-def test_16_merged_parts_are_the_whole(parts: int):
-    """Means and spreads merged in any order of parts equal those of all at once to 1e-10, far from zero too."""
-    rng = np.random.default_rng(parts)
-    values = (4096.1 + rng.normal(0, 0.3, (3000, 2))).astype(np.float32)
-    pieces = [BandPart.of(piece) for piece in np.array_split(values, parts)]
-    merged = pieces.pop(0)
-    for number in rng.permutation(len(pieces)):
-        merged = merged.merged(pieces[number])
-    found, exact = tabulate(merged, np.arange(2.0)), values.astype(np.float64)
-    assert found.mean == pytest.approx(exact.mean(axis=0), rel=1e-10)
-    assert found.std == pytest.approx(exact.std(axis=0), rel=1e-10)
 
 
 def test_16_columns_far_from_zero_keep_their_scale():

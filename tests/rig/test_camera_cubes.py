@@ -49,6 +49,15 @@ def test_header_by_hand() -> None:
     assert values[0, 0, 1] == 0x0B0A
 
 
+def test_wavelengths_come_out_in_nm() -> None:
+    """Whatever their unit; a list that does not fit the bands is left out."""
+    text = HEADER.format(lines=1).replace("400.5,\n500,\n600", "0.4, 0.5, 0.6\n} \nwavelength units = {um")
+    found = parse_cube_header(text, "h").wavelength_nm
+    assert found is not None
+    assert found.tolist() == [400, 500, 600]
+    assert parse_cube_header(text.replace("0.4, ", ""), "h").wavelength_nm is None
+
+
 def test_big_endian_with_an_offset() -> None:
     """Byte order and header offset are followed."""
     text = HEADER.format(lines=2).replace("byte order = 0", "byte order = 1").replace("offset = 0", "offset = 7")
@@ -59,12 +68,16 @@ def test_big_endian_with_an_offset() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("ENVI", "EVNI", "begins with 'EVNI"), ("bil", "bsq", "expected bil and 12"),
-        ("type = 12", "type = 4", "expected bil and 12"), ("samples = 5", "samples = x", "samples = 'x', expected"),
-        ("samples = 5\n", "", "samples = None"), ("order = 0", "order = 2", "expected 0 or 1"),
+        ("ENVI", "EVNI", "begins with 'EVNI"),
+        ("bil", "bsq", "expected bil and 12"),
+        ("type = 12", "type = 4", "expected bil and 12"),
+        ("samples = 5", "samples = x", "samples = 'x', expected"),
+        ("samples = 5\n", "", "samples = None"),
+        ("order = 0", "order = 2", "expected 0 or 1"),
         ("bands = 3", "bands = 0", "at least one of each"),
+        ("\n}\n", "\n", "never closed; .* fetch it again"),
     ],
-)  # fmt: skip
+)
 def test_headers_that_cameras_do_not_write(old: str, new: str, words: str) -> None:
     """Anything else than 16-bit lines is refused with what stands there."""
     with pytest.raises(RigError, match=words):
@@ -74,10 +87,14 @@ def test_headers_that_cameras_do_not_write(old: str, new: str, words: str) -> No
 def test_parts_in_order() -> None:
     """Parts follow each other by their first frames, with times by their indices in both layouts."""
     names, read = folder(
-        raw_4=bil(numbers(2, 4)), raw_4__hdr=header(2), frameIndex_4__txt=b"Frame Timestamp\r\n4 140\r\n5 150\r\n",
-        raw_0=bil(numbers(4)), raw_0__hdr=header(4), frameIndex_0__txt=b"Frame\tTime\n0\t100\n1\t110\n1\t115\n3\t130\n",
+        raw_4=bil(numbers(2, 4)),
+        raw_4__hdr=header(2),
+        frameIndex_4__txt=b"Frame Timestamp\r\n4 140\r\n5 150\r\n",
+        raw_0=bil(numbers(4)),
+        raw_0__hdr=header(4),
+        frameIndex_0__txt=b"Frame\tTime\n0\t100\n1\t110\n1\t115\n3\t130\n",
         imu_gps__txt=b"Roll\n",
-    )  # fmt: skip
+    )
     found = read_capture(names, read)
     np.testing.assert_array_equal(found.values, numbers(6))
     assert found.times.frame.tolist() == [0, 1, -1, 3, 4, 5]
@@ -115,8 +132,12 @@ def test_lines_between_parts_in_no_file() -> None:
         ({"raw_0": b"", "raw_0__hdr": header(0)}, "no whole line in raw_0, raw_0.hdr"),
         ({"raw_0": bil(numbers(1))}, "has no header raw_0.hdr"),
         (
-            {"raw_0": bil(numbers(1)), "raw_0__hdr": header(1), "raw_1": bil(numbers(1)),
-             "raw_1__hdr": header(1).replace(b"samples = 5\nbands = 3", b"samples = 3\nbands = 5")},
+            {
+                "raw_0": bil(numbers(1)),
+                "raw_0__hdr": header(1),
+                "raw_1": bil(numbers(1)),
+                "raw_1__hdr": header(1).replace(b"samples = 5\nbands = 3", b"samples = 3\nbands = 5"),
+            },
             "they are of several captures",
         ),
         (
@@ -125,7 +146,7 @@ def test_lines_between_parts_in_no_file() -> None:
             "899999 lines before raw_900000",
         ),
     ],
-)  # fmt: skip
+)
 def test_captures_that_are_none(files: dict[str, bytes], words: str) -> None:
     """What cannot be put together is refused with what is wrong."""
     with pytest.raises(RigError, match=words):

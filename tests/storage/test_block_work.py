@@ -22,7 +22,6 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.placed import PixelGrid
 from pipeline.rectify.tiles import plan_tiles
 from storage.arrays.mosaics import MosaicWriter
-from storage.band_statistics import plan_strips
 from storage.parallel import cluster_work, worker_facts
 from storage.parallel.block_work import block_graph, run_blocks
 from storage.parallel.crew import Crew, count_cores
@@ -419,11 +418,7 @@ def test_no_worker_outlives_its_crew(tmp_path: Path, sent: signal.Signals) -> No
 
 @pytest.mark.parametrize(("side", "tiles"), [(10240, 2560), (2560, 160)])
 def test_graphs_of_the_largest_field_stay_small(tmp_path: Path, side: int, tiles: int) -> None:
-    """10240 x 10240 px and 270 bands, coarse and fine: a task a shard, and for statistics one a row of them."""
+    """10240 x 10240 px and 270 bands, coarse and fine: a task a shard."""
     writer = MosaicWriter(tmp_path / "m.zarr", (side, side), np.linspace(400, 1000, 270))
     planned = plan_tiles([], LineCamera(), PixelGrid((0.0, 0.0), 1, (side, side)), writer.tile_shape)
-    strips = plan_strips(writer.path)
-    assert (len(planned), len(strips)) == (tiles, side // 64)
-    tasks = [len(block_graph(lambda number, *before: number, len(items), 16)) for items in (planned, strips)]
-    assert tasks == [tiles, side // 64]
-    assert sum(tasks) < 20_000
+    assert len(block_graph(lambda number, *before: number, len(planned), 16)) == len(planned) == tiles

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import SceneError
-from storage.dataset_layouts import HYKO_CLASSES, HYKO_LABELS, RANUS_CLASSES
-from storage.scene_files import load_scene_file
+from storage.readers.dataset_layouts import HYKO_CLASSES, HYKO_LABELS, RANUS_CLASSES
+from storage.readers.scene_files import load_scene_file
 
 NM = np.linspace(470, 630, 5)
 

@@ -10,7 +10,7 @@ import scipy.io
 from PIL import Image
 
 from pipeline.errors import SceneError
-from storage.datasets import load_data_set
+from storage.readers.datasets import load_data_set
 
 MASK_TO_CLASS = (2, 3, 5, 6, 8, 10, 11, 12, 14, 1, 4, 7, 9, 13, 15, 16)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SceneError
-from storage.envi_header import load_envi_header, parse_envi_header
+from storage.readers.envi_cubes import load_envi_header, parse_envi_header
 
 PLAIN = "ENVI\nsamples = 4\nlines = 3\nbands = 2\ndata type = 12\ninterleave = bil\nbyte order = 0\n"
 
@@ -31,9 +31,20 @@ def test_plain_header() -> None:
 
 @pytest.mark.parametrize(
     ("code", "kind"),
-    [(1, "u1"), (2, "i2"), (3, "i4"), (4, "f4"), (5, "f8"), (6, "c8"), (9, "c16"), (12, "u2"), (13, "u4"), (14, "i8"),
-     (15, "u8")],
-)  # fmt: skip
+    [
+        (1, "u1"),
+        (2, "i2"),
+        (3, "i4"),
+        (4, "f4"),
+        (5, "f8"),
+        (6, "c8"),
+        (9, "c16"),
+        (12, "u2"),
+        (13, "u4"),
+        (14, "i8"),
+        (15, "u8"),
+    ],
+)
 @pytest.mark.parametrize(("order", "mark"), [(0, "<"), (1, ">")])
 def test_data_types(code: int, kind: str, order: int, mark: str) -> None:
     """Every code of the format, in both byte orders."""

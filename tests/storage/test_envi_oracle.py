@@ -12,10 +12,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.envi_cubes import EnviCube, open_envi_cube
-from storage.envi_header import DATA_TYPES, INTERLEAVES
 from storage.export.envi_writer import EnviFile, write_envi
-from storage.scan_files import open_cube_source
+from storage.readers.envi_cubes import DATA_TYPES, INTERLEAVES, EnviCube, open_envi_cube
+from storage.readers.scan_files import open_cube_source
 
 pytest.importorskip("spectral", reason="SPy is the oracle: pip install spectral")
 envi = pytest.importorskip("spectral.io.envi", reason="SPy is the oracle: pip install spectral")

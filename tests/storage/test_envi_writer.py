@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import PoseError, SceneError, ShapeError
-from storage.envi_cubes import open_envi_cube
-from storage.envi_header import INTERLEAVES
 from storage.export.envi_writer import EnviFile, header_text, write_envi
+from storage.readers.envi_cubes import INTERLEAVES, open_envi_cube
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 SHAPE = (70, 13, 5)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SceneError
-from storage.frame_index_files import load_frame_index, times_of_lines
+from pipeline.rig.frame_index import times_of_lines
+from storage.readers.headwall_folders import load_frame_index
 
 
 def _index(folder: Path, text: str) -> Path:

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.scan_files import open_cube_source
+from storage.readers.scan_files import open_cube_source
 
 NM = "wavelength units = nm\nwavelength = {\n400.0\n,500.0\n,600.0\n}\n"
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pipeline.errors import SceneError
-from storage.labels import default_colour, load_labels
+from storage.readers.labels import default_colour, load_labels
 
 COLOURS = {"soil": (0, 0, 0), "crop": (0, 255, 0), "weed": (255, 0, 0)}
 

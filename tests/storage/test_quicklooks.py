@@ -23,7 +23,7 @@ from storage.arrays.quicklooks import (
     pictures_of,
     stretched,
 )
-from storage.scan_files import open_cube_source
+from storage.readers.scan_files import open_cube_source
 
 WAVES = np.linspace(400, 900, 12)
 LINES = np.random.default_rng(5).integers(100, 4000, (150, 600, 12), dtype=np.uint16)

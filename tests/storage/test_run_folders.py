@@ -8,6 +8,7 @@ import pytest
 
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
+from storage.archive.run_folders import try_exchange
 
 
 @pytest.mark.parametrize("name", ["../receipt.json", "/tmp/receipt.json", "a/b", "", ".", "x.part"])
@@ -37,3 +38,14 @@ def test_a_block_that_fails_publishes_nothing(tmp_path: Path) -> None:
         draft.write_file("receipt.json", "{}")["no"]  # type: ignore[index]
     assert archive.runs() == []
     assert list((tmp_path / "runs").iterdir()) == []
+
+
+def test_folders_exchange_their_names(tmp_path: Path) -> None:
+    """Each has what the other had; a name that leads nowhere is the system's own error."""
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "who").write_text(name)
+    assert try_exchange(tmp_path / "a", tmp_path / "b")
+    assert [(tmp_path / name / "who").read_text() for name in "ab"] == ["b", "a"]
+    with pytest.raises(FileNotFoundError):
+        try_exchange(tmp_path / "a", tmp_path / "c")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import SceneError, WavelengthError
-from storage.scene_files import load_scene_file
+from storage.readers.scene_files import load_scene_file
 
 NM = [450.0, 550.0, 650.0, 800.0, 900.0]
 

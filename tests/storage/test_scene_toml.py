@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError, WavelengthError
-from storage.scene_files import load_scene_file
+from storage.readers.scene_files import load_scene_file
 
 
 def _scene(folder: Path, cube: NDArray[np.uint16], toml: str) -> Path:

@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.errors import SceneError
 from storage.archive.toml_files import MOST_BYTES, read_toml
-from storage.scene_toml import load_scene_settings
+from storage.readers.scene_toml import load_scene_settings
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,8 @@ from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
 from storage.arrays.cubes import RawCubeWriter, SweepHeader
 from storage.arrays.mosaics import MosaicWriter
-from storage.scan_files import open_cube_source
-from storage.scene_files import load_scene_file
+from storage.readers.scan_files import open_cube_source
+from storage.readers.scene_files import load_scene_file
 
 NM = np.array([450.0, 550.0, 650.0, 800.0, 900.0])
 
@@ -281,7 +281,7 @@ def test_coordinates_that_claim_too_much(tmp_path: Path, cube: NDArray[np.uint16
 def test_blocks_beyond_the_memory(tmp_path: Path, cube: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch) -> None:
     """What reading some lines takes is held against the machine's memory, and chunks are read whole."""
     zarr.create_array(tmp_path / "a.zarr", data=cube, chunks=cube.shape)
-    monkeypatch.setattr("storage.declared_sizes.machine_bytes", lambda: cube.nbytes - 1)
+    monkeypatch.setattr("storage.readers.declared_sizes.machine_bytes", lambda: cube.nbytes - 1)
     with pytest.raises(SceneError, match="reading it takes about"):
         open_cube_source(tmp_path / "a.zarr")
 

@@ -1,37 +1,31 @@
-"""ENVI headers as instruments and programs write them: read leniently, refused with a reason where they say too little.
+"""ENVI files: headers read leniently and refused where they say too little, cubes lazily.
 
-The format is text of ``key = value`` lines after the word ENVI; values in braces may run over lines and be nested.
-Headwall adds lines that begin with ``;``, some of which hold settings of their own.
+The numbers stay in their file until a part of the view is read.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
+from pipeline.rig.envi_fields import finite_number, listed_numbers, split_header, wavelengths_nm
 
 LARGEST_HEADER = 1 << 22  # bytes; the largest seen holds 33 thousand
-UNBALANCED = "opens more braces than it closes"
-MOST_UNBALANCED = 16  # values that open more braces than they close: looking for each one's end reads the rest
 INTERLEAVES = ("bil", "bip", "bsq")
 # data type codes of the format's description
-DATA_TYPES = {
-    1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 6: "c8", 9: "c16", 12: "u2", 13: "u4", 14: "i8", 15: "u8",
-}  # fmt: skip
-NANOMETRES = {"nm", "nanometer", "nanometers", "nanometre", "nanometres"}
-MICROMETRES = {"um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"}
-UNSAID = {"", "unknown"}
+_CODES = (1, 2, 3, 4, 5, 6, 9, 12, 13, 14, 15)
+DATA_TYPES = dict(zip(_CODES, ("u1", "i2", "i4", "f4", "f8", "c8", "c16", "u2", "u4", "i8", "u8"), strict=True))
 # of these a header describes another kind of file than plain numbers
 OTHER_FILES = ("tiff", "jpeg", "jp2", "png", "bmp", "hdf", "netcdf", "nitf", "virtual", "meta")
-
-_BRACE = re.compile(r"[{}]")
-_SIGN = re.compile(r"[=:]")
+# where a data file's name may differ from its header's
+DATA_ENDINGS = ("", ".bin", ".dat", ".img", ".raw", ".bil", ".bip", ".bsq", ".cube")
 
 
 @dataclass(frozen=True)
@@ -53,6 +47,96 @@ class EnviHeader:
     fields: Mapping[str, str]  # all of them as written, keys in lower case, the outer braces taken off
     settings: Mapping[str, str]  # of the lines that begin with ;
     notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class EnviCube:
+    """An ENVI cube, opened. ``values`` is a read-only view of the file, (line, sample, band) in the file's type."""
+
+    path: Path
+    header: EnviHeader
+    values: NDArray[Any]
+    lost_lines: int  # that the header promises and the file does not hold whole
+    notes: tuple[str, ...]
+
+
+def open_envi_cube(path: str | Path) -> EnviCube:
+    """Open a cube by its header or its data file, of any interleave, type, byte order and header offset.
+
+    A file that is cut off keeps the lines that are whole in all bands, and ``lost_lines`` and a note say so.
+
+    Raises
+    ------
+    SceneError : header or data are missing or cannot be used, or no line is whole.
+    """
+    header_path, data_path = find_envi_pair(Path(path))
+    header = load_envi_header(header_path)
+    if "spectral library" in header.kind.lower():
+        raise SceneError(f"{header_path} describes a spectral library, expected a cube (line, sample, band)")
+    size = data_path.stat().st_size - header.offset
+    item = header.dtype.itemsize
+    line_bytes = header.samples * header.bands * item
+    promised = size // line_bytes if header.lines is None else header.lines
+    held = min(promised, _whole_lines(header, promised, size))
+    if held < 1:
+        raise SceneError(
+            f"{data_path} holds {max(size, 0)} bytes after an offset of {header.offset}, no whole line of "
+            f"{header.samples} samples x {header.bands} bands x {item} bytes in all bands; copy it again"
+        )
+    notes = list(header.notes)
+    if header.lines is None:
+        notes.append(f"the header does not say how many lines there are; the file holds {held}")
+    if held < promised:
+        notes.append(f"{data_path.name} is cut off: {held} of {promised} lines are whole")
+    elif size > promised * line_bytes:
+        notes.append(f"{data_path.name} holds {size - promised * line_bytes} bytes more than its header says")
+    values = _view(data_path, header, promised, held)
+    return EnviCube(data_path, header, values, promised - held, tuple(notes))
+
+
+def find_envi_pair(path: Path) -> tuple[Path, Path]:
+    """Give header and data file of an address that names either.
+
+    Raises
+    ------
+    SceneError : one of them is missing.
+    """
+    if path.suffix.lower() == ".hdr":
+        stem = path.with_suffix("")
+        endings = (ending for name in DATA_ENDINGS for ending in {name: None, name.upper(): None})
+        data = next((file for file in (stem.with_name(stem.name + end) for end in endings) if file.is_file()), None)
+        if data is None:
+            raise SceneError(
+                f"no data file beside {path}; expected {stem.name} or {stem.name}.bin, .dat, .img, .raw, ..."
+            )
+        return path, data
+    if not path.is_file():
+        raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
+    names = [path.name + ".hdr", path.stem + ".hdr", path.name + ".HDR", path.stem + ".HDR"]
+    header = next((file for file in map(path.with_name, names) if file.is_file()), None)
+    if header is None:
+        raise SceneError(f"no header beside {path}; expected {names[0]} or {names[1]}")
+    return header, path
+
+
+def _whole_lines(header: EnviHeader, lines: int, size: int) -> int:
+    """Lines that ``size`` bytes hold in all bands."""
+    row = header.samples * header.dtype.itemsize
+    if header.interleave == "bsq":  # band after band: the last one says how far all of them reach
+        return max(size - (header.bands - 1) * lines * row, 0) // row
+    return max(size, 0) // (row * header.bands)
+
+
+def _view(path: Path, header: EnviHeader, lines: int, held: int) -> NDArray[Any]:
+    """(line, sample, band) over the file's bytes; strides alone tell the interleaves apart."""
+    item, samples, bands = header.dtype.itemsize, header.samples, header.bands
+    strides = {
+        "bil": (bands * samples * item, item, samples * item),
+        "bip": (samples * bands * item, bands * item, item),
+        "bsq": (samples * item, item, lines * samples * item if bands > 1 else item),  # lines may be any promise
+    }[header.interleave]
+    content = np.memmap(path, np.uint8, mode="r")
+    return np.ndarray((held, samples, bands), header.dtype, content, header.offset, strides)
 
 
 def load_envi_header(path: Path) -> EnviHeader:
@@ -96,12 +180,12 @@ def parse_envi_header(text: str, where: str = "the header") -> EnviHeader:
         impossible, or it says that its file holds more than plain numbers (compressed, with bytes between frames).
     """
     notes: list[str] = []
-    fields, settings = _split(text, where, notes)
+    fields, settings = split_header(text, where, notes)
     samples, bands = (_whole(fields, key, where, least=1) for key in ("samples", "bands"))
     kind = fields.get("file type", "ENVI Standard")
     _refuse_layouts(fields, kind, where)
     channels = samples if "spectral library" in kind.lower() else bands
-    wavelength, scale = _wavelengths(fields, channels, notes)
+    wavelength, scale = wavelengths_nm(fields, channels, notes)
     return EnviHeader(
         where=where,
         samples=samples,
@@ -114,101 +198,20 @@ def parse_envi_header(text: str, where: str = "the header") -> EnviHeader:
         wavelength_nm=wavelength,
         fwhm_nm=None if wavelength is None else _widths(fields, channels, scale, notes),
         band_names=tuple(name.strip() for name in fields["band names"].split(",")) if "band names" in fields else (),
-        nodata=_number(fields.get("data ignore value", "")),
+        nodata=finite_number(fields.get("data ignore value", "")),
         fields=fields,
         settings=settings,
         notes=tuple(notes),
     )
 
 
-def _split(text: str, where: str, notes: list[str]) -> tuple[dict[str, str], dict[str, str]]:
-    """Fields and the settings in comments."""
-    lines = text.lstrip("\ufeff").splitlines()
-    first = next((number for number, line in enumerate(lines) if line.strip()), None)
-    if first is None or lines[first].strip().upper() != "ENVI":
-        begins = "is empty" if first is None else f"begins with {lines[first].strip()[:40]!r}"
-        raise SceneError(f"{where} {begins}, expected ENVI on its own line; it is no ENVI header, name another")
-    settings: dict[str, str] = {}
-    plain: list[str] = []
-    for line in lines[first + 1 :]:
-        if not line.lstrip().startswith(";"):
-            plain.append(line)
-        elif sign := _SIGN.search(line):
-            key = line[: sign.start()].lstrip()[1:].strip()
-            if key:
-                settings[key.lower()] = line[sign.end() :].strip()
-    fields: dict[str, str] = {}
-    for key, value in _pairs(plain, where, notes):
-        if fields.get(key, value) != value:
-            notes.append(f"{key} is given twice, the last one counts")
-        fields[key] = value
-    return fields, settings
-
-
-def _pairs(lines: list[str], where: str, notes: list[str]) -> Iterator[tuple[str, str]]:
-    """Keys and values, the outer braces taken off."""
-    number = 0
-    while number < len(lines):
-        line = lines[number].strip()
-        number += 1
-        key, sign, value = (part.strip() for part in line.partition("="))
-        if not sign or not key or _BRACE.search(key):
-            if line:
-                notes.append(f"passed over {line[:40]!r}, which is no key = value")
-            continue
-        key = " ".join(key.split()).lower()
-        if value.startswith("{"):
-            value, number = _braced(value, lines, number, f"{where}: {key}", notes)
-        yield key, value
-
-
-def _braced(value: str, lines: list[str], number: int, where: str, notes: list[str]) -> tuple[str, int]:
-    """A value that begins with a brace, to where the brace closes, and the number of the line after it."""
-    parts = [value]
-    depth = _depth(value)
-    end = number
-    while depth > 0 and end < len(lines):
-        parts.append(lines[end])
-        depth += _depth(lines[end])
-        end += 1
-    if depth > 0:  # one brace too many inside: the first line that ends with one closes it all
-        ends = [at for at, part in enumerate(parts) if part.rstrip().endswith("}")]
-        if not ends:
-            raise SceneError(f"{where} opens a brace that is never closed; is the header cut off?")
-        parts, end = parts[: ends[0] + 1], number + ends[0]
-        notes.append(f"{where} {UNBALANCED}")
-        if sum(note.endswith(UNBALANCED) for note in notes) > MOST_UNBALANCED:
-            raise SceneError(f"{where} {UNBALANCED}, as do {MOST_UNBALANCED} values before it; correct the header")
-    return _unwrapped("\n".join(parts)), end
-
-
-def _depth(text: str) -> int:
-    """Braces opened less those closed; escaped ones do not count."""
-    bare = re.sub(r"\\[{}]", "", text)
-    return bare.count("{") - bare.count("}")
-
-
-def _unwrapped(value: str) -> str:
-    """The inside of the outer braces: what follows the last one is dropped."""
-    close = value.rfind("}")
-    return value[1 : close if close > 0 else None].strip()
-
-
 def _whole(fields: Mapping[str, str], key: str, where: str, *, least: int) -> int:
     if key not in fields:
         raise SceneError(f"{where} does not say {key}; add the line '{key} = ...'")
-    number = _number(fields[key])
+    number = finite_number(fields[key])
     if number is None or number != int(number) or number < least:
         raise SceneError(f"{where}: {key} = {fields[key]!r}, expected a whole number from {least}; correct it")
     return int(number)
-
-
-def _number(text: str) -> float | None:
-    try:
-        number = float(text)
-    except ValueError:
-        return None
-    return number if np.isfinite(number) else None
 
 
 def _data_type(fields: Mapping[str, str], where: str, notes: list[str]) -> np.dtype[np.generic]:
@@ -225,11 +228,11 @@ def _data_type(fields: Mapping[str, str], where: str, notes: list[str]) -> np.dt
 
 def _refuse_layouts(fields: Mapping[str, str], kind: str, where: str) -> None:
     """Refuse files whose numbers do not simply follow each other: they would be read as other numbers."""
-    if _number(fields.get("file compression", "0")) != 0:
+    if finite_number(fields.get("file compression", "0")) != 0:
         raise SceneError(f"{where}: file compression = {fields['file compression']!r}, expected 0; unpack the file")
     for key in ("major frame offsets", "minor frame offsets"):
         words = [word for word in re.split(r"[,\s]+", fields.get(key, "")) if word]
-        if any(_number(word) != 0 for word in words):
+        if any(finite_number(word) != 0 for word in words):
             raise SceneError(
                 f"{where}: {key} = {fields[key]!r} puts bytes between frames, which is not read; store them without"
             )
@@ -249,44 +252,6 @@ def _interleave(fields: Mapping[str, str], bands: int, where: str, notes: list[s
     return found
 
 
-def _wavelengths(
-    fields: Mapping[str, str], channels: int, notes: list[str]
-) -> tuple[NDArray[np.float64] | None, float]:
-    """Centres [nm] and what one of the header's units is in nm."""
-    values = _listed(fields, "wavelength", channels, notes)
-    if values is None:
-        return None, 1.0
-    unit = fields.get("wavelength units", "").strip().lower()
-    if unit in NANOMETRES:
-        scale = 1.0
-    elif unit in MICROMETRES:
-        scale = 1000.0
-    elif unit in UNSAID and 200 <= values.min() <= values.max() <= 20000:
-        scale = 1.0
-        notes.append("the wavelengths have no unit, read as nm by their size")
-    elif unit in UNSAID and 0.2 <= values.min() <= values.max() <= 20:
-        scale = 1000.0
-        notes.append("the wavelengths have no unit, read as micrometres by their size")
-    else:
-        notes.append(f"wavelength units = {unit!r} are no lengths that can be read; the wavelengths are left out")
-        return None, 1.0
-    return values * scale, scale
-
-
 def _widths(fields: Mapping[str, str], channels: int, scale: float, notes: list[str]) -> NDArray[np.float64] | None:
-    values = _listed(fields, "fwhm", channels, notes)
+    values = listed_numbers(fields, "fwhm", channels, notes)
     return None if values is None or not (values > 0).all() else values * scale
-
-
-def _listed(fields: Mapping[str, str], key: str, count: int, notes: list[str]) -> NDArray[np.float64] | None:
-    """Numbers of a list, whatever commas and spaces stand between them; None with a note where it is none."""
-    if key not in fields:
-        return None
-    words = [word for word in re.split(r"[,\s]+", fields[key]) if word]
-    numbers = [_number(word) for word in words]
-    if len(words) != count or None in numbers:
-        wrong = next((word for word, number in zip(words, numbers, strict=True) if number is None), None)
-        why = f"{len(words)} for {count} bands" if wrong is None else f"{wrong!r} is no number"
-        notes.append(f"{key} is left out: {why}")
-        return None
-    return np.array(numbers, np.float64)

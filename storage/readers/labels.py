@@ -13,16 +13,22 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
-from storage.raster_files import load_raster
-from storage.scene_toml import ClassValue, Colour
+from storage.readers.raster_files import load_raster
+from storage.readers.scene_toml import ClassValue, Colour
 
 MOST_FOUND_CLASSES = 64
 
 # Eight colours that stay apart for most kinds of colour blindness (Okabe and Ito, 2008), in an order for maps.
 _EIGHT_COLOURS = (
-    (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66),
-    (0, 114, 178), (213, 94, 0), (204, 121, 167), (90, 90, 90),
-)  # fmt: skip
+    (230, 159, 0),
+    (86, 180, 233),
+    (0, 158, 115),
+    (240, 228, 66),
+    (0, 114, 178),
+    (213, 94, 0),
+    (204, 121, 167),
+    (90, 90, 90),
+)
 
 
 @dataclass(frozen=True)
@@ -60,11 +66,12 @@ def load_labels(
         codes = np.where(codes < 0, codes, codes * 0x010101)  # a grey value g is the colour (g, g, g)
     none = None if unlabelled is None else _code(unlabelled)
     stated = dict(classes) or _found_classes(codes, none, is_colour or by_colour, str(address))
+    colours = [v if isinstance(v, tuple) else default_colour(index) for index, v in enumerate(stated.values())]
     return Labels(
         index=_index(codes, stated, none, str(address)),
         names=tuple(stated),
         values=tuple(stated.values()),
-        colours=_class_colours(tuple(stated.values())),
+        colours=np.array(colours, np.uint8).reshape(-1, 3),
     )
 
 
@@ -148,11 +155,6 @@ def _index(
 def _shown(code: int, classes: Mapping[str, ClassValue]) -> str:
     is_colour = any(isinstance(value, tuple) for value in classes.values())
     return f"colour {list(_colour(code))}" if is_colour else f"value {code}"
-
-
-def _class_colours(values: tuple[ClassValue, ...]) -> NDArray[np.uint8]:
-    colours = [value if isinstance(value, tuple) else default_colour(index) for index, value in enumerate(values)]
-    return np.array(colours, np.uint8).reshape(-1, 3)
 
 
 def default_colour(index: int) -> Colour:

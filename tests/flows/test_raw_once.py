@@ -1,4 +1,4 @@
-"""Raw lines lie in an archive once, packing them changes no figure, and the command says what it saved."""
+"""Raw lines lie in an archive once, and pictures of them are drawn without reading them again."""
 
 from __future__ import annotations
 
@@ -13,20 +13,18 @@ import pytest
 import zarr
 from rich.console import Console
 
-from flows.publish.receipt import comparable
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.survey_settings import load_settings
 from storage.archive.archive import Archive
 from storage.arrays.cubes import RawCube, open_raw_cube
 from storage.arrays.quicklooks import pictures_of
-from tests.flows.conftest import CommandLine
 
 
 @pytest.fixture(scope="module")
 def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Published]:
     """An archive with one survey, which nobody changes, and what it published."""
-    root = tmp_path_factory.mktemp("pack") / "archive"
+    root = tmp_path_factory.mktemp("raw") / "archive"
     return root, _survey(root)
 
 
@@ -97,17 +95,6 @@ def test_both_sides_of_the_ledger_count_one_representation(surveyed: tuple[Path,
     assert savings["bytes_stored"]["full"] == round(savings["bytes_raw"]["full"] * ratio)
 
 
-def test_packing_changes_no_figure(surveyed: tuple[Path, Published], command_line: CommandLine, tmp_path: Path) -> None:
-    """The same survey finds every stage in the packed archive, and its receipt is the one of before."""
-    root, published = surveyed
-    copy = Path(shutil.copytree(root, tmp_path / "archive"))
-    assert command_line("pack", copy, "--older-than", "0").code == 0
-    again = _survey(copy).receipt
-    assert {stage["state"] for stage in again["stages"]} <= {"cached", "skipped"}
-    assert comparable(again) == comparable(published.receipt)
-    assert command_line("verify", copy).code == 0
-
-
 def test_the_picture_of_raw_lines_reads_no_raw_line(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A warm survey draws it from the quicklooks alone."""
 
@@ -119,54 +106,3 @@ def test_the_picture_of_raw_lines_reads_no_raw_line(copied: Path, monkeypatch: p
     assert (_survey(copied).folder / "quicklook.png").stat().st_size > 10_000
     stores = [ref.path for stage in ("capture", "rectify") for ref in Archive.open(copied).refs(stage)]
     assert all(pictures_of(store) for store in stores)
-
-
-def test_pack_says_what_it_saved(copied: Path, command_line: CommandLine) -> None:
-    """In a table, with its sum; a second time there is nothing to do."""
-    done = command_line("pack", copied, "--older-than", "0")
-    assert done.code == 0
-    assert "ratio" in done.out
-    assert "2 of 2 raw stores packed" in done.out
-    assert "Zarr version 3 specification" not in done.err
-    assert "2 left as stored: packed already\n0 of 2 raw stores packed, 0 B saved" in command_line(
-        "pack", copied, "--older-than", "0"
-    ).out  # fmt: skip
-
-
-def test_a_dry_run_changes_nothing(copied: Path, command_line: CommandLine) -> None:
-    """It names what would be packed, and why the rest would not."""
-    before = {path: path.stat().st_mtime_ns for path in copied.rglob("*")}
-    done = command_line("pack", copied, "--older-than", "0", "--dry-run", "--json")
-    content = json.loads(done.out)
-    assert [store["state"] for store in content["stores"]] == ["to pack", "to pack"]
-    assert (content["bytes_saved"], content["obstacle"]) == (0, None)
-    assert "2 left as stored: younger than 30 days" in command_line("pack", copied, "--dry-run").out
-    assert {path: path.stat().st_mtime_ns for path in copied.rglob("*")} == before
-
-
-def test_json_has_every_store(copied: Path, command_line: CommandLine) -> None:
-    """One object on stdout, with bytes and ratio."""
-    content = json.loads(command_line("pack", copied, "--older-than", "0", "--json").out)
-    assert content["bytes_saved"] == sum(store["before"] - store["after"] for store in content["stores"]) > 0
-    assert all(store["ratio"] == store["before"] / store["after"] for store in content["stores"])
-
-
-def test_an_archive_in_use_ends_with_code_3(copied: Path, command_line: CommandLine) -> None:
-    """And a sentence; numbers of days that are none with 2."""
-    with Archive.open(copied).in_use():
-        done = command_line("pack", copied, "--older-than", "0")
-    assert done.code == 3
-    assert "somebody is using the archive: run pack again when it is free" in done.out
-    refused = command_line("pack", copied, "--older-than", "-1")
-    assert (refused.code, len(refused.errors)) == (2, 1)
-    assert command_line("pack", copied / "nowhere").code == 1
-
-
-def test_a_damaged_store_ends_with_code_3(copied: Path, command_line: CommandLine) -> None:
-    """It is named and left; the others are packed."""
-    shard = next(copied.glob("stages/capture/*/*.zarr/dn/c/0/0/0"))
-    shard.write_bytes(shard.read_bytes()[:-1])
-    done = command_line("pack", copied, "--older-than", "0")
-    assert done.code == 3
-    assert "1 of 2 raw stores packed" in done.out
-    assert "dn/c/0/0/0 has" in done.out

@@ -1,7 +1,7 @@
 """Arrays of numbers in MATLAB's own files (versions 4 to 7), listed by their headers and read one at a time.
 
 What is packed is unpacked as far as its header says and no further. Cells, structures, objects, text and functions are
-passed over unread, however nested. Files of version 7.3 are HDF5: :mod:`storage.array_files` reads them.
+passed over unread, however nested. Files of version 7.3 are HDF5: :mod:`storage.readers.array_files` reads them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.declared_sizes import DEFLATE_RATIO, check_claim, check_memory
+from storage.readers.declared_sizes import DEFLATE_RATIO, check_claim, check_memory
 
 _HEADER = 128  # bytes before the first variable
 _MATRIX, _PACKED, _INT32 = 14, 15, 5  # types of elements

@@ -22,23 +22,38 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
-from storage.array_files import variable_names
-from storage.labels import Labels, load_labels
-from storage.raster_files import load_raster
-from storage.rasters import NEAR_INFRARED_NM, RGB_NM, Raster
-from storage.wavelengths import BandWavelengths
+from storage.readers.array_files import variable_names
+from storage.readers.cube_sources import NEAR_INFRARED_NM, RGB_NM, Raster
+from storage.readers.labels import Labels, load_labels
+from storage.readers.raster_files import load_raster
+from storage.readers.wavelengths import BandWavelengths
 
 HYKO_LABELS = "label_Semantic Classes for Urban Scenes"
 HYKO_CLASSES = {
-    "road": 1, "sidewalk": 2, "lane markers": 3, "grass": 4, "vegetation": 5, "panels, signs, traffic lights": 6,
-    "building": 7, "vehicle": 8, "person": 9, "sky": 10,
-}  # fmt: skip
+    "road": 1,
+    "sidewalk": 2,
+    "lane markers": 3,
+    "grass": 4,
+    "vegetation": 5,
+    "panels, signs, traffic lights": 6,
+    "building": 7,
+    "vehicle": 8,
+    "person": 9,
+    "sky": 10,
+}
 HYKO_UNDEFINED = 0
 RANUS_CLASSES = {
-    "sky": (128, 128, 128), "ground": (128, 0, 0), "water": (0, 128, 128), "mountain": (128, 128, 0),
-    "road": (128, 64, 128), "construction": (128, 0, 128), "vegetation": (0, 128, 0), "object": (64, 64, 0),
-    "vehicle": (0, 0, 128), "human": (64, 0, 128),
-}  # fmt: skip
+    "sky": (128, 128, 128),
+    "ground": (128, 0, 0),
+    "water": (0, 128, 128),
+    "mountain": (128, 128, 0),
+    "road": (128, 64, 128),
+    "construction": (128, 0, 128),
+    "vegetation": (0, 128, 0),
+    "object": (64, 64, 0),
+    "vehicle": (0, 0, 128),
+    "human": (64, 0, 128),
+}
 RANUS_TOLERANCE = 10  # by which a pixel's colour may differ from its class's, over all channels; black is no class
 
 

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import SceneError
-from storage.array_files import NAMED_ENDINGS, load_named, load_npy
-from storage.declared_sizes import DEFLATE_RATIO, check_claim, check_memory
-from storage.envi_cubes import open_envi_cube
-from storage.rasters import GREY_NM, RGB_NM, Raster
-from storage.tiff_files import TIFF_ENDINGS, read_tiff
-from storage.wavelengths import BandWavelengths
+from storage.readers.array_files import NAMED_ENDINGS, load_named, load_npy
+from storage.readers.cube_sources import GREY_NM, RGB_NM, Raster, check_numbers
+from storage.readers.declared_sizes import DEFLATE_RATIO, check_claim, check_memory
+from storage.readers.envi_cubes import open_envi_cube
+from storage.readers.tiff_files import TIFF_ENDINGS, read_tiff
+from storage.readers.wavelengths import BandWavelengths
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")
 SCENE_ENDINGS = (*IMAGE_ENDINGS, *TIFF_ENDINGS, ".npy", *NAMED_ENDINGS, ".hdr")
@@ -63,7 +63,9 @@ def load_raster(address: str | Path, *, dims: int) -> Raster:
         objects = "pickle" in str(error) or "Python objects" in str(error)
         why = "it holds Python objects or is damaged" if objects else str(error)
         raise SceneError(f"{path} cannot be read as {ending}: {why}; write it again as plain numbers") from error
-    _check_numbers(raster.values, path)
+    check_numbers(raster.values.dtype, path)
+    if raster.values.size == 0:
+        raise SceneError(f"{path} holds an empty array of shape {raster.values.shape}")
     return raster
 
 
@@ -85,15 +87,6 @@ def _read_envi(path: Path) -> Raster:
     if cube.header.wavelength_nm is not None:
         known = BandWavelengths(cube.header.wavelength_nm, cube.header.fwhm_nm, f"wavelengths from {path}")
     return Raster(cube.values, None, cube.header.nodata, cube.notes, known=known, files=(path, cube.path))
-
-
-def _check_numbers(values: NDArray[Any], path: Path) -> None:
-    if values.dtype.kind == "c":
-        raise SceneError(f"{path} holds complex numbers; store their magnitude")
-    if values.dtype.kind not in "buif":
-        raise SceneError(f"{path} holds {values.dtype}, expected whole or floating numbers")
-    if values.size == 0:
-        raise SceneError(f"{path} holds an empty array of shape {values.shape}")
 
 
 # --- images -----------------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,6 @@ from pipeline.errors import SceneError
 from storage.archive.toml_files import read_toml
 
 SETTINGS_NAME = "scene.toml"
-KNOWN_KEYS = (
-    "bands", "wavelengths_nm", "wavelengths_file", "dropped_bands", "nodata", "labels", "unlabelled", "classes",
-)  # fmt: skip
 
 Colour = tuple[int, int, int]
 ClassValue = int | Colour
@@ -32,6 +29,9 @@ class SceneSettings:
     labels: str | None = None  # relative to the folder of scene.toml; may hold {number}
     unlabelled: ClassValue | None = None
     classes: Mapping[str, ClassValue] = field(default_factory=dict)
+
+
+KNOWN_KEYS = tuple(one.name for one in fields(SceneSettings) if one.name != "path")
 
 
 def find_scene_settings(scene: Path) -> SceneSettings:

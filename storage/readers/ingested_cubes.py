@@ -25,7 +25,7 @@ from PIL import Image
 
 from storage.arrays.layout import create_array, create_group, image_spec, write_bands, write_small
 from storage.arrays.quicklooks import LineThumbnail, write_quicklook
-from storage.cube_sources import BLOCK_LINES, CubeSource
+from storage.readers.cube_sources import BLOCK_LINES, CubeSource
 
 KIND = "ingested cube"
 LONGEST_HEADER = 1 << 16  # characters of a header's text that are kept
@@ -65,7 +65,8 @@ def write_ingested_cube(
     SceneError : lines cannot be read.
     """
     kind = stored_dtype(source, lambda done: report(0.3 * done))
-    begin = 0.3 if _needs_a_look(source) else 0.0
+    looked_at = source.dtype.kind in "ui" and source.dtype not in (np.uint8, np.uint16)
+    begin = 0.3 if looked_at else 0.0
     group = create_group(folder / "cube.zarr", f"{KIND} {name}", _attributes(source, files, name))
     coordinates = _write_coordinates(group, source)
     about = {"long_name": "numbers of the file", "units": "1", **({"coordinates": coordinates} if coordinates else {})}
@@ -97,10 +98,6 @@ def stored_dtype(source: CubeSource, report: Report = lambda done: None) -> np.d
             return np.dtype(np.float32)
         report(stop / source.shape[0])
     return np.dtype(np.uint16)
-
-
-def _needs_a_look(source: CubeSource) -> bool:
-    return source.dtype.kind in "ui" and source.dtype not in (np.uint8, np.uint16)
 
 
 def _blocks(source: CubeSource) -> Iterator[tuple[int, int]]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import WavelengthError
-from storage.scene_toml import SceneSettings
+from storage.readers.scene_toml import SceneSettings
 
 RANGE_NM = (200.0, 3000.0)
 MICROMETRES = (0.2, 5.0)

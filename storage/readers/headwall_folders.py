@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.cube_sources import MOST_MISSING
-from storage.envi_cubes import EnviCube, find_envi_pair, open_envi_cube
-from storage.frame_index_files import LineTimes, load_frame_index, times_of_lines
+from pipeline.rig.frame_index import LONGEST_LINE, FrameIndex, LineTimes, parse_frame_index, times_of_lines
+from storage.readers.cube_sources import MOST_MISSING
+from storage.readers.envi_cubes import EnviCube, find_envi_pair, open_envi_cube
 
 _PART = re.compile(r"raw_(\d{1,12})(\.[A-Za-z]{1,4})?", re.IGNORECASE)
 _INDEX = re.compile(r"frameindex_(\d{1,12})\.txt", re.IGNORECASE)
@@ -117,14 +117,28 @@ def find_reference(folder: Path, kind: str) -> Path | None:
     ------
     SceneError : there are several; name one.
     """
-    found = [
-        entry for entry in sorted(folder.iterdir())
-        if entry.suffix.lower() == ".hdr" and entry.name.lower().startswith(kind)
-    ]  # fmt: skip
+    headers = (entry for entry in sorted(folder.iterdir()) if entry.suffix.lower() == ".hdr")
+    found = [entry for entry in headers if entry.name.lower().startswith(kind)]
     if len(found) > 1:
         names = ", ".join(entry.name for entry in found)
         raise SceneError(f"{folder} has several {kind} frames ({names}); name one with --{kind}")
     return found[0] if found else None
+
+
+def load_frame_index(path: Path) -> FrameIndex:
+    """Read one index. Lines that are no frame are passed over and counted; of a frame listed twice the first counts.
+
+    Raises
+    ------
+    SceneError : the file cannot be read, or no line of it is a frame.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
+            return parse_frame_index(iter(lambda: file.readline(LONGEST_LINE), ""), path.name, str(path))
+    except SceneError:
+        raise
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read: {error}; take it away to go on without times") from error
 
 
 def _headers(folder: Path) -> dict[int, Path]:

@@ -1,7 +1,6 @@
-"""What a cube gives that is to be stored or looked at, wherever it comes from: its lines when asked, and what is known.
+"""What readers give: an array as it stands in its file, or a cube that gives its lines when asked; and what is known.
 
-Those who open one (:mod:`storage.scan_files`, :mod:`storage.zarr_scenes`) fill it in; whoever stores it asks for 64
-lines at a time.
+Those who open a cube (``scan_files``, ``zarr_scenes``) fill it in; whoever stores it asks for 64 lines at a time.
 """
 
 from __future__ import annotations
@@ -17,11 +16,29 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.source import References
+from storage.readers.wavelengths import BandWavelengths
 
 BLOCK_LINES = 64
 MOST_MISSING = 1 << 14  # lines a cube may promise beyond those it has: each costs memory before any of them is seen
 
+RGB_NM = (640.0, 550.0, 460.0)
+NEAR_INFRARED_NM = 800.0
+GREY_NM = 550.0
+
 ReadLines = Callable[[int, int], NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Raster:
+    """One array as it stands in its file: (y, x) or (y, x, band), numbers of any kind."""
+
+    values: NDArray[Any]
+    assumed_nm: tuple[float, ...] | None = None  # what the file's colours suggest, band by band
+    nodata: float | None = None
+    notes: tuple[str, ...] = ()
+    indices: NDArray[np.uint8] | None = None  # (y, x) of an image that numbers its colours
+    known: BandWavelengths | None = None  # what the file says of its bands
+    files: tuple[Path, ...] = ()  # that it was read from, where that is more than the one named
 
 
 @dataclass(frozen=True)
@@ -77,10 +94,7 @@ class CubeSource:
 def check_cube_source(source: CubeSource) -> None:
     """Refuse what cannot be a cube (SceneError): no real numbers, nothing in it, frames of another size."""
     where = source.name
-    if source.dtype.kind == "c":
-        raise SceneError(f"{where} holds complex numbers; store their magnitude")
-    if source.dtype.kind not in "buif":
-        raise SceneError(f"{where} holds {source.dtype}, expected whole or floating numbers")
+    check_numbers(source.dtype, where)
     if min(source.shape) < 1:
         raise SceneError(f"{where} holds an empty cube of shape {source.shape}")
     for name, frame in (("dark", source.dark), ("white", source.white)):
@@ -89,6 +103,14 @@ def check_cube_source(source: CubeSource) -> None:
                 f"the {name} frame is {frame.shape} (sample, band), {where} is {source.shape[1:]}; give one taken with "
                 "the cube's own binning"
             )
+
+
+def check_numbers(kind: np.dtype[Any], where: object) -> None:
+    """Refuse what is no real number (SceneError)."""
+    if kind.kind == "c":
+        raise SceneError(f"{where} holds complex numbers; store their magnitude")
+    if kind.kind not in "buif":
+        raise SceneError(f"{where} holds {kind}, expected whole or floating numbers")
 
 
 def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:

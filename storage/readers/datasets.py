@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
-from storage.labels import load_codes
-from storage.raster_files import SCENE_ENDINGS, split_variable
-from storage.scene_files import SceneFile, load_scene_file, scene_number
-from storage.scene_toml import SETTINGS_NAME, load_scene_settings
+from storage.readers.labels import load_codes
+from storage.readers.raster_files import SCENE_ENDINGS, split_variable
+from storage.readers.scene_files import SceneFile, load_scene_file, scene_number
+from storage.readers.scene_toml import SETTINGS_NAME, load_scene_settings
 
 
 @dataclass(frozen=True)

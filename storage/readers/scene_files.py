@@ -18,15 +18,14 @@ from pipeline.errors import SceneError
 from pipeline.readings import MOST_STEPS, MOST_VALUE, beyond_range, find_beyond
 from pipeline.simulator.scene import BRIGHT_PERCENTILE
 from storage.archive.staging import file_hash
-from storage.cube_sources import BLOCK_LINES, scene_lines
-from storage.dataset_layouts import find_layout
-from storage.declared_sizes import machine_bytes
-from storage.labels import Labels, load_labels
-from storage.raster_files import load_raster, split_variable
-from storage.rasters import Raster
-from storage.scan_files import is_scan, known_bands, open_cube_source
-from storage.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
-from storage.wavelengths import settle_wavelengths
+from storage.readers.cube_sources import BLOCK_LINES, Raster, scene_lines
+from storage.readers.dataset_layouts import find_layout
+from storage.readers.declared_sizes import machine_bytes
+from storage.readers.labels import Labels, load_labels
+from storage.readers.raster_files import load_raster, split_variable
+from storage.readers.scan_files import is_scan, known_bands, open_cube_source
+from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
+from storage.readers.wavelengths import settle_wavelengths
 
 _LOOKED_AT = 1 << 20  # values, evenly spread, by which the range of a scene is told
 
@@ -50,7 +49,7 @@ class SceneFile:
 
     def with_labels(self, labels: NDArray[np.uint8], note: str) -> SceneFile:
         """The same scene with other labels; hash and provenance say so."""
-        digest = _digest(self.light_hash, self.class_names, self.class_values, _bytes_hash(labels))
+        digest = _labelled_hash(self.light_hash, self.class_names, self.class_values, labels)
         return replace(self, labels=labels, content_hash=digest, provenance=(*self.provenance, note))
 
 
@@ -89,18 +88,26 @@ def load_scene_file(
     cube = _three_axes(raster.values, file)
     chosen = _chosen_bands(bands, settings, cube.shape[2], file)
     light = settle_wavelengths(
-        file, chosen, cube.shape[2], stated=wavelengths, settings=settings, assumed_nm=raster.assumed_nm,
+        file,
+        chosen,
+        cube.shape[2],
+        stated=wavelengths,
+        settings=settings,
+        assumed_nm=raster.assumed_nm,
         known=raster.known,
-    )  # fmt: skip
+    )
     nodata = raster.nodata if settings.nodata is None else settings.nodata
     values, notes = _as_float(cube, chosen, nodata, file)
     found, label_note = _labels(file, (cube.shape[0], cube.shape[1]), labels, settings)
     if layout is not None and labels is None and settings.labels is None:
         found, label_note = layout.labels, (layout.label_note,)
+    count, widths = cube.shape[2], None if light.fwhm_nm is None else light.fwhm_nm.tolist()
+    some_bands = () if chosen == list(range(count)) else (f"bands {chosen} of {count}, counted from 0",)
     stated = () if settings.nodata is None else (f"nodata {settings.nodata!r}",)
-    light_hash = _digest(
-        _content_hash(file, raster), variable, chosen, light.centre_nm.tolist(), _listed(light.fwhm_nm), *stated
-    )
+    light_hash = _digest(_content_hash(file, raster), variable, chosen, light.centre_nm.tolist(), widths, *stated)
+    content_hash = light_hash
+    if found is not None:
+        content_hash = _labelled_hash(light_hash, found.names, found.values, found.index)
     return SceneFile(
         name=file.stem,
         path=file,
@@ -111,9 +118,9 @@ def load_scene_file(
         class_names=() if found is None else found.names,
         class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,
         class_values=() if found is None else found.values,
-        content_hash=light_hash if found is None else _labelled_hash(light_hash, found),
+        content_hash=content_hash,
         light_hash=light_hash,
-        provenance=(*_band_note(chosen, cube.shape[2]), *raster.notes, light.origin, *notes, *label_note),
+        provenance=(*some_bands, *raster.notes, light.origin, *notes, *label_note),
     )
 
 
@@ -137,9 +144,13 @@ def load_scan(address: str | Path) -> Raster:
     over = source.dark is not None and source.white is not None
     notes = (*source.notes, "values are over the white panel") if over else source.notes
     return Raster(
-        np.concatenate(blocks), None, None if over else source.nodata, notes, known=known_bands(source),
+        np.concatenate(blocks),
+        None,
+        None if over else source.nodata,
+        notes,
+        known=known_bands(source),
         files=source.files,
-    )  # fmt: skip
+    )
 
 
 def _content_hash(file: Path, raster: Raster) -> str:
@@ -147,12 +158,9 @@ def _content_hash(file: Path, raster: Raster) -> str:
     files = raster.files or (file,)
     if files == (file,):
         return file_hash(file)
-    inside = file if file.is_dir() else None
-    return _digest(*((_name_within(inside, entry), file_hash(entry)) for entry in files))
-
-
-def _name_within(folder: Path | None, file: Path) -> str:
-    return file.relative_to(folder).as_posix() if folder is not None and file.is_relative_to(folder) else ""
+    is_folder = file.is_dir()
+    inside = [entry.relative_to(file).as_posix() if is_folder and entry.is_relative_to(file) else "" for entry in files]
+    return _digest(*((name, file_hash(entry)) for name, entry in zip(inside, files, strict=True)))
 
 
 def _three_axes(values: NDArray[Any], path: Path) -> NDArray[Any]:
@@ -176,10 +184,6 @@ def _chosen_bands(bands: Sequence[int] | None, settings: SceneSettings, count: i
     if len(set(chosen)) < len(chosen):
         raise SceneError(f"{where}: {list(chosen)} names a band twice; name each once")
     return [int(band) for band in chosen]
-
-
-def _band_note(chosen: list[int], count: int) -> tuple[str, ...]:
-    return () if chosen == list(range(count)) else (f"bands {chosen} of {count}, counted from 0",)
 
 
 def _as_float(
@@ -268,17 +272,11 @@ def _fill_number(template: str, scene: Path) -> str:
     return template.replace("{number}", number)
 
 
-def _labelled_hash(light_hash: str, labels: Labels) -> str:
-    return _digest(light_hash, labels.names, labels.values, _bytes_hash(labels.index))
-
-
-def _listed(values: NDArray[np.float64] | None) -> list[float] | None:
-    return None if values is None else values.tolist()
+def _labelled_hash(
+    light_hash: str, names: Sequence[str], values: Sequence[ClassValue], index: NDArray[np.uint8]
+) -> str:
+    return _digest(light_hash, names, values, hashlib.sha256(np.ascontiguousarray(index).tobytes()).hexdigest())
 
 
 def _digest(*parts: object) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
-
-
-def _bytes_hash(values: NDArray[np.uint8]) -> str:
-    return hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest()

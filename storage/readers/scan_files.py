@@ -5,22 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.cube_sources import Bands, CubeSource, LineFacts, check_cube_source
-from storage.dataset_layouts import find_layout
-from storage.envi_cubes import DATA_ENDINGS, find_envi_pair, open_envi_cube
-from storage.envi_header import EnviHeader
-from storage.headwall_folders import PartedCube, find_reference, is_headwall_folder, one_part, open_parts
-from storage.raster_files import SCENE_ENDINGS, load_raster, split_variable
-from storage.scene_toml import SceneSettings, find_scene_settings
-from storage.tiff_files import TIFF_ENDINGS, TiffRows, open_tiff_rows
-from storage.wavelengths import BandWavelengths, settle_wavelengths
-from storage.zarr_scenes import find_zarr_store, open_zarr_cube
+from storage.readers.cube_sources import Bands, CubeSource, LineFacts, check_cube_source
+from storage.readers.dataset_layouts import find_layout
+from storage.readers.envi_cubes import DATA_ENDINGS, EnviHeader, find_envi_pair, open_envi_cube
+from storage.readers.headwall_folders import PartedCube, find_reference, is_headwall_folder, one_part, open_parts
+from storage.readers.raster_files import SCENE_ENDINGS, load_raster, split_variable
+from storage.readers.scene_toml import SceneSettings, find_scene_settings
+from storage.readers.tiff_files import TIFF_ENDINGS, TiffRows, open_tiff_rows
+from storage.readers.wavelengths import BandWavelengths, settle_wavelengths
+from storage.readers.zarr_scenes import find_zarr_store, open_zarr_cube
 
 _EXPOSURE = "exposure (ms)"  # a setting in the comments of Headwall's headers
 
@@ -45,7 +43,7 @@ def open_cube_source(
     ----------
     address
         ENVI header or data file, Headwall folder, Zarr store (``STORE:ARRAY``), or a file that
-        :func:`storage.raster_files.load_raster` reads.
+        :func:`storage.readers.raster_files.load_raster` reads.
     dark, white
         ENVI or .npy files of reference frames, averaged over their lines; they win over those in a Headwall folder.
 
@@ -159,14 +157,10 @@ def _parted_source(
         lines=_line_facts(whole),
         bands=bands,
         nodata=first.nodata,
-        headers={header.name: _text(header) for header in headers},
+        headers={header.name: header.read_bytes().decode("utf-8", errors="replace") for header in headers},
         notes=whole.notes,
         by_names=whole.by_names,
     )
-
-
-def _text(header: Path) -> str:
-    return header.read_bytes().decode("utf-8", errors="replace")
 
 
 def _line_facts(whole: PartedCube) -> LineFacts:
@@ -211,13 +205,13 @@ def _raster_source(address: str | Path) -> CubeSource:
     values = raster.values[..., None] if raster.values.ndim == 2 else raster.values
     if values.ndim != 3:
         raise SceneError(f"{path} holds shape {values.shape}; expected (y, x, band), or (y, x) for one band")
-    files = tuple(raster.files) or (path,)
+    native = values.dtype.newbyteorder("=")
     return CubeSource(
         name=path.name,
         shape=(values.shape[0], values.shape[1], values.shape[2]),
-        dtype=values.dtype.newbyteorder("="),
-        read=_reader(values),
-        files=files,
+        dtype=native,
+        read=lambda start, stop: np.asarray(values[start:stop], native),
+        files=tuple(raster.files) or (path,),
         lines=LineFacts(np.ones(values.shape[0], np.bool_)),
         bands=_raster_bands(path, raster.assumed_nm, raster.known, values.shape[2]),
         nodata=raster.nodata,
@@ -237,11 +231,6 @@ def _tiff_source(rows: TiffRows) -> CubeSource:
         nodata=rows.nodata,
         notes=rows.notes,
     )
-
-
-def _reader(values: NDArray[Any]) -> Any:
-    native = values.dtype.newbyteorder("=")
-    return lambda start, stop: np.asarray(values[start:stop], native)
 
 
 def _raster_bands(path: Path, assumed_nm: Sequence[float] | None, known: BandWavelengths | None, count: int) -> Bands:

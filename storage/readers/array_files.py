@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.declared_sizes import DEFLATE_RATIO, check_claim, check_memory
-from storage.mat_files import list_mat_variables, load_mat_variable
+from storage.readers.declared_sizes import DEFLATE_RATIO, check_claim, check_memory
+from storage.readers.mat_files import list_mat_variables, load_mat_variable
 
 NAMED_ENDINGS = (".mat", ".npz")  # hold several arrays: FILE:VARIABLE picks one
 

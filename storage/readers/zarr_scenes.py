@@ -1,6 +1,6 @@
 """Cubes out of Zarr stores: those of this project, and arrays of anyone with dims y x and band, or band y x.
 
-What a store says of itself is judged before it is opened (:mod:`storage.arrays.zarr_metadata`).
+What a store says of itself is judged before it is opened (:mod:`storage.readers.zarr_metadata`).
 """
 
 from __future__ import annotations
@@ -15,11 +15,14 @@ from typing import Any
 
 import numpy as np
 import zarr
+from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.archive_codec import allow_pcodec
-from storage.arrays.zarr_metadata import (
+from pipeline.rig.envi_fields import MICROMETRES, NANOMETRES, UNSAID
+from storage.arrays.layout import missing_codec
+from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, ReadLines
+from storage.readers.zarr_metadata import (
     METADATA,
     check_blocks,
     check_links,
@@ -28,16 +31,14 @@ from storage.arrays.zarr_metadata import (
     check_size,
     open_options,
 )
-from storage.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, ReadLines
-from storage.envi_header import MICROMETRES, NANOMETRES, UNSAID
 
 ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing")
 COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitude", "easting")
 BANDS = ("band", "bands", "wavelength", "wavelengths", "channel", "channels", "spectral")
 WAVELENGTHS = ("wavelength", "wavelengths", "radiation_wavelength")
 METRES = {"m", "meter", "meters", "metre", "metres"}
-SMALL = ("fwhm", "dark", "white", "panel", "bad", "flat", "mirror_x", "mirror_y", "valid_line", "time", "exposure_ms",
-         "frame")  # fmt: skip
+FRAMES = ("dark", "white", "panel", "bad", "flat")
+OF_LINES = ("mirror_x", "mirror_y", "valid_line", "time", "exposure_ms", "frame")
 
 
 @dataclass(frozen=True)
@@ -75,13 +76,12 @@ def open_zarr_cube(path: Path, variable: str | None = None) -> CubeSource:
     with _named(path):
         check_links(path)
         check_metadata(path)
-        allow_pcodec()
         node = zarr.open(path, mode="r", **open_options(path))
         group = node if isinstance(node, zarr.Group) else None
         arrays: dict[str, Any] = dict(node.arrays()) if isinstance(node, zarr.Group) else {"": node}
         name = _chosen(arrays, variable, path)
         array = arrays[name]
-        for used in [name, *sorted({*SMALL, *WAVELENGTHS, *_dims(array)} & set(arrays) - {name})]:
+        for used in [name, *sorted({"fwhm", *FRAMES, *OF_LINES, *WAVELENGTHS, *_dims(array)} & set(arrays) - {name})]:
             check_size(arrays[used], path, used)
             check_packing(arrays[used], path, used)
         order, notes = _axes(array, path)
@@ -96,6 +96,8 @@ def _named(path: Path) -> Iterator[None]:
         yield
     except SceneError:
         raise
+    except UnknownCodecError as error:
+        raise SceneError(missing_codec(str(path), error.codec_id)) from error
     except Exception as error:  # codecs and parsers raise anything at all on damaged bytes
         raise SceneError(f"{path} cannot be read as Zarr: {type(error).__name__}: {error}; is it damaged?") from error
 
@@ -138,9 +140,13 @@ def _dims(array: zarr.Array[Any]) -> list[str]:
 
 
 def _source(
-    path: Path, array: zarr.Array[Any], order: tuple[int, ...], arrays: Mapping[str, Any], attributes: dict[str, Any],
+    path: Path,
+    array: zarr.Array[Any],
+    order: tuple[int, ...],
+    arrays: Mapping[str, Any],
+    attributes: dict[str, Any],
     notes: tuple[str, ...],
-) -> CubeSource:  # fmt: skip
+) -> CubeSource:
     shape = tuple(array.shape[axis] for axis in order) + ((1,) if len(order) == 2 else ())
     packing = _packing(array)
     kind = np.dtype(np.float32) if not packing.plain else array.dtype.newbyteorder("=")
