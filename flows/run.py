@@ -33,6 +33,7 @@ from pipeline.errors import SettingsError, WeightsError
 from pipeline.grid import SceneGrid
 from pipeline.ground import GroundView
 from pipeline.ground_grid import ground_grid
+from pipeline.mounting import STRAIGHT
 from pipeline.once import Once
 from pipeline.scan import Sweep
 from pipeline.simulator.pointing import PointingErrors
@@ -74,6 +75,7 @@ class CaptureRun:
 
     def source_key(self) -> dict[str, Any]:
         """What the captured light depends on, beside the sweeps and the effects."""
+        mounting = self.settings.rig.mounting
         return {
             "source": self.source.name,
             "scene": self.scene.key,
@@ -82,6 +84,7 @@ class CaptureRun:
             "pointing_px": self.settings.pointing_px,
             **({} if self.settings.visit is None else {"visit": self.settings.visit}),
             **({} if self.rig is None else {"field": self.name}),
+            **({} if self.rig is None or mounting == STRAIGHT else {"mounting": asdict(mounting)}),
         }
 
 
@@ -153,13 +156,14 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     sealing = () if described.sealed else (unsealed_note(path),)
     vgg_notes = _check_vgg(settings, None if planning else load)
     source = make_source(scene, settings)
-    rig = rig_source(scene, settings) if settings.source == "rig" else None
+    planned = (*plan.coarse, *plan.full)
+    rig = rig_source(scene, settings, planned) if settings.source == "rig" else None
     check_memory(settings, source, grid, plan)
     _check_pose(settings, scene.shape)
     key = content_key(path)
     return SurveyRun(
         settings=settings, archive=Archive.open(settings.out), source=source, rig=rig, scene=scene,
-        planned=(*plan.coarse, *plan.full), described=described, load=load, weights_key=key, grid=grid, plan=plan,
+        planned=planned, described=described, load=load, weights_key=key, grid=grid, plan=plan,
         notes=(*notes, *sealing, *band_notes, *vgg_notes, *label_notes), refused=refused,
     )  # fmt: skip
 

@@ -219,7 +219,7 @@ def test_e8_the_slope_is_ill_conditioned():
 @pytest.mark.parametrize(("xi_px", "seed_deg", "psi_deg"), [(0, 90.0, 0.0), (500, 87.9, 3.0), (2365, 79.7, 13.6)])
 def test_e9_the_slope_is_vertical_on_the_rigs_own_path(xi_px: float, seed_deg: float, psi_deg: float):
     """With the axes of code seen in public the scan runs along Y: -atan(dY/dX) is near 90 deg, lines hardly turn."""
-    mounted = Mounting(axes=((0, 1), (-1, 0))).to_device(aim(xi_px, np.array([-0.5, 0.5])))
+    mounted = Mounting(axes="y,-x").to_device(aim(xi_px, np.array([-0.5, 0.5])))
     assert np.abs(np.rad2deg(slope_rotation(mounted))) == pytest.approx(seed_deg, abs=0.06)
     assert np.rad2deg(turn_of(aim(xi_px, 0.0))) == pytest.approx(psi_deg, abs=0.06)
 
