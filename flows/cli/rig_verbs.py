@@ -84,7 +84,8 @@ def emulate(
     effects
         Of the simulated rig, as `survey` takes them; auto by default.
     settings
-        A survey's TOML file, for what camera, optics and light are like. Flags win over it.
+        A survey's TOML file, for what camera, optics and light are like, and how the mirror is mounted. Flags win over
+        it.
     faults
         What goes wrong, with commas, each as name or name:seed; `list` shows all.
     baud

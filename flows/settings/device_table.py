@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from flows.settings.values import Span, parse_choice, parse_number, parse_switch, parse_text, parse_whole
+from pipeline.geometry.mounting import AXES
 
 Parser = Callable[[object, str], object]
 
@@ -30,6 +31,10 @@ RIG: dict[str, Parser] = {
     "park_at_close": parse_switch,
     "log_rate_hz": parse_number(Span(0.1, 10_000, "hz")),
     "log_samples": parse_whole(1, 16_383),
+    "mirror_axes": parse_choice(AXES, separator="  "),
+    "mirror_clocking_deg": parse_number(Span(-45, 45, "deg")),
+    "mirror_offset_x": parse_number(Span(-0.5, 0.5, "")),
+    "mirror_offset_y": parse_number(Span(-0.5, 0.5, "")),
     "host": parse_text,
     "control_port": parse_whole(1, 65_535),
     "file_port": parse_whole(1, 65_535),

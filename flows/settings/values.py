@@ -86,12 +86,12 @@ def parse_whole(low: int, high: int, *, why: str = "") -> Callable[[object, str]
     return parse
 
 
-def parse_choice(choices: Sequence[str]) -> Callable[[object, str], str]:
-    """A parser for one word out of ``choices``."""
+def parse_choice(choices: Sequence[str], *, separator: str = ", ") -> Callable[[object, str], str]:
+    """A parser for one word out of ``choices``; ``separator`` stands between them in the message."""
 
     def parse(value: object, place: str) -> str:
         if value not in choices:
-            raise SettingsError(f"{place} must be one of {', '.join(choices)}; got {value!r}")
+            raise SettingsError(f"{place} must be one of {separator.join(choices)}; got {value!r}")
         return str(value)
 
     return parse

@@ -19,9 +19,11 @@ from flows.settings.keys import BUILT_IN_SCENES
 from flows.settings.survey_settings import Settings, load_settings
 from flows.simulate.emulated_scene import emulated_source
 from pipeline.errors import SettingsError
+from pipeline.geometry.mounting import STRAIGHT
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, ServedRig
 from pipeline.rig.emulator.fast_clock import FastClock
 from pipeline.rig.emulator.fault_names import read_faults
+from pipeline.rig.survey_rig import SurveyRig
 
 EVERY_S = 0.2
 KEPT_CAPTURES = 64
@@ -81,8 +83,9 @@ def run_emulate(
     for note in notes:
         console.print(f"[dim]note: {escape(note)}[/]", highlight=False)
     rig = EmulatedRig(
-        source, FastClock(request.speed), mirror_faults=mirror_faults, camera_faults=camera_faults, kept=KEPT_CAPTURES
-    )
+        source, FastClock(request.speed), mirror_faults=mirror_faults, camera_faults=camera_faults, kept=KEPT_CAPTURES,
+        mounting=request.settings.rig.mounting,
+    )  # fmt: skip
     with _ending(ended or threading.Event()) as end, rig.serve(baud=request.baud) as served:
         _tell(request, served, console, as_json=as_json)
         with console.status(_state(rig)) as line:
@@ -94,7 +97,7 @@ def run_emulate(
 
 def _tell(request: EmulateRequest, served: ServedRig, console: Console, *, as_json: bool) -> None:
     """Say how to connect, and write the file that was asked for."""
-    table = _rig_table(served)
+    table = _rig_table(served) | _mounting_table(request.settings.rig)
     if request.out is not None:
         _write(request.out, _survey_toml(request.settings, table))
         console.print(f"survey it with: spectralzoom survey {escape(str(request.out))}", highlight=False)
@@ -113,6 +116,12 @@ def _rig_table(served: ServedRig) -> dict[str, object]:
         "port": served.port, "host": served.host, "control_port": served.camera_port, "file_port": served.file_port,
         "pulses": served.rig.camera.wired, "panel": round(float(panel.mean()), 6), "provenance": "emulated",
     }  # fmt: skip
+
+
+def _mounting_table(rig: SurveyRig) -> dict[str, object]:
+    """How the mirror is mounted, where that is not straight."""
+    names = ("mirror_axes", "mirror_clocking_deg", "mirror_offset_x", "mirror_offset_y")
+    return {name: getattr(rig, name) for name in names if rig.mounting != STRAIGHT}
 
 
 def _survey_toml(settings: Settings, table: dict[str, object]) -> str:

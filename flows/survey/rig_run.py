@@ -13,7 +13,8 @@ import numpy as np
 from flows.settings.keys import RIG_FIELD
 from flows.settings.survey_settings import Settings
 from pipeline.errors import SettingsError
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.mounting import STRAIGHT
+from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.lazy import Once
 from pipeline.rig.camera_limits import CameraLimits, check_times
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
@@ -32,17 +33,21 @@ FETCHED = "camera"  # folder within a capture's spool
 RIG_RECORD = "rig.json"  # in a capture's store, beside its cubes
 
 
-def rig_source(scene: RasterScene, settings: Settings) -> RigSource:
+def rig_source(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) -> RigSource:
     """Give the rig as a source of lines; nothing is connected before the first of them.
 
     Raises
     ------
     SettingsError : exposure and frame period are nothing that the camera takes.
+    PoseError : the mirror, as mounted, does not reach all of the planned sweeps.
     """
     from pipeline.rig.rig_source import RigSource, RigView  # drivers load scipy, which a plan does without
 
     camera = settings.camera
     check_times(camera.exposure_ms, camera.frame_ms, CameraLimits(most_rate_hz=camera.max_rate_hz))
+    if settings.rig.mounting != STRAIGHT:
+        for sweep in planned:
+            settings.rig.mounting.to_device(sweep_positions(sweep, camera))
     view = RigView(camera, scene.wavelength_nm, scene.shape)
     return RigSource(
         view, lambda: open_devices(settings), KeptInMemory(), rig=settings.rig,

@@ -31,6 +31,7 @@ from models.weights.files import (
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.mounting import STRAIGHT
 from pipeline.geometry.scan import Sweep
 from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView
@@ -75,6 +76,7 @@ class CaptureRun:
 
     def source_key(self) -> dict[str, Any]:
         """What the captured light depends on, beside the sweeps and the effects."""
+        mounting = self.settings.rig.mounting
         return {
             "source": self.source.name,
             "scene": self.scene.key,
@@ -83,6 +85,7 @@ class CaptureRun:
             "pointing_px": self.settings.pointing_px,
             **({} if self.settings.visit is None else {"visit": self.settings.visit}),
             **({} if self.rig is None else {"field": self.name}),
+            **({} if self.rig is None or mounting == STRAIGHT else {"mounting": asdict(mounting)}),
         }
 
 
@@ -154,13 +157,14 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     sealing = () if described.sealed else (unsealed_note(path),)
     vgg_notes = _check_vgg(settings, None if planning else load)
     source = make_source(scene, settings)
-    rig = rig_source(scene, settings) if settings.source == "rig" else None
+    planned = (*plan.coarse, *plan.full)
+    rig = rig_source(scene, settings, planned) if settings.source == "rig" else None
     check_memory(settings, source, grid, plan)
     _check_pose(settings, scene.shape)
     key = content_key(path)
     return SurveyRun(
         settings=settings, archive=open_archive(settings.out), source=source, rig=rig, scene=scene,
-        planned=(*plan.coarse, *plan.full), described=described, load=load, weights_key=key, grid=grid, plan=plan,
+        planned=planned, described=described, load=load, weights_key=key, grid=grid, plan=plan,
         notes=(*notes, *sealing, *band_notes, *vgg_notes, *label_notes), refused=refused,
     )  # fmt: skip
 

@@ -1,14 +1,17 @@
 """The mirror controller: the device behind :class:`pipeline.rig.steering.Steering`.
 
-Written for the documented protocol and tested against an emulator; never run on hardware. Positions are device X and Y.
+Written for the documented protocol and tested against an emulator; never run on hardware. Positions are those of a
+mirror mounted straight; on the wire they are the device's own, as the settings say that it is mounted.
 """
 
 from __future__ import annotations
 
 import logging
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from types import TracebackType
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from pipeline.errors import RigError, SettingsError
@@ -113,7 +116,7 @@ class MirrorController:
         PoseError : outside the disk; nothing is sent.
         StateUnknown : not acknowledged, or motions are frozen. RigError : the status forbids motion.
         """
-        target = wire_positions([(x, y)])[0]
+        target = wire_positions([(x, y)], self.settings.mounting)[0]
         self._move(hold_values(*target), f"going to {target[0]:.6g}; {target[1]:.6g}")
 
     def settle(self, within_s: float) -> None:
@@ -139,7 +142,7 @@ class MirrorController:
         Parameters
         ----------
         positions
-            (position, 2) device X and Y.
+            (position, 2) X and Y.
         read_back
             How much is read back and compared; None takes it from the settings.
         progress
@@ -150,7 +153,7 @@ class MirrorController:
         PoseError, ShapeError : a position is outside the disk, or too many; nothing is sent.
         RigError : a path plays, or the memory holds something else than was sent.
         """
-        cells = wire_positions(positions)
+        cells = wire_positions(positions, self.settings.mounting)
         if len(cells) > self.settings.vector_pairs:
             raise SettingsError(
                 f"the vector memory holds {self.settings.vector_pairs} positions, got {len(cells)}; load in parts"
@@ -210,7 +213,8 @@ class MirrorController:
         ------
         RigError : no log was started.
         """
-        return self._log.read(samples)
+        log = self._log.read(samples)
+        return replace(log, position=self.settings.mounting.to_model(log.position).astype(np.float32, copy=False))
 
     def park(self) -> None:
         """Send the mirror to 0; 0, as :meth:`goto` does."""

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from pipeline.errors import SettingsError
+from pipeline.geometry.mounting import STRAIGHT, Mounting
 from pipeline.geometry.vector_memory import Ends
 from pipeline.rig.steering import ReadBack
 from pipeline.rig.wire import Patience
@@ -37,6 +38,7 @@ class MirrorSettings:
     log_rate_hz: float = 10000.0
     log_samples: int = 2000
     provenance: str = "assumed"
+    mounting: Mounting = STRAIGHT
 
     def __post_init__(self) -> None:
         for name, low, high in _RANGES:

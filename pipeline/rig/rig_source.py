@@ -18,7 +18,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import RigError
 from pipeline.geometry.camera import LineCamera, bin_samples
+from pipeline.geometry.mounting import STRAIGHT
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera_files import NOT_LOGGED_IN
 from pipeline.rig.camera_references import as_references
@@ -103,10 +104,12 @@ class RigSource:
     @property
     def record(self) -> dict[str, Any]:
         """What captures with this ``kept`` were like: how lines were tied to the mirror, by which settings."""
-        told = {
+        told: dict[str, Any] = {
             name: getattr(self.rig, name)
             for name in ("pulses", "log_pulses", "ends", "read_back", "strict_crc", "provenance")
         }
+        if self.rig.mounting != STRAIGHT:
+            told["mounting"] = asdict(self.rig.mounting)
         _, notes = self._whole.get(self._journal.references, (None, ()))
         damage = {"journal": self._journal.damage} if self._journal.damage else {}
         return {"rig": told, "references": list(notes), "captures": self._journal.captures, **damage}

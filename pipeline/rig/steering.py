@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.mirror import check_reach
+from pipeline.geometry.mounting import STRAIGHT, Mounting
 from pipeline.rig.registers import Status, Trigger
 
 ReadBack = Literal["none", "sampled", "all"]
@@ -40,7 +41,7 @@ class MotionLog:
     positions.
     """
 
-    position: NDArray[np.float32]  # (sample, 2) device X and Y
+    position: NDArray[np.float32]  # (sample, 2) X and Y
     rate_hz: float
     started_s: float
     start_error_s: float
@@ -53,7 +54,10 @@ class MotionLog:
 
 
 class Steering(Protocol):
-    """A mirror that can be sent somewhere, or along a path. Positions are device X and Y, in the closed unit disk."""
+    """A mirror that can be sent somewhere, or along a path.
+
+    Positions are X and Y of a mirror mounted straight, in the closed unit disk: a driver knows how its own is mounted.
+    """
 
     def identity(self) -> Identity:
         """What steers it."""
@@ -97,13 +101,10 @@ class Steering(Protocol):
         """Let go of the mirror."""
 
 
-def wire_positions(positions: ArrayLike) -> NDArray[np.float32]:
-    """Give positions at the precision of the wire, float32, where rounding carries none beyond the rim.
+def wire_positions(positions: ArrayLike, mounting: Mounting = STRAIGHT) -> NDArray[np.float32]:
+    """Give positions (position, 2) at the precision of the wire, float32, where rounding carries none beyond the rim.
 
-    Parameters
-    ----------
-    positions
-        (position, 2) device X and Y.
+    They are those of the device that is mounted so, for what a straight one gets by the wire.
 
     Raises
     ------
@@ -118,7 +119,7 @@ def wire_positions(positions: ArrayLike) -> NDArray[np.float32]:
     rounded: NDArray[np.float32] = exact.astype(np.float32)
     beyond = np.hypot(*rounded.astype(np.float64).T) > 1
     rounded[beyond] = np.nextafter(rounded[beyond], np.float32(0))
-    return rounded
+    return rounded if mounting == STRAIGHT else wire_positions(mounting.to_device(rounded))
 
 
 def as_cells(positions: NDArray[Any]) -> bytes:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from pipeline.geometry.mounting import Mounting
 from pipeline.geometry.vector_memory import Ends
 from pipeline.rig.file_session import FileServer
 from pipeline.rig.mirror_settings import MirrorSettings
@@ -38,6 +39,10 @@ class SurveyRig:
     park_at_close: bool = False
     log_rate_hz: float = 10000.0
     log_samples: int = 2000
+    mirror_axes: str = "x,y"  # of a mirror mounted straight that the device's X and Y are; see `Mounting`
+    mirror_clocking_deg: float = 0.0
+    mirror_offset_x: float = 0.0
+    mirror_offset_y: float = 0.0
     host: str = "10.0.65.50"  # of the camera
     control_port: int = 8100
     file_port: int = 21
@@ -59,8 +64,13 @@ class SurveyRig:
         return MirrorSettings(
             self.port, self.baud, self.expected_id, self.deadline_s, self.retries, self.quiet_s, self.with_crc,
             self.strict_crc, self.ends, vector_pairs, self.read_back, self.check_status, self.park_at_close,
-            self.log_rate_hz, self.log_samples, self.provenance,
+            self.log_rate_hz, self.log_samples, self.provenance, self.mounting,
         )  # fmt: skip
+
+    @property
+    def mounting(self) -> Mounting:
+        """How the mirror is mounted."""
+        return Mounting(self.mirror_axes, self.mirror_clocking_deg, self.mirror_offset_x, self.mirror_offset_y)
 
     @property
     def camera(self) -> CameraAddress:

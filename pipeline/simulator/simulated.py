@@ -74,12 +74,10 @@ class SimulatedSource:
         """Some lines of a sweep, as effects ask about them."""
         return sweep_block(self.scene, self.rig, sweep, lines, seed=self.seed, started_s=self.started_s(sweep))
 
-    def render(self, sweep: Sweep, lines: range, samples: range | None = None) -> NDArray[np.uint16]:
-        """Give raw numbers (line, sample, band) of some lines, and of some binned samples; see `render_lines`."""
-        return render_lines(
-            self.scene, self.rig, self.choice, sweep, lines,
-            seed=self.seed, started_s=self.started_s(sweep), samples=samples,
-        )  # fmt: skip
+    def render(self, sweep: Sweep, lines: range) -> NDArray[np.uint16]:
+        """Give raw numbers (line, sample, band) of some lines; see `render_lines`."""
+        started_s = self.started_s(sweep)
+        return render_lines(self.scene, self.rig, self.choice, sweep, lines, seed=self.seed, started_s=started_s)
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
         """Give the sweep's lines one by one, from line ``first`` on.

@@ -68,17 +68,14 @@ class Sources:
         return {*module.registering, *(to for one in module.defined[target[1]] for to in one.named)}
 
     def closure(self, roots: Iterable[str], barriers: Collection[str] = ()) -> set[Target]:
-        """Give every definition that the roots reach without passing a barrier.
-
-        A barrier is a definition, ``Archive``, or one step from a definition to another, ``Run > Archive``.
-        """
-        ends = {tuple(self.named(name) for name in barrier.split(" > ")) for barrier in barriers}
+        """Give every definition that the roots reach without passing one of the barriers."""
+        ends = {self.named(name) for name in barriers}
         found, waiting = set[Target](), [self.named(name) for name in roots]
         while waiting:
             target = waiting.pop()
             if target not in found:
                 found.add(target)
-                waiting += [to for to in self.names(target) if (to,) not in ends and (target, to) not in ends]
+                waiting += self.names(target) - ends
         return found
 
     def digest(self, closure: Iterable[Target]) -> str:

@@ -194,9 +194,10 @@ def test_faults_are_listed(command_line: CommandLine) -> None:
 
 
 def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: CommandLine, tmp_path: Path) -> None:
-    """The file is a survey's settings, and both devices are where it says, until the emulation ends."""
+    """The file is a survey's settings: both devices are where it says, mounted so, until the emulation ends."""
     file = tmp_path / "emulated.toml"
-    settings = emulated_settings(None, {"size": "64x48", "bands": "40,90", "effects": "none", "seed": "3"})
+    wanted = {"size": "64x48", "bands": "40,90", "effects": "none", "seed": "3", "rig.mirror_axes": "y,-x"}
+    settings = emulated_settings(None, wanted)
     request = EmulateRequest(settings, ("split-replies:1",), 0, 20.0, file)
     ended, codes = threading.Event(), []
     console = Console(quiet=True)
@@ -205,7 +206,8 @@ def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: Comman
     try:
         while thread.is_alive() and not file.exists():
             thread.join(0.05)
-        assert load_settings(file).rig.provenance == "emulated"
+        rig = load_settings(file).rig
+        assert (rig.provenance, rig.mirror_axes) == ("emulated", "y,-x")
         told = tomllib.loads(file.read_text())
         assert {key: told[key] for key in ("scene", "size", "bands", "seed", "source")} == {
             "scene": "farm", "size": "64x48", "bands": [40, 90], "seed": 3, "source": "rig",

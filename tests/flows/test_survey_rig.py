@@ -26,9 +26,10 @@ from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.survey_settings import Settings, load_settings
 from flows.survey.effect_choice import chosen_effects
-from flows.survey.run import make_source
+from flows.survey.run import make_source, open_run
 from flows.survey.scene import open_scene
-from pipeline.errors import SettingsError
+from pipeline.errors import PoseError, SettingsError
+from pipeline.geometry.mounting import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera_references import mean_frame
 from pipeline.rig.capture_names import REFERENCES
@@ -69,12 +70,13 @@ def small_settings(out: Path, **changed: Any) -> Settings:
 
 @contextmanager
 def emulated(
-    settings: Settings, effects: Any, patch: pytest.MonkeyPatch, *, scene: RasterScene | None = None
-) -> Iterator[EmulatedRig]:
-    """Devices of surveys are emulated ones before a scene, the settings' by default, with effects."""
+    settings: Settings, effects: Any, patch: pytest.MonkeyPatch, *, scene: RasterScene | None = None,
+    mounting: Mounting = STRAIGHT,
+) -> Iterator[EmulatedRig]:  # fmt: skip
+    """Devices of surveys are emulated ones before a scene, the settings' by default, with effects, mounted somehow."""
     seen = open_scene(settings)[0] if scene is None else scene
     source = replace(make_source(seen, settings), chosen=effects)
-    whole = EmulatedRig(source, ManualClock(10.0), wired=settings.rig.pulses)
+    whole = EmulatedRig(source, ManualClock(10.0), wired=settings.rig.pulses, mounting=mounting)
     with whole.in_process() as line:
 
         def open_devices(told: Settings, *_: object) -> RigDevices:
@@ -155,6 +157,38 @@ def test_every_line_is_the_simulated_one(tmp_path: Path, monkeypatch: pytest.Mon
     for name, rows in expected.items():
         np.testing.assert_array_equal(found[name], rows, err_msg=name)
     np.testing.assert_array_equal(class_map_of(published, tmp_path / "rig"), class_map_of(simulated, tmp_path / "sim"))
+
+
+@pytest.mark.parametrize("axes", ["-x,-y", "y,-x"], ids=["upside down", "turned"])
+def test_a_mirror_mounted_otherwise_gives_the_same_survey_once_it_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, axes: str
+) -> None:
+    """Each line and the map are those of a straight rig; untold they are not, and telling it captures anew."""
+    usual = small_settings(tmp_path / "straight", source="rig", visit="first", budget=0.5)
+    with emulated(usual, {}, monkeypatch):
+        straight = run_survey(usual, QUIET)
+    untold = replace(usual, out=str(tmp_path / "mounted"))
+    told = replace(untold, rig=replace(usual.rig, mirror_axes=axes))
+    with emulated(usual, {}, monkeypatch, mounting=Mounting(axes)) as rig:
+        wrong = run_survey(untold, QUIET)
+        right = run_survey(told, QUIET)
+        assert coarse_captures(rig) == 2
+    expected, found, other = (rows_of(Path(out), one) for out, one in
+                              ((usual.out, straight), (told.out, right), (told.out, wrong)))  # fmt: skip
+    assert list(found) == list(expected)
+    for name, rows in expected.items():
+        np.testing.assert_array_equal(found[name], rows, err_msg=name)
+    maps = [class_map_of(one, Path(out)) for one, out in ((straight, usual.out), (right, told.out))]
+    np.testing.assert_array_equal(*maps)
+    coarse = "raw_coarse coarse-0"
+    assert (other[coarse] != expected[coarse]).mean() > 0.5
+
+
+def test_a_mounting_that_does_not_reach_the_field_is_refused_first(tmp_path: Path) -> None:
+    """Before anything moves: the mirror's rest lies where its range ends before the field does."""
+    beside = {"rig.mirror_offset_x": 0.5, "rig.mirror_offset_y": 0.5, "size": "6400x6400"}
+    with pytest.raises(PoseError, match=r"as mounted \(offset 0.5; 0.5\), .* outside the unit disk"):
+        open_run(small_settings(tmp_path, source="rig", **beside), planning=True)
 
 
 def test_pulses_of_frames_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -274,6 +308,9 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "a map without a pose": ({"source": "rig", "map.resolution_m": 0.5}, r"where the rig stands: give .pose."),
     "unknown key": ({"rig.prot": "/dev/ttyUSB0"}, r"unknown setting .*prot.*did you mean 'rig.port'"),
     "unknown word": ({"rig.pulses": "some"}, r"pulses must be one of position, frame, none; got 'some'"),
+    "axes that are none": ({"rig.mirror_axes": "x,x"}, r"mirror.axes must be one of x,y  x,-y .* -y,-x; got 'x,x'"),
+    "clocking as large as a turn": ({"rig.mirror_clocking_deg": 90}, r"clocking.deg must be .* -45 to 45 deg, got 90"),
+    "offset in degrees": ({"rig.mirror_offset_x": 2}, r"mirror.offset.x must be a number from -0.5 to 0.5, got 2"),
     "port number": ({"rig.control_port": 0}, r"control.port must be a whole number from 1 to 65535, got 0"),
     "settling in ms": ({"rig.settle_s": 200}, r"settle.s must be a number from 0.01 to 60 s, got 200.*milliseconds"),
     "no such source": ({"source": "rigg"}, r"source must be one of sim, rig; got 'rigg'"),

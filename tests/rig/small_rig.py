@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mounting import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.capture_runner import RigDevices
 from pipeline.rig.clock import ManualClock
@@ -80,13 +81,13 @@ class SmallRig:
 @contextmanager
 def small_rig(
     source: SimulatedSource | None = None, *, faults: dict[CameraFault, int] | None = None, passes: int = 0,
-    mirror_faults: Sequence[Fault] = (), vector_pairs: int = 1500, **settings: Any,
+    mirror_faults: Sequence[Fault] = (), vector_pairs: int = 1500, mounting: Mounting = STRAIGHT, **settings: Any,
 ) -> Iterator[SmallRig]:  # fmt: skip
-    """An emulated rig before a source's scene, until the context ends."""
+    """An emulated rig before a source's scene, until the context ends; its mirror is mounted as ``mounting`` says."""
     looked = small_source() if source is None else source
     rig = EmulatedRig(
         looked, ManualClock(50.0), mirror_faults=mirror_faults, wired=settings.get("pulses", "position"),
-        camera_faults=CameraFaults(dict(faults or {}), 0, passes),
+        camera_faults=CameraFaults(dict(faults or {}), 0, passes), mounting=mounting,
     )  # fmt: skip
     view = RigView(looked.camera, looked.wavelength_nm, looked.field_shape)
     with rig.in_process() as line:

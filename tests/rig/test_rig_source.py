@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from ftplib import FTP
 from itertools import islice
 
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
+from pipeline.geometry.mounting import Mounting
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rig.capture_journal import CaptureJournal
 from pipeline.rig.kept_files import KeptInMemory
@@ -37,6 +38,34 @@ def test_lines_are_those_of_the_simulated_source(sweep: Sweep):
     with small_rig() as rig:
         assert_same(list(rig.source().lines(sweep)), sweep)
         assert len(rig.captures) == 1
+
+
+MOUNTED = {
+    "upside down": Mounting("-x,-y"),
+    "turned": Mounting("y,-x"),
+    "turned, mirrored, clocked and beside its middle": Mounting("-y,-x", 7.3, 0.05, -0.02),
+}
+
+
+@pytest.mark.parametrize("mounting", MOUNTED.values(), ids=MOUNTED)
+def test_lines_of_a_mirror_mounted_otherwise_are_the_same_once_it_is_told(mounting: Mounting):
+    """By pulses bit for bit, and where the mirror's log measured them; other lines come where nobody says so."""
+    told = {f"mirror_{name}": value for name, value in asdict(mounting).items()}
+    with small_rig(mounting=mounting, **told) as rig:
+        source = rig.source()
+        assert_same(list(source.lines(COARSE)), COARSE)
+        assert_same(list(source.lines(FINE)), FINE)
+        assert source.record["rig"]["mounting"] == asdict(mounting)
+    with small_rig(mounting=mounting, log_pulses=True, log_samples=16000, **told) as rig:
+        found = list(rig.source().lines(FINE))
+    np.testing.assert_array_equal([line.data for line in found], [line.data for line in small_source().lines(FINE)])
+    off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - line_positions(FINE, CAMERA)
+    assert np.hypot(*off.T).max() * 11275 < 3  # px
+    with small_rig(mounting=mounting) as rig:
+        source = rig.source()
+        untold = list(source.lines(FINE))
+        assert "mounting" not in source.record["rig"]
+    assert not np.array_equal([line.data for line in untold], [line.data for line in found])
 
 
 @pytest.mark.parametrize(("sweep", "captures"), [(COARSE, 3), (FINE, 2)], ids=lambda value: getattr(value, "kind", ""))

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
+from pipeline.rectify.calibration.detector import find_bad_elements
 from storage.readers.scan_files import open_cube_source
 
 NM = "wavelength units = nm\nwavelength = {\n400.0\n,500.0\n,600.0\n}\n"
@@ -133,12 +134,17 @@ def test_folders_that_are_none(tmp_path: Path, lines: NDArray[np.uint16]) -> Non
 
 
 def test_real_references(real_data: Path) -> None:
-    """The frames of a real MV.X are found by their names, dark as integers and white as floats."""
+    """The frames of a real MV.X are found by their names, dark as integers, white as floats; 197 elements are hot."""
     dark = open_cube_source(real_data / "headwall_references" / "darkReference.bin")
     white = open_cube_source(real_data / "headwall_references" / "whiteReference.hdr")
     assert dark.shape == white.shape == (1, 1020, 301)
     assert (dark.dtype, white.dtype) == (np.uint16, np.float32)
     np.testing.assert_allclose(dark.lines.exposure_ms, [100.0033437])
+    level, light = dark.read(0, 1)[0].astype(float), white.read(0, 1)[0]
+    spread = 1.4826 * np.median(np.abs(level - np.median(level, axis=0)), axis=0)
+    bad = find_bad_elements(level, light)
+    assert np.count_nonzero(bad) == 197
+    np.testing.assert_array_equal(bad, level > np.median(level, axis=0) + 8 * np.maximum(1, spread))
 
 
 def test_times_of_a_part_that_is_cut_off(tmp_path: Path, lines: NDArray[np.uint16]) -> None:

@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 
+from pipeline.geometry.mounting import STRAIGHT, Mounting
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock, ManualClock
 from pipeline.rig.emulator.camera_device import CameraUnit
 from pipeline.rig.emulator.camera_faults import CameraFaults
@@ -67,17 +68,19 @@ class EmulatedRig:
         Whether frames are seen from where the mirror was sent, or from where its motion has it; see ``SceneCamera``.
     kept
         So many finished captures keep their files; 0 is all.
+    mounting
+        How the mirror is mounted, whatever drivers believe.
     """
 
     def __init__(
         self, source: SimulatedSource, clock: Clock | None = None, *, mirror_faults: Sequence[Fault] = (),
         camera_faults: CameraFaults | None = None, wired: Pulses = "position", look: Look = "sent", kept: int = 0,
-        mirror: MirrorUnit | None = None, camera: CameraUnit | None = None,
+        mirror: MirrorUnit | None = None, camera: CameraUnit | None = None, mounting: Mounting = STRAIGHT,
     ) -> None:  # fmt: skip
         self.clock = ManualClock() if clock is None else clock
         self.mirror = TriggeredMirror(self.clock, mirror_faults, unit=mirror)
         self.camera = SceneCamera(
-            SceneView(source), self.mirror, self.clock, wired=wired, look=look, kept=kept, unit=camera,
+            SceneView(source, mounting), self.mirror, self.clock, wired=wired, look=look, kept=kept, unit=camera,
             faults=camera_faults,
         )  # fmt: skip
         self.mirror.pulses = self.camera.pulses

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.mirror import direction_to_scene, position_to_direction
+from pipeline.geometry.mounting import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.capture_names import Announced
 from pipeline.rig.steering import wire_positions
@@ -58,9 +59,10 @@ class Beside:
 
 @dataclass(frozen=True)
 class SceneView:
-    """A simulated source, looked at from where an emulated mirror is."""
+    """A simulated source, looked at from where an emulated mirror is, which is mounted somehow."""
 
     source: SimulatedSource
+    mounting: Mounting = STRAIGHT
 
     def lines(self, told: Announced, held: Floats, times_ms: tuple[float, float], started_s: float) -> Raw:
         """Give raw lines (line, sample, band) of a sweep, not binned.
@@ -68,7 +70,7 @@ class SceneView:
         Parameters
         ----------
         held
-            (line, step, 2) positions during each exposure.
+            (line, step, 2) positions of the device during each exposure.
         times_ms
             Exposure and frame period.
         started_s
@@ -76,28 +78,29 @@ class SceneView:
         """
         sweep = replace(told.sweep, binning=1)
         rig = self._rig(times_ms)
-        number = self.numbers(sweep, held)
+        seen = self.mounting.to_model(held)
+        number = self.numbers(sweep, seen)
         planned = sweep_positions(sweep, rig.camera)[number]
-        wired = wire_positions(planned.reshape(-1, 2)).reshape(planned.shape)
+        wired = wire_positions(planned.reshape(-1, 2), self.mounting).reshape(planned.shape)
         as_planned = (held.astype(np.float32) == wired).all(axis=(1, 2))
         raw = []
         for run in _runs(number, as_planned):
             lines = range(int(number[run][0]), int(number[run][-1]) + 1)
             choice = self.source.choice
             if not as_planned[run][0]:
-                choice = _aimed(choice, Beside(self._off(held[run], planned[run]), lines.start))
+                choice = _aimed(choice, Beside(self._place(seen[run]) - self._place(planned[run]), lines.start))
             raw.append(self._render(rig, choice, sweep, lines, started_s))
         return np.concatenate(raw)
 
     def alone(self, name: str, held: Floats, times_ms: tuple[float, float], started_s: float) -> Raw:
-        """Give one raw line (1, sample, band) along x of a position (2,) that belongs to no sweep."""
-        place = direction_to_scene(position_to_direction(held)) / self.source.camera.ifov_rad
+        """Give one raw line (1, sample, band) along x of a position (2,) of the device that belongs to no sweep."""
+        place = self._place(self.mounting.to_model(held))
         sweep = Sweep(name, "fine", "x", float(place[0]), float(place[1]), 1)
         return self._render(self._rig(times_ms), self.source.choice, sweep, range(1), started_s)
 
-    def numbers(self, sweep: Sweep, held: Floats) -> Ints:
-        """Give the line (line,) of the sweep that each exposure is nearest to."""
-        scan = self._place(held)[..., 1].mean(axis=1)
+    def numbers(self, sweep: Sweep, seen: Floats) -> Ints:
+        """Give the line (line,) of the sweep that each exposure (line, step, 2) is nearest to."""
+        scan = self._place(seen)[..., 1].mean(axis=1)
         number = np.rint((scan - sweep.start_px - (sweep.step - 1) / 2) / sweep.step)
         lines: Ints = np.clip(number, 0, sweep.lines - 1).astype(np.int64)
         return lines
@@ -111,12 +114,9 @@ class SceneView:
             for name, mean in (("darkReference", taken.dark), ("whiteReference", taken.white))
         }
 
-    def _place(self, held: Floats) -> Floats:
+    def _place(self, position: Floats) -> Floats:
         """Along the line and the scan, (..., 2). [px]"""
-        return direction_to_scene(position_to_direction(held)) / self.source.camera.ifov_rad
-
-    def _off(self, held: Floats, planned: Floats) -> Floats:
-        return self._place(held) - self._place(planned)
+        return direction_to_scene(position_to_direction(position)) / self.source.camera.ifov_rad
 
     def _rig(self, times_ms: tuple[float, float]) -> Rig:
         """The source's rig, or one whose camera was told other times."""

@@ -9,11 +9,11 @@ import pytest
 
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep
-from pipeline.second_order import pointing_error
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.jitter import JITTER, tilt_to_scene
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig
+from tests.pipeline.second_order import pointing_error
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -500.0, 1001)
 RIG = Rig(mirror=replace(MirrorMotion(), repeatability_urad=40.0))

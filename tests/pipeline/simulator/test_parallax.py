@@ -10,11 +10,11 @@ import pytest
 
 from pipeline.geometry.mirror import scene_to_direction
 from pipeline.geometry.scan import Sweep, sweep_to_scene
-from pipeline.second_order import relief_error
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.parallax import PARALLAX, closeness
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Air, Rig
+from tests.pipeline.second_order import relief_error
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -100.0, 201)
 STEP = Air(distance_m=30.0, relief="step", nearest_m=3.0)

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.geometry.scan import Sweep
-from pipeline.second_order import staircase_jitter
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.staircase import STAIRCASE, beside_plan
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig
+from tests.pipeline.second_order import staircase_jitter
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -20.0, 41)
 
