@@ -52,7 +52,10 @@ def rectifying_ahead(run: SurveyRun, version: int, source: Source, key: str) -> 
     planned for all one knows: seams to be registered, or a mirror that no pulse steps or whose log says where it was.
     Trouble with it is no trouble of the capture: then the mosaic is made in its turn, by ``version`` of that stage.
     """
-    from pipeline.rig.capture_paths import can_trigger, planned_positions  # loads scipy, which a plan does without
+    from pipeline.rig.capture.capture_paths import (  # loads scipy, which a plan does without
+        can_trigger,
+        planned_positions,
+    )
 
     rig = run.settings.rig
     steady = not rig.log_pulses and all(can_trigger(rig.pulses, sweep) for sweep in run.plan.coarse)

@@ -16,9 +16,9 @@ from flows.app import print_json
 from flows.settings import load_settings
 from flows.terminal import on_stdout
 from pipeline.errors import SettingsError
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.emulator.fault_names import fault_table
-from pipeline.rig.headwall_camera import HeadwallCamera
-from pipeline.rig.mirror_port import open_mirror
+from pipeline.rig.mirror.mirror_port import open_mirror
 from pipeline.rig.rig_check import CheckRow, Device, check_camera, check_mirror, works
 from pipeline.rig.survey_rig import SurveyRig
 from pipeline.scan import CostModel

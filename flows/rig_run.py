@@ -14,9 +14,9 @@ from flows.setting_keys import RIG_FIELD
 from flows.settings import Settings
 from pipeline.errors import SettingsError
 from pipeline.once import Once
-from pipeline.rig.camera_limits import CameraLimits, check_times
+from pipeline.rig.camera.camera_settings import CameraLimits, check_times
+from pipeline.rig.camera.kept_files import KeptInMemory
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
-from pipeline.rig.kept_files import KeptInMemory
 from pipeline.scan import Sweep
 from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.scene import RasterScene
@@ -25,8 +25,8 @@ from storage.fetched_files import FetchedFiles
 
 if TYPE_CHECKING:
     from flows.run import CaptureRun
-    from pipeline.rig.capture_runner import RigDevices
-    from pipeline.rig.rig_source import RigSource
+    from pipeline.rig.capture.capture_runner import RigDevices
+    from pipeline.rig.capture.rig_source import RigSource
 
 FETCHED = "camera"  # folder within a capture's spool
 RIG_RECORD = "rig.json"  # in a capture's store, beside its cubes
@@ -39,7 +39,7 @@ def rig_source(scene: RasterScene, settings: Settings) -> RigSource:
     ------
     SettingsError : exposure and frame period are nothing that the camera takes.
     """
-    from pipeline.rig.rig_source import RigSource, RigView  # drivers load scipy, which a plan does without
+    from pipeline.rig.capture.rig_source import RigSource, RigView  # drivers load scipy, which a plan does without
 
     camera = settings.camera
     check_times(camera.exposure_ms, camera.frame_ms, CameraLimits(most_rate_hz=camera.max_rate_hz))
@@ -58,9 +58,9 @@ def open_devices(settings: Settings, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
     DeviceGone : no such port, in use, not permitted, or the camera is not there. DeadlinePassed : nothing answers.
     RigError : another device does.
     """
-    from pipeline.rig.capture_runner import RigDevices
-    from pipeline.rig.headwall_camera import HeadwallCamera
-    from pipeline.rig.mirror_port import open_mirror
+    from pipeline.rig.camera.headwall_camera import HeadwallCamera
+    from pipeline.rig.capture.capture_runner import RigDevices
+    from pipeline.rig.mirror.mirror_port import open_mirror
 
     rig = settings.rig
     mirror = open_mirror(rig.mirror(settings.cost.vector_pairs), clock, known=True)

@@ -43,7 +43,7 @@ from storage.layout import AngularGrid
 from storage.raster_files import load_raster
 
 if TYPE_CHECKING:
-    from pipeline.rig.rig_source import RigSource
+    from pipeline.rig.capture.rig_source import RigSource
 
 SHIPPED = "farm.safetensors"
 

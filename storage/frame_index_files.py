@@ -1,11 +1,11 @@
-"""Frame indices of Headwall cameras from their files; what their lines say is :mod:`pipeline.rig.frame_index`'s."""
+"""Frame indices of Headwall cameras from their files; their lines are read by :mod:`pipeline.rig.camera.frame_index`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from pipeline.errors import SceneError
-from pipeline.rig.frame_index import LONGEST_LINE, FrameIndex, LineTimes, parse_frame_index, times_of_lines
+from pipeline.rig.camera.frame_index import LONGEST_LINE, FrameIndex, LineTimes, parse_frame_index, times_of_lines
 
 __all__ = ["FrameIndex", "LineTimes", "load_frame_index", "times_of_lines"]
 

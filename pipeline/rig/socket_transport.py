@@ -6,7 +6,7 @@ import socket
 
 from pipeline.errors import SettingsError
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
-from pipeline.rig.refusals import DeadlinePassed, DeviceGone
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
 
 _LEAST_WAIT_S = 0.001
 _MOST_DRAINED = 1 << 20

@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from pipeline.rig.file_session import FileServer
-from pipeline.rig.mirror_settings import MirrorSettings
-from pipeline.rig.steering import ReadBack
+from pipeline.rig.camera.file_session import FileServer
+from pipeline.rig.mirror.mirror_settings import MirrorSettings
+from pipeline.rig.mirror.steering import ReadBack
 from pipeline.vector_memory import Ends
 
 if TYPE_CHECKING:
-    from pipeline.rig.headwall_camera import CameraAddress
+    from pipeline.rig.camera.headwall_camera import CameraAddress
 
 Pulses = Literal["position", "frame", "none"]
 
@@ -65,7 +65,9 @@ class SurveyRig:
     @property
     def camera(self) -> CameraAddress:
         """Where the camera's control socket is."""
-        from pipeline.rig.headwall_camera import CameraAddress  # loads scipy, which reading settings does not need
+        from pipeline.rig.camera.headwall_camera import (
+            CameraAddress,  # loads scipy, which reading settings does not need
+        )
 
         return CameraAddress(self.host, self.control_port, self.connect_s)
 

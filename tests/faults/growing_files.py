@@ -20,8 +20,8 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.errors import PipelineError
-from pipeline.rig.capture_journal import JOURNAL, CaptureJournal, Taken
-from pipeline.rig.kept_files import KeptInMemory
+from pipeline.rig.camera.kept_files import KeptInMemory
+from pipeline.rig.capture.capture_journal import JOURNAL, CaptureJournal, Taken
 from pipeline.scan import Sweep
 from storage.growing_checks import growing_problems
 from storage.ledger import Ledger

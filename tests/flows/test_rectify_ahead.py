@@ -16,7 +16,7 @@ from flows.run import open_run
 from flows.survey import STAGES, StageRunner
 from flows.survey_command import run_survey
 from pipeline.errors import RigError
-from pipeline.rig.rig_source import RigSource
+from pipeline.rig.capture.rig_source import RigSource
 from pipeline.scan import Sweep
 from pipeline.source import Line
 from storage.archive import Archive, StageRef

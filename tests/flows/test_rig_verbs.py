@@ -24,7 +24,7 @@ from flows.settings import load_settings
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, ServedRig
 from pipeline.rig.emulator.fast_clock import FastClock
 from pipeline.rig.emulator.faults import make_fault
-from pipeline.rig.pro_mode import Command
+from pipeline.rig.mirror.pro_mode import Command
 from tests.flows.conftest import CommandLine
 from tests.rig.small_rig import small_source
 

@@ -34,7 +34,7 @@ GATHER = ("pipeline/rectify/resample.py", "pipeline/rectify/kernels.py", "pipeli
 READERS = ("storage/scan_files.py", "storage/envi_header.py", "storage/envi_cubes.py", "storage/headwall_folders.py",
            "storage/frame_index_files.py", "storage/zarr_scenes.py", "storage/raster_files.py", "storage/rasters.py",
            "storage/tiff_files.py", "storage/array_files.py", "storage/mat_files.py", "storage/dataset_layouts.py",
-           "storage/wavelengths.py", "storage/scene_toml.py", "pipeline/rig/frame_index.py")  # fmt: skip
+           "storage/wavelengths.py", "storage/scene_toml.py", "pipeline/rig/camera/frame_index.py")  # fmt: skip
 SIMULATOR = ("pipeline/simulator", "pipeline/simulator/effects")
 SOURCES = {
     "effects": (*GEOMETRY, *GATHER, *SIMULATOR, "flows/effect_choice.py"),

@@ -7,11 +7,11 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.camera.headwall_control import ControlPatience, HeadwallControl
 from pipeline.rig.clock import ManualClock
+from pipeline.rig.device_errors import DeviceGone
 from pipeline.rig.emulator.camera_device import CameraDevice
-from pipeline.rig.headwall_camera import HeadwallCamera
-from pipeline.rig.headwall_control import ControlPatience, HeadwallControl
-from pipeline.rig.refusals import DeviceGone
 
 
 class CameraLine:

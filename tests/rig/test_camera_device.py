@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
+from pipeline.rig.camera.line_camera import CaptureUnknown
 from pipeline.rig.clock import ManualClock
+from pipeline.rig.device_errors import DeviceRefused
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
 from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
-from pipeline.rig.line_camera import CaptureUnknown
-from pipeline.rig.refusals import DeviceRefused
 from tests.rig.camera_line import control_of, scene_lines
 
 CAPTURE = b'capture({"prefix": "", "maxCubes": 1, "maxFramesPerCube": 5})'

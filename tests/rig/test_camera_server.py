@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.camera_files import fetch_files
+from pipeline.rig.camera.camera_files import fetch_files
+from pipeline.rig.camera.file_session import FileServer
+from pipeline.rig.camera.headwall_camera import CameraAddress, HeadwallCamera
+from pipeline.rig.camera.headwall_control import ControlPatience
+from pipeline.rig.camera.kept_files import KeptInMemory, RemoteFile
 from pipeline.rig.clock import SYSTEM_CLOCK, ManualClock
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, DeviceRefused
 from pipeline.rig.emulator.camera_capture import FrameClock, IndexLayout
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
 from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
 from pipeline.rig.emulator.camera_server import CameraServer, remote_files
-from pipeline.rig.file_session import FileServer
-from pipeline.rig.headwall_camera import CameraAddress, HeadwallCamera
-from pipeline.rig.headwall_control import ControlPatience
-from pipeline.rig.kept_files import KeptInMemory, RemoteFile
-from pipeline.rig.refusals import DeadlinePassed, DeviceGone, DeviceRefused
 from pipeline.rig.socket_transport import SocketTransport
 from tests.rig.camera_line import LinesOf, scene_lines, wait_for
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.rig.capture_journal import JOURNAL, CaptureJournal, Taken
-from pipeline.rig.kept_files import KeptInMemory
-from pipeline.rig.line_positions import LinePositions
+from pipeline.rig.camera.kept_files import KeptInMemory
+from pipeline.rig.capture.capture_journal import JOURNAL, CaptureJournal, Taken
+from pipeline.rig.capture.line_positions import LinePositions
 from tests.faults.growing_files import flip_journal
 from tests.rig.small_rig import COARSE, FINE
 

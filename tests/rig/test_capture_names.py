@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SettingsError
-from pipeline.rig.camera_limits import check_capture
-from pipeline.rig.capture_names import REFERENCES, Announced, announced, capture_prefix
+from pipeline.rig.camera.camera_settings import check_capture
+from pipeline.rig.capture.capture_names import REFERENCES, Announced, announced, capture_prefix
 from pipeline.scan import Sweep
 
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.rig.camera_cubes import CapturedLines
-from pipeline.rig.capture_journal import LoggedPath, Taken
-from pipeline.rig.capture_paths import next_path
-from pipeline.rig.captured_sweep import UntiedError, place_lines
-from pipeline.rig.frame_index import LineTimes
-from pipeline.rig.line_positions import MirrorTrack
+from pipeline.rig.camera.camera_cubes import CapturedLines
+from pipeline.rig.camera.frame_index import LineTimes
+from pipeline.rig.capture.capture_journal import LoggedPath, Taken
+from pipeline.rig.capture.capture_paths import next_path
+from pipeline.rig.capture.captured_sweep import UntiedError, place_lines
+from pipeline.rig.capture.line_positions import MirrorTrack
 from tests.rig.small_rig import CAMERA, COARSE, FINE
 
 PATH = next_path(FINE, 3, CAMERA, vector_pairs=7, triggered=True)  # lines 3 to 9

@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.rig.camera_files import FileServer
-from pipeline.rig.capture_names import REFERENCES, capture_prefix
+from pipeline.rig.camera.camera_files import FileServer
+from pipeline.rig.camera.headwall_camera import CameraAddress, HeadwallCamera
+from pipeline.rig.camera.kept_files import KeptInMemory
+from pipeline.rig.capture.capture_names import REFERENCES, capture_prefix
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
+from pipeline.rig.device_errors import DeviceGone
 from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
 from pipeline.rig.emulator.emulated_rig import EmulatedRig
 from pipeline.rig.emulator.fast_clock import FastClock
-from pipeline.rig.headwall_camera import CameraAddress, HeadwallCamera
-from pipeline.rig.kept_files import KeptInMemory
-from pipeline.rig.mirror_controller import MirrorController
-from pipeline.rig.mirror_port import open_mirror
-from pipeline.rig.mirror_settings import MirrorSettings
-from pipeline.rig.refusals import DeviceGone
-from pipeline.rig.registers import Trigger
+from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.mirror.mirror_port import open_mirror
+from pipeline.rig.mirror.mirror_settings import MirrorSettings
+from pipeline.rig.mirror.registers import Trigger
 from pipeline.rig.socket_transport import SocketTransport
 from pipeline.scan import Sweep, sweep_positions
 from pipeline.simulator.instrument import QUIET

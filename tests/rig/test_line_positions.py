@@ -9,8 +9,8 @@ import pytest
 
 from pipeline.camera import LineCamera
 from pipeline.errors import RigError, ShapeError
-from pipeline.rig.frame_times import FrameTimes
-from pipeline.rig.line_positions import (
+from pipeline.rig.capture.frame_times import FrameTimes
+from pipeline.rig.capture.line_positions import (
     CommandTimes,
     LinePositions,
     MirrorTrack,

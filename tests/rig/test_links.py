@@ -7,8 +7,9 @@ import logging
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.links import ProLink, SimpleLink
-from pipeline.rig.pro_payloads import (
+from pipeline.rig.device_errors import DeadlinePassed, DeviceRefused, StateUnknown
+from pipeline.rig.mirror.mirror_requests import ProLink, SimpleLink
+from pipeline.rig.mirror.pro_payloads import (
     ask_firmware,
     ask_status,
     cell_float,
@@ -22,10 +23,9 @@ from pipeline.rig.pro_payloads import (
     set_values,
     set_vector,
 )  # fmt: skip
-from pipeline.rig.refusals import DeadlinePassed, DeviceRefused, StateUnknown
-from pipeline.rig.registers import Status
-from pipeline.rig.simple_mode import go_x, go_xy, go_y
-from pipeline.rig.wire import Patience, Wire
+from pipeline.rig.mirror.registers import Status
+from pipeline.rig.mirror.simple_mode import go_x, go_xy, go_y
+from pipeline.rig.mirror.transactions import Patience, Wire
 from tests.rig.scripted import Pair, ScriptedTransport, scripted
 
 ASK = bytes.fromhex("7E 00 11 02 68 0A 0B 3B 7E")

@@ -13,7 +13,7 @@ from pipeline.rig.clock import ManualClock
 from pipeline.rig.emulator.exchange import Mode
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.emulator.mirror_state import MirrorUnit
-from pipeline.rig.registers import Status
+from pipeline.rig.mirror.registers import Status
 
 GO_PRO_CRC = b"GOPROCRC\r\n"
 

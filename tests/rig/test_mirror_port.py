@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig import mirror_port
-from pipeline.rig.mirror_port import open_mirror
-from pipeline.rig.mirror_settings import MirrorSettings
-from pipeline.rig.refusals import DeadlinePassed, DeviceGone
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
+from pipeline.rig.mirror import mirror_port
+from pipeline.rig.mirror.mirror_port import open_mirror
+from pipeline.rig.mirror.mirror_settings import MirrorSettings
 from tests.rig.mirror_bytes import CONNECT, LEAVE
 from tests.rig.scripted import ScriptedTransport, scripted
 

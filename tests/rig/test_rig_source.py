@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.capture_journal import CaptureJournal
-from pipeline.rig.kept_files import KeptInMemory
-from pipeline.rig.pro_mode import Command
-from pipeline.rig.steering import wire_positions
+from pipeline.rig.camera.kept_files import KeptInMemory
+from pipeline.rig.capture.capture_journal import CaptureJournal
+from pipeline.rig.mirror.pro_mode import Command
+from pipeline.rig.mirror.steering import wire_positions
 from pipeline.scan import Sweep, line_positions
 from pipeline.source import Line
 from tests.rig.small_rig import CAMERA, COARSE, FINE, small_rig, small_source

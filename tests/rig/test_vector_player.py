@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.rig.emulator.vector_player import MOST_STEPS, VectorPlayer
-from pipeline.rig.registers import Trigger
+from pipeline.rig.mirror.registers import Trigger
 from pipeline.vector_memory import Ends
 
 

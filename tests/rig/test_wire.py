@@ -9,8 +9,8 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.clock import ManualClock
-from pipeline.rig.refusals import DeadlinePassed, DeviceGone, StateUnknown
-from pipeline.rig.wire import Kind, Patience, Wire
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, StateUnknown
+from pipeline.rig.mirror.transactions import Kind, Patience, Wire
 from tests.rig.scripted import Late, Pair, ScriptedTransport, scripted
 
 

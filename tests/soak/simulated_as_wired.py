@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from flows.cli import main
-from pipeline.rig.camera_references import as_references, mean_frame
+from pipeline.rig.camera.camera_references import as_references, mean_frame
 from pipeline.rig.emulator.scene_camera import REFERENCE_FRAMES
 from pipeline.rig.emulator.scene_view import SceneView
 from pipeline.scan import Sweep

@@ -1,6 +1,7 @@
 """The emulated camera: commands in, replies out, captures that look at whatever it is given. No sockets, no waiting.
 
-Spoken is what :mod:`pipeline.rig.headwall_replies` reads; texts of refusals are made up, since no document tells them.
+It speaks what :mod:`pipeline.rig.camera.headwall_replies` reads; the texts of refusals are made up, since no document
+tells them.
 """
 
 from __future__ import annotations

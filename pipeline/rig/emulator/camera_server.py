@@ -15,9 +15,9 @@ from contextlib import suppress
 from typing import Any
 
 from pipeline.errors import RigError
+from pipeline.rig.camera.kept_files import RemoteFile
 from pipeline.rig.emulator.camera_device import CameraDevice
 from pipeline.rig.emulator.camera_faults import CameraFault
-from pipeline.rig.kept_files import RemoteFile
 
 LOG = logging.getLogger(__name__)
 _SLICE_S = 0.05  # how soon threads see that they are to end

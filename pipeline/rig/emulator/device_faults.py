@@ -10,10 +10,10 @@ import numpy as np
 
 from pipeline.rig.emulator.exchange import Chunk, Mode, Request
 from pipeline.rig.emulator.fault import Fault
-from pipeline.rig.pro_mode import Command, Frame, encode
-from pipeline.rig.pro_payloads import CELL, int_cell, read_vector, refuse
-from pipeline.rig.registers import VECTOR_MEMORY, Status
-from pipeline.rig.simple_mode import END, ID, VERSION
+from pipeline.rig.mirror.pro_mode import Command, Frame, encode
+from pipeline.rig.mirror.pro_payloads import CELL, int_cell, read_vector, refuse
+from pipeline.rig.mirror.registers import VECTOR_MEMORY, Status
+from pipeline.rig.mirror.simple_mode import END, ID, VERSION
 
 if TYPE_CHECKING:
     from pipeline.rig.emulator.mirror_device import MirrorDevice

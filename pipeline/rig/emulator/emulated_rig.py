@@ -1,7 +1,7 @@
 """A whole emulated rig: mirror and camera on one clock, the camera's exposures at the mirror's trigger, and a scene.
 
-A planned sweep that is announced (:func:`pipeline.rig.capture_names.capture_prefix` as the capture's prefix), loaded
-and played gives the simulated source's lines, bit for bit:
+A planned sweep that is announced (by a capture's prefix, :func:`pipeline.rig.capture.capture_names.capture_prefix`),
+loaded and played gives the simulated source's lines, bit for bit:
 
 - The mirror's vector unit takes the first cell as it is run, and one more at each rising edge. A path that is played by
   trigger therefore begins with a lead-in cell; line 0's first position is its second.
@@ -21,6 +21,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 
+from pipeline.rig.camera.file_session import FileServer
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.camera.headwall_control import HeadwallControl
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock, ManualClock
 from pipeline.rig.emulator.camera_device import CameraUnit
 from pipeline.rig.emulator.camera_faults import CameraFaults
@@ -33,9 +36,6 @@ from pipeline.rig.emulator.pty_port import EmulatedPort
 from pipeline.rig.emulator.scene_camera import Look, SceneCamera
 from pipeline.rig.emulator.scene_view import SceneView
 from pipeline.rig.emulator.triggered_mirror import TriggeredMirror
-from pipeline.rig.file_session import FileServer
-from pipeline.rig.headwall_camera import HeadwallCamera
-from pipeline.rig.headwall_control import HeadwallControl
 from pipeline.rig.survey_rig import Pulses
 from pipeline.simulator.simulated import SimulatedSource
 

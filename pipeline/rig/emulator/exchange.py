@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
-from pipeline.rig.pro_mode import Command, Damaged, Frame
+from pipeline.rig.mirror.pro_mode import Command, Damaged, Frame
 
 
 class Mode(Enum):

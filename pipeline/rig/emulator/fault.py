@@ -10,7 +10,7 @@ from random import Random
 from typing import TYPE_CHECKING
 
 from pipeline.rig.emulator.exchange import Chunk, Request
-from pipeline.rig.registers import Status
+from pipeline.rig.mirror.registers import Status
 
 if TYPE_CHECKING:
     from pipeline.rig.emulator.mirror_device import MirrorDevice

@@ -9,9 +9,9 @@ from pipeline.errors import SettingsError
 from pipeline.rig.emulator import device_faults as device
 from pipeline.rig.emulator import wire_faults as wire
 from pipeline.rig.emulator.fault import Chance, Fault, FaultKind, Where
-from pipeline.rig.pro_mode import Command, ErrorCode, error_words
-from pipeline.rig.registers import Status
-from pipeline.rig.simple_mode import Answer
+from pipeline.rig.mirror.pro_mode import Command, ErrorCode, error_words
+from pipeline.rig.mirror.registers import Status
+from pipeline.rig.mirror.simple_mode import Answer
 
 __all__ = ["KINDS", "Chance", "Fault", "FaultKind", "Where", "make_fault", "read_fault"]
 

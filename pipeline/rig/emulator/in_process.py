@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from itertools import count
 
 from pipeline.rig.clock import Clock
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
 from pipeline.rig.emulator.exchange import Chunk, VanishedError
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.refusals import DeadlinePassed, DeviceGone
-from pipeline.rig.wire import BITS_PER_BYTE
+from pipeline.rig.mirror.transactions import BITS_PER_BYTE
 
 
 @dataclass

@@ -6,9 +6,9 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from pipeline.rig.clock import Clock
+from pipeline.rig.device_errors import DeviceGone
 from pipeline.rig.emulator.camera_device import CameraDevice
 from pipeline.rig.emulator.exchange import Chunk
-from pipeline.rig.refusals import DeviceGone
 
 
 @dataclass

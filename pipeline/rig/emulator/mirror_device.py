@@ -23,10 +23,10 @@ from pipeline.rig.emulator.mirror_registers import RegisterFile
 from pipeline.rig.emulator.mirror_state import MirrorState, MirrorUnit
 from pipeline.rig.emulator.pro_answers import answer_frame
 from pipeline.rig.emulator.simple_answers import answer_line
-from pipeline.rig.pro_mode import BOUNDARY, ERROR_FLAG, Command, Damaged, ErrorCode, Frame, FrameReader, encode
-from pipeline.rig.pro_payloads import refuse
-from pipeline.rig.registers import Status
-from pipeline.rig.simple_mode import END, GO_PRO, GO_PRO_CRC, MOST_LINE, RESET, Answer
+from pipeline.rig.mirror.pro_mode import BOUNDARY, ERROR_FLAG, Command, Damaged, ErrorCode, Frame, FrameReader, encode
+from pipeline.rig.mirror.pro_payloads import refuse
+from pipeline.rig.mirror.registers import Status
+from pipeline.rig.mirror.simple_mode import END, GO_PRO, GO_PRO_CRC, MOST_LINE, RESET, Answer
 
 KEPT_ACTS = 5_000
 _BOUNDARY = bytes((BOUNDARY,))

@@ -12,9 +12,9 @@ import numpy as np
 
 from pipeline.rig.emulator.mirror_state import MirrorState
 from pipeline.rig.emulator.position_logger import PositionLogger
-from pipeline.rig.pro_mode import MOST_PAYLOAD, ErrorCode
-from pipeline.rig.pro_payloads import CELL, cell_float, cell_int, float_cell, int_cell
-from pipeline.rig.registers import (
+from pipeline.rig.mirror.pro_mode import MOST_PAYLOAD, ErrorCode
+from pipeline.rig.mirror.pro_payloads import CELL, cell_float, cell_int, float_cell, int_cell
+from pipeline.rig.mirror.registers import (
     FEEDBACK_A,
     FEEDBACK_X,
     LOG_RATE,

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.rig.clock import Clock
 from pipeline.rig.emulator.mirror_motion import AxisMotion, Stiffness
 from pipeline.rig.emulator.vector_player import VectorPlayer
-from pipeline.rig.registers import CHANNELS, ChannelRegisters, Status, Unit
+from pipeline.rig.mirror.registers import CHANNELS, ChannelRegisters, Status, Unit
 from pipeline.vector_memory import Ends
 
 RIM_SLACK = 1e-6  # of float32 cells

@@ -6,7 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.rig.emulator.mirror_state import MirrorState
-from pipeline.rig.registers import CHANNELS, FEEDBACK_A, FEEDBACK_X, LOG_SLOTS, ChannelRegisters, Unit, VectorRegister
+from pipeline.rig.mirror.registers import (
+    CHANNELS,
+    FEEDBACK_A,
+    FEEDBACK_X,
+    LOG_SLOTS,
+    ChannelRegisters,
+    Unit,
+    VectorRegister,
+)
 
 # what the slots take down after power came: two outputs of the drive, then both forms of the optical feedback
 FIRST_SLOTS = (0xE802, 0xE902, 0x2300, 0x2301, 0x2302, 0x2303)

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 from pipeline.errors import ShapeError
 from pipeline.rig.emulator.mirror_registers import RefusedError, RegisterFile
-from pipeline.rig.pro_mode import ERROR_FLAG, Command, ErrorCode, Frame
-from pipeline.rig.pro_payloads import (
+from pipeline.rig.mirror.pro_mode import ERROR_FLAG, Command, ErrorCode, Frame
+from pipeline.rig.mirror.pro_payloads import (
     acknowledge,
     int_cell,
     read_register,
@@ -16,7 +16,7 @@ from pipeline.rig.pro_payloads import (
     refuse,
     values_reply,
 )  # fmt: skip
-from pipeline.rig.registers import Status
+from pipeline.rig.mirror.registers import Status
 
 Handler = Callable[[RegisterFile, bytes], Frame]
 

@@ -13,7 +13,7 @@ from types import TracebackType
 from pipeline.errors import RigError
 from pipeline.rig.emulator.exchange import Chunk, VanishedError
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.wire import BITS_PER_BYTE
+from pipeline.rig.mirror.transactions import BITS_PER_BYTE
 
 LOG = logging.getLogger(__name__)
 _AT_ONCE = 4096  # bytes

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.rig.capture_names import REFERENCES, Announced, announced
+from pipeline.rig.capture.capture_names import REFERENCES, Announced, announced
 from pipeline.rig.clock import Clock
 from pipeline.rig.emulator.camera_capture import EmulatedCapture
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit

@@ -1,8 +1,8 @@
 """What the emulated camera sees of a simulated scene: the lines that a planned sweep has there, as the mirror plays it.
 
 Noise and drifts of the simulator are keyed by a sweep's name and a line's number, so the camera has to know both. The
-name, with the sweep's geometry, is in the capture's prefix (:mod:`pipeline.rig.capture_names`). The number is that of
-the line whose planned position is nearest to the one the mirror holds at mid exposure: what the vector index says where
+name, with the sweep's geometry, is in the capture's prefix (:mod:`pipeline.rig.capture.capture_names`). The number is
+that of the line whose planned position is nearest to the one the mirror holds at mid exposure: what the vector index says where
 the path is the planned one, and still right where it was loaded in parts, begins with a lead-in, or lost an edge.
 
 Where the mirror holds what was planned, to the last bit of the wire's float32, a line is that of the simulated source,
@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.mirror import direction_to_scene, position_to_direction
-from pipeline.rig.capture_names import Announced
-from pipeline.rig.steering import wire_positions
+from pipeline.rig.capture.capture_names import Announced
+from pipeline.rig.mirror.steering import wire_positions
 from pipeline.scan import Sweep, sweep_positions
 from pipeline.simulator.block import Block
 from pipeline.simulator.effects.effect import OFF, Bound

@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 
 from pipeline.rig.emulator.mirror_state import MirrorState
-from pipeline.rig.registers import CHANNELS, ChannelRegisters, Status, Unit
-from pipeline.rig.simple_mode import (
+from pipeline.rig.mirror.registers import CHANNELS, ChannelRegisters, Status, Unit
+from pipeline.rig.mirror.simple_mode import (
     ACKNOWLEDGE,
     END,
     ID,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.rig.registers import Trigger, Unit
+from pipeline.rig.mirror.registers import Trigger, Unit
 from pipeline.vector_memory import Ends
 
 MOST_STEPS = 20_000  # steps that are played one by one; of a longer silence only the last ones are

@@ -1,0 +1,157 @@
+"""Bytes to and from a device over a serial port, or over whatever else pyserial has an address for."""
+
+from __future__ import annotations
+
+import errno
+from typing import Any, Protocol
+
+from pipeline.errors import SettingsError
+from pipeline.rig.clock import SYSTEM_CLOCK, Clock
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
+
+USB_ID = (0x0483, 0xA31E)  # vendor and product of the mirror controller
+_SLICE_S = 0.02  # reads wait in slices: by so much a deadline may be overrun
+_WRITE_S = 0.25  # a frame takes 10 ms at 115200
+_MOST_DRAINED = 1 << 16
+
+
+class Transport(Protocol):
+    """A line to a device. Deadlines are moments of the clock that both ends of a call share."""
+
+    @property
+    def port(self) -> str:
+        """Its name in messages."""
+
+    def write(self, data: bytes, deadline: float) -> None:
+        """Send all bytes."""
+
+    def read(self, at_most: int, deadline: float) -> bytes:
+        """Wait for bytes and give those that are there; none where the deadline passes first."""
+
+    def drain(self) -> bytes:
+        """Give what is there already, without waiting."""
+
+    def close(self) -> None:
+        """Let go of the port."""
+
+
+class SerialTransport:
+    """A serial port, held exclusively.
+
+    Parameters
+    ----------
+    port
+        Name of the port, or an address that pyserial knows (``socket://host:port``).
+    baud
+        Speed; a USB port takes any.
+
+    Raises
+    ------
+    DeviceGone : no such port, in use, or not permitted; the message says what to do.
+    SettingsError : no such kind of address, or a speed that the port does not have.
+    """
+
+    def __init__(self, port: str, baud: int, clock: Clock = SYSTEM_CLOCK) -> None:
+        self.port = port
+        self._clock = clock
+        self._serial = _open(port, baud)
+
+    def write(self, data: bytes, deadline: float) -> None:
+        """Send all bytes.
+
+        Raises
+        ------
+        DeadlinePassed : the port did not take them in time; some may have gone.
+        DeviceGone : the port went away.
+        """
+        from serial import SerialException, SerialTimeoutException
+
+        if self._clock.now() >= deadline:
+            raise DeadlinePassed(f"no time was left to send {len(data)} bytes to {self.port}; give a longer deadline")
+        try:
+            self._serial.write(data)
+        except SerialTimeoutException:
+            raise DeadlinePassed(
+                f"{self.port} did not take {len(data)} bytes within {_WRITE_S:g} s; is the device on?"
+            ) from None
+        except (SerialException, OSError, TypeError) as error:
+            raise self._gone(error) from error
+
+    def read(self, at_most: int, deadline: float) -> bytes:
+        """Wait for bytes and give those that are there; none where the deadline passes first.
+
+        Raises
+        ------
+        DeviceGone : the port went away.
+        """
+        from serial import SerialException
+
+        try:
+            while self._clock.now() < deadline:
+                first: bytes = self._serial.read(1)
+                if first:
+                    rest: bytes = self._serial.read(min(at_most - 1, self._serial.in_waiting))
+                    return first + rest
+            return b""
+        except (SerialException, OSError, TypeError) as error:
+            raise self._gone(error) from error
+
+    def drain(self) -> bytes:
+        """Give what is there already, without waiting; not more than 64 KiB of one that never ends.
+
+        Raises
+        ------
+        DeviceGone : the port went away.
+        """
+        from serial import SerialException
+
+        drained = b""
+        try:
+            while len(drained) < _MOST_DRAINED and (there := self._serial.in_waiting):
+                drained += self._serial.read(there)
+        except (SerialException, OSError, TypeError) as error:
+            raise self._gone(error) from error
+        return drained
+
+    def close(self) -> None:
+        """Let go of the port."""
+        self._serial.close()
+
+    def _gone(self, error: Exception) -> DeviceGone:
+        return DeviceGone(f"{self.port} went away ({error}); look at the cable and the power, then connect again")
+
+
+def _open(port: str, baud: int) -> Any:
+    from serial import SerialException, serial_for_url
+
+    try:
+        return serial_for_url(port, baudrate=baud, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True)
+    except SerialException as error:
+        raise DeviceGone(_why_not(port, error)) from error
+    except (ValueError, OverflowError) as error:
+        raise SettingsError(
+            f"expected a port's name or an address that pyserial knows, and a speed, got {port!r} at {baud!r}: {error}"
+        ) from error
+
+
+def _why_not(port: str, error: OSError) -> str:
+    if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
+        return f"there is no port {port}; {_ports_here()}"
+    if error.errno in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
+        return f"{port} is in use by another program; close that, since two would mix their motions"
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return f"no permission for {port}; add this user to the port's group (mostly dialout), then log in again"
+    return f"{port} cannot be opened: {error}; is it a serial port, and the device on?"
+
+
+def _ports_here() -> str:
+    """Say which ports there are, and which of them is a mirror controller."""
+    from serial.tools.list_ports import comports
+
+    ports = list(comports())
+    mirrors = [port.device for port in ports if (port.vid, port.pid) == USB_ID]
+    if mirrors:
+        return f"a mirror controller is at {', '.join(mirrors)}: set the port to that"
+    if not ports:
+        return "this machine has no serial port: is the controller on, and its cable in?"
+    return f"there are {', '.join(sorted(port.device for port in ports))}; is the controller on?"
