@@ -18,7 +18,7 @@ from flows.terminal import on_stdout
 from pipeline.errors import SettingsError
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.emulator.fault_names import fault_table
-from pipeline.rig.mirror.mirror_port import open_mirror
+from pipeline.rig.mirror.mirror_controller import open_mirror
 from pipeline.rig.rig_check import CheckRow, Device, check_camera, check_mirror, works
 from pipeline.rig.survey_rig import SurveyRig
 from pipeline.scan import CostModel

@@ -19,8 +19,7 @@ from flows.emulated_scene import emulated_source
 from flows.setting_keys import BUILT_IN_SCENES
 from flows.settings import Settings, load_settings
 from pipeline.errors import SettingsError
-from pipeline.rig.emulator.emulated_rig import EmulatedRig, ServedRig
-from pipeline.rig.emulator.fast_clock import FastClock
+from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
 from pipeline.rig.emulator.fault_names import read_faults
 
 EVERY_S = 0.2

@@ -14,8 +14,8 @@ from flows.setting_keys import RIG_FIELD
 from flows.settings import Settings
 from pipeline.errors import SettingsError
 from pipeline.once import Once
+from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.camera.camera_settings import CameraLimits, check_times
-from pipeline.rig.camera.kept_files import KeptInMemory
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
 from pipeline.scan import Sweep
 from pipeline.simulator.raster import Light, Raster
@@ -60,7 +60,7 @@ def open_devices(settings: Settings, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
     """
     from pipeline.rig.camera.headwall_camera import HeadwallCamera
     from pipeline.rig.capture.capture_runner import RigDevices
-    from pipeline.rig.mirror.mirror_port import open_mirror
+    from pipeline.rig.mirror.mirror_controller import open_mirror
 
     rig = settings.rig
     mirror = open_mirror(rig.mirror(settings.cost.vector_pairs), clock, known=True)

@@ -1,4 +1,4 @@
-"""Frame indices of Headwall cameras from their files; their lines are read by :mod:`pipeline.rig.camera.frame_index`."""
+"""Frame indices of Headwall cameras from files; their lines are read by :mod:`pipeline.rig.camera.frame_index`."""
 
 from __future__ import annotations
 

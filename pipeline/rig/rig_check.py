@@ -11,10 +11,9 @@ from typing import Literal
 
 from pipeline.errors import PipelineError, RigError
 from pipeline.rig.camera.camera_files import log_in
-from pipeline.rig.camera.file_session import FileServer
+from pipeline.rig.camera.camera_settings import FileServer
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.mirror.mirror_controller import MirrorController
-from pipeline.rig.mirror.mirror_modes import check_model
+from pipeline.rig.mirror.mirror_controller import MirrorController, check_model
 from pipeline.rig.mirror.registers import Status
 
 Verdict = Literal["ok", "warn", "fail"]

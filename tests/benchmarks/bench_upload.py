@@ -15,8 +15,8 @@ from measure import Row
 
 from pipeline.rig.clock import SYSTEM_CLOCK
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.pty_port import EmulatedPort
-from pipeline.rig.mirror.mirror_port import open_mirror
+from pipeline.rig.emulator.mirror_ports import EmulatedPort
+from pipeline.rig.mirror.mirror_controller import open_mirror
 from pipeline.rig.mirror.mirror_settings import MirrorSettings
 from pipeline.rig.mirror.steering import ReadBack
 from pipeline.rig.mirror.transactions import BITS_PER_BYTE

@@ -23,12 +23,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.errors import PipelineError
-from pipeline.rig.camera.camera_files import fetch_files
-from pipeline.rig.camera.file_session import FileServer
-from pipeline.rig.camera.headwall_camera import CameraAddress, HeadwallCamera
-from pipeline.rig.camera.headwall_control import ControlPatience
-from pipeline.rig.camera.kept_files import KeptInMemory, RemoteFile
-from pipeline.rig.mirror.mirror_port import open_mirror
+from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
+from pipeline.rig.camera.camera_settings import CameraAddress, ControlPatience, FileServer
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.mirror.mirror_controller import open_mirror
 from pipeline.rig.mirror.mirror_settings import MirrorSettings
 from pipeline.rig.rig_check import CheckRow, check_camera, check_mirror
 from tests.faults.fault_table import Clock, Row

@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.errors import RigError
-from pipeline.rig.camera.file_session import FileServer
-from pipeline.rig.camera.headwall_camera import CameraAddress, HeadwallCamera
-from pipeline.rig.camera.headwall_control import ControlPatience
-from pipeline.rig.camera.kept_files import KeptInMemory
+from pipeline.rig.camera.camera_files import KeptInMemory
+from pipeline.rig.camera.camera_settings import CameraAddress, ControlPatience, FileServer
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.capture.rig_source import RigSource
 from pipeline.rig.clock import ManualClock

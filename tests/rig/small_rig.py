@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from pipeline.camera import LineCamera
-from pipeline.rig.camera.kept_files import Kept, KeptInMemory
+from pipeline.rig.camera.camera_files import Kept, KeptInMemory
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.capture.rig_source import RigSource, RigView
 from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
+from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults
 from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, InProcessRig
-from pipeline.rig.emulator.fault import Fault
+from pipeline.rig.emulator.mirror_faults import Fault
 from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.survey_rig import SurveyRig
 from pipeline.scan import Sweep

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
+from pipeline.rig.camera.camera_files import KeptInMemory
+from pipeline.rig.camera.camera_settings import ControlPatience
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.camera.headwall_control import ControlPatience
-from pipeline.rig.camera.kept_files import KeptInMemory
 from pipeline.rig.capture.capture_runner import RigDevices
-from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
-from pipeline.rig.emulator.fault import Fault
-from pipeline.rig.emulator.faults import make_fault
+from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults
+from pipeline.rig.emulator.fault_names import make_fault
+from pipeline.rig.emulator.mirror_faults import Fault
 from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.mirror.registers import Status
 from pipeline.scan import Sweep

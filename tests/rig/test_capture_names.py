@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.errors import SettingsError
 from pipeline.rig.camera.camera_settings import check_capture
-from pipeline.rig.capture.capture_names import REFERENCES, Announced, announced, capture_prefix
+from pipeline.rig.capture.capture_paths import REFERENCES, Announced, announced, capture_prefix
 from pipeline.scan import Sweep
 
 

@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.camera.camera_files import fetch_files
-from pipeline.rig.camera.file_session import FileServer
-from pipeline.rig.camera.kept_files import KeptInMemory, RemoteFile
+from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
+from pipeline.rig.camera.camera_settings import FileServer
 from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
-from pipeline.rig.emulator.camera_faults import CameraFault
+from pipeline.rig.emulator.camera_device import CameraDevice, CameraFault, CameraUnit
 from pipeline.rig.emulator.camera_server import CameraServer
 from tests.rig.camera_line import control_of, scene_lines
 from tests.rig.chaos_line import ChaosLine

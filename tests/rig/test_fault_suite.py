@@ -11,9 +11,9 @@ import pytest
 from pipeline.errors import RigError
 from pipeline.rig.clock import ManualClock
 from pipeline.rig.device_errors import StateUnknown
-from pipeline.rig.emulator.faults import KINDS, make_fault
-from pipeline.rig.emulator.in_process import InProcessTransport
+from pipeline.rig.emulator.fault_names import KINDS, make_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
+from pipeline.rig.emulator.mirror_ports import InProcessTransport
 from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.mirror.mirror_settings import MirrorSettings
 from pipeline.rig.mirror.pro_mode import Command, Frame, FrameReader

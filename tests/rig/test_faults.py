@@ -7,10 +7,9 @@ import pytest
 from pipeline.errors import SettingsError
 from pipeline.rig.clock import ManualClock
 from pipeline.rig.emulator.exchange import Mode, VanishedError
-from pipeline.rig.emulator.fault import Chance
-from pipeline.rig.emulator.faults import KINDS, Fault, make_fault, read_fault
+from pipeline.rig.emulator.fault_names import KINDS, make_fault, read_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.wire_faults import LATE_S, SLOW_S, TICK_S
+from pipeline.rig.emulator.mirror_faults import LATE_S, SLOW_S, TICK_S, Chance, Fault
 from pipeline.rig.mirror.pro_mode import ErrorCode, Frame, encode
 from pipeline.rig.mirror.pro_payloads import (
     ask_firmware,

@@ -8,7 +8,8 @@ from contextlib import contextmanager
 import pytest
 
 from pipeline.errors import RigError, SettingsError
-from pipeline.rig.camera.headwall_control import ControlPatience, HeadwallControl
+from pipeline.rig.camera.camera_settings import ControlPatience
+from pipeline.rig.camera.headwall_control import HeadwallControl
 from pipeline.rig.camera.line_camera import CaptureUnknown
 from pipeline.rig.clock import Clock, ManualClock
 from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown

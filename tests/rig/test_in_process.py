@@ -6,9 +6,9 @@ import pytest
 
 from pipeline.rig.clock import ManualClock
 from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
-from pipeline.rig.emulator.faults import make_fault
-from pipeline.rig.emulator.in_process import InProcessTransport
+from pipeline.rig.emulator.fault_names import make_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
+from pipeline.rig.emulator.mirror_ports import InProcessTransport
 from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.mirror.mirror_settings import MirrorSettings
 from pipeline.rig.mirror.transactions import BITS_PER_BYTE

@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.camera import LineCamera
 from pipeline.errors import RigError, ShapeError
-from pipeline.rig.capture.frame_times import FrameTimes
+from pipeline.rig.capture.clock_fit import FrameTimes
 from pipeline.rig.capture.line_positions import (
     CommandTimes,
     LinePositions,

@@ -9,6 +9,7 @@ import pytest
 from pipeline.errors import RigError
 from pipeline.rig.device_errors import DeadlinePassed, DeviceRefused, StateUnknown
 from pipeline.rig.mirror.mirror_requests import ProLink, SimpleLink
+from pipeline.rig.mirror.mirror_settings import Patience
 from pipeline.rig.mirror.pro_payloads import (
     ask_firmware,
     ask_status,
@@ -25,7 +26,7 @@ from pipeline.rig.mirror.pro_payloads import (
 )  # fmt: skip
 from pipeline.rig.mirror.registers import Status
 from pipeline.rig.mirror.simple_mode import go_x, go_xy, go_y
-from pipeline.rig.mirror.transactions import Patience, Wire
+from pipeline.rig.mirror.transactions import Wire
 from tests.rig.scripted import Pair, ScriptedTransport, scripted
 
 ASK = bytes.fromhex("7E 00 11 02 68 0A 0B 3B 7E")

@@ -11,15 +11,14 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import log_in
-from pipeline.rig.camera.file_session import FileServer
-from pipeline.rig.capture.capture_names import capture_prefix
+from pipeline.rig.camera.camera_settings import FileServer
+from pipeline.rig.capture.capture_paths import capture_prefix
 from pipeline.rig.clock import ManualClock
 from pipeline.rig.device_errors import DeviceGone, DeviceRefused
-from pipeline.rig.emulator.camera_device import CameraUnit
-from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
+from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults, CameraUnit
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, InProcessRig
 from pipeline.rig.emulator.exchange import Mode
-from pipeline.rig.emulator.faults import make_fault
+from pipeline.rig.emulator.fault_names import make_fault
 from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.mirror.mirror_settings import MirrorSettings
 from pipeline.rig.mirror.pro_mode import Command
@@ -202,7 +201,7 @@ def test_camera_in_order() -> None:
 
 def test_camera_out_of_order() -> None:
     """No control, no files, another password: a row each, and the other is asked all the same."""
-    with rig(camera=CameraFaults.of({CameraFault.HANGS_UP: 9})) as line:
+    with rig(camera=CameraFaults({CameraFault.HANGS_UP: 9})) as line:
         assert told(check_camera(line.camera(), line.files), "fail") == ["connect"]
     with rig() as line:
         gone = FileServer("127.0.0.1", 1)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.camera.kept_files import KeptInMemory
+from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.capture.capture_journal import CaptureJournal
 from pipeline.rig.mirror.pro_mode import Command
 from pipeline.rig.mirror.steering import wire_positions

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.rig.emulator.vector_player import MOST_STEPS, VectorPlayer
+from pipeline.rig.emulator.mirror_motion import MOST_STEPS, VectorPlayer
 from pipeline.rig.mirror.registers import Trigger
 from pipeline.vector_memory import Ends
 

@@ -10,7 +10,8 @@ import pytest
 from pipeline.errors import RigError
 from pipeline.rig.clock import ManualClock
 from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, StateUnknown
-from pipeline.rig.mirror.transactions import Kind, Patience, Wire
+from pipeline.rig.mirror.mirror_settings import Patience
+from pipeline.rig.mirror.transactions import Kind, Wire
 from tests.rig.scripted import Late, Pair, ScriptedTransport, scripted
 
 

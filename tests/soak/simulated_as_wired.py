@@ -13,8 +13,7 @@ import numpy as np
 
 from flows.cli import main
 from pipeline.rig.camera.camera_references import as_references, mean_frame
-from pipeline.rig.emulator.scene_camera import REFERENCE_FRAMES
-from pipeline.rig.emulator.scene_view import SceneView
+from pipeline.rig.emulator.scene_camera import REFERENCE_FRAMES, SceneView
 from pipeline.scan import Sweep
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import AT_REST, Line, References

@@ -8,19 +8,86 @@ readings. What the camera itself gives alike twice cannot be doubted here.
 from __future__ import annotations
 
 import logging
+import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Protocol
 
 from pipeline.errors import RigError
-from pipeline.rig.camera.file_session import DamagedTransfer, FileServer, FileSession, open_session
-from pipeline.rig.camera.kept_files import Kept, Progress, RemoteFile, check_remote_name
+from pipeline.rig.camera.camera_settings import FileServer
+from pipeline.rig.camera.ftp_session import DamagedTransfer, FileSession, open_session
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
 from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, DeviceRefused
 
 LOG = logging.getLogger(__name__)
 NOT_LOGGED_IN = 530  # of FTP: user or password is not taken, whatever file is asked for
+_UNFIT = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
+Progress = Callable[[str, int, int], None]  # file, bytes held, bytes in all
+
+
+@dataclass(frozen=True)
+class RemoteFile:
+    """An entry of a listing."""
+
+    name: str  # whole path
+    size: int | None  # bytes; None where the camera does not say
+    folder: bool
+    most: int | None = None  # bytes that it can have; None where nothing is known
+
+    @property
+    def base(self) -> str:
+        """The name without its folder."""
+        return self.name.rsplit("/", 1)[-1]
+
+
+def check_remote_name(name: str) -> None:
+    """Refuse a name that cannot stand in a line of text, as files are asked for (RigError)."""
+    if _UNFIT.search(name):
+        raise RigError(
+            f"the camera names a file {name!r:.200}, expected no line ends or control characters in a name; give it "
+            "another name there"
+        )
+
+
+class Kept(Protocol):
+    """Where fetched bytes go: files named as on the camera, of which a part may be there already."""
+
+    def size(self, name: str) -> int:
+        """Bytes held of a file; 0 of one that is not there."""
+
+    def read(self, name: str, start: int, stop: int) -> bytes:
+        """Some of the bytes held."""
+
+    def append(self, name: str, data: bytes) -> None:
+        """Add bytes at the end."""
+
+    def drop(self, name: str) -> None:
+        """Hold no byte of a file any more."""
+
+
+@dataclass
+class KeptInMemory:
+    """Files held in memory, for tests and for captures that fit."""
+
+    files: dict[str, bytearray] = field(default_factory=dict)
+
+    def size(self, name: str) -> int:
+        """Bytes held of a file; 0 of one that is not there."""
+        return len(self.files.get(name, b""))
+
+    def read(self, name: str, start: int, stop: int) -> bytes:
+        """Some of the bytes held."""
+        return bytes(self.files.get(name, bytearray())[start:stop])
+
+    def append(self, name: str, data: bytes) -> None:
+        """Add bytes at the end."""
+        self.files.setdefault(name, bytearray()).extend(data)
+
+    def drop(self, name: str) -> None:
+        """Hold no byte of a file any more."""
+        self.files.pop(name, None)
 
 
 def fetch_files(

@@ -1,4 +1,4 @@
-"""What no camera is asked to do: times and numbers that cannot be meant, refused before anything is sent."""
+"""Where the camera is, how long it is waited for, and what it is never asked to do: refused before anything is sent."""
 
 from __future__ import annotations
 
@@ -9,6 +9,50 @@ from dataclasses import dataclass
 from pipeline.errors import SettingsError
 
 _PREFIX = re.compile(r"[A-Za-z0-9_-]{0,64}")
+
+
+@dataclass(frozen=True)
+class CameraAddress:
+    """Where the camera is; as its maker sets it, unless changed there."""
+
+    host: str = "10.0.65.50"
+    port: int = 8100
+    connect_s: float = 3.0
+
+
+@dataclass(frozen=True)
+class ControlPatience:
+    """How long a command may take from its first byte to the prompt, and how often reads are asked again."""
+
+    deadline_s: float = 5.0
+    retries: int = 2
+    pause_s: float = 0.5  # before connecting again
+
+
+@dataclass(frozen=True)
+class FileServer:
+    """The camera's FTP server, and how long it is waited for. User and password as public programs use them."""
+
+    host: str = "10.0.65.50"
+    port: int = 21
+    user: str = "ftpuser"
+    password: str = "ftpuser"
+    stall_s: float = 10.0  # for a reply, for logging in, and for least_kb_s * stall_s of a file
+    tries: int = 3  # without a byte gained in between
+    pause_s: float = 1.0
+    block: int = 1 << 16  # bytes handed over at a time
+    overlap: int = 4096  # last bytes held that are fetched again, to see that it is the same file
+    least_kb_s: float = 100.0  # of a file that comes; slower counts as stalled
+    read_twice: bool = True  # every byte, to see that no other came: FTP has no checksums of its own
+
+    @property
+    def where(self) -> str:
+        """The server in messages."""
+        return f"the camera's file server {self.host}:{self.port}"
+
+    def most_s(self, size: int) -> float:
+        """Seconds that a file of ``size`` bytes may take with all its tries."""
+        return 2 * size / (1e3 * self.least_kb_s) + 3 * self.tries * (self.stall_s + self.pause_s)
 
 
 @dataclass(frozen=True)

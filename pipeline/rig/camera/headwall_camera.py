@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from collections.abc import Sequence
+from dataclasses import replace
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_cubes import CapturedLines, Read, read_capture, read_references
-from pipeline.rig.camera.camera_files import fetch_files
+from pipeline.rig.camera.camera_files import Kept, Progress, RemoteFile, fetch_files
 from pipeline.rig.camera.camera_references import MeanFrame, mean_frame
-from pipeline.rig.camera.camera_settings import CameraLimits
-from pipeline.rig.camera.file_claims import FrameClaim, bounded
-from pipeline.rig.camera.file_session import FileServer
-from pipeline.rig.camera.headwall_control import ControlPatience, HeadwallControl
-from pipeline.rig.camera.kept_files import Kept, Progress, RemoteFile
-from pipeline.rig.camera.line_camera import Capture
+from pipeline.rig.camera.camera_settings import CameraAddress, CameraLimits, ControlPatience, FileServer
+from pipeline.rig.camera.headwall_control import HeadwallControl
+from pipeline.rig.camera.line_camera import Capture, FrameClaim
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
-from pipeline.rig.socket_transport import SocketTransport
+from pipeline.rig.transports import SocketTransport
 
-
-@dataclass(frozen=True)
-class CameraAddress:
-    """Where the camera is; as its maker sets it, unless changed there."""
-
-    host: str = "10.0.65.50"
-    port: int = 8100
-    connect_s: float = 3.0
+MOST_TEXT = 1 << 26  # bytes of a header, a frame index or another text: an index of two million frames
+MOST_OFFSET = 1 << 16  # bytes before the first frame of a cube; cameras write none
+MOST_REFERENCE_FRAMES = 2048
+MOST_FILES = 4096
+_RAW = re.compile(r"raw_\d+", re.IGNORECASE)
+_REFERENCE = re.compile(r"(dark|white)[a-z_]*", re.IGNORECASE)
 
 
 class HeadwallCamera:
@@ -37,9 +34,14 @@ class HeadwallCamera:
 
     @classmethod
     def at(
-        cls, address: CameraAddress, server: FileServer, *, patience: ControlPatience | None = None,
-        limits: CameraLimits | None = None, clock: Clock = SYSTEM_CLOCK,
-    ) -> HeadwallCamera:  # fmt: skip
+        cls,
+        address: CameraAddress,
+        server: FileServer,
+        *,
+        patience: ControlPatience | None = None,
+        limits: CameraLimits | None = None,
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> HeadwallCamera:
         """A camera on the network."""
 
         def connect() -> SocketTransport:
@@ -74,7 +76,13 @@ class HeadwallCamera:
         DeviceRefused, DeadlinePassed, DeviceGone
         """
         files = self._finished(folder, claim)
-        fetch_files(self.server, sorted(files, key=_rawness), kept, progress, clock=self.clock)
+
+        def is_large(file: RemoteFile) -> bool:
+            base = file.base.lower()
+            return base.startswith("raw_") and not base.endswith(".hdr")
+
+        files.sort(key=lambda file: (is_large(file), file.name))
+        fetch_files(self.server, files, kept, progress, clock=self.clock)
         return read_capture([file.name for file in files], _reader(kept))
 
     def references(self, folder: str, kept: Kept, *, claim: FrameClaim | None = None) -> dict[str, MeanFrame]:
@@ -84,7 +92,7 @@ class HeadwallCamera:
         ------
         RigError, DeviceRefused, DeadlinePassed, DeviceGone
         """
-        files = [file for file in self._finished(folder, claim) if _base(file).lower().startswith(("dark", "white"))]
+        files = [file for file in self._finished(folder, claim) if file.base.lower().startswith(("dark", "white"))]
         fetch_files(self.server, files, kept, clock=self.clock)
         cubes = read_references([file.name for file in files], _reader(kept))
         return {kind: mean_frame(cube.values) for kind, cube in cubes.items()}
@@ -106,14 +114,38 @@ class HeadwallCamera:
         raise RigError(f"{folder} was listed differently each time; look at the camera's network, then run again")
 
 
-def _base(file: RemoteFile) -> str:
-    return file.name.rsplit("/", 1)[-1]
-
-
-def _rawness(file: RemoteFile) -> tuple[bool, str]:
-    base = _base(file).lower()
-    return base.startswith("raw_") and not base.endswith(".hdr"), file.name
-
-
 def _reader(kept: Kept) -> Read:
     return lambda name: kept.read(name, 0, kept.size(name))
+
+
+def bounded(files: Sequence[RemoteFile], claim: FrameClaim) -> list[RemoteFile]:
+    """Give the files with the most that each can have: cubes what was asked for, references and texts a fixed number.
+
+    Raises
+    ------
+    RigError : one claims more, or all cubes together do, or there are too many files.
+    """
+    if len(files) > MOST_FILES:
+        raise RigError(f"the camera lists {len(files)} files in one capture, expected {MOST_FILES} at most; look there")
+    found, cubes = [], []
+    for file in files:
+        most = MOST_TEXT
+        if _RAW.fullmatch(file.base):
+            most = claim.frames * claim.frame_bytes + MOST_OFFSET
+            cubes.append(file)
+        elif _REFERENCE.fullmatch(file.base):
+            most = MOST_REFERENCE_FRAMES * claim.frame_bytes + MOST_OFFSET
+        _check(file.name, file.size or 0, most)
+        found.append(replace(file, most=most))
+    if cubes:
+        most = claim.frames * claim.frame_bytes + len(cubes) * MOST_OFFSET
+        _check(f"{cubes[0].name} with the cubes beside it", sum(file.size or 0 for file in cubes), most)
+    return found
+
+
+def _check(name: str, size: int, most: int) -> None:
+    if size > most:
+        raise RigError(
+            f"{name} is said to have {size} bytes, expected {most} at most; nothing of it is fetched: look at what the "
+            "camera wrote, and at camera.samples and the wavelengths in the settings"
+        )

@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from pipeline.errors import RigError, SettingsError
-from pipeline.rig.camera.camera_settings import CameraLimits, check_capture, check_times
-from pipeline.rig.camera.headwall_answers import (
+from pipeline.rig.camera.camera_files import RemoteFile
+from pipeline.rig.camera.camera_settings import CameraLimits, ControlPatience, check_capture, check_times
+from pipeline.rig.camera.headwall_replies import (
     MisfitError,
+    ReplyReader,
     as_folder,
     as_listing,
     as_stopped,
@@ -20,9 +21,8 @@ from pipeline.rig.camera.headwall_answers import (
     check_times_set,
     other_command,
     response_of,
+    to_request,
 )
-from pipeline.rig.camera.headwall_replies import ReplyReader, to_request
-from pipeline.rig.camera.kept_files import RemoteFile
 from pipeline.rig.camera.line_camera import Capture, CaptureUnknown
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
 from pipeline.rig.device_errors import DeadlinePassed, DeviceRefused, StateUnknown
@@ -32,15 +32,6 @@ LOG = logging.getLogger(__name__)
 LONGEST_GREETING = 1 << 16  # bytes
 MOST_PASSED_OVER = 32  # replies to other commands, while one is waited for
 Answer = TypeVar("Answer")
-
-
-@dataclass(frozen=True)
-class ControlPatience:
-    """How long a command may take from its first byte to the prompt, and how often reads are asked again."""
-
-    deadline_s: float = 5.0
-    retries: int = 2
-    pause_s: float = 0.5  # before connecting again
 
 
 class HeadwallControl:

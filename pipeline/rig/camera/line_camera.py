@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from pipeline.rig.camera.camera_cubes import CapturedLines
+from pipeline.rig.camera.camera_files import Kept, Progress
 from pipeline.rig.camera.camera_references import MeanFrame
-from pipeline.rig.camera.file_claims import FrameClaim
-from pipeline.rig.camera.kept_files import Kept, Progress
 from pipeline.rig.device_errors import StateUnknown
 
 
@@ -30,6 +29,20 @@ class CaptureUnknown(StateUnknown):
         super().__init__(message)
         self.capturing = capturing  # None where the camera did not say
         self.folders = folders  # that were not there before
+
+
+@dataclass(frozen=True)
+class FrameClaim:
+    """What a capture was asked for: frames, in all its cubes, of so many numbers of 16 bits."""
+
+    frames: int
+    samples: int
+    bands: int
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of a frame."""
+        return 2 * self.samples * self.bands
 
 
 class LineCameraDevice(Protocol):

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from pipeline.checked_lines import read_checked, with_check
-from pipeline.rig.camera.kept_files import Kept
+from pipeline.rig.camera.camera_files import Kept
 from pipeline.rig.capture.line_positions import CommandTimes, LinePositions
 from pipeline.scan import Sweep
 
@@ -25,7 +25,7 @@ _TIES = ("method", "residual_us", "residual_px", "offset_s", "drift_ppm")
 
 
 @dataclass(frozen=True)
-class Taken:
+class CaptureRecord:
     """Lines ``first`` to ``stop`` of a sweep, in a folder of the camera."""
 
     sweep: Sweep
@@ -38,6 +38,11 @@ class Taken:
     index_at_end: int | None = None  # cell of the path that was played last
     log: LoggedPath | None = None
     spent: str = ""  # why no line is to be had from it any more
+
+    @property
+    def commands(self) -> CommandTimes:
+        """When path and capture were begun."""
+        return CommandTimes(self.run_s, self.capture_s)
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,7 @@ class CaptureJournal:
 
     def __init__(self, kept: Kept) -> None:
         self._kept = kept
-        self._taken: dict[str, Taken] = {}
+        self._taken: dict[str, CaptureRecord] = {}
         self._origins: dict[str, int] = {}  # stamp of line 0 [us], by the sweep's name
         self._ties: dict[str, dict[str, Any]] = {}
         self._ended: set[str] = set()  # folders
@@ -76,26 +81,26 @@ class CaptureJournal:
         self.damage: list[str] = []
         self._read()
 
-    def holding(self, sweep: Sweep, line: int) -> Taken | None:
+    def holding(self, sweep: Sweep, line: int) -> CaptureRecord | None:
         """The latest capture that has a line of the sweep and is not spent."""
         fits = [one for one in self._taken.values() if one.sweep == sweep and one.first <= line < one.stop]
         return next((one for one in reversed(fits) if not one.spent), None)
 
-    def began(self, taken: Taken) -> None:
+    def began(self, taken: CaptureRecord) -> None:
         """Take down a capture that the camera acknowledged."""
         self._write({"what": "capture", **asdict(taken)})
 
-    def ended(self, taken: Taken) -> Taken:
+    def ended(self, taken: CaptureRecord) -> CaptureRecord:
         """Take down what was read of the mirror after the capture."""
         ended = {"folder": taken.folder, "index_at_end": taken.index_at_end}
         self._write({"what": "end", **ended, "log": None if taken.log is None else asdict(taken.log)})
         return self._taken[taken.folder]
 
-    def spend(self, taken: Taken, why: str) -> None:
+    def spend(self, taken: CaptureRecord, why: str) -> None:
         """Expect no further line of a capture."""
         self._write({"what": "spent", "folder": taken.folder, "why": why})
 
-    def tied(self, taken: Taken, how: LinePositions, notes: Sequence[str]) -> None:
+    def tied(self, taken: CaptureRecord, how: LinePositions, notes: Sequence[str]) -> None:
         """Take down how a capture's lines were tied to the mirror, once."""
         if taken.folder not in self._ties:
             said = {name: getattr(how, name) for name in _TIES}
@@ -105,12 +110,11 @@ class CaptureJournal:
     def captures(self) -> list[dict[str, Any]]:
         """Every capture in order: lines of which sweep, where on the camera, how they were tied, why none is left."""
         return [
-            {
-                "folder": one.folder, "sweep": one.sweep.name, "first": one.first, "stop": one.stop,
-                **self._ties.get(one.folder, {}), **({"spent": one.spent} if one.spent else {}),
-            }
+            {"folder": one.folder, "sweep": one.sweep.name, "first": one.first, "stop": one.stop}
+            | self._ties.get(one.folder, {})
+            | ({"spent": one.spent} if one.spent else {})
             for one in self._taken.values()
-        ]  # fmt: skip
+        ]
 
     def refer(self, folder: str) -> None:
         """Take down where the dark and white frames are."""
@@ -154,7 +158,15 @@ class CaptureJournal:
                 self._taken.pop(record["folder"], None)  # a camera that was emptied gives its folders' names again
                 self._ties.pop(record["folder"], None)
                 self._ended.discard(record["folder"])
-                self._taken[record["folder"]] = _taken(record)
+                self._taken[record["folder"]] = CaptureRecord(
+                    Sweep(**record["sweep"]),
+                    record["first"],
+                    record["stop"],
+                    record["folder"],
+                    record["triggered"],
+                    tuple(record["run_s"]),
+                    tuple(record["capture_s"]),
+                )
             case "end":
                 log = None if record["log"] is None else LoggedPath(**record["log"])
                 found = self._taken[record["folder"]]
@@ -168,15 +180,3 @@ class CaptureJournal:
                 self.references = record["folder"]
             case "origin":
                 self._origins[record["sweep"]] = record["stamp_us"]
-
-
-def commands_of(taken: Taken) -> CommandTimes:
-    """When path and capture were begun."""
-    return CommandTimes(taken.run_s, taken.capture_s)
-
-
-def _taken(record: dict[str, Any]) -> Taken:
-    return Taken(
-        Sweep(**record["sweep"]), record["first"], record["stop"], record["folder"], record["triggered"],
-        tuple(record["run_s"]), tuple(record["capture_s"]),
-    )  # fmt: skip

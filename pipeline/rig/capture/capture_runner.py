@@ -13,12 +13,10 @@ import numpy as np
 
 from pipeline.camera import LineCamera
 from pipeline.errors import RigError
-from pipeline.rig.camera.kept_files import Kept
-from pipeline.rig.camera.line_camera import Capture, LineCameraDevice
-from pipeline.rig.capture.capture_journal import CaptureJournal, LoggedPath, Taken
-from pipeline.rig.capture.capture_names import capture_prefix
-from pipeline.rig.capture.capture_paths import LEAD, CapturePath
-from pipeline.rig.capture.captured_sweep import UntiedError
+from pipeline.rig.camera.camera_files import Kept
+from pipeline.rig.camera.line_camera import LineCameraDevice
+from pipeline.rig.capture.capture_journal import CaptureJournal, CaptureRecord, LoggedPath
+from pipeline.rig.capture.capture_paths import LEAD, CapturePath, UntiedError, capture_prefix
 from pipeline.rig.capture.line_positions import MirrorTrack, line_edges
 from pipeline.rig.clock import Clock
 from pipeline.rig.mirror.registers import Trigger
@@ -60,15 +58,21 @@ class CaptureRunner:
     """Runs captures on devices that are connected, and takes down what they acknowledge."""
 
     def __init__(
-        self, devices: RigDevices, kept: Kept, journal: CaptureJournal, camera: LineCamera, rig: SurveyRig, *,
+        self,
+        devices: RigDevices,
+        kept: Kept,
+        journal: CaptureJournal,
+        camera: LineCamera,
+        rig: SurveyRig,
+        *,
         say: Say = say_nothing,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.devices = devices
         self._kept, self._journal = kept, journal
         self._camera, self._rig, self._say = camera, rig, say
         self._configured = False
 
-    def take(self, path: CapturePath) -> Taken:
+    def take(self, path: CapturePath) -> CaptureRecord:
         """Take the lines of a path, and wait until they are on the camera.
 
         Motions and the capture are sent once. Where something fails after the mirror or the camera has begun, both are
@@ -93,12 +97,13 @@ class CaptureRunner:
                 steering.start_log(self._log_rate_hz(path.lines))
                 capture = self.devices.camera.capture(path.lines, prefix=prefix)
                 run_s = self._run(path)
-            taken = _taken(path, capture, run_s)
+            at_s = (capture.sent_s, capture.acknowledged_s)
+            taken = CaptureRecord(path.sweep, path.first, path.stop, capture.folder, path.triggered, run_s, at_s)
             self._journal.began(taken)
             self.wait(taken)
         return self._end(taken)
 
-    def wait(self, taken: Taken) -> None:
+    def wait(self, taken: CaptureRecord) -> None:
         """Wait until a capture is over; one that goes on too long is stopped, and what it has counts.
 
         Raises
@@ -121,7 +126,7 @@ class CaptureRunner:
                 until, stopped = clock.now() + WRITING_S, True
             clock.sleep(min(max(began + wanted - clock.now(), POLL_S), 1.0))
 
-    def recovered(self, taken: Taken) -> Taken:
+    def recovered(self, taken: CaptureRecord) -> CaptureRecord:
         """Take down the end of a capture whose process did not live to see it; nothing has played since."""
         self.wait(taken)
         if not taken.triggered or taken.index_at_end is not None:
@@ -137,10 +142,10 @@ class CaptureRunner:
         with self._stopped_on_error():
             capture = self.devices.camera.capture(1, prefix=prefix)
             at = (capture.sent_s, capture.acknowledged_s)
-            self.wait(Taken(AT_REST, 0, 1, capture.folder, False, at, at))
+            self.wait(CaptureRecord(AT_REST, 0, 1, capture.folder, False, at, at))
         return capture.folder
 
-    def log_of(self, taken: Taken) -> MirrorTrack | None:
+    def log_of(self, taken: CaptureRecord) -> MirrorTrack | None:
         """Read the mirror's log of a capture; None where there is none.
 
         Raises
@@ -171,7 +176,7 @@ class CaptureRunner:
         self.devices.steering.run(0, len(path.cells), path.rate_hz, 1, trigger)
         return sent, clock.now()
 
-    def _end(self, taken: Taken) -> Taken:
+    def _end(self, taken: CaptureRecord) -> CaptureRecord:
         steering = self.devices.steering
         if taken.triggered:
             taken = replace(taken, index_at_end=steering.index())
@@ -211,10 +216,3 @@ class CaptureRunner:
                 with suppress(RigError):
                     stop()
             raise
-
-
-def _taken(path: CapturePath, capture: Capture, run_s: tuple[float, float]) -> Taken:
-    return Taken(
-        path.sweep, path.first, path.stop, capture.folder, path.triggered, run_s,
-        (capture.sent_s, capture.acknowledged_s),
-    )  # fmt: skip

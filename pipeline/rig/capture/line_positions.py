@@ -13,8 +13,17 @@ import numpy as np
 from pipeline.camera import LineCamera
 from pipeline.errors import RigError, ShapeError
 from pipeline.mirror import check_reach, direction_to_scene, position_to_direction
-from pipeline.rig.capture.clock_fit import Bools, Floats, Ints, fit_clocks, match_edges
-from pipeline.rig.capture.frame_times import FrameTimes, StampAt, mend_times, whole_numbers
+from pipeline.rig.capture.clock_fit import (
+    Bools,
+    Floats,
+    FrameTimes,
+    Ints,
+    StampAt,
+    fit_clocks,
+    match_edges,
+    mend_times,
+    whole_numbers,
+)
 
 Method = Literal["trigger", "log", "command"]
 _MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}  # exposures from the stamp to mid exposure

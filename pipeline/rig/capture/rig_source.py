@@ -26,15 +26,21 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera, bin_samples
 from pipeline.errors import RigError
-from pipeline.rig.camera.camera_files import NOT_LOGGED_IN
+from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
 from pipeline.rig.camera.camera_references import as_references
-from pipeline.rig.camera.file_claims import FrameClaim
-from pipeline.rig.camera.kept_files import Kept
-from pipeline.rig.capture.capture_journal import CaptureJournal, Taken
-from pipeline.rig.capture.capture_names import REFERENCES
-from pipeline.rig.capture.capture_paths import CapturePath, can_trigger, next_path, path_of
+from pipeline.rig.camera.line_camera import FrameClaim
+from pipeline.rig.capture.capture_journal import CaptureJournal, CaptureRecord
+from pipeline.rig.capture.capture_paths import (
+    REFERENCES,
+    CapturePath,
+    PlacedLines,
+    UntiedError,
+    can_trigger,
+    next_path,
+    path_of,
+    place_lines,
+)
 from pipeline.rig.capture.capture_runner import CaptureRunner, RigDevices, Say, say_nothing
-from pipeline.rig.capture.captured_sweep import PlacedLines, UntiedError, place_lines
 from pipeline.rig.device_errors import DeviceRefused, StateUnknown
 from pipeline.rig.survey_rig import SurveyRig
 from pipeline.scan import Sweep
@@ -73,9 +79,15 @@ class RigSource:
     name = "rig"
 
     def __init__(
-        self, view: RigView, open_devices: Callable[[], RigDevices], kept: Kept, *, rig: SurveyRig | None = None,
-        vector_pairs: int = 1500, say: Say = say_nothing,
-    ) -> None:  # fmt: skip
+        self,
+        view: RigView,
+        open_devices: Callable[[], RigDevices],
+        kept: Kept,
+        *,
+        rig: SurveyRig | None = None,
+        vector_pairs: int = 1500,
+        say: Say = say_nothing,
+    ) -> None:
         self.view = view
         self.rig = SurveyRig() if rig is None else rig
         self.vector_pairs = vector_pairs
@@ -201,7 +213,7 @@ class RigSource:
                 yield from (found.get(number) or self._lost(sweep, number) for number in given)
                 waiting = waiting[len(given) :]
 
-    def _found_again(self, runner: CaptureRunner, held: Taken, wanted: Sequence[int]) -> dict[int, Line]:
+    def _found_again(self, runner: CaptureRunner, held: CaptureRecord, wanted: Sequence[int]) -> dict[int, Line]:
         """Those of the lines that a capture gives yet, by number."""
         found: dict[int, Line] = {}
         try:
@@ -268,7 +280,7 @@ class RigSource:
         triggered = can_trigger(self.rig.pulses, sweep)
         return next_path(sweep, line, self.camera, vector_pairs=self.vector_pairs, triggered=triggered)
 
-    def _read(self, runner: CaptureRunner, taken: Taken, line: int) -> Iterator[Line]:
+    def _read(self, runner: CaptureRunner, taken: CaptureRecord, line: int) -> Iterator[Line]:
         """Fetch a capture and give its lines from ``line`` on."""
         try:
             captured = runner.devices.camera.fetch(
@@ -313,7 +325,7 @@ class RigSource:
             return (stamp_us - origin) * 1e-6 + half_s
         return number * self.camera.frame_ms * 1e-3 + half_s
 
-    def _give_up(self, taken: Taken, line: int, why: str, *, last: bool) -> None:
+    def _give_up(self, taken: CaptureRecord, line: int, why: str, *, last: bool) -> None:
         """Expect no more of a capture: what it lacks is captured again, unless that has been tried already."""
         self._journal.spend(taken, why)
         if last:

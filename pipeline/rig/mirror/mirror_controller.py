@@ -6,27 +6,24 @@ Written for the documented protocol and tested against an emulator; never run on
 from __future__ import annotations
 
 import logging
-from contextlib import AbstractContextManager
 from types import TracebackType
 
 from numpy.typing import ArrayLike
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
-from pipeline.rig.mirror.mirror_modes import Modes, check_identity, check_model
-from pipeline.rig.mirror.mirror_requests import ProLink, SimpleLink
+from pipeline.rig.mirror.mirror_requests import Modes, ProLink
 from pipeline.rig.mirror.mirror_settings import MirrorSettings
-from pipeline.rig.mirror.motion_log import Logger
-from pipeline.rig.mirror.path_player import PathPlayer, Play, hold_values, run_values
+from pipeline.rig.mirror.path_player import Logger, PathPlayer, Play, hold_values, run_values, upload
 from pipeline.rig.mirror.pro_payloads import Value, ask_status, cell_int, set_values
 from pipeline.rig.mirror.registers import Status, Trigger
 from pipeline.rig.mirror.steering import Identity, MotionLog, Progress, ReadBack, as_cells, wire_positions
 from pipeline.rig.mirror.transactions import Wire
-from pipeline.rig.mirror.vector_upload import upload
-from pipeline.rig.transports import Transport
+from pipeline.rig.transports import SerialTransport, Transport
 
 LOG = logging.getLogger(__name__)
 _POLL_S = 0.01
+KNOWN_MODELS = ("MR-E", "MRE")  # begin the ids of the controllers that the documents are of
 
 
 class MirrorController:
@@ -67,10 +64,14 @@ class MirrorController:
         DeadlinePassed, DeviceGone : nothing answers. RigError : another device does.
         """
         self._pairs, self._identity = 0, None
-        found = self._modes.connect()
-        check_identity(found, self.wire.port, self.settings.expected_id)
+        found, expected = self._modes.connect(), self.settings.expected_id
+        if expected.lower() not in found.device.lower():
+            raise RigError(
+                f"expected a controller whose id holds {expected!r} on {self.wire.port}, got {found.device!r}; is this "
+                "the mirror?"
+            )
         if known:
-            check_model(found, self.wire.port, self.settings.expected_id)
+            check_model(found, self.wire.port, expected)
         self._identity = found  # not before: closing parks what is connected, and another device is not moved
         return found
 
@@ -102,7 +103,8 @@ class MirrorController:
         ------
         RigError : a path plays; modes are not changed under it.
         """
-        with self._simple_mode("ask for its temperature") as lines:
+        self._check_idle("ask for its temperature")
+        with self._modes.simple() as lines:
             return lines.temperature()
 
     def goto(self, x: float, y: float) -> None:
@@ -234,10 +236,6 @@ class MirrorController:
             raise RigError(f"{name} is refused on {self.wire.port}; {status.sentence}; mend that first")
         self._link.move(set_values(values), name)
 
-    def _simple_mode(self, purpose: str) -> AbstractContextManager[SimpleLink]:
-        self._check_idle(purpose)
-        return self._modes.simple()
-
     def _check_idle(self, purpose: str) -> None:
         if self.is_playing():
             raise RigError(f"{self.wire.port} plays a path; {purpose} when that is over, or halt it")
@@ -245,3 +243,33 @@ class MirrorController:
     def _check_connected(self) -> None:
         if self._identity is None:
             raise RigError(f"{self.wire.port} is not connected; call connect first")
+
+
+def open_mirror(settings: MirrorSettings, clock: Clock = SYSTEM_CLOCK, *, known: bool = False) -> MirrorController:
+    """Open the port that the settings name and connect to the controller there, see its connect. Nothing moves.
+
+    Raises
+    ------
+    DeviceGone : no such port, in use, or not permitted. DeadlinePassed : nothing answers. RigError : another device.
+    """
+    mirror = MirrorController(SerialTransport(settings.port, settings.baud, clock), settings, clock)
+    try:
+        mirror.connect(known=known)
+    except BaseException:
+        mirror.close()
+        raise
+    return mirror
+
+
+def check_model(identity: Identity, port: str, expected: str) -> None:
+    """Refuse to move what is no controller that the documents are of, unless the settings expect it by its id.
+
+    Raises
+    ------
+    RigError : another model, or another device altogether.
+    """
+    if not expected and not identity.device.upper().startswith(KNOWN_MODELS):
+        raise RigError(
+            f"firmware not known on {port}: {identity.words}; expected an id that begins with {KNOWN_MODELS[0]}: is "
+            "another device at this port? If it is the mirror, set rig.expected_id to a part of its id"
+        )

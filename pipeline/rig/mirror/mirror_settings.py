@@ -7,8 +7,16 @@ from dataclasses import dataclass
 
 from pipeline.errors import SettingsError
 from pipeline.rig.mirror.steering import ReadBack
-from pipeline.rig.mirror.transactions import Patience
 from pipeline.vector_memory import Ends
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long a transaction may take, how often a read is asked again within that, and how long silence lasts. [s]"""
+
+    deadline_s: float = 1.0
+    retries: int = 2
+    quiet_s: float = 0.1
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from enum import IntEnum
 
 from pipeline.errors import ShapeError
 
-BOUNDARY, ESCAPE, TURNED = 0x7E, 0x7D, 0x20
+BOUNDARY, TURNED = 0x7E, 0x20
 MOST_PAYLOAD = 50
 _HEAD, _CRC = 3, 2  # bytes: address, command, size; and the check behind the payload
 _LONGEST = 2 * (_HEAD + MOST_PAYLOAD + _CRC)  # between boundaries, every byte escaped

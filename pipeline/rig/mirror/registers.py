@@ -14,7 +14,7 @@ CHANNELS = 2  # 0 is X, 1 is Y
 _FEEDBACK, _LOGGER, _MEMORY, _CHAIN = 0x23, 0x24, 0x26, 0x40
 _STATIC, _VECTOR_UNIT, _XY_CONTROL = 0x50, 0x68, 0xC0  # plus the channel
 
-FEEDBACK_A, FEEDBACK_B = _FEEDBACK << 8 | 0x00, _FEEDBACK << 8 | 0x01
+FEEDBACK_A = _FEEDBACK << 8 | 0x00  # of the first axis; the second's is the next one
 FEEDBACK_X, FEEDBACK_Y = _FEEDBACK << 8 | 0x02, _FEEDBACK << 8 | 0x03
 
 VECTOR_MEMORY = _MEMORY << 8  # one vector, shared by the channels
@@ -133,6 +133,10 @@ class ChannelRegisters:
     def vector(self, register: VectorRegister) -> int:
         """Id of a register of the vector unit."""
         return self.vector_system << 8 | register
+
+    def followed(self, system: int) -> dict[int, int]:
+        """Values that make the channel follow an input, controlled by position."""
+        return {self.control: self.xy_system, self.input: system}
 
 
 class VectorRegister(IntEnum):

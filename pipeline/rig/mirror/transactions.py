@@ -6,12 +6,12 @@ import logging
 import math
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 from pipeline.errors import RigError
 from pipeline.rig.clock import Clock
 from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
+from pipeline.rig.mirror.mirror_settings import Patience
 from pipeline.rig.transports import Transport
 
 LOG = logging.getLogger(__name__)
@@ -23,15 +23,6 @@ _READS = ("greeting", "read")
 Answer = TypeVar("Answer")
 # Takes bytes as they come and gives the answer once it is whole.
 Receiver = Callable[[bytes], Answer | None]
-
-
-@dataclass(frozen=True)
-class Patience:
-    """How long a transaction may take, how often a read is asked again within that, and how long silence lasts. [s]"""
-
-    deadline_s: float = 1.0
-    retries: int = 2
-    quiet_s: float = 0.1
 
 
 class Wire:

@@ -12,9 +12,9 @@ import re
 import time
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 from pipeline.errors import PipelineError, RigError
+from pipeline.rig.camera.camera_settings import FileServer
 from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, DeviceRefused
 
 MOST_REPLY = 1 << 16  # bytes
@@ -24,32 +24,6 @@ _SIZE = re.compile(r"213 +(\d{1,18})\s*")
 
 class DamagedTransfer(RigError):  # noqa: N818 - the name says what is the case
     """What came is no FTP or not the file, as it is where bytes are lost, doubled or put in between: asked again."""
-
-
-@dataclass(frozen=True)
-class FileServer:
-    """The camera's FTP server, and how long it is waited for. User and password as public programs use them."""
-
-    host: str = "10.0.65.50"
-    port: int = 21
-    user: str = "ftpuser"
-    password: str = "ftpuser"
-    stall_s: float = 10.0  # for a reply, for logging in, and for least_kb_s * stall_s of a file
-    tries: int = 3  # without a byte gained in between
-    pause_s: float = 1.0
-    block: int = 1 << 16  # bytes handed over at a time
-    overlap: int = 4096  # last bytes held that are fetched again, to see that it is the same file
-    least_kb_s: float = 100.0  # of a file that comes; slower counts as stalled
-    read_twice: bool = True  # every byte, to see that no other came: FTP has no checksums of its own
-
-    @property
-    def where(self) -> str:
-        """The server in messages."""
-        return f"the camera's file server {self.host}:{self.port}"
-
-    def most_s(self, size: int) -> float:
-        """Seconds that a file of ``size`` bytes may take with all its tries."""
-        return 2 * size / (1e3 * self.least_kb_s) + 3 * self.tries * (self.stall_s + self.pause_s)
 
 
 class FileSession(ftplib.FTP):
