@@ -48,7 +48,7 @@ class _Sums:
 
 
 class FetchedFiles:
-    """A :class:`pipeline.rig.camera.kept_files.Kept` in a folder, which is made when the first bytes come."""
+    """A :class:`pipeline.rig.camera.camera_files.Kept` in a folder, which is made when the first bytes come."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -97,8 +97,11 @@ def _ask_mirror(mirror: MirrorController, rows: list[CheckRow], *, move: bool) -
     try:
         playing = mirror.is_playing()
         rows.append(_status(mirror, playing=playing))
-        rows.append(_playing(playing))
-        if not playing:
+        if playing:
+            mend = "is another program at work? Else halt it: a survey would"
+            rows.append(CheckRow("mirror", "path", "a path plays", "warn", mend))
+        else:
+            rows.append(CheckRow("mirror", "path", "no path plays"))
             rows.append(CheckRow("mirror", "temperature", f"{mirror.temperature():.1f} deg C"))
     except RigError as error:
         rows.append(failed("mirror", "status", error))
@@ -133,13 +136,6 @@ def _status(mirror: MirrorController, *, playing: bool) -> CheckRow:
     if status:
         return CheckRow("mirror", "status", status.sentence, "warn", "have a look at the mirror before a survey")
     return CheckRow("mirror", "status", status.sentence)
-
-
-def _playing(playing: bool) -> CheckRow:
-    if playing:
-        mend = "is another program at work? Else halt it: a survey would"
-        return CheckRow("mirror", "path", "a path plays", "warn", mend)
-    return CheckRow("mirror", "path", "no path plays")
 
 
 def _move(mirror: MirrorController, rows: list[CheckRow]) -> None:

@@ -17,20 +17,23 @@ from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
 USB_ID = (0x0483, 0xA31E)  # vendor and product of the mirror controller
 _SLICE_S = 0.02  # reads wait in slices: by so much a deadline may be overrun
 _WRITE_S = 0.25  # a frame takes 10 ms at 115200
-_MOST_DRAINED = 1 << 16
+_MOST_DRAINED = 1 << 16  # bytes of a port that never ends
 _LEAST_WAIT_S = 0.001  # of a socket
 _MOST_DRAINED_TCP = 1 << 20
 
 
 class Transport(Protocol):
-    """A line to a device. Deadlines are moments of the clock that both ends of a call share."""
+    """A line to a device. Deadlines are moments of the clock that both ends of a call share.
+
+    Whatever speaks over it raises DeviceGone where the device is not there any more.
+    """
 
     @property
     def port(self) -> str:
         """Its name in messages."""
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Send all bytes."""
+        """Send all bytes; DeadlinePassed where they were not taken in time, and then some may have gone."""
 
     def read(self, at_most: int, deadline: float) -> bytes:
         """Wait for bytes and give those that are there; none where the deadline passes first."""
@@ -43,7 +46,7 @@ class Transport(Protocol):
 
 
 class SerialTransport:
-    """A serial port, held exclusively.
+    """A :class:`Transport` over a serial port, held exclusively.
 
     Parameters
     ----------
@@ -64,13 +67,6 @@ class SerialTransport:
         self._serial = _open(port, baud)
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Send all bytes.
-
-        Raises
-        ------
-        DeadlinePassed : the port did not take them in time; some may have gone.
-        DeviceGone : the port went away.
-        """
         if self._clock.now() >= deadline:
             raise DeadlinePassed(f"no time was left to send {len(data)} bytes to {self.port}; give a longer deadline")
         try:
@@ -83,12 +79,6 @@ class SerialTransport:
             raise self._gone(error) from error
 
     def read(self, at_most: int, deadline: float) -> bytes:
-        """Wait for bytes and give those that are there; none where the deadline passes first.
-
-        Raises
-        ------
-        DeviceGone : the port went away.
-        """
         try:
             while self._clock.now() < deadline:
                 first: bytes = self._serial.read(1)
@@ -100,12 +90,6 @@ class SerialTransport:
             raise self._gone(error) from error
 
     def drain(self) -> bytes:
-        """Give what is there already, without waiting; not more than 64 KiB of one that never ends.
-
-        Raises
-        ------
-        DeviceGone : the port went away.
-        """
         drained = b""
         try:
             while len(drained) < _MOST_DRAINED and (there := self._serial.in_waiting):
@@ -115,7 +99,6 @@ class SerialTransport:
         return drained
 
     def close(self) -> None:
-        """Let go of the port."""
         self._serial.close()
 
     def _gone(self, error: Exception) -> DeviceGone:
@@ -155,7 +138,7 @@ def _ports_here() -> str:
 
 
 class SocketTransport:
-    """A connection to ``host:port``.
+    """A :class:`Transport` to ``host:port``.
 
     Raises
     ------
@@ -181,13 +164,6 @@ class SocketTransport:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Send all bytes.
-
-        Raises
-        ------
-        DeadlinePassed : they were not taken in time; some may have gone.
-        DeviceGone : the connection was lost.
-        """
         left = deadline - self._clock.now()
         if left <= 0:
             raise DeadlinePassed(f"no time was left to send {len(data)} bytes to {self.port}; give a longer deadline")
@@ -200,12 +176,6 @@ class SocketTransport:
             raise self._gone(str(error)) from error
 
     def read(self, at_most: int, deadline: float) -> bytes:
-        """Wait for bytes and give those that are there; none where the deadline passes first.
-
-        Raises
-        ------
-        DeviceGone : the connection was lost, or closed by the other end.
-        """
         left = deadline - self._clock.now()
         if left <= 0:
             return b""
@@ -222,12 +192,6 @@ class SocketTransport:
         return data
 
     def drain(self) -> bytes:
-        """Give what is there already, without waiting.
-
-        Raises
-        ------
-        DeviceGone : the connection was lost, or closed by the other end.
-        """
         drained = b""
         self._socket.setblocking(False)
         try:
@@ -245,7 +209,6 @@ class SocketTransport:
         return drained
 
     def close(self) -> None:
-        """Hang up."""
         self._socket.close()
 
     def _gone(self, why: str) -> DeviceGone:

@@ -114,13 +114,16 @@ def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
     RigError : there is no line, a header is missing, wrong or promises less, or the files do not belong together.
     """
     by_name = {name.rsplit("/", 1)[-1]: name for name in names}
-    firsts = sorted(int(match[1]) for name in by_name if (match := _PART.fullmatch(name)))
+    raw = sorted((int(match[1]), name) for name in by_name if (match := _PART.fullmatch(name)))
     notes: list[str] = []
-    parts = [(first, _read_cube(by_name, _named(by_name, _PART, first), read)) for first in firsts]
-    parts = [(first, cube) for first, cube in parts if len(cube.values)]
+    parts = [(first, cube) for first, name in raw if len((cube := _read_cube(by_name, name, read)).values)]
     if not parts:
         raise RigError(f"no whole line in {', '.join(sorted(by_name)) or 'an empty folder'}; capture again")
-    _check_alike(parts)
+    sizes = {cube.values.shape[1:] for _, cube in parts}
+    if len(sizes) > 1:
+        raise RigError(
+            f"parts of one capture have frames of {sorted(sizes)} (sample, band); they are of several captures"
+        )
     placed = _placed(parts, notes)
     lost = placed[-1][2].lost
     if lost > MOST_MISSING:
@@ -141,7 +144,9 @@ def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
             notes.append(
                 f"raw_{first} is cut off: {len(cube.values)} of {len(cube.values) + cube.lost} lines are whole"
             )
-        _put_times(times, slice(start, stop), _times(by_name, first, cube, read, notes))
+        if (own := _times(by_name, first, cube, read, notes)) is not None:
+            times.frame[start:stop], times.stamp_us[start:stop] = own.frame, own.stamp_us
+            times.exposure_ms[start:stop] = own.exposure_ms
     return CapturedLines(values, valid, parts[0][0], times, parts[0][1].header.wavelength_nm, tuple(notes))
 
 
@@ -181,18 +186,6 @@ def _read_cube(by_name: Mapping[str, str], name: str, read: Read) -> CubeLines:
     return cube_lines(found, data)
 
 
-def _named(by_name: Mapping[str, str], pattern: re.Pattern[str], number: int) -> str:
-    return next(name for name in by_name if (match := pattern.fullmatch(name)) and int(match[1]) == number)
-
-
-def _check_alike(parts: list[tuple[int, CubeLines]]) -> None:
-    sizes = {cube.values.shape[1:] for _, cube in parts}
-    if len(sizes) > 1:
-        raise RigError(
-            f"parts of one capture have frames of {sorted(sizes)} (sample, band); they are of several captures"
-        )
-
-
 def _placed(parts: list[tuple[int, CubeLines]], notes: list[str]) -> list[tuple[int, int, CubeLines]]:
     """Start line, first frame and lines of each part."""
     placed: list[tuple[int, int, CubeLines]] = []
@@ -225,11 +218,6 @@ def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, 
     own = times_of_lines(index, first, len(cube.values), cube.lost)
     notes += [*index.notes, *(f"{name}: {note}" for note in own.notes)]
     return own
-
-
-def _put_times(times: LineTimes, lines: slice, own: LineTimes | None) -> None:
-    if own is not None:
-        times.frame[lines], times.stamp_us[lines], times.exposure_ms[lines] = own.frame, own.stamp_us, own.exposure_ms
 
 
 def _whole(fields: Mapping[str, str], key: str, where: str) -> int:

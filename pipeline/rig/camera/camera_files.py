@@ -74,26 +74,26 @@ class KeptInMemory:
     files: dict[str, bytearray] = field(default_factory=dict)
 
     def size(self, name: str) -> int:
-        """Bytes held of a file; 0 of one that is not there."""
         return len(self.files.get(name, b""))
 
     def read(self, name: str, start: int, stop: int) -> bytes:
-        """Some of the bytes held."""
         return bytes(self.files.get(name, bytearray())[start:stop])
 
     def append(self, name: str, data: bytes) -> None:
-        """Add bytes at the end."""
         self.files.setdefault(name, bytearray()).extend(data)
 
     def drop(self, name: str) -> None:
-        """Hold no byte of a file any more."""
         self.files.pop(name, None)
 
 
 def fetch_files(
-    server: FileServer, files: Sequence[RemoteFile], kept: Kept, progress: Progress | None = None, *,
+    server: FileServer,
+    files: Sequence[RemoteFile],
+    kept: Kept,
+    progress: Progress | None = None,
+    *,
     clock: Clock = SYSTEM_CLOCK,
-) -> None:  # fmt: skip
+) -> None:
     """Fetch files one after the other until ``kept`` holds them whole.
 
     What is held from an earlier call is compared before anything is added to it. A transfer that breaks off is taken

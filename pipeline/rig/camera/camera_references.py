@@ -66,13 +66,17 @@ def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:
         notes.append(f"{np.count_nonzero(jumping)} of {jumping.size} elements jump amid the frames")
     return MeanFrame(
         (total / count).astype(np.float32), noise.astype(np.float32), count, stuck, jumping, odd, tuple(notes)
-    )  # fmt: skip
+    )
 
 
 def as_references(
-    dark: MeanFrame, white: MeanFrame, *, panel: ArrayLike = 1.0, saturated_dn: float | None = None,
+    dark: MeanFrame,
+    white: MeanFrame,
+    *,
+    panel: ArrayLike = 1.0,
+    saturated_dn: float | None = None,
     criteria: BadElementCriteria | None = None,
-) -> tuple[References, tuple[str, ...]]:  # fmt: skip
+) -> tuple[References, tuple[str, ...]]:
     """Join dark and white into the references of a sweep, and say what was found.
 
     An element is bad where its dark frame is stuck, where either jumps amid its frames, or where

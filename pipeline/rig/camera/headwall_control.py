@@ -39,7 +39,8 @@ class HeadwallControl:
 
     After a reply that was late or damaged the connection is given up and made anew, so that what comes late is never
     taken for the next command's reply. ``connect`` makes a connection; ``capture_root`` is the folder that new folders
-    appear in (assumed; the reply to a capture shows it).
+    appear in (assumed; the reply to a capture shows it). Commands raise DeviceRefused, DeadlinePassed or DeviceGone
+    besides what they say themselves.
     """
 
     def __init__(
@@ -70,7 +71,6 @@ class HeadwallControl:
         SettingsError : a time is none, too short (given in seconds?), or the exposure is longer than the period.
         RigError : the camera says that it set others.
         StateUnknown : a capture may be running, see ``capture``.
-        DeviceRefused, DeadlinePassed, DeviceGone
         """
         check_times(exposure_ms, frame_period_ms, self.limits)
         with self._lock:
@@ -87,7 +87,6 @@ class HeadwallControl:
         Raises
         ------
         CaptureUnknown : it was sent and not acknowledged. SettingsError : a number or the prefix cannot be used.
-        DeviceRefused : the camera did not begin. DeadlinePassed, DeviceGone : it could not be sent.
         """
         check_capture(frames, cubes, prefix)
         with self._lock:
@@ -111,21 +110,11 @@ class HeadwallControl:
             return Capture(folder, sent_s, self.clock.now(), frames, cubes)
 
     def is_capturing(self) -> bool:
-        """Ask whether a capture runs.
-
-        Raises
-        ------
-        DeviceRefused, DeadlinePassed, DeviceGone
-        """
+        """Ask whether a capture runs."""
         return self._ask("isCapturing", None, as_truth)
 
     def stop_capture(self) -> bool:
-        """End a capture; False where none ran. Stopping twice does no harm, so it is asked again without a reply.
-
-        Raises
-        ------
-        DeviceRefused, DeadlinePassed, DeviceGone
-        """
+        """End a capture; False where none ran. Stopping twice does no harm, so it is asked again without a reply."""
         try:
             return self._ask("stopCapture", None, as_stopped)
         except DeviceRefused:
@@ -134,12 +123,7 @@ class HeadwallControl:
             return False
 
     def list_files(self, folder: str) -> list[RemoteFile]:
-        """List one folder, in the order of names.
-
-        Raises
-        ------
-        SettingsError : the folder's name is empty. DeviceRefused, DeadlinePassed, DeviceGone
-        """
+        """List one folder, in the order of names; SettingsError for an empty name."""
         if not folder:
             raise SettingsError("expected a folder of the camera to list, such as /captured, got an empty name")
         return self._ask("listFiles", folder, as_listing)

@@ -142,12 +142,7 @@ def other_command(said: Said, name: str) -> str:
 
 
 def check_repeated(said: Said, sent: str, port: str) -> None:
-    """Refuse a reply to other words than were sent: they, or those that came back, were damaged on their way.
-
-    Raises
-    ------
-    RigError : the camera repeats a command with its argument, and it is another one.
-    """
+    """Refuse a reply to other words than were sent (RigError): they, or those that came back, were damaged."""
     if "(" in said.echo and said.echo.split() != sent.split():
         raise RigError(
             f"{port} took {said.echo[:200]!r}, sent was {sent[:200]!r}; look at the network between here and the camera"
@@ -179,12 +174,7 @@ def response_of(said: Said, name: str, port: str) -> Any:
 
 
 def as_folder(response: Any) -> str:
-    """The folder of a capture.
-
-    Raises
-    ------
-    MisfitError : this answers another command.
-    """
+    """The folder of a capture; MisfitError where this answers another command."""
     folder = response.get("folder") if isinstance(response, dict) else None
     if not isinstance(folder, str) or not folder:
         raise MisfitError("a reply without a folder")
@@ -193,12 +183,7 @@ def as_folder(response: Any) -> str:
 
 
 def check_times_set(response: Any, asked_ms: Mapping[str, float]) -> None:
-    """Compare the times that were set, as far as the response tells them, with those that were asked for. [ms]
-
-    Raises
-    ------
-    RigError : another time was set.
-    """
+    """Refuse other times [ms] than were asked for, as far as the response tells what was set (RigError)."""
     told = response if isinstance(response, dict) else {}
     for name, wanted in asked_ms.items():
         found = told.get(name, wanted)
@@ -209,12 +194,7 @@ def check_times_set(response: Any, asked_ms: Mapping[str, float]) -> None:
 
 
 def as_truth(response: Any) -> bool:
-    """Whether it captures.
-
-    Raises
-    ------
-    MisfitError : this answers another command.
-    """
+    """Whether it captures; MisfitError where this answers another command."""
     value = response.get("capturing") if isinstance(response, dict) else response
     if not isinstance(value, bool):
         raise MisfitError("a reply that is neither true nor false")

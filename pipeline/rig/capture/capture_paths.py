@@ -143,12 +143,7 @@ def next_path(sweep: Sweep, first: int, camera: LineCamera, *, vector_pairs: int
 
 
 def path_of(sweep: Sweep, lines: tuple[int, int], camera: LineCamera, *, triggered: bool) -> CapturePath:
-    """Give the path of some of the sweep's lines.
-
-    Raises
-    ------
-    PoseError : a position is beyond the mirror's disk.
-    """
+    """Give the path of some of the sweep's lines; PoseError where a position is beyond the mirror's disk."""
     held: NDArray[Any] = sweep_positions(sweep, camera)[slice(*lines)].reshape(-1, 2)
     lead = held[:LEAD] if triggered else held[:0]
     cells, middle = (

@@ -170,9 +170,14 @@ def fit_clocks(stamp_us: Ints, mirror_s: Floats) -> ClockFit:
 
 
 def match_edges(
-    stamp_us: Ints, number: Ints, edge_s: Floats, *, log_s: tuple[float, float], period_s: float,
+    stamp_us: Ints,
+    number: Ints,
+    edge_s: Floats,
+    *,
+    log_s: tuple[float, float],
+    period_s: float,
     first_near_s: float | None = None,
-) -> Ints:  # fmt: skip
+) -> Ints:
     """Say which edge each frame belongs to.
 
     Frames repeat at a steady rate, so one frame's edge must be known: the first edge is that of frame 0 where the log

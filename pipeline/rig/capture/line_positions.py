@@ -124,9 +124,7 @@ def lines_by_log(
         return _by_offset(frames, camera, track, stamp, float(first_s) + track.time_s[0], commands, notes)
     log_s = (float(track.time_s[0]), float(track.time_s[-1]))
     near = None if first_s is None else float(first_s) + log_s[0]
-    edge = match_edges(
-        stamp, number, track.edge_s, log_s=log_s, period_s=frames.period_ms * 1e-3, first_near_s=near
-    )  # fmt: skip
+    edge = match_edges(stamp, number, track.edge_s, log_s=log_s, period_s=frames.period_ms * 1e-3, first_near_s=near)
     tied = edge >= 0
     if not tied.any():
         raise RigError(
@@ -170,9 +168,16 @@ def lines_by_commands(
     px = _apart_px(track, camera, (middle_s[valid], middle_s[valid] + unknown_s))
     notes.append(f"software timing: a constant line offset of about {px:.2g} px stays")
     return LinePositions(
-        found, np.where(valid, middle_s - begins_s, np.nan), valid, "command", unknown_s * 1e6, px, begins_s, None,
+        found,
+        np.where(valid, middle_s - begins_s, np.nan),
+        valid,
+        "command",
+        unknown_s * 1e6,
+        px,
+        begins_s,
+        None,
         tuple(notes),
-    )  # fmt: skip
+    )
 
 
 def line_edges(index: Ints, time_s: Floats, first: int, step: int) -> Floats:
@@ -189,9 +194,14 @@ def line_edges(index: Ints, time_s: Floats, first: int, step: int) -> Floats:
 
 
 def _by_offset(
-    frames: FrameTimes, camera: LineCamera, track: MirrorTrack, stamp: Ints, first_s: float,
-    commands: CommandTimes | None, notes: list[str],
-) -> LinePositions:  # fmt: skip
+    frames: FrameTimes,
+    camera: LineCamera,
+    track: MirrorTrack,
+    stamp: Ints,
+    first_s: float,
+    commands: CommandTimes | None,
+    notes: list[str],
+) -> LinePositions:
     """Logged positions by an offset alone, from the commands' times."""
     assert commands is not None
     number = whole_numbers(frames.number)[0]
@@ -234,8 +244,10 @@ def _apart_px(track: MirrorTrack, camera: LineCamera, times: tuple[Floats, Float
 
 def _check_track(track: MirrorTrack) -> None:
     if track.time_s.ndim != 1 or not len(track.time_s) or track.position.shape != (len(track.time_s), 2):
-        raise ShapeError(f"expected logged times (sample,) and positions (sample, 2), got {track.time_s.shape} and "
-                         f"{track.position.shape}")  # fmt: skip
+        raise ShapeError(
+            f"expected logged times (sample,) and positions (sample, 2), got {track.time_s.shape} and "
+            f"{track.position.shape}"
+        )
 
 
 def _unknown_s(commands: CommandTimes) -> float:

@@ -40,7 +40,7 @@ _SLICE_S = 0.05  # how soon threads see that they are to end
 
 @dataclass
 class InProcessCameraLine:
-    """A transport to ``device``; both share the clock."""
+    """A :class:`~pipeline.rig.transports.Transport` to ``device``; both share the clock."""
 
     device: CameraDevice
     clock: Clock
@@ -53,23 +53,11 @@ class InProcessCameraLine:
         self._say(self.device.greet())
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Send all bytes, at once.
-
-        Raises
-        ------
-        DeviceGone : the camera hung up, or the line is closed.
-        """
         self._check_open()
         chunks, self._open = self._talk.feed(data)
         self._say(chunks)
 
     def read(self, at_most: int, deadline: float) -> bytes:
-        """Wait for bytes and give those that are there; none where the deadline passes first.
-
-        Raises
-        ------
-        DeviceGone : the camera hung up, and all that it had said is read.
-        """
         if not self._coming:
             self._check_open()
         if not self._coming or self._coming[0][0] > deadline:
@@ -82,14 +70,12 @@ class InProcessCameraLine:
         return data[:at_most]
 
     def drain(self) -> bytes:
-        """Give what is there already."""
         found = b""
         while self._coming and self._coming[0][0] <= self.clock.now():
             found += self._coming.popleft()[1]
         return found
 
     def close(self) -> None:
-        """Hang up; what the camera still had to say is lost."""
         self._open = False
         self._coming.clear()
 
@@ -169,8 +155,7 @@ class CameraServer:
     def _serve_control(self) -> None:
         while not self._ended.is_set():
             with suppress(TimeoutError):
-                connection, _ = self._listener.accept()
-                self._start(self._talk, connection)
+                self._start(self._talk, self._listener.accept()[0])
 
     def _talk(self, connection: socket.socket) -> None:
         """One client, until it says exit, goes away, or the server closes."""

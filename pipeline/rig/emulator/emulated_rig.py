@@ -19,7 +19,6 @@ import logging
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import TracebackType
 
 from pipeline.errors import SettingsError
 from pipeline.rig.camera.camera_settings import FileServer
@@ -50,11 +49,9 @@ class FastClock:
         self._began = SYSTEM_CLOCK.now()
 
     def now(self) -> float:
-        """Give the moment. [s]"""
         return (SYSTEM_CLOCK.now() - self._began) * self.speed
 
     def sleep(self, seconds: float) -> None:
-        """Wait until so much of this clock's time has passed; nothing for a time that is not above 0. [s]"""
         SYSTEM_CLOCK.sleep(seconds / self.speed)
 
 
@@ -195,9 +192,7 @@ class ServedRig:
     def __enter__(self) -> ServedRig:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:

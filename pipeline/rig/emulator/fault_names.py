@@ -149,12 +149,7 @@ def fault_table() -> list[tuple[str, str, str]]:
 
 
 def make_fault(name: str, seed: int = 0, at: int | None = None) -> Fault:
-    """Build a fault of the mirror; the seed says when it strikes and how, ``at`` at which opportunity instead.
-
-    Raises
-    ------
-    SettingsError : no such kind, or an opportunity below 0.
-    """
+    """Build a fault of the mirror (SettingsError: there is none); the seed says when and how, ``at`` when instead."""
     if name not in KINDS:
         raise SettingsError(f"there is no fault {name!r}; there are {', '.join(sorted(KINDS))}")
     if at is not None and at < 0:
@@ -163,12 +158,7 @@ def make_fault(name: str, seed: int = 0, at: int | None = None) -> Fault:
 
 
 def read_fault(text: str) -> Fault:
-    """Build a fault of the mirror from ``name`` or ``name:seed``.
-
-    Raises
-    ------
-    SettingsError : no such kind, or a seed that is no whole number.
-    """
+    """Build a fault of the mirror from ``name`` or ``name:seed`` (SettingsError: it is neither)."""
     name, _, seed = text.partition(":")
     if seed and not seed.lstrip("-").isdecimal():
         raise SettingsError(f"expected a fault as name or name:seed with a whole number, got {text!r}")

@@ -74,12 +74,7 @@ class MirrorDevice:
             return [chunk for fault in self.faults for chunk in fault.opened(self)]
 
     def receive(self, data: bytes) -> list[Chunk]:
-        """Take bytes, and give what comes back as (delay from now [s], bytes).
-
-        Raises
-        ------
-        VanishedError : a fault took the device away.
-        """
+        """Take bytes and give what comes back; VanishedError where a fault took the device away."""
         self.take_pulses()
         with self._lock:
             if self.gone:

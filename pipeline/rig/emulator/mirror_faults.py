@@ -167,7 +167,6 @@ class SpoiltReply(Fault):
     lasting: bool = False
 
     def outgoing(self, device: StruckMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
-        """Spoil the reply whose turn it is."""
         if not chunks or not (self.chance.lasts() if self.lasting else self.chance.comes()):
             return chunks
         return self.spoil(device, chunks, self.chance.random)
@@ -180,7 +179,6 @@ class OldReplyAgain(Fault):
     last: bytes = b""
 
     def outgoing(self, device: StruckMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
-        """Send the old reply first, when the turn has come."""
         whole = b"".join(data for _, data in chunks)
         if not whole:
             return chunks
@@ -194,7 +192,6 @@ class StaleBytes(Fault):
     """What another program asked for lies in the port when it is opened, and some more follows."""
 
     def opened(self, device: StruckMirror) -> list[Chunk]:
-        """Give what was left behind, in two parts."""
         self.chance.struck += 1
         left = self.chance.random.choice(_LEFT_BEHIND)
         cut = self.chance.random.randrange(1, len(left))
@@ -208,7 +205,6 @@ class RequestByte(Fault):
     change: Change
 
     def incoming(self, device: StruckMirror, data: bytes) -> bytes:
-        """Change the byte whose turn it is."""
         out = b""
         for byte in data:
             one = bytes((byte,))
@@ -221,7 +217,6 @@ class ProAtConnect(Fault):
     """An earlier session left the controller in pro mode."""
 
     def begin(self, device: StruckMirror) -> None:
-        """Be in one of the two pro modes."""
         self.chance.struck += 1
         device.set_mode(self.chance.random.choice((Mode.PRO, Mode.PRO_CRC)))
 
@@ -234,7 +229,6 @@ class SilentReset(Fault):
     commands: Collection[int] | None = None  # frames that can be struck; None is any request
 
     def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
-        """Restart instead of an answer."""
         if (self.commands is not None and request.command not in self.commands) or not self.chance.comes():
             return None
         device.restart(boot_s=self.boot_s)
@@ -248,7 +242,6 @@ class AnswersLine(Fault):
     answer: str
 
     def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
-        """Refuse the line whose turn it is."""
         if request.mode is not Mode.SIMPLE or not self.chance.comes():
             return None
         return self.answer.encode("ascii") + END
@@ -262,7 +255,6 @@ class AnswersError(Fault):
     commands: Collection[int] | None = None  # that can be struck; None is any
 
     def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
-        """Refuse the frame whose turn it is."""
         command = request.command
         if command is None or (self.commands is not None and command not in self.commands):
             return None
@@ -274,7 +266,6 @@ class CellLost(Fault):
     """One cell of the vector memory keeps what it held, though its writing is acknowledged."""
 
     def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
-        """Carry the request out and put one of the cells that it changes back."""
         if request.frame is None or request.command != Command.SET_VECTOR or len(request.frame.payload) < 5 + CELL:
             return None
         register, offset, length, _ = read_vector(request.frame.payload)
@@ -297,7 +288,6 @@ class StatusBit(Fault):
     bit: Status
 
     def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
-        """Take the request for an opportunity, no more."""
         if self.chance.lasts():
             device.state.flags |= self.bit
         return None
@@ -308,7 +298,6 @@ class OtherFirmware(Fault):
     """The controller is another model of its maker."""
 
     def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
-        """Say who it is."""
         if request.line in _OTHER_TEXTS:
             self.chance.struck += 1
             return _OTHER_TEXTS[request.line].encode("ascii") + END
@@ -323,7 +312,6 @@ class GoneBefore(Fault):
     """The device goes away before a request reaches it."""
 
     def incoming(self, device: StruckMirror, data: bytes) -> bytes:
-        """Go, when the turn has come."""
         if self.chance.comes():
             device.gone = True
             raise VanishedError("the device went away")
@@ -335,7 +323,6 @@ class GoneWithin(Fault):
     """The device goes away in the middle of a request, of which it took a part."""
 
     def incoming(self, device: StruckMirror, data: bytes) -> bytes:
-        """Take the bytes before the one whose turn it is, and go."""
         for place in range(len(data)):
             if self.chance.comes():
                 device.gone = True
@@ -348,7 +335,6 @@ class GoneAfter(Fault):
     """The device carries a request out and goes away before it answers."""
 
     def outgoing(self, device: StruckMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
-        """Go, when the turn has come."""
         if self.chance.comes():
             device.gone = True
             return []
@@ -360,7 +346,6 @@ class PortHangs(Fault):
     """From one request on the port takes no more bytes, and writing to it blocks."""
 
     def incoming(self, device: StruckMirror, data: bytes) -> bytes:
-        """Take none, once the turn has come."""
         if self.chance.lasts():
             device.hung = True
             return b""
@@ -372,7 +357,6 @@ class Echo(Fault):
     """A loop of wire instead of a controller: all that is sent comes back."""
 
     def instead(self, device: StruckMirror, data: bytes) -> list[Chunk]:
-        """Send the bytes back."""
         self.chance.struck += 1
         return [Chunk(device.unit.turnaround_s, data)]
 
@@ -384,7 +368,6 @@ class Modem(Fault):
     typed: bytes = field(default=b"", init=False)
 
     def instead(self, device: StruckMirror, data: bytes) -> list[Chunk]:
-        """Show the bytes, and answer the lines that they end."""
         self.chance.struck += 1
         answers = []
         for byte in data:

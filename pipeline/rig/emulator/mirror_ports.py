@@ -10,7 +10,6 @@ import threading
 import tty
 from dataclasses import dataclass, field
 from itertools import count
-from types import TracebackType
 
 from pipeline.errors import RigError
 from pipeline.rig.clock import Clock
@@ -26,9 +25,9 @@ _RETRY_S = 0.005  # of a user who does not read
 
 @dataclass
 class InProcessTransport:
-    """A transport to ``device``; both share the clock. ``sent`` are the writes, for whoever checks what was sent.
+    """A :class:`~pipeline.rig.transports.Transport` to ``device``; both share the clock.
 
-    ``baud`` paces both directions; 0 does not.
+    ``sent`` are the writes, for whoever checks what was sent. ``baud`` paces both directions; 0 does not.
     """
 
     device: MirrorDevice
@@ -45,12 +44,6 @@ class InProcessTransport:
         self._schedule(self.device.opened())
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Send all bytes, which takes their time on the line.
-
-        Raises
-        ------
-        DeadlinePassed : the port took none until then. DeviceGone : there is no device any more.
-        """
         self._check_open()
         self.sent.append(data)
         if self.device.hung:
@@ -63,12 +56,6 @@ class InProcessTransport:
             raise self._gone() from error
 
     def read(self, at_most: int, deadline: float) -> bytes:
-        """Wait for bytes and give those that are there; none where the deadline passes first.
-
-        Raises
-        ------
-        DeviceGone : there is no device any more.
-        """
         self._check_open()
         if not self._due and self.device.gone:
             raise self._gone()
@@ -80,7 +67,6 @@ class InProcessTransport:
         return data[:at_most]
 
     def drain(self) -> bytes:
-        """Give what is there already."""
         self._check_open()
         data = b""
         while self._due and self._due[0][0] <= self.clock.now():
@@ -88,7 +74,6 @@ class InProcessTransport:
         return data
 
     def close(self) -> None:
-        """Let go of the device; what it still had to say is lost."""
         self._closed = True
         self._due.clear()
 
@@ -130,18 +115,11 @@ class EmulatedPort:
         self.open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def open(self) -> str:
-        """Make the pty and serve it; give the name that users open.
-
-        Raises
-        ------
-        RigError : it is open, or this system has no ptys.
-        """
+        """Make the pty, serve it, and give the name that users open; RigError where this system has no ptys."""
         if self._thread is not None:
             raise RigError(f"the emulated port {self.path} is open; close it first")
         try:
@@ -191,12 +169,7 @@ class _Line:
         self._greeted = False
 
     def serve(self, stop: int) -> None:
-        """Carry bytes until the descriptor ``stop`` is closed at its other end.
-
-        Raises
-        ------
-        VanishedError : the device went away, and all that it had sent is delivered.
-        """
+        """Carry bytes until ``stop`` is closed at its other end; VanishedError once device and bytes are gone."""
         while True:
             heard = [stop] if self._device.hung else [stop, self._master]
             ready, _, _ = select.select(heard, [], [], self._patience())

@@ -73,12 +73,7 @@ class Register:
         return int_cell(int(value)) if self.whole else float_cell(float(value))
 
     def check(self, cell: bytes) -> float | int:
-        """Read a cell that is to be written.
-
-        Raises
-        ------
-        RefusedError : the register is read only, or the value is out of its range.
-        """
+        """Read a cell that is to be written; RefusedError where it may not be, or is out of range."""
         if self.write is None:
             raise RefusedError(ErrorCode.READ_ONLY)
         value: float | int = cell_int(cell) if self.whole else cell_float(cell)
@@ -146,12 +141,7 @@ class RegisterFile:
         return acknowledge(command)
 
     def get(self, number: int) -> bytes:
-        """Give a register's cell.
-
-        Raises
-        ------
-        RefusedError : there is no such register.
-        """
+        """Give a register's cell; RefusedError where there is no such register."""
         self._state.advance()
         return self._find(number).to_cell()
 
@@ -172,12 +162,7 @@ class RegisterFile:
         self._state.aim()
 
     def get_cells(self, number: int, offset: int, length: int) -> bytes:
-        """Give cells of the vector memory or of a slot of the logger; offset and length in bytes.
-
-        Raises
-        ------
-        RefusedError : no such vector, not whole cells, beyond the vector's end, or more than a frame carries.
-        """
+        """Give whole cells of the vector memory or of a log's slot (else RefusedError); offset and length in bytes."""
         start, stop = _cells(offset, length)
         if number == VECTOR_MEMORY:
             _within(stop, self._state.memory.size)
@@ -188,12 +173,7 @@ class RegisterFile:
         return self.logger.cells(number - log_slot(0), start, stop)
 
     def put_cells(self, number: int, offset: int, data: bytes) -> None:
-        """Write cells of the vector memory.
-
-        Raises
-        ------
-        RefusedError : no such vector, one that is read only, not whole cells, or beyond the vector's end.
-        """
+        """Write whole cells of the vector memory (else RefusedError)."""
         start, stop = _cells(offset, len(data))
         if number != VECTOR_MEMORY:
             raise RefusedError(ErrorCode.READ_ONLY if number in _LOGGED else ErrorCode.NO_REGISTER)

@@ -6,7 +6,6 @@ Written for the documented protocol and tested against an emulator; never run on
 from __future__ import annotations
 
 import logging
-from types import TracebackType
 
 from numpy.typing import ArrayLike
 
@@ -49,9 +48,7 @@ class MirrorController:
     def __enter__(self) -> MirrorController:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def connect(self, *, known: bool = False) -> Identity:
@@ -76,12 +73,7 @@ class MirrorController:
         return found
 
     def identity(self) -> Identity:
-        """What the controller said it is when it was connected.
-
-        Raises
-        ------
-        RigError : it is not connected.
-        """
+        """What the controller said it is when it was connected; RigError where it is not connected."""
         self._check_connected()
         assert self._identity is not None
         return self._identity
@@ -97,12 +89,7 @@ class MirrorController:
         return Status(self._link.ask(ask_status(), "the status", cell_int))
 
     def temperature(self) -> float:
-        """Temperature, read in simple mode. [deg C]
-
-        Raises
-        ------
-        RigError : a path plays; modes are not changed under it.
-        """
+        """Temperature, read in simple mode; RigError where a path plays, as modes are not changed under it. [deg C]"""
         self._check_idle("ask for its temperature")
         with self._modes.simple() as lines:
             return lines.temperature()
@@ -119,12 +106,7 @@ class MirrorController:
         self._move(hold_values(*target), f"going to {target[0]:.6g}; {target[1]:.6g}")
 
     def settle(self, within_s: float) -> None:
-        """Wait until the mirror is at rest.
-
-        Raises
-        ------
-        RigError : it is not, or the device trimmed the target to the rim.
-        """
+        """Wait until the mirror is at rest; RigError where it is not, or the device trimmed the target to the rim."""
         until = self.wire.clock.now() + within_s
         while Status.NOT_STABLE in (status := self.status()):
             if self.wire.clock.now() >= until:
@@ -206,12 +188,7 @@ class MirrorController:
         self._log.start(self.settings.log_rate_hz if rate_hz is None else rate_hz, with_index=with_index)
 
     def read_log(self, samples: int | None = None) -> MotionLog:
-        """End the log and fetch ``samples`` of it, or as many as the time since its start has.
-
-        Raises
-        ------
-        RigError : no log was started.
-        """
+        """End the log and fetch ``samples`` of it, or as many as the time since its start has."""
         return self._log.read(samples)
 
     def park(self) -> None:
@@ -262,12 +239,7 @@ def open_mirror(settings: MirrorSettings, clock: Clock = SYSTEM_CLOCK, *, known:
 
 
 def check_model(identity: Identity, port: str, expected: str) -> None:
-    """Refuse to move what is no controller that the documents are of, unless the settings expect it by its id.
-
-    Raises
-    ------
-    RigError : another model, or another device altogether.
-    """
+    """Refuse a model that the documents are not of, unless the settings expect it by its id (RigError)."""
     if not expected and not identity.device.upper().startswith(KNOWN_MODELS):
         raise RigError(
             f"firmware not known on {port}: {identity.words}; expected an id that begins with {KNOWN_MODELS[0]}: is "

@@ -23,12 +23,7 @@ Value = float | int
 
 
 def float_cell(value: float) -> bytes:
-    """Give the cell of a float32.
-
-    Raises
-    ------
-    ShapeError : the value does not fit a float32.
-    """
+    """Give the cell of a float32; ShapeError where the value does not fit."""
     try:
         return struct.pack(">f", value)
     except OverflowError:
@@ -36,12 +31,7 @@ def float_cell(value: float) -> bytes:
 
 
 def int_cell(value: int) -> bytes:
-    """Give the cell of an integer of 32 bits, with or without a sign.
-
-    Raises
-    ------
-    ShapeError : the value does not fit.
-    """
+    """Give the cell of an integer of 32 bits, with or without a sign; ShapeError where the value does not fit."""
     if not -(2**31) <= value < 2**32:
         raise ShapeError(f"expected an integer of 32 bits, got {value}")
     return (value & 0xFFFFFFFF).to_bytes(CELL, "big")
@@ -88,22 +78,12 @@ def set_value(register: int, value: Value) -> Frame:
 
 
 def get_values(registers: Sequence[int]) -> Frame:
-    """Ask for up to 8 registers; the reply is their count and their cells.
-
-    Raises
-    ------
-    ShapeError : none, or more than one frame takes.
-    """
+    """Ask for 1 to 8 registers (else ShapeError); the reply is their count and their cells."""
     return Frame(Command.GET_VALUES, _count(len(registers)) + b"".join(map(_id, registers)))
 
 
 def set_values(values: Mapping[int, Value]) -> Frame:
-    """Set up to 8 registers at once, in the order given.
-
-    Raises
-    ------
-    ShapeError : none, or more than one frame takes.
-    """
+    """Set 1 to 8 registers (else ShapeError) at once, in the order given."""
     ids, cells = b"".join(map(_id, values)), b"".join(map(to_cell, values.values()))
     return Frame(Command.SET_VALUES, _count(len(values)) + ids + cells)
 

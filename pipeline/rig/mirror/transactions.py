@@ -141,12 +141,7 @@ class Wire:
             LOG.log(level, "%s: dropped %d stale bytes %s: %s", self.port, len(stale), when, stale[:64].hex(" "))
 
     def check_known(self, name: str) -> None:
-        """Refuse a motion where the state is unknown.
-
-        Raises
-        ------
-        StateUnknown : an earlier motion was not acknowledged.
-        """
+        """Refuse a motion where an earlier one was not acknowledged (StateUnknown)."""
         if self.unknown:
             raise StateUnknown(
                 f"{name} is refused on {self.port}: {self.unknown}, so where the mirror is is not known. Look at it, "
