@@ -17,9 +17,9 @@ from flows.settings.survey_settings import load_settings
 from flows.terminal.shown_text import on_stdout
 from pipeline.errors import SettingsError
 from pipeline.geometry.scan import CostModel
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.emulator.fault_names import fault_table
-from pipeline.rig.headwall_camera import HeadwallCamera
-from pipeline.rig.mirror_port import open_mirror
+from pipeline.rig.mirror.mirror_controller import open_mirror
 from pipeline.rig.rig_check import CheckRow, Device, check_camera, check_mirror, works
 from pipeline.rig.survey_rig import SurveyRig
 

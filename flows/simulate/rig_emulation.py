@@ -20,8 +20,7 @@ from flows.settings.survey_settings import Settings, load_settings
 from flows.simulate.emulated_scene import emulated_source
 from pipeline.errors import SettingsError
 from pipeline.geometry.mounting import STRAIGHT
-from pipeline.rig.emulator.emulated_rig import EmulatedRig, ServedRig
-from pipeline.rig.emulator.fast_clock import FastClock
+from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
 from pipeline.rig.emulator.fault_names import read_faults
 from pipeline.rig.survey_rig import SurveyRig
 

@@ -16,9 +16,9 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.mounting import STRAIGHT
 from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.lazy import Once
-from pipeline.rig.camera_limits import CameraLimits, check_times
+from pipeline.rig.camera.camera_files import KeptInMemory
+from pipeline.rig.camera.camera_settings import CameraLimits, check_times
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
-from pipeline.rig.kept_files import KeptInMemory
 from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.scene import RasterScene
 from pipeline.source import Line, Source
@@ -26,8 +26,8 @@ from storage.arrays.fetched_files import FetchedFiles
 
 if TYPE_CHECKING:
     from flows.survey.run import CaptureRun
-    from pipeline.rig.capture_runner import RigDevices
-    from pipeline.rig.rig_source import RigSource
+    from pipeline.rig.capture.capture_runner import RigDevices
+    from pipeline.rig.capture.rig_source import RigSource
 
 FETCHED = "camera"  # folder within a capture's spool
 RIG_RECORD = "rig.json"  # in a capture's store, beside its cubes
@@ -41,7 +41,7 @@ def rig_source(scene: RasterScene, settings: Settings, planned: Sequence[Sweep])
     SettingsError : exposure and frame period are nothing that the camera takes.
     PoseError : the mirror, as mounted, does not reach all of the planned sweeps.
     """
-    from pipeline.rig.rig_source import RigSource, RigView  # drivers load scipy, which a plan does without
+    from pipeline.rig.capture.rig_source import RigSource, RigView  # drivers load scipy, which a plan does without
 
     camera = settings.camera
     check_times(camera.exposure_ms, camera.frame_ms, CameraLimits(most_rate_hz=camera.max_rate_hz))
@@ -63,9 +63,9 @@ def open_devices(settings: Settings, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
     DeviceGone : no such port, in use, not permitted, or the camera is not there. DeadlinePassed : nothing answers.
     RigError : another device does.
     """
-    from pipeline.rig.capture_runner import RigDevices
-    from pipeline.rig.headwall_camera import HeadwallCamera
-    from pipeline.rig.mirror_port import open_mirror
+    from pipeline.rig.camera.headwall_camera import HeadwallCamera
+    from pipeline.rig.capture.capture_runner import RigDevices
+    from pipeline.rig.mirror.mirror_controller import open_mirror
 
     rig = settings.rig
     mirror = open_mirror(rig.mirror(settings.cost.vector_pairs), clock, known=True)

@@ -45,7 +45,7 @@ from storage.readers.raster_files import load_raster
 from storage.remote.opening import open_archive
 
 if TYPE_CHECKING:
-    from pipeline.rig.rig_source import RigSource
+    from pipeline.rig.capture.rig_source import RigSource
 
 SHIPPED = "farm.safetensors"
 

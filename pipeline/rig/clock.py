@@ -24,11 +24,9 @@ class SystemClock:
     """The monotonic clock of the machine."""
 
     def now(self) -> float:
-        """Give the moment, counted from anywhere. [s]"""
         return time.monotonic()
 
     def sleep(self, seconds: float) -> None:
-        """Wait; nothing for a time that is not above 0. [s]"""
         if seconds > 0:
             time.sleep(seconds)
 
@@ -43,21 +41,14 @@ class ManualClock:
         self._now = start
 
     def now(self) -> float:
-        """Give the moment, counted from anywhere. [s]"""
         return self._now
 
     def sleep(self, seconds: float) -> None:
-        """Move the clock; nothing for a time that is not above 0. [s]"""
         if seconds > 0:
             self._now += seconds
 
     def advance(self, seconds: float) -> None:
-        """Move the clock on. [s]
-
-        Raises
-        ------
-        SettingsError : the time is below 0.
-        """
+        """Move the clock on by so much; SettingsError where that is below 0. [s]"""
         if not seconds >= 0:
             raise SettingsError(f"a clock only goes forward, got {seconds} s; give 0 or more")
         self._now += seconds

@@ -10,12 +10,11 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 from pipeline.errors import PipelineError, RigError
-from pipeline.rig.camera_files import log_in
-from pipeline.rig.file_session import FileServer
-from pipeline.rig.headwall_camera import HeadwallCamera
-from pipeline.rig.mirror_controller import MirrorController
-from pipeline.rig.mirror_modes import check_model
-from pipeline.rig.registers import Status
+from pipeline.rig.camera.camera_files import log_in
+from pipeline.rig.camera.camera_settings import FileServer
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.mirror.mirror_controller import MirrorController, check_model
+from pipeline.rig.mirror.registers import Status
 
 Verdict = Literal["ok", "warn", "fail"]
 Device = Literal["mirror", "camera"]
@@ -98,8 +97,11 @@ def _ask_mirror(mirror: MirrorController, rows: list[CheckRow], *, move: bool) -
     try:
         playing = mirror.is_playing()
         rows.append(_status(mirror, playing=playing))
-        rows.append(_playing(playing))
-        if not playing:
+        if playing:
+            mend = "is another program at work? Else halt it: a survey would"
+            rows.append(CheckRow("mirror", "path", "a path plays", "warn", mend))
+        else:
+            rows.append(CheckRow("mirror", "path", "no path plays"))
             rows.append(CheckRow("mirror", "temperature", f"{mirror.temperature():.1f} deg C"))
     except RigError as error:
         rows.append(failed("mirror", "status", error))
@@ -134,13 +136,6 @@ def _status(mirror: MirrorController, *, playing: bool) -> CheckRow:
     if status:
         return CheckRow("mirror", "status", status.sentence, "warn", "have a look at the mirror before a survey")
     return CheckRow("mirror", "status", status.sentence)
-
-
-def _playing(playing: bool) -> CheckRow:
-    if playing:
-        mend = "is another program at work? Else halt it: a survey would"
-        return CheckRow("mirror", "path", "a path plays", "warn", mend)
-    return CheckRow("mirror", "path", "no path plays")
 
 
 def _move(mirror: MirrorController, rows: list[CheckRow]) -> None:

@@ -7,16 +7,13 @@ the assumed values somebody has confirmed.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pipeline.geometry.mounting import Mounting
 from pipeline.geometry.vector_memory import Ends
-from pipeline.rig.file_session import FileServer
-from pipeline.rig.mirror_settings import MirrorSettings
-from pipeline.rig.steering import ReadBack
-
-if TYPE_CHECKING:
-    from pipeline.rig.headwall_camera import CameraAddress
+from pipeline.rig.camera.camera_settings import CameraAddress, FileServer
+from pipeline.rig.mirror.mirror_settings import MirrorSettings
+from pipeline.rig.mirror.steering import ReadBack
 
 Pulses = Literal["position", "frame", "none"]
 
@@ -62,10 +59,24 @@ class SurveyRig:
     def mirror(self, vector_pairs: int) -> MirrorSettings:
         """Give the settings of the mirror's driver; SettingsError where they are out of range."""
         return MirrorSettings(
-            self.port, self.baud, self.expected_id, self.deadline_s, self.retries, self.quiet_s, self.with_crc,
-            self.strict_crc, self.ends, vector_pairs, self.read_back, self.check_status, self.park_at_close,
-            self.log_rate_hz, self.log_samples, self.provenance, self.mounting,
-        )  # fmt: skip
+            port=self.port,
+            baud=self.baud,
+            expected_id=self.expected_id,
+            deadline_s=self.deadline_s,
+            retries=self.retries,
+            quiet_s=self.quiet_s,
+            with_crc=self.with_crc,
+            strict_crc=self.strict_crc,
+            ends=self.ends,
+            vector_pairs=vector_pairs,
+            read_back=self.read_back,
+            check_status=self.check_status,
+            park_at_close=self.park_at_close,
+            log_rate_hz=self.log_rate_hz,
+            log_samples=self.log_samples,
+            provenance=self.provenance,
+            mounting=self.mounting,
+        )
 
     @property
     def mounting(self) -> Mounting:
@@ -75,14 +86,17 @@ class SurveyRig:
     @property
     def camera(self) -> CameraAddress:
         """Where the camera's control socket is."""
-        from pipeline.rig.headwall_camera import CameraAddress  # loads scipy, which reading settings does not need
-
         return CameraAddress(self.host, self.control_port, self.connect_s)
 
     @property
     def files(self) -> FileServer:
         """Where the camera's files are."""
         return FileServer(
-            self.host, self.file_port, self.user, self.password, self.stall_s, least_kb_s=self.least_kb_s,
+            self.host,
+            self.file_port,
+            self.user,
+            self.password,
+            self.stall_s,
+            least_kb_s=self.least_kb_s,
             read_twice=self.read_twice,
-        )  # fmt: skip
+        )

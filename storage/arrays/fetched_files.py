@@ -26,7 +26,7 @@ from typing import BinaryIO
 from urllib.parse import quote
 
 from pipeline.checked_lines import read_checked, with_check
-from pipeline.rig.refusals import NotKept
+from pipeline.rig.device_errors import NotKept
 from storage.archive.plain_files import open_plain, plain_reader, plain_size, read_plain
 from storage.archive.staging import sync_path
 
@@ -48,7 +48,7 @@ class _Sums:
 
 
 class FetchedFiles:
-    """A :class:`pipeline.rig.kept_files.Kept` in a folder, which is made when the first bytes come."""
+    """A :class:`pipeline.rig.camera.camera_files.Kept` in a folder, which is made when the first bytes come."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

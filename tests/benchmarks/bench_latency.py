@@ -28,7 +28,7 @@ from measure import Row
 
 if TYPE_CHECKING:
     from flows.settings.survey_settings import Settings
-    from pipeline.rig.capture_runner import RigDevices
+    from pipeline.rig.capture.capture_runner import RigDevices
     from pipeline.rig.emulator.emulated_rig import EmulatedRig
 
 PX, MOST_S = 2560, 5.0
@@ -89,7 +89,7 @@ class _AskedError(Exception):
 @contextmanager
 def _watched(moments: Moments) -> Iterator[None]:
     """Take the time of exposures, lines and the first path of a fine sweep."""
-    from pipeline.rig.capture_runner import CaptureRunner
+    from pipeline.rig.capture.capture_runner import CaptureRunner
     from storage.arrays.spool import Spool
 
     append, take = Spool.append, CaptureRunner.take
@@ -141,8 +141,8 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
 
 
 def _devices(rig: EmulatedRig, line: Any) -> Callable[..., RigDevices]:
-    from pipeline.rig.capture_runner import RigDevices
-    from pipeline.rig.mirror_controller import MirrorController
+    from pipeline.rig.capture.capture_runner import RigDevices
+    from pipeline.rig.mirror.mirror_controller import MirrorController
 
     def open_devices(told: Settings, *_: object) -> RigDevices:
         line.transport = type(line.transport)(rig.mirror, line.clock)

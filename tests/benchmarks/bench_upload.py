@@ -15,11 +15,11 @@ from measure import Row
 
 from pipeline.rig.clock import SYSTEM_CLOCK
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.pty_port import EmulatedPort
-from pipeline.rig.mirror_port import open_mirror
-from pipeline.rig.mirror_settings import MirrorSettings
-from pipeline.rig.steering import ReadBack
-from pipeline.rig.wire import BITS_PER_BYTE
+from pipeline.rig.emulator.mirror_ports import EmulatedPort
+from pipeline.rig.mirror.mirror_controller import open_mirror
+from pipeline.rig.mirror.mirror_settings import MirrorSettings
+from pipeline.rig.mirror.steering import ReadBack
+from pipeline.rig.mirror.transactions import BITS_PER_BYTE
 
 PAIRS = 1500
 BAUDS = (115200, 256000)

@@ -21,8 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.errors import PipelineError
 from pipeline.geometry.scan import Sweep
-from pipeline.rig.capture_journal import JOURNAL, CaptureJournal, Taken
-from pipeline.rig.kept_files import KeptInMemory
+from pipeline.rig.camera.camera_files import KeptInMemory
+from pipeline.rig.capture.capture_journal import JOURNAL, CaptureJournal, CaptureRecord
 from storage.archive.ledger import Ledger
 from storage.arrays.spool import Spool
 from storage.maintenance.growing_checks import growing_problems
@@ -111,7 +111,7 @@ def flip_journal(flips: int, seed: int = 0) -> Rot:
     truth = []
     for number in range(8):
         times = (float(number), number + 0.5)
-        taken = Taken(SWEEP, 5 * number, 5 * number + 5, f"/captured/a_{number}", True, times, times)
+        taken = CaptureRecord(SWEEP, 5 * number, 5 * number + 5, f"/captured/a_{number}", True, times, times)
         journal.began(taken)
         truth.append(asdict(journal.ended(taken)))
     content, chance, found = bytes(kept.files[JOURNAL]), random.Random(seed), Rot()

@@ -23,13 +23,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.errors import PipelineError
-from pipeline.rig.camera_files import fetch_files
-from pipeline.rig.file_session import FileServer
-from pipeline.rig.headwall_camera import CameraAddress, HeadwallCamera
-from pipeline.rig.headwall_control import ControlPatience
-from pipeline.rig.kept_files import KeptInMemory, RemoteFile
-from pipeline.rig.mirror_port import open_mirror
-from pipeline.rig.mirror_settings import MirrorSettings
+from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
+from pipeline.rig.camera.camera_settings import CameraAddress, ControlPatience, FileServer
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.mirror.mirror_controller import open_mirror
+from pipeline.rig.mirror.mirror_settings import MirrorSettings
 from pipeline.rig.rig_check import CheckRow, check_camera, check_mirror
 from tests.faults.fault_table import Clock, Row
 from tests.rig.chaos_line import Mangler

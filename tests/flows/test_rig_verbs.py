@@ -21,10 +21,9 @@ from rich.console import Console
 
 from flows.settings.survey_settings import load_settings
 from flows.simulate.rig_emulation import EmulateRequest, emulated_settings, run_emulate
-from pipeline.rig.emulator.emulated_rig import EmulatedRig, ServedRig
-from pipeline.rig.emulator.fast_clock import FastClock
-from pipeline.rig.emulator.faults import make_fault
-from pipeline.rig.pro_mode import Command
+from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
+from pipeline.rig.emulator.fault_names import make_fault
+from pipeline.rig.mirror.pro_mode import Command
 from tests.flows.conftest import CommandLine
 from tests.rig.small_rig import small_source
 

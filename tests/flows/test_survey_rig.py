@@ -31,20 +31,18 @@ from flows.survey.scene import open_scene
 from pipeline.errors import PoseError, SettingsError
 from pipeline.geometry.mounting import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep
-from pipeline.rig.camera_references import mean_frame
-from pipeline.rig.capture_names import REFERENCES
-from pipeline.rig.capture_runner import RigDevices
+from pipeline.rig.camera.camera_references import mean_frame
+from pipeline.rig.capture.capture_paths import REFERENCES
+from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.clock import SYSTEM_CLOCK, ManualClock
-from pipeline.rig.emulator.camera_faults import CameraFault
-from pipeline.rig.emulator.emulated_rig import EmulatedRig
-from pipeline.rig.emulator.fast_clock import FastClock
-from pipeline.rig.emulator.faults import make_fault
-from pipeline.rig.emulator.scene_camera import REFERENCE_FRAMES
-from pipeline.rig.emulator.scene_view import SceneView
-from pipeline.rig.mirror_controller import MirrorController
-from pipeline.rig.pro_mode import Command
-from pipeline.rig.refusals import DeviceGone
-from pipeline.rig.transport import SerialTransport
+from pipeline.rig.device_errors import DeviceGone
+from pipeline.rig.emulator.camera_device import CameraFault
+from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
+from pipeline.rig.emulator.fault_names import make_fault
+from pipeline.rig.emulator.scene_camera import REFERENCE_FRAMES, SceneView
+from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.mirror.pro_mode import Command
+from pipeline.rig.transports import SerialTransport
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.scene import RasterScene, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource

@@ -1,74 +1,25 @@
-"""A camera's control line without a network: an emulated camera in this process, by a clock turned by hand."""
+"""An emulated camera in this process, by a clock turned by hand, and what it sees."""
 
 from __future__ import annotations
-
-from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.rig.camera.camera_settings import ControlPatience
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.camera.headwall_control import HeadwallControl
 from pipeline.rig.clock import ManualClock
 from pipeline.rig.emulator.camera_device import CameraDevice
-from pipeline.rig.headwall_camera import HeadwallCamera
-from pipeline.rig.headwall_control import ControlPatience, HeadwallControl
-from pipeline.rig.refusals import DeviceGone
-
-
-class CameraLine:
-    """A transport to an emulated camera; waiting moves the clock and takes no time."""
-
-    port = "emulated:8100"
-
-    def __init__(self, device: CameraDevice, clock: ManualClock) -> None:
-        self._clock = clock
-        self._talk = device.connection()
-        self._coming: deque[tuple[float, bytes]] = deque()
-        self._open = True
-        self._say([(chunk.delay_s, chunk.data) for chunk in device.greet()])
-
-    def _say(self, chunks: list[tuple[float, bytes]]) -> None:
-        when = self._clock.now()
-        for delay_s, data in chunks:
-            when += delay_s
-            self._coming.append((when, data))
-
-    def write(self, data: bytes, deadline: float) -> None:
-        """Hand a command to the camera."""
-        if not self._open:
-            raise DeviceGone("the line is down")
-        chunks, self._open = self._talk.feed(data)
-        self._say([(chunk.delay_s, chunk.data) for chunk in chunks])
-
-    def read(self, at_most: int, deadline: float) -> bytes:
-        """Wait for the camera's next bytes."""
-        if not self._coming and not self._open:
-            raise DeviceGone("the connection was lost (closed by the other end)")
-        if not self._coming or self._coming[0][0] > deadline:
-            self._clock.sleep(deadline - self._clock.now())
-            return b""
-        when, data = self._coming.popleft()
-        self._clock.sleep(when - self._clock.now())
-        if data[at_most:]:
-            self._coming.appendleft((when, data[at_most:]))
-        return data[:at_most]
-
-    def drain(self) -> bytes:
-        """Give what has come already."""
-        found = b""
-        while self._coming and self._coming[0][0] <= self._clock.now():
-            found += self._coming.popleft()[1]
-        return found
-
-    def close(self) -> None:
-        """Hang up."""
-        self._open = False
-        self._coming.clear()
+from pipeline.rig.emulator.camera_server import InProcessCameraLine
 
 
 def control_of(device: CameraDevice, clock: ManualClock, retries: int = 2) -> HeadwallControl:
     """A control client of an emulated camera in this process."""
     return HeadwallControl(
-        lambda: CameraLine(device, clock), clock=clock, patience=ControlPatience(5.0, retries), capture_root="/captured"
+        lambda: InProcessCameraLine(device, clock, "emulated:8100"),
+        clock=clock,
+        patience=ControlPatience(5.0, retries),
+        capture_root="/captured",
     )
 
 

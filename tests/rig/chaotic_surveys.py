@@ -9,14 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.errors import RigError
-from pipeline.rig.capture_runner import RigDevices
+from pipeline.rig.camera.camera_files import KeptInMemory
+from pipeline.rig.camera.camera_settings import CameraAddress, ControlPatience, FileServer
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.capture.capture_runner import RigDevices
+from pipeline.rig.capture.rig_source import RigSource
 from pipeline.rig.clock import ManualClock
 from pipeline.rig.emulator.camera_server import CameraServer
-from pipeline.rig.file_session import FileServer
-from pipeline.rig.headwall_camera import CameraAddress, HeadwallCamera
-from pipeline.rig.headwall_control import ControlPatience
-from pipeline.rig.kept_files import KeptInMemory
-from pipeline.rig.rig_source import RigSource
 from pipeline.source import Line, References
 from tests.rig.chaos_line import OFTEN, ChaosLine
 from tests.rig.small_rig import COARSE, FINE, SmallRig, small_rig, small_source

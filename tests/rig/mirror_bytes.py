@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.rig.mirror_controller import MirrorController
-from pipeline.rig.mirror_settings import MirrorSettings
+from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.mirror.mirror_settings import MirrorSettings
 from tests.rig.scripted import Pair, ScriptedTransport
 
 

@@ -12,15 +12,15 @@ import numpy as np
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mounting import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep
-from pipeline.rig.capture_runner import RigDevices
+from pipeline.rig.camera.camera_files import Kept, KeptInMemory
+from pipeline.rig.capture.capture_runner import RigDevices
+from pipeline.rig.capture.rig_source import RigSource, RigView
 from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
+from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults
 from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, InProcessRig
-from pipeline.rig.emulator.fault import Fault
-from pipeline.rig.kept_files import Kept, KeptInMemory
-from pipeline.rig.mirror_controller import MirrorController
-from pipeline.rig.rig_source import RigSource, RigView
+from pipeline.rig.emulator.mirror_faults import Fault
+from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.survey_rig import SurveyRig
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import RigError
-from pipeline.rig.camera_cubes import cube_lines, parse_cube_header, read_capture, read_references
+from pipeline.rig.camera.camera_cubes import cube_lines, parse_cube_header, read_capture, read_references
 
 HEADER = (
     "ENVI\n; a comment\ninterleave = bil\ndata type = 12\nlines = {lines}\nsamples = 5\nbands = 3\nbyte order = 0\n"

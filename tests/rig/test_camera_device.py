@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
+from pipeline.rig.camera.line_camera import CaptureUnknown
 from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
-from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
-from pipeline.rig.line_camera import CaptureUnknown
-from pipeline.rig.refusals import DeviceRefused
+from pipeline.rig.device_errors import DeviceRefused
+from pipeline.rig.emulator.camera_device import CameraConnection, CameraDevice, CameraFault, CameraFaults, CameraUnit
 from tests.rig.camera_line import control_of, scene_lines
 
 CAPTURE = b'capture({"prefix": "", "maxCubes": 1, "maxFramesPerCube": 5})'
@@ -21,7 +20,7 @@ PROMPT = b"\r\nhpi> "
 
 def device_with(fault: CameraFault | None = None, times: int = 1, seed: int = 0, **unit: object) -> CameraDevice:
     """A camera with one fault."""
-    faults = CameraFaults.of({} if fault is None else {fault: times}, seed)
+    faults = CameraFaults({} if fault is None else {fault: times}, seed)
     return CameraDevice(scene_lines(), ManualClock(), unit=CameraUnit(**unit), faults=faults)  # type: ignore[arg-type]
 
 
@@ -68,7 +67,7 @@ def device_with(fault: CameraFault | None = None, times: int = 1, seed: int = 0,
 def test_bytes_of_every_command(sent: bytes, received: bytes) -> None:
     """Each command gives its bytes, in one piece or byte by byte."""
     for size in (1, len(sent)):
-        talk = device_with().connection()
+        talk = CameraConnection(device_with())
         came = b""
         for at in range(0, len(sent), size):
             chunks, goes_on = talk.feed(sent[at : at + size])
@@ -79,7 +78,7 @@ def test_bytes_of_every_command(sent: bytes, received: bytes) -> None:
 
 def test_exit_ends_the_connection() -> None:
     """Nothing is said to exit."""
-    assert device_with().connection().feed(b"exit\r") == ([], False)
+    assert CameraConnection(device_with()).feed(b"exit\r") == ([], False)
 
 
 def test_frames_pass_with_time() -> None:

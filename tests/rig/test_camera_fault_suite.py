@@ -17,15 +17,15 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.geometry.scan import Sweep
-from pipeline.rig.capture_runner import RigDevices
-from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
-from pipeline.rig.emulator.fault import Fault
-from pipeline.rig.emulator.faults import make_fault
-from pipeline.rig.headwall_camera import HeadwallCamera
-from pipeline.rig.headwall_control import ControlPatience
-from pipeline.rig.kept_files import KeptInMemory
-from pipeline.rig.mirror_controller import MirrorController
-from pipeline.rig.registers import Status
+from pipeline.rig.camera.camera_files import KeptInMemory
+from pipeline.rig.camera.camera_settings import ControlPatience
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.capture.capture_runner import RigDevices
+from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults
+from pipeline.rig.emulator.fault_names import make_fault
+from pipeline.rig.emulator.mirror_faults import Fault
+from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.mirror.registers import Status
 from pipeline.source import Line
 from tests.rig.small_rig import SmallRig, small_rig, small_source
 from tests.rig.test_fault_suite import moves

@@ -12,19 +12,22 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.camera_files import fetch_files
+from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
+from pipeline.rig.camera.camera_settings import CameraAddress, ControlPatience, FileServer
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.clock import SYSTEM_CLOCK, ManualClock
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, DeviceRefused
 from pipeline.rig.emulator.camera_capture import FrameClock, IndexLayout
-from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
-from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
-from pipeline.rig.emulator.camera_server import CameraServer, remote_files
-from pipeline.rig.file_session import FileServer
-from pipeline.rig.headwall_camera import CameraAddress, HeadwallCamera
-from pipeline.rig.headwall_control import ControlPatience
-from pipeline.rig.kept_files import KeptInMemory, RemoteFile
-from pipeline.rig.refusals import DeadlinePassed, DeviceGone, DeviceRefused
-from pipeline.rig.socket_transport import SocketTransport
+from pipeline.rig.emulator.camera_device import CameraDevice, CameraFault, CameraFaults, CameraUnit
+from pipeline.rig.emulator.camera_server import CameraServer
+from pipeline.rig.transports import SocketTransport
 from tests.rig.camera_line import LinesOf, scene_lines, wait_for
+
+
+def remote_files(device: CameraDevice, folder: str) -> list[RemoteFile]:
+    """A device's files in a folder, as a listing has them."""
+    files = sorted(device.files().items())
+    return [RemoteFile(name, len(data), False) for name, data in files if name.startswith(folder + "/")]
 
 
 @contextmanager
@@ -33,7 +36,7 @@ def camera(
 ) -> Iterator[tuple[HeadwallCamera, CameraDevice, LinesOf]]:
     """A served camera, its driver by the same clock, and what it sees."""
     clock, lines = ManualClock(100.0), scene_lines()
-    device = CameraDevice(lines, clock, unit=unit, faults=CameraFaults.of(faults))
+    device = CameraDevice(lines, clock, unit=unit, faults=CameraFaults(dict(faults or {})))
     with CameraServer(device) as served:
         files = FileServer(served.host, served.file_port, stall_s=2.0, pause_s=0.01, **server)  # type: ignore[arg-type]
         driver = HeadwallCamera.at(CameraAddress(served.host, served.port), files, clock=clock)
@@ -233,7 +236,7 @@ def test_other_servers(says: bytes, kind: type[RigError], words: str) -> None:
 
 def test_silence_on_a_real_socket() -> None:
     """By the system's clock a lost reply costs its deadline, and the next connection answers."""
-    device = CameraDevice(scene_lines(), SYSTEM_CLOCK, faults=CameraFaults.of({CameraFault.SILENT: 1}))
+    device = CameraDevice(scene_lines(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.SILENT: 1}))
     with CameraServer(device) as served:
         driver = HeadwallCamera.at(
             CameraAddress(served.host, served.port), FileServer(), patience=ControlPatience(0.3, 1, 0.01)
@@ -245,7 +248,7 @@ def test_silence_on_a_real_socket() -> None:
 
 def test_closing_does_not_wait_for_what_is_late() -> None:
     """A reply that a fault holds back for a minute holds back nobody who closes the camera."""
-    device = CameraDevice(scene_lines(), SYSTEM_CLOCK, faults=CameraFaults.of({CameraFault.LATE: 1}))
+    device = CameraDevice(scene_lines(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.LATE: 1}))
     with CameraServer(device) as served, socket.create_connection((served.host, served.port), timeout=5) as client:
         client.sendall(b"isCapturing\r")
         while not device.commands:

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.rig.capture_journal import JOURNAL, CaptureJournal, Taken
-from pipeline.rig.kept_files import KeptInMemory
-from pipeline.rig.line_positions import LinePositions
+from pipeline.rig.camera.camera_files import KeptInMemory
+from pipeline.rig.capture.capture_journal import JOURNAL, CaptureJournal, CaptureRecord
+from pipeline.rig.capture.line_positions import LinePositions
 from tests.faults.growing_files import flip_journal
 from tests.rig.small_rig import COARSE, FINE
 
-ONE = Taken(FINE, 0, 5, "/captured/a", True, (0.0, 0.1), (0.1, 0.2))
+ONE = CaptureRecord(FINE, 0, 5, "/captured/a", True, (0.0, 0.1), (0.1, 0.2))
 OTHER = replace(ONE, folder="/captured/b", first=3, stop=9)
 
 

@@ -7,16 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.rig.camera_cubes import CapturedLines
-from pipeline.rig.capture_journal import LoggedPath, Taken
-from pipeline.rig.capture_paths import next_path
-from pipeline.rig.captured_sweep import UntiedError, place_lines
-from pipeline.rig.frame_index import LineTimes
-from pipeline.rig.line_positions import MirrorTrack
+from pipeline.rig.camera.camera_cubes import CapturedLines
+from pipeline.rig.camera.frame_index import LineTimes
+from pipeline.rig.capture.capture_journal import CaptureRecord, LoggedPath
+from pipeline.rig.capture.capture_paths import UntiedError, next_path, place_lines
+from pipeline.rig.capture.line_positions import MirrorTrack
 from tests.rig.small_rig import CAMERA, COARSE, FINE
 
 PATH = next_path(FINE, 3, CAMERA, vector_pairs=7, triggered=True)  # lines 3 to 9
-TAKEN = Taken(FINE, 3, 9, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=6)
+TAKEN = CaptureRecord(FINE, 3, 9, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=6)
 
 
 def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
@@ -69,7 +68,7 @@ def test_mirror_that_stepped_otherwise_is_not_believed(index: int):
 def test_mirror_that_stands_within_a_line_is_not_believed(index: int):
     """Coarse lines hold four cells each: two of them end at cell 8, and whoever stands beside it lost an edge."""
     path = next_path(COARSE, 2, CAMERA, vector_pairs=12, triggered=True)
-    taken = Taken(COARSE, 2, 4, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=8)
+    taken = CaptureRecord(COARSE, 2, 4, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=8)
     assert place_lines(frames([0, 1]), path, taken, CAMERA, None).row.tolist() == [0, 1]
     with pytest.raises(UntiedError, match=rf"stands at cell {index} of its path, after 2 frames cell 8 was expected"):
         place_lines(frames([0, 1]), path, replace(taken, index_at_end=index), CAMERA, None)
@@ -79,7 +78,7 @@ def test_log_began_before_its_acknowledgement():
     """Between the request for the log and its acknowledgement: the middle counts, and the span is not known."""
     path = next_path(FINE, 3, CAMERA, vector_pairs=6, triggered=False)
     log = LoggedPath("/captured/x/mirror_log", 1000.0, started_s=0.06, start_error_s=0.04)
-    taken = Taken(FINE, 3, 9, "/captured/x", False, (5.0, 5.1), (0.1, 0.2), log=log)
+    taken = CaptureRecord(FINE, 3, 9, "/captured/x", False, (5.0, 5.1), (0.1, 0.2), log=log)
     track = MirrorTrack(np.arange(1000) / 1000, np.zeros((1000, 2)))
     tied = place_lines(frames(list(range(6))), path, taken, CAMERA, track).tied
     assert tied.method == "log"

@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.camera_files import fetch_files
+from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
+from pipeline.rig.camera.camera_settings import FileServer
 from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
-from pipeline.rig.emulator.camera_faults import CameraFault
+from pipeline.rig.emulator.camera_device import CameraDevice, CameraFault, CameraUnit
 from pipeline.rig.emulator.camera_server import CameraServer
-from pipeline.rig.file_session import FileServer
-from pipeline.rig.kept_files import KeptInMemory, RemoteFile
 from tests.rig.camera_line import control_of, scene_lines
 from tests.rig.chaos_line import ChaosLine
 from tests.rig.chaotic_surveys import survey_in_chaos

@@ -12,20 +12,18 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.scan import Sweep, sweep_positions
-from pipeline.rig.camera_files import FileServer
-from pipeline.rig.capture_names import REFERENCES, capture_prefix
+from pipeline.rig.camera.camera_files import KeptInMemory
+from pipeline.rig.camera.camera_settings import CameraAddress, FileServer
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.capture.capture_paths import REFERENCES, capture_prefix
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
-from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
-from pipeline.rig.emulator.emulated_rig import EmulatedRig
-from pipeline.rig.emulator.fast_clock import FastClock
-from pipeline.rig.headwall_camera import CameraAddress, HeadwallCamera
-from pipeline.rig.kept_files import KeptInMemory
-from pipeline.rig.mirror_controller import MirrorController
-from pipeline.rig.mirror_port import open_mirror
-from pipeline.rig.mirror_settings import MirrorSettings
-from pipeline.rig.refusals import DeviceGone
-from pipeline.rig.registers import Trigger
-from pipeline.rig.socket_transport import SocketTransport
+from pipeline.rig.device_errors import DeviceGone
+from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults
+from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
+from pipeline.rig.mirror.mirror_controller import MirrorController, open_mirror
+from pipeline.rig.mirror.mirror_settings import MirrorSettings
+from pipeline.rig.mirror.registers import Trigger
+from pipeline.rig.transports import SocketTransport
 from pipeline.simulator.instrument import QUIET
 from pipeline.simulator.simulated import SimulatedSource
 from tests.rig.camera_line import wait_for
@@ -203,7 +201,7 @@ def test_frames_that_wait_to_be_looked_at_keep_the_camera_busy() -> None:
 
 def test_cube_that_is_cut_off_lacks_lines() -> None:
     """A fault of the camera strikes what it sees of the scene, too."""
-    with connected(camera_faults=CameraFaults.of({CameraFault.CUT_CUBE: 1})) as (pair, _):
+    with connected(camera_faults=CameraFaults({CameraFault.CUT_CUBE: 1})) as (pair, _):
         found = pair.camera.fetch(pair.play(FINE), KeptInMemory())
     assert found.valid.tolist() == [True] * (FINE.lines - 2) + [False] * 2
     np.testing.assert_array_equal(found.values[:-2], planned(FINE, range(FINE.lines - 2)))

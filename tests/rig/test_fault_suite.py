@@ -10,15 +10,15 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.faults import KINDS, make_fault
-from pipeline.rig.emulator.in_process import InProcessTransport
+from pipeline.rig.device_errors import StateUnknown
+from pipeline.rig.emulator.fault_names import KINDS, make_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.mirror_controller import MirrorController
-from pipeline.rig.mirror_settings import MirrorSettings
-from pipeline.rig.pro_mode import Command, Frame, FrameReader
-from pipeline.rig.pro_payloads import cell_int, read_registers
-from pipeline.rig.refusals import StateUnknown
-from pipeline.rig.registers import VectorRegister, X, Y
+from pipeline.rig.emulator.mirror_ports import InProcessTransport
+from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.mirror.mirror_settings import MirrorSettings
+from pipeline.rig.mirror.pro_mode import Command, Frame, FrameReader
+from pipeline.rig.mirror.pro_payloads import cell_int, read_registers
+from pipeline.rig.mirror.registers import VectorRegister, X, Y
 
 SEEDS = range(20)
 SETTINGS = MirrorSettings(expected_id="MR-E", read_back="all")

@@ -7,13 +7,20 @@ import pytest
 from pipeline.errors import SettingsError
 from pipeline.rig.clock import ManualClock
 from pipeline.rig.emulator.exchange import Mode, VanishedError
-from pipeline.rig.emulator.fault import Chance
-from pipeline.rig.emulator.faults import KINDS, Fault, make_fault, read_fault
+from pipeline.rig.emulator.fault_names import KINDS, make_fault, read_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.wire_faults import LATE_S, SLOW_S, TICK_S
-from pipeline.rig.pro_mode import ErrorCode, Frame, encode
-from pipeline.rig.pro_payloads import ask_firmware, ask_status, float_cell, get_value, refuse, set_value, set_vector
-from pipeline.rig.registers import VECTOR_MEMORY, Status, X
+from pipeline.rig.emulator.mirror_faults import LATE_S, SLOW_S, TICK_S, Chance, Fault
+from pipeline.rig.mirror.pro_mode import ErrorCode, Frame, encode
+from pipeline.rig.mirror.pro_payloads import (
+    ask_firmware,
+    ask_status,
+    float_cell,
+    get_value,
+    refuse,
+    set_value,
+    set_vector,
+)
+from pipeline.rig.mirror.registers import VECTOR_MEMORY, Status, X
 
 CODES = {
     "error-frame": ErrorCode.FRAME_INVALID, "error-length": ErrorCode.LENGTH_MISMATCH,

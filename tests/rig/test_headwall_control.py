@@ -8,10 +8,11 @@ from contextlib import contextmanager
 import pytest
 
 from pipeline.errors import RigError, SettingsError
+from pipeline.rig.camera.camera_settings import ControlPatience
+from pipeline.rig.camera.headwall_control import HeadwallControl
+from pipeline.rig.camera.line_camera import CaptureUnknown
 from pipeline.rig.clock import Clock, ManualClock
-from pipeline.rig.headwall_control import ControlPatience, HeadwallControl
-from pipeline.rig.line_camera import CaptureUnknown
-from pipeline.rig.refusals import DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
 from tests.rig.scripted import Late, Pair, Reply, ScriptedTransport
 
 HELLO = b"Hyperspec\r\nhpi> "

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig import headwall_replies
-from pipeline.rig.headwall_replies import ReplyReader, to_request
+from pipeline.rig.camera import headwall_replies
+from pipeline.rig.camera.headwall_replies import ReplyReader, to_request
 
 REPLY = b'isCapturing\r\n{"success": true, "response": false, "errorMessage": ""}\r\nhpi> '
 

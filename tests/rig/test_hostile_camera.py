@@ -8,12 +8,10 @@ from dataclasses import dataclass
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.camera_files import fetch_files, log_in
-from pipeline.rig.file_session import FileServer
-from pipeline.rig.headwall_camera import CameraAddress, HeadwallCamera
-from pipeline.rig.headwall_control import ControlPatience
-from pipeline.rig.kept_files import KeptInMemory, RemoteFile
-from pipeline.rig.refusals import DeadlinePassed, DeviceGone
+from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files, log_in
+from pipeline.rig.camera.camera_settings import CameraAddress, ControlPatience, FileServer
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
 from pipeline.rig.rig_check import check_camera
 from tests.rig.hostile_camera import Answers, HostileControl, HostileFiles, Pieces, flood, trickled
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 
 from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.faults import make_fault
-from pipeline.rig.emulator.in_process import InProcessTransport
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
+from pipeline.rig.emulator.fault_names import make_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.mirror_controller import MirrorController
-from pipeline.rig.mirror_settings import MirrorSettings
-from pipeline.rig.refusals import DeadlinePassed, DeviceGone
-from pipeline.rig.wire import BITS_PER_BYTE
+from pipeline.rig.emulator.mirror_ports import InProcessTransport
+from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.mirror.mirror_settings import MirrorSettings
+from pipeline.rig.mirror.transactions import BITS_PER_BYTE
 
 
 def line(*faults: str, baud: int = 0) -> InProcessTransport:

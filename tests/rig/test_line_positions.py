@@ -9,8 +9,8 @@ import pytest
 
 from pipeline.errors import RigError, ShapeError
 from pipeline.geometry.camera import LineCamera
-from pipeline.rig.frame_times import FrameTimes
-from pipeline.rig.line_positions import (
+from pipeline.rig.capture.clock_fit import FrameTimes
+from pipeline.rig.capture.line_positions import (
     CommandTimes,
     LinePositions,
     MirrorTrack,

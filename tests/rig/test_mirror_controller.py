@@ -6,10 +6,10 @@ import pytest
 
 from pipeline.errors import PoseError, RigError, SettingsError, ShapeError
 from pipeline.rig.clock import ManualClock
-from pipeline.rig.mirror_controller import MirrorController
-from pipeline.rig.refusals import DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
-from pipeline.rig.registers import Status, Trigger
-from pipeline.rig.steering import Identity, Steering
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
+from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.mirror.registers import Status, Trigger
+from pipeline.rig.mirror.steering import Identity, Steering
 from tests.rig.mirror_bytes import (
     CONNECT,
     DONE,

@@ -13,7 +13,7 @@ from pipeline.rig.clock import ManualClock
 from pipeline.rig.emulator.exchange import Mode
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.emulator.mirror_state import MirrorUnit
-from pipeline.rig.registers import Status
+from pipeline.rig.mirror.registers import Status
 
 GO_PRO_CRC = b"GOPROCRC\r\n"
 
@@ -201,14 +201,14 @@ def test_what_was_stays_until_it_is_acknowledged(now: Status, was: Status) -> No
     """A bit that came and went leaves its copy; one that still is, is latched again at once."""
     device = MirrorDevice(ManualClock())
     device.state.flags = now
-    assert device.status() == now | was
+    assert device.state.status() == now | was
     device.state.flags = Status(0)
-    assert device.status() == was
+    assert device.state.status() == was
     device.state.acknowledge()
-    assert device.status() == Status(0)
+    assert device.state.status() == Status(0)
     device.state.flags = now
     device.state.acknowledge()
-    assert device.status() == now | was
+    assert device.state.status() == now | was
 
 
 @given(cuts=st.lists(st.integers(0, 400), max_size=40))

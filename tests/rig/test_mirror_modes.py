@@ -7,7 +7,7 @@ import logging
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.refusals import DeadlinePassed, DeviceRefused
+from pipeline.rig.device_errors import DeadlinePassed, DeviceRefused
 from tests.rig.mirror_bytes import CONNECT, ENTER, GREET, LEAVE, WELL, WHO, connected
 from tests.rig.scripted import scripted
 

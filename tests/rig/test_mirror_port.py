@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig import mirror_port
-from pipeline.rig.mirror_port import open_mirror
-from pipeline.rig.mirror_settings import MirrorSettings
-from pipeline.rig.refusals import DeadlinePassed, DeviceGone
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
+from pipeline.rig.mirror import mirror_controller
+from pipeline.rig.mirror.mirror_controller import open_mirror
+from pipeline.rig.mirror.mirror_settings import MirrorSettings
 from tests.rig.mirror_bytes import CONNECT, LEAVE
 from tests.rig.scripted import ScriptedTransport, scripted
 
@@ -22,7 +22,7 @@ def give(monkeypatch: pytest.MonkeyPatch, transport: ScriptedTransport) -> None:
         assert (port, baud, clock) == ("/dev/mirror", 256000, transport.clock)
         return transport
 
-    monkeypatch.setattr(mirror_port, "SerialTransport", opened)
+    monkeypatch.setattr(mirror_controller, "SerialTransport", opened)
 
 
 SETTINGS = MirrorSettings(port="/dev/mirror", baud=256000, strict_crc=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.refusals import DeviceRefused
+from pipeline.rig.device_errors import DeviceRefused
 from tests.rig.mirror_bytes import CONNECT, DONE, SET_LOG, START_LOG, STOP_LOG, connected, pair
 from tests.rig.scripted import Late, Pair, scripted
 

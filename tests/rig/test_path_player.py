@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from pipeline.errors import SettingsError
-from pipeline.rig.path_player import Play, hold_values, run_values
-from pipeline.rig.pro_payloads import set_values
+from pipeline.rig.mirror.path_player import Play, hold_values, run_values
+from pipeline.rig.mirror.pro_payloads import set_values
 
 
 def test_motions_fit_one_frame():

@@ -10,8 +10,8 @@ from pipeline.rig.clock import ManualClock
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.emulator.mirror_motion import AxisMotion, Stiffness
 from pipeline.rig.emulator.mirror_state import MirrorUnit
-from pipeline.rig.pro_mode import ErrorCode, Frame, FrameReader, encode
-from pipeline.rig.pro_payloads import (
+from pipeline.rig.mirror.pro_mode import ErrorCode, Frame, FrameReader, encode
+from pipeline.rig.mirror.pro_payloads import (
     Value,
     cell_float,
     cell_int,
@@ -22,7 +22,7 @@ from pipeline.rig.pro_payloads import (
     set_values,
     set_vector,
 )  # fmt: skip
-from pipeline.rig.registers import (
+from pipeline.rig.mirror.registers import (
     FEEDBACK_X,
     FEEDBACK_Y,
     LOG_RATE,

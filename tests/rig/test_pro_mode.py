@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import ShapeError
-from pipeline.rig.pro_mode import Command, Damaged, ErrorCode, Frame, FrameReader, crc_arc, encode, error_words
+from pipeline.rig.mirror.pro_mode import Command, Damaged, ErrorCode, Frame, FrameReader, crc_arc, encode, error_words
 
 nasty = st.one_of(
     st.binary(max_size=50), st.lists(st.sampled_from([0x7D, 0x7E, 0x5D, 0x5E, 0]), max_size=50).map(bytes)

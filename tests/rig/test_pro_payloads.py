@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import ShapeError
-from pipeline.rig.pro_mode import ErrorCode, Frame, FrameReader, encode
-from pipeline.rig.pro_payloads import (
+from pipeline.rig.mirror.pro_mode import ErrorCode, Frame, FrameReader, encode
+from pipeline.rig.mirror.pro_payloads import (
     acknowledge,
     ask_firmware,
     ask_status,

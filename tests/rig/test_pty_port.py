@@ -13,13 +13,13 @@ import serial
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.clock import SYSTEM_CLOCK
-from pipeline.rig.emulator.fast_clock import FastClock
-from pipeline.rig.emulator.faults import make_fault
+from pipeline.rig.device_errors import DeviceGone
+from pipeline.rig.emulator.emulated_rig import FastClock
+from pipeline.rig.emulator.fault_names import make_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.pty_port import EmulatedPort
-from pipeline.rig.mirror_port import open_mirror
-from pipeline.rig.mirror_settings import MirrorSettings
-from pipeline.rig.refusals import DeviceGone
+from pipeline.rig.emulator.mirror_ports import EmulatedPort
+from pipeline.rig.mirror.mirror_controller import open_mirror
+from pipeline.rig.mirror.mirror_settings import MirrorSettings
 
 GET = bytes.fromhex("7e 00 11 02 50 01 59 3c 7e")
 GOT = bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.rig.registers import FEEDBACK_X, FEEDBACK_Y, VECTOR_MEMORY, Status, VectorRegister, X, Y, log_slot
+from pipeline.rig.mirror.registers import FEEDBACK_X, FEEDBACK_Y, VECTOR_MEMORY, Status, VectorRegister, X, Y, log_slot
 
 
 def test_registers_have_the_published_ids():

@@ -10,22 +10,21 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.camera_files import log_in
-from pipeline.rig.capture_names import capture_prefix
+from pipeline.rig.camera.camera_files import log_in
+from pipeline.rig.camera.camera_settings import FileServer
+from pipeline.rig.capture.capture_paths import capture_prefix
 from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.camera_device import CameraUnit
-from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
+from pipeline.rig.device_errors import DeviceGone, DeviceRefused
+from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults, CameraUnit
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, InProcessRig
 from pipeline.rig.emulator.exchange import Mode
-from pipeline.rig.emulator.faults import make_fault
-from pipeline.rig.file_session import FileServer
-from pipeline.rig.mirror_controller import MirrorController
-from pipeline.rig.mirror_settings import MirrorSettings
-from pipeline.rig.pro_mode import Command
-from pipeline.rig.refusals import DeviceGone, DeviceRefused
-from pipeline.rig.registers import Status
+from pipeline.rig.emulator.fault_names import make_fault
+from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.mirror.mirror_settings import MirrorSettings
+from pipeline.rig.mirror.pro_mode import Command
+from pipeline.rig.mirror.registers import Status
+from pipeline.rig.mirror.steering import MotionLog
 from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, works
-from pipeline.rig.steering import MotionLog
 from tests.rig.small_rig import FINE, small_source
 
 SETS = {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
@@ -202,7 +201,7 @@ def test_camera_in_order() -> None:
 
 def test_camera_out_of_order() -> None:
     """No control, no files, another password: a row each, and the other is asked all the same."""
-    with rig(camera=CameraFaults.of({CameraFault.HANGS_UP: 9})) as line:
+    with rig(camera=CameraFaults({CameraFault.HANGS_UP: 9})) as line:
         assert told(check_camera(line.camera(), line.files), "fail") == ["connect"]
     with rig() as line:
         gone = FileServer("127.0.0.1", 1)

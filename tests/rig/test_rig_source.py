@@ -13,10 +13,10 @@ import pytest
 from pipeline.errors import RigError
 from pipeline.geometry.mounting import Mounting
 from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.rig.capture_journal import CaptureJournal
-from pipeline.rig.kept_files import KeptInMemory
-from pipeline.rig.pro_mode import Command
-from pipeline.rig.steering import wire_positions
+from pipeline.rig.camera.camera_files import KeptInMemory
+from pipeline.rig.capture.capture_journal import CaptureJournal
+from pipeline.rig.mirror.pro_mode import Command
+from pipeline.rig.mirror.steering import wire_positions
 from pipeline.source import Line
 from tests.rig.small_rig import CAMERA, COARSE, FINE, small_rig, small_source
 

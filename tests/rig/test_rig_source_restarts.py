@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.capture_journal import JOURNAL
-from pipeline.rig.emulator.faults import make_fault
-from pipeline.rig.headwall_control import HeadwallControl
-from pipeline.rig.kept_files import KeptInMemory
+from pipeline.rig.camera.camera_files import KeptInMemory
+from pipeline.rig.camera.headwall_control import HeadwallControl
+from pipeline.rig.capture.capture_journal import JOURNAL
+from pipeline.rig.emulator.fault_names import make_fault
 from tests.rig.small_rig import COARSE, FINE, SmallRig, small_rig, small_source
 from tests.rig.test_rig_source_faults import KeptUntil, KilledError, SlowEye, assert_same
 

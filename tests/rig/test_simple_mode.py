@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import RigError, ShapeError
-from pipeline.rig.refusals import DeviceRefused
-from pipeline.rig.registers import Status
-from pipeline.rig.simple_mode import (
+from pipeline.rig.device_errors import DeviceRefused
+from pipeline.rig.mirror.registers import Status
+from pipeline.rig.mirror.simple_mode import (
     LineReader,
     check_done,
     go_x,

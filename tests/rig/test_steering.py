@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import PoseError, ShapeError
-from pipeline.rig.steering import MotionLog, as_cells, wire_positions
+from pipeline.rig.mirror.steering import MotionLog, as_cells, wire_positions
 
 
 @given(st.floats(0, 1), st.floats(-7, 7))

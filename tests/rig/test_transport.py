@@ -15,8 +15,8 @@ import serial
 
 from pipeline.errors import SettingsError
 from pipeline.rig.clock import SYSTEM_CLOCK
-from pipeline.rig.refusals import DeadlinePassed, DeviceGone
-from pipeline.rig.transport import SerialTransport
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
+from pipeline.rig.transports import SerialTransport
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo terminals are of POSIX systems")
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.vector_memory import Ends
-from pipeline.rig.emulator.vector_player import MOST_STEPS, VectorPlayer
-from pipeline.rig.registers import Trigger
+from pipeline.rig.emulator.mirror_motion import MOST_STEPS, VectorPlayer
+from pipeline.rig.mirror.registers import Trigger
 
 
 def player(**settings: object) -> VectorPlayer:

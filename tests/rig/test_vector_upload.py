@@ -9,13 +9,14 @@ from hypothesis import strategies as st
 
 from pipeline.errors import RigError
 from pipeline.rig.clock import ManualClock
-from pipeline.rig.links import ProLink
-from pipeline.rig.pro_mode import Command, Frame, FrameReader, encode
-from pipeline.rig.pro_payloads import acknowledge, read_vector
-from pipeline.rig.refusals import DeadlinePassed
-from pipeline.rig.steering import ReadBack, as_cells, wire_positions
-from pipeline.rig.vector_upload import frames_to_check, upload
-from pipeline.rig.wire import BITS_PER_BYTE, Patience, Wire
+from pipeline.rig.device_errors import DeadlinePassed
+from pipeline.rig.mirror.mirror_requests import ProLink
+from pipeline.rig.mirror.mirror_settings import Patience
+from pipeline.rig.mirror.path_player import frames_to_check, upload
+from pipeline.rig.mirror.pro_mode import Command, Frame, FrameReader, encode
+from pipeline.rig.mirror.pro_payloads import acknowledge, read_vector
+from pipeline.rig.mirror.steering import ReadBack, as_cells, wire_positions
+from pipeline.rig.mirror.transactions import BITS_PER_BYTE, Wire
 
 BAUD = 115200
 

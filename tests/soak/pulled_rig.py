@@ -20,10 +20,9 @@ from typing import Any, Literal
 from flows.settings.survey_settings import load_settings
 from flows.simulate.emulated_scene import emulated_source
 from pipeline.rig.emulator.camera_server import CameraServer
-from pipeline.rig.emulator.emulated_rig import EmulatedRig
-from pipeline.rig.emulator.fast_clock import FastClock
-from pipeline.rig.emulator.pty_port import EmulatedPort
-from pipeline.rig.emulator.scene_view import SceneView
+from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
+from pipeline.rig.emulator.mirror_ports import EmulatedPort
+from pipeline.rig.emulator.scene_camera import SceneView
 from pipeline.simulator.simulated import SimulatedSource
 from tests.faults.nursery import ROOT
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# positions (line, 2) and times (line,) of mid exposure -> lines (line, sample, band) uint16
 Floats = NDArray[Any]  # float64
 Ints = NDArray[np.int64]
-Lines = Callable[[Floats, Floats], NDArray[np.uint16]]
-Positions = Callable[[Floats], Floats]
+Raw = NDArray[np.uint16]
+Lines = Callable[[Floats, Floats], Raw]  # positions (line, 2), times (line,) of mid exposure -> (line, sample, band)
+Positions = Callable[[Floats], Floats]  # times (line,) -> (line, 2)
 
 _BLOCK = 64  # frames looked at together
 
@@ -26,9 +26,9 @@ class FrameClock:
     drift_ppm: float = 0.0
     delay_s: float = 0.01  # from the command to the first exposure
 
-    def stamp_us(self, time_s: Floats) -> NDArray[np.int64]:
+    def stamp_us(self, time_s: Floats) -> Ints:
         """Stamps of times of the emulator's clock."""
-        passed: NDArray[np.int64] = np.rint(time_s * (1 + self.drift_ppm * 1e-6) * 1e6).astype(np.int64)
+        passed: Ints = np.rint(time_s * (1 + self.drift_ppm * 1e-6) * 1e6).astype(np.int64)
         return self.origin_us + passed
 
 
@@ -54,9 +54,9 @@ class EmulatedCapture:
     clock: FrameClock
     layout: IndexLayout
     wavelength_nm: Sequence[float]
-    references: dict[str, NDArray[np.uint16]] = field(default_factory=dict)  # name -> (frame, sample, band)
+    references: dict[str, Raw] = field(default_factory=dict)  # name -> (frame, sample, band)
     cut_bytes: int = 0  # missing at the end of the last cube
-    _lines: list[NDArray[np.uint16]] = field(default_factory=list)
+    _lines: list[Raw] = field(default_factory=list)
     _taken: int = 0
     _whole: dict[str, bytes] | None = None  # all files, once no frame is to come
 
@@ -79,12 +79,6 @@ class EmulatedCapture:
     def stop(self, now_s: float) -> None:
         """Take no frame that is not over."""
         self.most_frames = self.due(now_s)
-
-    def take(self, now_s: float, positions: Positions, lines: Lines) -> None:
-        """Look, for all frames that are over by now and not taken yet."""
-        while len(numbers := self.pending(now_s)):
-            middle_s = self.middle_s(numbers)
-            self.put(lines(positions(middle_s), middle_s))
 
     def pending(self, now_s: float, most: int = _BLOCK) -> Ints:
         """Numbers of the next frames, ``most`` at most, that are over by now and not taken yet."""
@@ -140,17 +134,16 @@ class EmulatedCapture:
         rows = [f"{number}{self.layout.between}{stamp}" for number, stamp in zip(shown, stamps, strict=True)]
         return (self.layout.end.join([f"Frame#{self.layout.between}Timestamp", *rows]) + self.layout.end).encode()
 
-    def _header(self, frames: NDArray[np.uint16]) -> bytes:
+    def _header(self, frames: Raw) -> bytes:
         lines, samples, bands = frames.shape
-        wavelengths = self.wavelength_nm if len(self.wavelength_nm) == bands else ()
-        fields = [
-            "ENVI", "interleave = bil", "data type = 12", f"lines = {lines}", f"samples = {samples}",
-            f"bands = {bands}", "byte order = 0", "header offset = 0",
-        ]  # fmt: skip
-        if wavelengths:
-            fields.append("wavelength = {\n" + ",\n".join(f"{value:.17g}" for value in wavelengths) + "\n}")
-        return ("\n".join(fields) + "\n").encode()
+        text = (
+            f"ENVI\ninterleave = bil\ndata type = 12\nlines = {lines}\nsamples = {samples}\nbands = {bands}\n"
+            "byte order = 0\nheader offset = 0\n"
+        )
+        if bands and len(self.wavelength_nm) == bands:
+            text += "wavelength = {\n" + ",\n".join(f"{value:.17g}" for value in self.wavelength_nm) + "\n}\n"
+        return text.encode()
 
 
-def _bil(frames: NDArray[np.uint16]) -> bytes:
+def _bil(frames: Raw) -> bytes:
     return np.ascontiguousarray(frames.transpose(0, 2, 1), "<u2").tobytes()

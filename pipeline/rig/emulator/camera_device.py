@@ -1,13 +1,17 @@
 """The emulated camera: commands in, replies out, captures that look at whatever it is given. No sockets, no waiting.
 
-Spoken is what :mod:`pipeline.rig.headwall_replies` reads; texts of refusals are made up, since no document tells them.
+It speaks what :mod:`pipeline.rig.camera.headwall_replies` reads; the texts of refusals are made up, since no document
+tells them.
 """
 
 from __future__ import annotations
 
 import json
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from enum import Enum
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,11 +20,59 @@ from numpy.typing import NDArray
 from pipeline.errors import RigError
 from pipeline.rig.clock import Clock
 from pipeline.rig.emulator.camera_capture import EmulatedCapture, FrameClock, IndexLayout, Lines, Positions
-from pipeline.rig.emulator.camera_faults import CameraFault, CameraFaults
 from pipeline.rig.emulator.exchange import Chunk
 
 PROMPT = b"\r\nhpi> "
 MOST_LINE = 4096
+
+
+class CameraFault(Enum):
+    """A fault of the camera, and what happens where it strikes."""
+
+    words: str
+
+    SLOW = "slow", "a reply comes late, and in time"
+    LATE = "late", "a reply comes after any deadline"
+    SILENT = "silent", "a command is done and its reply is lost"
+    SPLIT = "split", "a reply comes in pieces"
+    MERGED = "merged", "a reply comes together with one to a command that nobody sent"
+    STALE = "stale", "a reply to another command comes before the right one"
+    NOT_JSON = "not-json", "a reply is no JSON"
+    HANGS_UP = "hangs-up", "a command is done, and the connection closed without a reply"
+    FULL = "full", "a capture is refused: the disk is full"
+    BUSY = "busy", "a capture is refused: the camera is busy"
+    CUT_CUBE = "cut-cube", "a cube ends within a line"
+    BREAKS_OFF = "breaks-off", "a transfer of a file is closed half way"
+    REFUSES_FILES = "refuses-files", "a connection for files is closed at once"
+
+    def __new__(cls, name: str, words: str) -> CameraFault:
+        fault = object.__new__(cls)
+        fault._value_, fault.words = name, words
+        return fault
+
+
+@dataclass
+class CameraFaults:
+    """Faults still to come, each so many times, after ``passes`` occasions; where pieces are cut is by the seed."""
+
+    left: dict[CameraFault, int] = field(default_factory=dict)
+    seed: int = 0
+    passes: int = 0
+    slow_s: float = 1.0
+    late_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        self.rng = np.random.default_rng(self.seed)
+
+    def strikes(self, fault: CameraFault) -> bool:
+        """Whether the fault strikes now; it is then one less to come."""
+        if self.left.get(fault, 0) < 1:
+            return False
+        if self.passes > 0:
+            self.passes -= 1
+            return False
+        self.left[fault] -= 1
+        return True
 
 
 @dataclass(frozen=True)
@@ -55,9 +107,14 @@ class CameraDevice:
     """
 
     def __init__(
-        self, lines: Lines, clock: Clock, *, positions: Positions = at_rest, unit: CameraUnit | None = None,
+        self,
+        lines: Lines,
+        clock: Clock,
+        *,
+        positions: Positions = at_rest,
+        unit: CameraUnit | None = None,
         faults: CameraFaults | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.unit = CameraUnit() if unit is None else unit
         self.faults = CameraFaults() if faults is None else faults
         self.clock = clock
@@ -72,20 +129,19 @@ class CameraDevice:
         greeting = f"{self.unit.greeting}\r\n".encode() if self.unit.greeting else b""
         return self._cut(greeting + PROMPT[2:])
 
-    def connection(self) -> CameraConnection:
-        """A connection's own half of the talk: bytes of commands that are not whole yet."""
-        return CameraConnection(self)
-
     def command(self, line: str) -> list[Chunk] | None:
         """Do one command; give its reply, in pieces and in time, or None where the connection ends."""
         with self._lock:
             self.commands.append(line)
             if line == "exit":
                 return None
-            reply = json.dumps(self._reply(line))
+            try:
+                said = {"success": True, "response": self._do(line), "errorMessage": ""}
+            except RigError as error:
+                said = {"success": False, "response": None, "errorMessage": str(error)}
             if self.faults.strikes(CameraFault.HANGS_UP):
                 return None
-            return self._spoken(line, reply)
+            return self._spoken(line, json.dumps(said))
 
     def is_capturing(self) -> bool:
         """Whether a capture runs."""
@@ -100,11 +156,10 @@ class CameraDevice:
     def files(self) -> dict[str, bytes]:
         """All files by their whole names, as they are now."""
         with self._lock:
-            found: dict[str, bytes] = {}
-            for capture in self.captures:
-                capture.take(self.clock.now(), self._positions, self._lines)
-                found |= {f"{capture.folder}/{name}": data for name, data in capture.files().items()}
-            return found
+            self._look()
+            return {
+                f"{capture.folder}/{name}": data for capture in self.captures for name, data in capture.files().items()
+            }
 
     def folders(self) -> set[str]:
         """All folders."""
@@ -112,6 +167,13 @@ class CameraDevice:
         return every | {
             "/" + "/".join(name.split("/")[1:end]) for name in every for end in range(2, name.count("/") + 1)
         }
+
+    def _look(self) -> None:
+        """Look at all frames that are over by now."""
+        for capture in self.captures:
+            while len(numbers := capture.pending(self.clock.now())):
+                middle_s = capture.middle_s(numbers)
+                capture.put(self._lines(self._positions(middle_s), middle_s))
 
     def _spoken(self, line: str, reply: str) -> list[Chunk]:
         echo = f"{line}\r\n" if self.unit.echoes else ""
@@ -138,13 +200,10 @@ class CameraDevice:
     def _cut(self, data: bytes) -> list[Chunk]:
         if not self.faults.strikes(CameraFault.SPLIT):
             return [Chunk(0.0, data)]
-        return [Chunk(0.002, piece) for piece in self.faults.cut(data)]
-
-    def _reply(self, line: str) -> dict[str, Any]:
-        try:
-            return {"success": True, "response": self._do(line), "errorMessage": ""}
-        except RigError as error:
-            return {"success": False, "response": None, "errorMessage": str(error)}
+        rng, most = self.faults.rng, max(len(data) - 1, 0)
+        count = min(int(rng.integers(1, 7)), most)
+        ends = sorted(int(end) + 1 for end in rng.permutation(most)[:count])
+        return [Chunk(0.002, data[start:stop]) for start, stop in pairwise([0, *ends, len(data)])]
 
     def _do(self, line: str) -> Any:
         name, _, rest = line.partition("(")
@@ -154,13 +213,16 @@ class CameraDevice:
                 argument = json.loads(rest.rstrip().removesuffix(")"))
             except ValueError:
                 raise RigError(f"argument of {name} is not JSON") from None
-        does = {
-            "configure": self._configure, "capture": self._capture, "listFiles": self._list,
-            "isCapturing": lambda _: self.is_capturing(), "stopCapture": self._stop,
-        }.get(name.strip())  # fmt: skip
-        if does is None:
+        does: dict[str, Callable[[Any], Any]] = {
+            "configure": self._configure,
+            "capture": self._capture,
+            "listFiles": self._list,
+            "isCapturing": lambda _: self.is_capturing(),
+            "stopCapture": self._stop,
+        }
+        if name.strip() not in does:
             raise RigError(f"unknown command {name}")
-        return does(argument)
+        return does[name.strip()](argument)
 
     def _configure(self, argument: Any) -> Any:
         if not isinstance(argument, dict) or not {"exposure", "framePeriod"} >= set(argument):
@@ -194,10 +256,18 @@ class CameraDevice:
             probe = self._lines(self._positions(np.array([self.clock.now()])), np.array([self.clock.now()]))
             cut = probe[0].size * 3  # a line and a half of two bytes a number
         return EmulatedCapture(
-            folder, self.clock.now() + self.unit.clock.delay_s, self.exposure_ms * 1e-3, self.period_ms * 1e-3,
-            frames, frames * cubes if cubes else None, self.unit.clock, self.unit.layout, self.unit.wavelength_nm,
-            self.unit.references, cut,
-        )  # fmt: skip
+            folder,
+            began_s=self.clock.now() + self.unit.clock.delay_s,
+            exposure_s=self.exposure_ms * 1e-3,
+            period_s=self.period_ms * 1e-3,
+            frames_per_cube=frames,
+            most_frames=frames * cubes if cubes else None,
+            clock=self.unit.clock,
+            layout=self.unit.layout,
+            wavelength_nm=self.unit.wavelength_nm,
+            references=self.unit.references,
+            cut_bytes=cut,
+        )
 
     def _stop(self, argument: Any) -> bool:
         if not self.is_capturing():
@@ -210,18 +280,17 @@ class CameraDevice:
         if folder not in self.folders():
             raise RigError(f"no such folder {folder}")
         under = folder.rstrip("/") + "/"
-        entries = [
-            {"name": name, "size": 0, "mtime": 0, "isDirectory": True}
-            for name in self.folders() if name != folder and name.startswith(under) and "/" not in name[len(under) :]
-        ]  # fmt: skip
-        for name, data in self.files().items():
-            if name.startswith(under) and "/" not in name[len(under) :]:
-                entries.append({"name": name, "size": len(data), "mtime": 0, "isDirectory": False})
-        return sorted(entries, key=lambda entry: str(entry["name"]))
+        found = [(name, 0, True) for name in self.folders() if name != folder]
+        found += [(name, len(data), False) for name, data in self.files().items()]
+        return [
+            {"name": name, "size": size, "mtime": 0, "isDirectory": is_folder}
+            for name, size, is_folder in sorted(found)
+            if name.startswith(under) and "/" not in name[len(under) :]
+        ]
 
 
 class CameraConnection:
-    """Bytes of one connection, cut into commands at carriage returns."""
+    """One connection's own half of the talk: its bytes, cut into commands at carriage returns."""
 
     def __init__(self, device: CameraDevice) -> None:
         self._device = device

@@ -1,26 +1,93 @@
-"""The emulated camera on the network: its control socket and its files over FTP, on free ports of this machine.
+"""Ways to the emulated camera: a control line in this process, or its control socket and files over FTP on free ports.
 
-The files stay in memory. pyftpdlib serves them and is imported when a server starts.
+The files stay in memory; pyftpdlib serves them.
 """
 
 from __future__ import annotations
 
 import io
 import logging
+import os
 import socket
 import stat
 import threading
 import warnings
+from collections import deque
 from contextlib import suppress
+from dataclasses import dataclass, field
 from typing import Any
 
 from pipeline.errors import RigError
-from pipeline.rig.emulator.camera_device import CameraDevice
-from pipeline.rig.emulator.camera_faults import CameraFault
-from pipeline.rig.kept_files import RemoteFile
+from pipeline.rig.clock import Clock
+from pipeline.rig.device_errors import DeviceGone
+from pipeline.rig.emulator.camera_device import CameraConnection, CameraDevice, CameraFault
+from pipeline.rig.emulator.exchange import Chunk
+
+try:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # asyncore, which Python 3.11 still has
+        from pyftpdlib.authorizers import DummyAuthorizer
+        from pyftpdlib.filesystems import AbstractedFS
+        from pyftpdlib.handlers import DTPHandler, FTPHandler
+        from pyftpdlib.ioloop import IOLoop
+        from pyftpdlib.servers import FTPServer
+except ImportError as error:
+    raise RigError("the emulated camera's files need pyftpdlib; install it: pip install 'pyftpdlib>=2'") from error
 
 LOG = logging.getLogger(__name__)
 _SLICE_S = 0.05  # how soon threads see that they are to end
+
+
+@dataclass
+class InProcessCameraLine:
+    """A :class:`~pipeline.rig.transports.Transport` to ``device``; both share the clock."""
+
+    device: CameraDevice
+    clock: Clock
+    port: str = "emulated camera"
+    _coming: deque[tuple[float, bytes]] = field(default_factory=deque, init=False)
+    _open: bool = field(default=True, init=False)
+
+    def __post_init__(self) -> None:
+        self._talk = CameraConnection(self.device)
+        self._say(self.device.greet())
+
+    def write(self, data: bytes, deadline: float) -> None:
+        self._check_open()
+        chunks, self._open = self._talk.feed(data)
+        self._say(chunks)
+
+    def read(self, at_most: int, deadline: float) -> bytes:
+        if not self._coming:
+            self._check_open()
+        if not self._coming or self._coming[0][0] > deadline:
+            self.clock.sleep(deadline - self.clock.now())
+            return b""
+        due_s, data = self._coming.popleft()
+        self.clock.sleep(due_s - self.clock.now())
+        if len(data) > at_most:
+            self._coming.appendleft((due_s, data[at_most:]))
+        return data[:at_most]
+
+    def drain(self) -> bytes:
+        found = b""
+        while self._coming and self._coming[0][0] <= self.clock.now():
+            found += self._coming.popleft()[1]
+        return found
+
+    def close(self) -> None:
+        self._open = False
+        self._coming.clear()
+
+    def _say(self, chunks: list[Chunk]) -> None:
+        due_s = self.clock.now()
+        for chunk in chunks:
+            due_s += chunk.delay_s
+            self._coming.append((due_s, chunk.data))
+
+    def _check_open(self) -> None:
+        if not self._open:
+            raise DeviceGone(f"the connection to {self.port} was lost (closed by the other end)")
 
 
 class CameraServer:
@@ -33,13 +100,19 @@ class CameraServer:
 
     Raises
     ------
-    RigError : a port is taken, or pyftpdlib is not installed.
+    RigError : a port is taken.
     """
 
     def __init__(
-        self, device: CameraDevice, *, host: str = "127.0.0.1", port: int = 0, file_port: int = 0,
-        user: str = "ftpuser", password: str = "ftpuser",
-    ) -> None:  # fmt: skip
+        self,
+        device: CameraDevice,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        file_port: int = 0,
+        user: str = "ftpuser",
+        password: str = "ftpuser",
+    ) -> None:
         self.device = device
         self.host = host
         self._ended = threading.Event()
@@ -82,12 +155,11 @@ class CameraServer:
     def _serve_control(self) -> None:
         while not self._ended.is_set():
             with suppress(TimeoutError):
-                connection, _ = self._listener.accept()
-                self._start(self._talk, connection)
+                self._start(self._talk, self._listener.accept()[0])
 
     def _talk(self, connection: socket.socket) -> None:
         """One client, until it says exit, goes away, or the server closes."""
-        talk = self.device.connection()
+        talk = CameraConnection(self.device)
         with connection, suppress(OSError):
             connection.settimeout(_SLICE_S)
             chunks, goes_on = self.device.greet(), True
@@ -117,68 +189,18 @@ class CameraServer:
         self._files.close_all()
 
 
-def remote_files(device: CameraDevice, folder: str) -> list[RemoteFile]:
-    """A device's files in a folder, as a listing has them."""
-    return [
-        RemoteFile(name, len(data), False)
-        for name, data in sorted(device.files().items()) if name.startswith(folder + "/")
-    ]  # fmt: skip
-
-
-def _file_server(device: CameraDevice, address: tuple[str, int], user: tuple[str, str]) -> Any:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # asyncore, which Python 3.11 still has
-            from pyftpdlib.authorizers import DummyAuthorizer
-            from pyftpdlib.filesystems import AbstractedFS
-            from pyftpdlib.handlers import DTPHandler, FTPHandler
-            from pyftpdlib.ioloop import IOLoop
-            from pyftpdlib.servers import FTPServer
-    except ImportError as error:
-        raise RigError("the emulated camera's files need pyftpdlib; install it: pip install 'pyftpdlib>=2'") from error
+def _file_server(device: CameraDevice, address: tuple[str, int], user: tuple[str, str]) -> FTPServer:
     chatter = logging.getLogger("pyftpdlib")
     chatter.setLevel(logging.ERROR)
     if not chatter.handlers:
         chatter.addHandler(logging.NullHandler())  # else it turns itself up to everything, on stderr
     authorizer = DummyAuthorizer()
     authorizer.add_user(*user, homedir=".", perm="elr")
-    transfer = type("CameraTransfer", (_BreakingTransfer, DTPHandler), {"device": device})
-    handler = type(
-        "CameraFileHandler",
-        (_RefusingHandler, FTPHandler),
-        {
-            "device": device, "authorizer": authorizer, "dtp_handler": transfer, "use_sendfile": False,
-            "abstracted_fs": type("CameraFolders", (_FilesInMemory, AbstractedFS), {"device": device}),
-            "auth_failed_timeout": 0, "banner": "emulated camera",
-        },
-    )  # fmt: skip
+    handler = type("CameraFileHandler", (_FileHandler,), {"device": device, "authorizer": authorizer})
     try:
         return FTPServer(address, handler, ioloop=IOLoop())
     except OSError as error:
         raise RigError(f"{address[0]}:{address[1]} cannot be listened on ({error}); take another port") from error
-
-
-class _RefusingHandler:
-    """Closes connections for files while that fault strikes."""
-
-    device: CameraDevice
-
-    def handle(self) -> None:
-        if self.device.faults.strikes(CameraFault.REFUSES_FILES):
-            self.close()  # type: ignore[attr-defined]
-            return
-        super().handle()  # type: ignore[misc]
-
-
-class _BreakingTransfer:
-    """Closes a transfer half way while that fault strikes, and the session with it."""
-
-    device: CameraDevice
-
-    def push_with_producer(self, producer: Any) -> None:
-        if self.device.faults.strikes(CameraFault.BREAKS_OFF):
-            producer = _HalfOf(producer, self)
-        super().push_with_producer(producer)  # type: ignore[misc]
 
 
 class _HalfOf:
@@ -197,6 +219,15 @@ class _HalfOf:
         return data
 
 
+class _BreakingTransfer(DTPHandler):  # type: ignore[misc]
+    """Closes a transfer half way while that fault strikes, and the session with it."""
+
+    def push_with_producer(self, producer: Any) -> None:
+        if self.cmd_channel.device.faults.strikes(CameraFault.BREAKS_OFF):
+            producer = _HalfOf(producer, self)
+        super().push_with_producer(producer)
+
+
 class _NamedBytes(io.BytesIO):
     """A file in memory with the name that servers ask for."""
 
@@ -205,14 +236,16 @@ class _NamedBytes(io.BytesIO):
         self.name = name
 
 
-class _FilesInMemory:
+class _FilesInMemory(AbstractedFS):  # type: ignore[misc]
     """A device's files as a read-only file system."""
 
-    device: CameraDevice
-    cwd: str
+    @property
+    def device(self) -> CameraDevice:
+        device: CameraDevice = self.cmd_channel.device
+        return device
 
     def ftp2fs(self, path: str) -> str:
-        return str(self.ftpnorm(path))  # type: ignore[attr-defined]
+        return str(self.ftpnorm(path))
 
     def fs2ftp(self, path: str) -> str:
         return path
@@ -247,8 +280,6 @@ class _FilesInMemory:
         return sorted({name[len(under) :].split("/")[0] for name in every if name.startswith(under) and name != under})
 
     def stat(self, path: str) -> Any:
-        import os
-
         mode = stat.S_IFDIR | 0o555 if self.isdir(path) else stat.S_IFREG | 0o444
         size = 0 if self.isdir(path) else self.getsize(path)
         return os.stat_result((mode, 0, 0, 1, 0, 0, size, 0, 0, 0))
@@ -260,3 +291,20 @@ class _FilesInMemory:
             return self.device.files()[path]
         except KeyError:
             raise FileNotFoundError(2, "No such file", path) from None
+
+
+class _FileHandler(FTPHandler):  # type: ignore[misc]
+    """A session of the file server; it is closed at once while that fault strikes."""
+
+    device: CameraDevice
+    dtp_handler = _BreakingTransfer
+    abstracted_fs = _FilesInMemory
+    use_sendfile = False
+    auth_failed_timeout = 0
+    banner = "emulated camera"
+
+    def handle(self) -> None:
+        if self.device.faults.strikes(CameraFault.REFUSES_FILES):
+            self.close()
+            return
+        super().handle()

@@ -1,14 +1,14 @@
 """A whole emulated rig: mirror and camera on one clock, the camera's exposures at the mirror's trigger, and a scene.
 
-A planned sweep that is announced (:func:`pipeline.rig.capture_names.capture_prefix` as the capture's prefix), loaded
-and played gives the simulated source's lines, bit for bit:
+A planned sweep that is announced (by a capture's prefix, :func:`pipeline.rig.capture.capture_paths.capture_prefix`),
+loaded and played gives the simulated source's lines, bit for bit:
 
 - The mirror's vector unit takes the first cell as it is run, and one more at each rising edge. A path that is played by
   trigger therefore begins with a lead-in cell; line 0's first position is its second.
 - A line that holds several positions gets as many pulses, evenly over its exposure, or what ``wired`` says. Without
   trigger the path is run at (positions of a line) / (frame period), and is the planned one where it begins within half
   a held position of the first exposure.
-- Frames count as the line whose planned positions the mirror holds. See :mod:`pipeline.rig.emulator.scene_view`.
+- Frames count as the line whose planned positions the mirror holds. See :mod:`pipeline.rig.emulator.scene_camera`.
 - The frames hold all samples of the camera; binning is the reader's. A capture with the prefix ``references`` has dark
   and white cubes beside its frames.
 """
@@ -19,24 +19,20 @@ import logging
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import TracebackType
 
+from pipeline.errors import SettingsError
 from pipeline.geometry.mounting import STRAIGHT, Mounting
+from pipeline.rig.camera.camera_settings import FileServer
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.camera.headwall_control import HeadwallControl
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock, ManualClock
-from pipeline.rig.emulator.camera_device import CameraUnit
-from pipeline.rig.emulator.camera_faults import CameraFaults
-from pipeline.rig.emulator.camera_server import CameraServer
-from pipeline.rig.emulator.fault import Fault
-from pipeline.rig.emulator.in_process import InProcessTransport
-from pipeline.rig.emulator.in_process_camera import InProcessCameraLine
+from pipeline.rig.emulator.camera_device import CameraFaults, CameraUnit
+from pipeline.rig.emulator.camera_server import CameraServer, InProcessCameraLine
+from pipeline.rig.emulator.mirror_device import MirrorDevice
+from pipeline.rig.emulator.mirror_faults import Fault
+from pipeline.rig.emulator.mirror_ports import EmulatedPort, InProcessTransport
 from pipeline.rig.emulator.mirror_state import MirrorUnit
-from pipeline.rig.emulator.pty_port import EmulatedPort
-from pipeline.rig.emulator.scene_camera import Look, SceneCamera
-from pipeline.rig.emulator.scene_view import SceneView
-from pipeline.rig.emulator.triggered_mirror import TriggeredMirror
-from pipeline.rig.file_session import FileServer
-from pipeline.rig.headwall_camera import HeadwallCamera
-from pipeline.rig.headwall_control import HeadwallControl
+from pipeline.rig.emulator.scene_camera import Look, SceneCamera, SceneView
 from pipeline.rig.survey_rig import Pulses
 from pipeline.simulator.simulated import SimulatedSource
 
@@ -44,8 +40,24 @@ LOG = logging.getLogger(__name__)
 _NAP_S = 0.01
 
 
+class FastClock:
+    """Monotonic time, ``speed`` times as fast as it is, from 0 on. Sleeping takes as much less."""
+
+    def __init__(self, speed: float = 1.0) -> None:
+        if not 0 < speed < float("inf"):
+            raise SettingsError(f"a speed of {speed:g}: expected how many times as fast time goes, above 0 (--speed)")
+        self.speed = speed
+        self._began = SYSTEM_CLOCK.now()
+
+    def now(self) -> float:
+        return (SYSTEM_CLOCK.now() - self._began) * self.speed
+
+    def sleep(self, seconds: float) -> None:
+        SYSTEM_CLOCK.sleep(seconds / self.speed)
+
+
 @dataclass(frozen=True)
-class Seen:
+class RigState:
     """What both devices do at a moment."""
 
     position: tuple[float, float]  # device X and Y
@@ -73,24 +85,39 @@ class EmulatedRig:
     """
 
     def __init__(
-        self, source: SimulatedSource, clock: Clock | None = None, *, mirror_faults: Sequence[Fault] = (),
-        camera_faults: CameraFaults | None = None, wired: Pulses = "position", look: Look = "sent", kept: int = 0,
-        mirror: MirrorUnit | None = None, camera: CameraUnit | None = None, mounting: Mounting = STRAIGHT,
-    ) -> None:  # fmt: skip
+        self,
+        source: SimulatedSource,
+        clock: Clock | None = None,
+        *,
+        mirror_faults: Sequence[Fault] = (),
+        camera_faults: CameraFaults | None = None,
+        wired: Pulses = "position",
+        look: Look = "sent",
+        kept: int = 0,
+        mirror: MirrorUnit | None = None,
+        camera: CameraUnit | None = None,
+        mounting: Mounting = STRAIGHT,
+    ) -> None:
         self.clock = ManualClock() if clock is None else clock
-        self.mirror = TriggeredMirror(self.clock, mirror_faults, unit=mirror)
+        self.mirror = MirrorDevice(self.clock, mirror_faults, unit=mirror)
         self.camera = SceneCamera(
-            SceneView(source, mounting), self.mirror, self.clock, wired=wired, look=look, kept=kept, unit=camera,
+            SceneView(source, mounting),
+            self.mirror,
+            self.clock,
+            wired=wired,
+            look=look,
+            kept=kept,
+            unit=camera,
             faults=camera_faults,
-        )  # fmt: skip
+        )
         self.mirror.pulses = self.camera.pulses
 
-    def seen(self) -> Seen:
+    def seen(self) -> RigState:
         """Say what both devices do now."""
         x, y = self.mirror.positions(self.clock.now())
         last = self.mirror.acts[-1].request.words if self.mirror.acts else ""
         mode = "gone" if self.mirror.gone else "hung" if self.mirror.hung else self.mirror.mode.value
-        return Seen((float(x), float(y)), mode, last, self.camera.is_capturing(), len(self.camera.captures))
+        return RigState((float(x), float(y)), mode, last, self.camera.is_capturing(), len(self.camera.captures))
 
     def in_process(self, *, baud: int = 0) -> InProcessRig:
         """Give lines to both devices without ports; only the camera's files go through a socket of this machine."""
@@ -169,9 +196,7 @@ class ServedRig:
     def __enter__(self) -> ServedRig:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:

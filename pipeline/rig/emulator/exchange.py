@@ -1,13 +1,15 @@
-"""What passes between the parts of the emulated controller: modes, requests, replies in time."""
+"""What passes between the emulated controller and whoever speaks to it, and what a fault may do with a controller."""
 
 from __future__ import annotations
 
 import errno
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
-from pipeline.rig.pro_mode import Command, Damaged, Frame
+from pipeline.rig.clock import Clock
+from pipeline.rig.emulator.mirror_state import MirrorState, MirrorUnit
+from pipeline.rig.mirror.pro_mode import Command, Damaged, Frame
 
 
 class Mode(Enum):
@@ -19,7 +21,7 @@ class Mode(Enum):
 
 
 class Chunk(NamedTuple):
-    """Bytes that the controller sends, so long after it took the request. [s]"""
+    """Bytes that a device sends, so long after it took the request. [s]"""
 
     delay_s: float
     data: bytes
@@ -53,3 +55,22 @@ class VanishedError(OSError):
 
     def __init__(self, why: str) -> None:
         super().__init__(errno.EIO, why)
+
+
+class StruckMirror(Protocol):
+    """The emulated controller as a fault sees it. ``gone``: no port knows it; ``hung``: its port takes no bytes."""
+
+    clock: Clock
+    unit: MirrorUnit
+    state: MirrorState
+    gone: bool
+    hung: bool
+
+    def set_mode(self, mode: Mode) -> None:
+        """Speak another mode from the next byte on."""
+
+    def restart(self, *, boot_s: float | None = None) -> None:
+        """Lose everything and be in simple mode, deaf for a while."""
+
+    def carry_out(self, request: Request) -> bytes:
+        """Do what a request asks for and give the bytes of the reply."""

@@ -1,16 +1,19 @@
 """The emulated mirror controller: bytes in, bytes out. No transport, and time only by the clock that it is given.
 
-Both modes of the documented protocol. Assumed, as the documents leave it open: an empty line has no answer; a reset is
-answered by OK, and what comes while the controller boots is lost; in pro mode bytes that are no frame are answered by
-error 0001 at the next boundary, requests are checked by their CRC after GOPROCRC alone, and replies always carry it.
+Both modes of the documented protocol. Assumed, as the documents leave it open: an empty line has no answer; NO answers
+a line that is not known, ERROR one that is known and cannot be read; a position beyond the rim is pulled in to it, and
+the answer says to which side it lay; a reset is answered by OK, and what comes while the controller boots is lost; in
+pro mode bytes that are no frame are answered by error 0001 at the next boundary, requests are checked by their CRC
+after GOPROCRC alone, and replies always carry it.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,18 +21,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.rig.clock import Clock
 from pipeline.rig.emulator.exchange import Chunk, Mode, Request, VanishedError
-from pipeline.rig.emulator.fault import Fault
+from pipeline.rig.emulator.mirror_faults import Fault
 from pipeline.rig.emulator.mirror_registers import RegisterFile
 from pipeline.rig.emulator.mirror_state import MirrorState, MirrorUnit
-from pipeline.rig.emulator.pro_answers import answer_frame
-from pipeline.rig.emulator.simple_answers import answer_line
-from pipeline.rig.pro_mode import BOUNDARY, ERROR_FLAG, Command, Damaged, ErrorCode, Frame, FrameReader, encode
-from pipeline.rig.pro_payloads import refuse
-from pipeline.rig.registers import Status
-from pipeline.rig.simple_mode import END, GO_PRO, GO_PRO_CRC, MOST_LINE, RESET, Answer
+from pipeline.rig.mirror import simple_mode
+from pipeline.rig.mirror.pro_mode import BOUNDARY, ERROR_FLAG, Command, ErrorCode, Frame, FrameReader, encode
+from pipeline.rig.mirror.pro_payloads import refuse
+from pipeline.rig.mirror.registers import CHANNELS, ChannelRegisters, Unit
+from pipeline.rig.mirror.simple_mode import END, MOST_LINE, Answer
 
 KEPT_ACTS = 5_000
 _BOUNDARY = bytes((BOUNDARY,))
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:E[-+]?\d+)?"
+_PLACE = re.compile(rf"(X|Y|XY)=({_NUMBER})(?:;({_NUMBER}))?")
+
+Floats = NDArray[np.float64]
+Pulses = Callable[[float, float], Floats]  # (pulse, 2) rises and falls of pulses that rise within a span of time
 
 
 @dataclass(frozen=True)
@@ -44,15 +51,18 @@ class MirrorDevice:
     """One emulated controller with its mirror.
 
     ``acts`` are the requests carried out so far, the newest ``KEPT_ACTS``; ``gone`` and ``hung`` say that the
-    port knows no device any more, or takes no bytes. Methods may be called from several threads: the port's, and that
-    of an emulated camera, which gives triggers and asks for positions.
+    port knows no device any more, or takes no bytes. ``pulses`` is what is wired to the trigger input, which is looked
+    at before anything else is done. Methods may be called from several threads: the port's, and that of an emulated
+    camera, which gives triggers and asks for positions.
     """
 
     def __init__(self, clock: Clock, faults: Sequence[Fault] = (), *, unit: MirrorUnit | None = None) -> None:
         self.clock, self.faults, self.unit = clock, tuple(faults), MirrorUnit() if unit is None else unit
         self.acts: deque[Act] = deque(maxlen=KEPT_ACTS)
         self.gone = self.hung = False
-        self._lock = threading.RLock()
+        self.pulses: Pulses | None = None
+        self._pulses_taken_s = clock.now()
+        self._lock, self._wire = threading.RLock(), threading.Lock()
         self.state = MirrorState(clock, self.unit)
         self.restart(boot_s=0.0)
         for fault in self.faults:
@@ -64,12 +74,8 @@ class MirrorDevice:
             return [chunk for fault in self.faults for chunk in fault.opened(self)]
 
     def receive(self, data: bytes) -> list[Chunk]:
-        """Take bytes, and give what comes back as (delay from now [s], bytes).
-
-        Raises
-        ------
-        VanishedError : a fault took the device away.
-        """
+        """Take bytes and give what comes back; VanishedError where a fault took the device away."""
+        self.take_pulses()
         with self._lock:
             if self.gone:
                 raise VanishedError("the device is gone")
@@ -88,19 +94,34 @@ class MirrorDevice:
     ) -> None:
         """Take ``count`` pulses at the trigger input, one every ``period_s``, from now or from ``started_s`` on."""
         with self._lock:
-            self.state.trigger(count, period_s, started_s, width_s)
+            now_s = self.state.advance()
+            rises = (now_s if started_s is None else started_s) + np.arange(count, dtype=np.float64) * period_s
+            self.state.trigger(rises, rises + width_s)
 
-    def positions(self, times_s: ArrayLike) -> NDArray[np.float64]:
+    def take_pulses(self) -> None:
+        """Step through the vector memory as the pulses at the trigger input since the last call say."""
+        if self.pulses is None:
+            return
+        with self._wire:
+            now_s = self.clock.now()
+            pulses = self.pulses(self._pulses_taken_s, now_s)
+            self._pulses_taken_s = max(now_s, self._pulses_taken_s)
+            if len(pulses):
+                with self._lock:
+                    self.state.trigger(pulses[:, 0], pulses[:, 1])
+
+    def positions(self, times_s: ArrayLike) -> Floats:
         """Give where the mirror truly was, (..., 2) device X and Y, at times of the clock up to now (...)."""
+        self.take_pulses()
         with self._lock:
             return self.state.positions(times_s)
 
-    def status(self) -> Status:
-        """Give the status bits as the controller reports them: what is so, and what faults make of it."""
-        status = self.state.status()
-        for fault in self.faults:
-            status = fault.status(status)
-        return status
+    def sent(self, times_s: ArrayLike) -> Floats:
+        """Give where the mirror was sent, (..., 2), at times of the clock up to now (...)."""
+        self.take_pulses()
+        with self._lock:
+            self.state.advance()
+            return np.stack([axis.commands(times_s) for axis in self.state.axes], axis=-1)
 
     def restart(self, *, boot_s: float | None = None) -> None:
         """Lose everything and be in simple mode, deaf for a while: a reset, or a loss of power."""
@@ -131,10 +152,8 @@ class MirrorDevice:
         """Take bytes up to a boundary, and give those behind it: a frame may change the mode."""
         taken, end, rest = data.partition(_BOUNDARY)
         for found in self._reader.feed(taken + end):
-            if isinstance(found, Frame):
-                self._answer(Request(self.mode, frame=found), out)
-            else:
-                self._answer(Request(self.mode, damaged=found), out)
+            whole, damaged = (found, None) if isinstance(found, Frame) else (None, found)
+            self._answer(Request(self.mode, frame=whole, damaged=damaged), out)
         return rest
 
     def _answer(self, request: Request, out: list[Chunk]) -> None:
@@ -152,30 +171,64 @@ class MirrorDevice:
     def carry_out(self, request: Request) -> bytes:
         """Do what a request asks for and give the bytes of the reply, whatever faults there are."""
         self.acts.append(Act(self.clock.now(), request))
-        if request.damaged is not None:
-            return encode(_refuse_damaged(request.damaged))
-        return self._simple(request.line) if request.frame is None else encode(self._pro(request.frame))
-
-    def _simple(self, line: str) -> bytes:
-        modes = {GO_PRO: Mode.PRO, GO_PRO_CRC: Mode.PRO_CRC}
-        if line in modes:
-            self.set_mode(modes[line])
-        elif line == RESET:
-            self.restart()
-        else:
-            return answer_line(self.state, line, self.status()).encode("ascii") + END
-        return Answer.OK.encode("ascii") + END
+        if request.damaged is not None:  # answered to the command that the bytes seem to hold, if any
+            command = request.damaged.data[1] if len(request.damaged.data) > 1 else 0
+            return encode(refuse(command & ~ERROR_FLAG, ErrorCode.FRAME_INVALID))
+        if request.frame is not None:
+            return encode(self._pro(request.frame))
+        return self._simple(request.line).encode("ascii") + END
 
     def _pro(self, frame: Frame) -> Frame:
         if self.mode is Mode.PRO_CRC and not frame.crc_good:
             return refuse(frame.command & ~ERROR_FLAG, ErrorCode.CRC_WRONG)
-        reply = answer_frame(self.registers, frame, self.status())
+        reply = self.registers.answer(frame)
         if reply.command == Command.SET_MODE:
             self.set_mode(Mode.SIMPLE)
         return reply
 
+    def _simple(self, line: str) -> str:
+        """Carry out a line, in capitals and without its end, and give the answer without an end."""
+        if len(line) + len(END) > MOST_LINE:
+            return Answer.ERROR
+        match line:
+            case simple_mode.ID:
+                return self.unit.model
+            case simple_mode.VERSION:
+                return self.unit.version
+            case simple_mode.SERIAL:
+                return self.unit.serial_number
+            case simple_mode.TEMPERATURE:
+                return f"{self.unit.temperature_c:.2f}"
+            case simple_mode.STATUS:
+                return f"{int(self.state.status()):08X}"
+            case simple_mode.ACKNOWLEDGE:
+                self.state.acknowledge()
+            case simple_mode.GO_PRO:
+                self.set_mode(Mode.PRO)
+            case simple_mode.GO_PRO_CRC:
+                self.set_mode(Mode.PRO_CRC)
+            case simple_mode.RESET:
+                self.restart()
+            case simple_mode.START:
+                pass
+            case _:
+                return self._go(line)
+        return Answer.OK
 
-def _refuse_damaged(damaged: Damaged) -> Frame:
-    """The answer to bytes between boundaries that are no frame: to the command that they seem to hold, if any."""
-    command = damaged.data[1] if len(damaged.data) > 1 else 0
-    return refuse(command & ~ERROR_FLAG, ErrorCode.FRAME_INVALID)
+    def _go(self, line: str) -> Answer:
+        name, equals, _ = line.partition("=")
+        if not equals or name not in ("X", "Y", "XY"):
+            return Answer.NO
+        found = _PLACE.fullmatch(line)
+        if found is None or (name == "XY") != (found[3] is not None):
+            return Answer.ERROR
+        state, places = self.state, [float(number) for number in found.groups()[1:] if number is not None]
+        x, y = (axis[Unit.XY] for axis in state.static)
+        x, y = {"X": (places[0], y), "Y": (x, places[0]), "XY": (places[0], places[-1])}[name]
+        for channel in range(CHANNELS):
+            registers = ChannelRegisters(channel)
+            state.inputs[channel], state.controls[channel] = registers.static_system, registers.xy_system
+        state.hold({0: x, 1: y})
+        if not state.trimmed:
+            return Answer.OK
+        return Answer.BELOW if -min(places) > max(places) else Answer.ABOVE

@@ -1,8 +1,9 @@
-"""The emulated controller's registers: which there are, what may be written to them, and the error where it may not."""
+"""The emulated controller's registers and its answers to frames: what may be read and written, or which error it is."""
 
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -10,11 +11,23 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.rig.emulator.mirror_state import MirrorState
-from pipeline.rig.emulator.position_logger import PositionLogger
-from pipeline.rig.pro_mode import MOST_PAYLOAD, ErrorCode
-from pipeline.rig.pro_payloads import CELL, cell_float, cell_int, float_cell, int_cell
-from pipeline.rig.registers import (
+from pipeline.errors import ShapeError
+from pipeline.rig.emulator.mirror_state import MirrorState, PositionLogger
+from pipeline.rig.mirror.pro_mode import ERROR_FLAG, MOST_PAYLOAD, Command, ErrorCode, Frame
+from pipeline.rig.mirror.pro_payloads import (
+    CELL,
+    acknowledge,
+    cell_float,
+    cell_int,
+    float_cell,
+    int_cell,
+    read_register,
+    read_registers,
+    read_vector,
+    refuse,
+    values_reply,
+)
+from pipeline.rig.mirror.registers import (
     FEEDBACK_A,
     FEEDBACK_X,
     LOG_RATE,
@@ -26,12 +39,13 @@ from pipeline.rig.registers import (
     Unit,
     VectorRegister,
     log_slot,
-)  # fmt: skip
+)
 
 LOWEST_HZ, HIGHEST_HZ = 0.0, 10_000.0
 _TEMPERATURES = 0x2200  # mirror, electronics, and the limits of both, in whole degrees
 _ANALOG, _GENERATOR = 0x58, 0x60
 _CURRENT_A = 0.7
+_LOGGED = range(log_slot(0), log_slot(LOG_SLOTS))  # vectors of the logger
 
 
 class RefusedError(Exception):
@@ -59,12 +73,7 @@ class Register:
         return int_cell(int(value)) if self.whole else float_cell(float(value))
 
     def check(self, cell: bytes) -> float | int:
-        """Read a cell that is to be written.
-
-        Raises
-        ------
-        RefusedError : the register is read only, or the value is out of its range.
-        """
+        """Read a cell that is to be written; RefusedError where it may not be, or is out of range."""
         if self.write is None:
             raise RefusedError(ErrorCode.READ_ONLY)
         value: float | int = cell_int(cell) if self.whole else cell_float(cell)
@@ -81,22 +90,58 @@ class RegisterFile:
     def __init__(self, state: MirrorState) -> None:
         self._state = state
         self.logger = PositionLogger(state)
-        self._registers = {
-            **_board(state), **_logger(self.logger), **_channel(state, 0), **_channel(state, 1)
-        }  # fmt: skip
+        self._registers = {**_board(state), **_logger(self.logger), **_channel(state, 0), **_channel(state, 1)}
 
-    @property
-    def firmware_id(self) -> int:
-        """Id of the firmware, which is no register."""
-        return self._state.unit.firmware_id
+    def answer(self, frame: Frame) -> Frame:
+        """Carry out a frame of pro mode and give the reply, which may say why not."""
+        command = frame.command & ~ERROR_FLAG
+        try:
+            return self._carry_out(frame.command, frame.payload)
+        except RefusedError as refused:
+            return refuse(command, refused.code)
+        except ShapeError:
+            return refuse(command, ErrorCode.LENGTH_MISMATCH)
+
+    def _carry_out(self, command: int, payload: bytes) -> Frame:
+        match command:
+            case Command.FIRMWARE_ID | Command.STATUS:
+                _expect(payload in (b"", b"\x00\x00"))
+                asked_id = command == Command.FIRMWARE_ID
+                return Frame(command, int_cell(self._state.unit.firmware_id if asked_id else int(self._state.status())))
+            case Command.SET_MODE:  # which is the device's own affair
+                _expect(len(payload) == 2)
+                if any(payload):
+                    raise RefusedError(ErrorCode.OUT_OF_RANGE)
+            case Command.GET_VALUE:
+                register, cell = read_register(payload)
+                _expect(not cell)
+                return Frame(command, self.get(register))
+            case Command.SET_VALUE:
+                register, cell = read_register(payload)
+                _expect(bool(cell))
+                self.put({register: cell})
+            case Command.GET_VALUES:
+                asked = read_registers(payload, with_cells=False)
+                _expect(bool(asked))
+                return values_reply([self.get(number) for number, _ in asked])
+            case Command.SET_VALUES:
+                given = read_registers(payload, with_cells=True)
+                _expect(bool(given))
+                self.put(dict(given))
+            case Command.GET_VECTOR:
+                register, offset, length, cells = read_vector(payload)
+                _expect(not cells)
+                return Frame(command, self.get_cells(register, offset, length))
+            case Command.SET_VECTOR:
+                register, offset, length, cells = read_vector(payload)
+                _expect(len(cells) == length)
+                self.put_cells(register, offset, cells)
+            case _:
+                raise RefusedError(ErrorCode.COMMAND_UNKNOWN)
+        return acknowledge(command)
 
     def get(self, number: int) -> bytes:
-        """Give a register's cell.
-
-        Raises
-        ------
-        RefusedError : there is no such register.
-        """
+        """Give a register's cell; RefusedError where there is no such register."""
         self._state.advance()
         return self._find(number).to_cell()
 
@@ -117,32 +162,21 @@ class RegisterFile:
         self._state.aim()
 
     def get_cells(self, number: int, offset: int, length: int) -> bytes:
-        """Give cells of the vector memory or of a slot of the logger; offset and length in bytes.
-
-        Raises
-        ------
-        RefusedError : no such vector, not whole cells, beyond the vector's end, or more than a frame carries.
-        """
+        """Give whole cells of the vector memory or of a log's slot (else RefusedError); offset and length in bytes."""
         start, stop = _cells(offset, length)
         if number == VECTOR_MEMORY:
             _within(stop, self._state.memory.size)
             return self._state.memory[start:stop].astype(">f4").tobytes()
-        if number not in range(log_slot(0), log_slot(LOG_SLOTS)):
+        if number not in _LOGGED:
             raise RefusedError(ErrorCode.NO_REGISTER)
         _within(stop, self.logger.rows)
         return self.logger.cells(number - log_slot(0), start, stop)
 
     def put_cells(self, number: int, offset: int, data: bytes) -> None:
-        """Write cells of the vector memory.
-
-        Raises
-        ------
-        RefusedError : no such vector, one that is read only, not whole cells, or beyond the vector's end.
-        """
+        """Write whole cells of the vector memory (else RefusedError)."""
         start, stop = _cells(offset, len(data))
         if number != VECTOR_MEMORY:
-            logged = number in range(log_slot(0), log_slot(LOG_SLOTS))
-            raise RefusedError(ErrorCode.READ_ONLY if logged else ErrorCode.NO_REGISTER)
+            raise RefusedError(ErrorCode.READ_ONLY if number in _LOGGED else ErrorCode.NO_REGISTER)
         _within(stop, self._state.memory.size)
         self._state.advance()
         self._state.memory[start:stop] = np.frombuffer(data, ">f4")
@@ -152,6 +186,11 @@ class RegisterFile:
         if found is None:
             raise RefusedError(ErrorCode.NO_REGISTER)
         return found
+
+
+def _expect(fits: bool) -> None:
+    if not fits:
+        raise ShapeError("a payload whose length does not fit the command")
 
 
 def _cells(offset: int, length: int) -> tuple[int, int]:
@@ -184,18 +223,9 @@ def _board(state: MirrorState) -> dict[int, Register]:
 
 
 def _logger(logger: PositionLogger) -> dict[int, Register]:
-    def choose(slot: int, register: int) -> None:
-        logger.slots[slot] = register
-
-    def set_rate(rate_hz: float) -> None:
-        logger.rate_hz = rate_hz
-
-    table = {
-        log_slot(slot): Register(partial(logger.slots.__getitem__, slot), partial(choose, slot), 0, 0xFFFF, whole=True)
-        for slot in range(LOG_SLOTS)
-    }
+    table = {log_slot(slot): Register(*_item(logger.slots, slot), 0, 0xFFFF, whole=True) for slot in range(LOG_SLOTS)}
     table[LOG_RUN] = Register(lambda: logger.running, lambda on: logger.run(bool(on)), 0, 1, whole=True)
-    table[LOG_RATE] = Register(lambda: logger.rate_hz, set_rate, 1.0, HIGHEST_HZ)
+    table[LOG_RATE] = Register(*_attribute(logger, "rate_hz", float), 1.0, HIGHEST_HZ)
     return table
 
 
@@ -209,21 +239,13 @@ def _channel(state: MirrorState, channel: int) -> dict[int, Register]:
             raise RefusedError(ErrorCode.SYSTEM_NOT_SELECTABLE)
         state.inputs[channel] = system
 
-    def control(system: int) -> None:
-        state.controls[channel] = system
-
-    def hold(unit: Unit, value: float) -> None:
-        state.static[channel][unit] = value
-
     table = {
         registers.input: Register(lambda: state.inputs[channel], choose, 0, 0xFF, whole=True),
-        registers.control: Register(lambda: state.controls[channel], control, 0, 0xFF, whole=True),
+        registers.control: Register(*_item(state.controls, channel), 0, 0xFF, whole=True),
     }
     for unit in Unit:
         most = _CURRENT_A if unit is Unit.CURRENT else 1.0
-        table[registers.static_system << 8 | unit] = Register(
-            partial(state.static[channel].__getitem__, unit), partial(hold, unit), -most, most
-        )
+        table[registers.static_system << 8 | unit] = Register(*_item(state.static[channel], unit), -most, most)
     kept: dict[int, float] = {}
     for number in (
         *range((_ANALOG + channel) << 8 | 1, ((_ANALOG + channel) << 8) + 6),
@@ -231,16 +253,12 @@ def _channel(state: MirrorState, channel: int) -> dict[int, Register]:
         *range(registers.xy_system << 8, (registers.xy_system << 8) + 3),
     ):
         kept[number] = 0.0
-        table[number] = Register(partial(kept.__getitem__, number), partial(kept.__setitem__, number))
+        table[number] = Register(*_item(kept, number))
     return {**table, **_vector_unit(state, channel)}
 
 
 def _vector_unit(state: MirrorState, channel: int) -> dict[int, Register]:
-    player = state.players[channel]
-    most = state.memory.size
-
-    def setter(name: str, kind: type = int) -> Callable[[float], None]:
-        return lambda value: setattr(player, name, kind(value))
+    player, most = state.players[channel], state.memory.size
 
     def run(on: int) -> None:
         if not on:
@@ -250,20 +268,27 @@ def _vector_unit(state: MirrorState, channel: int) -> dict[int, Register]:
         else:
             player.run(state.moment)
 
-    def reader(name: str) -> Callable[[], float]:
-        return lambda: getattr(player, name)
-
     rows = {
-        VectorRegister.UNIT: Register(reader("unit"), setter("unit", Unit), 0, 2, whole=True),
-        VectorRegister.RUN: Register(reader("running"), run, 0, 1, whole=True),
-        VectorRegister.START: Register(reader("start"), setter("start"), 0, most, whole=True),
-        VectorRegister.END: Register(reader("end"), setter("end"), 0, most, whole=True),
-        VectorRegister.FREQUENCY: Register(reader("frequency_hz"), setter("frequency_hz", float), 1e-3, HIGHEST_HZ),
+        VectorRegister.UNIT: Register(*_attribute(player, "unit", Unit), 0, 2, whole=True),
+        VectorRegister.RUN: Register(lambda: player.running, run, 0, 1, whole=True),
+        VectorRegister.START: Register(*_attribute(player, "start"), 0, most, whole=True),
+        VectorRegister.END: Register(*_attribute(player, "end"), 0, most, whole=True),
+        VectorRegister.FREQUENCY: Register(*_attribute(player, "frequency_hz", float), 1e-3, HIGHEST_HZ),
         VectorRegister.LOWEST: Register(lambda: LOWEST_HZ),
         VectorRegister.HIGHEST: Register(lambda: HIGHEST_HZ),
-        VectorRegister.CYCLES: Register(reader("cycles"), setter("cycles"), -1, 2**31 - 1, whole=True, signed=True),
-        VectorRegister.TRIGGER: Register(reader("external"), setter("external", Trigger), 0, 2, whole=True),
+        VectorRegister.CYCLES: Register(*_attribute(player, "cycles"), -1, 2**31 - 1, whole=True, signed=True),
+        VectorRegister.TRIGGER: Register(*_attribute(player, "external", Trigger), 0, 2, whole=True),
         VectorRegister.OUTPUT: Register(lambda: state.played[channel]),
-        VectorRegister.INDEX: Register(reader("index"), whole=True),
+        VectorRegister.INDEX: Register(lambda: player.index, whole=True),
     }
     return {ChannelRegisters(channel).vector(name): register for name, register in rows.items()}
+
+
+def _item(holder: Any, key: int) -> tuple[Callable[[], Any], Callable[[Any], object]]:
+    """How an item of a list or of a dictionary is read and written."""
+    return partial(operator.getitem, holder, key), partial(operator.setitem, holder, key)
+
+
+def _attribute(holder: object, name: str, kind: type = int) -> tuple[Callable[[], Any], Callable[[Any], object]]:
+    """How an attribute is read and written."""
+    return partial(getattr, holder, name), lambda value: setattr(holder, name, kind(value))

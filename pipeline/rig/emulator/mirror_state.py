@@ -1,4 +1,4 @@
-"""What the emulated mirror controller is in: targets, vector memory, motion, status. No protocol; time by a clock.
+"""What the emulated mirror controller is in: targets, vector memory, motion, status, log. No protocol; time by a clock.
 
 Nothing runs by itself: everything is worked out up to the clock's moment when somebody asks.
 """
@@ -15,9 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.geometry.vector_memory import Ends
 from pipeline.rig.clock import Clock
-from pipeline.rig.emulator.mirror_motion import AxisMotion, Stiffness
-from pipeline.rig.emulator.vector_player import VectorPlayer
-from pipeline.rig.registers import CHANNELS, ChannelRegisters, Status, Unit
+from pipeline.rig.emulator.mirror_motion import AxisMotion, Stiffness, VectorPlayer
+from pipeline.rig.mirror.registers import (
+    CHANNELS,
+    FEEDBACK_A,
+    FEEDBACK_X,
+    ChannelRegisters,
+    Status,
+    Unit,
+    VectorRegister,
+)
 
 RIM_SLACK = 1e-6  # of float32 cells
 STABLE_WITHIN = 1e-4  # of the disk's radius; about 1 px of the view
@@ -96,14 +103,10 @@ class MirrorState:
         self._aim(self.advance())
         self.latched |= self._present(self.moment) & _COPIES
 
-    def trigger(self, count: int, period_s: float, started_s: float | None, width_s: float) -> None:
+    def trigger(self, rises_s: NDArray[np.float64], falls_s: NDArray[np.float64]) -> None:
         """Take pulses at the trigger input."""
-        now = self.advance()
-        rises: NDArray[np.float64] = (now if started_s is None else started_s) + np.arange(
-            count, dtype=np.float64
-        ) * period_s
         for player in self.players:
-            player.trigger(rises, rises + width_s)
+            player.trigger(rises_s, falls_s)
         self.advance()
 
     def positions(self, times_s: ArrayLike) -> NDArray[np.float64]:
@@ -153,3 +156,56 @@ class MirrorState:
         for bit, copy in _LATCHED.items():
             was |= copy if bit in flags else Status(0)
         return flags | was
+
+
+# what the logger's slots take down after power came: two outputs of the drive, then both forms of the optical feedback
+FIRST_SLOTS = (0xE802, 0xE902, 0x2300, 0x2301, 0x2302, 0x2303)
+
+
+class PositionLogger:
+    """Slots, rate and rows of the logger. It stops by itself when its rows are full."""
+
+    def __init__(self, state: MirrorState) -> None:
+        self._state = state
+        self.slots = list(FIRST_SLOTS)
+        self.rate_hz = 10_000.0
+        self._began_s: float | None = None
+        self._stopped_s: float | None = None
+
+    @property
+    def running(self) -> bool:
+        """Whether rows are still taken down."""
+        return self._began_s is not None and self._stopped_s is None and self.rows < self._state.unit.log_rows
+
+    @property
+    def rows(self) -> int:
+        """Rows taken down since the run began."""
+        if self._began_s is None:
+            return 0
+        until = self._state.clock.now() if self._stopped_s is None else self._stopped_s
+        return min(int((until - self._began_s) * self.rate_hz + 1e-9) + 1, self._state.unit.log_rows)
+
+    def run(self, on: bool) -> None:
+        """Begin anew, or stop; a logger that is stopped keeps its rows."""
+        if on:
+            self._began_s, self._stopped_s = self._state.clock.now(), None
+        elif self.running:
+            self._stopped_s = self._state.clock.now()
+
+    def cells(self, slot: int, start: int, stop: int) -> bytes:
+        """Give the cells of some rows of a slot; registers that do not change with time have their rest value 0."""
+        times = (self._began_s or 0.0) + np.arange(start, stop) / self.rate_hz
+        register, state = self.slots[slot], self._state
+        for channel in range(CHANNELS):
+            registers, player = ChannelRegisters(channel), state.players[channel]
+            if register in (FEEDBACK_X + channel, FEEDBACK_A + channel):
+                return state.positions(times)[:, channel].astype(">f4").tobytes()
+            if register == registers.vector(VectorRegister.INDEX):
+                state.advance()
+                return player.indices(times).astype(">u4").tobytes()
+            if register == registers.vector(VectorRegister.OUTPUT):
+                state.advance()
+                return state.memory[player.indices(times)].astype(">f4").tobytes()
+            if register == registers.static_xy:
+                return np.full(times.size, state.static[channel][Unit.XY], ">f4").tobytes()
+        return np.zeros(times.size, ">f4").tobytes()

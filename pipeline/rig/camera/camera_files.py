@@ -1,0 +1,264 @@
+"""Files of the camera over FTP: fetched in order, continued where an earlier try ended, and every byte read twice.
+
+FTP says nothing of what is in a file, so one that came with bytes lost, doubled or put in between can have the right
+size. What is held is therefore read again and compared before it counts, and dropped whole where it differs from two
+readings. What the camera itself gives alike twice cannot be doubted here.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from pipeline.errors import RigError
+from pipeline.rig.camera.camera_settings import FileServer
+from pipeline.rig.camera.ftp_session import DamagedTransfer, FileSession, open_session
+from pipeline.rig.clock import SYSTEM_CLOCK, Clock
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, DeviceRefused
+
+LOG = logging.getLogger(__name__)
+NOT_LOGGED_IN = 530  # of FTP: user or password is not taken, whatever file is asked for
+_UNFIT = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
+Progress = Callable[[str, int, int], None]  # file, bytes held, bytes in all
+
+
+@dataclass(frozen=True)
+class RemoteFile:
+    """An entry of a listing."""
+
+    name: str  # whole path
+    size: int | None  # bytes; None where the camera does not say
+    folder: bool
+    most: int | None = None  # bytes that it can have; None where nothing is known
+
+    @property
+    def base(self) -> str:
+        """The name without its folder."""
+        return self.name.rsplit("/", 1)[-1]
+
+
+def check_remote_name(name: str) -> None:
+    """Refuse a name that cannot stand in a line of text, as files are asked for (RigError)."""
+    if _UNFIT.search(name):
+        raise RigError(
+            f"the camera names a file {name!r:.200}, expected no line ends or control characters in a name; give it "
+            "another name there"
+        )
+
+
+class Kept(Protocol):
+    """Where fetched bytes go: files named as on the camera, of which a part may be there already."""
+
+    def size(self, name: str) -> int:
+        """Bytes held of a file; 0 of one that is not there."""
+
+    def read(self, name: str, start: int, stop: int) -> bytes:
+        """Some of the bytes held."""
+
+    def append(self, name: str, data: bytes) -> None:
+        """Add bytes at the end."""
+
+    def drop(self, name: str) -> None:
+        """Hold no byte of a file any more."""
+
+
+@dataclass
+class KeptInMemory:
+    """Files held in memory, for tests and for captures that fit."""
+
+    files: dict[str, bytearray] = field(default_factory=dict)
+
+    def size(self, name: str) -> int:
+        return len(self.files.get(name, b""))
+
+    def read(self, name: str, start: int, stop: int) -> bytes:
+        return bytes(self.files.get(name, bytearray())[start:stop])
+
+    def append(self, name: str, data: bytes) -> None:
+        self.files.setdefault(name, bytearray()).extend(data)
+
+    def drop(self, name: str) -> None:
+        self.files.pop(name, None)
+
+
+def fetch_files(
+    server: FileServer,
+    files: Sequence[RemoteFile],
+    kept: Kept,
+    progress: Progress | None = None,
+    *,
+    clock: Clock = SYSTEM_CLOCK,
+) -> None:
+    """Fetch files one after the other until ``kept`` holds them whole.
+
+    What is held from an earlier call is compared before anything is added to it. A transfer that breaks off is taken
+    up again; what has come stays in ``kept`` however this ends, unless it is damaged, and a later call goes on there.
+
+    Raises
+    ------
+    RigError : a file is not the one of which a part is held, is larger than it can be, or comes damaged each time.
+    DeviceRefused : the server does not give a file, or takes another password.
+    DeadlinePassed, DeviceGone : ``server.tries`` tries in a row brought nothing, or all of them took too long.
+    """
+    for file in files:
+        check_remote_name(file.name)
+        _Fetch(server, file, kept, progress, clock).run()
+
+
+def log_in(server: FileServer) -> str:
+    """Log in to the server, look at nothing, and give its welcome.
+
+    Raises
+    ------
+    DeviceRefused : it takes another password. RigError : no FTP. DeadlinePassed, DeviceGone : it is not there.
+    """
+    try:
+        with open_session(server) as session:
+            return session.getwelcome().removeprefix("220").strip() or "logged in"
+    except DamagedTransfer as error:
+        raise RigError(str(error)) from error
+
+
+@dataclass
+class _Fetch:
+    """One file on its way. Of the bytes that are held the first ``sure`` ones came alike twice."""
+
+    server: FileServer
+    file: RemoteFile
+    kept: Kept
+    progress: Progress | None
+    clock: Clock
+    sure: int = 0
+    doubted: tuple[int, int] = (-1, 0)  # the first byte that came differently, and how often in a row
+    damaged: int = 0
+    refused: int = 0
+
+    def __post_init__(self) -> None:
+        self.earlier = self.held  # by another call, maybe of another file of that name
+        self.began = time.monotonic()
+
+    @property
+    def held(self) -> int:
+        """Bytes that are kept."""
+        return self.kept.size(self.file.name)
+
+    def run(self) -> None:
+        """Read until the file is whole and sure, again where a session breaks off."""
+        failed = 0
+        while True:
+            before = (self.held, self.sure)
+            try:
+                with open_session(self.server) as session:
+                    self._go_on(session)
+                return
+            except (DamagedTransfer, DeadlinePassed, DeviceGone, DeviceRefused) as error:
+                failed = 1 if (self.held, self.sure) > before else failed + 1
+                self._judge(error, failed)
+                LOG.info("%s; going on at byte %d of %s", error, self.held, self.file.name)
+                self.clock.sleep(self.server.pause_s)
+
+    def _judge(self, error: RigError, failed: int) -> None:
+        """Raise what ends the fetching; nothing where the file may be asked for again."""
+        late = time.monotonic() - self.began > self.server.most_s(self.file.size or self.held)
+        if isinstance(error, DeviceRefused):
+            self.refused += 1
+            if self.refused > 1 or late:  # once more: the words may have been damaged on their way there
+                raise error
+        elif isinstance(error, DamagedTransfer):
+            self.damaged += 1
+            if self.damaged >= 2 * self.server.tries - 1 or late:  # it may be dropped and begun anew meanwhile
+                self._drop(error)
+                raise RigError(str(error)) from error
+        elif failed >= self.server.tries or late:
+            raise type(error)(
+                f"{error}; {self.held} bytes of {self.file.name} are kept, and fetching again goes on there"
+            ) from error
+
+    def _go_on(self, session: FileSession) -> None:
+        size = self._whole_size(session)
+        if self.held > size:
+            self._drop(
+                RigError(
+                    f"{self.held} bytes of {self.file.name} are held, the camera's file has {size}: it is another one; "
+                    "take what is held away and fetch again"
+                )
+            )
+        if self.progress is not None:
+            self.progress(self.file.name, self.held, size)
+        if size == 0:
+            self.kept.append(self.file.name, b"")
+        while self.sure < size:
+            held = self.held
+            try:
+                self._read(session, held, size)
+            except DamagedTransfer as error:
+                if self.held > held:  # what this reading brought may lie beside its place
+                    self._drop(error)
+                raise
+            self.sure = held if self.server.read_twice else size
+
+    def _read(self, session: FileSession, held: int, size: int) -> None:
+        """Read once from where nothing is sure: compare with what is held, and add what is beyond it."""
+        at = self.sure if self.server.read_twice else max(held - self.server.overlap, 0)
+        with closing(session.pieces(self.file.name, at, size)) as pieces:
+            for data in pieces:
+                same = min(len(data), max(held - at, 0))
+                known = self.kept.read(self.file.name, at, at + same)
+                if data[:same] != known:
+                    self._differ(at + next(i for i in range(same) if data[i] != known[i]), held)
+                if self.server.read_twice:
+                    self.sure = max(self.sure, min(at + same, held))
+                at += len(data)
+                if same < len(data):
+                    self._keep(data[same:], size)
+
+    def _keep(self, data: bytes, size: int) -> None:
+        self.kept.append(self.file.name, data)
+        if self.progress is not None:
+            self.progress(self.file.name, self.held, size)
+
+    def _differ(self, at: int, held: int) -> None:
+        """Doubt this reading where it differs from what is held; where the next one does too, what is held goes."""
+        self.doubted = (at, self.doubted[1] + 1 if self.doubted[0] == at else 1)
+        if self.doubted[1] > 1 or not self.server.read_twice:
+            self._drop(
+                RigError(
+                    f"the bytes of {self.file.name} before byte {held} differ from those held: it is another file; "
+                    "take what is held away and fetch again"
+                )
+            )
+        raise DamagedTransfer(
+            f"byte {at} of {self.file.name} came differently each time; look at the network between here and the "
+            "camera, then run again"
+        )
+
+    def _drop(self, error: RigError) -> None:
+        """Hold nothing of the file any more, unless it is of an earlier call and may be of another file: then raise."""
+        if self.sure < self.earlier:
+            raise RigError(str(error)) from error
+        self.kept.drop(self.file.name)
+        self.sure = self.earlier = 0
+
+    def _whole_size(self, session: FileSession) -> int:
+        """Size by the server; the listing must agree, or the file still grows."""
+        listed, most = self.file.size, self.file.most
+        told = session.size_of(self.file.name)
+        size = listed if told is None else told
+        if size is None:
+            raise RigError(f"neither the listing nor SIZE tells how long {self.file.name} is; fetch it by hand")
+        if listed is not None and listed != size:
+            raise DamagedTransfer(
+                f"{self.file.name} has {size} bytes, {listed} when it was listed; is the capture still running? "
+                "Fetch when it has ended"
+            )
+        if most is not None and size > most:
+            raise RigError(
+                f"{self.file.name} is said to have {size} bytes, expected {most} at most; nothing of it is fetched: "
+                "look at what the camera wrote"
+            )
+        return size

@@ -1,0 +1,238 @@
+"""Captures of a sweep: what each is called, what the vector memory holds during it, and where its lines lie then.
+
+A capture's prefix says which lines of which sweep it takes, so that a folder tells what it holds.
+``coarse-0_cy-31p5_0p5_96x16x16_0`` is the sweep ``coarse-0``, a coarse one whose lines lie along y, on strip -31.5 px,
+from scan coordinate 0.5 px on, of 96 lines of 16 held positions, binned by 16; the capture begins at its line 0. ``p``
+is the decimal point; a number that takes more room than its bits is ``b`` and those, to base 32.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import RigError, SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Axis, Sweep, line_positions, sweep_positions
+from pipeline.geometry.vector_memory import memory_loads
+from pipeline.rig.camera.camera_cubes import CapturedLines
+from pipeline.rig.camera.camera_settings import check_capture
+from pipeline.rig.capture.capture_journal import CaptureRecord
+from pipeline.rig.capture.clock_fit import FrameTimes
+from pipeline.rig.capture.line_positions import (
+    CommandTimes,
+    LinePositions,
+    MirrorTrack,
+    PlayedPath,
+    lines_by_commands,
+    lines_by_log,
+    lines_by_trigger,
+)
+from pipeline.rig.mirror.steering import wire_positions
+from pipeline.rig.survey_rig import Pulses
+
+LEAD = 1  # cells before the first line's: a unit that waits for edges takes its first cell at the run command, assumed
+REFERENCES = "references"  # prefix of a capture that is made for the dark and white frames in its folder
+_DIGITS = "0123456789abcdefghijklmnopqrstuv"
+_LONGEST = 14  # b and 64 bits
+_NUMBER = r"(-?\d+(?:p\d+)?|b[0-9a-v]{13})"
+_FORM = re.compile(rf"(.+)_([cf])([xy]){_NUMBER}_{_NUMBER}_(\d+)x(\d+)x(\d+)_(\d+)", re.DOTALL)
+_KINDS: dict[str, Literal["coarse", "fine"]] = {"c": "coarse", "f": "fine"}
+
+
+@dataclass(frozen=True)
+class Announced:
+    """A sweep, and its line that a capture's first frame takes."""
+
+    sweep: Sweep
+    first: int
+
+
+def capture_prefix(sweep: Sweep, first: int = 0) -> str:
+    """Give the prefix of a capture of a sweep's lines from ``first`` on.
+
+    Raises
+    ------
+    SettingsError : the sweep's name holds what a folder's name must not, or is too long.
+    """
+    sizes = f"{sweep.lines}x{sweep.step}x{sweep.binning}"
+    place = f"{sweep.kind[0]}{sweep.along}{_written(sweep.strip_px)}_{_written(sweep.start_px)}"
+    prefix = f"{sweep.name}_{place}_{sizes}_{first}"
+    check_capture(0, 0, prefix)
+    return prefix
+
+
+def announced(prefix: str) -> Announced | None:
+    """Read a capture's prefix; None where it announces no sweep."""
+    found = _FORM.fullmatch(prefix)
+    if found is None:
+        return None
+    name, kind, along, strip, start, *sizes = found.groups()
+    axis: Axis = "x" if along == "x" else "y"
+    lines, step, binning, first = map(int, sizes)
+    if lines < 1 or step < 1 or binning < 1 or first >= lines:
+        return None
+    return Announced(Sweep(name, _KINDS[kind], axis, _number(strip), _number(start), lines, step, binning), first)
+
+
+def _written(value: float) -> str:
+    short = repr(float(value)).removesuffix(".0")
+    if len(short) < _LONGEST and set(short) <= set("-.0123456789"):
+        return short.replace(".", "p")
+    bits = int.from_bytes(struct.pack(">d", value), "big")
+    return "b" + "".join(_DIGITS[bits >> shift & 31] for shift in range(60, -1, -5))
+
+
+def _number(text: str) -> float:
+    if not text.startswith("b"):
+        return float(text.replace("p", "."))
+    bits = 0
+    for digit in text[1:]:
+        bits = bits << 5 | _DIGITS.index(digit)
+    return float(struct.unpack(">d", (bits & (1 << 64) - 1).to_bytes(8, "big"))[0])
+
+
+@dataclass(frozen=True)
+class CapturePath:
+    """Lines ``first`` to ``stop`` of a sweep, and the positions that are held for them.
+
+    Positions are those of the plan, rounded to float32 as they go over the wire.
+    """
+
+    sweep: Sweep
+    first: int
+    stop: int
+    cells: NDArray[np.float32]  # (lead + held, 2)
+    middle: NDArray[np.float32]  # (line, 2) at mid exposure
+    rate_hz: float  # of cells, for a path that no edge drives
+    triggered: bool  # by one edge a cell; then the first line's first position is held twice
+
+    @property
+    def lines(self) -> int:
+        """Lines of the capture."""
+        return self.stop - self.first
+
+    @property
+    def played(self) -> PlayedPath:
+        """The path as it runs by its own clock, for lines that are tied to it by time."""
+        return PlayedPath(self.cells.astype(np.float64), self.rate_hz)
+
+    def frames_at(self, index: int) -> int | None:
+        """Frames that edges were counted of, where the cell ``index`` was played last; None within a line."""
+        frames, rest = divmod(index + 1 - LEAD, self.sweep.step)
+        return None if rest else frames
+
+
+def next_path(sweep: Sweep, first: int, camera: LineCamera, *, vector_pairs: int, triggered: bool) -> CapturePath:
+    """Give the path of the sweep's lines from ``first`` on, as many as the vector memory takes.
+
+    Raises
+    ------
+    SettingsError : the positions of one line do not fit the memory. PoseError : one is beyond the mirror's disk.
+    """
+    if vector_pairs <= LEAD:
+        raise SettingsError(f"a vector memory of {vector_pairs} pairs holds no line; expected more than {LEAD}")
+    rest = replace(sweep, lines=sweep.lines - first)
+    stop = first + memory_loads([rest], vector_pairs - LEAD)[0].parts[0].lines[1]
+    return path_of(sweep, (first, stop), camera, triggered=triggered)
+
+
+def path_of(sweep: Sweep, lines: tuple[int, int], camera: LineCamera, *, triggered: bool) -> CapturePath:
+    """Give the path of some of the sweep's lines; PoseError where a position is beyond the mirror's disk."""
+    held: NDArray[Any] = sweep_positions(sweep, camera)[slice(*lines)].reshape(-1, 2)
+    lead = held[:LEAD] if triggered else held[:0]
+    cells, middle = (
+        wire_positions(some) for some in (np.concatenate([lead, held]), line_positions(sweep, camera)[slice(*lines)])
+    )
+    return CapturePath(sweep, *lines, cells, middle, sweep.step * 1000 / camera.frame_ms, triggered)
+
+
+def can_trigger(pulses: Pulses, sweep: Sweep) -> bool:
+    """Whether the pulses at the mirror's input step through this sweep: one a position is needed."""
+    return pulses == "position" or (pulses == "frame" and sweep.step == 1)
+
+
+class UntiedError(RigError):
+    """A capture from which no line, or no further one, is to be had: it is taken again."""
+
+
+@dataclass(frozen=True)
+class PlacedLines:
+    """A capture's lines by their order in the sweep."""
+
+    row: NDArray[np.int64]  # (line,) of the captured values; -1 of a line that the camera dropped
+    tied: LinePositions  # by row
+    stamp_us: NDArray[np.int64]  # (row,) by the camera's clock; -1 where it says nothing
+
+    def is_valid(self, line: int) -> bool:
+        """Whether a line, counted from the capture's first, is there with its position."""
+        row = int(self.row[line])
+        return row >= 0 and bool(self.tied.valid[row])
+
+
+def place_lines(
+    captured: CapturedLines, path: CapturePath, taken: CaptureRecord, camera: LineCamera, track: MirrorTrack | None
+) -> PlacedLines:
+    """Give each line of the path its row of the capture, up to the last one that is there whole.
+
+    Raises
+    ------
+    UntiedError : nothing, or what contradicts itself, ties frames to the mirror.
+    """
+    held = int(np.flatnonzero(captured.valid)[-1]) + 1
+    number = _numbers(captured, held, path.lines)
+    frames = FrameTimes(number, captured.times.stamp_us[:held], camera.exposure_ms, camera.frame_ms)
+    try:
+        tied = _tied(frames, path, taken, camera, track, total=len(captured.values))
+    except RigError as error:
+        raise UntiedError(f"{taken.folder}: {error}") from error
+    row = np.full(min(int(number.max()) + 1, path.lines), -1, np.int64)
+    rows = np.flatnonzero(captured.valid[:held] & (number >= 0) & (number < path.lines))
+    row[number[rows]] = rows
+    return PlacedLines(row, tied, frames.stamp_us)
+
+
+def _numbers(captured: CapturedLines, held: int, lines: int) -> NDArray[np.int64]:
+    """Frames' numbers from the capture's start; where none is told, rows in order if none can be missing."""
+    told = captured.times.frame[:held]
+    if (told >= 0).any():
+        return np.where(told >= 0, told - captured.first_frame, -1)
+    return np.arange(held) if len(captured.values) == lines else told
+
+
+def _tied(
+    frames: FrameTimes,
+    path: CapturePath,
+    taken: CaptureRecord,
+    camera: LineCamera,
+    track: MirrorTrack | None,
+    *,
+    total: int,
+) -> LinePositions:
+    """Positions by edges in the mirror's log, else by the edges that stepped it, by its log, by the commands' times."""
+    commands = taken.commands
+    if taken.log is not None:  # then it, and not the path, was begun before the capture
+        began = (taken.log.started_s - taken.log.start_error_s, taken.log.started_s)
+        commands = CommandTimes(began, taken.capture_s)
+    if taken.triggered:
+        counted = None if taken.index_at_end is None else path.frames_at(taken.index_at_end)
+        taken_in_all = max(total, int(frames.number.max()) + 1)
+        if taken.index_at_end is not None and counted != taken_in_all:
+            raise RigError(
+                f"the mirror stands at cell {taken.index_at_end} of its path, after {taken_in_all} frames cell "
+                f"{taken_in_all * path.sweep.step} was expected: edges were lost, or are not one a position (see "
+                f"pulses in [rig])"
+            )
+        if track is not None and track.edge_s is not None and len(track.edge_s):
+            return lines_by_log(frames, camera, track, commands=commands)
+        sent = PlayedPath(path.middle.astype(np.float64), path.rate_hz)
+        last = None if counted is None else int(frames.number.max())
+        return lines_by_trigger(frames, camera, sent, index_at_end=last)
+    if track is not None and taken.log is not None and len(track.position) > 1:
+        return lines_by_log(frames, camera, track, commands=commands)
+    return lines_by_commands(frames, camera, path.played, taken.commands)

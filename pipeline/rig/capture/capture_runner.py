@@ -1,0 +1,218 @@
+"""One capture after the other on a rig: path up, mirror to its start, both begun in order, and the end taken down."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.errors import RigError
+from pipeline.geometry.camera import LineCamera
+from pipeline.rig.camera.camera_files import Kept
+from pipeline.rig.camera.line_camera import LineCameraDevice
+from pipeline.rig.capture.capture_journal import CaptureJournal, CaptureRecord, LoggedPath
+from pipeline.rig.capture.capture_paths import LEAD, CapturePath, UntiedError, capture_prefix
+from pipeline.rig.capture.line_positions import MirrorTrack, line_edges
+from pipeline.rig.clock import Clock
+from pipeline.rig.mirror.registers import Trigger
+from pipeline.rig.mirror.steering import MotionLog, Steering
+from pipeline.rig.survey_rig import SurveyRig
+from pipeline.source import AT_REST
+
+LOG = logging.getLogger(__name__)
+SLACK_S = 5.0  # by which a capture may take longer than its frames
+WRITING_S = 120.0  # that a camera may go on writing what it has, once it was told to stop
+POLL_S = 0.05
+_CELL, _INDEX = np.dtype(">f4"), np.dtype(">i4")
+
+Say = Callable[[str], None]  # what the rig is at, in a few words
+
+
+def say_nothing(words: str) -> None:
+    """Tell nobody what the rig is at."""
+
+
+@dataclass(frozen=True)
+class RigDevices:
+    """Both devices, connected, and the clock that their drivers go by."""
+
+    steering: Steering
+    camera: LineCameraDevice
+    clock: Clock
+
+    def close(self) -> None:
+        """Let go of both, whatever either says."""
+        for device in (self.steering, self.camera):
+            try:
+                device.close()
+            except RigError as error:
+                LOG.warning("while letting go of the rig: %s", error)
+
+
+class CaptureRunner:
+    """Runs captures on devices that are connected, and takes down what they acknowledge."""
+
+    def __init__(
+        self,
+        devices: RigDevices,
+        kept: Kept,
+        journal: CaptureJournal,
+        camera: LineCamera,
+        rig: SurveyRig,
+        *,
+        say: Say = say_nothing,
+    ) -> None:
+        self.devices = devices
+        self._kept, self._journal = kept, journal
+        self._camera, self._rig, self._say = camera, rig, say
+        self._configured = False
+
+    def take(self, path: CapturePath) -> CaptureRecord:
+        """Take the lines of a path, and wait until they are on the camera.
+
+        Motions and the capture are sent once. Where something fails after the mirror or the camera has begun, both are
+        told to stop.
+
+        Raises
+        ------
+        StateUnknown, DeviceRefused, DeadlinePassed, DeviceGone, RigError
+        """
+        steering, prefix = self.devices.steering, capture_prefix(path.sweep, path.first)
+        self._configure()
+        steering.load_path(path.cells, progress=lambda done, total: self._say(f"path: {done} of {total} cells"))
+        steering.goto(*(float(place) for place in path.cells[0]))
+        steering.settle(self._rig.settle_s)
+        with self._stopped_on_error():
+            if path.triggered:
+                if self._rig.log_pulses:
+                    steering.start_log(self._log_rate_hz(path.lines), with_index=True)
+                run_s = self._run(path)
+                capture = self.devices.camera.capture(path.lines, prefix=prefix)
+            else:
+                steering.start_log(self._log_rate_hz(path.lines))
+                capture = self.devices.camera.capture(path.lines, prefix=prefix)
+                run_s = self._run(path)
+            at_s = (capture.sent_s, capture.acknowledged_s)
+            taken = CaptureRecord(path.sweep, path.first, path.stop, capture.folder, path.triggered, run_s, at_s)
+            self._journal.began(taken)
+            self.wait(taken)
+        return self._end(taken)
+
+    def wait(self, taken: CaptureRecord) -> None:
+        """Wait until a capture is over; one that goes on too long is stopped, and what it has counts.
+
+        Raises
+        ------
+        RigError : it does not end, though it was told to. DeviceRefused, DeadlinePassed, DeviceGone
+        """
+        camera, clock = self.devices.camera, self.devices.clock
+        began, wanted = clock.now(), self._seconds(taken.stop - taken.first)
+        until, stopped = began + wanted + SLACK_S, False
+        while camera.is_capturing():
+            self._say(f"capturing: {clock.now() - began:.0f} of {wanted:.0f} s")
+            if clock.now() >= until:
+                if stopped:
+                    raise RigError(
+                        f"the camera still captures {taken.folder}, {WRITING_S:g} s after it was told to stop; see "
+                        "what it does, then run again: what it has is fetched then"
+                    )
+                LOG.warning("the capture %s goes on for too long and is stopped", taken.folder)
+                camera.stop()
+                until, stopped = clock.now() + WRITING_S, True
+            clock.sleep(min(max(began + wanted - clock.now(), POLL_S), 1.0))
+
+    def recovered(self, taken: CaptureRecord) -> CaptureRecord:
+        """Take down the end of a capture whose process did not live to see it; nothing has played since."""
+        self.wait(taken)
+        if not taken.triggered or taken.index_at_end is not None:
+            return taken
+        return self._journal.ended(replace(taken, index_at_end=self.devices.steering.index()))
+
+    def look_at_rest(self, prefix: str) -> str:
+        """Take one frame with the mirror at 0; 0 (unless the settings say otherwise), and give its folder."""
+        self._configure()
+        if self._rig.white_at_rest:
+            self.devices.steering.park()
+            self.devices.steering.settle(self._rig.settle_s)
+        with self._stopped_on_error():
+            capture = self.devices.camera.capture(1, prefix=prefix)
+            at = (capture.sent_s, capture.acknowledged_s)
+            self.wait(CaptureRecord(AT_REST, 0, 1, capture.folder, False, at, at))
+        return capture.folder
+
+    def log_of(self, taken: CaptureRecord) -> MirrorTrack | None:
+        """Read the mirror's log of a capture; None where there is none.
+
+        Raises
+        ------
+        UntiedError : what is kept of it is not what the mirror gave.
+        """
+        if taken.log is None:
+            return None
+        names = (taken.log.name, taken.log.index_name)
+        files = [self._kept.read(name, 0, self._kept.size(name)) if name else b"" for name in names]
+        if taken.log.crc32 not in (None, zlib.crc32(b"".join(files))):
+            raise UntiedError(f"the mirror's log that is kept as {taken.log.name} has changed (its CRC-32 differs)")
+        position = np.frombuffer(files[0][: len(files[0]) // 8 * 8], _CELL).reshape(-1, 2).astype(np.float64)
+        time_s = np.arange(len(position)) / taken.log.rate_hz
+        if not taken.log.index_name:
+            return MirrorTrack(time_s, position)
+        index = np.frombuffer(files[1][: len(files[1]) // 4 * 4], _INDEX).astype(np.int64)
+        return MirrorTrack(time_s, position, line_edges(index, time_s[: len(index)], LEAD, taken.sweep.step))
+
+    def _configure(self) -> None:
+        if not self._configured:
+            self.devices.camera.configure(self._camera.exposure_ms, self._camera.frame_ms)
+        self._configured = True
+
+    def _run(self, path: CapturePath) -> tuple[float, float]:
+        clock, trigger = self.devices.clock, Trigger.RISING_EDGE if path.triggered else Trigger.OFF
+        sent = clock.now()
+        self.devices.steering.run(0, len(path.cells), path.rate_hz, 1, trigger)
+        return sent, clock.now()
+
+    def _end(self, taken: CaptureRecord) -> CaptureRecord:
+        steering = self.devices.steering
+        if taken.triggered:
+            taken = replace(taken, index_at_end=steering.index())
+        if self._rig.log_pulses or not taken.triggered:
+            taken = replace(taken, log=self._keep_log(taken.folder, steering.read_log()))
+        steering.halt()
+        return self._journal.ended(taken)
+
+    def _keep_log(self, folder: str, log: MotionLog) -> LoggedPath:
+        name, position = self._new_name(f"{folder}/mirror_log"), log.position.astype(_CELL).tobytes()
+        self._kept.append(name, position)
+        index_name = "" if log.index is None else self._new_name(f"{folder}/mirror_index")
+        index = b"" if log.index is None else log.index.astype(_INDEX).tobytes()
+        if index_name:
+            self._kept.append(index_name, index)
+        crc32 = zlib.crc32(position + index)
+        return LoggedPath(name, log.rate_hz, log.started_s, log.start_error_s, index_name, crc32)
+
+    def _new_name(self, name: str) -> str:
+        """A name of which nothing is kept: a camera that was emptied gives its folders' names again."""
+        names = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
+        return next(one for one in names if not self._kept.size(one))
+
+    def _log_rate_hz(self, lines: int) -> float:
+        """As fast as the logger goes, or so that it holds the whole capture."""
+        return min(self._rig.log_rate_hz, (self._rig.log_samples - 1) / (self._seconds(lines) + SLACK_S))
+
+    def _seconds(self, lines: int) -> float:
+        return lines * self._camera.frame_ms * 1e-3
+
+    @contextmanager
+    def _stopped_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            for stop in (self.devices.camera.stop, self.devices.steering.halt):
+                with suppress(RigError):
+                    stop()
+            raise

@@ -1,0 +1,356 @@
+"""The rig as a source of lines: a sweep's positions go to the mirror, captures to the camera, and lines come back.
+
+A sweep is taken in captures, each of as many lines as the mirror's vector memory holds positions for. Of each the
+camera's files are fetched, its lines tied to the mirror, summed over neighbours as the sweep wants, and given in order.
+Where pulses step the mirror a line's position is the one sent to it at mid exposure, as the wire has it (float32);
+without them it is the one that the mirror's log measured. Time is by the camera's own stamps, to a microsecond.
+
+Over an emulated rig lines are those of the simulated source it looks with, bit for bit, in however many captures: their
+noise is keyed by the sweep's name and the line's number, which captures are called by. Times differ where a load falls
+in the midst of a sweep: the simulated one goes on without a break, a rig has to stop for it.
+
+Whatever the rig has acknowledged is in a journal beside the fetched files, so a later call with the same ``kept`` takes
+up a transfer where it broke off, and captures only what the camera does not have.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import RigError
+from pipeline.geometry.camera import LineCamera, bin_samples
+from pipeline.geometry.mounting import STRAIGHT
+from pipeline.geometry.scan import Sweep
+from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
+from pipeline.rig.camera.camera_references import as_references
+from pipeline.rig.camera.line_camera import FrameClaim
+from pipeline.rig.capture.capture_journal import CaptureJournal, CaptureRecord
+from pipeline.rig.capture.capture_paths import (
+    REFERENCES,
+    CapturePath,
+    PlacedLines,
+    UntiedError,
+    can_trigger,
+    next_path,
+    path_of,
+    place_lines,
+)
+from pipeline.rig.capture.capture_runner import CaptureRunner, RigDevices, Say, say_nothing
+from pipeline.rig.device_errors import DeviceRefused, StateUnknown
+from pipeline.rig.survey_rig import SurveyRig
+from pipeline.simulator.instrument import check_binning
+from pipeline.source import Line, References
+
+LOG = logging.getLogger(__name__)
+BARREN = 2  # captures in a row without a line that end a sweep
+
+
+@dataclass(frozen=True)
+class RigView:
+    """What is known of a look before it is taken."""
+
+    camera: LineCamera
+    wavelength_nm: NDArray[np.float64]  # (band,)
+    field_shape: tuple[int, int]  # (y, x) [px]
+
+
+class RigSource:
+    """A :class:`pipeline.source.Source` over a rig. Devices are opened when they are first needed.
+
+    Parameters
+    ----------
+    open_devices
+        Connects both; they are closed when a session, or a call outside of one, ends.
+    kept
+        Where the camera's files and the journal go. With that of an earlier process its captures are gone on with.
+    vector_pairs
+        Positions that the mirror's memory holds.
+    say
+        Called with what the rig is at, in a few words, while no line comes: a path goes up, lines are captured, files
+        are fetched.
+    """
+
+    name = "rig"
+
+    def __init__(
+        self,
+        view: RigView,
+        open_devices: Callable[[], RigDevices],
+        kept: Kept,
+        *,
+        rig: SurveyRig | None = None,
+        vector_pairs: int = 1500,
+        say: Say = say_nothing,
+    ) -> None:
+        self.view = view
+        self.rig = SurveyRig() if rig is None else rig
+        self.vector_pairs = vector_pairs
+        self._open, self._kept, self._say = open_devices, kept, say
+        self._journal = CaptureJournal(kept)
+        self._unknown: list[str] = []  # why nobody knows what the rig does; shared by all that are made from this one
+        self._runner: CaptureRunner | None = None
+        self._whole: dict[str, tuple[References, tuple[str, ...]]] = {}  # of all samples, and notes, by folder
+
+    @property
+    def camera(self) -> LineCamera:
+        """The camera, as the settings have it."""
+        return self.view.camera
+
+    @property
+    def wavelength_nm(self) -> NDArray[np.float64]:
+        """(band,) centre wavelengths [nm]."""
+        return self.view.wavelength_nm
+
+    @property
+    def field_shape(self) -> tuple[int, int]:
+        """(y, x) size of the field [px]."""
+        return self.view.field_shape
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """What captures with this ``kept`` were like: how lines were tied to the mirror, by which settings."""
+        told: dict[str, Any] = {
+            name: getattr(self.rig, name)
+            for name in ("pulses", "log_pulses", "ends", "read_back", "strict_crc", "provenance")
+        }
+        if self.rig.mounting != STRAIGHT:
+            told["mounting"] = asdict(self.rig.mounting)
+        _, notes = self._whole.get(self._journal.references, (None, ()))
+        damage = {"journal": self._journal.damage} if self._journal.damage else {}
+        return {"rig": told, "references": list(notes), "captures": self._journal.captures, **damage}
+
+    def keeping(self, kept: Kept) -> RigSource:
+        """Give the same source with its files elsewhere."""
+        return self._like(kept, self._say)
+
+    def saying(self, say: Say) -> RigSource:
+        """Give the same source that tells somebody what the rig is at."""
+        return self._like(self._kept, say)
+
+    def _like(self, kept: Kept, say: Say) -> RigSource:
+        other = RigSource(self.view, self._open, kept, rig=self.rig, vector_pairs=self.vector_pairs, say=say)
+        other._unknown = self._unknown
+        if kept is self._kept:
+            other._whole = self._whole
+        return other
+
+    @contextmanager
+    def session(self) -> Iterator[CaptureRunner]:
+        """Hold on to the devices over several calls; inner sessions share them.
+
+        Raises
+        ------
+        DeviceGone, DeadlinePassed, RigError : a device is not there, or another one is.
+        StateUnknown : what an earlier session sent was not acknowledged; nothing is sent again by this process.
+        """
+        if self._runner is not None:
+            yield self._runner
+            return
+        if self._unknown:
+            raise StateUnknown(f"nothing more is sent to the rig: {self._unknown[0]}; look at it, then run again")
+        devices = self._open()
+        try:
+            self._runner = CaptureRunner(devices, self._kept, self._journal, self.camera, self.rig, say=self._say)
+            yield self._runner
+        except StateUnknown as error:
+            self._unknown.append(str(error))
+            raise
+        finally:
+            self._runner = None
+            devices.close()
+
+    def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
+        """Give the sweep's lines one by one, from line ``first`` on.
+
+        Raises
+        ------
+        ShapeError : sums of ``sweep.binning`` samples at full scale do not fit uint16.
+        PoseError : a position of the sweep is out of the mirror's reach.
+        StateUnknown : a motion or a capture was sent and not acknowledged.
+        RigError : a device failed, or what it sent does not fit; lines given so far, and captures acknowledged, stay.
+        """
+        check_binning(sweep, self.camera)
+        if first >= sweep.lines:
+            return
+        line, barren = first, 0
+        with self.session() as runner:
+            while line < sweep.lines:
+                before, why = line, "its files end there"
+                held = self._journal.holding(sweep, line)
+                taken = runner.take(self._next(sweep, line)) if held is None else runner.recovered(held)
+                try:
+                    for found in self._read(runner, taken, line):
+                        yield found
+                        line += 1
+                except (UntiedError, DeviceRefused) as error:
+                    if isinstance(error, DeviceRefused) and error.code == NOT_LOGGED_IN:
+                        raise  # the capture is there, and waits for another password
+                    why = str(error)
+                barren = 0 if line > before else barren + 1
+                if line < taken.stop:
+                    self._give_up(taken, line, why, last=barren >= BARREN)
+
+    def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
+        """Give single lines of those given before, in order, from the files of the captures that hold them.
+
+        Nothing is captured for them. A line that no capture gives any more comes as one that the camera dropped: there,
+        and not valid.
+
+        Raises
+        ------
+        RigError : a device failed, or the password is not taken.
+        """
+        waiting = list(numbers)
+        with self.session() as runner:
+            while waiting:
+                held = self._journal.holding(sweep, waiting[0])
+                found = {} if held is None else self._found_again(runner, held, waiting)
+                given = [number for number in waiting if held is not None and number < held.stop] or waiting[:1]
+                yield from (found.get(number) or self._lost(sweep, number) for number in given)
+                waiting = waiting[len(given) :]
+
+    def _found_again(self, runner: CaptureRunner, held: CaptureRecord, wanted: Sequence[int]) -> dict[int, Line]:
+        """Those of the lines that a capture gives yet, by number."""
+        found: dict[int, Line] = {}
+        try:
+            for line in self._read(runner, runner.recovered(held), wanted[0]):
+                if line.number in wanted:
+                    found[line.number] = line
+        except (UntiedError, DeviceRefused) as error:
+            if getattr(error, "code", None) == NOT_LOGGED_IN:
+                raise
+            LOG.warning("%s, from line %d on: lost; %s: %s", held.sweep.name, wanted[0], held.folder, error)
+        return found
+
+    def _lost(self, sweep: Sweep, number: int) -> Line:
+        path = path_of(sweep, (number, number + 1), self.camera, triggered=can_trigger(self.rig.pulses, sweep))
+        frame = (self.camera.samples // sweep.binning, len(self.wavelength_nm))
+        nothing, (x, y) = np.zeros(frame, np.uint16), path.middle[0]
+        time_s = self._time_s(sweep, number, -1)
+        return Line(number, nothing, float(x), float(y), time_s, self.camera.exposure_ms, valid=False)
+
+    def references(self, sweep: Sweep) -> References:
+        """Dark and white frames with the sweep's binning, captured and fetched once for all sweeps.
+
+        Raises
+        ------
+        RigError : the camera has none beside its captures, they do not fit, or a device failed.
+        """
+        if self._journal.references not in self._whole:
+            with self.session() as runner:
+                known = self._journal.references and self._known_references(runner)
+                if not known:
+                    self._journal.refer(runner.look_at_rest(REFERENCES))
+                    known = self._whole_references(runner, self._journal.references)
+                self._whole[self._journal.references] = known
+        whole, _ = self._whole[self._journal.references]
+        bad = None if whole.bad is None or not whole.bad.any() else _sums(whole.bad, sweep.binning) > 0
+        dark, white = (_sums(frame, sweep.binning) for frame in (whole.dark, whole.white))
+        return References(dark, white, whole.panel, bad, by_mirror=self.rig.white_at_rest)
+
+    def _known_references(self, runner: CaptureRunner) -> tuple[References, tuple[str, ...]] | None:
+        """The frames of an earlier session; None where the camera has them no more: it was emptied, or is another."""
+        folder = self._journal.references
+        try:
+            return self._whole_references(runner, folder)
+        except RigError as error:
+            if type(error) not in (RigError, DeviceRefused) or getattr(error, "code", None) == NOT_LOGGED_IN:
+                raise
+            LOG.warning("dark and white frames are taken again; %s: %s", folder, error)
+            return None
+
+    def _whole_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]]:
+        """Dark and white frames of all samples, and what was found of them."""
+        frames = runner.devices.camera.references(folder, self._kept, claim=self._claim(1))
+        missing = [kind for kind in ("dark", "white") if kind not in frames]
+        if missing:
+            raise RigError(
+                f"{folder} on the camera holds no {' and no '.join(missing)} reference; take both with the camera's "
+                "own program, then run again"
+            )
+        whole, notes = as_references(frames["dark"], frames["white"], panel=self.rig.panel)
+        self._check_size(whole.dark.shape, folder)
+        return whole, notes
+
+    def _next(self, sweep: Sweep, line: int) -> CapturePath:
+        triggered = can_trigger(self.rig.pulses, sweep)
+        return next_path(sweep, line, self.camera, vector_pairs=self.vector_pairs, triggered=triggered)
+
+    def _read(self, runner: CaptureRunner, taken: CaptureRecord, line: int) -> Iterator[Line]:
+        """Fetch a capture and give its lines from ``line`` on."""
+        try:
+            captured = runner.devices.camera.fetch(
+                taken.folder, self._kept, self._fetched, claim=self._claim(taken.stop - taken.first)
+            )
+        except RigError as error:
+            if type(error) is not RigError:  # a device that is gone, or a disk that is full: nothing is wrong with it
+                raise
+            raise UntiedError(str(error)) from error
+        self._check_size(captured.values.shape[1:], taken.folder)
+        path = path_of(taken.sweep, (taken.first, taken.stop), self.camera, triggered=taken.triggered)
+        placed = place_lines(captured, path, taken, self.camera, runner.log_of(taken))
+        self._journal.tied(taken, placed.tied, captured.notes)
+        yield from self._given(captured.values, placed, path, line)
+
+    def _fetched(self, _: str, held: int, size: int) -> None:
+        self._say(f"fetching: {held / 1e6:.1f} of {size / 1e6:.1f} MB")
+
+    def _given(self, values: NDArray[np.uint16], placed: PlacedLines, path: CapturePath, line: int) -> Iterator[Line]:
+        """Lines from ``line`` on; one that the camera dropped, or that nothing places, is there and not valid."""
+        sweep = path.sweep
+        nothing = np.zeros((values.shape[1] // sweep.binning, values.shape[2]), np.uint16)
+        for place in range(line - path.first, len(placed.row)):
+            row, valid = int(placed.row[place]), placed.is_valid(place)
+            x, y = placed.tied.position[row] if valid else path.middle[place]
+            yield Line(
+                number=path.first + place,
+                data=bin_samples(values[row], sweep.binning) if row >= 0 else nothing,
+                mirror_x=float(x),
+                mirror_y=float(y),
+                time_s=self._time_s(sweep, path.first + place, int(placed.stamp_us[row]) if row >= 0 else -1),
+                exposure_ms=self.camera.exposure_ms,
+                valid=valid,
+            )
+
+    def _time_s(self, sweep: Sweep, number: int, stamp_us: int) -> float:
+        """Of mid exposure since the sweep's first line began, by the camera's stamps; by its rate without them."""
+        half_s = self.camera.exposure_ms / 2 * 1e-3
+        known = stamp_us >= 0
+        origin = self._journal.origin_us(sweep, stamp_us if known and number == 0 else None)
+        if known and origin is not None:
+            return (stamp_us - origin) * 1e-6 + half_s
+        return number * self.camera.frame_ms * 1e-3 + half_s
+
+    def _give_up(self, taken: CaptureRecord, line: int, why: str, *, last: bool) -> None:
+        """Expect no more of a capture: what it lacks is captured again, unless that has been tried already."""
+        self._journal.spend(taken, why)
+        if last:
+            raise RigError(
+                f"sweep {taken.sweep.name}: {BARREN} captures in a row gave no line {line}; the last, {taken.folder}: "
+                f"{why}. The {line} lines before it are kept; mend that and run again"
+            )
+        LOG.warning("%s: line %d is captured again; %s: %s", taken.sweep.name, line, taken.folder, why)
+
+    def _claim(self, frames: int) -> FrameClaim:
+        return FrameClaim(frames, self.camera.samples, len(self.wavelength_nm))
+
+    def _check_size(self, found: tuple[int, ...], folder: str) -> None:
+        wanted = (self.camera.samples, len(self.wavelength_nm))
+        if found != wanted:
+            raise RigError(
+                f"{folder} holds lines of {found} (sample, band), the settings say {wanted}; set camera.samples and "
+                "the wavelengths to what the camera gives"
+            )
+
+
+def _sums(frame: NDArray[Any], binning: int) -> NDArray[np.float32]:
+    count = len(frame) // binning
+    sums: NDArray[np.float32] = frame[: count * binning].reshape(count, binning, -1).sum(axis=1, dtype=np.float32)
+    return sums

@@ -1,0 +1,380 @@
+"""Faults of the emulated controller: bytes and replies on their way, what it answers, what it is in, ports that go."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from random import Random
+
+import numpy as np
+
+from pipeline.rig.emulator.exchange import Chunk, Mode, Request, StruckMirror, VanishedError
+from pipeline.rig.mirror.pro_mode import Command, Frame, encode
+from pipeline.rig.mirror.pro_payloads import CELL, int_cell, read_vector, refuse
+from pipeline.rig.mirror.registers import VECTOR_MEMORY, Status
+from pipeline.rig.mirror.simple_mode import END, ID, VERSION
+
+LATE_S = 20.0  # beyond any deadline
+SLOW_S = 0.02  # from byte to byte
+TICK_S = 0.005  # at which replies that wait for each other leave
+# the end of a reply with a text, one of a status, and a whole frame: what another program left behind
+_LEFT_BEHIND = (b"R-E-2\r\n", b"00000010\r\n", bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e"))
+_OTHER_TEXTS = {ID: "LENS-DRIVER-4", VERSION: "0.0.1"}
+_OTHER_FIRMWARE = 0xDEAD0001
+
+Change = Callable[[bytes, int, Random], bytes]  # some bytes, and the place of the one that is changed
+Spoil = Callable[[StruckMirror, list[Chunk], Random], list[Chunk]]
+
+
+@dataclass
+class Chance:
+    """When a fault strikes: at one of the opportunities that come, early ones as likely as later twice as many."""
+
+    random: Random
+    at: int
+    seen: int = 0
+    struck: int = 0
+
+    @classmethod
+    def drawn(cls, name: str, seed: int, span: int, at: int | None = None) -> Chance:
+        """Draw the opportunity, from 0 to ``span``, exclusive; ``at`` says it instead."""
+        random = Random(f"{name} {seed}")
+        drawn = int(2 ** random.uniform(0, math.log2(span + 1))) - 1
+        return cls(random, min(drawn, span - 1) if at is None else at)
+
+    def comes(self) -> bool:
+        """Take note of an opportunity and say whether it is the one."""
+        self.seen += 1
+        now = self.seen == self.at + 1
+        self.struck += now
+        return now
+
+    def lasts(self) -> bool:
+        """Take note of an opportunity and say whether it is the one, or comes after it."""
+        return self.comes() or self.seen > self.at
+
+
+@dataclass
+class Fault:
+    """A fault that never strikes. Hooks are called in the order in which they stand here."""
+
+    chance: Chance
+
+    def begin(self, device: StruckMirror) -> None:
+        """Take a hand as the controller is switched on."""
+
+    def opened(self, device: StruckMirror) -> list[Chunk]:
+        """Give what is found in the port as it is opened."""
+        return []
+
+    def instead(self, device: StruckMirror, data: bytes) -> list[Chunk] | None:
+        """Answer bytes in the controller's place; None leaves them to it."""
+        return None
+
+    def incoming(self, device: StruckMirror, data: bytes) -> bytes:
+        """Give the bytes that reach the controller."""
+        return data
+
+    def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
+        """Give a reply to a request that then is not carried out; None lets the controller do it."""
+        return None
+
+    def outgoing(self, device: StruckMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
+        """Give the bytes that leave the controller, and when."""
+        return chunks
+
+
+# what may become of bytes
+
+
+def lose(data: bytes, at: int, random: Random) -> bytes:
+    """Leave a byte out."""
+    return data[:at] + data[at + 1 :]
+
+
+def flip(data: bytes, at: int, random: Random) -> bytes:
+    """Turn one bit of a byte."""
+    return data[:at] + bytes((data[at] ^ 1 << random.randrange(8),)) + data[at + 1 :]
+
+
+def double(data: bytes, at: int, random: Random) -> bytes:
+    """Have a byte twice."""
+    return data[: at + 1] + data[at:]
+
+
+# what may become of a reply
+
+
+def changed(change: Change) -> Spoil:
+    """Change one byte."""
+
+    def spoil(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+        delay_s, data = chunks[0]
+        return [Chunk(delay_s, change(data, random.randrange(len(data)), random)), *chunks[1:]]
+
+    return spoil
+
+
+def split(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+    """Cut it into pieces of a few bytes, a millisecond apart."""
+    pieces = []
+    for delay_s, data in chunks:
+        while data:
+            size = random.randint(1, 3)
+            pieces.append(Chunk(delay_s, data[:size]))
+            data, delay_s = data[size:], delay_s + 1e-3
+    return pieces
+
+
+def merge(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+    """Let it wait for the next tick of a slow clock, with those that wait already."""
+    now = device.clock.now()
+    return [Chunk(math.ceil((now + delay_s) / TICK_S) * TICK_S - now, data) for delay_s, data in chunks]
+
+
+def noise(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+    """Put bytes that mean nothing before it."""
+    return [Chunk(chunks[0].delay_s, random.randbytes(random.randint(1, 12))), *chunks]
+
+
+def late(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+    """Hold it back beyond any deadline."""
+    return [Chunk(delay_s + LATE_S, data) for delay_s, data in chunks]
+
+
+def just_late(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+    """Hold it back until around its deadline of a second, so that it may meet the next request."""
+    return [Chunk(delay_s + random.uniform(0.3, 1.5), data) for delay_s, data in chunks]
+
+
+def lost(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+    """Keep it."""
+    return []
+
+
+def slow(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+    """Send its bytes one at a time, with long gaps."""
+    whole = b"".join(data for _, data in chunks)
+    return [Chunk(chunks[0].delay_s + place * SLOW_S, whole[place : place + 1]) for place in range(len(whole))]
+
+
+@dataclass
+class SpoiltReply(Fault):
+    """One reply leaves otherwise than it should, or all from one on do; requests without a reply do not count."""
+
+    spoil: Spoil
+    lasting: bool = False
+
+    def outgoing(self, device: StruckMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
+        if not chunks or not (self.chance.lasts() if self.lasting else self.chance.comes()):
+            return chunks
+        return self.spoil(device, chunks, self.chance.random)
+
+
+@dataclass
+class OldReplyAgain(Fault):
+    """The reply before is sent once more, in front of one reply."""
+
+    last: bytes = b""
+
+    def outgoing(self, device: StruckMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
+        whole = b"".join(data for _, data in chunks)
+        if not whole:
+            return chunks
+        again = [Chunk(chunks[0].delay_s, self.last)] if self.chance.comes() and self.last else []
+        self.last = whole
+        return again + chunks
+
+
+@dataclass
+class StaleBytes(Fault):
+    """What another program asked for lies in the port when it is opened, and some more follows."""
+
+    def opened(self, device: StruckMirror) -> list[Chunk]:
+        self.chance.struck += 1
+        left = self.chance.random.choice(_LEFT_BEHIND)
+        cut = self.chance.random.randrange(1, len(left))
+        return [Chunk(0.0, left[:cut]), Chunk(0.01, left[cut:])]
+
+
+@dataclass
+class RequestByte(Fault):
+    """One byte of all that go to the controller is changed."""
+
+    change: Change
+
+    def incoming(self, device: StruckMirror, data: bytes) -> bytes:
+        out = b""
+        for byte in data:
+            one = bytes((byte,))
+            out += self.change(one, 0, self.chance.random) if self.chance.comes() else one
+        return out
+
+
+@dataclass
+class ProAtConnect(Fault):
+    """An earlier session left the controller in pro mode."""
+
+    def begin(self, device: StruckMirror) -> None:
+        self.chance.struck += 1
+        device.set_mode(self.chance.random.choice((Mode.PRO, Mode.PRO_CRC)))
+
+
+@dataclass
+class SilentReset(Fault):
+    """The controller restarts by itself as a request comes, says nothing and is in simple mode afterwards."""
+
+    boot_s: float
+    commands: Collection[int] | None = None  # frames that can be struck; None is any request
+
+    def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
+        if (self.commands is not None and request.command not in self.commands) or not self.chance.comes():
+            return None
+        device.restart(boot_s=self.boot_s)
+        return b""
+
+
+@dataclass
+class AnswersLine(Fault):
+    """One line of simple mode gets a refusal and is not carried out."""
+
+    answer: str
+
+    def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
+        if request.mode is not Mode.SIMPLE or not self.chance.comes():
+            return None
+        return self.answer.encode("ascii") + END
+
+
+@dataclass
+class AnswersError(Fault):
+    """One frame gets an error code and is not carried out."""
+
+    code: int
+    commands: Collection[int] | None = None  # that can be struck; None is any
+
+    def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
+        command = request.command
+        if command is None or (self.commands is not None and command not in self.commands):
+            return None
+        return encode(refuse(command, self.code)) if self.chance.comes() else None
+
+
+@dataclass
+class CellLost(Fault):
+    """One cell of the vector memory keeps what it held, though its writing is acknowledged."""
+
+    def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
+        if request.frame is None or request.command != Command.SET_VECTOR or len(request.frame.payload) < 5 + CELL:
+            return None
+        register, offset, length, _ = read_vector(request.frame.payload)
+        memory, cells = device.state.memory, slice(offset // CELL, (offset + length) // CELL)
+        if register != VECTOR_MEMORY or not self.chance.comes():
+            return None
+        before = memory[cells].copy()
+        reply = device.carry_out(request)
+        differing = np.flatnonzero(memory[cells] != before)
+        if differing.size:
+            place = self.chance.random.choice(differing.tolist())
+            memory[cells.start + place] = before[place]
+        return reply
+
+
+@dataclass
+class StatusBit(Fault):
+    """From one request on a bit of the status is on, and stays."""
+
+    bit: Status
+
+    def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
+        if self.chance.lasts():
+            device.state.flags |= self.bit
+        return None
+
+
+@dataclass
+class OtherFirmware(Fault):
+    """The controller is another model of its maker."""
+
+    def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
+        if request.line in _OTHER_TEXTS:
+            self.chance.struck += 1
+            return _OTHER_TEXTS[request.line].encode("ascii") + END
+        if request.command == Command.FIRMWARE_ID:
+            self.chance.struck += 1
+            return encode(Frame(Command.FIRMWARE_ID, int_cell(_OTHER_FIRMWARE)))
+        return None
+
+
+@dataclass
+class GoneBefore(Fault):
+    """The device goes away before a request reaches it."""
+
+    def incoming(self, device: StruckMirror, data: bytes) -> bytes:
+        if self.chance.comes():
+            device.gone = True
+            raise VanishedError("the device went away")
+        return data
+
+
+@dataclass
+class GoneWithin(Fault):
+    """The device goes away in the middle of a request, of which it took a part."""
+
+    def incoming(self, device: StruckMirror, data: bytes) -> bytes:
+        for place in range(len(data)):
+            if self.chance.comes():
+                device.gone = True
+                return data[:place]
+        return data
+
+
+@dataclass
+class GoneAfter(Fault):
+    """The device carries a request out and goes away before it answers."""
+
+    def outgoing(self, device: StruckMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
+        if self.chance.comes():
+            device.gone = True
+            return []
+        return chunks
+
+
+@dataclass
+class PortHangs(Fault):
+    """From one request on the port takes no more bytes, and writing to it blocks."""
+
+    def incoming(self, device: StruckMirror, data: bytes) -> bytes:
+        if self.chance.lasts():
+            device.hung = True
+            return b""
+        return data
+
+
+@dataclass
+class Echo(Fault):
+    """A loop of wire instead of a controller: all that is sent comes back."""
+
+    def instead(self, device: StruckMirror, data: bytes) -> list[Chunk]:
+        self.chance.struck += 1
+        return [Chunk(device.unit.turnaround_s, data)]
+
+
+@dataclass
+class Modem(Fault):
+    """A modem instead of a controller: it shows what is typed, and answers lines as modems do."""
+
+    typed: bytes = field(default=b"", init=False)
+
+    def instead(self, device: StruckMirror, data: bytes) -> list[Chunk]:
+        self.chance.struck += 1
+        answers = []
+        for byte in data:
+            if byte == 0x0D:
+                good = self.typed.strip().upper().startswith(b"AT")
+                answers.append(b"\r\nOK\r\n" if good else b"\r\nERROR\r\n" if self.typed.strip() else b"")
+                self.typed = b""
+            else:
+                self.typed = (self.typed + bytes((byte,)))[-64:]
+        return [Chunk(device.unit.turnaround_s, data + b"".join(answers))]

@@ -1,0 +1,163 @@
+"""Registers and status bits of the mirror controller. A register's id is its system's, times 256, plus its number.
+
+From what the maker publishes and from public software for the controller; none of it was tried on hardware. Positions
+(units of 1 at the rim of the mirror's disk) are what unit 2, XY, stands for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+
+CHANNELS = 2  # 0 is X, 1 is Y
+
+_FEEDBACK, _LOGGER, _MEMORY, _CHAIN = 0x23, 0x24, 0x26, 0x40
+_STATIC, _VECTOR_UNIT, _XY_CONTROL = 0x50, 0x68, 0xC0  # plus the channel
+
+FEEDBACK_A = _FEEDBACK << 8 | 0x00  # of the first axis; the second's is the next one
+FEEDBACK_X, FEEDBACK_Y = _FEEDBACK << 8 | 0x02, _FEEDBACK << 8 | 0x03
+
+VECTOR_MEMORY = _MEMORY << 8  # one vector, shared by the channels
+
+LOG_SLOTS = 6
+LOG_RUN, LOG_RATE = _LOGGER << 8 | 0x10, _LOGGER << 8 | 0x11
+
+
+class Unit(IntEnum):
+    """What the numbers of an input are."""
+
+    CURRENT = 0
+    FEEDBACK = 1
+    XY = 2
+
+
+class Trigger(IntEnum):
+    """Which edges at the trigger input step through the vector memory."""
+
+    OFF = 0
+    BOTH_EDGES = 1
+    RISING_EDGE = 2
+
+
+class Status(IntFlag):
+    """Status bits. The ``WAS`` bits stay until they are acknowledged."""
+
+    DISCONNECTED = 1 << 0
+    ELECTRONICS_WARM = 1 << 1
+    MIRROR_WARM = 1 << 2
+    EEPROM_INVALID = 1 << 3
+    NOT_STABLE = 1 << 4
+    OUTPUT_LIMIT = 1 << 5
+    AVERAGE_LIMIT = 1 << 6
+    TRIMMED = 1 << 7
+    WAS_DISCONNECTED = 1 << 8
+    WAS_ELECTRONICS_WARM = 1 << 9
+    WAS_MIRROR_WARM = 1 << 10
+    WAS_OUTPUT_LIMIT = 1 << 11
+    WAS_AVERAGE_LIMIT = 1 << 12
+    WAS_TRIMMED = 1 << 13
+
+    @property
+    def words(self) -> list[str]:
+        """What is on, in words for whoever stands before the rig; bits without a known meaning by their number."""
+        known = [words for bit, words in _WORDS.items() if bit in self]
+        rest = int(self) & ~sum(_WORDS)
+        return known + [f"bit {place}, whose meaning is not known" for place in range(32) if rest >> place & 1]
+
+    @property
+    def sentence(self) -> str:
+        """The bits and what they say, for messages."""
+        return f"status {int(self):08X}: {'; '.join(self.words) or 'nothing is amiss'}"
+
+    @property
+    def stops_motion(self) -> bool:
+        """Whether something is on, now, with which the mirror does not go where it is sent."""
+        return bool(self & _STOPS)
+
+
+_WORDS = {
+    Status.DISCONNECTED: "the mirror head is not connected",
+    Status.ELECTRONICS_WARM: "the mirror head's electronics are too warm",
+    Status.MIRROR_WARM: "the mirror is too warm",
+    Status.EEPROM_INVALID: "the mirror's own calibration cannot be read",
+    Status.NOT_STABLE: "the mirror is not at rest",
+    Status.OUTPUT_LIMIT: "the drive is at its limit",
+    Status.AVERAGE_LIMIT: "the drive's average is at its limit",
+    Status.TRIMMED: "a target was beyond the rim, and was trimmed to it",
+    Status.WAS_DISCONNECTED: "the mirror head was not connected (since acknowledged last)",
+    Status.WAS_ELECTRONICS_WARM: "the mirror head's electronics were too warm (since acknowledged last)",
+    Status.WAS_MIRROR_WARM: "the mirror was too warm (since acknowledged last)",
+    Status.WAS_OUTPUT_LIMIT: "the drive was at its limit (since acknowledged last)",
+    Status.WAS_AVERAGE_LIMIT: "the drive's average was at its limit (since acknowledged last)",
+    Status.WAS_TRIMMED: "a target was trimmed to the rim (since acknowledged last)",
+}
+_STOPS = Status.DISCONNECTED | Status.ELECTRONICS_WARM | Status.MIRROR_WARM | Status.EEPROM_INVALID
+
+
+@dataclass(frozen=True)
+class ChannelRegisters:
+    """The registers of one channel: the inputs it can follow, and which of them it does."""
+
+    channel: int
+
+    @property
+    def static_xy(self) -> int:
+        """Held position, float."""
+        return self.static_system << 8 | Unit.XY
+
+    @property
+    def input(self) -> int:
+        """Which system the channel follows."""
+        return _CHAIN << 8 | 5 * self.channel
+
+    @property
+    def control(self) -> int:
+        """Which system controls the channel."""
+        return _CHAIN << 8 | 5 * self.channel + 2
+
+    @property
+    def static_system(self) -> int:
+        """System of held positions."""
+        return _STATIC + self.channel
+
+    @property
+    def vector_system(self) -> int:
+        """System that plays the vector memory."""
+        return _VECTOR_UNIT + self.channel
+
+    @property
+    def xy_system(self) -> int:
+        """System that controls position."""
+        return _XY_CONTROL + self.channel
+
+    def vector(self, register: VectorRegister) -> int:
+        """Id of a register of the vector unit."""
+        return self.vector_system << 8 | register
+
+    def followed(self, system: int) -> dict[int, int]:
+        """Values that make the channel follow an input, controlled by position."""
+        return {self.control: self.xy_system, self.input: system}
+
+
+class VectorRegister(IntEnum):
+    """Registers of the vector unit."""
+
+    UNIT = 0x0
+    RUN = 0x1
+    START = 0x2
+    END = 0x3
+    FREQUENCY = 0x4  # cells per second, float
+    LOWEST = 0x5  # float, read only
+    HIGHEST = 0x6  # float, read only
+    CYCLES = 0x7  # -1 is without end
+    TRIGGER = 0x8
+    OUTPUT = 0x9  # float, read only
+    INDEX = 0xA  # read only
+
+
+X, Y = ChannelRegisters(0), ChannelRegisters(1)
+
+
+def log_slot(slot: int) -> int:
+    """Id of the register that says what a slot of the logger takes down, and of the vector that it takes down."""
+    return _LOGGER << 8 | slot

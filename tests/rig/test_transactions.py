@@ -1,0 +1,260 @@
+"""Transactions: deadlines, retries, motions that are sent once, late and stale bytes, and what is counted."""
+
+from __future__ import annotations
+
+import logging
+import threading
+
+import pytest
+
+from pipeline.errors import RigError
+from pipeline.rig.clock import ManualClock
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, StateUnknown
+from pipeline.rig.mirror.mirror_settings import Patience
+from pipeline.rig.mirror.transactions import Kind, Wire
+from tests.rig.scripted import Late, Pair, ScriptedTransport, scripted
+
+
+def one_line(data: bytes) -> bytes | None:
+    """Take a whole part that ends a line as the answer."""
+    if data == b"bad\n":
+        raise RigError("expected an answer, got bad")
+    return data if data.endswith(b"\n") else None
+
+
+def ask(wire: Wire, data: bytes = b"q\n", kind: Kind = "read") -> bytes:
+    """One transaction."""
+    return wire.exchange(data, f"asking {data.decode().strip()}", kind, lambda: one_line)
+
+
+def make(transport: ScriptedTransport, **patience: float) -> Wire:
+    """A wire over the transport, a second and two retries by default."""
+    given = {"deadline_s": 1.0, "retries": 2, "quiet_s": 0.1} | patience
+    return Wire(transport, transport.clock, Patience(given["deadline_s"], int(given["retries"]), given["quiet_s"]))
+
+
+@pytest.mark.parametrize("lost", [0, 1, 2])
+def test_reads_are_asked_again_within_the_deadline(lost: int):
+    """Up to two lost answers cost time within the one deadline."""
+    with scripted([(b"q\n", b"")] * lost + [(b"q\n", b"a\n")]) as transport:
+        assert ask(make(transport)) == b"a\n"
+        assert transport.clock.now() < 1.0
+
+
+def test_the_deadline_holds_for_all_retries_together():
+    """Three lost answers take the deadline and no more, and the request was sent three times."""
+    with scripted([(b"q\n", b"")] * 3) as transport:
+        with pytest.raises(DeadlinePassed, match="asking q from scripted"):
+            ask(make(transport))
+        assert transport.sent == 3
+        assert transport.clock.now() == pytest.approx(1.0)
+
+
+def test_a_slow_answer_is_not_cut_off():
+    """An answer that takes most of the deadline, byte by byte, is waited for as long as it goes on."""
+    parts = [Late(0.1 * number, b"a") for number in range(1, 9)]
+    with scripted([(b"q\n", [*parts, Late(0.9, b"\n")])]) as transport:
+        assert ask(make(transport)) == b"\n"
+        assert transport.sent == 1
+
+
+def test_waiting_for_silence_between_retries_stays_within_the_deadline():
+    """Bytes that trickle on after a retry was due do not stretch the transaction."""
+    parts = [Late(0.4 + 0.09 * number, b"x") for number in range(20)]
+    transport = ScriptedTransport([(b"q\n", parts), (b"q\n", b"")], ManualClock())
+    with pytest.raises(DeadlinePassed):
+        ask(make(transport))
+    assert transport.clock.now() == pytest.approx(1.0)
+
+
+def test_nonsense_is_asked_again():
+    """An answer that is none is asked for again; the last one is said."""
+    with scripted([(b"q\n", b"bad\n"), (b"q\n", b"a\n")]) as transport:
+        assert ask(make(transport)) == b"a\n"
+    with scripted([(b"q\n", b"bad\n")] * 3) as transport, pytest.raises(RigError, match="got bad"):
+        ask(make(transport))
+
+
+def test_answer_behind_nonsense_is_not_the_next_ones():
+    """What is no answer leaves one owed: it is waited for, and not taken for the answer to what is asked then."""
+    behind = [b"bad\n", Late(0.05, b"a\n")]
+    with scripted([(b"q\n", behind), (b"q\n", b"b\n")]) as transport:
+        assert ask(make(transport)) == b"b\n"
+
+
+def test_writes_are_sent_once():
+    """A write without an answer is not sent again, and freezes nothing."""
+    with scripted([(b"w\n", b"")]) as transport:
+        wire = make(transport)
+        with pytest.raises(DeadlinePassed):
+            ask(wire, b"w\n", "write")
+        assert not wire.unknown
+
+
+@pytest.mark.parametrize("received", [b"", b"half", b"bad\n", [Late(1.5, b"ok\n")], [DeviceGone("it went away")]])
+def test_a_motion_without_acknowledgement_is_sent_once_and_freezes(received):
+    """Whatever became of the acknowledgement, the motion may have happened: it and all others are refused from then."""
+    transport = ScriptedTransport([(b"m\n", received)], ManualClock())
+    wire = make(transport)
+    with pytest.raises(StateUnknown, match="asking m was sent to scripted and may have happened or not"):
+        ask(wire, b"m\n", "motion")
+    for _ in range(3):
+        with pytest.raises(StateUnknown, match=r"asking n is refused .*asking m was sent and not acknowledged"):
+            ask(wire, b"n\n", "motion")
+    assert transport.sent == 1
+
+
+def test_a_late_acknowledgement_never_answers_the_next_read(caplog: pytest.LogCaptureFixture):
+    """It is thrown away, and motions stay refused, with what a person can do."""
+    pairs: list[Pair] = [(b"m\n", [Late(1.05, b"late\n")]), (b"q\n", b"a\n")]
+    with scripted(pairs) as transport, caplog.at_level(logging.WARNING):
+        wire = make(transport)
+        with pytest.raises(StateUnknown, match="Look at the mirror, then run again, which connects anew"):
+            ask(wire, b"m\n", "motion")
+        assert ask(wire) == b"a\n"
+        with pytest.raises(StateUnknown, match="Look at it, then run again, which connects anew"):
+            ask(wire, b"n\n", "motion")
+    assert "dropped 5 stale bytes" in caplog.text
+
+
+def test_an_interrupted_motion_freezes():
+    """Whoever stops the program while a motion waits for its acknowledgement does not know either."""
+    transport = ScriptedTransport([(b"m\n", b"x")], ManualClock())
+    wire = make(transport)
+
+    def stop(data: bytes) -> bytes:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        wire.exchange(b"m\n", "going", "motion", lambda: stop)
+    with pytest.raises(StateUnknown, match="going was interrupted"):
+        ask(wire, b"n\n", "motion")
+
+
+def test_reads_work_while_motions_are_frozen():
+    """Looking is always allowed."""
+    with scripted([(b"m\n", b""), (b"q\n", b"a\n")]) as transport:
+        wire = make(transport)
+        with pytest.raises(StateUnknown):
+            ask(wire, b"m\n", "motion")
+        assert ask(wire) == b"a\n"
+
+
+def test_a_late_answer_never_answers_the_next_request():
+    """An answer that comes after its deadline is waited for and dropped before the next request goes."""
+    pairs: list[Pair] = [(b"q\n", [Late(1.05, b"old\n")]), (b"r\n", b"new\n")]
+    with scripted(pairs) as transport:
+        wire = make(transport, retries=0)
+        with pytest.raises(DeadlinePassed):
+            ask(wire)
+        assert ask(wire, b"r\n") == b"new\n"
+
+
+def test_silence_is_waited_for_once():
+    """After an answer that never came the next request waits for it, and the ones behind that do not."""
+    with scripted([(b"q\n", b""), (b"r\n", b"a\n"), (b"s\n", b"b\n")]) as transport:
+        wire = make(transport, retries=0)
+        with pytest.raises(DeadlinePassed):
+            ask(wire)
+        ask(wire, b"r\n")
+        assert transport.clock.now() == pytest.approx(1.1)
+        ask(wire, b"s\n")
+        assert transport.clock.now() == pytest.approx(1.1)
+
+
+def test_a_late_answer_of_a_retried_read_never_answers_the_next_request():
+    """Both answers of a read that was asked twice are taken off the line."""
+    pairs: list[Pair] = [(b"q\n", [Late(0.5, b"old\n")]), (b"q\n", b"a\n"), (b"r\n", b"new\n")]
+    with scripted(pairs, drained=b"") as transport:
+        wire = make(transport, quiet_s=0.3)
+        assert ask(wire) == b"a\n"
+        assert ask(wire, b"r\n") == b"new\n"
+
+
+def test_stale_bytes_are_drained_and_logged(caplog: pytest.LogCaptureFixture):
+    """What an earlier session left on the line is no answer."""
+    with scripted([(b"q\n", b"a\n")], stale=b"old\n", drained=b"old\n") as transport:
+        assert ask(make(transport)) == b"a\n"
+    assert "scripted: dropped 4 stale bytes before asking q: 6f 6c 64 0a" in caplog.text
+
+
+def test_a_device_that_never_stops_talking_holds_nothing_up():
+    """Silence is waited for only so long."""
+
+    class Babbling(ScriptedTransport):
+        """Says something every 10 ms."""
+
+        def read(self, at_most: int, deadline: float) -> bytes:
+            if self.clock.now() >= deadline:
+                return b""
+            self.clock.sleep(0.01)
+            return b"x"
+
+    transport = Babbling([(b"q\n", b""), (b"r\n", b"")], ManualClock())
+    wire = make(transport)
+    with pytest.raises(DeadlinePassed, match=r"bytes that are none came: 78"):
+        ask(wire)
+    with pytest.raises(DeadlinePassed, match="r from"):
+        ask(wire, b"r\n", "write")
+    assert transport.clock.now() < 3
+
+
+def test_a_port_that_is_gone_is_not_asked_again():
+    """Where there is nobody, nothing is repeated; a motion that was not sent freezes nothing."""
+    with scripted([(b"q\n", [DeviceGone("it went away")])]) as transport, pytest.raises(DeviceGone):
+        ask(make(transport))
+
+    class Gone(ScriptedTransport):
+        """Cannot even be drained."""
+
+        def drain(self) -> bytes:
+            raise DeviceGone("it went away")
+
+    wire = make(Gone([], ManualClock()))
+    with pytest.raises(DeviceGone):
+        ask(wire, b"m\n", "motion")
+    assert not wire.unknown
+
+
+def test_bytes_on_the_wire_are_counted():
+    """In both directions, stale bytes and retries included."""
+    with scripted([(b"q\n", b""), (b"q\n", b"abc\n")], stale=b"xy", drained=b"xy") as transport:
+        wire = make(transport)
+        ask(wire)
+        assert (wire.bytes_sent, wire.bytes_received) == (4, 6)
+
+
+def test_transactions_do_not_mix():
+    """Several threads ask at once, and each gets its own answer."""
+
+    class Echo(ScriptedTransport):
+        """Answers with what was asked, in two parts."""
+
+        def write(self, data: bytes, deadline: float) -> None:
+            assert not self._line
+            self._line.extend([(0.0, data[:1]), (0.0, data[1:])])
+
+    def whole() -> object:
+        held = b""
+
+        def take(data: bytes) -> bytes | None:
+            nonlocal held
+            held += data
+            return held if held.endswith(b"\n") else None
+
+        return take
+
+    wire = make(Echo([], ManualClock()))
+    wrong: list[bytes] = []
+
+    def work(mine: bytes) -> None:
+        for _ in range(50):
+            if wire.exchange(mine, "it", "read", whole) != mine:
+                wrong.append(mine)
+
+    threads = [threading.Thread(target=work, args=(f"{number}\n".encode(),)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(10)
+    assert not wrong
