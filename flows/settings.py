@@ -17,8 +17,8 @@ from pipeline.errors import PoseError, SettingsError
 from pipeline.ground import RigPose
 from pipeline.rig.survey_rig import SurveyRig
 from pipeline.scan import CostModel
-from pipeline.simulator.farm_laws import USUAL_DAY, USUAL_HOUR, has_days
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
+from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from storage.block_work import Crew
 from storage.toml_files import read_toml
 
@@ -57,8 +57,8 @@ class Settings:
     kernel: Literal["catmull-rom", "bilinear", "nearest"] = "catmull-rom"
     pointing_px: float = 0.0  # how far off the mirror may point; above 0 sweeps overlap and their seams are registered
     size: tuple[int, int] | None = None  # (width, height) of the built-in scene [px]
-    day: int | None = None  # of the year, for farm@2: 172 unless given
-    hour: float | None = None  # true solar time, for farm@2: 11 unless given [h]
+    day: int | None = None  # of the year, for the farm: 172 unless given
+    hour: float | None = None  # true solar time, for the farm: 11 unless given [h]
     camera: LineCamera = field(default_factory=LineCamera)
     optics: Optics = field(default_factory=Optics)
     mirror: MirrorMotion = field(default_factory=MirrorMotion)
@@ -83,7 +83,7 @@ class Settings:
     @property
     def moment(self) -> tuple[int, float] | None:
         """Day of the year and true solar time [h] of the built-in scene; None of a scene that has none."""
-        if not has_days(self.scene):
+        if self.scene not in BUILT_IN_SCENES:
             return None
         return USUAL_DAY if self.day is None else self.day, USUAL_HOUR if self.hour is None else self.hour
 

@@ -18,8 +18,8 @@ from pipeline.coverage import cheapest_full, coarse_sweeps
 from pipeline.grid import SceneGrid
 from pipeline.rectify.region import mosaic_rows
 from pipeline.scan import CostModel
-from pipeline.simulator.farm_laws import built_in_farm
 from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from storage.codec_trials import CODECS, store_in_memory
 from storage.layout import round_bits
@@ -51,7 +51,7 @@ class Stored:
 
 def _prepare(seed: int) -> Captured:
     weights = load_weights(Path(str(resources.files("models") / "shipped" / SHIPPED)))
-    camera, scene = LineCamera(), built_in_farm("farm", seed, SHAPE)
+    camera, scene = LineCamera(), farm_scene(seed, SHAPE)
     grid = SceneGrid(*SHAPE, weights.config.patch, weights.config.factor)
     source = SimulatedSource(scene, Rig(camera), seed)
     along, full, _ = cheapest_full(grid, camera, CostModel())

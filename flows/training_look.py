@@ -23,10 +23,10 @@ from pipeline.rectify.region import mosaic_rows
 from pipeline.scan import CostModel, Sweep
 from pipeline.simulator.choice import decide
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.farm_laws import law_of_key
 from pipeline.simulator.render import Choice
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.farm.farm_scene import law_of_key
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from pipeline.simulator.survey_clock import sweep_starts
 from pipeline.simulator.survey_probe import probe_survey

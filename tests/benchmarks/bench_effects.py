@@ -19,12 +19,12 @@ from pipeline.simulator.effects.effect import Effect, Light
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.effects.rotation import ROTATION
 from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.farm import farm_scene
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Rig
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.stored_light import noise_electrons
 from pipeline.simulator.survey_probe import probe_scene
 from pipeline.simulator.verification import verify
@@ -102,7 +102,7 @@ def _of_rig(scene: RasterScene, name: str, rig: Rig, sweeps: tuple[Sweep, ...]) 
         _cpu_row(name, "cheap", clocks, apart["cheap"]),
         _cpu_row(name, "exact", clocks, 0.0),
         _verified(scene, name, decision, probe, f"probe {probed:.1f} s, choice {decided:.2f} s"),
-        Row(f"farm@1, {name}: on", ", ".join(f"{one.name}" for one in decision.taken if one.is_on)),
+        Row(f"farm, {name}: on", ", ".join(f"{one.name}" for one in decision.taken if one.is_on)),
     ]
 
 
@@ -123,7 +123,7 @@ def _apart(light: Sequence[Light], exact: Sequence[Light], rig: Rig) -> float:
 
 def _tolerance_row(name: str, apart: Mapping[str, float], decision: Decision) -> Row:
     return Row(
-        f"farm@1 1024 x 1280 x 270, {name}, auto at {TOLERANCE} sigma: greatest change of light",
+        f"farm 1024 x 1280 x 270, {name}, auto at {TOLERANCE} sigma: greatest change of light",
         f"{apart['auto']:.3g} sigma, bound {decision.error:.3g}",
         f"<= {TOLERANCE} sigma",
         apart["auto"] <= decision.error <= TOLERANCE,
@@ -137,7 +137,7 @@ def _cpu_row(name: str, against: str, clocks: Mapping[str, Clock], apart: float)
     goal = against == "cheap" and RIGS[name] == Rig()
     what = "each as cheap as a tenth of the tolerance lets it be" if against == "cheap" else "exact"
     return Row(
-        f"farm@1, {name}, auto: processor time against everything on, {what}",
+        f"farm, {name}, auto: processor time against everything on, {what}",
         f"1/{ratio(clocks, against, 'auto'):.2f}",
         f">= {LEAST_SAVED:g} times less" if goal else "",
         ratio(clocks, against, "auto") >= LEAST_SAVED if goal else None,
@@ -157,6 +157,6 @@ def _verified(scene: RasterScene, name: str, decision: Decision, probe: Probe, b
     spent = time.process_time() - clock
     worst = max(measured.values())
     return Row(
-        f"farm@1, {name}: verification of the choice, processor time", f"{spent:.1f} s, {worst:.2g} sigma",
+        f"farm, {name}: verification of the choice, processor time", f"{spent:.1f} s, {worst:.2g} sigma",
         peers=f"{before}; {len({(chip.sweep.name, chip.lines) for chip in chips.values()})} chips",
     )  # fmt: skip

@@ -22,11 +22,11 @@ from pipeline.simulator.effects.keystone import KEYSTONE
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.effects.rotation import ROTATION
 from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.farm import farm_scene
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.stored_light import noise_electrons
 from pipeline.simulator.survey_probe import probe_scene
 

@@ -22,7 +22,7 @@ from flows.reprocess_command import ReprocessRequest, _survey, run_reprocess
 from flows.settings import Settings
 from models.weights import content_key
 from pipeline.errors import ArchiveError, SettingsError, WeightsError
-from pipeline.simulator.farm import CLASSES
+from pipeline.simulator.scenes.farm.canvas import CLASSES
 from storage.archive import Archive
 from storage.lineage import Catalogue
 from tests.conftest import Survey, WeightsMaker

@@ -35,7 +35,7 @@ READERS = ("storage/scan_files.py", "storage/envi_header.py", "storage/envi_cube
            "storage/frame_index_files.py", "storage/zarr_scenes.py", "storage/raster_files.py", "storage/rasters.py",
            "storage/tiff_files.py", "storage/array_files.py", "storage/mat_files.py", "storage/dataset_layouts.py",
            "storage/wavelengths.py", "storage/scene_toml.py", "pipeline/rig/frame_index.py")  # fmt: skip
-SIMULATOR = ("pipeline/simulator", "pipeline/simulator/effects")
+SIMULATOR = ("pipeline/simulator",)
 SOURCES = {
     "effects": (*GEOMETRY, *GATHER, *SIMULATOR, "flows/effect_choice.py"),
     "capture": (*GEOMETRY, *GATHER, *SIMULATOR, "storage/cubes.py"),
@@ -85,7 +85,7 @@ def digest_of(stage: str) -> str:
     digest = hashlib.sha256()
     for name in SOURCES[stage]:
         path = ROOT / name
-        for file in sorted(path.glob("*.py")) if path.is_dir() else [path]:
+        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
             digest.update(ast.dump(_bare_code(file)).encode())
     for shared, names in FUNCTIONS[stage].items():
         nodes = [node for node in _bare_code(ROOT / shared).body if isinstance(node, ast.FunctionDef | ast.ClassDef)]

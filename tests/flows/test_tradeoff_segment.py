@@ -12,7 +12,7 @@ from flows.tradeoff_segment import AGREEMENT, BAND_COUNT, BANDS, PRECISION, PREC
 from models.segmenter import Segmenter, SegmenterConfig
 from models.spectral import Normalisation, SpectralBasis
 from models.weights import Weights
-from pipeline.simulator.farm import farm_scene
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 
 SHAPE = (128, 192)
 

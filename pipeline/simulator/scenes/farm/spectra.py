@@ -1,9 +1,9 @@
 """Spectra of the built-in farm: what its materials reflect, and how many electrons that gives in each band.
 
-Plant stands come from PROSPECT-D and 4SAIL [1]_ [2]_ (package ``prosail``), soil from the dry and the wet spectrum of
-that package, sun and sky from Bird and Riordan's SPECTRL2 [3]_ (package ``pvlib``). What those do not give follows
-laws of this project, written at each function; so does the camera's quantum efficiency (assumed). Everything is held
-at 1 nm and seen through Gaussian bands.
+Plant stands come from PROSPECT-D and 4SAIL [1]_ [2]_ (package ``prosail``), seen from above; soil from the dry and the
+wet spectrum of that package, mixed by moisture [3]_; sun and sky from Bird and Riordan's SPECTRL2 [4]_ (package
+``pvlib``). What those do not give follows laws of this project, written at each function; so do the stages' parameters
+and the camera's quantum efficiency (assumed). Everything is held at 1 nm and seen through Gaussian bands.
 
 References
 ----------
@@ -11,7 +11,8 @@ References
    Sensing of Environment 193, 2017. doi:10.1016/j.rse.2017.03.004
 .. [2] Verhoef, "Light scattering by leaf layers with application to canopy reflectance modeling: the SAIL model",
    Remote Sensing of Environment 16, 1984. doi:10.1016/0034-4257(84)90057-9
-.. [3] Bird and Riordan, "Simple solar spectral model for direct and diffuse irradiance on horizontal and tilted
+.. [3] Lobell and Asner, "Moisture effects on soil reflectance", Soil Science Society of America Journal 66, 2002.
+.. [4] Bird and Riordan, "Simple solar spectral model for direct and diffuse irradiance on horizontal and tilted
    planes at the earth's surface for cloudless atmospheres", TR-215-2436, 1984. doi:10.2172/5986936
 """
 
@@ -21,7 +22,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.errors import WavelengthError
@@ -33,6 +34,8 @@ FWHM_NM = 6.0  # assumed
 PANEL_REFLECTANCE = 0.99
 FILL = 0.95  # of the full well, by a perfect white in the brightest band
 TWIN_CENTRE_NM, TWIN_HALF_WIDTH_NM, TWIN_CONTRAST = 715.0, 25.0, 0.10
+RIPE_CONTRAST = 0.4  # of the twins' contrast, in ripe wheat (law of this project)
+MOISTURE_EXPONENT = 5.0  # law of this project; 80 % of the darkening is done at 0.32 by volume
 
 GRID_NM: Spectrum = np.arange(400.0, 1031.0)  # room for the upper half of the last band
 _SUN_ZENITH_DEG = 30.0
@@ -42,9 +45,10 @@ _SUN_ZENITH_DEG = 30.0
 class Canopy:
     """One plant stand for PROSPECT-D and 4SAIL, seen from above with the sun 30 degrees from the zenith.
 
-    Ranges used here: structure n 1.3-2.1; chlorophyll ``cab`` 8-62, carotenoids ``car`` 4-14 and anthocyanins ``ant``
-    0-6 ug/cm2; brown pigment 0-1; water ``cw`` 0.004-0.030 cm; dry matter ``cm`` 0.003-0.012 g/cm2; leaf area index
-    1-6; mean leaf angle ``lidfa`` 25-72 degrees from the horizontal; ``dry_soil`` is the share of dry soil below.
+    Ranges of living plants here: structure n 1.3-2.1; chlorophyll ``cab`` 8-62, carotenoids ``car`` 4-14 and
+    anthocyanins ``ant`` 0-6 ug/cm2; brown pigment 0-1; water ``cw`` 0.004-0.030 cm; dry matter ``cm`` 0.003-0.012
+    g/cm2; leaf area index 1-6; mean leaf angle ``lidfa`` 16-72 degrees from the horizontal; ``dry_soil`` is the share
+    of dry soil below.
     """
 
     n: float
@@ -59,13 +63,23 @@ class Canopy:
     dry_soil: float = 0.7
 
 
-CANOPIES: dict[str, Canopy] = {
-    "maize_dense": Canopy(1.45, 55, 11, 0.5, 0.00, 0.013, 0.0050, 4.5, 52),
-    "maize_sparse": Canopy(1.45, 44, 9, 0.5, 0.02, 0.012, 0.0050, 1.5, 48),
-    "beet_dense": Canopy(1.75, 40, 8, 0.5, 0.00, 0.026, 0.0040, 4.0, 30),
-    "beet_sparse": Canopy(1.75, 34, 7, 1.0, 0.00, 0.024, 0.0040, 1.4, 28),
-    "wheat_a_dense": Canopy(1.55, 50, 11, 0.0, 0.05, 0.010, 0.0050, 5.5, 70),
-    "wheat_a_sparse": Canopy(1.55, 42, 10, 0.0, 0.10, 0.010, 0.0050, 2.0, 68),
+STAGES: dict[str, Canopy] = {
+    "maize_young": Canopy(1.40, 36, 8, 0.5, 0.00, 0.014, 0.0040, 1.3, 45),
+    "maize_full": Canopy(1.45, 55, 11, 0.5, 0.00, 0.013, 0.0050, 4.5, 52),
+    "maize_ripe": Canopy(1.80, 9, 6, 0.5, 0.60, 0.006, 0.0060, 3.2, 55),
+    "beet_young": Canopy(1.60, 34, 7, 1.0, 0.00, 0.026, 0.0035, 1.2, 25),
+    "beet_full": Canopy(1.75, 42, 8, 0.5, 0.00, 0.026, 0.0040, 4.2, 30),
+    "beet_old": Canopy(1.85, 26, 8, 1.5, 0.20, 0.022, 0.0045, 3.2, 38),
+    "wheat_a_young": Canopy(1.45, 42, 9, 0.0, 0.03, 0.012, 0.0040, 1.8, 48),
+    "wheat_a_full": Canopy(1.55, 52, 11, 0.0, 0.03, 0.010, 0.0050, 5.5, 68),
+    "wheat_a_filling": Canopy(1.65, 34, 10, 0.0, 0.15, 0.008, 0.0055, 4.6, 66),
+    "wheat_a_ripe": Canopy(2.10, 0.5, 2.5, 0.0, 0.30, 0.002, 0.0070, 3.0, 62),
+    "wheat_a_lodged": Canopy(1.65, 36, 10, 0.0, 0.12, 0.008, 0.0055, 5.0, 18),
+    "wheat_a_lodged_ripe": Canopy(2.10, 0.5, 2.5, 0.0, 0.50, 0.002, 0.0070, 3.6, 16),
+    "tree_autumn": Canopy(2.00, 14, 9, 4.0, 0.45, 0.007, 0.0110, 4.0, 40),
+}
+"""Crops, and leaves of trees in autumn, at the stages of their life. Ripe wheat has next to no chlorophyll or water."""
+OTHERS: dict[str, Canopy] = {
     "weed_leafy": Canopy(1.40, 28, 8, 3.0, 0.00, 0.018, 0.0030, 3.0, 35),
     "weed_red": Canopy(1.50, 24, 9, 6.0, 0.05, 0.014, 0.0040, 2.0, 42),
     "volunteer": Canopy(1.50, 30, 7, 5.0, 0.00, 0.022, 0.0065, 3.5, 40),
@@ -73,12 +87,10 @@ CANOPIES: dict[str, Canopy] = {
     "grass_dry": Canopy(1.90, 12, 6, 0.0, 0.80, 0.005, 0.0070, 2.5, 60),
     "tree": Canopy(2.10, 62, 14, 1.5, 0.15, 0.009, 0.0120, 6.0, 40),
 }
-"""Dense and sparse stands: a field mixes the two, which is how its vigour varies."""
-
-MATERIALS: tuple[str, ...] = (
-    "soil_dry", "soil_wet", "gravel", "water", "straw", *CANOPIES, "wheat_b_dense", "wheat_b_sparse",
-    "blossom", "shade",
-)  # fmt: skip
+"""Stands that look alike all year."""
+_TWINS = {name.replace("wheat_a", "wheat_b"): name for name in STAGES if name.startswith("wheat_a")}
+_LASTING = ("soil_dry", "soil_wet", "gravel", "water", "straw", *OTHERS, "blossom", "shade")
+MATERIALS: tuple[str, ...] = (*_LASTING, *STAGES, *_TWINS, "straw_grey", "twigs")
 
 
 @dataclass(frozen=True)
@@ -119,26 +131,30 @@ def band_centres(bands: int) -> tuple[Spectrum, Spectrum]:
 
 
 @lru_cache(maxsize=16)
-def spectral_library(bands: int) -> SpectralLibrary:
-    """Compute every material in ``bands`` equally spaced Gaussian bands from 400 to 1000 nm (arrays are read-only).
+def spectral_library(bands: int, materials: tuple[str, ...] = MATERIALS) -> SpectralLibrary:
+    """Compute some materials in ``bands`` equally spaced Gaussian bands from 400 to 1000 nm (arrays are read-only).
 
     Raises
     ------
     WavelengthError : fewer than 2 bands.
     """
-    return seen_in_bands(_reflectance_1nm(), bands)
-
-
-def seen_in_bands(reflectance_1nm: Spectrum, bands: int) -> SpectralLibrary:
-    """See spectra on the 1 nm grid, (material, grid), in ``bands`` equally spaced bands; WavelengthError below 2."""
     wavelength, fwhm = band_centres(bands)
+    known = _known_spectra()
     response = band_response(wavelength, fwhm) * (_photons() * _quantum_efficiency())
     light = response.sum(axis=1)
-    reflectance = reflectance_1nm @ response.T / light
+    reflectance = np.stack([known[name] for name in materials]) @ response.T / light
     parts = (wavelength, fwhm, reflectance, light / light.max())
     for part in parts:
         part.setflags(write=False)
     return SpectralLibrary(*parts)
+
+
+def wet_share(moisture: ArrayLike) -> NDArray[np.float32]:
+    """Share of the wet soil's spectrum by water in the topsoil (by volume), from 0 to below 1.
+
+    The exponential law of [3] with one exponent for all bands, so that bare soil lies on one line.
+    """
+    return np.asarray(1 - np.exp(-MOISTURE_EXPONENT * np.maximum(moisture, 0)), np.float32)
 
 
 def band_response(wavelength_nm: Spectrum, fwhm_nm: Spectrum) -> NDArray[np.float64]:
@@ -176,40 +192,30 @@ def _quantum_efficiency() -> Spectrum:
 
 
 @lru_cache(maxsize=1)
-def _reflectance_1nm() -> NDArray[np.float64]:
-    """Reflectance of every material on the 1 nm grid, (material, grid)."""
-    known = known_spectra()
-    return np.stack([known[name] for name in MATERIALS])
+def _known_spectra() -> dict[str, Spectrum]:
+    """Reflectance of each of ``MATERIALS`` on the 1 nm grid from 400 to 1030 nm."""
+    from prosail import run_prosail, spectral_lib  # numba: a second to import
 
+    def stand(one: Canopy) -> Spectrum:
+        leaf, blades = (one.n, one.cab, one.car, one.cbrown, one.cw, one.cm), (one.lai, one.lidfa)
+        light = (_SUN_ZENITH_DEG, 0.0, 0.0)  # seen straight from above
+        seen = run_prosail(
+            *leaf, *blades, 0.05, *light, ant=one.ant, prospect_version="D", rsoil=1.0, psoil=one.dry_soil
+        )
+        return np.asarray(seen[: len(GRID_NM)], dtype=np.float64)
 
-@lru_cache(maxsize=1)
-def known_spectra() -> dict[str, Spectrum]:
-    """Give the reflectance of each of ``MATERIALS`` on the 1 nm grid from 400 to 1030 nm; not to be written to."""
-    from prosail import spectral_lib
-
-    size = len(GRID_NM)
-    iron = _iron_oxide()
+    size, iron = len(GRID_NM), _iron_oxide()
     dry, wet = iron * spectral_lib.soil.rsoil1[:size], iron * spectral_lib.soil.rsoil2[:size]
-    known: dict[str, Spectrum] = {name: canopy_spectrum(canopy) for name, canopy in CANOPIES.items()}
-    for stand in ("dense", "sparse"):
-        known[f"wheat_b_{stand}"] = known[f"wheat_a_{stand}"] * twin_factor()
+    known = {name: stand(canopy) for name, canopy in (OTHERS | STAGES).items()}
+    for name, other in _TWINS.items():  # varieties differ by their leaves' green, of which ripe wheat has little left
+        known[name] = known[other] * (1 + (RIPE_CONTRAST if name.endswith("ripe") else 1.0) * (_twin_factor() - 1))
+    straw = _straw()
     known |= {"soil_dry": dry, "soil_wet": 0.35 * dry + 0.65 * wet, "gravel": _gravel(), "water": _water()}
-    known |= {"straw": _straw(), "blossom": _blossom(known["weed_leafy"]), "shade": _shade()}
-    return known
+    known |= {"straw": straw, "straw_grey": _weathered(straw), "twigs": _twigs()}
+    return known | {"blossom": _blossom(known["weed_leafy"]), "shade": _shade()}
 
 
-def canopy_spectrum(canopy: Canopy) -> Spectrum:
-    """Bidirectional reflectance of a stand, seen straight from above."""
-    from prosail import run_prosail
-
-    spectrum = run_prosail(
-        canopy.n, canopy.cab, canopy.car, canopy.cbrown, canopy.cw, canopy.cm, canopy.lai, canopy.lidfa,
-        0.05, _SUN_ZENITH_DEG, 0.0, 0.0, ant=canopy.ant, prospect_version="D", rsoil=1.0, psoil=canopy.dry_soil,
-    )  # fmt: skip
-    return np.asarray(spectrum[: len(GRID_NM)], dtype=np.float64)
-
-
-def twin_factor() -> Spectrum:
+def _twin_factor() -> Spectrum:
     """Second wheat over the first: 1 + 0.10 cos^2 within 25 nm of 715 nm, else 1 (law of this project).
 
     As if the red edge lay about 3 nm further to the blue: a variety of the same stature with a little less
@@ -238,6 +244,16 @@ def _water() -> Spectrum:
 def _straw() -> Spectrum:
     """Bleached cereal straw: 0.10 at 400 nm to 0.50 by a logistic about 620 nm, 90 nm wide (law of this project)."""
     return np.asarray(0.08 + 0.42 / (1 + np.exp(-(GRID_NM - 620) / 90)))
+
+
+def _weathered(straw: Spectrum) -> Spectrum:
+    """Straw of last year: half as bright, and its slope nearly washed out (law of this project)."""
+    return np.asarray(0.06 + 0.30 * straw + 0.10 * (GRID_NM - 400) / 600)
+
+
+def _twigs() -> Spectrum:
+    """Bark: 0.05 at 400 nm, rising straight to 0.29 at 1000 nm (law of this project)."""
+    return np.asarray(0.05 + 0.24 * (GRID_NM - 400) / 600)
 
 
 def _blossom(leaves: Spectrum) -> Spectrum:

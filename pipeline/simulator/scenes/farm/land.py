@@ -184,8 +184,8 @@ def edge(distance: NDArray[np.floating]) -> Field:
 
 def disc_pixels(
     centres: Points, radius: NDArray[np.float64], shape: tuple[int, int]
-) -> tuple[NDArray[np.intp], Field, Field, NDArray[np.intp]]:
-    """Pixels under many discs: flat numbers, coverage, dy over the radius, and number of the disc, all (n,)."""
+) -> tuple[NDArray[np.intp], Field, NDArray[np.intp]]:
+    """Pixels under discs: flat numbers, coverage and number of the disc that covers most of the pixel, (n,) each."""
     reach = int(np.ceil(radius.max(initial=0.0) + 1))
     offset = np.arange(-reach, reach + 1)
     place = centres + (np.array(shape) - 1) / 2
@@ -195,8 +195,15 @@ def disc_pixels(
     dy, dx = y - place[:, 0, None, None], x - place[:, 1, None, None]
     cover = edge(radius[:, None, None] - np.hypot(dy, dx))
     hit = (cover > 0) & (y >= 0) & (y < shape[0]) & (x >= 0) & (x < shape[1])
-    disc = np.nonzero(hit)[0]
-    return (y * shape[1] + x)[hit], cover[hit], (dy[hit] / radius[disc]).astype(np.float32), disc
+    index, cover, disc = (y * shape[1] + x)[hit], cover[hit], np.nonzero(hit)[0]
+    order = np.lexsort((cover, index))
+    last = order[np.flatnonzero(np.diff(index[order], append=-1))]
+    return index[last], cover[last], disc[last]
+
+
+def scene_points(index: NDArray[np.intp], shape: tuple[int, int]) -> Points:
+    """Scene coordinates of flat pixel numbers, (n, 2)."""
+    return np.stack(np.divmod(index, shape[1]), axis=-1) - (np.array(shape) - 1) / 2
 
 
 def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cell: float) -> Field:

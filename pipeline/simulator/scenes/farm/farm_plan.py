@@ -1,7 +1,7 @@
-"""The plan of ``farm@2``: which field lies where, how its rows run, how it is kept, what lines part it; the truth.
+"""The farm's plan: which field lies where, how its rows run, how it is kept, what lines part it; the truth.
 
 Everything is drawn from the seed alone, so that the land of another day is the same land; day and hour only say what
-stands on it and where the sun is. Land, uses and lines between parcels are divided as in ``farm@1``.
+stands on it and where the sun is.
 """
 
 from __future__ import annotations
@@ -12,25 +12,27 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.errors import SceneError
-from pipeline.simulator.farm import BORDER_SHARES, PARCEL_AREA_PX
-from pipeline.simulator.farm_layout import Border, Parcel, allot, divide_land, stream, visible_area
-from pipeline.simulator.farm_seasons import (
+from pipeline.simulator.scenes.farm.land import Border, Parcel, allot, divide_land, stream, visible_area
+from pipeline.simulator.scenes.farm.seasons import (
     CROPS,
     Crop,
     Land,
+    Sun,
     foliage,
     land_on,
     lodged_share,
     soil_moisture,
     stage_shares,
+    sun_over_farm,
 )
-from pipeline.simulator.farm_sun import Sun, sun_over_farm
-from pipeline.simulator.season_spectra import SEASON_MATERIALS
+from pipeline.simulator.scenes.farm.spectra import MATERIALS
 
-USE_SHARES: dict[str, float] = {
-    "maize": 0.16, "sugar_beet": 0.15, "wheat_a": 0.15, "wheat_b": 0.15, "stubble": 0.09, "grass": 0.08, "soil": 0.11,
-    "late_maize": 0.045, "late_beet": 0.045,
-}  # fmt: skip
+PARCEL_AREA_PX = 95_000.0
+USE_SHARES = {
+    **{"maize": 0.16, "sugar_beet": 0.15, "wheat_a": 0.15, "wheat_b": 0.15, "stubble": 0.09, "grass": 0.08},
+    **{"soil": 0.11, "late_maize": 0.045, "late_beet": 0.045},
+}
+BORDER_SHARES = {"road": 0.20, "ditch": 0.38, "hedge": 0.17, "margin": 0.25}  # of the lines between parcels
 TWINS = {"wheat_a": "wheat_b", "wheat_b": "wheat_a"}
 UNEVEN_DAYS = 9.0  # by which plants of one field are at most ahead of or behind the rest
 _ROWS_ELSEWHERE = {"stubble": (3.4, 4.4), "grass": (36.0, 52.0), "soil": (9.0, 13.0)}
@@ -80,9 +82,8 @@ class FieldPlan:
             return set()
         names = set(stage_shares(crop, np.linspace(land.days - UNEVEN_DAYS, land.days + UNEVEN_DAYS, 37)))
         if self.use in TWINS:
-            names |= (
-                {f"{self.use}_lodged", f"{self.use}_lodged_ripe"} if self.lodging * lodged_share(day) > 0 else set()
-            )
+            if self.lodging * lodged_share(day) > 0:
+                names |= {f"{self.use}_lodged", f"{self.use}_lodged_ripe"}
             names |= {name.replace(self.use, TWINS[self.use]) for name in names}
         return names
 
@@ -112,7 +113,7 @@ class FarmPlan:
         there |= {name for name, share in foliage(self.day).items() if share > 0}
         for one in self.fields:
             there |= one.materials_on(self.day)
-        return tuple(name for name in SEASON_MATERIALS if name in there)
+        return tuple(name for name in MATERIALS if name in there)
 
 
 def farm_plan(seed: int, shape: tuple[int, int] = (1024, 1280), *, day: int = 172, hour: float = 11.0) -> FarmPlan:

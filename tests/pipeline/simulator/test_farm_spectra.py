@@ -7,7 +7,16 @@ import pytest
 
 from pipeline.camera import LineCamera, digitise
 from pipeline.errors import WavelengthError
-from pipeline.simulator.spectra import CANOPIES, FWHM_NM, MATERIALS, band_response, spectral_library
+from pipeline.simulator.scenes.farm.spectra import (
+    FWHM_NM,
+    MATERIALS,
+    OTHERS,
+    STAGES,
+    band_response,
+    spectral_library,
+)
+
+LEAFY = [name for name in (*OTHERS, *STAGES) if not name.endswith(("dry", "ripe", "autumn", "old"))]
 
 
 def at(name: str, nm: float) -> float:
@@ -24,7 +33,7 @@ def test_reflectance_is_physical() -> None:
     assert reflectance.max() < 0.75
 
 
-@pytest.mark.parametrize("name", [name for name in CANOPIES if name != "grass_dry"])
+@pytest.mark.parametrize("name", LEAFY)
 def test_canopies_show_a_red_edge(name: str) -> None:
     """Green plants have an NDVI above 0.6 and a green peak."""
     near, red = at(name, 800), at(name, 670)
@@ -46,7 +55,7 @@ def test_wet_soil_is_darker_than_dry() -> None:
     assert (wet < 0.7 * dry).all()
 
 
-@pytest.mark.parametrize("stand", ["dense", "sparse"])
+@pytest.mark.parametrize("stand", ["young", "full", "filling", "lodged"])
 def test_twins_differ_at_the_red_edge_alone(stand: str) -> None:
     """The two wheats differ by more than 5 % about 715 nm, and by less than 0.1 % outside 680-750 nm."""
     library = spectral_library(270)

@@ -1,28 +1,49 @@
-"""What the fields of ``farm@2`` look like on a day: stands in rows, lodged patches, stubble, meadows, bare soil."""
+"""What the fields look like on a day: stands in rows, lodged patches, stubble, meadows, bare soil; and how rows lie."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pipeline.simulator.farm_fields import Content, Ground, Mixture, blend, grass
-from pipeline.simulator.farm_layout import Field, Points, parcel_pixels, smooth_noise, stream, stripes
-from pipeline.simulator.farm_plan import TWINS, UNEVEN_DAYS, FieldPlan
-from pipeline.simulator.farm_seasons import (
+from pipeline.simulator.scenes.farm.canvas import Ground, Mixture, Work, blend, grass, moist_soil
+from pipeline.simulator.scenes.farm.farm_plan import TWINS, UNEVEN_DAYS, FieldPlan
+from pipeline.simulator.scenes.farm.land import (
+    Field,
+    Points,
+    edge,
+    parcel_pixels,
+    smooth_noise,
+    stream,
+    stripes,
+)
+from pipeline.simulator.scenes.farm.seasons import (
     YEAR_DAYS,
     Crop,
+    Sun,
     canopy_cover,
     crop_height,
     lodged_share,
     stage_shares,
 )
-from pipeline.simulator.season_canvas import Work, moist_soil
-from pipeline.simulator.season_rows import Rows, row_gaps, row_shadow, rows_of, stripes_of, wheel_marks
 
+Floats = NDArray[np.float64]
 ON_ROW = 0.97  # greatest cover
 CLOSED = 0.62  # of the period, a row's greatest width; then the gap between rows fills
 LODGED_PATCH_PX = 30.0
+PASS_ROWS = 8  # sown at a time; each pass lies a little aside
+PASS_SD = 0.03  # of the period
+PIECE_PX = 14.0  # a gap is 0.15 of this to all of it, short ones oftener
+
+
+class Content(NamedTuple):
+    """Materials and class shares of a surface, each summing to 1 per pixel."""
+
+    mixture: Mixture
+    shares: Mixture
 
 
 def paint_fields(work: Work) -> None:
@@ -48,12 +69,12 @@ def _content(
     salt = int(rng.integers(2**31))
     rows = rows_of(rng, field, centres)
     if land.phase == "grass":
-        return meadow(rows, field, here, land.days, work.plan.day)
+        return _meadow(rows, field, here, land.days, work.plan.day)
     soil = moist_soil(work.plan, here, field.wetter)
     if land.phase == "soil" or (crop is None and land.phase == "crop"):
-        return bare_field(rows, field, here, soil)
+        return _bare_field(rows, field, here, soil)
     if crop is None or land.phase == "stubble":
-        return stubble_field(rows, field, here, soil, land.days)
+        return _stubble_field(rows, field, here, soil, land.days)
     gaps = row_gaps(salt, field, rows, here)
     return _standing_crop(work, field, crop, (rows, here, soil), (gaps, down))
 
@@ -114,7 +135,7 @@ def _with_wheel_marks(content: Content, field: FieldPlan, rows: Rows, soil: Mixt
     return Content(mixture, blend(content.shares, {"track": np.ones_like(marks)}, marks))
 
 
-def stubble_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture, days: float) -> Content:
+def _stubble_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture, days: float) -> Content:
     """Straw in cut rows, swaths for nine days, soil between; straw greys over months and green comes back."""
     row = stripes(rows.place, field.row_period_px, CLOSED * field.row_period_px)
     swath = stripes(rows.across, 44.0, 12.0) * np.float32(days < 9)
@@ -129,7 +150,7 @@ def stubble_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture, day
     return _with_wheel_marks(content, field, rows, soil)
 
 
-def meadow(rows: Rows, field: FieldPlan, here: Ground, days: float, day: int) -> Content:
+def _meadow(rows: Rows, field: FieldPlan, here: Ground, days: float, day: int) -> Content:
     """Grass mown in bands; pale for weeks after mowing, dull in winter."""
     winter = 0.5 + 0.5 * np.cos(2 * np.pi * (day - 25) / YEAR_DAYS)
     dryness = float(0.18 + 0.34 * np.exp(-days / 12) + 0.24 * winter)
@@ -138,7 +159,7 @@ def meadow(rows: Rows, field: FieldPlan, here: Ground, days: float, day: int) ->
     return Content(mixture, {"grass": np.ones_like(bands)})
 
 
-def bare_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture) -> Content:
+def _bare_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture) -> Content:
     """Soil as harrow or drill left it, in furrows; wheel marks on fallow."""
     period = field.row_period_px if field.crop is None else 10.5
     furrow = stripes(rows.place, period, 3.0)
@@ -163,3 +184,88 @@ def _lodged(noise: Field, field: FieldPlan, day: int) -> Field:
     if share <= 0 or crop is None or field.land_on(day).phase != "crop" or field.land_on(day).days < 150:
         return np.zeros_like(noise)
     return np.asarray(np.clip((noise - NormalDist().inv_cdf(1 - share)) / 0.2 + 0.5, 0, 1), np.float32)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Pixels against the rows, (n,) each; on headlands rows run along the field's end.
+
+    ``across`` and ``along`` are distances in the field's own frame, ``place`` the distance across the rows where the
+    pixel is, ``onward`` along them, ``ends`` to the nearest end of the field [px], ``normal`` (n, 2) across the rows.
+    """
+
+    across: Floats
+    along: Floats
+    ends: Floats
+    place: Floats
+    onward: Floats
+    normal: Points
+
+
+def rows_of(rng: np.random.Generator, field: FieldPlan, centres: Points) -> Rows:
+    """Lay a field's rows; ``rng`` gives how far each pass of the drill lies aside."""
+    angle = np.deg2rad(field.row_angle_deg)
+    normal, ahead = np.array([np.cos(angle), -np.sin(angle)]), np.array([np.sin(angle), np.cos(angle)])
+    across, along = centres @ normal + field.row_phase_px, centres @ ahead
+    ends, end_normal = np.full(len(centres), 1e4), np.tile(normal, (len(centres), 1))
+    for ny, nx, offset in field.parcel.cuts:
+        if abs(ahead @ (ny, nx)) > 0.7:
+            distance = centres @ np.array([ny, nx]) - offset
+            nearer = distance < ends
+            ends[nearer], end_normal[nearer] = distance[nearer], (ny, nx)
+    aside = rng.normal(0, PASS_SD * field.row_period_px, 512)
+    passes = np.floor(across / (PASS_ROWS * field.row_period_px) - 0.5 / PASS_ROWS).astype(int)
+    turned = ends < field.headland_px
+    place = np.where(turned, ends, across + aside[passes % 512])
+    normals = np.where(turned[:, None], end_normal, normal)
+    return Rows(across, along, ends, place, np.where(turned, across, along), normals)
+
+
+def row_gaps(salt: int, field: FieldPlan, rows: Rows, here: Ground) -> Field:
+    """Share of each pixel where nothing came up: pieces of rows, more of them where vigour is poor."""
+    number = np.rint(rows.place / field.row_period_px).astype(np.int64)
+    position = rows.onward / PIECE_PX + _scatter(number, number, salt)
+    piece = np.floor(position).astype(np.int64)
+    inside = (position - piece) * PIECE_PX
+    length = PIECE_PX * (0.15 + 0.85 * _scatter(number, piece, salt + 1) ** 2)
+    fails = _scatter(number, piece, salt + 2) < field.gap_rate * np.clip(1 - 0.6 * here.vigour, 0.2, 3)
+    onto = np.abs(rows.place - number * field.row_period_px) / field.row_period_px  # 0 on the row, 0.5 between rows
+    return np.asarray(edge(np.minimum(inside, length - inside)) * fails * np.clip(2.2 - 3.4 * onto, 0, 1), np.float32)
+
+
+def row_shadow(sun: Sun, height: float, rows: Rows, period: float, width: Floats) -> Field:
+    """Share of each pixel in the shadow of rows of a height, outside the rows themselves."""
+    room = np.maximum(period - width, 0)
+    shift = np.clip(height * (rows.normal @ sun.cast), -room, room)
+    both = stripes_of(rows.place - shift / 2, period, width + np.abs(shift))
+    return np.asarray(np.clip(both - stripes_of(rows.place, period, width), 0, 1), np.float32)
+
+
+def stripes_of(place: Floats, period: float, width: Floats) -> Field:
+    """Share of each pixel covered by stripes whose width differs from pixel to pixel (``land.stripes``)."""
+    start = place + (width - 1) / 2
+    whole, rest = np.divmod(start, period)
+    last, left = np.divmod(start + 1, period)
+    return np.asarray((last - whole) * width + np.minimum(left, width) - np.minimum(rest, width), np.float32)
+
+
+def wheel_marks(field: FieldPlan, rows: Rows) -> Field:
+    """Share of each pixel under tramlines, which also go round on the headland; 0 where the field has none."""
+    trams = field.tramlines
+    if trams is None:
+        return np.zeros(len(rows.across), np.float32)
+    shift = rows.across + trams.shift
+    pair = stripes(shift, trams.spacing, trams.width) + stripes(shift + trams.gauge, trams.spacing, trams.width)
+    middle = field.headland_px / 2
+    turn = edge(trams.width / 2 - np.abs(np.abs(rows.ends - middle) - trams.gauge / 2))
+    inner = edge(rows.ends - middle - trams.gauge / 2)
+    return np.asarray(np.clip(np.maximum(pair * inner, turn), 0, 1), np.float32)
+
+
+def _scatter(first: NDArray[np.int64], second: NDArray[np.int64], salt: int) -> Floats:
+    """Evenly spread numbers from 0 to below 1 that only depend on what is given (integer hash)."""
+    mixed = first.astype(np.uint32) * np.uint32(0x9E3779B1) ^ second.astype(np.uint32) * np.uint32(0x85EBCA6B)
+    mixed ^= np.uint32((salt * 0xC2B2AE35) & 0xFFFFFFFF)
+    for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
+        mixed = (mixed ^ (mixed >> np.uint32(shift))) * np.uint32(factor)
+    return np.asarray(mixed ^ (mixed >> np.uint32(16)), np.float64) / 2**32

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,18 +9,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
-from pipeline.errors import SceneError, WavelengthError
-from pipeline.simulator.farm import CLASS_COLOURS, farm_scene
-from pipeline.simulator.farm_fields import CLASSES
-from pipeline.simulator.farm_layout import parcel_pixels
-from pipeline.simulator.farm_on_day import SEASON_LAW, farm_on_day
-from pipeline.simulator.farm_plan import FarmPlan, farm_plan
+from pipeline.errors import SceneError, SettingsError, WavelengthError
 from pipeline.simulator.scene import RasterScene
-from pipeline.simulator.season_spectra import SEASON_MATERIALS
+from pipeline.simulator.scenes.farm.canvas import CLASS_COLOURS, CLASSES
+from pipeline.simulator.scenes.farm.farm_plan import FarmPlan, farm_plan
+from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene, law_of_key, refuse_removed
+from pipeline.simulator.scenes.farm.land import parcel_pixels
+from pipeline.simulator.scenes.farm.spectra import MATERIALS
 
 SIZE, LONG, WIDE = (420, 520), (400, 1000), (720, 1000)
-FIRST_LAW_PLANES = "f1593b3c349769af37f22339596b95a7"
-FIRST_LAW_LABELS = "2c7893ca793492946e0adea95f25921b"
 
 
 def labels_of(scene: RasterScene) -> NDArray[np.uint8]:
@@ -59,7 +54,7 @@ def plane(scene: RasterScene, plan: FarmPlan, name: str) -> NDArray[np.float32]:
 @given(st.integers(0, 2**40), st.integers(1, 70), st.integers(1, 70), st.integers(1, 366))
 def test_abundances_are_shares(seed: int, height: int, width: int, day: int) -> None:
     """Abundances of any seed, size and day are non-negative and sum to 1, and every pixel has a known class."""
-    scene = farm_on_day(seed, (height, width), bands=2, day=day)
+    scene = farm_scene(seed, (height, width), bands=2, day=day)
     assert scene.planes.dtype == np.float32
     assert scene.planes.shape[2] <= 40
     assert scene.planes.min() >= 0
@@ -70,26 +65,26 @@ def test_abundances_are_shares(seed: int, height: int, width: int, day: int) -> 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 700), (500, 3), (31, 57)])
 def test_any_size(shape: tuple[int, int]) -> None:
     """Sizes that divide by nothing work, down to one pixel."""
-    scene = farm_on_day(5, shape, bands=2, day=200)
+    scene = farm_scene(5, shape, bands=2, day=200)
     assert scene.shape == shape
     assert np.isfinite(scene.values()).all()
 
 
 def test_values_are_reflectance() -> None:
-    """Scene values lie between 0 and 1 in every band, and the panel is that of the first law."""
-    scene = farm_on_day(2, (120, 160), bands=31, day=205)
+    """Scene values lie between 0 and 1 in every band; the panel is nearly white."""
+    scene = farm_scene(2, (120, 160), bands=31, day=205)
     assert scene.values().min() > 0
     assert scene.values().max() < 0.85
-    np.testing.assert_array_equal(scene.panel, farm_scene(2, (8, 8), bands=31).panel)
+    assert scene.panel.tolist() == [np.float32(0.99)] * 31
     assert scene.class_names == CLASSES
     np.testing.assert_array_equal(scene.class_colours, CLASS_COLOURS)
 
 
 def test_equal_arguments_give_equal_farms() -> None:
     """One seed and day give one scene, bit for bit; the global generator plays no part."""
-    first = farm_on_day(11, (120, 150), bands=5, day=190)
+    first = farm_scene(11, (120, 150), bands=5, day=190)
     np.random.seed(1)  # noqa: NPY002 - the point of the test
-    second = farm_on_day(11, (120, 150), bands=5, day=190)
+    second = farm_scene(11, (120, 150), bands=5, day=190)
     assert first.key == second.key
     np.testing.assert_array_equal(first.planes, second.planes)
     np.testing.assert_array_equal(first.labels, second.labels)
@@ -97,12 +92,12 @@ def test_equal_arguments_give_equal_farms() -> None:
 
 def test_key_tells_the_law_and_the_day() -> None:
     """The key names law, seed, day, shape, hour, bands and what the camera changes."""
-    key = farm_on_day(42, (20, 30), bands=7, day=99).key
-    assert key.startswith(f"{SEASON_LAW}/seed=42/day=99/shape=20x30")
+    key = farm_scene(42, (20, 30), bands=7, day=99).key
+    assert key.startswith(f"{FARM_LAW}/seed=42/day=99/shape=20x30")
     others = [
-        farm_on_day(42, (20, 30), bands=7, day=100),
-        farm_on_day(42, (20, 30), bands=7, day=99, hour=9.5),
-        farm_on_day(42, (20, 30), bands=7, camera=LineCamera(electrons_per_dn=3.0), day=99),
+        farm_scene(42, (20, 30), bands=7, day=100),
+        farm_scene(42, (20, 30), bands=7, day=99, hour=9.5),
+        farm_scene(42, (20, 30), bands=7, camera=LineCamera(electrons_per_dn=3.0), day=99),
     ]
     assert len({key, *(scene.key for scene in others)}) == 4
 
@@ -114,7 +109,7 @@ def test_another_day_is_the_same_land() -> None:
         np.testing.assert_array_equal(one.parcel.corners, other.parcel.corners)
         assert (one.use, one.row_angle_deg, one.row_period_px) == (other.use, other.row_angle_deg, other.row_period_px)
     assert [kind for _, kind in june.borders] == [kind for _, kind in april.borders]
-    scenes = [labels_of(farm_on_day(4, SIZE, bands=2, day=day)) for day in (110, 172)]
+    scenes = [labels_of(farm_scene(4, SIZE, bands=2, day=day)) for day in (110, 172)]
     for label in ("tree", "water"):
         masks = [scene == CLASSES.index(label) for scene in scenes]
         assert (masks[0] & masks[1]).sum() > 0.75 * (masks[0] | masks[1]).sum()
@@ -122,14 +117,14 @@ def test_another_day_is_the_same_land() -> None:
 
 def test_the_hour_moves_only_shadows() -> None:
     """Labels do not depend on the hour, the picture does."""
-    morning, noon = (farm_on_day(4, (200, 200), bands=2, hour=hour) for hour in (8.0, 12.0))
+    morning, noon = (farm_scene(4, (200, 200), bands=2, hour=hour) for hour in (8.0, 12.0))
     np.testing.assert_array_equal(morning.labels, noon.labels)
     assert np.abs(morning.planes - noon.planes).max() > 0.3
 
 
 def test_every_class_is_there_in_june() -> None:
     """On the day of the default the farm of the default size has every class."""
-    counts = np.bincount(labels_of(farm_on_day(0, bands=2)).ravel(), minlength=len(CLASSES))
+    counts = np.bincount(labels_of(farm_scene(0, bands=2)).ravel(), minlength=len(CLASSES))
     assert counts.min() > 0.003 * counts.sum()
 
 
@@ -137,7 +132,7 @@ def test_green_cover_grows_up_to_its_peak() -> None:
     """From emergence to full cover, no field of maize or beet loses leaves from one survey to the next."""
     before: dict[int, float] = {}
     for day in (120, 150, 165, 180, 195):
-        plan, scene = farm_plan(3, SIZE, day=day), farm_on_day(3, SIZE, bands=2, day=day)
+        plan, scene = farm_plan(3, SIZE, day=day), farm_scene(3, SIZE, bands=2, day=day)
         for number, field in enumerate(plan.fields):
             crop, where = field.crop, inner_pixels(plan, number)
             if crop is None or field.use.startswith("wheat") or where.size < 2000:
@@ -152,7 +147,7 @@ def test_green_cover_grows_up_to_its_peak() -> None:
 def test_harvested_cereals_are_stubble() -> None:
     """Wheat before harvest is wheat, stubble of fresh straw after it, and bare soil after tillage."""
     for day, label in ((172, "wheat"), (230, "stubble"), (277, "soil")):
-        plan, scene = farm_plan(1, SIZE, day=day), farm_on_day(1, SIZE, bands=2, day=day)
+        plan, scene = farm_plan(1, SIZE, day=day), farm_scene(1, SIZE, bands=2, day=day)
         fields = [number for number, field in enumerate(plan.fields) if field.use.startswith("wheat")]
         sizes = {number: inner_pixels(plan, number) for number in fields}
         number = max(fields, key=lambda one: sizes[one].size)
@@ -166,7 +161,7 @@ def test_more_weeds_where_the_plan_has_more() -> None:
     """Fields rank by their share of weed pixels as by the plan's density of weeds."""
     found, planned = [], []
     for seed in range(2):
-        plan, scene = farm_plan(seed, WIDE, day=172), farm_on_day(seed, WIDE, bands=2, day=172)
+        plan, scene = farm_plan(seed, WIDE, day=172), farm_scene(seed, WIDE, bands=2, day=172)
         for number, field in enumerate(plan.fields):
             where = inner_pixels(plan, number)
             if field.use in ("maize", "sugar_beet", "wheat_a", "wheat_b") and where.size > 8_000:
@@ -181,7 +176,7 @@ def test_bare_soil_lies_on_a_line() -> None:
     """Near infrared against red of bare soil, wet or dry, lit or among clods, is a line to 0.006 of reflectance."""
     red, near = [], []
     for day in (100, 172, 290):
-        plan, scene = farm_plan(6, SIZE, day=day), farm_on_day(6, SIZE, bands=61, day=day)
+        plan, scene = farm_plan(6, SIZE, day=day), farm_scene(6, SIZE, bands=61, day=day)
         soil = sum(plane(scene, plan, name) for name in ("soil_dry", "soil_wet", "shade"))
         bare = np.flatnonzero(np.asarray(soil) > 0.999)[::7]
         bands = [int(np.abs(scene.wavelength_nm - nm).argmin()) for nm in (670, 800)]
@@ -201,7 +196,7 @@ def test_wet_days_have_darker_soil() -> None:
     days = sorted(moisture, key=lambda day: moisture[day])
     shares = []
     for day in (days[0], days[-1]):
-        plan, scene = farm_plan(0, SIZE, day=day), farm_on_day(0, SIZE, bands=2, day=day)
+        plan, scene = farm_plan(0, SIZE, day=day), farm_scene(0, SIZE, bands=2, day=day)
         wet, dry = plane(scene, plan, "soil_wet"), plane(scene, plan, "soil_dry")
         shares.append(wet.sum() / (wet + dry).sum())
     assert moisture[days[-1]] > moisture[days[0]] + 0.1
@@ -213,7 +208,7 @@ def test_lodged_patches_grow_in_ripening_wheat() -> None:
     parts = []
     assert not any("lodged" in name for name in farm_plan(0, LONG, day=140).materials)
     for day in (180, 200):
-        plan, scene = farm_plan(0, LONG, day=day), farm_on_day(0, LONG, bands=2, day=day)
+        plan, scene = farm_plan(0, LONG, day=day), farm_scene(0, LONG, bands=2, day=day)
         lodged = [name for name in plan.materials if "lodged" in name]
         parts.append(np.sum([plane(scene, plan, name) for name in lodged], axis=0))
         lies = np.flatnonzero(parts[-1] > 0.6)
@@ -226,7 +221,7 @@ def test_lodged_patches_grow_in_ripening_wheat() -> None:
 
 def test_edges_are_mixed_pixels() -> None:
     """Water's pixels at the shore hold a part of it, not all or nothing."""
-    plan, scene = farm_plan(0, SIZE), farm_on_day(0, SIZE, bands=2)
+    plan, scene = farm_plan(0, SIZE), farm_scene(0, SIZE, bands=2)
     water = plane(scene, plan, "water")
     part = (water > 0.15) & (water < 0.75)
     assert 0.1 < part.sum() / (water > 0.15).sum() < 0.8
@@ -235,42 +230,48 @@ def test_edges_are_mixed_pixels() -> None:
 def test_planes_are_the_plans_materials() -> None:
     """A day's scene mixes only what the day can show, in the order of the whole list."""
     plan = farm_plan(0, day=225)
-    assert len(plan.materials) < len(SEASON_MATERIALS)
-    assert list(plan.materials) == sorted(plan.materials, key=SEASON_MATERIALS.index)
+    assert len(plan.materials) < len(MATERIALS)
+    assert list(plan.materials) == sorted(plan.materials, key=MATERIALS.index)
     assert not any(name.startswith("wheat") for name in plan.materials)
-    assert farm_on_day(0, bands=3, day=225).electrons.shape == (len(plan.materials), 3)
+    assert farm_scene(0, bands=3, day=225).electrons.shape == (len(plan.materials), 3)
 
 
 @pytest.mark.parametrize("day", [0, 367, -5])
 def test_days_outside_the_year_are_refused(day: int) -> None:
     """A day of no year is refused with what came."""
     with pytest.raises(SceneError, match=rf"day is 1 to 366, counted from 1 January, got {day}"):
-        farm_on_day(0, (8, 8), day=day)
+        farm_scene(0, (8, 8), day=day)
 
 
 @pytest.mark.parametrize(("day", "hour"), [(172, 1.0), (355, 16.0), (172, float("nan"))])
 def test_night_is_refused(day: int, hour: float) -> None:
     """The farm is not drawn without sun; the message says how low it stands and what to do."""
     with pytest.raises(SceneError, match=r"the sun stands at .* degrees.*take an hour nearer to 12"):
-        farm_on_day(0, (8, 8), day=day, hour=hour)
+        farm_scene(0, (8, 8), day=day, hour=hour)
 
 
 @pytest.mark.parametrize(("seed", "shape"), [(-1, (8, 8)), (0, (0, 8))])
 def test_impossible_farms_are_refused(seed: int, shape: tuple[int, int]) -> None:
     """A negative seed or an empty shape is refused with what came."""
     with pytest.raises(SceneError, match=rf"got seed {seed}, shape"):
-        farm_on_day(seed, shape)
+        farm_scene(seed, shape)
 
 
 def test_one_band_is_refused() -> None:
     """A farm in one band is refused."""
     with pytest.raises(WavelengthError, match="at least 2 bands"):
-        farm_on_day(0, (8, 8), bands=1)
+        farm_scene(0, (8, 8), bands=1)
 
 
-def test_the_first_law_is_untouched() -> None:
-    """``farm@1`` gives the bits that it gave before there was a second law."""
-    scene = farm_scene(7, (96, 120), bands=2)
-    assert scene.key.startswith("farm@1/seed=7/shape=96x120")
-    assert hashlib.blake2b(scene.planes.tobytes(), digest_size=16).hexdigest() == FIRST_LAW_PLANES
-    assert hashlib.blake2b(labels_of(scene).tobytes(), digest_size=16).hexdigest() == FIRST_LAW_LABELS
+def test_a_key_tells_its_law() -> None:
+    """That of the removed farm too, for archives hold it; a file's tells none."""
+    assert law_of_key(farm_scene(0, (8, 8)).key) == FARM_LAW == "farm@2"
+    assert law_of_key("farm@1/seed=4/shape=20x30/bands=270/full_well=20155") == "farm@1"
+    assert law_of_key("3f2a") is None
+
+
+def test_the_removed_farm_is_refused() -> None:
+    """By its name alone, with what to take and what its archives are still good for."""
+    refuse_removed("farm")
+    with pytest.raises(SettingsError, match=r"farm@1 was removed: take farm \(farm@2\).*can still be listed, verified"):
+        refuse_removed("farm@1")

@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.crop_rows import find_rows
-from pipeline.simulator.farm_fields import Ground
-from pipeline.simulator.farm_layout import Parcel, parcel_pixels, stripes
-from pipeline.simulator.farm_on_day import farm_on_day
-from pipeline.simulator.farm_plan import FarmPlan, FieldPlan, farm_plan
-from pipeline.simulator.farm_sun import Sun
-from pipeline.simulator.season_rows import row_gaps, row_shadow, rows_of, stripes_of, wheel_marks
+from pipeline.simulator.scenes.farm.canvas import Ground
+from pipeline.simulator.scenes.farm.farm_plan import FarmPlan, FieldPlan, farm_plan
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.scenes.farm.fields import row_gaps, row_shadow, rows_of, stripes_of, wheel_marks
+from pipeline.simulator.scenes.farm.land import Parcel, parcel_pixels, stripes
+from pipeline.simulator.scenes.farm.seasons import Sun
 
 WINDOW = 128
 
@@ -22,7 +22,7 @@ WINDOW = 128
 @pytest.fixture(scope="module")
 def survey() -> tuple[FarmPlan, NDArray[np.float32]]:
     """A farm's plan in June and what the near infrared shows of it, (y, x)."""
-    scene = farm_on_day(1, bands=4)
+    scene = farm_scene(1, bands=4)
     return farm_plan(1), scene.planes @ np.ascontiguousarray(scene.spectra()[:, 3])
 
 

@@ -1,20 +1,21 @@
-"""Weeds of ``farm@2``: plants at fixed places, thrown in clusters along the rows, that come up, grow and die."""
+"""Weeds: plants at fixed places, thrown in clusters along the rows, that come up, grow and die."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.farm import union_of_discs
-from pipeline.simulator.farm_layout import Points, disc_pixels, polygon_area, stream
-from pipeline.simulator.farm_plan import FieldPlan
-from pipeline.simulator.farm_seasons import YEAR_DAYS, days_since_turned, weed_size
-from pipeline.simulator.season_canvas import Work
+from pipeline.simulator.scenes.farm.canvas import Work
+from pipeline.simulator.scenes.farm.farm_plan import FieldPlan
+from pipeline.simulator.scenes.farm.land import Points, disc_pixels, polygon_area, stream
+from pipeline.simulator.scenes.farm.seasons import YEAR_DAYS, days_since_turned, weed_size
 
 Floats = NDArray[np.float64]
 SPECIES: dict[str, tuple[float, float, float]] = {  # share, and first and last day of emergence
-    "weed_leafy": (0.55, 95.0, 172.0), "weed_red": (0.30, 105.0, 185.0), "mustard": (0.15, 92.0, 150.0),
-}  # fmt: skip
+    "weed_leafy": (0.55, 95.0, 172.0),
+    "weed_red": (0.30, 105.0, 185.0),
+    "mustard": (0.15, 92.0, 150.0),
+}
 FLOWERING = (36.0, 85.0)  # days since mustard came up
 CLUSTERED, CLUSTER = 0.65, 22  # share of plants in clusters, and plants in one
 ALONG_PX, ASIDE_PX = 16.0, 6.0  # spread of a cluster along the rows and across, sd
@@ -30,7 +31,7 @@ def plant_weeds(work: Work) -> None:
             grown.setdefault(name, []).append(plants)
     for name, parts in sorted(grown.items()):
         plants = np.concatenate(parts)
-        index, cover, _ = union_of_discs(*disc_pixels(plants[:, :2], plants[:, 2], work.plan.shape)[:3])
+        index, cover, _ = disc_pixels(plants[:, :2], plants[:, 2], work.plan.shape)
         work.canvas.over(index, 0.92 * cover, {name: np.ones_like(cover)}, "weed")
 
 

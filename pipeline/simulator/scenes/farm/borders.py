@@ -1,28 +1,24 @@
-"""What lies between the fields of ``farm@2``: margins, hedges, ditches, roads, ponds and trees with their shadows."""
+"""What lies between the fields: margins, hedges, ditches, roads, ponds and trees with their shadows."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.farm import hedge_crowns, scene_points, standing_trees, union_of_discs, wobble
-from pipeline.simulator.farm_fields import Mixture, grass, hard_track
-from pipeline.simulator.farm_layout import (
+from pipeline.simulator.scenes.farm.canvas import Canvas, Mixture, Work, grass, hard_track
+from pipeline.simulator.scenes.farm.land import (
     Band,
     Border,
-    Field,
     Points,
     band_pixels,
     disc_pixels,
     edge,
+    scene_points,
     smooth_noise,
     stream,
 )
-from pipeline.simulator.farm_seasons import foliage
-from pipeline.simulator.farm_sun import crown_shadows
-from pipeline.simulator.season_canvas import SeasonCanvas, Work
+from pipeline.simulator.scenes.farm.seasons import Sun, foliage
 
-Numbers = NDArray[np.intp]
 WIDTHS = {"margin": (2.0, 4.5), "hedge": (4.5, 6.5), "ditch": (1.3, 2.2), "road": (3.0, 5.0)}  # half, px
 BANKS = {"margin": (0.0, 0.0), "hedge": (0.0, 0.0), "ditch": (2.5, 4.5), "road": (1.0, 2.5)}
 BARE_CROWN = 0.62  # cover of a crown without leaves
@@ -40,7 +36,7 @@ def paint_borders(work: Work) -> None:
 def _paint_line(work: Work, rng: np.random.Generator, border: Border, kind: str) -> None:
     """Grass on both sides, and what the kind has in the middle; a ditch is fuller after rain."""
     canvas, plan = work.canvas, work.plan
-    band = wobble(rng, band_pixels(border, 12.0, canvas.shape), 0.8 if kind == "road" else 1.6)
+    band = _wobbled(rng, band_pixels(border, 12.0, canvas.shape), 0.8 if kind == "road" else 1.6)
     here = work.ground.at(band.index)
     half, bank = rng.uniform(*WIDTHS[kind]), rng.uniform(*BANKS[kind])
     dryness, strip, inner = rng.uniform(0.25, 0.55), rng.uniform() < 0.5, rng.uniform(0.8, 1.2)
@@ -54,7 +50,14 @@ def _paint_line(work: Work, rng: np.random.Generator, border: Border, kind: str)
             _cover(canvas, band, inner, grass(here, 0.5), "grass")
 
 
-def _cover(canvas: SeasonCanvas, band: Band, half: float, mixture: Mixture, label: str) -> None:
+def _wobbled(rng: np.random.Generator, band: Band, size: float) -> Band:
+    """Bend a line a little: two sines of random phase, 37 and 61 px per radian."""
+    phases = rng.uniform(0, 2 * np.pi, 2)
+    bend = np.sin(band.along / 37 + phases[0]) + np.sin(band.along / 61 + phases[1])
+    return Band(band.index, band.across + np.float32(size / 2) * bend.astype(np.float32), band.along)
+
+
+def _cover(canvas: Canvas, band: Band, half: float, mixture: Mixture, label: str) -> None:
     """Lay a surface over the pixels within ``half`` of the line."""
     cover = edge(half - np.abs(band.across))
     hit = np.flatnonzero(cover)
@@ -83,11 +86,32 @@ def dig_ponds(work: Work) -> None:
 def crowns_of(work: Work) -> Points:
     """Crowns of hedges and of trees beside the lines: y, x and radius, (n, 3)."""
     plan = work.plan
-    crowns = [standing_trees(stream(plan.seed, "trees"), [border for border, _ in plan.borders])]
+    crowns = [_standing_trees(stream(plan.seed, "trees"), [border for border, _ in plan.borders])]
     for number, (border, kind) in enumerate(plan.borders):
         if kind == "hedge":
-            crowns.append(hedge_crowns(stream(plan.seed, f"hedge {number}"), border))
+            crowns.append(_hedge_crowns(stream(plan.seed, f"hedge {number}"), border))
     return np.concatenate(crowns)
+
+
+def _hedge_crowns(rng: np.random.Generator, border: Border) -> Points:
+    """Crowns along a line: y, x and radius, (n, 3); every twentieth is missing."""
+    along = np.arange(0.0, border.length, 5.0)
+    along = along[rng.uniform(size=along.size) > 0.05]
+    step = (border.end - border.start) / max(border.length, 1e-9)
+    centres = border.start + along[:, None] * step + rng.normal(0, 1.0, (along.size, 2))
+    return np.column_stack([centres, rng.uniform(4, 7, along.size)])
+
+
+def _standing_trees(rng: np.random.Generator, borders: list[Border]) -> Points:
+    """Single trees beside the lines, one in 320 px: y, x and radius, (n, 3)."""
+    trees = [np.zeros((0, 3))]
+    for border in borders:
+        count = rng.poisson(border.length / 320)
+        step = (border.end - border.start) / max(border.length, 1e-9)
+        aside = rng.choice([-1.0, 1.0], (count, 1)) * rng.uniform(7, 14, (count, 1)) * np.array([-step[1], step[0]])
+        places = border.start + rng.uniform(0, border.length, (count, 1)) * step + aside
+        trees.append(np.column_stack([places, rng.uniform(5, 12, count)]))
+    return np.concatenate(trees)
 
 
 def plant_trees(work: Work) -> None:
@@ -101,7 +125,7 @@ def plant_trees(work: Work) -> None:
     dark = np.flatnonzero(shadow)
     depth = np.asarray(SHADOW * opaque * shadow[dark], np.float32)
     canvas.over(dark, depth, {"shade": np.ones_like(depth)}, None)
-    index, cover, disc = _crown_pixels(centres, radius, plan.shape)
+    index, cover, disc = disc_pixels(centres, radius, plan.shape)
     away = ((scene_points(index, plan.shape) - centres[disc]) / radius[disc, None]) @ plan.sun.cast
     away /= np.hypot(*plan.sun.cast)
     here = work.ground.at(index)
@@ -110,8 +134,26 @@ def plant_trees(work: Work) -> None:
     canvas.over(index, np.asarray(opaque * cover, np.float32), mixture | {"shade": shade}, "tree")
 
 
-def _crown_pixels(centres: Points, radius: Points, shape: tuple[int, int]) -> tuple[Numbers, Field, Numbers]:
-    """Pixels under crowns: flat numbers, coverage and number of the crown that covers most, (n,) each."""
-    index, cover, _, disc = disc_pixels(centres, radius, shape)
-    index, cover, which = union_of_discs(index, cover, disc.astype(np.float32))
-    return index, cover, which.astype(np.intp)
+def crown_shadows(
+    centres: Points, radius: NDArray[np.float64], sun: Sun, shape: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Cover of the ground by shadows of ellipsoid crowns, (y, x) from 0 to 1.
+
+    A crown is ``radius`` wide and 0.9 ``radius`` high each way about a point 1.2 ``radius`` above the ground; its
+    shadow is an ellipse, and where shadows meet the darker counts.
+    """
+    covered = np.zeros(shape, np.float32)
+    length = float(np.hypot(*sun.cast))
+    along = sun.cast / length
+    middles = centres + 1.2 * radius[:, None] * sun.cast + (np.array(shape) - 1) / 2
+    for (y0, x0), width in zip(middles, radius, strict=True):
+        reach = float(np.hypot(width, 0.9 * width * length))
+        top, bottom = (int(np.clip(y0 + side * (reach + 1), 0, shape[0])) for side in (-1, 1))
+        left, right = (int(np.clip(x0 + side * (reach + 1), 0, shape[1])) for side in (-1, 1))
+        dy = (np.arange(top, bottom + 1) - y0)[: shape[0] - top, None]
+        dx = (np.arange(left, right + 1) - x0)[None, : shape[1] - left]
+        far = np.hypot((dy * along[0] + dx * along[1]) / reach, (dx * along[0] - dy * along[1]) / width)
+        cover = np.clip((1 - far) * width + 0.5, 0, 1)
+        window = covered[top : top + dy.size, left : left + dx.size]
+        np.maximum(window, cover.astype(np.float32), out=window)
+    return covered
