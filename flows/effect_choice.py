@@ -15,7 +15,7 @@ from flows.receipt import to_json
 from flows.run import CaptureRun
 from flows.settings import plain_value
 from pipeline.errors import IncompleteStoreError
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.chips import candidate_chips, worst_chips
 from pipeline.simulator.choice import Decision, decide
 from pipeline.simulator.effects.effect import Effect, Light
@@ -135,7 +135,7 @@ def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> d
 
     renders = 0
 
-    def render(block: Block, chosen: Mapping[Effect, str]) -> Light:
+    def render(block: SweepBlock, chosen: Mapping[Effect, str]) -> Light:
         nonlocal renders
         renders += 1
         run.report(DRAFT + (VERIFIED - DRAFT) * renders / (renders + len(EFFECTS)))  # how many there will be is open
@@ -151,7 +151,7 @@ def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> d
     return verify(decision, render, worst, units)
 
 
-def _whole_sweeps(run: CaptureRun) -> list[Block]:
+def _whole_sweeps(run: CaptureRun) -> list[SweepBlock]:
     """Every sweep as one block, each after those before it."""
     scene, rig, clock = run.scene, run.settings.simulated_rig, sweep_starts(run.planned, run.camera, run.settings.cost)
     return [

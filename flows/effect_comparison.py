@@ -23,7 +23,7 @@ from pipeline.camera import bin_samples
 from pipeline.errors import BoundError
 from pipeline.scan import Sweep
 from pipeline.simulator.arithmetic import contrast_about, misplaced_electrons, misplaced_share
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.effects.registry import BY_NAME
 from pipeline.simulator.instrument import BLOCK_LINES
@@ -206,7 +206,7 @@ class _Taken:
     cpu_s: float
 
 
-def _taken(source: SimulatedSource, block: Block) -> _Taken:
+def _taken(source: SimulatedSource, block: SweepBlock) -> _Taken:
     began = time.process_time()
     light = expected_light(source.scene, block, source.choice)
     raw = read_out(light, block, source.choice)

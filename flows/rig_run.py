@@ -18,7 +18,7 @@ from pipeline.rig.camera_limits import CameraLimits, check_times
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
 from pipeline.rig.kept_files import KeptInMemory
 from pipeline.scan import Sweep
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.raster import SceneLight, SceneRaster
 from pipeline.simulator.scene import RasterScene
 from pipeline.source import Line, Source
 from storage.fetched_files import FetchedFiles
@@ -127,8 +127,10 @@ def field_before_rig(settings: Settings) -> RasterScene:
     return RasterScene(
         name=settings.name or RIG_FIELD,
         key=f"{RIG_FIELD}/{settings.name or ''}/{width}x{height}",
-        raster=Raster.of(nothing),
-        light=Once.of(Light(np.zeros((1, bands), np.float32), np.full(bands, settings.camera.full_well_e, np.float32))),
+        raster=SceneRaster.of(nothing),
+        light=Once.of(
+            SceneLight(np.zeros((1, bands), np.float32), np.full(bands, settings.camera.full_well_e, np.float32))
+        ),
         panel=np.full(bands, settings.rig.panel, np.float32),
         wavelength_nm=np.array(settings.wavelengths, np.float64),
     )

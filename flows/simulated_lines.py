@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from flows.tradeoff import Level
 from pipeline.coverage import full_sweeps
 from pipeline.grid import SceneGrid
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.choice import decide
 from pipeline.simulator.effects.effect import OFF, Effect
 from pipeline.simulator.effects.registry import EFFECTS, FOOTPRINT, RAYS
@@ -40,7 +40,7 @@ class FarmLines:
     scene: RasterScene
     rig: Rig
     probe: Probe
-    blocks: tuple[Block, ...]
+    blocks: tuple[SweepBlock, ...]
     exact: Mapping[Effect, str]  # everything that the rig has, in its exact variant
 
     @property

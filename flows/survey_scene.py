@@ -16,7 +16,7 @@ from models.weights import Description
 from pipeline.errors import SceneError, SettingsError
 from pipeline.grid import UNLABELLED
 from pipeline.once import Once
-from pipeline.simulator.raster import Light
+from pipeline.simulator.raster import SceneLight
 from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, law_of_key
 from storage.declared_sizes import machine_bytes
@@ -104,7 +104,7 @@ def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
     return replace(
         scene,
         key=f"{scene.key}/only={','.join(map(str, bands))}",
-        light=Once(lambda: Light(scene.electrons[:, chosen], scene.panel_electrons[chosen])),
+        light=Once(lambda: SceneLight(scene.electrons[:, chosen], scene.panel_electrons[chosen])),
         panel=scene.panel[chosen],
         wavelength_nm=scene.wavelength_nm[chosen],
         fwhm_nm=None if scene.fwhm_nm is None else scene.fwhm_nm[chosen],

@@ -13,7 +13,7 @@ from flows.tradeoff import Setting, Tradeoff, register
 from flows.tradeoff_simulate import FOOTPRINT, Seen, prepare_footprint
 from pipeline.once import Once
 from pipeline.simulator.effects.effect import Effect, Moments
-from pipeline.simulator.raster import Light as SceneLight
+from pipeline.simulator.raster import SceneLight
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import RasterScene

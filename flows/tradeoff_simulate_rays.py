@@ -13,10 +13,10 @@ from flows.tradeoff import Setting, register
 from flows.tradeoff_simulate import FOOTPRINT
 from pipeline.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.once import Once
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.registry import RAYS
 from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.raster import Light as SceneLight
+from pipeline.simulator.raster import SceneLight
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.scene import RasterScene, to_bands
 
@@ -36,7 +36,7 @@ class Beside:
     name = "beside"
     variants = ("rays",)
 
-    def displaced(self, block: Block, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
+    def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
         """Give how far from the middle ray it meets the scene. [px]"""
         ifov, normal = block.rig.camera.ifov_rad, position_to_normal(block.middle)[:, None]
         rays = np.stack(np.broadcast_arrays(self.turn * ifov, block.slopes + self.run * ifov, 1.0), axis=-1)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import Effect, Light
 from pipeline.simulator.effects.rotation import ROTATION
 from pipeline.simulator.effects.slit import SLIT
@@ -22,7 +22,7 @@ from pipeline.simulator.kernel_fit import NEGLIGIBLE
 from pipeline.simulator.tap_tables import TABULATED
 
 Floats = NDArray[np.float64]
-Render = Callable[[Block, Mapping[Effect, str]], Light]
+Render = Callable[[SweepBlock, Mapping[Effect, str]], Light]
 
 ROUNDING = 4e-6  # of the brightest light of some lines: float32 sums
 REACH_PX = 8  # of a footprint's weights, along the line and the scan
@@ -56,7 +56,7 @@ def _folded(ways: Mapping[Effect, str]) -> dict[str, str]:
     return blurs | {one.name: "box" for one in ways if one.name == SLIT.name}
 
 
-def contrast_about(block: Block, render: Render) -> Floats:
+def contrast_about(block: SweepBlock, render: Render) -> Floats:
     """Give the range of the scene's light within reach of each sample's footprint, (1, sample, band). [e-]
 
     The scene is looked at by middle rays, a px and half a px apart: pixels may lie between those of one look.

@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Block:
+class SweepBlock:
     """Lines ``lines`` (numbers within the sweep) and samples ``samples`` (of the camera, before binning).
 
     A line's result never depends on which others are in the block, nor a sample's. ``started_s`` is when the sweep

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.scan import scene_to_sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import Light
 from pipeline.simulator.stored_light import stored_mean
 
@@ -21,7 +21,7 @@ CHIP_LINES = 3  # whole ones, for stray light comes from all of a line
 MOST_CANDIDATES = 40
 
 
-def candidate_chips(whole: Sequence[Block], places: Floats, *, lines: int = CHIP_LINES) -> list[Block]:
+def candidate_chips(whole: Sequence[SweepBlock], places: Floats, *, lines: int = CHIP_LINES) -> list[SweepBlock]:
     """Give chips about places of the scene and about the first, middle and last line of every sweep.
 
     Parameters
@@ -41,7 +41,9 @@ def candidate_chips(whole: Sequence[Block], places: Floats, *, lines: int = CHIP
     return [replace(block, lines=range(first, min(first + lines, block.sweep.lines))) for block, first in chosen]
 
 
-def worst_chips(candidates: Sequence[Block], render: Callable[[Block], Light], units: Units) -> dict[str, Block]:
+def worst_chips(
+    candidates: Sequence[SweepBlock], render: Callable[[SweepBlock], Light], units: Units
+) -> dict[str, SweepBlock]:
     """Choose where bounds are hardest to keep: the steepest, brightest, darkest and most oblique of some chips.
 
     Of numbers as they are stored, and of each binning that the sweeps have its own.
@@ -61,7 +63,7 @@ def worst_chips(candidates: Sequence[Block], render: Callable[[Block], Light], u
     ------
     ShapeError : there is nothing to choose from.
     """
-    best: dict[str, tuple[float, Block]] = {}
+    best: dict[str, tuple[float, SweepBlock]] = {}
     least = min((chip.sweep.binning for chip in candidates), default=1)
     for chip in candidates:
         binning = chip.sweep.binning
@@ -79,7 +81,7 @@ def worst_chips(candidates: Sequence[Block], render: Callable[[Block], Light], u
     return {name: chip for name, (_, chip) in best.items()}
 
 
-def _first_lines(block: Block, places: Floats, lines: int) -> list[int]:
+def _first_lines(block: SweepBlock, places: Floats, lines: int) -> list[int]:
     """First lines of the chips of one sweep, ascending."""
     sweep, camera = block.sweep, block.rig.camera
     middles = [0, sweep.lines // 2, sweep.lines - 1] if sweep.lines else []
@@ -92,7 +94,7 @@ def _first_lines(block: Block, places: Floats, lines: int) -> list[int]:
     return sorted({max(0, min(middle - lines // 2, sweep.lines - lines)) for middle in middles})
 
 
-def _scores(chip: Block, relative: Floats) -> dict[str, float]:
+def _scores(chip: SweepBlock, relative: Floats) -> dict[str, float]:
     """How much a chip is what it may be named for, of light in units."""
     steps = [np.abs(np.diff(relative, axis=axis)).max(initial=0.0) for axis in (0, 1)]
     return {

@@ -32,7 +32,7 @@ CHEAP_SHARE = 0.1  # of the tolerance: what a variant may err by itself in the r
 
 
 @dataclass(frozen=True)
-class Taken:
+class Treatment:
     """What was decided for one effect, beside what leaving it out would have done and exactness would have cost.
 
     ``small``: off, within the tolerance. ``needed``: leaving it out exceeds the tolerance alone; ``spent``: with the
@@ -61,7 +61,7 @@ class Decision:
     ``px_bands`` is how many numbers all sweeps have, from which costs are estimated.
     """
 
-    taken: tuple[Taken, ...]
+    taken: tuple[Treatment, ...]
     tolerance: float
     unit: Unit
     asked: str
@@ -87,7 +87,7 @@ class Decision:
         """Per px and band, of the effects that are on [ns]."""
         return cost_of((one.menu for one in self.taken), {one.name: one.option for one in self.taken})
 
-    def cost_of(self, one: Taken) -> float:
+    def cost_of(self, one: Treatment) -> float:
         """Per px and band, of one effect beside the others as they are taken [ns]."""
         return one.menu.cost_beside(one.option, {other.name: other.option for other in self.taken})
 
@@ -143,7 +143,7 @@ def decide(
     options = _cheapened(open_menus, tolerance, forced=named is not None)
     for menu in open_menus:
         option = options[menu.name]
-        taken[menu.name] = Taken(menu, option, _reason(menu, option, tolerance, named))
+        taken[menu.name] = Treatment(menu, option, _reason(menu, option, tolerance, named))
     every = [probes] if isinstance(probes, Probe) else probes
     lines = sum(sweep.lines for probe in every for sweep in probe.sweeps)
     px_bands = lines * rig.camera.samples * len(every[0].wavelength_nm)
@@ -172,18 +172,20 @@ def named_effects(asked: str, known: Sequence[str]) -> frozenset[str] | None:
     return frozenset(words)
 
 
-def _settled(menus: Sequence[Menu], tolerance: float, named: frozenset[str] | None, *, exact: bool) -> Iterator[Taken]:
+def _settled(
+    menus: Sequence[Menu], tolerance: float, named: frozenset[str] | None, *, exact: bool
+) -> Iterator[Treatment]:
     """Give what needs no weighing: absent, not asked for, exact, or all off."""
     for menu in menus:
         kept = menu.name in ALWAYS_ON
         if not menu.present:
-            yield Taken(menu, menu.off, "absent")
+            yield Treatment(menu, menu.off, "absent")
         elif named is not None and menu.name not in named and not kept:
-            yield Taken(menu, menu.off, "unasked")
+            yield Treatment(menu, menu.off, "unasked")
         elif tolerance == 0 or exact:
-            yield Taken(menu, menu.exact, "always" if kept else "exact" if named is None else "asked")
+            yield Treatment(menu, menu.exact, "always" if kept else "exact" if named is None else "asked")
         elif named is None and not kept and menu.off.error == 0:
-            yield Taken(menu, menu.off, "unseen")
+            yield Treatment(menu, menu.off, "unseen")
 
 
 def _cheapened(menus: Sequence[Menu], tolerance: float, *, forced: bool) -> dict[str, Option]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera, bin_samples
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.read_noise import READ_NOISE
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
 from pipeline.simulator.effects.rotation import ROTATION
@@ -57,13 +57,13 @@ def sweep_block(
     seed: int = 0,
     started_s: float = 0.0,
     samples: range | None = None,
-) -> Block:
+) -> SweepBlock:
     """Give some lines of a sweep over a scene, as effects ask about them.
 
     ``samples`` are the camera's, before binning; ``started_s`` is when the sweep starts, after the survey did.
     """
     exposures = rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
-    return Block(
+    return SweepBlock(
         rig, sweep, lines, scene.wavelength_nm, scene.shape, seed, samples, started_s, scene.fwhm_nm,
         scene.panel_electrons.astype(np.float64) * exposures,
     )  # fmt: skip

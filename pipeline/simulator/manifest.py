@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.simulator.choice import Decision, Taken
+from pipeline.simulator.choice import Decision, Treatment
 from pipeline.simulator.probe import Unit
 
 UNIT_WORDS: dict[Unit, str] = {"sigma": "sigma of the noise", "dn": "DN"}
@@ -20,7 +20,7 @@ def list_effects(decision: Decision, measured: Mapping[str, float] | None = None
     is stored, at the worst binning, by treating the effect so, in ``unit``, with the factor of safety: 0 where it is
     exact or absent, None where there is none; ``measured``, the same on chips of the scene (None where not verified);
     ``cost_s``, estimated CPU seconds of all sweeps; ``why`` in a sentence, and its parts: ``reason`` (see
-    `choice.Taken`), ``left_out``, the bound on what leaving it out would change, and ``magnitude``, how large it is
+    `choice.Treatment`), ``left_out``, the bound on what leaving it out would change, and ``magnitude``, how large it is
     here, in the words of its own bound.
 
     Parameters
@@ -58,7 +58,7 @@ def sum_up(decision: Decision, measured: Mapping[str, float] | None = None) -> d
     }
 
 
-def _row(one: Taken, decision: Decision, measured: float | None) -> dict[str, Any]:
+def _row(one: Treatment, decision: Decision, measured: float | None) -> dict[str, Any]:
     return {
         "name": one.name,
         "state": "on" if one.is_on else "off",
@@ -74,7 +74,7 @@ def _row(one: Taken, decision: Decision, measured: float | None) -> dict[str, An
     }
 
 
-def explain(one: Taken, decision: Decision) -> str:
+def explain(one: Treatment, decision: Decision) -> str:
     """Say why an effect is on or off, with the magnitude that its own bound states."""
     unit = UNIT_WORDS[decision.unit]
     said = f"{_reason(one, decision)}: {one.menu.off.why}"
@@ -84,7 +84,7 @@ def explain(one: Taken, decision: Decision) -> str:
     return said
 
 
-def _reason(one: Taken, decision: Decision) -> str:
+def _reason(one: Treatment, decision: Decision) -> str:
     unit, tolerance = UNIT_WORDS[decision.unit], _number(decision.tolerance)
     left_out = f"left out it could change a stored number by {_number(one.menu.off.error)} {unit}"
     asked = one.name in [word.strip() for word in decision.asked.split(",")]

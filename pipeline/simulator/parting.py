@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pipeline.simulator.effects.effect import Moments
 from pipeline.simulator.footprint import Footprint, fold
-from pipeline.simulator.rays import Views
-from pipeline.simulator.tap_sums import Beside, part_places, shape_of
+from pipeline.simulator.rays import RayViews
+from pipeline.simulator.tap_sums import PartOffsets, part_places, shape_of
 from pipeline.simulator.tap_tables import box_weight
 
 Floats = NDArray[np.float64]
@@ -22,7 +22,7 @@ _FINER = (18, 6)  # than any; what they are held against
 _PHASES = (0.0, 0.5)  # of the pixels, along either axis
 
 
-def fewest_parts(share: float, box: tuple[float, float], views: Views) -> Parts:
+def fewest_parts(share: float, box: tuple[float, float], views: RayViews) -> Parts:
     """Give the fewest boxes that misplace at most a ``share`` of the light where views are turned most.
 
     ``box`` is across and along [px]. A blur, or held positions, make the share smaller.
@@ -48,10 +48,10 @@ def misplaced(parts: Parts, box: tuple[float, float], shape: tuple[float, ...]) 
 
 def _weights(parts: Parts, box: tuple[float, float], shape: tuple[float, ...]) -> Floats:
     """Weights (phase, along, scan) of the pixels around a sample, in closed form."""
-    none, views = np.zeros((2, 1)), Views(*(np.array([one]) for one in (0.0, 0.0, *shape)))
+    none, views = np.zeros((2, 1)), RayViews(*(np.array([one]) for one in (0.0, 0.0, *shape)))
     footprint: Footprint = fold(box, parts, 1, Moments(none, none))
     scale = shape_of(footprint, views)
-    places = Beside.of(views, scale, 0.0, 0.0).parts(footprint.shift, part_places(footprint))
+    places = PartOffsets.of(views, scale, 0.0, 0.0).parts(footprint.shift, part_places(footprint))
     along, scan = (one[0, :, 0].astype(np.float64) for one in places)
     reach = math.ceil((1 + max(map(abs, shape))) * sum(box)) + 3
     pixel = np.arange(-reach, reach + 1)[:, None]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.effects.line_ends import at_line_ends
 from pipeline.simulator.probe import Probe
@@ -44,7 +44,7 @@ class Pointing(ABC):
     def of_lines(self, sweep_name: str, lines: range) -> Floats:
         """Give the error of some lines of a sweep, (line, 2) along the line and the scan [px]."""
 
-    def aim(self, block: Block, variant: str) -> Floats:
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
         """Give the error of a block's lines, (line, 1, 2) along the line and the scan. [px]"""
         return self.of_lines(block.sweep.name, block.lines)[:, None]
 

@@ -16,7 +16,7 @@ Drawn = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 _BINOMIAL = (np.array([1, 8, 28, 56, 70, 56, 28, 8, 1]) / 256).astype(np.float32)
 
 
-class Raster:
+class SceneRaster:
     """Planes (y, x, component) float32 and labels (y, x) uint8 of a scene, drawn when they are first asked for.
 
     Their shape is known before. Raises SceneError for an empty one.
@@ -32,9 +32,9 @@ class Raster:
         self._lock = Lock()
 
     @staticmethod
-    def of(planes: NDArray[np.float32], labels: NDArray[np.uint8] | None = None) -> Raster:
+    def of(planes: NDArray[np.float32], labels: NDArray[np.uint8] | None = None) -> SceneRaster:
         """Hold arrays that are there already; SceneError where they do not fit each other."""
-        raster = Raster(planes.shape, labelled=labels is not None, draw=lambda: (planes, labels))
+        raster = SceneRaster(planes.shape, labelled=labels is not None, draw=lambda: (planes, labels))
         raster.drawn()
         return raster
 
@@ -74,7 +74,7 @@ def _halved(planes: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True)
-class Light:
+class SceneLight:
     """Electrons at the default exposure: (component, band) per unit of component, and (band,) of the white panel."""
 
     electrons: NDArray[np.float32]

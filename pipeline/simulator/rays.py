@@ -11,7 +11,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Views:
+class RayViews:
     """Where samples look, and how far the scene point moves per px of the camera, along the line and across; (n,) each.
 
     ``along`` and ``scan`` are tangents or px; the others are px of the scene over px of the camera: ``along_run`` and
@@ -25,20 +25,20 @@ class Views:
     along_turn: Floats
     scan_turn: Floats
 
-    def __getitem__(self, which: slice | NDArray[np.intp]) -> Views:
+    def __getitem__(self, which: slice | NDArray[np.intp]) -> RayViews:
         """Some of the samples."""
-        return Views(*(getattr(self, one.name)[which] for one in fields(self)))
+        return RayViews(*(getattr(self, one.name)[which] for one in fields(self)))
 
-    def thinned(self, level: int) -> Views:
+    def thinned(self, level: int) -> RayViews:
         """The same places in px of a scene of which every ``level``-th pixel is left, the first one first."""
         return self if level == 1 else replace(self, along=self.along / level, scan=self.scan / level)
 
-    def flat(self) -> Views:
+    def flat(self) -> RayViews:
         """All in one row."""
-        return Views(*(np.ravel(getattr(self, one.name)) for one in fields(self)))
+        return RayViews(*(np.ravel(getattr(self, one.name)) for one in fields(self)))
 
 
-def exact_views(normal: Floats, across: Floats | float, slopes: Floats) -> Views:
+def exact_views(normal: Floats, across: Floats | float, slopes: Floats) -> RayViews:
     """Give where camera rays (across, slope, 1) meet the scene after the mirror, as tangents.
 
     ``normal`` is (..., 3), of arrays that broadcast. The reflection is written out for the two tangents; the ray's
@@ -49,7 +49,7 @@ def exact_views(normal: Floats, across: Floats | float, slopes: Floats) -> Views
     ahead = across - twice * x
     along, scan = (slopes - twice * y) / ahead, (1 - twice * z) / ahead
     forward_turn, forward_run = 1 - 2 * x * x, -2 * x * y
-    return Views(
+    return RayViews(
         along,
         scan,
         (1 - 2 * y * y - along * forward_run) / ahead,
@@ -59,8 +59,8 @@ def exact_views(normal: Floats, across: Floats | float, slopes: Floats) -> Views
     )
 
 
-def straight_views(centre: Floats, across: Floats | float, slopes: Floats) -> Views:
+def straight_views(centre: Floats, across: Floats | float, slopes: Floats) -> RayViews:
     """Give where the same rays would look if lines lay straight along their axis, for line centres (..., 2)."""
     along = centre[..., 0] + slopes
     one, none = np.ones(along.shape), np.zeros(along.shape)
-    return Views(along, np.broadcast_to(centre[..., 1] + across, along.shape), one, none, none, one)
+    return RayViews(along, np.broadcast_to(centre[..., 1] + across, along.shape), one, none, none, one)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError, ShapeError
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.dark_current import DARK_CURRENT, dark_electrons
 from pipeline.simulator.effects.defects import DEFECTS, dead_elements, hot_electrons
 from pipeline.simulator.effects.effect import OFF
@@ -35,7 +35,7 @@ from pipeline.simulator.render import Choice
 Light = NDArray[np.float32]
 
 
-def read_out(light: Light, block: Block, chosen: Mapping[Any, str] | Choice) -> NDArray[np.uint16]:
+def read_out(light: Light, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> NDArray[np.uint16]:
     """Turn expected electrons into DN, with the readout's effects among those chosen.
 
     The converter always rounds (half to even) and never gives less than 0 or more than its full scale.
@@ -64,7 +64,7 @@ def read_out(light: Light, block: Block, chosen: Mapping[Any, str] | Choice) -> 
     return raw
 
 
-def dark_frame(block: Block, chosen: Mapping[Any, str] | Choice) -> Light:
+def dark_frame(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Light:
     """Give what the chosen readout shows without light, on average, (sample, band) float32, before rounding. [DN]"""
     readout, camera = Readout(block, Choice.of(chosen)), block.rig.camera
     dark = np.zeros((len(block.columns), len(block.wavelength_nm)), np.float32)
@@ -78,7 +78,7 @@ def dark_frame(block: Block, chosen: Mapping[Any, str] | Choice) -> Light:
 class Readout:
     """The readout of one block's samples under a choice of effects."""
 
-    block: Block
+    block: SweepBlock
     choice: Choice
 
     def electrons(self, light: Light, number: int) -> Light:
@@ -169,7 +169,7 @@ class Readout:
         return OFF if ideal else self.choice.variant(name)
 
 
-def _not_finite(expected: Light, block: Block, number: int) -> SceneError:
+def _not_finite(expected: Light, block: SweepBlock, number: int) -> SceneError:
     sample, band = np.argwhere(~np.isfinite(expected))[0]
     return SceneError(
         f"sweep {block.sweep.name}: line {number}, sample {block.columns[sample]}, band {band} expects"

@@ -15,7 +15,7 @@ from pipeline.grid import UNLABELLED
 from pipeline.once import Once
 from pipeline.readings import MOST_VALUE, find_beyond
 from pipeline.rectify.resample import gather
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.raster import SceneLight, SceneRaster
 
 DEFAULT_EXPOSURE_MS = 100.0  # the exposure at which Scene.electrons is stated
 WELL_SHARE = 0.6  # of the full well, filled by the bright end of a scene without a radiance law
@@ -78,8 +78,8 @@ class RasterScene:
 
     name: str
     key: str
-    raster: Raster
-    light: Once[Light]
+    raster: SceneRaster
+    light: Once[SceneLight]
     panel: NDArray[np.float32]
     wavelength_nm: NDArray[np.float64]
     fwhm_nm: NDArray[np.float64] | None = None
@@ -93,7 +93,7 @@ class RasterScene:
             self._checked_light()
         self._check_bands("panel", self.panel)
 
-    def _checked_light(self) -> Light:
+    def _checked_light(self) -> SceneLight:
         light, bands, components = self.light(), len(self.wavelength_nm), self.raster.shape[2]
         wanted = {(components, bands)} | ({(bands,)} if bands == components else set())
         if light.electrons.shape not in wanted:
@@ -204,9 +204,9 @@ def raster_from_values(
     return RasterScene(
         name=name,
         key=key or content_key(planes),
-        raster=Raster.of(planes, labels),
+        raster=SceneRaster.of(planes, labels),
         light=Once.of(
-            Light(
+            SceneLight(
                 np.full(bands, WELL_SHARE * camera.full_well_e / bright, np.float32),
                 np.full(bands, camera.full_well_e, np.float32),
             )

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from pipeline.rectify.kernels import tensor_rows
 from pipeline.simulator.footprint import Footprint
 from pipeline.simulator.quadrature import footprint_rays
-from pipeline.simulator.rays import Views
+from pipeline.simulator.rays import RayViews
 from pipeline.simulator.scene import RasterScene, Scene
-from pipeline.simulator.tap_sums import Gatherer, Pixels
+from pipeline.simulator.tap_sums import Gatherer, ScenePixels
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -67,7 +67,7 @@ class _Bands:
 class Looker:
     """Looks at scenes through one footprint, from views whose shape is within a range."""
 
-    def __init__(self, footprint: Footprint, extremes: Views) -> None:
+    def __init__(self, footprint: Footprint, extremes: RayViews) -> None:
         """``extremes`` are views all over what will be looked at; their places do not matter."""
         self.footprint = footprint
         self._extremes = extremes
@@ -78,7 +78,7 @@ class Looker:
         windows, whole = self.footprint.windows(), self.footprint
         return [(level, some, Gatherer(whole.part(level, some), self._extremes)) for level, some in windows]
 
-    def look(self, scene: Scene, steps: Sequence[Views], *, along_y: bool, exposures: float) -> Light:
+    def look(self, scene: Scene, steps: Sequence[RayViews], *, along_y: bool, exposures: float) -> Light:
         """Give the light (n, band) of samples that look so at each of the held positions. [e-]
 
         A sample's light does not depend on the others: products of matrices are always of the same shape.
@@ -113,7 +113,7 @@ class Looker:
         share: Light = (self.footprint.shares / np.reshape(steps * sums, (-1, 1))).T.astype(np.float32)
         return share
 
-    def _sampled(self, scene: Scene, views: Views, along_y: bool, out: Light) -> None:
+    def _sampled(self, scene: Scene, views: RayViews, along_y: bool, out: Light) -> None:
         """Components of a scene without pixels, by rays."""
         out[:] = 0
         for kernel in range(self.footprint.kernels):
@@ -128,8 +128,8 @@ class Looker:
         return [footprint_rays(self.footprint, kernel) for kernel in range(self.footprint.kernels)]
 
 
-def _pixels(scene: RasterScene, along_y: bool, level: int) -> Pixels:
+def _pixels(scene: RasterScene, along_y: bool, level: int) -> ScenePixels:
     """A scene's pixels, or every ``level``-th of them."""
     planes = np.ascontiguousarray(scene.raster.thinned(level), np.float32)
     rows, columns, components = planes.shape
-    return Pixels(tensor_rows(planes.reshape(-1, components)), (rows, columns), along_y)
+    return ScenePixels(tensor_rows(planes.reshape(-1, components)), (rows, columns), along_y)

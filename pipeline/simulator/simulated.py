@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.scan import Sweep, line_positions
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.instrument import BLOCK_LINES, USUAL, check_binning, render_lines, sweep_block
 from pipeline.simulator.pointing import Pointing
 from pipeline.simulator.render import Choice
@@ -70,7 +70,7 @@ class SimulatedSource:
         """When a sweep starts, after the survey did [s]."""
         return 0.0 if self.clock is None else float(self.clock.get(sweep.name, 0.0))
 
-    def block(self, sweep: Sweep, lines: range) -> Block:
+    def block(self, sweep: Sweep, lines: range) -> SweepBlock:
         """Some lines of a sweep, as effects ask about them."""
         return sweep_block(self.scene, self.rig, sweep, lines, seed=self.seed, started_s=self.started_s(sweep))
 

@@ -13,7 +13,7 @@ from pipeline.camera import LineCamera
 from pipeline.mirror import direction_to_normal, scene_to_direction
 from pipeline.scan import Sweep, scene_to_sweep
 from pipeline.simulator.footprint import Footprint
-from pipeline.simulator.rays import Views, exact_views
+from pipeline.simulator.rays import RayViews, exact_views
 from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene
 from pipeline.simulator.scene_light import Looker
 
@@ -89,7 +89,7 @@ def light_seen(
     return light
 
 
-def rays_of(views: SampleViews, camera: LineCamera, turned: Way = (0.0, 0.0)) -> Views:
+def rays_of(views: SampleViews, camera: LineCamera, turned: Way = (0.0, 0.0)) -> RayViews:
     """Give the middle rays of samples, moved by (along, across) px of the camera, in tangents."""
     ifov = camera.ifov_rad
     tangents = np.stack([views.strip_px, views.scan_px], axis=-1) * ifov

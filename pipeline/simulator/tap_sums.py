@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator.footprint import Footprint
-from pipeline.simulator.rays import Views
+from pipeline.simulator.rays import RayViews
 from pipeline.simulator.tap_tables import TAIL, TapTable
 
 if TYPE_CHECKING:  # a second to import: the functions that use it do so, and a plan of a survey never needs it
@@ -26,7 +26,7 @@ Light = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Pixels:
+class ScenePixels:
     """A scene's planes as rows of a table, and what a step along the line and the scan is in it."""
 
     table: torch.Tensor  # (pixel, component)
@@ -45,7 +45,7 @@ class Pixels:
 
 
 @dataclass(frozen=True)
-class Shape:
+class PartShape:
     """How kernels lie in the scene at some samples, (kernel, n) each: second moments of one part, as scales of it."""
 
     along: Floats
@@ -54,7 +54,7 @@ class Shape:
 
 
 @dataclass(frozen=True)
-class Beside:
+class PartOffsets:
     """Where parts of a footprint lie beside the pixel nearest to a sample's view, in float32 from here on."""
 
     centre: tuple[Light, Light]  # (n,) along and scan [px]
@@ -63,11 +63,11 @@ class Beside:
     lean: tuple[Light, Light]  # across it, with the lean of the parts of each kernel, (kernel or 1, 1, n)
 
     @staticmethod
-    def of(views: Views, shape: Shape, along: Floats | float, scan: Floats | float) -> Beside:
+    def of(views: RayViews, shape: PartShape, along: Floats | float, scan: Floats | float) -> PartOffsets:
         """Those of some samples, whose views are so far from their pixel."""
         turn = views.along_turn, views.scan_turn
         pairs = (along, scan), (views.along_run, views.scan_run), turn, (turn[0] + shape.lean[:, None], turn[1])
-        return Beside(*((np.asarray(one, np.float32), np.asarray(other, np.float32)) for one, other in pairs))
+        return PartOffsets(*((np.asarray(one, np.float32), np.asarray(other, np.float32)) for one, other in pairs))
 
     def parts(self, shift: Floats, places: Light) -> tuple[Light, Light]:
         """Give how far beside the pixel parts of kernels lie, along and scan, (kernel, part, n) each. [px]
@@ -86,12 +86,12 @@ class Beside:
 class Gatherer:
     """Gathers a scene's components through a footprint at views whose shape is within a range."""
 
-    def __init__(self, footprint: Footprint, views: Views) -> None:
+    def __init__(self, footprint: Footprint, views: RayViews) -> None:
         """``views`` are some that hold the extremes of all that will be gathered."""
         self.footprint = footprint
         shape = shape_of(footprint, views)
         self.places = part_places(footprint)
-        beside = Beside.of(views, shape, 0.0, 0.0)
+        beside = PartOffsets.of(views, shape, 0.0, 0.0)
         reach = [float(np.abs(off).max(initial=0.0)) + 0.02 for off in beside.parts(footprint.shift, self.places)]
         width, (across, along) = footprint.box, footprint.parts
         ranges = [(float(one.min()), float(one.max())) for one in (shape.along, shape.scan)]
@@ -104,7 +104,7 @@ class Gatherer:
         """Pixels of a window."""
         return self.along.taps * self.scan.taps
 
-    def gather(self, pixels: Pixels, views: Views, out: Light, numbers: NDArray[np.intp] | None = None) -> None:
+    def gather(self, pixels: ScenePixels, views: RayViews, out: Light, numbers: NDArray[np.intp] | None = None) -> None:
         """Write the components (number, n, component) that some samples see through every kernel.
 
         They are sums over the parts. ``views`` are in px of the pixels, ``numbers`` (kernel,) where in ``out`` kernels
@@ -116,7 +116,7 @@ class Gatherer:
         index = self._window(pixels, along, scan)
         shape = shape_of(self.footprint, views)
         rows = self.along.scale_rows(shape.along), self.scan.scale_rows(shape.scan)
-        beside = Beside.of(views, shape, views.along - along, views.scan - scan)
+        beside = PartOffsets.of(views, shape, views.along - along, views.scan - scan)
         count, starts = len(along), torch.arange(0, index.numel(), self.taps, dtype=index.dtype)
         turned, places = torch.empty((count, self.taps)), index.view(-1)
         off = beside.parts(self.footprint.shift.astype(np.float32), self.places)
@@ -126,7 +126,7 @@ class Gatherer:
             sums = torch.embedding_bag(pixels.table, places, starts, False, 0, False, turned.view(-1), False)[0]
             out[number] = sums.numpy()
 
-    def _window(self, pixels: Pixels, along: Floats, scan: Floats) -> torch.Tensor:
+    def _window(self, pixels: ScenePixels, along: Floats, scan: Floats) -> torch.Tensor:
         """Rows of the pixels' table, (n, tap); outside of the scene its edge is repeated."""
         import torch
 
@@ -161,7 +161,7 @@ def _joint(turn: Light, run: Light) -> Light:
     return joint.reshape(-1, turn.shape[2])
 
 
-def shape_of(footprint: Footprint, views: Views) -> Shape:
+def shape_of(footprint: Footprint, views: RayViews) -> PartShape:
     """Give how the parts of a footprint lie so that all have the second moments that rays give it."""
     (across, along), (slit, pixel) = footprint.parts, footprint.box
     run, turn = footprint.variance[:, :, None] + np.array([pixel / along, slit / across])[:, None, None] ** 2 / 12
@@ -172,7 +172,7 @@ def shape_of(footprint: Footprint, views: Views) -> Shape:
         lean = (a * b * run + c * d * turn) / (d * between)
     wide = a * a * run + c * c * turn - lean * (2 * c + lean) * between
     high = b * b * run + d * d * turn
-    return Shape(_scale(wide, run), _scale(high, turn), lean)
+    return PartShape(_scale(wide, run), _scale(high, turn), lean)
 
 
 def _scale(variance: Floats, nominal: Floats) -> Floats:

@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from pipeline.errors import BoundError
 from pipeline.simulator.arithmetic import contrast_about, misplaced_electrons, misplaced_share
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.chips import Units
-from pipeline.simulator.choice import Decision, Taken
+from pipeline.simulator.choice import Decision, Treatment
 from pipeline.simulator.effects.effect import OFF, Effect, Light
 from pipeline.simulator.manifest import TOTAL, UNIT_WORDS
 from pipeline.simulator.options import acts_on_light
 from pipeline.simulator.stored_light import stored_mean
 
 Floats = NDArray[np.float64]
-Render = Callable[[Block, Mapping[Effect, str]], Light]
+Render = Callable[[SweepBlock, Mapping[Effect, str]], Light]
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class _Chip:
     """A chip with everything on as it is stored, and what a unit of the tolerance is at each of its numbers [e-]."""
 
     name: str
-    block: Block
+    block: SweepBlock
     light: NDArray[np.floating]
     unit: NDArray[np.floating]
     render: Render
@@ -55,7 +55,7 @@ class _Change:
         return math.inf if math.isnan(self.change) else self.change - self.rounding
 
 
-def verify(decision: Decision, render: Render, chips: Mapping[str, Block], units: Units) -> dict[str, float]:
+def verify(decision: Decision, render: Render, chips: Mapping[str, SweepBlock], units: Units) -> dict[str, float]:
     """Measure on chips what every effect that is off or cheapened changes, and all together, against everything on.
 
     What changes are numbers as they are stored: sums of neighbouring samples where a sweep bins them.
@@ -95,7 +95,7 @@ def verify(decision: Decision, render: Render, chips: Mapping[str, Block], units
     return measured
 
 
-def _once_each(chips: Mapping[str, Block]) -> dict[str, Block]:
+def _once_each(chips: Mapping[str, SweepBlock]) -> dict[str, SweepBlock]:
     """Join the names of chips that are the same lines: the brightest is often the steepest as well."""
     names: dict[tuple[str, range], list[str]] = {}
     for name, block in chips.items():
@@ -103,17 +103,17 @@ def _once_each(chips: Mapping[str, Block]) -> dict[str, Block]:
     return {" and ".join(said): chips[said[0]] for said in names.values()}
 
 
-def _chip(name: str, block: Block, render: Render, decision: Decision, units: Units) -> _Chip:
+def _chip(name: str, block: SweepBlock, render: Render, decision: Decision, units: Units) -> _Chip:
     light = stored_mean(render(block, decision.exact), block.sweep.binning)
     unit = np.broadcast_to(units(np.asarray(light, np.float32), block.sweep.binning), light.shape)
     return _Chip(name, block, light, unit, render)
 
 
-def _changes_light(one: Taken) -> bool:
+def _changes_light(one: Treatment) -> bool:
     return acts_on_light(one.menu.effect) and one.menu.present and one.option is not one.menu.exact
 
 
-def _with(decision: Decision, inexact: Sequence[Taken]) -> dict[Effect, str]:
+def _with(decision: Decision, inexact: Sequence[Treatment]) -> dict[Effect, str]:
     """Everything exact but these, in the order of the chain."""
     instead = {one.name: one.option.variant for one in inexact}
     variants = {effect: instead.get(effect.name, variant) for effect, variant in decision.exact.items()}

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.defects import DEFECTS, dead_elements, hot_electrons
 from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.fixed_pattern import PRNU, STRIPING
@@ -53,7 +53,7 @@ def take_references(scene: Scene, rig: Rig, choice: Choice, sweep: Sweep) -> Ref
     )
 
 
-def _panel_light(block: Block, choice: Choice) -> Frame:
+def _panel_light(block: SweepBlock, choice: Choice) -> Frame:
     """Electrons that the panel gives in one exposure, (sample, band)."""
     assert block.white_e is not None
     light = np.repeat(block.white_e.astype(np.float32)[None, None], len(block.columns), axis=1)
@@ -70,7 +70,7 @@ def _panel_light(block: Block, choice: Choice) -> Frame:
     return seen
 
 
-def _bad_elements(block: Block, choice: Choice, binning: int) -> NDArray[np.bool_] | None:
+def _bad_elements(block: SweepBlock, choice: Choice, binning: int) -> NDArray[np.bool_] | None:
     """Dead and hot elements, (sample, band): of a sum one is enough; None where there are none."""
     if choice.variant(DEFECTS.name) == OFF:
         return None

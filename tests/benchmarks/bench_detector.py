@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera, digitise
 from pipeline.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.dark_current import DARK_CURRENT
 from pipeline.simulator.effects.fixed_pattern import PRNU
 from pipeline.simulator.effects.quantisation import QUANTISATION
@@ -71,9 +71,9 @@ def _light_by_level() -> Light:
     return np.broadcast_to(levels, (LINES, SAMPLES, BANDS)).copy()
 
 
-def _block(rig: Rig, seed: int = 0) -> Block:
+def _block(rig: Rig, seed: int = 0) -> SweepBlock:
     sweep = Sweep("fine", "fine", "x", strip_px=0.0, start_px=0.0, lines=LINES)
-    return Block(rig, sweep, range(LINES), np.linspace(400.0, 1000.0, BANDS), (SAMPLES, SAMPLES), seed=seed)
+    return SweepBlock(rig, sweep, range(LINES), np.linspace(400.0, 1000.0, BANDS), (SAMPLES, SAMPLES), seed=seed)
 
 
 def _ours(light: Light, variant: str, seed: int = 0) -> Raw:

@@ -12,7 +12,7 @@ import numpy as np
 from measure import Clock, Row, ratio, time_in_turn
 
 from pipeline.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.chips import candidate_chips, worst_chips
 from pipeline.simulator.choice import Decision, decide
 from pipeline.simulator.effects.effect import Effect, Light
@@ -106,12 +106,12 @@ def _of_rig(scene: RasterScene, name: str, rig: Rig, sweeps: tuple[Sweep, ...]) 
     ]
 
 
-def _block(scene: RasterScene, rig: Rig, sweep: Sweep, lines: range) -> Block:
+def _block(scene: RasterScene, rig: Rig, sweep: Sweep, lines: range) -> SweepBlock:
     white = scene.panel_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-    return Block(rig, sweep, lines, scene.wavelength_nm, scene.shape, fwhm_nm=scene.fwhm_nm, white_e=white)
+    return SweepBlock(rig, sweep, lines, scene.wavelength_nm, scene.shape, fwhm_nm=scene.fwhm_nm, white_e=white)
 
 
-def _image(scene: RasterScene, block: Block, chosen: Mapping[Effect, str]) -> None:
+def _image(scene: RasterScene, block: SweepBlock, chosen: Mapping[Effect, str]) -> None:
     read_out(expected_light(scene, block, chosen), block, chosen)
 
 

@@ -13,7 +13,7 @@ from measure import Clock, Row, ratio, time_in_turn
 from numpy.typing import NDArray
 
 from pipeline.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.choice import CHEAP_SHARE, Decision, decide
 from pipeline.simulator.effects.aberration import ABERRATION
 from pipeline.simulator.effects.diffraction import DIFFRACTION
@@ -47,12 +47,14 @@ class Survey:
     sweeps: tuple[Sweep, ...]
     decision: Decision
 
-    def blocks(self) -> list[Block]:
+    def blocks(self) -> list[SweepBlock]:
         """Lines in the middle of one half of an outer sweep, some at a time."""
         exposures = self.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
         white = self.scene.panel_electrons.astype(np.float64) * exposures
         first = SIZE // 4 - LINES // 2
-        whole = Block(self.rig, self.sweeps[0], range(SIZE), self.scene.wavelength_nm, self.scene.shape, white_e=white)
+        whole = SweepBlock(
+            self.rig, self.sweeps[0], range(SIZE), self.scene.wavelength_nm, self.scene.shape, white_e=white
+        )
         return [replace(whole, lines=range(at, at + AT_ONCE)) for at in range(first, first + LINES, AT_ONCE)]
 
     @property
@@ -100,7 +102,7 @@ def _survey() -> Survey:
     return Survey(scene, rig, sweeps, decision)
 
 
-def _simulated(survey: Survey, chosen: dict[Effect, str], blocks: list[Block]) -> None:
+def _simulated(survey: Survey, chosen: dict[Effect, str], blocks: list[SweepBlock]) -> None:
     for block in blocks:
         read_out(expected_light(survey.scene, block, chosen), block, chosen)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.errors import SceneError
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.aberration import ABERRATION
 from pipeline.simulator.effects.keystone import KEYSTONE
 from pipeline.simulator.effects.registry import EFFECTS, READOUT
@@ -34,7 +34,7 @@ COUNTING = replace(CAMERA, samples=640, bits=16, read_noise_e=0.0, dark_dn=0.0)
 def counts_of(level: float, variant: str, electrons_per_dn: float = 1.0) -> NDArray[np.float64]:
     """What 1e5 samples count of so much light, by shot noise alone. [e-]"""
     rig = Rig(camera=replace(COUNTING, electrons_per_dn=electrons_per_dn))
-    block = Block(rig, SWEEP, range(8), np.linspace(400, 1000, 20), (60, 80))
+    block = SweepBlock(rig, SWEEP, range(8), np.linspace(400, 1000, 20), (60, 80))
     light = np.full((8, 640, 20), level, np.float32)
     return read_out(light, block, {SHOT: variant}).astype(np.float64) * electrons_per_dn
 

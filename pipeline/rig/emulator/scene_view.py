@@ -23,7 +23,7 @@ from pipeline.mirror import direction_to_scene, position_to_direction
 from pipeline.rig.capture_names import Announced
 from pipeline.rig.steering import wire_positions
 from pipeline.scan import Sweep, sweep_positions
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.instrument import render_lines
 from pipeline.simulator.probe import Probe
@@ -47,7 +47,7 @@ class Beside:
     variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.2})
 
-    def aim(self, block: Block, variant: str) -> Floats:
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
         """Give the shifts of a block's lines, along the line and the scan. [px]"""
         return self.shift_px[block.numbers - self.first]
 

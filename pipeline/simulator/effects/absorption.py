@@ -16,7 +16,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound, Light
 from pipeline.simulator.effects.sight import has_relief, reach_m, sample_distances, spoken_reach
 from pipeline.simulator.gain_range import GainRange
@@ -79,7 +79,7 @@ class Absorption:
         passed = transmission(np.geomspace(*reach, _LOOKS), rig, nm)
         return GainRange.of(passed, nm, uneven=float(passed.max(initial=0.0) - passed.min(initial=1.0)))
 
-    def gain(self, block: Block, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Light:
         """Give (line, sample, band), or (1, 1, band) where all is at one distance."""
         rig, reach = block.rig, reach_m(block.rig)
         if reach is None:

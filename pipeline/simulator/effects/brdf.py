@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.scan import Sweep, points_of_scan
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound, Light
 from pipeline.simulator.gain_range import GainRange
 from pipeline.simulator.probe import Probe
@@ -58,7 +58,7 @@ class Brdf:
         greatest = 1 + slope * angle + rig.sky.hot_spot * float(np.exp(-phase / HOT_SPOT_RAD))
         return GainRange.between(least, greatest, bands, uneven=greatest - least)
 
-    def gain(self, block: Block, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Light:
         """Give (line, sample, 1)."""
         sky = block.rig.sky
         if sky.brdf_per_rad == 0 and sky.hot_spot == 0:

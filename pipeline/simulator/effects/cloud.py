@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scan import points_of_scan
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound, Light
 from pipeline.simulator.gain_range import GainRange
 from pipeline.simulator.probe import Probe
@@ -48,7 +48,7 @@ class Cloud:
         share = rig.sky.cloud_share
         return GainRange.between(1 - share, 1.0, len(probe.wavelength_nm), uneven=share)
 
-    def gain(self, block: Block, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Light:
         """Give (line, sample, 1)."""
         sky = block.rig.sky
         if sky.cloud_share == 0:

@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.daylight import knots_within, relative_daylight, sun_elevation_deg
 from pipeline.simulator.effects.effect import OFF, Bound, Light
 from pipeline.simulator.gain_range import GainRange
@@ -59,7 +59,7 @@ class Drift:
         """Give the daylight of the survey."""
         return daylight_range(probe, rig)
 
-    def gain(self, block: Block, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Light:
         """Give (line, 1, band), or (line, 1, 1) of the variants that take all bands as one."""
         sky = block.rig.sky
         if sky.started is None:

@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -69,14 +69,14 @@ class Effect(Protocol):
 class Aim(Effect, Protocol):
     """The mirror looks beside its plan."""
 
-    def aim(self, block: Block, variant: str) -> Floats:
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
         """Give how far, (line, step, 2) along the line and the scan at every held position; step may be 1. [px]"""
 
 
 class Displacement(Effect, Protocol):
     """Rays meet the scene elsewhere than at its plane's own place."""
 
-    def displaced(self, block: Block, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
+    def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
         """Give what to add to scene points (line, sample): along the line and the scan. [px]"""
 
 
@@ -110,12 +110,12 @@ class Blur(Effect, Protocol):
 class Gain(Effect, Protocol):
     """Light is multiplied."""
 
-    def gain(self, block: Block, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Light:
         """Give the factor, an array that broadcasts to (line, sample, band)."""
 
 
-class Change(Effect, Protocol):
+class LightChange(Effect, Protocol):
     """Light is changed in another linear way: spectra mixed, light added."""
 
-    def change(self, light: Light, block: Block, variant: str) -> Light:
+    def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
         """Give the changed light of a block, (line, sample, band) [e-]; may work in place."""

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.gain_range import GainRange
 from pipeline.simulator.noise import normal_deviates
@@ -42,7 +42,7 @@ class Prnu:
         least, greatest = float(gains.min(initial=1.0)), float(gains.max(initial=1.0))
         return GainRange.between(least, greatest, bands, uneven=greatest - least)
 
-    def gain(self, block: Block, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Light:
         """Give the gain of each element, (1, sample, band)."""
         return response_gain(block.rig, len(block.wavelength_nm))[None, block.columns]
 
@@ -69,7 +69,7 @@ class Striping:
         least, greatest = float(gains.min(initial=1.0)), float(gains.max(initial=1.0))
         return GainRange.between(least, greatest, bands, uneven=greatest - least)
 
-    def gain(self, block: Block, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Light:
         """Give the gain of each column, (1, sample, 1)."""
         return stripe_gain(block.rig)[None, block.columns]
 

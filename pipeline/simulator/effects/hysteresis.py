@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scan import Sweep, line_positions
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.effects.line_ends import at_line_ends
 from pipeline.simulator.probe import Probe
@@ -32,7 +32,7 @@ class Hysteresis:
     variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.07})
 
-    def aim(self, block: Block, variant: str) -> Floats:
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
         """Give the shift, (line, 1, 2) along the line and the scan. [px]"""
         return _course(block.rig, block.sweep, block.middle)[:, None]
 
@@ -54,7 +54,7 @@ class ThermalDrift:
     variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.06})
 
-    def aim(self, block: Block, variant: str) -> Floats:
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
         """Give the shift since the survey's start, (line, 1, 2) along the line and the scan. [px]"""
         walked = block.rig.mirror.drift_px_per_min / 60 * block.time_s
         return np.stack([walked * one for one in _along_and_scan(block.rig)], axis=-1)[:, None]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.mirror import position_to_normal
 from pipeline.scan import line_positions
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.effects.line_ends import end_gains
 from pipeline.simulator.probe import Probe
@@ -33,7 +33,7 @@ class Jitter:
     variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.15})
 
-    def aim(self, block: Block, variant: str) -> Floats:
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
         """Give the shift, (line, 1, 2) along the line and the scan. [px]"""
         drawn = np.array([block.stream(self.name, number).standard_normal(2) for number in block.numbers.tolist()])
         shift: Floats = (tilt_to_scene(block.normals) * drawn.reshape(-1, 1, 2)).sum(axis=-1) * _sigma_px(block.rig)

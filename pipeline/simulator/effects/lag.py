@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.effects.line_ends import at_line_ends
 from pipeline.simulator.probe import Probe
@@ -43,7 +43,7 @@ class Lag:
     variants = (EXACT, EULER)
     cost_ns = MappingProxyType({EXACT: 0.15, EULER: 0.12})
 
-    def aim(self, block: Block, variant: str) -> Floats:
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
         """Give the shift, (line, step, 2) along the line and the scan. [px]"""
         scan = transient(block.rig, block.sweep, block.numbers, variant)
         return np.stack([np.zeros_like(scan), scan], axis=-1)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scan import points_of_scan
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Air, Rig
@@ -31,7 +31,7 @@ class Parallax:
     variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.2})
 
-    def displaced(self, block: Block, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
+    def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
         """Give what to add to points (line, sample), along the line and along the scan. [px]"""
         air, sweep = block.rig.air, block.sweep
         if air.distance_m is None:

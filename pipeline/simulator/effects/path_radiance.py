@@ -19,7 +19,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.daylight import relative_daylight
 from pipeline.simulator.effects.absorption import AIR_MASS_M
 from pipeline.simulator.effects.brdf import BRDF
@@ -97,7 +97,7 @@ class PathRadiance:
             added_bend=alone.added_bend * most + 2 * alone.added_steepest * sun.steepest + alone.added_e * sun.bend,
         )
 
-    def change(self, light: Light, block: Block, variant: str) -> Light:
+    def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
         """Change the light in place."""
         reach = reach_m(block.rig)
         if reach is None:
@@ -110,7 +110,7 @@ class PathRadiance:
             light += (self._horizon(block) * lost).astype(np.float32, copy=False)
         return light
 
-    def _horizon(self, block: Block) -> Light:
+    def _horizon(self, block: SweepBlock) -> Light:
         """Light of endless air at a line's time, (line or 1, 1, band) [e-]."""
         sky, still = block.rig.sky, block.rig.air.airlight_share * np.asarray(block.white_e, np.float64)
         if sky.started is not None:

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.coatings import reflectance
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.effects.vignetting import ahead, sweep_ends
@@ -63,7 +63,7 @@ class Polarisation:
             return GainRange.between(1.0, 1.0, len(nm))
         return GainRange.of(_factors_between(incidence, rig, nm), nm, uneven=0.0)
 
-    def gain(self, block: Block, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Light:
         """Give the factor of each line, (line, 1, band)."""
         looks = ahead(block.sweep.strip_px, block.scan_px, block.rig.camera)
         factor: Light = _factors(_incidence(looks), block.rig, block.wavelength_nm).astype(np.float32)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator.band_differences import rising_runs
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
@@ -67,7 +67,7 @@ class Response:
         why = f"bands widen from {0.0 if known is None else np.nanmin(known):.3g} to {rig.optics.fwhm_nm:.3g} nm"
         return Bound(float(np.minimum(curved, steep).max()), f"{why}: {sd:.2g} nm sd more")
 
-    def change(self, light: Light, block: Block, variant: str) -> Light:
+    def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
         """Give the light of a block in the rig's bands."""
         return widen_bands(light, block.wavelength_nm, block.fwhm_nm, block.rig.optics.fwhm_nm)
 

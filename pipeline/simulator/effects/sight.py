@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scan import points_of_scan
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.parallax import closeness
 from pipeline.simulator.rig_model import Rig
 
@@ -30,7 +30,7 @@ def has_relief(rig: Rig) -> bool:
     return reach is not None and reach[0] != reach[1]
 
 
-def sample_distances(block: Block) -> Floats:
+def sample_distances(block: SweepBlock) -> Floats:
     """Give the distance where each sample looks by the plan, (line, sample) [m]; (1, 1) where all of it is the same."""
     ends = reach_m(block.rig)
     if ends is None or ends[0] == ends[1]:

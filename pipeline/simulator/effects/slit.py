@@ -11,7 +11,7 @@ from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.effects.turned import MARGIN, UPRIGHT, beside_plan_px
 from pipeline.simulator.parting import Parts, fewest_parts
 from pipeline.simulator.probe import Probe
-from pipeline.simulator.rays import Views
+from pipeline.simulator.rays import RayViews
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.tap_tables import BETWEEN_ROWS, SCALE_STEP, TABULATED
 
@@ -59,7 +59,7 @@ class SlitBox:
 SLIT = SlitBox()
 
 
-def box_parts(variant: str, rig: Rig, views: Views) -> Parts:
+def box_parts(variant: str, rig: Rig, views: RayViews) -> Parts:
     """Give into how many boxes a variant parts the footprint, across and along, for views all over a sweep."""
     if variant in _STATED:
         return fewest_parts(_STATED[variant], box_of(variant, rig), views)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.effects.lag import transient
 from pipeline.simulator.effects.line_ends import at_line_ends, end_gains
@@ -88,7 +88,7 @@ def held_variance(positions: int) -> float:
     return (positions**2 - 1) / 12
 
 
-def smeared_positions(block: Block, variant: str) -> Floats:
+def smeared_positions(block: SweepBlock, variant: str) -> Floats:
     """Give the mirror positions (line, step, 2) at which a footprint stands in an exposure."""
     if variant == POSITIONS and block.sweep.step > 1:
         return block.positions

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator.band_differences import difference_rates, rising_gaps, rising_runs
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
@@ -55,7 +55,7 @@ class Smile:
         part = min(shift / float(gaps.min()), 0.5)
         return Bound(steep * shift + min(bent, steep * shift * 2 * part * (1 - part)), why)
 
-    def change(self, light: Light, block: Block, variant: str) -> Light:
+    def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
         """Give the light at the wavelengths that each sample sees."""
         camera, smile = block.rig.camera, block.rig.optics.smile_nm
         if smile == 0 or light.shape[-1] < 2:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Optics, Rig
@@ -49,7 +49,7 @@ class StrayLight:
             return Bound(halo, f"{why}; {1 - optics.stray_even:.2g} of it in a halo")
         return Bound(optics.stray_share * spread + halo, why)
 
-    def change(self, light: Light, block: Block, variant: str) -> Light:
+    def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
         """Give the light after scattering; works in place.
 
         Raises

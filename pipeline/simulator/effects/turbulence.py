@@ -17,7 +17,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.blurring import UNITS
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.effects.sight import FARTHEST_M
@@ -40,7 +40,7 @@ class Turbulence:
     variants = ("jitter",)
     cost_ns = MappingProxyType({"jitter": 0.13})
 
-    def aim(self, block: Block, variant: str) -> Floats:
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
         """Give how far each line looks beside its plan, (line, 1, 2) along the line and the scan. [px]"""
         sigma = turbulence_px(block.rig)
         draws = [block.stream(self.name, int(number)).standard_normal(2) for number in block.numbers]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.gain_range import GainRange
 from pipeline.simulator.probe import Probe
@@ -56,7 +56,7 @@ class Vignetting:
         least, greatest = float(shares.min(initial=1.0)), float(shares.max(initial=1.0))
         return GainRange.between(least, greatest, len(probe.wavelength_nm))
 
-    def gain(self, block: Block, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Light:
         """Give the factor of each line, (line, 1, 1)."""
         sweep, camera = block.sweep, block.rig.camera
         scan_px = sweep.held_px() if variant == HELD else sweep.line_px()[:, None]

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound
 from pipeline.simulator.probe import Probe
 from pipeline.simulator.rig_model import Rig
@@ -34,7 +34,7 @@ class Wind:
     variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.9})
 
-    def displaced(self, block: Block, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
+    def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
         """Give what to add to points (line, sample), along the line and along the scan. [px]"""
         sway, air = sway_px(block.rig), block.rig.air
         if sway == 0 or air.distance_m is None:

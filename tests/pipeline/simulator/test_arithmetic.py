@@ -11,7 +11,7 @@ import pytest
 from pipeline.camera import LineCamera
 from pipeline.scan import Sweep
 from pipeline.simulator.arithmetic import ROUNDING, contrast_about, misplaced_electrons, misplaced_share
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.aberration import ABERRATION
 from pipeline.simulator.effects.diffraction import DIFFRACTION
 from pipeline.simulator.effects.effect import Light
@@ -38,7 +38,7 @@ def test_contrast_is_that_of_the_scene_about_a_sample() -> None:
     scene = raster_from_values(values, RIG.camera, name="t", wavelength_nm=np.array([550.0]))
     block = sweep_block(scene, RIG, SWEEP, range(6, 8))  # looks at rows 24 to 31
 
-    def render(block: Block, chosen: Any) -> Light:
+    def render(block: SweepBlock, chosen: Any) -> Light:
         return expected_light(scene, block, chosen)
 
     contrast = contrast_about(block, render)[0, :, 0]

@@ -9,13 +9,13 @@ import pytest
 
 from pipeline.errors import ShapeError
 from pipeline.scan import Sweep, sweep_to_scene
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.chips import MOST_CANDIDATES, candidate_chips, worst_chips
 from pipeline.simulator.effects.effect import Light
 from tests.pipeline.simulator.made_up_effects import RIG
 
 FAR = Sweep("far", "fine", "y", -400.0, -900.0, 50)
-WHOLE = Block(RIG, FAR, range(50), np.array([500.0]), (1000, 2000))
+WHOLE = SweepBlock(RIG, FAR, range(50), np.array([500.0]), (1000, 2000))
 
 
 def ones(light: Light, binning: int) -> Light:
@@ -26,7 +26,7 @@ def ones(light: Light, binning: int) -> Light:
 def test_worst_chips_are_about_the_worst_places():
     """A bright spot, a dark one, an edge, and the line that meets the mirror most obliquely, each its own chip."""
 
-    def light(chip: Block) -> Light:
+    def light(chip: SweepBlock) -> Light:
         seen = np.full((50, 640, 1), 50.0, np.float32)
         seen[10, 100], seen[45, 630], seen[20, 200:400] = 60.0, 41.0, 58.0
         seen[20, 300:] = 43.0
@@ -42,7 +42,7 @@ def test_worst_chips_are_about_the_worst_places():
 def test_each_binning_has_worst_chips_of_its_own():
     """Sums by sums: what is brightest as a sample need not be so in a sum of 4."""
 
-    def light(chip: Block) -> Light:
+    def light(chip: SweepBlock) -> Light:
         seen = np.full((50, 640, 1), 50.0, np.float32)
         seen[10, 100], seen[30, 100:108] = 60.0, 58.0
         return seen[chip.lines.start : chip.lines.stop]

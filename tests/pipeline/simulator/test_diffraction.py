@@ -13,7 +13,7 @@ from scipy.special import j0, j1
 
 from pipeline.once import Once
 from pipeline.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.aberration import ABERRATION
 from pipeline.simulator.effects.diffraction import (
     DIFFRACTION,
@@ -27,7 +27,7 @@ from pipeline.simulator.effects.keystone import KEYSTONE
 from pipeline.simulator.effects.pupil import pupil_contrast
 from pipeline.simulator.effects.slit import SLIT
 from pipeline.simulator.footprint import fold
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.raster import SceneLight, SceneRaster
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
 from pipeline.simulator.scene import RasterScene
@@ -131,10 +131,10 @@ def test_rendered_waves_are_those_of_the_pupil(axis: int, cycles: float):
     where = np.arange(900) - 449.5
     wave = 1 + np.cos(2 * np.pi * cycles * where)
     planes = np.ones((900, 900, 1), np.float32) * (wave[:, None, None] if axis == 0 else wave[None, :, None])
-    light = Light(np.full((1, 3), 1.0, np.float32), np.ones(3, np.float32))
-    scene = RasterScene("w", "w", Raster.of(planes.astype(np.float32)), Once.of(light), np.ones(3, np.float32), NM)
+    light = SceneLight(np.full((1, 3), 1.0, np.float32), np.ones(3, np.float32))
+    scene = RasterScene("w", "w", SceneRaster.of(planes.astype(np.float32)), Once.of(light), np.ones(3, np.float32), NM)
     sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=-20.0, lines=40)
-    block = Block(RIG, sweep, range(40), NM, scene.shape, samples=range(300, 340))
+    block = SweepBlock(RIG, sweep, range(40), NM, scene.shape, samples=range(300, 340))
     found = expected_light(scene, block, {SLIT: "1x1", DIFFRACTION: "airy"})
     profile = found.mean(axis=1 - axis)
     place = (np.arange(-20.0, 20.0) if axis == 0 else block.slopes / RIG.camera.ifov_rad)[:, None]

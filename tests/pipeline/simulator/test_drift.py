@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.once import Once
 from pipeline.simulator.effects.drift import DRIFT, daylight_range
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.raster import SceneLight, SceneRaster
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.scene import RasterScene
 from tests.pipeline.simulator.outdoors import (
@@ -94,7 +94,7 @@ def test_rendered() -> None:
     """Through the chain a flat scene is as bright as the gain says."""
     spectra = white_e().astype(np.float32)
     scene = RasterScene(
-        "flat", "flat", Raster.of(np.ones((*SHAPE, 1), np.float32)), Once.of(Light(spectra[None], spectra)),
+        "flat", "flat", SceneRaster.of(np.ones((*SHAPE, 1), np.float32)), Once.of(SceneLight(spectra[None], spectra)),
         np.ones(BANDS, np.float32), block_of(rig_with()).wavelength_nm,
     )  # fmt: skip
     block = block_of(rig_with(started=MORNING), range(0, 60, 30), started_s=600.0, samples=range(4))

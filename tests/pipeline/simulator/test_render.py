@@ -11,13 +11,13 @@ from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
 from pipeline.once import Once
 from pipeline.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import Moments
 from pipeline.simulator.effects.rotation import ROTATION
 from pipeline.simulator.effects.slit import SLIT
 from pipeline.simulator.effects.smear import SMEAR
 from pipeline.simulator.effects.stray_light import STRAY_LIGHT
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.raster import SceneLight, SceneRaster
 from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scene import RasterScene, raster_from_values
@@ -35,14 +35,18 @@ def grainy(bands: int = 5, seed: int = 0) -> RasterScene:
     wavelength = np.linspace(400, 1000, bands)
     electrons = rng.uniform(1e3, 9e3, (3, bands)).astype(np.float32)
     return RasterScene(
-        "grain", "grain", Raster.of(planes), Once.of(Light(electrons, electrons[0])), np.ones(bands, np.float32),
+        "grain",
+        "grain",
+        SceneRaster.of(planes),
+        Once.of(SceneLight(electrons, electrons[0])),
+        np.ones(bands, np.float32),
         wavelength,
-    )  # fmt: skip
+    )
 
 
-def block_of(scene: RasterScene, sweep: Sweep, lines: range, **more: object) -> Block:
+def block_of(scene: RasterScene, sweep: Sweep, lines: range, **more: object) -> SweepBlock:
     """Lines of a sweep by a rig as it is."""
-    return Block(Rig(), sweep, lines, scene.wavelength_nm, scene.shape, **more)
+    return SweepBlock(Rig(), sweep, lines, scene.wavelength_nm, scene.shape, **more)
 
 
 NEAR = replace(FINE, strip_px=20.0, start_px=-40.0)
@@ -84,7 +88,7 @@ def test_diagonal_scene_is_that_of_its_matrix() -> None:
     """A scene with a plane of its own in each band gives what its diagonal matrix of electrons gives."""
     diagonal = raster_from_values(np.random.default_rng(1).uniform(0, 1, (60, 50, 4)), CAMERA, name="d",
                                   wavelength_nm=np.linspace(400, 1000, 4))  # fmt: skip
-    light = Light(np.diag(diagonal.electrons), diagonal.panel_electrons)
+    light = SceneLight(np.diag(diagonal.electrons), diagonal.panel_electrons)
     full = replace(diagonal, light=Once.of(light))
     chosen = {**PLAIN, Widening(): "only"}
     one, other = (expected_light(s, block_of(s, NEAR, range(12, 16)), chosen) for s in (diagonal, full))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.once import Once
 from pipeline.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.aberration import ABERRATION
 from pipeline.simulator.effects.defocus import DEFOCUS
 from pipeline.simulator.effects.diffraction import DIFFRACTION
@@ -18,7 +18,7 @@ from pipeline.simulator.effects.keystone import KEYSTONE
 from pipeline.simulator.effects.pupil import pupil_contrast
 from pipeline.simulator.effects.slit import SLIT
 from pipeline.simulator.effects.turbulence import TURBULENCE
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.raster import SceneLight, SceneRaster
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig
 from pipeline.simulator.scene import RasterScene
@@ -32,8 +32,8 @@ ALL = {DIFFRACTION: "airy", DEFOCUS: "disc", ABERRATION: "gaussian", KEYSTONE: "
 def scene_of(planes: NDArray[np.float32]) -> RasterScene:
     """A raster of one component, of the same 1000 e- in all bands."""
     electrons = np.full((1, 3), 1000.0, np.float32)
-    light = Once.of(Light(electrons, electrons[0]))
-    return RasterScene("waves", "waves", Raster.of(planes), light, np.ones(3, np.float32), NM)
+    light = Once.of(SceneLight(electrons, electrons[0]))
+    return RasterScene("waves", "waves", SceneRaster.of(planes), light, np.ones(3, np.float32), NM)
 
 
 def waves(period: float) -> RasterScene:
@@ -44,7 +44,7 @@ def waves(period: float) -> RasterScene:
 
 def light_of(scene: RasterScene, lines: range, chosen: dict[Any, str], samples: range | None = None) -> NDArray[Any]:
     """Electrons of some lines through the footprint and what is chosen."""
-    block = Block(RIG, SWEEP, lines, NM, scene.shape, samples=samples)
+    block = SweepBlock(RIG, SWEEP, lines, NM, scene.shape, samples=samples)
     return expected_light(scene, block, {SLIT: "3x1", **chosen})
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.camera import LineCamera
 from pipeline.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.rotation import ROTATION
 from pipeline.simulator.effects.slit import SLIT
 from pipeline.simulator.effects.smear import SMEAR, folded_positions, held_variance, smeared_positions
@@ -26,7 +26,7 @@ RIG = Rig(camera=LineCamera(samples=64))
 def test_positions_are_held_by_the_mirror_or_the_footprint(step: int) -> None:
     """All positions of an exposure stand for it, or one in whose footprint they are; their variance is known."""
     sweep = Sweep("s", "coarse", "x", strip_px=0.0, start_px=0.0, lines=4, step=step)
-    block = Block(RIG, sweep, range(4), np.array([550.0]), (30, 60))
+    block = SweepBlock(RIG, sweep, range(4), np.array([550.0]), (30, 60))
     found = {variant: smeared_positions(block, variant).shape[1] for variant in ("off", *SMEAR.variants)}
     assert found == {"off": 1, "positions": step, "folded": 1}
     assert [folded_positions(sweep, variant) for variant in ("off", "positions", "folded")] == [1, 1, step]
@@ -39,7 +39,7 @@ def test_no_smear_where_every_line_has_one_position() -> None:
     scene = raster_from_values(np.random.default_rng(0).uniform(0, 1, (30, 60, 1)), RIG.camera, name="t",
                                wavelength_nm=np.array([550.0]))  # fmt: skip
     assert SMEAR.bound(probe_scene(scene, RIG, [sweep]), RIG).value == 0
-    block = Block(RIG, sweep, range(4), scene.wavelength_nm, scene.shape)
+    block = SweepBlock(RIG, sweep, range(4), scene.wavelength_nm, scene.shape)
     np.testing.assert_array_equal(smeared_positions(block, "positions"), block.middle[:, None])
 
 
@@ -53,7 +53,7 @@ def test_change_is_within_the_bound(step: int, period: float, variant: str) -> N
     scene = raster_from_values(values[..., None], RIG.camera, name="t", wavelength_nm=np.array([550.0]))
     sweep = Sweep("s", "coarse", "x", strip_px=3.0, start_px=-36.0, lines=72 // step, step=step, binning=step)
     bound = SMEAR.bound(probe_scene(scene, RIG, [sweep]), RIG, variant).value
-    block = Block(RIG, sweep, range(sweep.lines), scene.wavelength_nm, scene.shape)
+    block = SweepBlock(RIG, sweep, range(sweep.lines), scene.wavelength_nm, scene.shape)
     exact = expected_light(scene, block, {ROTATION: "rays", SMEAR: "positions", SLIT: "3x1"})
     other = expected_light(scene, block, {ROTATION: "rays", SMEAR: variant, SLIT: "3x1"})
     change = (np.abs(other - exact) / noise_electrons(exact, RIG)).max()

@@ -12,7 +12,7 @@ from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, SettingsError
 from pipeline.once import Once
 from pipeline.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.aberration import ABERRATION
 from pipeline.simulator.effects.diffraction import DIFFRACTION
 from pipeline.simulator.effects.keystone import KEYSTONE
@@ -21,7 +21,7 @@ from pipeline.simulator.effects.rotation import ROTATION
 from pipeline.simulator.effects.slit import SLIT
 from pipeline.simulator.options import SAFETY, list_options
 from pipeline.simulator.probe import Probe
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.raster import SceneLight, SceneRaster
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Detector, Rig
 from pipeline.simulator.scene import RasterScene, raster_from_values
@@ -52,14 +52,18 @@ def mixed(seed: int, shape: tuple[int, int] = (80, 110), bands: int = 6) -> Rast
     planes[rng.integers(20, 60), rng.integers(20, 90)] += rng.uniform(0, 2)
     electrons = rng.uniform(50, 6e3, (3, bands)).astype(np.float32)
     return RasterScene(
-        "mixed", f"{seed}", Raster.of(planes), Once.of(Light(electrons, electrons[0])), np.ones(bands, np.float32),
+        "mixed",
+        f"{seed}",
+        SceneRaster.of(planes),
+        Once.of(SceneLight(electrons, electrons[0])),
+        np.ones(bands, np.float32),
         np.linspace(400, 1000, bands),
-    )  # fmt: skip
+    )
 
 
 def seen(scene: RasterScene, sweep: Sweep, variant: str = "3x1", blurs: dict[Any, str] | None = None) -> np.ndarray:
     """All lines of a sweep through the footprint."""
-    block = Block(RIG, sweep, range(sweep.lines), scene.wavelength_nm, scene.shape)
+    block = SweepBlock(RIG, sweep, range(sweep.lines), scene.wavelength_nm, scene.shape)
     return expected_light(scene, block, {ROTATION: "rays", SLIT: variant, **(blurs or {})})
 
 
@@ -232,7 +236,12 @@ def test_number_that_is_not_finite_is_refused_with_its_place(bad: float) -> None
     planes[41, 17, 2] = bad
     light = np.ones((3, 4), np.float32)
     scene = RasterScene(
-        "holey", "k", Raster.of(planes), Once.of(Light(light, light[0])), np.ones(4, np.float32), np.arange(4) + 400.0
+        "holey",
+        "k",
+        SceneRaster.of(planes),
+        Once.of(SceneLight(light, light[0])),
+        np.ones(4, np.float32),
+        np.arange(4) + 400.0,
     )
     with pytest.raises(SceneError, match="holey is not finite at row 41, column 17, component 2"):
         probe_scene(scene, RIG, [SWEEP])

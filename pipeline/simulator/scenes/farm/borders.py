@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.scenes.farm.canvas import Canvas, Mixture, Work, grass, hard_track
+from pipeline.simulator.scenes.farm.canvas import Canvas, Mixture, Painting, grass, hard_track
 from pipeline.simulator.scenes.farm.land import (
     Band,
     Border,
@@ -25,7 +25,7 @@ BARE_CROWN = 0.62  # cover of a crown without leaves
 SHADOW = 0.78  # of the ground under a crown's shadow that no direct sun reaches
 
 
-def paint_borders(work: Work) -> None:
+def paint_borders(work: Painting) -> None:
     """Draw the lines between parcels, roads last."""
     for kind in ("margin", "hedge", "ditch", "road"):
         for number, (border, its_kind) in enumerate(work.plan.borders):
@@ -33,7 +33,7 @@ def paint_borders(work: Work) -> None:
                 _paint_line(work, stream(work.plan.seed, f"border {number}"), border, kind)
 
 
-def _paint_line(work: Work, rng: np.random.Generator, border: Border, kind: str) -> None:
+def _paint_line(work: Painting, rng: np.random.Generator, border: Border, kind: str) -> None:
     """Grass on both sides, and what the kind has in the middle; a ditch is fuller after rain."""
     canvas, plan = work.canvas, work.plan
     band = _wobbled(rng, band_pixels(border, 12.0, canvas.shape), 0.8 if kind == "road" else 1.6)
@@ -64,7 +64,7 @@ def _cover(canvas: Canvas, band: Band, half: float, mixture: Mixture, label: str
     canvas.over(band.index[hit], cover[hit], {name: part[hit] for name, part in mixture.items()}, label)
 
 
-def dig_ponds(work: Work) -> None:
+def dig_ponds(work: Painting) -> None:
     """Ponds with grass round them, in meadows where there are any: one, and one more for every 650 000 px."""
     canvas, plan = work.canvas, work.plan
     rng, shape = stream(plan.seed, "ponds"), plan.shape
@@ -83,7 +83,7 @@ def dig_ponds(work: Work) -> None:
         canvas.over(index, cover, {"water": np.ones_like(cover)}, "water")
 
 
-def crowns_of(work: Work) -> Points:
+def crowns_of(work: Painting) -> Points:
     """Crowns of hedges and of trees beside the lines: y, x and radius, (n, 3)."""
     plan = work.plan
     crowns = [_standing_trees(stream(plan.seed, "trees"), [border for border, _ in plan.borders])]
@@ -114,7 +114,7 @@ def _standing_trees(rng: np.random.Generator, borders: list[Border]) -> Points:
     return np.concatenate(trees)
 
 
-def plant_trees(work: Work) -> None:
+def plant_trees(work: Painting) -> None:
     """Shadows on the ground, away from the sun, then crowns that are darker on that side, in the leaves of the day."""
     canvas, plan = work.canvas, work.plan
     crowns = crowns_of(work)

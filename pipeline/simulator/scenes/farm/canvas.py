@@ -92,7 +92,7 @@ class Canvas:
 
 
 @dataclass(frozen=True)
-class Work:
+class Painting:
     """All that painting needs: the plan, what varies over the land, and the canvas."""
 
     plan: FarmPlan

@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
 from pipeline.once import Once
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.raster import SceneLight, SceneRaster
 from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.scenes.farm.borders import dig_ponds, paint_borders, plant_trees
-from pipeline.simulator.scenes.farm.canvas import CLASS_COLOURS, CLASSES, Canvas, Ground, Work
+from pipeline.simulator.scenes.farm.canvas import CLASS_COLOURS, CLASSES, Canvas, Ground, Painting
 from pipeline.simulator.scenes.farm.farm_plan import FarmPlan, farm_plan
 from pipeline.simulator.scenes.farm.fields import paint_fields
 from pipeline.simulator.scenes.farm.land import stream
@@ -99,9 +99,9 @@ def farm_scene(
     seen_by, size = camera or LineCamera(), f"{shape[0]}x{shape[1]}"
     wavelength, fwhm = band_centres(bands)
 
-    def light() -> Light:
+    def light() -> SceneLight:
         library = spectral_library(bands, plan.materials)
-        return Light(library.electrons(seen_by), library.panel_electrons(seen_by))
+        return SceneLight(library.electrons(seen_by), library.panel_electrons(seen_by))
 
     return RasterScene(
         name="farm",
@@ -109,7 +109,7 @@ def farm_scene(
             f"{FARM_LAW}/seed={seed}/day={plan.day}/shape={size}/hour={plan.hour:g}/bands={bands}"
             f"/full_well={seen_by.full_well_e:g}"
         ),
-        raster=Raster((*shape, len(plan.materials)), labelled=True, draw=lambda: _draw(plan)),
+        raster=SceneRaster((*shape, len(plan.materials)), labelled=True, draw=lambda: _draw(plan)),
         light=Once(light),
         panel=np.full(bands, PANEL_REFLECTANCE, np.float32),
         wavelength_nm=wavelength,
@@ -122,7 +122,7 @@ def farm_scene(
 def _draw(plan: FarmPlan) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Abundances (y, x, material) and labels (y, x)."""
     ground = Ground.draw(stream(plan.seed, "ground"), plan.shape)
-    work = Work(plan, ground, Canvas(plan.shape, plan.materials))
+    work = Painting(plan, ground, Canvas(plan.shape, plan.materials))
     paint_fields(work)
     plant_weeds(work)
     paint_borders(work)

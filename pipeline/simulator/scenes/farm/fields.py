@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.scenes.farm.canvas import Ground, Mixture, Work, blend, grass, moist_soil
+from pipeline.simulator.scenes.farm.canvas import Ground, Mixture, Painting, blend, grass, moist_soil
 from pipeline.simulator.scenes.farm.farm_plan import TWINS, UNEVEN_DAYS, FieldPlan
 from pipeline.simulator.scenes.farm.land import (
     Field,
@@ -46,7 +46,7 @@ class Content(NamedTuple):
     shares: Mixture
 
 
-def paint_fields(work: Work) -> None:
+def paint_fields(work: Painting) -> None:
     """Draw every field."""
     plan = work.plan
     lodging = _lodging_field(work)
@@ -61,7 +61,7 @@ def paint_fields(work: Work) -> None:
 
 
 def _content(
-    work: Work, rng: np.random.Generator, field: FieldPlan, centres: Points, ground: tuple[Ground, Field]
+    work: Painting, rng: np.random.Generator, field: FieldPlan, centres: Points, ground: tuple[Ground, Field]
 ) -> Content:
     """Materials and class shares of one field."""
     here, down = ground
@@ -80,7 +80,7 @@ def _content(
 
 
 def _standing_crop(
-    work: Work,
+    work: Painting,
     field: FieldPlan,
     crop: Crop,
     place: tuple[Rows, Ground, Mixture],
@@ -168,7 +168,7 @@ def _bare_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture) -> Co
     return _with_wheel_marks(content, field, rows, soil) if field.crop is None else content
 
 
-def _lodging_field(work: Work) -> Field | None:
+def _lodging_field(work: Painting) -> Field | None:
     """Random field whose highest parts lie first, (y, x); None where nothing lies on the day."""
     plan = work.plan
     standing = any(one.lodging > 0 and one.land_on(plan.day).phase == "crop" for one in plan.fields)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.scenes.farm.canvas import Work
+from pipeline.simulator.scenes.farm.canvas import Painting
 from pipeline.simulator.scenes.farm.farm_plan import FieldPlan
 from pipeline.simulator.scenes.farm.land import Points, disc_pixels, polygon_area, stream
 from pipeline.simulator.scenes.farm.seasons import YEAR_DAYS, days_since_turned, weed_size
@@ -23,7 +23,7 @@ VOLUNTEERS = 1 / 6000  # single plants of another crop per px
 SEEN_PX = 0.35  # least radius of a plant that is drawn
 
 
-def plant_weeds(work: Work) -> None:
+def plant_weeds(work: Painting) -> None:
     """Draw the weeds of every field, each a disc of one spectrum."""
     grown: dict[str, list[NDArray[np.float64]]] = {}
     for number, field in enumerate(work.plan.fields):
