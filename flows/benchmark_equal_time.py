@@ -26,7 +26,7 @@ from pipeline.errors import PoseError
 from pipeline.planning import plan_fine
 from pipeline.scan import CostModel
 from pipeline.selection import frame_seats
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene
 
 ROUNDS = 3  # set-ups do not grow with the exposure, so that one step falls short; three settle it
 

@@ -20,8 +20,8 @@ from models.weights import AnyWeights, Description, Weights, content_key, descri
 from pipeline.camera import LineCamera
 from pipeline.errors import PipelineError, SceneError, SettingsError, WeightsError
 from pipeline.grid import SceneGrid
-from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
+from pipeline.simulator.scenes.scene import RasterScene
 
 FARM_TEST_SCENES = 4
 

@@ -14,7 +14,7 @@ from flows.survey_scene import judged_labels
 from flows.training_data import TrainingData
 from pipeline.errors import SceneError, SettingsError
 from pipeline.grid import UNLABELLED
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene
 
 Show = Callable[[str, float, str], None]
 

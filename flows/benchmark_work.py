@@ -24,7 +24,7 @@ from flows.training_data import TrainingData
 from models.weights import AnyWeights, Weights
 from pipeline.camera import LineCamera
 from pipeline.line_blocks import WIDTHS
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene
 
 Record = dict[str, Any]
 Report = Callable[[float], None]

@@ -16,22 +16,19 @@ from flows.run import CaptureRun
 from flows.settings import plain_value
 from pipeline.errors import IncompleteStoreError
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.chips import candidate_chips, worst_chips
-from pipeline.simulator.choice import Decision, decide
 from pipeline.simulator.effects.effect import Effect, Light
+from pipeline.simulator.effects.light_units import unit_at
+from pipeline.simulator.effects.line import ROTATION, SLIT
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
 from pipeline.simulator.instrument import sweep_block
-from pipeline.simulator.manifest import list_effects, sum_up
-from pipeline.simulator.probe import Probe
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.simulated import SimulatedSource
-from pipeline.simulator.stored_light import unit_at
-from pipeline.simulator.survey_clock import sweep_starts
-from pipeline.simulator.survey_probe import probe_survey
-from pipeline.simulator.verification import verify
+from pipeline.simulator.selection.choice import Decision, decide
+from pipeline.simulator.selection.manifest import list_effects, sum_up
+from pipeline.simulator.selection.survey_probe import probe_survey
+from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
+from pipeline.simulator.simulated import SimulatedSource, sweep_starts
 from storage.archive import StageRef
 from storage.stored_tables import read_table
 
@@ -145,9 +142,9 @@ def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> d
     candidates = [
         chip
         for probe in probes
-        for chip in candidate_chips([one for one in whole if one.sweep in probe.sweeps], probe.places)
+        for chip in candidate_blocks([one for one in whole if one.sweep in probe.sweeps], probe.places)
     ]
-    worst = worst_chips(candidates, lambda block: expected_light(scene, block, LOOK), units)
+    worst = worst_blocks(candidates, lambda block: expected_light(scene, block, LOOK), units)
     return verify(decision, render, worst, units)
 
 

@@ -31,7 +31,7 @@ from pipeline.grid import UNLABELLED
 from pipeline.planning import price_of_seats
 from pipeline.savings import count_lines
 from pipeline.selection import frame_seats
-from pipeline.simulator.pointing import CommonOffset, PointingErrors
+from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive import StageRef
 from storage.class_maps import load_class_map

@@ -18,8 +18,7 @@ from pipeline.rig.camera_limits import CameraLimits, check_times
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
 from pipeline.rig.kept_files import KeptInMemory
 from pipeline.scan import Sweep
-from pipeline.simulator.raster import SceneLight, SceneRaster
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from pipeline.source import Line, Source
 from storage.fetched_files import FetchedFiles
 

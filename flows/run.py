@@ -35,8 +35,8 @@ from pipeline.ground import GroundView
 from pipeline.ground_grid import ground_grid
 from pipeline.once import Once
 from pipeline.scan import Sweep
-from pipeline.simulator.pointing import PointingErrors
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.effects.pointing import PointingErrors
+from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive import Archive
 from storage.layout import AngularGrid

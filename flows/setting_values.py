@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from pipeline.errors import BudgetError, SettingsError
-from pipeline.simulator.choice import named_effects
+from pipeline.simulator.effects.probe import Unit
 from pipeline.simulator.effects.registry import BY_NAME
-from pipeline.simulator.probe import Unit
 from pipeline.simulator.scenes.farm.farm_scene import refuse_removed
+from pipeline.simulator.selection.choice import named_effects
 from storage.block_work import Crew
 from storage.staging import is_name
 

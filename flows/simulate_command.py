@@ -26,7 +26,7 @@ from models.process import keep_freed_memory, use_one_thread
 from pipeline.errors import ArchiveError, SceneError, SettingsError
 from pipeline.grid import SceneGrid
 from pipeline.scan import Sweep
-from pipeline.simulator.manifest import UNIT_WORDS
+from pipeline.simulator.selection.manifest import UNIT_WORDS
 from storage.archive import Archive, StageRef
 from storage.scene_files import load_scene_file
 

@@ -30,7 +30,7 @@ from models.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, sc
 from models.regions import whole_field
 from pipeline.planning import FinePlan, plan_fine
 from pipeline.scan import Sweep
-from pipeline.simulator.survey_clock import sweep_starts
+from pipeline.simulator.simulated import sweep_starts
 from pipeline.source import Line, Source
 from storage.archive import StageRef, stage_key
 from storage.attention import Attention, write_attention

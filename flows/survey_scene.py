@@ -16,9 +16,8 @@ from models.weights import Description
 from pipeline.errors import SceneError, SettingsError
 from pipeline.grid import UNLABELLED
 from pipeline.once import Once
-from pipeline.simulator.raster import SceneLight
-from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, law_of_key
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight
 from storage.declared_sizes import machine_bytes
 from storage.raster_files import load_raster
 from storage.scene_files import load_scene_file

@@ -18,8 +18,8 @@ from pipeline.grid import SceneGrid
 from pipeline.rectify.region import mosaic_rows
 from pipeline.scan import Axis, CostModel, Sweep
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 

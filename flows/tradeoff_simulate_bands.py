@@ -12,11 +12,11 @@ from flows.simulated_lines import FarmLines, Light
 from flows.tradeoff import Setting, Tradeoff, register
 from flows.tradeoff_simulate import FOOTPRINT, Seen, prepare_footprint
 from pipeline.once import Once
-from pipeline.simulator.effects.effect import Effect, Moments
-from pipeline.simulator.raster import SceneLight
+from pipeline.simulator.effects.effect import Effect
+from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight
 
 EACH = "each band"
 GROUPS = (6, 4, 3, 2, 1)

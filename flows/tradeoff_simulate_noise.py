@@ -13,12 +13,9 @@ from flows.tradeoff import Level, Setting, Tradeoff, register
 from pipeline.camera import LineCamera
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.counting import QUANTISATION, READ_NOISE, SATURATION, SHOT
 from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.effects.quantisation import QUANTISATION
-from pipeline.simulator.effects.read_noise import READ_NOISE
-from pipeline.simulator.effects.saturation import SATURATION
-from pipeline.simulator.effects.shot import SHOT
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.rig_model import Rig
 

@@ -14,11 +14,10 @@ from flows.tradeoff_simulate import FOOTPRINT
 from pipeline.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.once import Once
 from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.line import SLIT
 from pipeline.simulator.effects.registry import RAYS
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.raster import SceneLight
 from pipeline.simulator.render import expected_light
-from pipeline.simulator.scene import RasterScene, to_bands
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, to_bands
 
 LINES = 2  # of each block
 RAYS_PER_PX = (1, 2, 4, 8)

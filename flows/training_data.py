@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, SettingsError
 from pipeline.grid import UNLABELLED
-from pipeline.simulator.scene import RasterScene, raster_from_values
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, FARM_NAMES, farm_scene, refuse_removed
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene
 from storage.datasets import DataSet, load_data_set
 from storage.scene_files import SceneFile
 

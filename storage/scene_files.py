@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.readings import MOST_STEPS, MOST_VALUE, beyond_range, find_beyond
-from pipeline.simulator.scene import BRIGHT_PERCENTILE
+from pipeline.simulator.scenes.image_scene import BRIGHT_PERCENTILE
 from storage.cube_sources import BLOCK_LINES, scene_lines
 from storage.dataset_layouts import find_layout
 from storage.declared_sizes import machine_bytes

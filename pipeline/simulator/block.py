@@ -1,7 +1,8 @@
-"""Some lines of one sweep as a rig takes them: what every effect may ask about where and when they are taken."""
+"""Some lines of one sweep as a rig takes them: what effects may ask about where and when, and their random streams."""
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 from pipeline.mirror import position_to_normal
 from pipeline.scan import Sweep, line_positions, sweep_positions
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.streams import line_stream
 
 Floats = NDArray[np.float64]
 
@@ -83,3 +83,27 @@ class SweepBlock:
     def stream(self, effect: str, number: int) -> np.random.Generator:
         """Give an effect's random stream at one line."""
         return line_stream(self.seed, self.sweep.name, effect, number)
+
+
+def line_stream(seed: int, sweep: str, effect: str, number: int) -> np.random.Generator:
+    """Give the stream of one effect at one line of one sweep: blocks, order and other effects never change it."""
+    return _stream(seed, _word(sweep), _word(effect), number)
+
+
+def sweep_stream(seed: int, sweep: str, effect: str) -> np.random.Generator:
+    """Give the stream of one effect for a whole sweep."""
+    return _stream(seed, _word(sweep), _word(effect))
+
+
+def unit_stream(unit: int, effect: str) -> np.random.Generator:
+    """Give the stream of what belongs to one copy of the rig, whatever it looks at: its fixed patterns."""
+    return _stream(unit, _word(effect))
+
+
+def _word(name: str) -> int:
+    return zlib.crc32(name.encode())
+
+
+def _stream(entropy: int, *key: int) -> np.random.Generator:
+    """Give a stream whose key is hashed to its state; words of SFC64 take half the time of a counter-based Philox."""
+    return np.random.Generator(np.random.SFC64(np.random.SeedSequence(entropy=entropy, spawn_key=key)))

@@ -16,13 +16,9 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError, ShapeError
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.dark_current import DARK_CURRENT, dark_electrons
-from pipeline.simulator.effects.defects import DEFECTS, dead_elements, hot_electrons
+from pipeline.simulator.effects.counting import EXACT, READ_NOISE, SATURATION, SHOT, well_reached
 from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.effects.read_noise import READ_NOISE
-from pipeline.simulator.effects.saturation import SATURATION, well_reached
-from pipeline.simulator.effects.shot import EXACT, SHOT
-from pipeline.simulator.noise import (
+from pipeline.simulator.effects.noise import (
     LEAST_MERGED_READ_E,
     least_expected,
     merged_noise,
@@ -30,6 +26,7 @@ from pipeline.simulator.noise import (
     photon_counts,
     rounded_counts,
 )
+from pipeline.simulator.effects.sensor import DARK_CURRENT, DEFECTS, dark_electrons, dead_elements, hot_electrons
 from pipeline.simulator.render import Choice
 
 Light = NDArray[np.float32]

@@ -14,19 +14,17 @@ from pipeline.errors import SettingsError
 from pipeline.mirror import direction_to_scene, position_to_direction, position_to_normal
 from pipeline.scan import Sweep, line_positions, shifted_position
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Effect, Moments
-from pipeline.simulator.effects.pupil import middle_normal
-from pipeline.simulator.effects.slit import box_of, box_parts
-from pipeline.simulator.effects.smear import folded_positions, smeared_positions
-from pipeline.simulator.footprint import Footprint, fold
-from pipeline.simulator.rays import RayViews, exact_views, straight_views
+from pipeline.simulator.effects.effect import OFF, Effect
+from pipeline.simulator.effects.line import box_of, box_parts, folded_positions, smeared_positions
+from pipeline.simulator.optics.footprint import Footprint, fold
+from pipeline.simulator.optics.kernel_fit import Moments
+from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal, straight_views
+from pipeline.simulator.optics.scene_light import Looker
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene
-from pipeline.simulator.scene_light import Looker
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, Scene
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
-
 LOOKS = 17  # lines of a sweep and samples of a line that tell how far a footprint's shape varies
 
 
@@ -160,7 +158,7 @@ def _looker_of(block: SweepBlock, choice: Choice) -> Looker:
 def _looker(
     rig: Rig, sweep: Sweep, wavelengths: bytes, blurs: tuple[tuple[Any, str], ...], names: tuple[str, ...]
 ) -> Looker:
-    wavelength, normal = np.frombuffer(wavelengths), middle_normal(sweep, rig)
+    wavelength, normal = np.frombuffer(wavelengths), middle_normal(sweep, rig.camera)
     moments = [blur.moments(rig, wavelength, variant, normal) for blur, variant in blurs]
     slit, smear, rotation = names
     views = views_all_over(rig, sweep, exact=rotation != OFF)

@@ -17,13 +17,9 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera, digitise
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.dark_current import DARK_CURRENT
-from pipeline.simulator.effects.fixed_pattern import PRNU
-from pipeline.simulator.effects.quantisation import QUANTISATION
-from pipeline.simulator.effects.read_noise import READ_NOISE
-from pipeline.simulator.effects.saturation import SATURATION
-from pipeline.simulator.effects.shot import SHOT
-from pipeline.simulator.noise import merged_noise, normal_deviates, photon_counts, rounded_counts
+from pipeline.simulator.effects.counting import QUANTISATION, READ_NOISE, SATURATION, SHOT
+from pipeline.simulator.effects.noise import merged_noise, normal_deviates, photon_counts, rounded_counts
+from pipeline.simulator.effects.sensor import DARK_CURRENT, PRNU
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.rig_model import Detector, Rig
 

@@ -13,21 +13,19 @@ from measure import Clock, Row, ratio, time_in_turn
 
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.chips import candidate_chips, worst_chips
-from pipeline.simulator.choice import Decision, decide
 from pipeline.simulator.effects.effect import Effect, Light
+from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.line import ROTATION, SLIT
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.probe import Probe
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Rig
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.stored_light import noise_electrons
-from pipeline.simulator.survey_probe import probe_scene
-from pipeline.simulator.verification import verify
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.selection.choice import Decision, decide
+from pipeline.simulator.selection.survey_probe import probe_scene
+from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
 from tests.pipeline.simulator.bound_trials import DRAWN, Trial, trials
 from tests.pipeline.simulator.random_cases import random_case
 
@@ -152,7 +150,7 @@ def _verified(scene: RasterScene, name: str, decision: Decision, probe: Probe, b
         return noise_electrons(light, rig, binning)
 
     whole = [_block(scene, rig, sweep, range(sweep.lines)) for sweep in probe.sweeps]
-    chips = worst_chips(candidate_chips(whole, probe.places), lambda chip: expected_light(scene, chip, LOOK), units)
+    chips = worst_blocks(candidate_blocks(whole, probe.places), lambda chip: expected_light(scene, chip, LOOK), units)
     measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), chips, units)
     spent = time.process_time() - clock
     worst = max(measured.values())

@@ -14,21 +14,18 @@ from numpy.typing import NDArray
 
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.choice import CHEAP_SHARE, Decision, decide
-from pipeline.simulator.effects.aberration import ABERRATION
-from pipeline.simulator.effects.diffraction import DIFFRACTION
+from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import Effect
-from pipeline.simulator.effects.keystone import KEYSTONE
+from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.stored_light import noise_electrons
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.selection.choice import CHEAP_SHARE, Decision, decide
+from pipeline.simulator.selection.survey_probe import probe_scene
 
 SIZE = 2560  # px of the scene
 LINES, AT_ONCE = 256, 16

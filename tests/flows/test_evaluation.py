@@ -15,9 +15,9 @@ from models.metrics import confusion
 from pipeline.camera import LineCamera
 from pipeline.grid import UNLABELLED
 from pipeline.rectify.illumination import LightRatio
-from pipeline.simulator.pointing import CommonOffset, PointingErrors
+from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive import Archive, StageRef
 

@@ -23,10 +23,10 @@ from models.weights import Description
 from pipeline.camera import LineCamera
 from pipeline.errors import ArchiveError, SceneError, SettingsError
 from pipeline.grid import SceneGrid
-from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.scenes.farm.canvas import CLASSES
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, REMOVED_LAW, farm_scene
 from pipeline.simulator.scenes.farm.seasons import sun_over_farm
+from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive import Archive
 from storage.lineage import Catalogue
 

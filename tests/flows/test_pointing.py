@@ -18,7 +18,7 @@ from flows.survey_command import run_survey
 from models.inference import Glance
 from models.spectral import SpectralBasis
 from pipeline.grid import SceneGrid
-from pipeline.simulator.pointing import PointingErrors
+from pipeline.simulator.effects.pointing import PointingErrors
 from storage.archive import StageRef
 from storage.layout import open_group, read_array
 from storage.patches import PatchWriter

@@ -45,7 +45,8 @@ from pipeline.rig.refusals import DeviceGone
 from pipeline.rig.transport import SerialTransport
 from pipeline.scan import Sweep
 from pipeline.simulator.instrument import effects_on
-from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import References
 from storage.archive import Archive

@@ -21,10 +21,10 @@ from flows.tradeoff_simulate_noise import DIM_NOISE, NOISE, law_of_numbers
 from flows.tradeoff_simulate_rays import SUPERSAMPLING
 from flows.tradeoff_table import print_tradeoff
 from pipeline.camera import LineCamera
+from pipeline.simulator.effects.blurs import KEYSTONE
+from pipeline.simulator.effects.counting import SHOT
 from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.effects.keystone import KEYSTONE
-from pipeline.simulator.effects.shot import SHOT
-from pipeline.simulator.effects.slit import SLIT
+from pipeline.simulator.effects.line import SLIT
 from pipeline.simulator.rig_model import Rig
 
 

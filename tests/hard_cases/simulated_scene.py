@@ -11,17 +11,16 @@ from pipeline.camera import LineCamera
 from pipeline.once import Once
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.choice import Decision, decide
 from pipeline.simulator.effects.effect import Effect
+from pipeline.simulator.effects.light_units import noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.instrument import sweep_block
-from pipeline.simulator.options import acts_on_light
-from pipeline.simulator.raster import SceneLight, SceneRaster
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
-from pipeline.simulator.scene import RasterScene
-from pipeline.simulator.stored_light import noise_electrons
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.selection.choice import Decision, decide
+from pipeline.simulator.selection.options import acts_on_light
+from pipeline.simulator.selection.survey_probe import probe_scene
 
 ROUNDING = 4e-6  # of the light over its noise: sums of float32 in another order
 CAMERA = LineCamera(samples=64)

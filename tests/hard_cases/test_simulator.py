@@ -13,17 +13,15 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.errors import SceneError
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.aberration import ABERRATION
-from pipeline.simulator.effects.keystone import KEYSTONE
+from pipeline.simulator.effects.blurs import ABERRATION, KEYSTONE
+from pipeline.simulator.effects.counting import SHOT
+from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.registry import EFFECTS, READOUT
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.shot import SHOT
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.options import ALWAYS_ON
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Detector, Optics, Rig
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.selection.options import ALWAYS_ON
+from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.hard_cases.simulated_scene import CAMERA, EVERYTHING, RIG, SWEEP, block_of, decided, left_out, scene_of
 
 TOLERANCES = [0.0, 0.1, math.inf]

@@ -13,8 +13,8 @@ from models.spectral import SpectralBasis
 from pipeline.camera import LineCamera, look
 from pipeline.errors import SceneError
 from pipeline.grid import SceneGrid
-from pipeline.simulator.raster import SceneRaster
-from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneRaster
 
 CAMERA = LineCamera(bits=14)
 NM = np.linspace(450, 950, 6)

@@ -14,13 +14,13 @@ from pipeline.errors import PoseError, ShapeError
 from pipeline.mirror import direction_to_scene, mirror_throughput, position_to_normal, reflect
 from pipeline.once import Once
 from pipeline.scan import Sweep, line_positions, sweep_positions
+from pipeline.simulator.effects.pointing import CommonOffset
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.instrument import USUAL, effects_on, render_lines, sweep_block
-from pipeline.simulator.pointing import CommonOffset
-from pipeline.simulator.raster import SceneLight, SceneRaster
 from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
-from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 
 CAMERA = LineCamera()
 OPTICS = effects_on("rotation", "slit", "smear")

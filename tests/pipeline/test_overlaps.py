@@ -18,11 +18,11 @@ from pipeline.rectify.alignment import no_shifts
 from pipeline.rectify.overlaps import BroadSweep, PlacedImage, broad_bands, overlap_windows, places_seen
 from pipeline.rectify.seams import Registration, measure_windows, place_images, register_sweeps
 from pipeline.scan import Axis, Sweep, line_positions, points_of_scan, sweep_to_scene
+from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.instrument import effects_on
-from pipeline.simulator.pointing import PointingErrors
-from pipeline.simulator.raster import SceneLight
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import SceneLight
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 CAMERA = LineCamera(samples=160)

@@ -10,8 +10,8 @@ import pytest
 from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, ShapeError
 from pipeline.once import Once
-from pipeline.simulator.raster import SceneLight, SceneRaster
-from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 
 CAMERA = LineCamera()
 WAVELENGTH = np.array([660.0, 800.0])

@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.simulator.effects.lag import responses
+from pipeline.simulator.effects.mirror_path import responses
 
 Floats = NDArray[np.float64]
 KEPT_STEPS = 20_000  # commands that an axis remembers; older times are given as the oldest state that is known

@@ -25,8 +25,8 @@ from pipeline.rig.steering import wire_positions
 from pipeline.scan import Sweep, sweep_positions
 from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.instrument import render_lines
-from pipeline.simulator.probe import Probe
 from pipeline.simulator.render import Choice
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource

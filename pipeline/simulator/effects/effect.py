@@ -2,13 +2,13 @@
 
 An effect does its work at one of six places of the chain, in this order: the mirror looks elsewhere (``Aim``), rays
 meet the scene elsewhere (``Displacement``), the footprint is blurred or shifted band by band (``Blur``), light is
-multiplied (``Gain``) or changed (``Change``), electrons are read out (``readout.py``). All before that are linear in
-the light.
+multiplied (``Gain``) or changed (``LightChange``), electrons are read out (``readout.py``). All before that are linear
+in the light.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.rig_model import Rig
 
 Floats = NDArray[np.float64]
@@ -78,26 +79,6 @@ class Displacement(Effect, Protocol):
 
     def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
         """Give what to add to scene points (line, sample): along the line and the scan. [px]"""
-
-
-@dataclass(frozen=True)
-class Moments:
-    """What a blur does to each band, (2, band) each: along the line and the scan.
-
-    A shift [px], a Gaussian of a variance [px^2], and diffraction at an elliptic pupil, told by the wavelength over the
-    pupil's widths [px]; None without any. The pattern of a pupil has no variance: no Gaussian stands for it.
-    """
-
-    shift: Floats
-    variance: Floats
-    waves: Floats | None = None
-
-    @staticmethod
-    def together(blurs: Sequence[Moments], bands: int) -> Moments:
-        """Those of blurs one after the other. At most one of them is diffraction."""
-        none = np.zeros((2, bands))
-        shift, variance = sum((one.shift for one in blurs), none), sum((one.variance for one in blurs), none)
-        return Moments(shift, variance, next((one.waves for one in blurs if one.waves is not None), None))
 
 
 class Blur(Effect, Protocol):

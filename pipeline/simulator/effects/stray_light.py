@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipeline.errors import ShapeError
 from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Optics, Rig
 
 Light = NDArray[np.float32]

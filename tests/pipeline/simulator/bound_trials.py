@@ -9,10 +9,10 @@ import numpy as np
 
 from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Effect, Light
+from pipeline.simulator.effects.light_units import noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS, READOUT
-from pipeline.simulator.options import SAFETY, Menu, list_options
 from pipeline.simulator.render import expected_light
-from pipeline.simulator.stored_light import noise_electrons
+from pipeline.simulator.selection.options import SAFETY, Menu, list_options
 from tests.pipeline.simulator.random_cases import Case
 
 ROUNDING = 4e-6  # of the light over the unit: sums of float32 in another order

@@ -9,9 +9,8 @@ from scipy.special import ndtr
 
 from pipeline.mirror import position_to_normal
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.pupil import middle_normal
-from pipeline.simulator.rays import exact_views
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.optics.rays import exact_views, middle_normal
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 Places = tuple[np.ndarray, np.ndarray]
 
@@ -43,7 +42,7 @@ def fine_light(
 
 def _moments(block: SweepBlock, blurs: dict[Any, str]) -> tuple[np.ndarray, np.ndarray]:
     """Shift and variance, (band, 2) each."""
-    nm, normal = block.wavelength_nm, middle_normal(block.sweep, block.rig)
+    nm, normal = block.wavelength_nm, middle_normal(block.sweep, block.rig.camera)
     found = [blur.moments(block.rig, nm, variant, normal) for blur, variant in blurs.items()]
     none = np.zeros((2, len(nm)))
     return sum((one.shift for one in found), none).T, sum((one.variance for one in found), none).T

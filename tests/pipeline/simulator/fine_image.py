@@ -15,7 +15,7 @@ from scipy.special import j1
 
 from pipeline.camera import LineCamera
 from pipeline.scan import Sweep
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.probe import Probe
 
 Floats = NDArray[np.float64]
 Transfer = Floats | complex

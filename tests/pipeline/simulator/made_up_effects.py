@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound, Light
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
 SWEEP = Sweep("fine-0", "fine", "x", 0.0, -50.0, 100)

@@ -12,7 +12,7 @@ from pipeline.camera import LineCamera
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Air, Rig, Sky
 
 Floats = NDArray[np.float64]

@@ -18,12 +18,11 @@ from pipeline.camera import LineCamera
 from pipeline.once import Once
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.coatings import Coating
-from pipeline.simulator.probe import Probe
-from pipeline.simulator.raster import SceneLight, SceneRaster
+from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.optics.coatings import Coating
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Relief, Rig, Sky
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.selection.survey_probe import probe_scene
 
 Floats = NDArray[np.float64]
 LONG_PX, WIDE_PX = 640, 160  # of a scene

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.once import Once
 from pipeline.scan import Sweep
-from pipeline.simulator.band_differences import second_difference, steepest_difference
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.probe import Probe, Unit
-from pipeline.simulator.raster import SceneLight, SceneRaster
+from pipeline.simulator.effects.gain_range import second_difference, steepest_difference
+from pipeline.simulator.effects.probe import Probe, Unit
 from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]

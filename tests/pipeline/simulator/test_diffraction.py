@@ -14,23 +14,22 @@ from scipy.special import j0, j1
 from pipeline.once import Once
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.aberration import ABERRATION
-from pipeline.simulator.effects.diffraction import (
+from pipeline.simulator.effects.blurs import (
+    ABERRATION,
     DIFFRACTION,
+    KEYSTONE,
     THIRD_RING,
     airy_energy,
     airy_variance,
     diffraction_fwhm,
 )
-from pipeline.simulator.effects.effect import Moments
-from pipeline.simulator.effects.keystone import KEYSTONE
-from pipeline.simulator.effects.pupil import pupil_contrast
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.footprint import fold
-from pipeline.simulator.raster import SceneLight, SceneRaster
+from pipeline.simulator.effects.line import SLIT
+from pipeline.simulator.optics.footprint import fold
+from pipeline.simulator.optics.kernel_fit import Moments
+from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from tests.pipeline.simulator.fine_image import FLAT, IMAGES, SWEEP, airy, airy_contrast, change, gaussian, probe_of
 
 RIG = Rig()

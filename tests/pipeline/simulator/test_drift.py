@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from pipeline.once import Once
-from pipeline.simulator.effects.drift import DRIFT, daylight_range
-from pipeline.simulator.raster import SceneLight, SceneRaster
+from pipeline.simulator.effects.lighting import DRIFT, daylight_range
 from pipeline.simulator.render import expected_light
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from tests.pipeline.simulator.outdoors import (
     BANDS,
     MORNING,

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipeline.camera import LineCamera, look
-from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.farm.land import (
     Parcel,
@@ -23,6 +22,7 @@ from pipeline.simulator.scenes.farm.land import (
     stream,
     stripes,
 )
+from pipeline.simulator.scenes.scene import RasterScene
 
 
 @pytest.fixture(scope="module")

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, SettingsError, WavelengthError
-from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.scenes.farm.canvas import CLASS_COLOURS, CLASSES
 from pipeline.simulator.scenes.farm.farm_plan import FarmPlan, farm_plan
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene, law_of_key, refuse_removed
 from pipeline.simulator.scenes.farm.land import parcel_pixels
 from pipeline.simulator.scenes.farm.spectra import MATERIALS
+from pipeline.simulator.scenes.scene import RasterScene
 
 SIZE, LONG, WIDE = (420, 520), (400, 1000), (720, 1000)
 

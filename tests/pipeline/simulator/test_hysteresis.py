@@ -9,8 +9,8 @@ import pytest
 
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.hysteresis import HYSTERESIS, THERMAL_DRIFT, pointing_field, scan_sign
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.mirror_pointing import HYSTERESIS, THERMAL_DRIFT, pointing_field, scan_sign
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Detector, MirrorMotion, Rig
 
 SWEEP = Sweep("strip", "fine", "x", 640.0, -700.0, 1401)

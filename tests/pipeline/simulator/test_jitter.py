@@ -11,8 +11,8 @@ from pipeline.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.scan import Sweep
 from pipeline.second_order import pointing_error
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.jitter import JITTER, tilt_to_scene
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.mirror_pointing import JITTER, tilt_to_scene
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -500.0, 1001)

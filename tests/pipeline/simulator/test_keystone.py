@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 
 from pipeline.once import Once
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.keystone import KEYSTONE, keystone_shift
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.raster import SceneLight, SceneRaster
+from pipeline.simulator.effects.blurs import KEYSTONE, keystone_shift
+from pipeline.simulator.effects.line import SLIT
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from tests.pipeline.simulator.fine_image import FLAT, IMAGES, SWEEP, change, probe_of, shifted
 
 NM = np.array([400.0, 700.0, 1000.0])

@@ -14,8 +14,8 @@ from scipy.linalg import expm
 from pipeline.camera import LineCamera
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.lag import LAG, responses, transient
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.mirror_path import LAG, responses, transient
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -100.0, 200)

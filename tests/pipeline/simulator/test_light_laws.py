@@ -14,18 +14,13 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.aberration import ABERRATION
-from pipeline.simulator.effects.defocus import DEFOCUS
-from pipeline.simulator.effects.diffraction import DIFFRACTION
+from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import OFF, Effect
-from pipeline.simulator.effects.keystone import KEYSTONE
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.effects.smear import SMEAR
-from pipeline.simulator.raster import SceneRaster
+from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig
-from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneRaster
 from tests.pipeline.simulator.bound_trials import IN_THE_LIGHT
 
 SIZE = 96

@@ -12,19 +12,15 @@ from pipeline.camera import LineCamera
 from pipeline.once import Once
 from pipeline.scan import Sweep, sweep_to_scene
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.hysteresis import HYSTERESIS, THERMAL_DRIFT
-from pipeline.simulator.effects.jitter import JITTER
-from pipeline.simulator.effects.lag import LAG
-from pipeline.simulator.effects.parallax import PARALLAX
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.effects.staircase import STAIRCASE
-from pipeline.simulator.effects.wind import WIND
-from pipeline.simulator.probe import Probe
-from pipeline.simulator.raster import SceneLight, SceneRaster
+from pipeline.simulator.effects.line import ROTATION, SLIT
+from pipeline.simulator.effects.mirror_path import LAG, STAIRCASE
+from pipeline.simulator.effects.mirror_pointing import HYSTERESIS, JITTER, THERMAL_DRIFT
+from pipeline.simulator.effects.moving_air import WIND
+from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.effects.relief import PARALLAX
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, MirrorMotion, Rig
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneLight, SceneRaster
 
 CAMERA = LineCamera(samples=64, exposure_ms=4.0)
 MOTION = replace(

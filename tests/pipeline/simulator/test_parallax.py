@@ -12,8 +12,8 @@ from pipeline.mirror import scene_to_direction
 from pipeline.scan import Sweep, sweep_to_scene
 from pipeline.second_order import relief_error
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.parallax import PARALLAX, closeness
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.effects.relief import PARALLAX, closeness
 from pipeline.simulator.rig_model import Air, Rig
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -100.0, 201)

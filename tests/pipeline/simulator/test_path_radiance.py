@@ -15,13 +15,13 @@ from pipeline.coverage import full_sweeps
 from pipeline.grid import SceneGrid
 from pipeline.once import Once
 from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.effects.path_radiance import PATH_RADIANCE, extinction_per_m, rayleigh_per_m
-from pipeline.simulator.gain_range import fixed_variance
-from pipeline.simulator.raster import SceneLight, SceneRaster
+from pipeline.simulator.effects.haze import PATH_RADIANCE, extinction_per_m, rayleigh_per_m
+from pipeline.simulator.effects.light_units import fixed_variance
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Rig, Sky
-from pipeline.simulator.scene import RasterScene, raster_from_values
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.outdoors import (
     BANDS,
     MORNING,

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.coatings import reflectance
-from pipeline.simulator.effects.polarisation import POLARISATION
+from pipeline.simulator.effects.mirror_throughput import POLARISATION
+from pipeline.simulator.optics.coatings import reflectance
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 from tests.pipeline.simulator.spectral_light import probe_of, rig_with
 

@@ -14,13 +14,8 @@ from pipeline.camera import LineCamera
 from pipeline.errors import SceneError, ShapeError
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.dark_current import DARK_CURRENT
-from pipeline.simulator.effects.defects import DEFECTS, dead_elements, hot_electrons
-from pipeline.simulator.effects.fixed_pattern import PRNU, STRIPING
-from pipeline.simulator.effects.quantisation import QUANTISATION
-from pipeline.simulator.effects.read_noise import READ_NOISE
-from pipeline.simulator.effects.saturation import SATURATION
-from pipeline.simulator.effects.shot import SHOT
+from pipeline.simulator.effects.counting import QUANTISATION, READ_NOISE, SATURATION, SHOT
+from pipeline.simulator.effects.sensor import DARK_CURRENT, DEFECTS, PRNU, STRIPING, dead_elements, hot_electrons
 from pipeline.simulator.readout import dark_frame, read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Detector, Rig

@@ -12,15 +12,13 @@ from pipeline.errors import SettingsError
 from pipeline.once import Once
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import Moments
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.effects.smear import SMEAR
+from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.effects.stray_light import STRAY_LIGHT
-from pipeline.simulator.raster import SceneLight, SceneRaster
+from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 
 CAMERA = LineCamera()
 FINE = Sweep("fine", "fine", "x", strip_px=900.0, start_px=-700.0, lines=20)

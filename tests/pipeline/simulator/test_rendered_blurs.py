@@ -11,17 +11,13 @@ from numpy.typing import NDArray
 from pipeline.once import Once
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.aberration import ABERRATION
-from pipeline.simulator.effects.defocus import DEFOCUS
-from pipeline.simulator.effects.diffraction import DIFFRACTION
-from pipeline.simulator.effects.keystone import KEYSTONE
-from pipeline.simulator.effects.pupil import pupil_contrast
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.effects.turbulence import TURBULENCE
-from pipeline.simulator.raster import SceneLight, SceneRaster
+from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
+from pipeline.simulator.effects.line import SLIT
+from pipeline.simulator.effects.moving_air import TURBULENCE
+from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 
 NM = np.array([400.0, 600.0, 1000.0])
 RIG = Rig(optics=Optics(aberration_px=0.3, keystone_px=0.4), air=Air(distance_m=120.0))

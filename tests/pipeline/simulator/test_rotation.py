@@ -9,13 +9,13 @@ from pipeline.camera import LineCamera
 from pipeline.mirror import line_rotation, position_to_direction
 from pipeline.scan import Sweep, line_positions
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
+from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import RasterScene, raster_from_values
-from pipeline.simulator.stored_light import noise_electrons
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.selection.survey_probe import probe_scene
 
 RIG = Rig(camera=LineCamera(samples=80))
 

@@ -12,7 +12,7 @@ from pipeline.rectify.region import read_seats
 from pipeline.scan import Axis
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.seat_windows import render_seats, seat_window
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 

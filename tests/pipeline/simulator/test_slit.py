@@ -10,13 +10,12 @@ import pytest
 from pipeline.camera import LineCamera, footprint_kernel
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.slit import SLIT, box_of, box_parts
-from pipeline.simulator.effects.turned import MARGIN
-from pipeline.simulator.parting import fewest_parts, misplaced
+from pipeline.simulator.effects.line import MARGIN, SLIT, box_of, box_parts
+from pipeline.simulator.optics.tap_sums import fewest_parts, misplaced
 from pipeline.simulator.render import expected_light, views_all_over
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import raster_from_values
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.selection.survey_probe import probe_scene
 
 RIG = Rig(camera=LineCamera(samples=64))
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-14.5, lines=30)

@@ -8,14 +8,12 @@ import pytest
 from pipeline.camera import LineCamera
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.effects.smear import SMEAR, folded_positions, held_variance, smeared_positions
+from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR, folded_positions, held_variance, smeared_positions
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import raster_from_values
-from pipeline.simulator.stored_light import noise_electrons
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.bound_trials import trials
 from tests.pipeline.simulator.random_cases import random_case
 

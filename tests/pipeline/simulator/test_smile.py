@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.response import RESPONSE
-from pipeline.simulator.effects.smile import SMILE, wavelength_shift
+from pipeline.simulator.effects.spectrometer import RESPONSE, SMILE, wavelength_shift
 from pipeline.simulator.effects.stray_light import STRAY_LIGHT
 from pipeline.simulator.render import expected_light
 from tests.pipeline.simulator.spectral_light import (

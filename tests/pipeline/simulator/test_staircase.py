@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from pipeline.scan import Sweep
 from pipeline.second_order import staircase_jitter
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.staircase import STAIRCASE, beside_plan
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.mirror_path import STAIRCASE, beside_plan
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -20.0, 41)

@@ -13,21 +13,18 @@ from pipeline.errors import SceneError, SettingsError
 from pipeline.once import Once
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.aberration import ABERRATION
-from pipeline.simulator.effects.diffraction import DIFFRACTION
-from pipeline.simulator.effects.keystone import KEYSTONE
+from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
+from pipeline.simulator.effects.light_units import noise_electrons, stored_mean
+from pipeline.simulator.effects.line import ROTATION, SLIT
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.options import SAFETY, list_options
-from pipeline.simulator.probe import Probe
-from pipeline.simulator.raster import SceneLight, SceneRaster
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Detector, Rig
-from pipeline.simulator.scene import RasterScene, raster_from_values
-from pipeline.simulator.stored_light import noise_electrons, stored_mean
-from pipeline.simulator.survey_looks import views_of_places
-from pipeline.simulator.survey_probe import probe_scene, probe_survey
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.selection.options import SAFETY, list_options
+from pipeline.simulator.selection.survey_looks import views_of_places
+from pipeline.simulator.selection.survey_probe import probe_scene, probe_survey
 
 RIG = Rig(camera=LineCamera(samples=96))
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-30.0, lines=61)

@@ -12,16 +12,12 @@ from pipeline.camera import LineCamera
 from pipeline.once import Once
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.aberration import ABERRATION
-from pipeline.simulator.effects.diffraction import DIFFRACTION
-from pipeline.simulator.effects.keystone import KEYSTONE
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.effects.smear import SMEAR
-from pipeline.simulator.raster import SceneLight
+from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
+from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight
 from tests.pipeline.simulator.fine_footprint import fine_light
 
 CAMERA = LineCamera()

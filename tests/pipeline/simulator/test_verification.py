@@ -10,10 +10,10 @@ import pytest
 
 from pipeline.errors import BoundError
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.choice import Decision, decide
 from pipeline.simulator.effects.effect import Effect, Light
-from pipeline.simulator.manifest import TOTAL
-from pipeline.simulator.verification import Floats, verify
+from pipeline.simulator.selection.choice import Decision, decide
+from pipeline.simulator.selection.manifest import TOTAL
+from pipeline.simulator.selection.verification import Floats, verify
 from tests.pipeline.simulator.made_up_effects import RIG, SWEEP, Brightening, MadeUp, even_probe
 
 BLOCK = SweepBlock(RIG, SWEEP, range(20, 28), np.array([500.0, 600.0]), (200, 700))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pipeline.mirror import mirror_throughput
 from pipeline.scan import Sweep, line_positions
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.vignetting import MOST_BEND, VIGNETTING
+from pipeline.simulator.effects.mirror_throughput import MOST_BEND, VIGNETTING
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from tests.pipeline.simulator.spectral_light import probe_of, rig_with, small_scene, worst

@@ -11,14 +11,11 @@ from pipeline.camera import LineCamera
 from pipeline.once import Once
 from pipeline.rectify.calibrate import calibrate
 from pipeline.scan import Sweep, line_positions
-from pipeline.simulator.effects.dark_current import dark_electrons
-from pipeline.simulator.effects.defects import dead_elements, hot_electrons
-from pipeline.simulator.effects.fixed_pattern import response_gain, stripe_gain
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
+from pipeline.simulator.effects.sensor import dark_electrons, dead_elements, hot_electrons, response_gain, stripe_gain
 from pipeline.simulator.instrument import USUAL, effects_on
-from pipeline.simulator.raster import SceneLight, SceneRaster
 from pipeline.simulator.rig_model import Detector, Rig
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import References
 

@@ -11,8 +11,8 @@ import pytest
 from pipeline.camera import LineCamera
 from pipeline.scan import Sweep, sweep_to_scene
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.wind import WIND, line_to_line_px, sway_px, within_exposure_px
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.moving_air import WIND, line_to_line_px, sway_px, within_exposure_px
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Air, Rig
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -100.0, 201)

@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.errors import SettingsError
 from pipeline.once import Once
-from pipeline.simulator.raster import SceneLight, SceneRaster
-from pipeline.simulator.scene import RasterScene
 from pipeline.simulator.scenes.farm.borders import dig_ponds, paint_borders, plant_trees
 from pipeline.simulator.scenes.farm.canvas import CLASS_COLOURS, CLASSES, Canvas, Ground, Painting
 from pipeline.simulator.scenes.farm.farm_plan import FarmPlan, farm_plan
@@ -37,6 +35,7 @@ from pipeline.simulator.scenes.farm.fields import paint_fields
 from pipeline.simulator.scenes.farm.land import stream
 from pipeline.simulator.scenes.farm.spectra import PANEL_REFLECTANCE, band_centres, spectral_library
 from pipeline.simulator.scenes.farm.weeds import plant_weeds
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 
 # A law is what a seed is drawn by; it stands first in a scene's key, and one that is out there never changes.
 FARM_LAW, REMOVED_LAW = "farm@2", "farm@1"
