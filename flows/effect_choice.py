@@ -39,18 +39,18 @@ RECORD = "effects.json"
 LOOK = {
     ROTATION: ROTATION.variants[0],
     SLIT: SLIT.variants[-1],
-}  # what chips are chosen by: the footprint alone, where lines really lie
+}  # what lines are chosen by: the footprint alone, where lines really lie
 DRAFT, VERIFIED = 0.3, 1.0
 
 
 def choose_effects(run: CaptureRun, produce: Produce) -> StageRef:
-    """Decide for scene and rig which effects to simulate, and check it on the worst chips of the scene.
+    """Decide for scene and rig which effects to simulate, and check it on the worst lines of the scene.
 
     Where a rig takes the lines there is nothing to decide.
 
     Raises
     ------
-    BoundError : what would be left out changes a chip by more than its bound says.
+    BoundError : what would be left out changes light by more than its bound says.
     SceneError : the scene holds a number that is not finite.
     """
     tolerance, asked = run.settings.tol, run.settings.effects
@@ -70,7 +70,7 @@ def choose_effects(run: CaptureRun, produce: Produce) -> StageRef:
 
     params = {
         "scene": run.scene.key,
-        "seed": run.settings.seed,  # of what is drawn for the chips
+        "seed": run.settings.seed,  # of what is drawn for the lines
         "asked": asked,
         "tol": str(tolerance),
         "camera": asdict(run.camera),
@@ -124,7 +124,7 @@ def source_with(
 
 
 def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> dict[str, float]:
-    """Measure what is left out on the worst chips of the scene, in the unit of the tolerance."""
+    """Measure what is left out on the worst lines of the scene, in the unit of the tolerance."""
     scene, rig = run.scene, run.settings.simulated_rig
 
     def units(light: Light, binning: int) -> Light:
@@ -140,9 +140,9 @@ def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> d
 
     whole = _whole_sweeps(run)
     candidates = [
-        chip
+        block
         for probe in probes
-        for chip in candidate_blocks([one for one in whole if one.sweep in probe.sweeps], probe.places)
+        for block in candidate_blocks([one for one in whole if one.sweep in probe.sweeps], probe.places)
     ]
     worst = worst_blocks(candidates, lambda block: expected_light(scene, block, LOOK), units)
     return verify(decision, render, worst, units)

@@ -81,29 +81,21 @@ class SweepBlock:
         return centres
 
     def stream(self, effect: str, number: int) -> np.random.Generator:
-        """Give an effect's random stream at one line."""
-        return line_stream(self.seed, self.sweep.name, effect, number)
-
-
-def line_stream(seed: int, sweep: str, effect: str, number: int) -> np.random.Generator:
-    """Give the stream of one effect at one line of one sweep: blocks, order and other effects never change it."""
-    return _stream(seed, _word(sweep), _word(effect), number)
+        """Give an effect's random stream at one line: blocks, order and other effects never change it."""
+        return _stream(self.seed, self.sweep.name, effect, number)
 
 
 def sweep_stream(seed: int, sweep: str, effect: str) -> np.random.Generator:
     """Give the stream of one effect for a whole sweep."""
-    return _stream(seed, _word(sweep), _word(effect))
+    return _stream(seed, sweep, effect)
 
 
 def unit_stream(unit: int, effect: str) -> np.random.Generator:
     """Give the stream of what belongs to one copy of the rig, whatever it looks at: its fixed patterns."""
-    return _stream(unit, _word(effect))
+    return _stream(unit, effect)
 
 
-def _word(name: str) -> int:
-    return zlib.crc32(name.encode())
-
-
-def _stream(entropy: int, *key: int) -> np.random.Generator:
+def _stream(entropy: int, *key: str | int) -> np.random.Generator:
     """Give a stream whose key is hashed to its state; words of SFC64 take half the time of a counter-based Philox."""
-    return np.random.Generator(np.random.SFC64(np.random.SeedSequence(entropy=entropy, spawn_key=key)))
+    words = [zlib.crc32(one.encode()) if isinstance(one, str) else one for one in key]
+    return np.random.Generator(np.random.SFC64(np.random.SeedSequence(entropy=entropy, spawn_key=words)))

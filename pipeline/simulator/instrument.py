@@ -70,11 +70,10 @@ def sweep_block(
 
     ``samples`` are the camera's, before binning; ``started_s`` is when the sweep starts, after the survey did.
     """
-    exposures = rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
+    white = scene.panel_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     return SweepBlock(
-        rig, sweep, lines, scene.wavelength_nm, scene.shape, seed, samples, started_s, scene.fwhm_nm,
-        scene.panel_electrons.astype(np.float64) * exposures,
-    )  # fmt: skip
+        rig, sweep, lines, scene.wavelength_nm, scene.shape, seed, samples, started_s, scene.fwhm_nm, white
+    )
 
 
 def render_lines(

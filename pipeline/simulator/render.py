@@ -16,7 +16,7 @@ from pipeline.scan import Sweep, line_positions, shifted_position
 from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Effect
 from pipeline.simulator.effects.line import box_of, box_parts, folded_positions, smeared_positions
-from pipeline.simulator.optics.footprint import Footprint, fold
+from pipeline.simulator.optics.footprint import fold
 from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal, straight_views
 from pipeline.simulator.optics.scene_light import Looker
@@ -83,11 +83,6 @@ def expected_light(scene: Scene, block: SweepBlock, chosen: Mapping[Any, str] | 
     if block.samples is not None and any(getattr(effect, "whole_line", False) for effect, _ in choice.effects):
         return expected_light(scene, replace(block, samples=None), choice)[:, block.columns]
     return _changed(_seen(scene, block, choice), block, choice)
-
-
-def folded_footprint(block: SweepBlock, choice: Choice) -> Footprint:
-    """Fold slit, pixel, the blurs that are on and perhaps held positions: the same for all of a sweep, made once."""
-    return _looker_of(block, choice).footprint
 
 
 def held_positions(block: SweepBlock, choice: Choice) -> Floats:

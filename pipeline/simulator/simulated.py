@@ -76,10 +76,8 @@ class SimulatedSource:
 
     def render(self, sweep: Sweep, lines: range, samples: range | None = None) -> NDArray[np.uint16]:
         """Give raw numbers (line, sample, band) of some lines, and of some binned samples; see `render_lines`."""
-        return render_lines(
-            self.scene, self.rig, self.choice, sweep, lines,
-            seed=self.seed, started_s=self.started_s(sweep), samples=samples,
-        )  # fmt: skip
+        start, of_these = self.started_s(sweep), (self.scene, self.rig, self.choice, sweep, lines)
+        return render_lines(*of_these, seed=self.seed, started_s=start, samples=samples)
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
         """Give the sweep's lines one by one, from line ``first`` on.

@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.effects.effect import OFF, Bound, Merged
+from pipeline.simulator.effects.effect import OFF, Blur, Bound, Merged
 from pipeline.simulator.effects.probe import UNITS, Probe
 from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.optics.rays import normals_met, pupil_contrast, spread_of_rays, spread_of_waves
@@ -18,21 +18,16 @@ from pipeline.simulator.rig_model import Rig
 
 Floats = NDArray[np.float64]
 AIRY, GAUSSIAN, ONE_WIDTH = "airy", "gaussian", "one-width"
-WIDTH = 1.029  # full width at half maximum of the Airy pattern [lambda / D]
 THIRD_RING = 10.173468135062722  # third zero of J1
 FIRST_NM, LAST_NM = 400.0, 1000.0  # of the spectrograph
+_ALONE: Floats = np.ones(1)
 
 
-def blurred_bound(probe: Probe, variance: Floats, cause: str) -> Bound:
-    """Bound what a kernel of mean 0 and (2, band) variance [px^2] changes; ``cause`` says where the blur comes from.
+def blurred_bound(probe: Probe, cause: str, variance: Floats, share: Floats = _ALONE) -> Bound:
+    """Bound what a sum of Gaussians changes, of (kernel, 2, band) variance [px^2] and shares (kernel,).
 
-    The sentence names the band that changes most.
+    ``cause`` says where the blur comes from; the sentence names the band that changes most.
     """
-    return mixture_bound(probe, np.ones(1), variance[None], cause)
-
-
-def mixture_bound(probe: Probe, share: Floats, variance: Floats, cause: str) -> Bound:
-    """Bound what a sum of Gaussians changes, of shares (kernel,) and (kernel, 2, band) variance [px^2]."""
     change = sum((part * probe.change_blurred(one) for part, one in zip(share, variance, strict=True)), np.zeros(1))
     value = float(change.max(initial=0.0))
     if not variance.any():
@@ -53,11 +48,17 @@ def even(variance: Floats, bands: int) -> Moments:
 
 
 @dataclass(frozen=True)
-class Diffraction:
-    """Blur that grows with the wavelength: by the pupil, or a Gaussian of each band's own, or of the middle's."""
+class Diffraction(Blur):
+    """Diffraction at the mirror, the aperture stop: an Airy pattern, stretched along the scan by the elliptic pupil.
+
+    The pattern has no variance: its rings hold 2 / (pi v) of the light beyond v = pi D theta / lambda, and what it
+    passes of a slow wave falls in proportion to the wave's frequency. The exact variant is the pupil's own transfer
+    function in every band, far tails included: `kernel_fit` finds few kernels for it. The others put a Gaussian in its
+    place, of each band or of the middle one, of the variance of what lies inside the third dark ring (94 % of the
+    light); they pass up to 0.08 more of a wave.
+    """
 
     name = "diffraction"
-    variants = (AIRY, GAUSSIAN, ONE_WIDTH)
     # Through boxes of a few parts. Each kernel costs: of the pattern's core, of its tails, of the bands' own widths.
     cost_ns = MappingProxyType({AIRY: 6.7, GAUSSIAN: 3.4, ONE_WIDTH: 0.3})
 
@@ -83,15 +84,10 @@ class Diffraction:
             instead = _gaussian(waves, variant) if variant != OFF else np.zeros_like(waves)
             missing.append([np.abs((one * waves) ** 2 - instead) for one in size])
         cause = "diffraction" if variant == OFF else f"diffraction as a Gaussian, {variant},"
-        return mixture_bound(probe, share, np.max(missing, axis=0), cause)
+        return blurred_bound(probe, cause, np.max(missing, axis=0), share)
 
 
 DIFFRACTION = Diffraction()
-
-
-def diffraction_fwhm(rig: Rig, wavelength_nm: Floats, normal: Floats | None = None) -> Floats:
-    """Give the full width at half maximum, (2, band) along line and scan: 1.03 lambda / (pupil's width IFOV). [px]"""
-    return WIDTH * _radian_px(rig, wavelength_nm) * np.sqrt(spread_of_waves(normal))[:, None]
 
 
 def airy_energy(v: float) -> float:
@@ -149,22 +145,16 @@ def _gaussian(waves: Floats, variant: str) -> Floats:
 
 def _waves(rig: Rig, wavelength_nm: Floats, normal: Floats | None) -> Floats:
     """lambda over the pupil's widths along line and scan, (2, band). [px]"""
-    waves: Floats = _radian_px(rig, wavelength_nm) * np.sqrt(spread_of_waves(normal))[:, None]
+    angle = np.asarray(wavelength_nm, np.float64) * 1e-9 / (rig.optics.aperture_mm * 1e-3)
+    waves: Floats = angle / rig.camera.ifov_rad * np.sqrt(spread_of_waves(normal))[:, None]
     return waves
 
 
-def _radian_px(rig: Rig, wavelength_nm: Floats) -> Floats:
-    """lambda / D over the IFOV, (band,)."""
-    angle: Floats = np.asarray(wavelength_nm, np.float64) * 1e-9 / (rig.optics.aperture_mm * 1e-3)
-    return angle / rig.camera.ifov_rad
-
-
 @dataclass(frozen=True)
-class Aberration:
-    """Blur of ``optics.aberration_px`` standard deviation."""
+class Aberration(Blur):
+    """Blur by the lens itself: a Gaussian of ``optics.aberration_px`` (sd) in all bands and both directions."""
 
     name = "aberration"
-    variants = ("gaussian",)
     cost_ns = MappingProxyType({"gaussian": 0.3})
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
@@ -175,18 +165,20 @@ class Aberration:
         """Bound the error of no blur."""
         if variant != OFF:
             return Bound(0.0, "exact")
-        return blurred_bound(probe, self.moments(rig, probe.wavelength_nm, variant).variance, "blur of the lens")
+        return blurred_bound(probe, "blur of the lens", self.moments(rig, probe.wavelength_nm, variant).variance[None])
 
 
 ABERRATION = Aberration()
 
 
 @dataclass(frozen=True)
-class Defocus:
-    """Blur by the distance from the plane of focus: that of ``air.distance_m`` for all of the scene."""
+class Defocus(Blur):
+    """Blur by the distance from the plane of focus, that of ``air.distance_m`` for all of the scene.
+
+    A point beside the distance of focus is an image of the pupil: a disc foreshortened along the scan.
+    """
 
     name = "defocus"
-    variants = ("disc",)
     cost_ns = MappingProxyType({"disc": 0.3})
 
     def merged(self, rig: Rig) -> Merged:
@@ -195,7 +187,7 @@ class Defocus:
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
         """Give the blur, equal in all bands; ``normal`` (3,) is the mirror's in the camera frame, None at rest."""
-        return even(_variance(rig, rig.air.distance_m, normal), len(wavelength_nm))
+        return even(defocus_px(rig, rig.air.distance_m, normal) ** 2 / 16, len(wavelength_nm))
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
         """Bound the error of no blur over all positions of the sweeps."""
@@ -203,36 +195,36 @@ class Defocus:
             return Bound(0.0, "exact")
         if rig.distances_m is None:
             return Bound(0.0, "the scene has no distance")
-        worst = np.max(
-            [_variance(rig, rig.air.distance_m, normal) for normal in normals_met(probe.sweeps, rig.camera)], axis=0
-        )
+        normals = normals_met(probe.sweeps, rig.camera)
+        worst = np.max([defocus_px(rig, rig.air.distance_m, normal) ** 2 / 16 for normal in normals], axis=0)
         cause = f"defocus at {rig.air.distance_m:g} m, focused at {rig.optics.focus_m:g} m"
-        return blurred_bound(probe, even(worst, len(probe.wavelength_nm)).variance, cause)
+        return blurred_bound(probe, cause, even(worst, len(probe.wavelength_nm)).variance[None])
 
 
 DEFOCUS = Defocus()
 
 
 def defocus_px(rig: Rig, distance_m: float | None, normal: Floats | None = None) -> Floats:
-    """Give the axes of the blur's disc, (2,) along line and scan: pupil |1/d - 1/d_f| / IFOV; 0 without a distance."""
+    """Give the axes of the blur's disc, (2,) along line and scan: pupil |1/d - 1/d_f| / IFOV; 0 without a distance.
+
+    In px; the variance of such an even disc is a sixteenth of its diameter squared.
+    """
     if distance_m is None or distance_m == rig.optics.focus_m:
         return np.zeros(2)
     round_px = rig.optics.aperture_mm * 1e-3 * abs(1 / distance_m - 1 / rig.optics.focus_m) / rig.camera.ifov_rad
     return round_px * np.sqrt(spread_of_rays(normal))
 
 
-def _variance(rig: Rig, distance_m: float | None, normal: Floats | None) -> Floats:
-    """(2,) along line and scan: an even disc has a sixteenth of its diameter squared. [px^2]"""
-    variance: Floats = defocus_px(rig, distance_m, normal) ** 2 / 16
-    return variance
-
-
 @dataclass(frozen=True)
-class Keystone:
-    """Shift of the footprint along the line, of its own in each band."""
+class Keystone(Blur):
+    """Shift along the line, of its own in each band: a line is imaged longer at one wavelength than at another.
+
+    At the last wavelength a sample sees the scene ``keystone_px / 2`` further along the line (towards higher sample
+    numbers) than the mirror model says, at the first as much less far; so a red image lies at lower sample numbers than
+    a blue one. It is linear from 400 to 1000 nm, whatever bands the scene has of these, and stays at its ends beyond.
+    """
 
     name = "keystone"
-    variants = ("linear",)
     cost_ns = MappingProxyType({"linear": 2.6})
 
     def merged(self, rig: Rig) -> Merged:

@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from pipeline.simulator.effects.effect import OFF, Bound, Merged
+from pipeline.simulator.effects.effect import OFF, Bound, Effect, Merged
 from pipeline.simulator.effects.noise import (
     CHIP_SAMPLES,
     LEAST_MERGED_READ_E,
@@ -28,14 +28,13 @@ DIM_NS = 80.0  # of an exact count below `SERIES_FROM_E`, in lines of any light
 
 
 @dataclass(frozen=True)
-class Saturation:
+class Saturation(Effect):
     """What is above the well or the converter's full scale is lost. Off, the converter clips all the same.
 
     Raw lines are numbers of so many bits, so every line is clipped whatever a probe of a few lines found.
     """
 
     name = "saturation"
-    variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.1})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
@@ -68,7 +67,7 @@ def well_reached(rig: Rig, read_noise_e: float) -> bool:
 
 
 @dataclass(frozen=True)
-class Shot:
+class Shot(Effect):
     """Poisson counts. ``gaussian`` has their first three cumulants, and takes the read noise into the same draw.
 
     Where so few electrons are expected that a patch of its numbers could be told from exact ones, it is exact.
@@ -76,7 +75,6 @@ class Shot:
     """
 
     name = "shot"
-    variants = (EXACT, GAUSSIAN)
     cost_ns = MappingProxyType({EXACT: 10.0, GAUSSIAN: 3.9})  # of light above `SERIES_FROM_E`
 
     def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
@@ -131,14 +129,13 @@ def in_unit(deviations: float, sd_e: float, probe: Probe, rig: Rig) -> float:
 
 
 @dataclass(frozen=True)
-class ReadNoise:
+class ReadNoise(Effect):
     """Normal, with the camera's standard deviation. In one draw with the shot noise where that is not exact.
 
     Noise counts twice the total variation between the distributions of a sample with and without: see `told_apart`.
     """
 
     name = "read-noise"
-    variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 3.2})
 
     def merged(self, rig: Rig) -> Merged | None:
@@ -164,11 +161,10 @@ READ_NOISE = ReadNoise()
 
 
 @dataclass(frozen=True)
-class Quantisation:
+class Quantisation(Effect):
     """Rounding half to even. Raw lines are whole numbers, so it is never left out."""
 
     name = "quantisation"
-    variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.4})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:

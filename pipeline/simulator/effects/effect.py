@@ -45,7 +45,7 @@ class Merged(NamedTuple):
 
 
 class Effect(Protocol):
-    """What the decision needs to know. ``variants`` go from exact to cheap; off is none of them.
+    """What the decision needs to know, by name. Variants go from exact to cheap; off is none of them.
 
     One that shares its work with another's says so by ``merged(rig)``; one whose cost depends on the light gives it by
     ``cost_at(probe, rig)``, like ``cost_ns``.
@@ -56,12 +56,13 @@ class Effect(Protocol):
         """What flags, manifest and streams call it."""
 
     @property
-    def variants(self) -> tuple[str, ...]:
-        """Ways to compute it, the exact one first."""
+    def cost_ns(self) -> Mapping[str, float]:
+        """Measured cost of each variant per px and band, the exact one first [ns]."""
 
     @property
-    def cost_ns(self) -> Mapping[str, float]:
-        """Measured cost of each variant per px and band [ns]."""
+    def variants(self) -> tuple[str, ...]:
+        """Ways to compute it, the exact one first."""
+        return tuple(self.cost_ns)
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
         """Bound the error of leaving it out, or of a variant against the exact one; 0 where the rig lacks it."""

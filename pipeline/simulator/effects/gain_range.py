@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-Light = NDArray[np.float32]
+Real = TypeVar("Real", np.float32, np.float64)
 
 
 @dataclass(frozen=True)
@@ -40,19 +41,15 @@ class GainRange:
     def of(factors: Floats, wavelength_nm: Floats, *, uneven: float, added_e: Floats | None = None) -> GainRange:
         """Those of (state, band) factors that stand for all that there are, with (state, band) light added."""
         added = np.zeros((1, factors.shape[1])) if added_e is None else added_e
-        return GainRange(
-            factors.min(axis=0), factors.max(axis=0), uneven, *_differences(factors, wavelength_nm),
-            added.max(axis=0), *_differences(added, wavelength_nm),
-        )  # fmt: skip
+        own, of_added = _differences(factors, wavelength_nm), _differences(added, wavelength_nm)
+        return GainRange(factors.min(axis=0), factors.max(axis=0), uneven, *own, added.max(axis=0), *of_added)
 
 
 def _differences(factors: Floats, wavelength_nm: Floats) -> tuple[Floats, Floats]:
     nm = np.asarray(wavelength_nm, np.float64)
     if len(nm) < 2:
         return np.zeros(len(nm)), np.zeros(len(nm))
-    bent: Floats = np.abs(second_difference(factors, nm)).max(axis=0)  # type: ignore[arg-type]
-    steep: Floats = steepest_difference(factors, nm).max(axis=0)  # type: ignore[arg-type]
-    return steep, bent
+    return steepest_difference(factors, nm).max(axis=0), np.abs(second_difference(factors, nm)).max(axis=0)
 
 
 def rising_runs(wavelength_nm: Floats) -> list[slice]:
@@ -81,7 +78,7 @@ def difference_rates(wavelength_nm: Floats) -> Floats:
     return rates
 
 
-def second_difference(spectra: Light, wavelength_nm: Floats) -> Light:
+def second_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArray[Real]:
     """Give D I of spectra (..., band), as :func:`difference_rates` defines it. [1/nm^2]"""
     down, up = difference_rates(wavelength_nm).astype(spectra.dtype)
     steps, out = np.diff(spectra, axis=-1), np.zeros_like(spectra)
@@ -90,7 +87,7 @@ def second_difference(spectra: Light, wavelength_nm: Floats) -> Light:
     return out
 
 
-def steepest_difference(spectra: Light, wavelength_nm: Floats) -> Light:
+def steepest_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArray[Real]:
     """Give |I'| of spectra (..., band) towards the steeper neighbour of each band; 0 for a run of one band. [1/nm]"""
     gaps = np.diff(wavelength_nm)
     rate = np.divide(1, gaps, out=np.zeros_like(gaps), where=gaps > 0).astype(spectra.dtype)

@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Bound, Light
+from pipeline.simulator.effects.effect import OFF, Bound, Gain, Light, LightChange
 from pipeline.simulator.effects.gain_range import GainRange
 from pipeline.simulator.effects.light_units import lights_within, unit_electrons
-from pipeline.simulator.effects.lighting import BRDF, CLOUD, daylight_range
+from pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.effects.relief import has_relief, reach_m, sample_distances, spoken_reach
 from pipeline.simulator.rig_model import Air, Rig
@@ -32,7 +32,7 @@ from pipeline.simulator.scenes.daylight import relative_daylight
 
 Floats = NDArray[np.float64]
 RANGE, UNIFORM = "range", "uniform"
-# Rows: wavelength [nm], coefficient of [1]; straight between, 0 outside. About 5 nm fine at oxygen A, 10 nm elsewhere.
+# Rows: wavelength [nm], coefficient of [2]; straight between, 0 outside. About 5 nm fine at oxygen A, 10 nm elsewhere.
 WATER = np.array([
     (570.0, 0.0), (593.0, 0.075), (610.0, 0.0), (667.6, 0.0), (690.0, 0.016), (710.0, 0.0125), (718.0, 1.8),
     (724.4, 2.5), (740.0, 0.061), (752.5, 0.0008), (780.0, 0.0006), (800.0, 0.036), (816.0, 1.6), (823.7, 2.5),
@@ -53,15 +53,15 @@ KRUSE = 0.585  # of the root of 1 km [3]
 
 
 @dataclass(frozen=True)
-class Absorption:
+class Absorption(Gain):
     """Share of the light that gases leave over a distance, averaged over the width of a band.
 
-    The band model of [1] for whole atmospheres, taken to paths of metres (assumed: no source for these at 6 nm).
+    Water vapour about 720, 820 and 940 nm, oxygen at 690 and 760 nm: the band model of [2] for whole atmospheres,
+    taken to paths of metres (assumed: no source for these at 6 nm).
     ``range`` takes each sample's own distance, ``uniform`` the middle of nearest and farthest.
     """
 
     name = "absorption"
-    variants = (RANGE, UNIFORM)
     cost_ns = MappingProxyType({RANGE: 2.7, UNIFORM: 0.2})  # of a scene with relief
 
     def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
@@ -119,30 +119,16 @@ def transmission(metres: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
     fine = wavelength_nm[:, None] + sigma * _QUADRATURE  # (band, node)
     mass = metres[:, None, None] / AIR_MASS_M
     water_cm = metres[:, None, None] * rig.air.vapour_g_per_m3 * 1e-4  # as liquid: 1 g/m^2 is 1e-4 cm
-    passed = _water(_coefficient(WATER, fine), water_cm)
-    passed *= _oxygen(_coefficient(OXYGEN, fine), mass)
+    water, oxygen = (np.interp(fine, table[:, 0], table[:, 1], left=0.0, right=0.0) for table in (WATER, OXYGEN))
+    x, y = water * water_cm, oxygen * mass
+    passed = np.exp(-0.2385 * x / (1 + 20.07 * x) ** 0.45)  # [2] Eq. 2-8
+    passed *= np.exp(-1.41 * y / (1 + 118.3 * y) ** 0.45)  # [2] Eq. 2-11
     mean: Floats = (passed * (weight / weight.sum())).sum(axis=-1)
     return mean
 
 
-def _coefficient(table: Floats, wavelength_nm: Floats) -> Floats:
-    return np.interp(wavelength_nm, table[:, 0], table[:, 1], left=0.0, right=0.0)
-
-
-def _water(coefficient: Floats, centimetres: Floats) -> Floats:
-    x = coefficient * centimetres  # [1] Eq. 2-8
-    passed: Floats = np.exp(-0.2385 * x / (1 + 20.07 * x) ** 0.45)
-    return passed
-
-
-def _oxygen(coefficient: Floats, mass: Floats) -> Floats:
-    x = coefficient * mass  # [1] Eq. 2-11
-    passed: Floats = np.exp(-1.41 * x / (1 + 118.3 * x) ** 0.45)
-    return passed
-
-
 @dataclass(frozen=True)
-class PathRadiance:
+class PathRadiance(LightChange):
     """Light L at a distance d arrives as L exp(-beta d) + H (1 - exp(-beta d)).
 
     beta is ``extinction_per_m``. H, the light of endless air, is ``air.airlight_share`` of the white panel's and
@@ -151,7 +137,6 @@ class PathRadiance:
     """
 
     name = "path-radiance"
-    variants = (RANGE, UNIFORM)
     cost_ns = MappingProxyType({RANGE: 3.1, UNIFORM: 0.5})  # of a scene with relief
 
     def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
@@ -187,7 +172,7 @@ class PathRadiance:
         uneven = float(passed.max(initial=0.0) - passed.min(initial=1.0))
         if probe.white_e is None:
             return GainRange.of(passed, nm, uneven=uneven)
-        sun = daylight_range(probe, rig)
+        sun = DRIFT.gain_range(probe, rig)
         still = rig.air.airlight_share * probe.white_e * (1 - passed)
         alone = GainRange.of(passed, nm, uneven=uneven, added_e=still)
         most = sun.greatest.max(initial=1.0)
@@ -258,7 +243,7 @@ def _contrast(probe: Probe, rig: Rig) -> Floats:
     brightest = lit * high
     share = np.divide(horizon, brightest, out=np.ones_like(brightest), where=brightest > horizon)  # a band may be black
     above = probe.level * np.clip(1 - share, 0.0, 1.0)
-    sun = daylight_range(probe, rig)
+    sun = DRIFT.gain_range(probe, rig)
     below = np.maximum(horizon - shaded * low, 0.0) * np.maximum(sun.greatest, 1.0)
     worst: Floats = np.maximum(above, below / unit_electrons(shaded * np.minimum(sun.least, 1.0) * low, probe, rig))
     return worst

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.scan import Sweep, points_of_scan
 from pipeline.simulator.block import SweepBlock, sweep_stream
-from pipeline.simulator.effects.effect import OFF, Bound, Light
+from pipeline.simulator.effects.effect import OFF, Bound, Gain, Light
 from pipeline.simulator.effects.gain_range import GainRange
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig, Sky
@@ -28,7 +28,7 @@ _LOOKS = 65  # lines of a sweep, and samples of a line, at which angles are take
 
 
 @dataclass(frozen=True)
-class Drift:
+class Drift(Gain):
     """Light at a line's mid exposure over the light at the survey's start, to which the scene is stated.
 
     ``spectral`` is SPECTRL2 under a clear sky, band by band, by the air that the sun shines through. ``scalar`` is the
@@ -38,7 +38,6 @@ class Drift:
     """
 
     name = "drift"
-    variants = (SPECTRAL, SCALAR, LINEAR)
     cost_ns = MappingProxyType({SPECTRAL: 0.4, SCALAR: 0.2, LINEAR: 0.2})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
@@ -52,7 +51,8 @@ class Drift:
             return Bound(0.0, "band by band")
         seconds = probe.seconds + rig.camera.frame_ms * 1e-3  # to the end of the last line
         worst = np.zeros(len(probe.wavelength_nm))
-        for some in _parts(_corners(rig.sky, probe.wavelength_nm, seconds, variant)):
+        times = _corners(rig.sky, probe.wavelength_nm, seconds, variant)
+        for some in np.array_split(times, len(times) // _KNOTS_AT_ONCE + 1):
             exact = _daylight(rig.sky, probe.wavelength_nm, some, SPECTRAL)
             missed = exact - (1 if variant == OFF else _daylight(rig.sky, probe.wavelength_nm, some, variant))
             worst = np.maximum(worst, np.abs(missed).max(axis=0))
@@ -62,8 +62,13 @@ class Drift:
         return Bound(probe.scaled(worst), f"light {verb} by at most {100 * worst.max(initial=0.0):.3g} % {course}")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        """Give the daylight of the survey."""
-        return daylight_range(probe, rig)
+        """Give the daylight of the survey over that at its start; 1 without a time of day."""
+        nm = np.asarray(probe.wavelength_nm, np.float64)
+        if rig.sky.started is None:
+            return GainRange.between(1.0, 1.0, len(nm))
+        times = knots_within(rig.sky, probe.seconds + rig.camera.frame_ms * 1e-3)
+        light = relative_daylight(rig.sky, nm, times)
+        return GainRange.of(light, nm, uneven=float(np.ptp(light, axis=1).max(initial=0.0)))
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
         """Give (line, 1, band), or (line, 1, 1) of the variants that take all bands as one."""
@@ -74,16 +79,6 @@ class Drift:
 
 
 DRIFT = Drift()
-
-
-def daylight_range(probe: Probe, rig: Rig) -> GainRange:
-    """Give the daylight of the survey over that at its start; 1 without a time of day."""
-    nm = np.asarray(probe.wavelength_nm, np.float64)
-    if rig.sky.started is None:
-        return GainRange.between(1.0, 1.0, len(nm))
-    times = knots_within(rig.sky, probe.seconds + rig.camera.frame_ms * 1e-3)
-    light = relative_daylight(rig.sky, nm, times)
-    return GainRange.of(light, nm, uneven=float(np.ptp(light, axis=1).max(initial=0.0)))
 
 
 def _daylight(sky: Sky, wavelength_nm: Floats, seconds: Floats, variant: str) -> Floats:
@@ -115,16 +110,12 @@ def _corners(sky: Sky, wavelength_nm: Floats, seconds: float, variant: str) -> F
     return np.append(times, dark) if dark < seconds else times
 
 
-def _parts(times: Floats) -> list[Floats]:
-    return np.array_split(times, len(times) // _KNOTS_AT_ONCE + 1)
-
-
 def _spoken(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
 
 
 @dataclass(frozen=True)
-class Cloud:
+class Cloud(Gain):
     """Straight bands of shadow, as wide as the gaps between them, that drift over the scene at a constant speed.
 
     Direction and place follow from the seed alone, so that all sweeps of a survey lie under the same clouds. The edge
@@ -132,7 +123,6 @@ class Cloud:
     """
 
     name = "cloud"
-    variants = ("shadow",)
     cost_ns = MappingProxyType({"shadow": 0.3})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
@@ -183,7 +173,7 @@ def shadow(way_px: Floats, size_px: float) -> Floats:
 
 
 @dataclass(frozen=True)
-class Brdf:
+class Brdf(Gain):
     """Reflectance over that in the undeflected direction: 1 + b a + h exp(-phase / 2 deg), never below 0.
 
     The angle a of view runs along the scene's x axis, which lies in the sun's plane (assumed); b is
@@ -193,7 +183,6 @@ class Brdf:
     """
 
     name = "brdf"
-    variants = ("angles",)
     cost_ns = MappingProxyType({"angles": 0.2})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:

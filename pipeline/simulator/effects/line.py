@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipeline.camera import LineCamera
 from pipeline.scan import Sweep, points_of_scan
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.effects.effect import OFF, Bound, Effect
 from pipeline.simulator.effects.mirror_path import beside_plan, greatest_lag_px, transient
 from pipeline.simulator.effects.mirror_pointing import at_line_ends, end_gains
 from pipeline.simulator.effects.moving_air import sway_gradient, turbulence_px
@@ -48,11 +48,10 @@ def beside_plan_px(probe: Probe, rig: Rig) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class Rotation:
-    """Line rotation and projective scale. Off, every line lies straight along its axis at nominal scale."""
+class Rotation(Effect):
+    """Line rotation and projective scale, by rays. Off, every line lies straight along its axis at nominal scale."""
 
     name = "rotation"
-    variants = ("rays",)
     cost_ns = MappingProxyType({"rays": 0.0})  # straight lines take as long
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
@@ -93,7 +92,7 @@ def _course(sweep: Sweep, camera: LineCamera, beside: tuple[float, float]) -> tu
 
 
 @dataclass(frozen=True)
-class SlitBox:
+class SlitBox(Effect):
     """The footprint of slit and pixel. Off, a sample sees what its middle ray meets.
 
     The box is in closed form over the scene's pixels, as long as it does not lie turned among them. Variants tell into
@@ -102,7 +101,6 @@ class SlitBox:
     """
 
     name = "slit"
-    variants = ("9x3", "5x2", "3x1", "1-percent", "3-percent", UPRIGHT)
     # Beside the rig's blurs, which need eleven kernels whatever the slit, at strips of +-960 px; at +-320 less of them.
     cost_ns = MappingProxyType({"9x3": 38.0, "5x2": 10.0, "3x1": 1.8, "1-percent": 1.4, "3-percent": 1.3, UPRIGHT: 0.3})
 
@@ -153,14 +151,13 @@ def _words(variant: str) -> str:
 
 
 @dataclass(frozen=True)
-class Smear:
-    """The positions held within an exposure. Off, the mirror stands at mid exposure.
+class Smear(Effect):
+    """The positions held within an exposure while the mirror moves on. Off, it stands at mid exposure.
 
     ``folded`` takes them into the footprint, as if all lines of an exposure lay as its middle one does.
     """
 
     name = "smear"
-    variants = (POSITIONS, FOLDED)
     cost_ns = MappingProxyType({POSITIONS: 15.0, FOLDED: 5.2})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
@@ -169,7 +166,7 @@ class Smear:
         They vary as the mirror runs: without them its course within an exposure is left out as well.
         """
         most = max((sweep.step for sweep in probe.sweeps), default=1)
-        variance = held_variance(most)
+        variance = (most**2 - 1) / 12  # of positions 1 px apart
         if variant == POSITIONS or variance == 0:
             return Bound(0.0, "the mirror stands still while a line is exposed" if variance == 0 else "exact")
         if variant == FOLDED:
@@ -208,11 +205,6 @@ def _courses(sweeps: tuple[Sweep, ...], rig: Rig) -> Iterator[Floats]:
     for sweep in {(one.lines, one.step): one for one in sweeps if one.lines and one.step > 1}.values():
         numbers = np.arange(sweep.lines)
         yield transient(rig, sweep, numbers) + beside_plan(rig.mirror.positions_per_line, sweep.step, numbers)
-
-
-def held_variance(positions: int) -> float:
-    """Variance of positions 1 px apart [px^2]."""
-    return (positions**2 - 1) / 12
 
 
 def smeared_positions(block: SweepBlock, variant: str) -> Floats:

@@ -13,22 +13,21 @@ from numpy.typing import NDArray
 
 from pipeline.scan import Sweep
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.effects.effect import OFF, Aim, Bound
 from pipeline.simulator.effects.mirror_pointing import at_line_ends
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 
 Floats = NDArray[np.float64]
-EXACT, CENTRES = "exact", "centres"
+EXACT, CENTRES, EULER = "exact", "centres", "euler"
 MOST_PARTS = 8  # of an exposure; a jump of h px within a part goes unseen as a blur of at most h^2/32 px^2
-EXACT, EULER = "exact", "euler"
 _SERIES_BELOW = 0.5  # of (1 + 2 zeta) tau; 20 terms then leave less than 1e-20
 _TERMS = 20
 _RAMP = 64  # steps of a line that are as good as a ramp
 
 
 @dataclass(frozen=True)
-class Staircase:
+class Staircase(Aim):
     """Sample and hold with any number of positions per px of path. Off, each px of the path has its one position.
 
     The memory is played at a steady rate while lines are exposed and stands still while they are read out; it is
@@ -38,7 +37,6 @@ class Staircase:
     """
 
     name = "staircase"
-    variants = (EXACT, CENTRES)
     cost_ns = MappingProxyType({EXACT: 18.0, CENTRES: 0.01})  # exact: five positions a line instead of one
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
@@ -105,8 +103,13 @@ def _moments(positions: float, sweeps: tuple[Sweep, ...], variant: str) -> tuple
 
 
 @dataclass(frozen=True)
-class Lag:
-    """What is left of the start of a sweep, as the mean shift of the view over each held position.
+class Lag(Aim):
+    """Mirror lag and overshoot: what is left of the start of a sweep, as the mean shift over each held position.
+
+    The mirror follows its commands as a second-order system. One that has long been moving at a steady rate lies a
+    steady way behind, which calibration takes away. What is left is the difference of a mirror that starts from rest to
+    that steady one: a free oscillation that dies out, exactly known at any time; x'' + 2 zeta x' + x = 0 in units of
+    1 / natural frequency.
 
     Before a sweep the mirror has flown back along the scan by the sweep's length, has had ``settled_s`` to come to
     rest one held position ahead of the first, and takes the first step as line 0 begins. Moves along the line, between
@@ -115,7 +118,6 @@ class Lag:
     """
 
     name = "lag"
-    variants = (EXACT, EULER)
     cost_ns = MappingProxyType({EXACT: 0.15, EULER: 0.12})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
@@ -129,7 +131,9 @@ class Lag:
             return Bound(0.0, "exact")
         worst = greatest_lag_px(rig, probe.sweeps, variant)
         moved = at_line_ends(probe.sweeps, rig.camera, 0.0, worst)
-        return Bound(probe.moved(*moved), f"lines lie up to {worst:.2g} px off {_reason(rig, variant)}")
+        pace = f"{rig.camera.frame_ms:g} ms a line, {rig.mirror.natural_hz:g} Hz"
+        why = f"while the mirror gets up to speed ({pace})" if variant == OFF else "where a coarse integration has them"
+        return Bound(probe.moved(*moved), f"lines lie up to {worst:.2g} px off {why}")
 
 
 LAG = Lag()
@@ -286,9 +290,3 @@ def _advance(matrix: Floats, start: Floats, numbers: NDArray[np.int64]) -> tuple
 def _times(matrix: Floats, place: Floats, rate: Floats) -> tuple[Floats, Floats]:
     """A 2 x 2 matrix times states, written out: a library's product may round by the number of states."""
     return matrix[0, 0] * place + matrix[0, 1] * rate, matrix[1, 0] * place + matrix[1, 1] * rate
-
-
-def _reason(rig: Rig, variant: str) -> str:
-    if variant == EULER:
-        return "where a coarse integration has them"
-    return f"while the mirror gets up to speed ({rig.camera.frame_ms:g} ms a line, {rig.mirror.natural_hz:g} Hz)"

@@ -14,7 +14,7 @@ from pipeline.camera import LineCamera
 from pipeline.mirror import position_to_normal
 from pipeline.scan import Sweep, line_positions, points_of_scan
 from pipeline.simulator.block import SweepBlock, unit_stream
-from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.effects.effect import OFF, Aim, Bound
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -50,7 +50,7 @@ def at_line_ends(sweeps: Iterable[Sweep], camera: LineCamera, along: float, scan
 
 
 @dataclass(frozen=True)
-class Jitter:
+class Jitter(Aim):
     """A normal deviate of the tilt about either axis, anew for every line.
 
     At rest the view moves by 2 sigma in the plane of incidence, which is the scan's axis, and by sqrt(2) sigma across
@@ -58,7 +58,6 @@ class Jitter:
     """
 
     name = "jitter"
-    variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.15})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
@@ -133,14 +132,13 @@ def _spreads(probe: Probe, rig: Rig) -> tuple[float, float, float]:
 
 
 @dataclass(frozen=True)
-class Hysteresis:
+class Hysteresis(Aim):
     """A systematic error of pointing: smooth over the mirror's disk, one field for each copy of the rig.
 
     The field is at most ``hysteresis_px`` in either axis; a scan the other way meets it with the other sign.
     """
 
     name = "hysteresis"
-    variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.07})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
@@ -158,11 +156,10 @@ class Hysteresis:
 
 
 @dataclass(frozen=True)
-class ThermalDrift:
+class ThermalDrift(Aim):
     """The view walks in one direction as the unit warms up; each copy of the rig has a direction of its own."""
 
     name = "thermal-drift"
-    variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.06})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.effects.effect import OFF, Bound, Gain
 from pipeline.simulator.effects.gain_range import GainRange
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.optics.coatings import reflectance
@@ -29,7 +29,7 @@ _LOOKS = 65  # incidences at which the sweeps' factors are taken for the bounds
 
 
 @dataclass(frozen=True)
-class Vignetting:
+class Vignetting(Gain):
     """Light goes with the mirror's area as the camera sees it: |n_z| over |n_z| at rest, one factor for each line.
 
     ``held`` averages over the positions of an exposure, ``middle`` takes the one at mid exposure. A single patch sees
@@ -37,7 +37,6 @@ class Vignetting:
     """
 
     name = "vignetting"
-    variants = (HELD, MIDDLE)
     cost_ns = MappingProxyType({HELD: 0.2, MIDDLE: 0.2})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
@@ -88,7 +87,7 @@ def ahead(along_px: float, scan_px: Floats, camera: LineCamera) -> Floats:
 
 
 @dataclass(frozen=True)
-class Polarisation:
+class Polarisation(Gain):
     """Light goes with the coating's reflectance at the chief ray's incidence over that at rest, 45 deg.
 
     By Fresnel's formulae for bare metal, see `coatings`: from 20 to 70 deg aluminium goes from +0.5 to -3.7 % (mean of
@@ -98,7 +97,6 @@ class Polarisation:
     """
 
     name = "polarisation"
-    variants = (EXACT,)
     cost_ns = MappingProxyType({EXACT: 0.2})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:

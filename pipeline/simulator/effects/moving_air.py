@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator.block import SweepBlock, sweep_stream
-from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.effects.effect import OFF, Aim, Bound, Displacement
 from pipeline.simulator.effects.probe import UNITS, Probe
 from pipeline.simulator.effects.relief import FARTHEST_M
 from pipeline.simulator.rig_model import Rig
@@ -24,11 +24,18 @@ GUST_M = 3.0  # length of the waves that run over a canopy; assumed
 
 
 @dataclass(frozen=True)
-class Turbulence:
-    """Jitter of the lines, normal and equal in both directions."""
+class Turbulence(Aim):
+    """Jitter of the lines, normal and equal in both directions: warm air bends the light, anew for every line.
+
+    References
+    ----------
+    .. [1] Andrews and Phillips, "Laser Beam Propagation through Random Media", 2nd edition, SPIE Press, 2005, chapters
+       6 (angle of arrival) and 8 (scintillation).
+    .. [2] Fried, "Optical resolution through a randomly inhomogeneous medium for very long and very short exposures",
+       Journal of the Optical Society of America 56, 1966. doi:10.1364/JOSA.56.001372
+    """
 
     name = "turbulence"
-    variants = ("jitter",)
     cost_ns = MappingProxyType({"jitter": 0.13})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
@@ -92,7 +99,7 @@ def _way_m(rig: Rig) -> float:
 
 
 @dataclass(frozen=True)
-class Wind:
+class Wind(Displacement):
     """Crop motion: the scene sways by a travelling wave along the wind, its phase and direction drawn for a survey.
 
     All of the scene sways, bare soil too, as one that stands at mid exposure. Lines sample the sway at the frame rate:
@@ -103,7 +110,6 @@ class Wind:
     """
 
     name = "wind"
-    variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.9})
 
     def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:

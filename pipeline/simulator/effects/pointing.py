@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.effects.effect import OFF, Aim, Bound
 from pipeline.simulator.effects.mirror_pointing import at_line_ends
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
@@ -27,11 +27,10 @@ _MOST_DEVIATES = 6.0  # beyond, one line in 5e8 lies
 Floats = NDArray[np.float64]
 
 
-class Pointing(ABC):
+class Pointing(Aim, ABC):
     """How far a mirror looks beside the places that it reports: an aim of the chain, on wherever there is one."""
 
     name = "pointing"
-    variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.2})
 
     @property

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.scan import points_of_scan
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.effects.effect import OFF, Bound, Displacement
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Air, Rig
 
@@ -19,7 +19,7 @@ FARTHEST_M = 1e7  # infinity: nothing passes so much air
 
 
 @dataclass(frozen=True)
-class Parallax:
+class Parallax(Displacement):
     """Displacement of what is not at the scene's distance, for which scale and geometry are right.
 
     The virtual pinhole lies a lever L behind the pivot on the chief ray, which itself passes through the pivot at any
@@ -29,7 +29,6 @@ class Parallax:
     """
 
     name = "parallax"
-    variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.2})
 
     def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:

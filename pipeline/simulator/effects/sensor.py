@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator.block import SweepBlock, unit_stream
-from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.effects.effect import OFF, Bound, Effect, Gain
 from pipeline.simulator.effects.gain_range import GainRange
 from pipeline.simulator.effects.noise import normal_deviates, told_apart
 from pipeline.simulator.effects.probe import Probe
@@ -25,11 +25,18 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class DarkCurrent:
-    """As many electrons in every element; they take part in the shot noise."""
+class DarkCurrent(Effect):
+    """Electrons that warmth sets free, as many in every element; they take part in the shot noise.
+
+    References
+    ----------
+    .. [1] Janesick, "Scientific Charge-Coupled Devices", SPIE Press, 2001: dark current of a depleted sensor goes with
+       T^1.5 exp(-Eg / 2kT), and Eg by Varshni's formula.
+    .. [2] Widenhorn, Blouke, Weber, Rest and Bodegom, "Temperature dependence of dark current in a CCD", Proceedings of
+       SPIE 4669, 2002. doi:10.1117/12.463446
+    """
 
     name = "dark-current"
-    variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.1})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
@@ -79,11 +86,10 @@ def dark_electrons(rig: Rig) -> float:
 
 
 @dataclass(frozen=True)
-class Defects:
+class Defects(Effect):
     """Dead elements gather no light; hot ones add electrons, with their shot noise. An element may be both."""
 
     name = "defects"
-    variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.3})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
@@ -133,11 +139,10 @@ def _mask(unit: int, kind: str, samples: int, bands: int, *, share: float) -> Ma
 
 
 @dataclass(frozen=True)
-class Prnu:
+class Prnu(Gain):
     """Every element has a gain of its own, normal about 1, never below 0."""
 
     name = "prnu"
-    variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.2})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
@@ -160,11 +165,10 @@ class Prnu:
 
 
 @dataclass(frozen=True)
-class Striping:
+class Striping(Gain):
     """All bands of a sample share a gain, normal about 1, never below 0: stripes along the scan."""
 
     name = "striping"
-    variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.2})
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.effects.effect import OFF, Bound, LightChange
 from pipeline.simulator.effects.gain_range import difference_rates, rising_gaps, rising_runs
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
@@ -37,7 +37,7 @@ class BandGroup(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Response:
+class Response(LightChange):
     """Each band is averaged over its neighbours so that variances add up to the rig's: fwhm_rig^2 - fwhm_scene^2.
 
     ``exact`` is the heat kernel exp(v/2 D) of the bands' second divided difference D: no weight below 0, sum 1, mean 0
@@ -46,7 +46,6 @@ class Response:
     """
 
     name = "response"
-    variants = (EXACT,)
     cost_ns = MappingProxyType({EXACT: 2.2})
     whole_line = True  # a product's rounding depends on how many samples it has: a line is made whole, then cut
 
@@ -154,7 +153,7 @@ def _why_nothing(probe: Probe, rig: Rig) -> str:
 
 
 @dataclass(frozen=True)
-class Smile:
+class Smile(LightChange):
     """A sample records in band b the light of wavelength lambda_b + s, s = smile_nm (u / u_end)^2.
 
     u is the sample's way from the line's centre: s is 0 there and ``smile_nm`` at both ends. Above 0 the ends see
@@ -163,7 +162,6 @@ class Smile:
     """
 
     name = "smile"
-    variants = (CUBIC, LINEAR)
     within_spectra = True  # a factor of a whole spectrum passes through
     cost_ns = MappingProxyType({CUBIC: 0.9, LINEAR: 0.5})
 

@@ -63,16 +63,14 @@ class Footprint:
 
         What blurs a scene before pixels are left out is taken off the Gaussians.
         """
-        some = replace(self, shift=self.shift[:, which], variance=self.variance[:, which],
-                       shares=self.shares[which], level=self.level[which])  # fmt: skip
+        some = replace(self, shares=self.shares[which], level=self.level[which])
+        shift, variance = self.shift[:, which], self.variance[:, which]
         if level == 1:
-            return some
-        variance = some.variance - THINNED * (level**2 - 1)
+            return replace(some, shift=shift, variance=variance)
+        variance = variance - THINNED * (level**2 - 1)
         variance[1] += (self.held**2 - 1) / 12
-        return replace(
-            some, box=(self.box[0] / level, self.box[1] / level), parts=(1, 1), held=1, shift=some.shift / level,
-            variance=np.maximum(variance, 0.0) / level**2,
-        )  # fmt: skip
+        variance, box = np.maximum(variance, 0.0) / level**2, (self.box[0] / level, self.box[1] / level)
+        return replace(some, box=box, parts=(1, 1), held=1, shift=shift / level, variance=variance)
 
 
 def fold(box: tuple[float, float], parts: tuple[int, int], held: int, blurs: Moments) -> Footprint:

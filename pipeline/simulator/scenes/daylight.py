@@ -50,7 +50,7 @@ def relative_daylight(sky: Sky, wavelength_nm: Floats, seconds: Floats) -> Float
     """
     start, place = _started(sky), (sky.latitude_deg, sky.longitude_deg)
     first = _irradiance(*place, np.array([start]), wavelength_nm)
-    faintest = _at_bands(_clear_sky(np.array([FAINTEST_DEG]), np.array([start])), wavelength_nm)
+    faintest = _at_bands(_light_of(np.array([FAINTEST_DEG]), np.array([start])), wavelength_nm)
     ratio: Floats = _irradiance(*place, start + np.asarray(seconds), wavelength_nm) / np.maximum(first, faintest)
     return ratio
 
@@ -86,7 +86,7 @@ def _irradiance(latitude: float, longitude: float, moments: Floats, wavelength_n
 def _table(latitude: float, longitude: float, hour: int) -> Floats:
     """Light at the knots of one hour and the first of the next, (knot, wavelength of the model)."""
     moments = (hour * _KNOTS_AN_HOUR + np.arange(_KNOTS_AN_HOUR + 1.0)) * KNOT_S
-    table = _clear_sky(_elevation_deg(latitude, longitude, moments), moments)
+    table = _light_of(_elevation_deg(latitude, longitude, moments), moments)
     table.setflags(write=False)
     return table
 
@@ -100,25 +100,23 @@ def _elevation_deg(latitude: float, longitude: float, moments: Floats) -> Floats
     return elevation
 
 
-def _clear_sky(elevation_deg: Floats, moments: Floats) -> Floats:
+def clear_sky(zenith_deg: Floats | float, airmass: Floats | float, day: Floats | float) -> tuple[Floats, Floats]:
+    """Give SPECTRL2's wavelengths [nm] and its light on level ground (wavelength, sun) [W/m^2/nm]: one air for all."""
+    from pvlib.spectrum import spectrl2  # half a second of pandas: only for whoever asks for daylight
+
+    turned = {"apparent_zenith": zenith_deg, "aoi": zenith_deg, "surface_tilt": 0.0, "relative_airmass": airmass}
+    air = {"surface_pressure": 101325.0, "precipitable_water": 1.5, "ozone": 0.31, "aerosol_turbidity_500nm": 0.1}
+    sky = spectrl2(**turned, **air, ground_albedo=0.2, dayofyear=day)  # Pa, cm, atm cm
+    return np.asarray(sky["wavelength"], np.float64), np.asarray(sky["poa_global"], np.float64)
+
+
+def _light_of(elevation_deg: Floats, moments: Floats) -> Floats:
     """Light on level ground for heights of the sun, (time, wavelength of the model); 0 at the horizon and below."""
     from pvlib.atmosphere import get_relative_airmass
-    from pvlib.spectrum import spectrl2
 
     zenith = 90.0 - np.maximum(elevation_deg, 0.0)
-    sky = spectrl2(
-        apparent_zenith=zenith,
-        aoi=zenith,
-        surface_tilt=0.0,
-        ground_albedo=0.2,
-        surface_pressure=101325.0,
-        relative_airmass=get_relative_airmass(zenith, "kastenyoung1989"),
-        precipitable_water=1.5,  # cm
-        ozone=0.31,  # atm cm
-        aerosol_turbidity_500nm=0.1,
-        dayofyear=_day_of_year(moments),
-    )
-    return np.where(elevation_deg[:, None] > 0, np.maximum(sky["poa_global"].T, 0.0), 0.0)
+    light = clear_sky(zenith, get_relative_airmass(zenith, "kastenyoung1989"), _day_of_year(moments))[1]
+    return np.where(elevation_deg[:, None] > 0, np.maximum(light.T, 0.0), 0.0)
 
 
 def _day_of_year(moments: Floats) -> Floats:
@@ -141,17 +139,4 @@ def _at_bands(light: Floats, wavelength_nm: Floats) -> Floats:
 
 @lru_cache(maxsize=1)
 def _model_wavelengths() -> Floats:
-    from pvlib.spectrum import spectrl2
-
-    overhead = dict.fromkeys(("apparent_zenith", "aoi", "surface_tilt"), 0.0)
-    sky = spectrl2(
-        **overhead,
-        ground_albedo=0.2,
-        surface_pressure=101325.0,
-        relative_airmass=1.0,
-        precipitable_water=1.5,
-        ozone=0.31,
-        aerosol_turbidity_500nm=0.1,
-        dayofyear=172,
-    )
-    return np.asarray(sky["wavelength"], np.float64)
+    return clear_sky(0.0, 1.0, 172)[0]

@@ -18,7 +18,7 @@ def list_effects(decision: Decision, measured: Mapping[str, float] | None = None
 
     Each has ``name``; ``state`` (on or off); ``variant`` (None where off); ``bound`` on the change of any number that
     is stored, at the worst binning, by treating the effect so, in ``unit``, with the factor of safety: 0 where it is
-    exact or absent, None where there is none; ``measured``, the same on chips of the scene (None where not verified);
+    exact or absent, None where there is none; ``measured``, the same on lines of the scene (None where not verified);
     ``cost_s``, estimated CPU seconds of all sweeps; ``why`` in a sentence, and its parts: ``reason`` (see
     `choice.Treatment`), ``left_out``, the bound on what leaving it out would change, and ``magnitude``, how large it is
     here, in the words of its own bound.

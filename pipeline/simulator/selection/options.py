@@ -166,14 +166,17 @@ def _check_names(effects: Iterable[Effect]) -> None:
 
 def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
     """Whether the rig has the effect: leaving it out would change a scene that shows everything."""
-    ones = np.ones(len(probe.wavelength_nm))
-    loud = replace(
-        probe, level=ones, spread=ones, span=ones, spectral_slope=ones, spectral_curvature=ones,
-        slope=np.ones((2, len(ones))), curvature=np.ones((2, len(ones))),
-        brightest_e=max(probe.brightest_e, rig.camera.full_well_e), slit_errors={},
-    )  # fmt: skip
+    bright = max(probe.brightest_e, rig.camera.full_well_e)
+    loud = replace(_even_probe(probe, 1.0), brightest_e=bright, slit_errors={})
     shown = max(effect.bound(loud, rig, OFF).value, effect.bound(probe, rig, OFF).value)
     return effect.name in ALWAYS_ON or shown > 0
+
+
+def _even_probe(probe: Probe, derivatives: float) -> Probe:
+    """The probe of a scene of level 1 and the same derivatives in every band."""
+    ones, both = np.ones(len(probe.wavelength_nm)), np.full((2, len(probe.wavelength_nm)), derivatives)
+    seen = replace(probe, level=ones, spread=ones, span=ones, slope=both, curvature=both)
+    return replace(seen, spectral_slope=both[0], spectral_curvature=both[1])
 
 
 def _gain_range(effect: Effect, probe: Probe, rig: Rig) -> GainRange | None:
@@ -183,14 +186,8 @@ def _gain_range(effect: Effect, probe: Probe, rig: Rig) -> GainRange | None:
         return stated
     if not hasattr(effect, "gain"):
         return None
-    bands = len(probe.wavelength_nm)
-    nothing, ones = np.zeros(bands), np.ones(bands)
-    even = replace(
-        probe, level=ones, spread=ones, span=ones, spectral_slope=nothing, spectral_curvature=nothing,
-        slope=np.zeros((2, bands)), curvature=np.zeros((2, bands)), unit_least_dn=1.0,
-    )  # fmt: skip
-    off = effect.bound(even, rig, OFF).value
-    return GainRange.between(max(1 - off, 0.0), 1 + off, bands, uneven=2 * off)
+    off = effect.bound(replace(_even_probe(probe, 0.0), unit_least_dn=1.0), rig, OFF).value
+    return GainRange.between(max(1 - off, 0.0), 1 + off, len(probe.wavelength_nm), uneven=2 * off)
 
 
 def _gain_beside(effect: Effect, ranges: Sequence[GainRange | None], place: int, growth: Growth) -> float:

@@ -130,18 +130,14 @@ def _differences(probe: Probe, rig: Rig, blurs: list[Any], normal: Floats) -> tu
     nm = np.asarray(probe.wavelength_nm, np.float64)
     blurred = Moments.together([blur.moments(rig, nm, blur.variants[0], normal) for blur in blurs], len(nm))
     steep, bend = np.zeros((2, *probe.slope.shape))
-    for share, waves in _patterns(blurred):
+    shares, widths = np.ones(1), np.zeros((1, *blurred.variance.shape))
+    if blurred.waves is not None:  # diffraction is a sum of Gaussians
+        shares, sizes = airy_gaussians()
+        widths = sizes[:, None, None] * blurred.waves
+    for share, waves in zip(shares.tolist(), widths, strict=True):
         first, second = _by_gaussian(probe, nm, blurred.shift, blurred.variance + waves**2, waves)
         steep, bend = steep + share * first, bend + share * second
     return steep, bend
-
-
-def _patterns(blurred: Moments) -> list[tuple[float, Floats]]:
-    """Shares and widths (2, band) of the Gaussians that diffraction is a sum of; one of no width without it."""
-    if blurred.waves is None:
-        return [(1.0, np.zeros_like(blurred.variance))]
-    shares, sizes = airy_gaussians()
-    return [(float(share), size * blurred.waves) for share, size in zip(shares, sizes, strict=True)]
 
 
 def _by_gaussian(probe: Probe, nm: Floats, shift: Floats, variance: Floats, width: Floats) -> tuple[Floats, Floats]:
@@ -149,25 +145,15 @@ def _by_gaussian(probe: Probe, nm: Floats, shift: Floats, variance: Floats, widt
 
     ``width`` (2, band) is the part of it that grows in proportion to the wavelength.
     """
-    moved, spread, wider = (_first(values, nm) for values in (shift, variance, np.sqrt(variance)))
+    moved, spread, wider = (steepest_difference(values, nm) for values in (shift, variance, np.sqrt(variance)))
+    shift_bend, spread_bend = (np.abs(second_difference(values, nm)) for values in (shift, variance))
     steep = probe.slope * moved + np.minimum(probe.curvature * spread / 2, probe.slope * wider)
-    bend = probe.slope * _second(shift, nm) + probe.curvature * (
-        _second(variance, nm) / 2 + (moved + spread * FINEST_PER_PX / 2) ** 2
-    )
+    turned = spread_bend / 2 + (moved + spread * FINEST_PER_PX / 2) ** 2
+    bend = probe.slope * shift_bend + probe.curvature * turned
     if not width.any():
         return steep, bend
-    grown = _first(width, nm) / width
+    grown = steepest_difference(width, nm) / width
     by_span = probe.slope * moved + _PER_LOG * probe.span * grown
-    across = probe.slope * _second(shift, nm) + probe.curvature * moved**2
+    across = probe.slope * shift_bend + probe.curvature * moved**2
     bend_by_span = across + probe.span * grown * (_PER_LOG_AND_PX * moved / width + _PER_LOG_TWICE * grown)
     return np.minimum(steep, by_span), np.minimum(bend, bend_by_span)
-
-
-def _first(values: Floats, nm: Floats) -> Floats:
-    steep: Floats = steepest_difference(values, nm)  # type: ignore[arg-type, assignment]
-    return steep
-
-
-def _second(values: Floats, nm: Floats) -> Floats:
-    bent: Floats = np.abs(second_difference(values, nm))  # type: ignore[arg-type]
-    return bent

@@ -204,15 +204,25 @@ def _summed_up(scene: Scene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit, se
     off_mean = np.maximum(most - means.min(), means.max() - least)
     off_other = np.maximum(most - low, high - least)
     return Probe(
-        unit=unit, sweeps=sweeps, wavelength_nm=scene.wavelength_nm, fwhm_nm=scene.fwhm_nm,
-        level=_greatest(level), spread=_greatest(stored_mean(_above(off_mean, high), binning) / scale),
+        unit=unit,
+        sweeps=sweeps,
+        wavelength_nm=scene.wavelength_nm,
+        fwhm_nm=scene.fwhm_nm,
+        level=_greatest(level),
+        spread=_greatest(stored_mean(_above(off_mean, high), binning) / scale),
         span=_greatest(stored_mean(_above(off_other, high), binning) / scale),
-        slope=slope, curvature=curvature, spectral_slope=spectral[0], spectral_curvature=spectral[1],
-        brightest_e=float(most.max()), darkest_e=float(least.min()),
+        slope=slope,
+        curvature=curvature,
+        spectral_slope=spectral[0],
+        spectral_curvature=spectral[1],
+        brightest_e=float(most.max()),
+        darkest_e=float(least.min()),
         unit_least_dn=float(scale.min()) / camera.electrons_per_dn,
-        lines=sum(sweep.lines for sweep in sweeps), seconds=CostModel().seconds(list(sweeps), camera),
-        white_e=scene.panel_electrons.astype(np.float64) * (camera.exposure_ms / DEFAULT_EXPOSURE_MS), binning=binning,
-    )  # fmt: skip
+        lines=sum(sweep.lines for sweep in sweeps),
+        seconds=CostModel().seconds(list(sweeps), camera),
+        white_e=scene.panel_electrons.astype(np.float64) * (camera.exposure_ms / DEFAULT_EXPOSURE_MS),
+        binning=binning,
+    )
 
 
 def _derivatives(seen: Light, scale: Light, binning: int) -> tuple[Floats, Floats]:
@@ -228,10 +238,10 @@ def _derivatives(seen: Light, scale: Light, binning: int) -> tuple[Floats, Float
     slope, curvature = [], []
     for axis in (0, 1):
         behind, back, ahead, front, before, after = seen[1 + 6 * axis : 7 + 6 * axis]
-        pairs = [(behind, back, _NEAR), (back, level, _NEAR), (level, ahead, _NEAR), (ahead, front, _NEAR),
-                 (before, level, _FAR), (level, after, _FAR)]  # fmt: skip
+        near, far = [(behind, back), (back, level), (level, ahead), (ahead, front)], [(before, level), (level, after)]
         triples = [(back, ahead, _NEAR), (behind, front, _FAR), (before, after, _FAR)]
-        slope.append(np.max([size(b - a) / way for a, b, way in pairs], axis=0))
+        steps = [size(b - a) / _NEAR for a, b in near] + [size(b - a) / _FAR for a, b in far]
+        slope.append(np.max(steps, axis=0))
         curvature.append(np.max([size(a + b - 2 * level) / way**2 for a, b, way in triples], axis=0))
     return np.array(slope), np.array(curvature)
 

@@ -28,7 +28,7 @@ Render = Callable[[SweepBlock, Mapping[Effect, str]], Light]
 
 
 def candidate_blocks(whole: Sequence[SweepBlock], places: Floats, *, lines: int = VERIFIED_LINES) -> list[SweepBlock]:
-    """Give chips about places of the scene and about the first, middle and last line of every sweep.
+    """Give blocks of few lines about places of the scene and about the first, middle and last line of every sweep.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def candidate_blocks(whole: Sequence[SweepBlock], places: Floats, *, lines: int 
 def worst_blocks(
     candidates: Sequence[SweepBlock], render: Callable[[SweepBlock], Light], units: Units
 ) -> dict[str, SweepBlock]:
-    """Choose where bounds are hardest to keep: the steepest, brightest, darkest and most oblique of some chips.
+    """Choose where bounds are hardest to keep: the steepest, brightest, darkest and most oblique of some blocks.
 
     Of numbers as they are stored, and of each binning that the sweeps have its own.
 
@@ -63,32 +63,32 @@ def worst_blocks(
 
     Returns
     -------
-    By name; one chip may have several.
+    By name; one block may have several.
 
     Raises
     ------
     ShapeError : there is nothing to choose from.
     """
     best: dict[str, tuple[float, SweepBlock]] = {}
-    least = min((chip.sweep.binning for chip in candidates), default=1)
-    for chip in candidates:
-        binning = chip.sweep.binning
-        light = stored_mean(render(chip), binning)
+    least = min((block.sweep.binning for block in candidates), default=1)
+    for block in candidates:
+        binning = block.sweep.binning
+        light = stored_mean(render(block), binning)
         if not light.size:
             continue
-        for name, score in _scores(chip, light / units(light, binning)).items():
+        for name, score in _scores(block, light / units(light, binning)).items():
             called = name if binning == least else f"{name} in sums of {binning}"
             if called not in best or score > best[called][0]:
-                best[called] = score, chip
+                best[called] = score, block
     if not best:
         raise ShapeError(
-            f"no chip to verify effects on: {len(candidates)} candidates hold no sample; give lines of a sweep"
+            f"no lines to verify effects on: {len(candidates)} candidates hold no sample; give lines of a sweep"
         )
-    return {name: chip for name, (_, chip) in best.items()}
+    return {name: block for name, (_, block) in best.items()}
 
 
 def _first_lines(block: SweepBlock, places: Floats, lines: int) -> list[int]:
-    """First lines of the chips of one sweep, ascending."""
+    """First lines of the blocks of one sweep, ascending."""
     sweep, camera = block.sweep, block.rig.camera
     middles = [0, sweep.lines // 2, sweep.lines - 1] if sweep.lines else []
     centred = np.reshape(places, (-1, 2)) - (np.array(block.shape) - 1) / 2
@@ -100,20 +100,20 @@ def _first_lines(block: SweepBlock, places: Floats, lines: int) -> list[int]:
     return sorted({max(0, min(middle - lines // 2, sweep.lines - lines)) for middle in middles})
 
 
-def _scores(chip: SweepBlock, relative: Floats) -> dict[str, float]:
-    """How much a chip is what it may be named for, of light in units."""
+def _scores(block: SweepBlock, relative: Floats) -> dict[str, float]:
+    """How much a block is what it may be named for, of light in units."""
     steps = [np.abs(np.diff(relative, axis=axis)).max(initial=0.0) for axis in (0, 1)]
     return {
         "steepest": float(max(steps)),
         "brightest": float(relative.max()),
         "darkest": -float(relative.min()),
-        "most oblique": float(chip.normals[:, 2].max()),
+        "most oblique": float(block.normals[:, 2].max()),
     }
 
 
 @dataclass(frozen=True)
-class _Chip:
-    """A chip with everything on as it is stored, and what a unit of the tolerance is at each of its numbers [e-]."""
+class _Rendered:
+    """A block with everything on as it is stored, and what a unit of the tolerance is at each of its numbers [e-]."""
 
     name: str
     block: SweepBlock
@@ -129,7 +129,7 @@ class _Chip:
 
 @dataclass(frozen=True)
 class _Change:
-    """The greatest change on a chip in units of the tolerance; the one that arithmetic least explains, and where."""
+    """The greatest change on a block in units of the tolerance; the one that arithmetic least explains, and where."""
 
     greatest: float
     change: float = 0.0
@@ -142,8 +142,8 @@ class _Change:
         return math.inf if math.isnan(self.change) else self.change - self.rounding
 
 
-def verify(decision: Decision, render: Render, chips: Mapping[str, SweepBlock], units: Units) -> dict[str, float]:
-    """Measure on chips what every effect that is off or cheapened changes, and all together, against everything on.
+def verify(decision: Decision, render: Render, blocks: Mapping[str, SweepBlock], units: Units) -> dict[str, float]:
+    """Measure on blocks what every effect that is off or cheapened changes, and all together, against everything on.
 
     What changes are numbers as they are stored: sums of neighbouring samples where a sweep bins them.
 
@@ -154,8 +154,8 @@ def verify(decision: Decision, render: Render, chips: Mapping[str, SweepBlock], 
     ----------
     render
         Expected electrons (line, sample, band) of a block with some effects on.
-    chips
-        By name, as `chips.worst_chips` chooses them.
+    blocks
+        By name, as `worst_blocks` chooses them.
     units
         From expected electrons with everything on, and their binning, to one unit of the tolerance at each. [e-]
 
@@ -167,14 +167,14 @@ def verify(decision: Decision, render: Render, chips: Mapping[str, SweepBlock], 
     ------
     BoundError : a change exceeds the bound that the decision counted on; names effect, bound, change and place.
     """
-    full = [_chip(name, block, render, decision, units) for name, block in _once_each(chips).items()]
+    full = [_rendered(name, block, render, decision, units) for name, block in _once_each(blocks).items()]
     changed = [one for one in decision.taken if _changes_light(one)]
     trials = [(one.name, [one]) for one in changed] + [(TOTAL, changed)]
     measured: dict[str, float] = {}
     for name, inexact in trials:
         bound, chosen = math.fsum(one.option.error for one in inexact), _with(decision, inexact)
         share = misplaced_share(decision.exact, chosen)
-        found = [_greatest_change(chip, render(chip.block, chosen), bound, share) for chip in full] if inexact else []
+        found = [_greatest_change(one, render(one.block, chosen), bound, share) for one in full] if inexact else []
         worst = max(found, key=lambda one: one.unexplained, default=_Change(0.0))
         if not worst.unexplained <= bound:
             raise BoundError(_complaint(name, worst, bound, decision))
@@ -182,18 +182,18 @@ def verify(decision: Decision, render: Render, chips: Mapping[str, SweepBlock], 
     return measured
 
 
-def _once_each(chips: Mapping[str, SweepBlock]) -> dict[str, SweepBlock]:
-    """Join the names of chips that are the same lines: the brightest is often the steepest as well."""
+def _once_each(blocks: Mapping[str, SweepBlock]) -> dict[str, SweepBlock]:
+    """Join the names of blocks that are the same lines: the brightest is often the steepest as well."""
     names: dict[tuple[str, range], list[str]] = {}
-    for name, block in chips.items():
+    for name, block in blocks.items():
         names.setdefault((block.sweep.name, block.lines), []).append(name)
-    return {" and ".join(said): chips[said[0]] for said in names.values()}
+    return {" and ".join(said): blocks[said[0]] for said in names.values()}
 
 
-def _chip(name: str, block: SweepBlock, render: Render, decision: Decision, units: Units) -> _Chip:
+def _rendered(name: str, block: SweepBlock, render: Render, decision: Decision, units: Units) -> _Rendered:
     light = stored_mean(render(block, decision.exact), block.sweep.binning)
     unit = np.broadcast_to(units(np.asarray(light, np.float32), block.sweep.binning), light.shape)
-    return _Chip(name, block, light, unit, render)
+    return _Rendered(name, block, light, unit, render)
 
 
 def _changes_light(one: Treatment) -> bool:
@@ -207,21 +207,21 @@ def _with(decision: Decision, inexact: Sequence[Treatment]) -> dict[Effect, str]
     return {effect: variant for effect, variant in variants.items() if variant != OFF}
 
 
-def _greatest_change(chip: _Chip, light: Light, bound: float, share: float) -> _Change:
-    binning = chip.block.sweep.binning
-    change = np.abs(stored_mean(light, binning).astype(np.float64) - chip.light) / chip.unit
+def _greatest_change(one: _Rendered, light: Light, bound: float, share: float) -> _Change:
+    binning = one.block.sweep.binning
+    change = np.abs(stored_mean(light, binning).astype(np.float64) - one.light) / one.unit
     if not change.size:
         return _Change(0.0)
     rounding = np.zeros(change.shape)
     if not change.max() <= bound:
-        rounding = misplaced_electrons(chip.light, chip.contrast, share) / chip.unit
+        rounding = misplaced_electrons(one.light, one.contrast, share) / one.unit
     worst = np.unravel_index(int(np.argmax(change - rounding)), change.shape)  # the first NaN, if there is one
     line, number, band = worst
-    block, summed = chip.block, "" if binning == 1 else f" (of {binning} summed)"
+    block, summed = one.block, "" if binning == 1 else f" (of {binning} summed)"
     count = number if binning > 1 else block.columns[number]
     place = f"sweep {block.sweep.name}, line {block.numbers[line]}, sample {count}{summed}, band {band}"
     return _Change(
-        float(change.max()), float(change[worst]), float(rounding[worst]), f"{place} of the {chip.name} chip"
+        float(change.max()), float(change[worst]), float(rounding[worst]), f"{place} of the {one.name} lines"
     )
 
 

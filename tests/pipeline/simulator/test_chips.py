@@ -75,5 +75,5 @@ def test_candidates_stay_few_and_within_short_sweeps():
 
 def test_nothing_to_choose_from_is_refused():
     """Rather than verified on nothing."""
-    with pytest.raises(ShapeError, match="no chip to verify effects on: 0 candidates hold no sample"):
+    with pytest.raises(ShapeError, match="no lines to verify effects on: 0 candidates hold no sample"):
         worst_blocks([], lambda chip: np.zeros((0, 640, 1), np.float32), ones)

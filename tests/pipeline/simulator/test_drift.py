@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.once import Once
-from pipeline.simulator.effects.lighting import DRIFT, daylight_range
+from pipeline.simulator.effects.lighting import DRIFT
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from tests.pipeline.simulator.outdoors import (
@@ -47,7 +47,7 @@ def test_no_time_no_drift() -> None:
     rig = rig_with()
     assert DRIFT.bound(probe_of(rig), rig).value == 0
     assert (DRIFT.gain(block_of(rig), "spectral") == 1).all()
-    assert (daylight_range(probe_of(rig), rig).greatest == 1).all()
+    assert (DRIFT.gain_range(probe_of(rig), rig).greatest == 1).all()
 
 
 @pytest.mark.parametrize("started", [NOON, MORNING, NIGHT])

@@ -59,7 +59,7 @@ def test_broken_bound_is_named_with_its_place():
     decision = decided(Brightening("drift", 0.01, share=0.1))
     said = (
         r"drift: .* changes light by 0\.12 sigma of the noise at sweep fine-0, line 40, sample 0, band 0 of the "
-        r"brightest chip, above its bound of 0\.0145.*--tol 0 or"
+        r"brightest lines, above its bound of 0\.0145.*--tol 0 or"
     )
     with pytest.raises(BoundError, match=said):
         verify(decision, render, CHIPS, units)
@@ -92,6 +92,6 @@ def test_sums_are_held_against_the_bound_as_they_are_stored():
         return np.full(light.shape, 100.0 / np.sqrt(binning))
 
     assert verify(decided(shared), render, {"steepest": BLOCK}, noise)["drift"] == pytest.approx(0.01, rel=1e-3)
-    said = r"light by 0\.02 sigma .* sample 0 \(of 4 summed\), band 0 of the steepest chip"
+    said = r"light by 0\.02 sigma .* sample 0 \(of 4 summed\), band 0 of the steepest lines"
     with pytest.raises(BoundError, match=said):
         verify(decided(shared), render, {"steepest": coarse}, noise)

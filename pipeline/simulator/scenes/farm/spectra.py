@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.errors import WavelengthError
+from pipeline.simulator.scenes.daylight import clear_sky
 
 Spectrum = NDArray[np.float64]
 
@@ -169,21 +170,8 @@ def band_response(wavelength_nm: Spectrum, fwhm_nm: Spectrum) -> NDArray[np.floa
 
 def _photons() -> Spectrum:
     """Relative global photon flux on level ground: SPECTRL2 under a clear sky on 21 June at sea level."""
-    from pvlib.spectrum import spectrl2  # half a second of pandas: only for whoever needs the farm
-
-    sky = spectrl2(
-        apparent_zenith=_SUN_ZENITH_DEG,
-        aoi=_SUN_ZENITH_DEG,
-        surface_tilt=0.0,
-        ground_albedo=0.2,
-        surface_pressure=101325.0,
-        relative_airmass=1 / np.cos(np.deg2rad(_SUN_ZENITH_DEG)),
-        precipitable_water=1.5,  # cm
-        ozone=0.31,  # atm cm
-        aerosol_turbidity_500nm=0.1,
-        dayofyear=172,
-    )
-    return np.asarray(np.interp(GRID_NM, sky["wavelength"], sky["poa_global"][:, 0]) * GRID_NM)
+    wavelength, light = clear_sky(_SUN_ZENITH_DEG, 1 / np.cos(np.deg2rad(_SUN_ZENITH_DEG)), 172)
+    return np.asarray(np.interp(GRID_NM, wavelength, light[:, 0]) * GRID_NM)
 
 
 def _quantum_efficiency() -> Spectrum:
