@@ -24,7 +24,7 @@ from pipeline.rig.capture_names import Announced
 from pipeline.rig.steering import wire_positions
 from pipeline.scan import Sweep, sweep_positions
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.effects.effect import Aim, Bound
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.instrument import render_lines
 from pipeline.simulator.render import Choice
@@ -38,20 +38,19 @@ Raw = NDArray[np.uint16]
 
 
 @dataclass(frozen=True)
-class Beside:
+class Beside(Aim):
     """An aim of the chain: how far lines lie beside their plan, (line, step, 2) from line ``first`` on. [px]"""
 
     shift_px: Floats
     first: int
     name = "beside"
-    variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.2})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
         """Give the shifts of a block's lines, along the line and the scan. [px]"""
         return self.shift_px[block.numbers - self.first]
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Nothing is known beforehand of where an emulated mirror goes."""
         return Bound(0.0, "follows the emulated mirror")
 

@@ -69,14 +69,12 @@ class Diffraction(Blur):
             return Moments(none, none, waves)
         return Moments(none, _gaussian(waves, variant))
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound the error of no blur, or of a Gaussian, over all positions of the sweeps.
 
         The pattern is a sum of Gaussians of many widths: each changes the image, or a Gaussian in its place, by no more
         than the difference of their variances does.
         """
-        if variant == AIRY:
-            return Bound(0.0, "exact")
         share, size = airy_gaussians()
         found = [_waves(rig, probe.wavelength_nm, normal) for normal in normals_met(probe.sweeps, rig.camera)]
         missing = []
@@ -161,10 +159,8 @@ class Aberration(Blur):
         """Give the blur, equal in all bands."""
         return even(np.full(2, rig.optics.aberration_px**2), len(wavelength_nm))
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound the error of no blur."""
-        if variant != OFF:
-            return Bound(0.0, "exact")
         return blurred_bound(probe, "blur of the lens", self.moments(rig, probe.wavelength_nm, variant).variance[None])
 
 
@@ -189,10 +185,8 @@ class Defocus(Blur):
         """Give the blur, equal in all bands; ``normal`` (3,) is the mirror's in the camera frame, None at rest."""
         return even(defocus_px(rig, rig.air.distance_m, normal) ** 2 / 16, len(wavelength_nm))
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound the error of no blur over all positions of the sweeps."""
-        if variant != OFF:
-            return Bound(0.0, "exact")
         if rig.distances_m is None:
             return Bound(0.0, "the scene has no distance")
         normals = normals_met(probe.sweeps, rig.camera)
@@ -237,10 +231,8 @@ class Keystone(Blur):
         shift[0] = keystone_shift(rig, wavelength_nm)
         return Moments(shift, np.zeros_like(shift))
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound the error of no shift: slope along the line times shift, never more than the span, band by band."""
-        if variant != OFF:
-            return Bound(0.0, "exact")
         shift = np.abs(keystone_shift(rig, probe.wavelength_nm))
         change = np.minimum(probe.slope[0] * shift, probe.span)
         if not shift.any():

@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from pipeline.simulator.effects.effect import OFF, Bound, Effect, Merged
+from pipeline.simulator.effects.effect import Bound, Effect, Merged
 from pipeline.simulator.effects.noise import (
     CHIP_SAMPLES,
     LEAST_MERGED_READ_E,
@@ -37,15 +37,13 @@ class Saturation(Effect):
     name = "saturation"
     cost_ns = MappingProxyType({"exact": 0.1})
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by how far the brightest sample, 6 deviations up, reaches above the lower of both limits."""
         limit = min(rig.camera.full_well_e, rig.detector.well_e)
         camera, brightest = rig.camera, max(probe.brightest_e, 0.0)
         expected = brightest + dark_electrons(rig) + most_hot_electrons(rig)
         sd = 0.0 if rig.detector.noiseless else float(np.hypot(np.sqrt(expected), camera.read_noise_e))
         over = max(expected + REACH * sd - limit, 0.0)
-        if variant != OFF:
-            return Bound(0.0, "exact")
         if over == 0:
             return Bound(0.0, f"{expected:.3g} e- and 6 x {sd:.3g} e- of noise stay below {limit:.3g} e-")
         why = f"{expected:.3g} e- and 6 x {sd:.3g} e- of noise reach {over:.3g} e- above the limit of {limit:.3g} e-"
@@ -91,13 +89,13 @@ class Shot(Effect):
         dim = float((expected < least_expected(read if merged else 0.0)).mean())
         return {EXACT: counted, GAUSSIAN: self.cost_ns[GAUSSIAN] + dim * counted}
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it at the brightest sample, where it is the greatest share of all noise."""
         brightest = max(probe.brightest_e, 0.0) + dark_electrons(rig) + most_hot_electrons(rig)
         if rig.detector.noiseless:
             return Bound(0.0, "the sensor is ideal")
-        if variant == EXACT or brightest == 0:
-            return Bound(0.0, "exact" if variant == EXACT else "no electrons are expected")
+        if brightest == 0:
+            return Bound(0.0, "no electrons are expected")
         read = rig.camera.read_noise_e
         total = float(np.hypot(np.sqrt(brightest), read))
         if variant == GAUSSIAN:
@@ -144,13 +142,13 @@ class ReadNoise(Effect):
             return None
         return Merged(SHOT.name, GAUSSIAN, 0.0)
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it at the darkest sample, where it is the greatest share of all noise."""
         read = rig.camera.read_noise_e
         if rig.detector.noiseless:
             return Bound(0.0, "the sensor is ideal")
-        if variant != OFF or read == 0:
-            return Bound(0.0, "exact" if variant != OFF else "the camera has none")
+        if read == 0:
+            return Bound(0.0, "the camera has none")
         shot = float(np.sqrt(max(probe.darkest_e, 0.0)))
         total = float(np.hypot(shot, read))
         why = f"{read:.3g} e- beside at least {shot:.3g} e- of shot noise make {total:.3g} e-"
@@ -167,10 +165,8 @@ class Quantisation(Effect):
     name = "quantisation"
     cost_ns = MappingProxyType({"exact": 0.4})
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by half a DN."""
-        if variant != OFF:
-            return Bound(0.0, "exact")
         value = probe.added(0.5 * rig.camera.electrons_per_dn, rig.camera.electrons_per_dn)
         return Bound(value, f"0.5 DN of {rig.camera.electrons_per_dn:g} e-")
 

@@ -66,6 +66,10 @@ class Effect(Protocol):
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
         """Bound the error of leaving it out, or of a variant against the exact one; 0 where the rig lacks it."""
+        return Bound(0.0, "exact") if variant == self.variants[0] else self.missed(probe, rig, variant)
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound the error of leaving it out, or of a variant that is not the exact one."""
 
 
 class Aim(Effect, Protocol):

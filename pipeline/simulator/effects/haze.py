@@ -68,12 +68,12 @@ class Absorption(Gain):
         """Give the cost for the scene's relief: without any, samples share one distance."""
         return self.cost_ns if has_relief(rig) else dict.fromkeys(self.variants, self.cost_ns[UNIFORM])
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by level times the share that gases take, or that a variant misses."""
         reach = reach_m(rig)
         if reach is None:
             return Bound(0.0, "the scene has no distance")
-        if variant == RANGE or (variant == UNIFORM and reach[0] == reach[1]):
+        if variant == UNIFORM and reach[0] == reach[1]:
             return Bound(0.0, "every sample at its own distance")
         near, middle, far = transmission(np.array([reach[0], sum(reach) / 2, reach[1]]), rig, probe.wavelength_nm)
         share = 1 - far if variant == OFF else np.maximum(near - middle, middle - far)
@@ -143,7 +143,7 @@ class PathRadiance(LightChange):
         """Give the cost for the scene's relief: without any, samples share one distance."""
         return self.cost_ns if has_relief(rig) else dict.fromkeys(self.variants, self.cost_ns[UNIFORM])
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by the share that is lost, or that a variant misses, times the greatest difference of signal and H.
 
         Over the noise of the signal that difference is greatest where the signal is greatest, or least.
@@ -151,7 +151,7 @@ class PathRadiance(LightChange):
         reach = reach_m(rig)
         if reach is None:
             return Bound(0.0, "the scene has no distance")
-        if variant == RANGE or (variant == UNIFORM and reach[0] == reach[1]):
+        if variant == UNIFORM and reach[0] == reach[1]:
             return Bound(0.0, "every sample at its own distance")
         depth = extinction_per_m(rig.air, probe.wavelength_nm)
         lost = -np.expm1(-depth * reach[1])

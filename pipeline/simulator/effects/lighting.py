@@ -40,15 +40,13 @@ class Drift(Gain):
     name = "drift"
     cost_ns = MappingProxyType({SPECTRAL: 0.4, SCALAR: 0.2, LINEAR: 0.2})
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by level times the greatest change of the light, or its difference to a variant, through the survey.
 
         The light is straight between its knots, so that its extremes lie on them.
         """
         if rig.sky.started is None:
             return Bound(0.0, "the survey has no time of day")
-        if variant == SPECTRAL:
-            return Bound(0.0, "band by band")
         seconds = probe.seconds + rig.camera.frame_ms * 1e-3  # to the end of the last line
         worst = np.zeros(len(probe.wavelength_nm))
         times = _corners(rig.sky, probe.wavelength_nm, seconds, variant)
@@ -125,13 +123,11 @@ class Cloud(Gain):
     name = "cloud"
     cost_ns = MappingProxyType({"shadow": 0.3})
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by level times the share that a cloud takes; whether a shadow comes is up to the seed."""
         sky = rig.sky
         if sky.cloud_share == 0:
             return Bound(0.0, "the sky is clear")
-        if variant != OFF:
-            return Bound(0.0, "every sample at its own place")
         why = f"a shadow takes {sky.cloud_share:.0%} of the light and moves {sky.cloud_px_per_s:g} px/s over the scene"
         return Bound(probe.scaled(sky.cloud_share), why)
 
@@ -185,13 +181,11 @@ class Brdf(Gain):
     name = "brdf"
     cost_ns = MappingProxyType({"angles": 0.2})
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by level times the greatest slope part plus the greatest hot spot within the sweeps."""
         slope, hot = rig.sky.brdf_per_rad, rig.sky.hot_spot
         if slope == 0 and hot == 0:
             return Bound(0.0, "the scene reflects alike in all directions")
-        if variant != OFF:
-            return Bound(0.0, "every sample at its own angle")
         angle, phase = _extremes(probe.sweeps, rig.camera)
         share = slope * angle + hot * float(np.exp(-phase / HOT_SPOT_RAD))
         peak = f" and a hot spot of {hot:.2g}" if hot else ""

@@ -54,10 +54,8 @@ class Rotation(Effect):
     name = "rotation"
     cost_ns = MappingProxyType({"rays": 0.0})  # straight lines take as long
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by slope times the greatest way between where rays meet the scene and where straight lines would."""
-        if variant != OFF:
-            return Bound(0.0, "rays are exact")
         along, scan = _farthest(probe.sweeps, rig.camera, beside_plan_px(probe, rig))
         most = f"{round(along, 9):.3g} px along and {round(scan, 9):.3g} px along the scan"
         why = f"lines are turned and stretched by at most {most}"
@@ -104,15 +102,13 @@ class SlitBox(Effect):
     # Beside the rig's blurs, which need eleven kernels whatever the slit, at strips of +-960 px; at +-320 less of them.
     cost_ns = MappingProxyType({"9x3": 38.0, "5x2": 10.0, "3x1": 1.8, "1-percent": 1.4, "3-percent": 1.3, UPRIGHT: 0.3})
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by half as much again as the probe measured; where it has not, by the box's variance and the span.
 
         How a variant errs depends on what the scene holds within the footprint, which no derivative of the image
         behind it tells. It was measured beside the rig's blurs: leaving one out is bounded by itself, for any slit.
         What is rounded in tables, and what lines turn more where the mirror looks beside its plan, add a little.
         """
-        if variant == self.variants[0]:
-            return Bound(0.0, "exact")
         width, bands = rig.camera.slit_px, len(probe.wavelength_nm)
         why = f"{_words(variant)} in place of a footprint {width:.2g} px wide and 1 px long"
         box = np.array([[1.0], [width**2]]) / 12
@@ -160,15 +156,15 @@ class Smear(Effect):
     name = "smear"
     cost_ns = MappingProxyType({POSITIONS: 15.0, FOLDED: 5.2})
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound what a blur of the positions' variance changes; 0 where every line has one position.
 
         They vary as the mirror runs: without them its course within an exposure is left out as well.
         """
         most = max((sweep.step for sweep in probe.sweeps), default=1)
         variance = (most**2 - 1) / 12  # of positions 1 px apart
-        if variant == POSITIONS or variance == 0:
-            return Bound(0.0, "the mirror stands still while a line is exposed" if variance == 0 else "exact")
+        if variance == 0:
+            return Bound(0.0, "the mirror stands still while a line is exposed")
         if variant == FOLDED:
             along, scan = _beside(probe.sweeps, rig)
             along, scan = along + sway_gradient(rig), scan + sway_gradient(rig) + greatest_share(rig.air)

@@ -45,11 +45,11 @@ class Staircase(Aim):
         scan = beside_plan(positions, block.sweep.step, block.numbers, _parts(positions, block.sweep.step, variant))
         return np.stack([np.zeros_like(scan), scan], axis=-1)
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by what a shift of the mean and a blur of the second moment change, or slope times the mean way."""
         positions = rig.mirror.positions_per_line
-        if variant == EXACT or positions == 1 or not probe.sweeps:
-            return Bound(0.0, "exact" if variant == EXACT else "each px of the path has its one position")
+        if positions == 1 or not probe.sweeps:
+            return Bound(0.0, "each px of the path has its one position")
         mean, size, square = _moments(positions, probe.sweeps, variant)
         both = np.zeros(probe.slope.shape)
         ends = [at_line_ends(probe.sweeps, rig.camera, 0.0, way) for way in (size, mean, square**0.5)]
@@ -125,10 +125,8 @@ class Lag(Aim):
         scan = transient(block.rig, block.sweep, block.numbers, variant)
         return np.stack([np.zeros_like(scan), scan], axis=-1)
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by slope times the greatest shift of any line, or times the greatest difference of the variants."""
-        if variant == EXACT:
-            return Bound(0.0, "exact")
         worst = greatest_lag_px(rig, probe.sweeps, variant)
         moved = at_line_ends(probe.sweeps, rig.camera, 0.0, worst)
         pace = f"{rig.camera.frame_ms:g} ms a line, {rig.mirror.natural_hz:g} Hz"

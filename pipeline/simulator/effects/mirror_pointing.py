@@ -14,7 +14,7 @@ from pipeline.camera import LineCamera
 from pipeline.mirror import position_to_normal
 from pipeline.scan import Sweep, line_positions, points_of_scan
 from pipeline.simulator.block import SweepBlock, unit_stream
-from pipeline.simulator.effects.effect import OFF, Aim, Bound
+from pipeline.simulator.effects.effect import Aim, Bound
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
@@ -66,7 +66,7 @@ class Jitter(Aim):
         shift: Floats = (tilt_to_scene(block.normals) * drawn.reshape(-1, 1, 2)).sum(axis=-1) * _sigma_px(block.rig)
         return shift[:, None]
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound what the worst of all lines' deviates changes; with a probability of 1e-3 a survey goes beyond.
 
         A line changes by at most its slope's share in the two tilts times the length of the two deviates. That length
@@ -74,8 +74,8 @@ class Jitter(Aim):
         sqrt(2 ln(n / 1e-3)), 5.4 for 2560 lines.
         """
         sigma, lines = _sigma_px(rig), probe.lines
-        if variant != OFF or sigma == 0 or lines == 0:
-            return Bound(0.0, "the mirror comes back to the same tilt" if variant == OFF else "exact")
+        if sigma == 0 or lines == 0:
+            return Bound(0.0, "the mirror comes back to the same tilt")
         along, scan, common = _spreads(probe, rig)
         most = math.sqrt(2 * math.log(lines / EXCEEDED))
         g, h = probe.slope[0] * along, probe.slope[1] * scan
@@ -145,10 +145,10 @@ class Hysteresis(Aim):
         """Give the shift, (line, 1, 2) along the line and the scan. [px]"""
         return _course(block.rig, block.sweep, block.middle)[:, None]
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by slope times the greatest shift that any line of the sweeps has: the field is known."""
-        if variant != OFF or rig.mirror.hysteresis_px == 0 or not probe.sweeps:
-            return Bound(0.0, "the mirror comes to the same place from either side" if variant == OFF else "exact")
+        if rig.mirror.hysteresis_px == 0 or not probe.sweeps:
+            return Bound(0.0, "the mirror comes to the same place from either side")
         ways = [_course(rig, sweep, line_positions(sweep, rig.camera)) for sweep in probe.sweeps]
         along, scan = np.abs(np.concatenate(ways)).max(axis=0, initial=0.0)
         why = f"lines lie up to {along:.2g} px off along the line and {scan:.2g} px along the scan"
@@ -167,11 +167,11 @@ class ThermalDrift(Aim):
         walked = block.rig.mirror.drift_px_per_min / 60 * block.time_s
         return np.stack([walked * one for one in _along_and_scan(block.rig)], axis=-1)[:, None]
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by slope times the way walked until the last line."""
         rate = rig.mirror.drift_px_per_min
-        if variant != OFF or rate == 0 or not probe.sweeps:
-            return Bound(0.0, "the view does not drift" if variant == OFF else "exact")
+        if rate == 0 or not probe.sweeps:
+            return Bound(0.0, "the view does not drift")
         walked = rate / 60 * (probe.seconds + rig.camera.frame_ms * 1e-3)
         along, scan = (walked * abs(one) for one in _along_and_scan(rig))
         why = f"the view drifts by {walked:.2g} px, {rate:g} px/min for {probe.seconds:.3g} s"

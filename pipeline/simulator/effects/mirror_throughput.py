@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.camera import LineCamera
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Bound, Gain
+from pipeline.simulator.effects.effect import Bound, Gain
 from pipeline.simulator.effects.gain_range import GainRange
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.optics.coatings import reflectance
@@ -39,10 +39,8 @@ class Vignetting(Gain):
     name = "vignetting"
     cost_ns = MappingProxyType({HELD: 0.2, MIDDLE: 0.2})
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by the greatest signal times the factor's greatest difference from 1 over all sweeps."""
-        if variant == HELD:
-            return Bound(0.0, "exact")
         if variant == MIDDLE:
             most = max((sweep.step for sweep in probe.sweeps), default=1)
             bend = MOST_BEND / 2 * rig.camera.ifov_rad**2 * (most**2 - 1) / 12
@@ -99,13 +97,11 @@ class Polarisation(Gain):
     name = "polarisation"
     cost_ns = MappingProxyType({EXACT: 0.2})
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by the greatest signal times the factor's greatest difference from 1 over all sweeps."""
         incidence = _incidence(sweep_ends(probe, rig.camera))
         if rig.mirror.coating == "ideal" or not incidence.size:
             return Bound(0.0, "the mirror reflects everything" if incidence.size else "no line is taken")
-        if variant == EXACT:
-            return Bound(0.0, "exact")
         factors = _factors_between(incidence, rig, probe.wavelength_nm)
         between = np.abs(np.diff(factors, 2, axis=0)).max(axis=0) / 8  # most that a chord misses of what it cuts off
         most = np.abs(factors - 1).max(axis=0) + between

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator.block import SweepBlock, sweep_stream
-from pipeline.simulator.effects.effect import OFF, Aim, Bound, Displacement
+from pipeline.simulator.effects.effect import Aim, Bound, Displacement
 from pipeline.simulator.effects.probe import UNITS, Probe
 from pipeline.simulator.effects.relief import FARTHEST_M
 from pipeline.simulator.rig_model import Rig
@@ -44,14 +44,12 @@ class Turbulence(Aim):
         draws = [block.stream(self.name, int(number)).standard_normal(2) for number in block.numbers]
         return sigma * np.array(draws, np.float64).reshape(-1, 1, 2)
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound the error of leaving the lines where they are, for all lines at once but in one survey of 1000.
 
         The way of a line is Rayleigh's: it exceeds m sigma with the probability exp(-m^2 / 2), so that no line of N
         exceeds sqrt(2 ln(N / risk)) sigma but with the risk; 5.3 for 1000 lines.
         """
-        if variant != OFF:
-            return Bound(0.0, "exact")
         sigma = turbulence_px(rig)
         if not sigma:
             return Bound(0.0, "no distance or no turbulence")
@@ -125,11 +123,11 @@ class Wind(Displacement):
         right, down = moved * math.cos(heading), moved * math.sin(heading)
         return (right, down) if block.sweep.along == "x" else (down, right)
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by the amplitude times the length of the steepest gradient, whichever way the wind blows."""
         sway = sway_px(rig)
-        if variant != OFF or sway == 0:
-            return Bound(0.0, "the air is calm" if variant == OFF else "exact")
+        if sway == 0:
+            return Bound(0.0, "the air is calm")
         steep = sway * np.hypot(probe.slope[0], probe.slope[1])
         return Bound(float(np.minimum(steep, probe.span).max(initial=0.0)), _reason(rig, sway))
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Aim, Bound
+from pipeline.simulator.effects.effect import Aim, Bound
 from pipeline.simulator.effects.mirror_pointing import at_line_ends
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
@@ -46,11 +46,11 @@ class Pointing(Aim, ABC):
         """Give the error of a block's lines, (line, 1, 2) along the line and the scan. [px]"""
         return self.of_lines(block.sweep.name, block.lines)[:, None]
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by slope times the greatest error."""
         along, scan = self.reach_px
-        if variant != OFF or along == scan == 0:
-            return Bound(0.0, "the mirror looks where it reports" if variant == OFF else "exact")
+        if along == scan == 0:
+            return Bound(0.0, "the mirror looks where it reports")
         why = f"the mirror looks up to {along:.2g} px beside along the line and {scan:.2g} px along the scan"
         return Bound(probe.moved(*at_line_ends(probe.sweeps, rig.camera, along, scan)), why)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.scan import points_of_scan
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Bound, Displacement
+from pipeline.simulator.effects.effect import Bound, Displacement
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Air, Rig
 
@@ -40,11 +40,11 @@ class Parallax(Displacement):
         share = air.lever_m * (closeness(air, row / max((size - 1) / 2, 0.5)) - 1 / air.distance_m)
         return share * (along_px - sweep.strip_px), share * (scan_px - block.scan_px[:, None])
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by slope times the displacement at the lines' ends of the part farthest from the scene's distance."""
         share = greatest_share(rig.air)
-        if variant != OFF or share == 0 or not probe.sweeps:
-            return Bound(0.0, "all of the scene is at one distance" if variant == OFF else "exact")
+        if share == 0 or not probe.sweeps:
+            return Bound(0.0, "all of the scene is at one distance")
         along, scan = (share * half for half in _half_lines(probe, rig))
         near, far = rig.distances_m or (0.0, 0.0)
         why = f"at the lines' ends {along:.2g} px between {near:g} and {far:g} m ({rig.air.relief})"

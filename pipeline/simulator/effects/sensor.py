@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator.block import SweepBlock, unit_stream
-from pipeline.simulator.effects.effect import OFF, Bound, Effect, Gain
+from pipeline.simulator.effects.effect import Bound, Effect, Gain
 from pipeline.simulator.effects.gain_range import GainRange
 from pipeline.simulator.effects.noise import normal_deviates, told_apart
 from pipeline.simulator.effects.probe import Probe
@@ -39,11 +39,11 @@ class DarkCurrent(Effect):
     name = "dark-current"
     cost_ns = MappingProxyType({"exact": 0.1})
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it where least noise hides it: its mean, and what its spread adds to the noise."""
         electrons = dark_electrons(rig)
-        if variant != OFF or electrons == 0:
-            return Bound(0.0, "exact" if variant != OFF else "the sensor has none")
+        if electrons == 0:
+            return Bound(0.0, "the sensor has none")
         sd = float(np.hypot(rig.camera.read_noise_e, np.sqrt(max(probe.darkest_e, 0.0))))
         spread = told_apart(float(np.hypot(sd, np.sqrt(electrons))), sd)
         if probe.unit == "dn":
@@ -92,12 +92,12 @@ class Defects(Effect):
     name = "defects"
     cost_ns = MappingProxyType({"exact": 0.3})
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by the greatest signal of bands with dead elements, and the electrons of hot ones."""
         bands = len(probe.wavelength_nm)
         dead, hot = dead_elements(rig, bands), hot_electrons(rig, bands)
-        if variant != OFF or not (dead.any() or hot.any()):
-            return Bound(0.0, "exact" if variant != OFF else "no element is dead or hot")
+        if not (dead.any() or hot.any()):
+            return Bound(0.0, "no element is dead or hot")
         lost = probe.scaled(dead.any(axis=0).astype(np.float64))
         electrons = float(hot.max())
         gained = min(electrons, rig.camera.full_well_e)  # the converter's end
@@ -145,19 +145,17 @@ class Prnu(Gain):
     name = "prnu"
     cost_ns = MappingProxyType({"exact": 0.2})
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by the greatest signal of each band times the greatest gain beside 1 that the sensor has there."""
         share = rig.detector.response_share
-        if variant != OFF or share == 0:
-            return Bound(0.0, "exact" if variant != OFF else "all elements respond alike")
+        if share == 0:
+            return Bound(0.0, "all elements respond alike")
         off = np.abs(response_gain(rig, len(probe.wavelength_nm)) - 1).max(axis=0)
         return Bound(probe.scaled(off), f"gains differ by {share:.2%} (sd), {off.max():.2%} at most")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         """Give the sensor's least and greatest gain."""
-        gains, bands = response_gain(rig, len(probe.wavelength_nm)), len(probe.wavelength_nm)
-        least, greatest = float(gains.min(initial=1.0)), float(gains.max(initial=1.0))
-        return GainRange.between(least, greatest, bands, uneven=greatest - least)
+        return _range_of(response_gain(rig, len(probe.wavelength_nm)), probe)
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
         """Give the gain of each element, (1, sample, band)."""
@@ -171,19 +169,17 @@ class Striping(Gain):
     name = "striping"
     cost_ns = MappingProxyType({"exact": 0.2})
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by the greatest signal times the greatest gain beside 1 that the sensor has."""
         share = rig.detector.stripe_share
-        if variant != OFF or share == 0:
-            return Bound(0.0, "exact" if variant != OFF else "all columns respond alike")
+        if share == 0:
+            return Bound(0.0, "all columns respond alike")
         off = float(np.abs(stripe_gain(rig) - 1).max())
         return Bound(probe.scaled(off), f"gains of columns differ by {share:.2%} (sd), {off:.2%} at most")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         """Give the sensor's least and greatest gain."""
-        gains, bands = stripe_gain(rig), len(probe.wavelength_nm)
-        least, greatest = float(gains.min(initial=1.0)), float(gains.max(initial=1.0))
-        return GainRange.between(least, greatest, bands, uneven=greatest - least)
+        return _range_of(stripe_gain(rig), probe)
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
         """Give the gain of each column, (1, sample, 1)."""
@@ -203,6 +199,11 @@ def response_gain(rig: Rig, bands: int) -> Light:
 def stripe_gain(rig: Rig) -> Light:
     """Give the gains of the sensor's columns, (sample, 1) of the whole camera."""
     return _gains(rig.detector.unit, "striping", rig.camera.samples, 1, share=rig.detector.stripe_share)
+
+
+def _range_of(gains: Light, probe: Probe) -> GainRange:
+    least, greatest = float(gains.min(initial=1.0)), float(gains.max(initial=1.0))
+    return GainRange.between(least, greatest, len(probe.wavelength_nm), uneven=greatest - least)
 
 
 @lru_cache(maxsize=8)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Bound, LightChange
+from pipeline.simulator.effects.effect import Bound, LightChange
 from pipeline.simulator.effects.gain_range import difference_rates, rising_gaps, rising_runs
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
@@ -49,7 +49,7 @@ class Response(LightChange):
     cost_ns = MappingProxyType({EXACT: 2.2})
     whole_line = True  # a product's rounding depends on how many samples it has: a line is made whole, then cut
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by I'' v / 2, or by I' sqrt(v) where that is less; 0 where the scene's bands are as wide.
 
         The kernel solves a heat equation: the change is the mean of D I over the time v / 2, so the bound holds on any
@@ -59,8 +59,6 @@ class Response(LightChange):
         variance = missing_variance(rig.optics.fwhm_nm, probe.fwhm_nm, len(wavelength))
         if not variance.any():
             return Bound(0.0, _why_nothing(probe, rig))
-        if variant == EXACT:
-            return Bound(0.0, "exact")
         near = np.abs(wavelength[:, None] - wavelength) <= REACH_SD * np.sqrt(variance)[:, None]
         curved = np.where(near, probe.spectral_curvature, 0).max(axis=1) * variance / 2
         steep = np.where(near, probe.spectral_slope, 0).max(axis=1) * np.sqrt(variance)
@@ -165,7 +163,7 @@ class Smile(LightChange):
     within_spectra = True  # a factor of a whole spectrum passes through
     cost_ns = MappingProxyType({CUBIC: 0.9, LINEAR: 0.5})
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by I' s, and a cubic beside its chord by I'' s (h - s) / 2 in a gap h between bands."""
         wavelength = np.asarray(probe.wavelength_nm, np.float64)
         shift = abs(rig.optics.smile_nm)
@@ -174,8 +172,6 @@ class Smile(LightChange):
         gaps = rising_gaps(wavelength)
         if not gaps.size:
             return Bound(0.0, "no two bands of rising wavelength: a shift of wavelengths shows on no single band")
-        if variant == CUBIC:
-            return Bound(0.0, "exact")
         bent = _most_bent(shift, wavelength, probe.spectral_curvature)
         if variant == LINEAR:
             return Bound(bent, f"{shift:.3g} nm at a line's ends, between bands {gaps.max():.3g} nm apart by lines")

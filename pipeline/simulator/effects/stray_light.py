@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Bound, LightChange
+from pipeline.simulator.effects.effect import Bound, LightChange
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Optics, Rig
 
@@ -36,13 +36,11 @@ class StrayLight(LightChange):
     cost_ns = MappingProxyType({HALO: 1.2, EVEN: 0.65})
     whole_line = True  # light comes from all samples: a line is made whole, then cut
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by f (S - mean), were all to fall evenly, and what the halo differs from that."""
         optics = rig.optics
         if optics.stray_share == 0:
             return Bound(0.0, "no light is scattered")
-        if variant == HALO:
-            return Bound(0.0, "exact")
         spread = float(np.max(probe.spread, initial=0))
         halo = optics.stray_share * (1 - optics.stray_even) * _most_halo(probe, rig, spread)
         why = f"{optics.stray_share:.2g} of a line's light, signals up to {spread:.3g} {probe.unit} from its mean"
