@@ -18,7 +18,7 @@ from pipeline.ground import RigPose
 from pipeline.rig.survey_rig import SurveyRig
 from pipeline.scan import CostModel
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
-from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
+from pipeline.simulator.scenes.farm.farm_scene import REMOVED_LAW, USUAL_DAY, USUAL_HOUR
 from storage.block_work import Crew
 from storage.toml_files import read_toml
 
@@ -220,7 +220,7 @@ def _read_toml(path: Path) -> dict[str, object]:
 
 def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
     """Relative paths of a file's settings, made to start at the file's folder."""
-    named = {*BUILT_IN_SCENES, RIG_FIELD}
+    named = {*BUILT_IN_SCENES, REMOVED_LAW, RIG_FIELD}
     anchored = dict(table)
     for key in _PATHS:
         value = table.get(key)

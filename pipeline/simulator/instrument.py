@@ -38,7 +38,7 @@ SEEN = frozenset({RESPONSE.name, SMILE.name, PRNU.name, STRIPING.name})  # by li
 def effects_on(*names: str) -> Choice:
     """Give effects by their names, in the order of the chain: exact ones, but for shot noise, which is cheap.
 
-    Cheap shot noise may stand for the exact one: see `shot.Shot`.
+    Cheap shot noise may stand for the exact one: see `counting.Shot`.
 
     Raises
     ------

@@ -12,7 +12,7 @@ import pytest
 
 from flows.compare_command import find_run, run_compare
 from flows.generations import asked_again, newest_runs
-from flows.settings import Settings, parse_settings
+from flows.settings import Settings, load_settings, parse_settings
 from flows.survey_scene import check_labels, farm_refusal, open_scene
 from flows.training_data import farm_data, farm_looks, farm_test_data, read_farm_name
 from flows.training_look import observe_scene
@@ -73,6 +73,22 @@ def test_days_that_are_none_are_refused(table: dict[str, Any], words: str) -> No
     """By the settings, before any scene is opened."""
     with pytest.raises(SettingsError, match=words):
         parse_settings(table)
+
+
+def test_a_file_that_names_the_removed_farm_is_refused(tmp_path: Path) -> None:
+    """The name is no path: it is not looked for beside the file."""
+    (tmp_path / "field.toml").write_text(f'scene = "{REMOVED_LAW}"\n')
+    with pytest.raises(SettingsError, match="farm@1 was removed"):
+        load_settings(tmp_path / "field.toml")
+
+
+def test_runs_of_the_removed_farm_are_told_apart(tmp_path: Path) -> None:
+    """By their seeds: its name is no scene's file."""
+    archive = Archive.open(tmp_path)
+    keys = [f"farm@1/seed={seed}/shape=8x8/bands=9" for seed in (0, 1)]
+    made = [_publish(archive, key, scene=REMOVED_LAW) for key in keys]
+    with pytest.raises(SceneError, match="of different fields"):
+        run_compare(tmp_path, *made)
 
 
 def test_night_is_refused_before_anything_is_drawn() -> None:

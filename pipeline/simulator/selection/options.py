@@ -11,7 +11,7 @@ the image from the exact one. Noise of samples that are summed grows as their su
 
 Composition. Kernels that are not negative and sum to 1 have gain 1 at most, readout none. Gains of light (vignetting,
 drift, ...) multiply the errors of all other effects in the light, each by its own greatest factor, and change the unit:
-see `gain_range`. Gains and changes are asked for their bounds with the light that earlier gains leave and add.
+see `passed_light`. Gains and changes are asked for their bounds with the light that earlier gains leave and add.
 """
 
 from __future__ import annotations
