@@ -19,7 +19,7 @@ from flows.survey.scores import score_of
 from flows.terminal.shown_text import on_stdout
 from pipeline.errors import ArchiveError, SceneError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.simulator.farm_laws import law_of_key
+from pipeline.simulator.scenes.farm.farm_scene import REMOVED_LAW, law_of_key
 from storage.archive.addresses import in_text
 from storage.archive.archive import Archive
 from storage.archive.changes import ABSENT, flatten
@@ -32,6 +32,7 @@ from storage.remote.opening import open_archive
 
 LARGEST_PAIRS = 10
 NOT_ASKED = ("notes", "out")  # of a receipt's settings
+NO_FILES = (None, *BUILT_IN_SCENES, REMOVED_LAW)  # scenes of runs that are no file's
 
 
 def run_compare(archive: str | Path, old: str, new: str, out: Path | None = None, *, as_json: bool = False) -> int:
@@ -87,7 +88,7 @@ def find_run(catalogue: Catalogue, text: str) -> Run:
 def _is_same_field(old: Run, new: Run) -> bool:
     """By the scene's key without its bands, or by the scene's file, which may show the field as it is now."""
     files = [run.settings.get("scene") for run in (old, new)]
-    same_file = files[0] == files[1] and files[0] not in (None, *BUILT_IN_SCENES)
+    same_file = files[0] == files[1] and files[0] not in NO_FILES
     return _field_key(old) == _field_key(new) or same_file
 
 
@@ -101,7 +102,7 @@ def _field_key(run: Run) -> str:
 
 def _field_words(run: Run) -> str:
     scene = run.settings.get("scene")
-    return str(_field_key(run) if scene in (None, *BUILT_IN_SCENES) else scene)
+    return str(_field_key(run) if scene in NO_FILES else scene)
 
 
 def _check_same_field(old: Run, new: Run) -> None:

@@ -18,7 +18,7 @@ from flows.survey.stages import VERSIONS
 from flows.survey.survey import STAGES
 from models.weights.files import content_key
 from pipeline.errors import SettingsError, WeightsError
-from pipeline.simulator.farm_laws import USUAL_DAY, USUAL_HOUR, farm_law, has_days, law_of_key
+from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, USUAL_DAY, USUAL_HOUR, law_of_key
 from storage.archive.keys import canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
@@ -54,7 +54,7 @@ def _light_of(run: Run) -> dict[str, Any]:
     """What the light of a run depends on, with the farm by its law: ``farm`` has not always meant the present one."""
     settings = {**run.settings, **_scene_of(run)}
     light = {key: settings.get(key) for key in OF_THE_LIGHT}
-    if has_days(str(settings.get("scene"))):
+    if settings.get("scene") == FARM_LAW:
         usual = {"day": USUAL_DAY, "hour": USUAL_HOUR}
         light |= {key: value if light[key] is None else light[key] for key, value in usual.items()}
     return light
@@ -65,7 +65,7 @@ def _scene_of(run: Run) -> Mapping[str, str]:
     scene = run.settings.get("scene")
     if scene not in BUILT_IN_SCENES:
         return {}
-    return {"scene": law_of_key(str(run.receipt.get("scene"))) or farm_law(str(scene))}
+    return {"scene": law_of_key(str(run.receipt.get("scene"))) or FARM_LAW}
 
 
 def is_called(generation: Generation, pattern: str) -> bool:
@@ -78,7 +78,7 @@ def is_called(generation: Generation, pattern: str) -> bool:
 def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
     """The settings of a run for another survey into the archive ``out``, with other weights if they are given.
 
-    A farm is asked for by the law that the run was drawn by: it is the same land, whatever ``farm`` means by now.
+    A farm is asked for by the law that the run was drawn by: it is the same land, or none where the law was removed.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
     What lies in a scene's file is not looked at.
     """
     drawn_by = law_of_key(str(run.receipt.get("scene")))
-    of_this_law = settings.scene not in BUILT_IN_SCENES or drawn_by == farm_law(settings.scene)
+    of_this_law = settings.scene not in BUILT_IN_SCENES or drawn_by == FARM_LAW
     stale = stale_stores(catalogue, catalogue.named_and_below[run.uri], weights_key(settings))
     return of_this_law and not stale and is_whole(catalogue, run) and not is_pending(run.receipt)
 

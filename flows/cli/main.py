@@ -137,7 +137,7 @@ def train(
     mask_classes: str | None = None,
     as_json: AsJson = False,
 ) -> int:
-    """Train weights on DATASET: `farm` (or `farm@1`, `farm@2`), a folder of labelled scenes, or one scene file.
+    """Train weights on DATASET: `farm` (`farm@2`), a folder of labelled scenes, or one scene file.
 
     The state of the run is kept beside the weights, in OUT.checkpoint: the same command goes on where it was stopped.
     `spectralzoom evaluate` then says how good the weights are on scenes that they were not trained on.
@@ -145,7 +145,7 @@ def train(
     Parameters
     ----------
     dataset
-        `farm` (or `farm@1`, `farm@2`), a folder with images, labels and a scene.toml, or a file.
+        `farm` (`farm@2`), a folder with images, labels and a scene.toml, or a file.
     out
         File of weights to write (.safetensors).
     hold_out
@@ -160,7 +160,7 @@ def train(
     minutes
         The longest that the steps may take; looking at the scenes before and validating after come on top.
     scenes
-        How many scenes of the built-in farm; by default 24 of farm@1, 48 of farm@2, on days from April to October.
+        How many scenes of the built-in farm, on days from April to October; 48 by default.
     patch
         Size of a patch [px]; by default 16 for the farm, 8 to 32 for files, by their size.
     factor

@@ -69,7 +69,7 @@ def evaluate(
     Parameters
     ----------
     dataset
-        `farm` (or `farm@1`, `farm@2`), a folder of labelled scenes, or one scene file; with RUN, an archive.
+        `farm` (`farm@2`), a folder of labelled scenes, or one scene file; with RUN, an archive.
     run
         A run of the archive: its name, `latest` or `previous`. `evaluate archive/runs/NAME` is the same.
     weights

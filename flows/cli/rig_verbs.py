@@ -68,15 +68,15 @@ def emulate(
     Parameters
     ----------
     scene
-        What it looks at: `farm` (by default; also `farm@1`, `farm@2`), or an image or cube file.
+        What it looks at: `farm` (by default; `farm@2`), or an image or cube file.
     size
         Of the scene `farm`, width x height [px]: 256x256 by default.
     seed
         Of the scene `farm` and of all noise; 0 by default.
     day
-        Of the year, 1 to 366, for the scene `farm@2`: 172 by default.
+        Of the year, 1 to 366, for the scene `farm`: 172 by default.
     hour
-        True solar time [h], for the scene `farm@2`: 11 by default.
+        True solar time [h], for the scene `farm`: 11 by default.
     bands
         Bands of the file (or of the farm's 270) to use, from 0: 0,1
     wavelengths

@@ -37,7 +37,7 @@ def simulate(
     Parameters
     ----------
     scene
-        `farm` (built in; also `farm@1`, `farm@2`), or an image or cube file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat,
+        `farm` (built in; `farm@2`), or an image or cube file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat,
         ENVI, Zarr.
     out
         Archive for the raw cubes: a folder, or s3://bucket/prefix.
@@ -57,9 +57,9 @@ def simulate(
     size
         Of the scene `farm`, width x height [px]: 1280x1024 by default.
     day
-        Of the year, 1 to 366, for the scene `farm@2`: 172 by default.
+        Of the year, 1 to 366, for the scene `farm`: 172 by default.
     hour
-        True solar time [h], for the scene `farm@2`: 11 by default; the sun stands in the south at 12.
+        True solar time [h], for the scene `farm`: 11 by default; the sun stands in the south at 12.
     bands
         Bands of the file (or of the farm's 270) to use, from 0: 0,1
     wavelengths

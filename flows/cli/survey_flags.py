@@ -19,7 +19,7 @@ class SurveyFlags:
     visit: str | None = None
     """Which look at the field, in any words: another one is captured anew, the same one is gone on with."""
     scene: str | None = None
-    """`farm` (built in; also `farm@1`, `farm@2`), or an image or cube file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat, ENVI,
+    """`farm` (built in; `farm@2`), or an image or cube file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat, ENVI,
     Zarr."""
     labels: str | None = None
     """File of class colours or numbers on the scene's pixels; accuracy is reported then."""
@@ -72,9 +72,9 @@ class SurveyFlags:
     size: str | None = None
     """Of the scene `farm`, width x height [px]: 1280x1024 by default."""
     day: str | None = None
-    """Of the year, 1 to 366, for the scene `farm@2`: 172 by default."""
+    """Of the year, 1 to 366, for the scene `farm`: 172 by default."""
     hour: str | None = None
-    """True solar time [h], for the scene `farm@2`: 11 by default; the sun stands in the south at 12."""
+    """True solar time [h], for the scene `farm`: 11 by default; the sun stands in the south at 12."""
     exposure_ms: str | None = None
     """Exposure of a line [ms]; 100 by default."""
 

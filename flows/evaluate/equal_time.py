@@ -26,7 +26,7 @@ from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps
 from pipeline.planning.fine_pass import plan_fine
 from pipeline.planning.selection import frame_seats
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene
 
 ROUNDS = 3  # set-ups do not grow with the exposure, so that one step falls short; three settle it
 

@@ -20,8 +20,8 @@ from models.weights.files import AnyWeights, Description, Weights, content_key, 
 from pipeline.errors import PipelineError, SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.simulator.farm_laws import FARM_NAMES
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
+from pipeline.simulator.scenes.scene import RasterScene
 
 FARM_TEST_SCENES = 4
 
@@ -155,7 +155,7 @@ def open_frames(
     count = FARM_TEST_SCENES if scenes is None else scenes
     if count < 1:
         raise SettingsError(f"--scenes must be at least 1, got {count}")
-    return _only(dataset, farm_test_data(dataset, count, camera), frames)
+    return _only(dataset, farm_test_data(count, camera), frames)
 
 
 def _only(dataset: str, data: TrainingData, frames: tuple[str, ...]) -> TrainingData:

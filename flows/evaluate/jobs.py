@@ -14,7 +14,7 @@ from flows.survey.scene import judged_labels
 from flows.training.data import TrainingData
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene
 
 Show = Callable[[str, float, str], None]
 

@@ -24,7 +24,7 @@ from flows.training.data import TrainingData
 from models.weights.files import AnyWeights, Weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.planning.line_blocks import WIDTHS
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene
 
 Record = dict[str, Any]
 Report = Callable[[float], None]

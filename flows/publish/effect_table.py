@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flows.terminal.figures import DASH, format_seconds
-from pipeline.simulator.manifest import UNIT_WORDS
+from pipeline.simulator.selection.manifest import UNIT_WORDS
 
 WIDE = 100  # characters, from which words fit into the table
 COLOURS = {"on": "green", "off": "dim"}
@@ -96,7 +96,7 @@ def total_words(total: Mapping[str, Any]) -> Sequence[str]:
     if total["bound"] is None:
         words.append("What is left out has no bound.")
     else:
-        measured = "" if total["measured"] is None else f", measured on the worst chips {total['measured']:.2g}"
+        measured = "" if total["measured"] is None else f", measured on the worst lines {total['measured']:.2g}"
         if total["measured"] is not None and total["measured"] > total["bound"]:
             measured += ", more by what arithmetic makes of light with such contrasts"
         words.append(

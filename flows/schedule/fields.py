@@ -19,7 +19,7 @@ from flows.schedule.times import Timetable
 from flows.schedule.wall_clock import SystemWallClock, WallClock
 from flows.settings.survey_settings import Settings, load_settings
 from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
-from pipeline.simulator.farm_laws import has_days
+from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
 from storage.archive.ledger import Ledger
 from storage.archive.staging import take_lock
 from storage.archive.toml_files import read_toml
@@ -53,7 +53,7 @@ class ServedField:
         What stands before a rig, an emulated one too, is as it is.
         """
         asked = replace(self.settings, name=self.name, visit=moment_words(due))
-        if asked.source == "sim" and has_days(asked.scene) and asked.day is None:
+        if asked.source == "sim" and asked.scene in FARM_NAMES and asked.day is None:
             asked = replace(asked, day=due.astimezone(timetable.zone).timetuple().tm_yday)
         return asked
 

@@ -17,6 +17,7 @@ from flows.settings.values import (
     parse_memory,
     parse_name,
     parse_number,
+    parse_scene,
     parse_scheduler,
     parse_size,
     parse_switch,
@@ -29,8 +30,8 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel
 from pipeline.ground.view import LIMITS, RigPose
 from pipeline.rig.survey_rig import SurveyRig
-from pipeline.simulator.farm_laws import FARM_NAMES
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Sky
+from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
 
 POLICIES = (
     "gain", "entropy", "margin", "sobel", "saliency", "spectral-residual", "random", "stratified", "centre", "uniform",
@@ -99,7 +100,7 @@ TABLES: dict[str, tuple[type[Any], dict[str, Parser]]] = {
 SURVEY: dict[str, Parser] = {
     "name": parse_name,
     "visit": parse_text,
-    "scene": parse_text,
+    "scene": parse_scene,
     "labels": parse_text,
     "bands": parse_bands,
     "wavelengths": parse_wavelengths,

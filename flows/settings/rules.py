@@ -9,7 +9,7 @@ from flows.settings.device_table import MOST_PAIRS
 from flows.settings.keys import BUILT_IN_SCENES, RIG_FIELD, MapChoice
 from models.network.vgg_sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import SettingsError
-from pipeline.simulator.farm_laws import SEASON_LAW, has_days
+from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
 
 if TYPE_CHECKING:
     from flows.settings.survey_settings import Settings
@@ -42,9 +42,9 @@ def check_together(settings: Settings, origin: Mapping[str, str]) -> None:
     if settings.size is not None and settings.scene not in (*BUILT_IN_SCENES, RIG_FIELD):
         raise SettingsError(f"size is for built-in scenes ({', '.join(BUILT_IN_SCENES)}); {settings.scene} has its own")
     for name, value in {"day": settings.day, "hour": settings.hour}.items():
-        if value is not None and not has_days(settings.scene):
+        if value is not None and settings.scene not in BUILT_IN_SCENES:
             raise SettingsError(
-                f"{place_of(name, origin.get(name))} = {value:g} is for the scene {SEASON_LAW}, whose fields grow; "
+                f"{place_of(name, origin.get(name))} = {value:g} is for the scene {FARM_LAW}, whose fields grow; "
                 f"{settings.scene} is as it is: leave it out"
             )
     if settings.camera.dark_dn >= settings.camera.full_scale_dn:

@@ -17,8 +17,8 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel
 from pipeline.ground.view import RigPose
 from pipeline.rig.survey_rig import SurveyRig
-from pipeline.simulator.farm_laws import USUAL_DAY, USUAL_HOUR, has_days
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
+from pipeline.simulator.scenes.farm.farm_scene import REMOVED_LAW, USUAL_DAY, USUAL_HOUR
 from storage.archive.toml_files import read_toml
 from storage.parallel.crew import Crew
 
@@ -56,8 +56,8 @@ class Settings:
     kernel: Literal["catmull-rom", "bilinear", "nearest"] = "catmull-rom"
     pointing_px: float = 0.0  # how far off the mirror may point; above 0 sweeps overlap and their seams are registered
     size: tuple[int, int] | None = None  # (width, height) of the built-in scene [px]
-    day: int | None = None  # of the year, for farm@2: 172 unless given
-    hour: float | None = None  # true solar time, for farm@2: 11 unless given [h]
+    day: int | None = None  # of the year, for the farm: 172 unless given
+    hour: float | None = None  # true solar time, for the farm: 11 unless given [h]
     camera: LineCamera = field(default_factory=LineCamera)
     optics: Optics = field(default_factory=Optics)
     mirror: MirrorMotion = field(default_factory=MirrorMotion)
@@ -82,7 +82,7 @@ class Settings:
     @property
     def moment(self) -> tuple[int, float] | None:
         """Day of the year and true solar time [h] of the built-in scene; None of a scene that has none."""
-        if not has_days(self.scene):
+        if self.scene not in BUILT_IN_SCENES:
             return None
         return USUAL_DAY if self.day is None else self.day, USUAL_HOUR if self.hour is None else self.hour
 
@@ -229,7 +229,7 @@ def _read_toml(path: Path) -> dict[str, object]:
 
 def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
     """Relative paths of a file's settings, made to start at the file's folder."""
-    named = {*BUILT_IN_SCENES, RIG_FIELD}
+    named = {*BUILT_IN_SCENES, REMOVED_LAW, RIG_FIELD}
     anchored = dict(table)
     for key in _PATHS:
         value = table.get(key)

@@ -8,9 +8,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from pipeline.errors import BudgetError, SettingsError
-from pipeline.simulator.choice import named_effects
+from pipeline.simulator.effects.probe import Unit
 from pipeline.simulator.effects.registry import BY_NAME
-from pipeline.simulator.probe import Unit
+from pipeline.simulator.scenes.farm.farm_scene import refuse_removed
+from pipeline.simulator.selection.choice import named_effects
 from storage.archive.staging import is_name
 from storage.parallel.crew import Crew
 
@@ -102,6 +103,13 @@ def parse_text(value: object, place: str) -> str:
     if not isinstance(value, str) or not value.strip():
         raise SettingsError(f"{place} must be text that is not empty, got {value!r}")
     return value
+
+
+def parse_scene(value: object, place: str) -> str:
+    """The name of a scene or of its file; that of a farm which is drawn no more is refused."""
+    text = parse_text(value, place)
+    refuse_removed(text)
+    return text
 
 
 def parse_name(value: object, place: str) -> str:

@@ -22,18 +22,17 @@ from flows.survey.run import CaptureRun
 from pipeline.errors import BoundError
 from pipeline.geometry.camera import bin_samples
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.arithmetic import contrast_about, misplaced_electrons, misplaced_share
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import Effect
+from pipeline.simulator.effects.light_units import stored_mean, unit_at
+from pipeline.simulator.effects.probe import Unit
 from pipeline.simulator.effects.registry import BY_NAME
 from pipeline.simulator.instrument import BLOCK_LINES
-from pipeline.simulator.manifest import UNIT_WORDS
-from pipeline.simulator.probe import Unit
 from pipeline.simulator.readout import dark_frame, read_out
 from pipeline.simulator.render import expected_light
-from pipeline.simulator.simulated import SimulatedSource
-from pipeline.simulator.stored_light import stored_mean, unit_at
-from pipeline.simulator.survey_clock import sweep_starts
+from pipeline.simulator.selection.arithmetic import contrast_about, misplaced_electrons, misplaced_share
+from pipeline.simulator.selection.manifest import UNIT_WORDS
+from pipeline.simulator.simulated import SimulatedSource, sweep_starts
 from storage.archive.archive import StageRef
 
 MOST_S = 60.0  # of processor time for both ways together; beyond, not all lines are compared
@@ -206,7 +205,7 @@ class _Taken:
     cpu_s: float
 
 
-def _taken(source: SimulatedSource, block: Block) -> _Taken:
+def _taken(source: SimulatedSource, block: SweepBlock) -> _Taken:
     began = time.process_time()
     light = expected_light(source.scene, block, source.choice)
     raw = read_out(light, block, source.choice)

@@ -21,7 +21,7 @@ from flows.publish.colour_stretch import develop, stretch
 from flows.publish.panels import INK, MUTED
 from flows.simulate.effect_comparison import Comparison, View
 from flows.terminal.figures import format_count, format_seconds
-from pipeline.simulator.probe import Unit
+from pipeline.simulator.effects.probe import Unit
 
 UNIT_SIGNS: dict[Unit, str] = {"sigma": "σ", "dn": "DN"}  # noqa: RUF001
 _OF_KEY: dict[Unit, str] = {"sigma": "σ of the noise", "dn": "DN"}  # noqa: RUF001

@@ -38,7 +38,7 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.planning.fine_pass import price_of_seats
 from pipeline.planning.savings import count_lines
 from pipeline.planning.selection import frame_seats
-from pipeline.simulator.pointing import CommonOffset, PointingErrors
+from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import StageRef
 from storage.archive.stored_tables import read_table

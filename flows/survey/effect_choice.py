@@ -15,23 +15,20 @@ from flows.publish.receipt import to_json
 from flows.settings.survey_settings import plain_value
 from flows.survey.run import CaptureRun
 from pipeline.errors import IncompleteStoreError
-from pipeline.simulator.block import Block
-from pipeline.simulator.chips import candidate_chips, worst_chips
-from pipeline.simulator.choice import Decision, decide
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import Effect, Light
+from pipeline.simulator.effects.light_units import unit_at
+from pipeline.simulator.effects.line import ROTATION, SLIT
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
 from pipeline.simulator.instrument import sweep_block
-from pipeline.simulator.manifest import list_effects, sum_up
-from pipeline.simulator.probe import Probe
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.simulated import SimulatedSource
-from pipeline.simulator.stored_light import unit_at
-from pipeline.simulator.survey_clock import sweep_starts
-from pipeline.simulator.survey_probe import probe_survey
-from pipeline.simulator.verification import verify
+from pipeline.simulator.selection.choice import Decision, decide
+from pipeline.simulator.selection.manifest import list_effects, sum_up
+from pipeline.simulator.selection.survey_probe import probe_survey
+from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
+from pipeline.simulator.simulated import SimulatedSource, sweep_starts
 from storage.archive.archive import StageRef
 from storage.archive.stored_tables import read_table
 
@@ -42,18 +39,18 @@ RECORD = "effects.json"
 LOOK = {
     ROTATION: ROTATION.variants[0],
     SLIT: SLIT.variants[-1],
-}  # what chips are chosen by: the footprint alone, where lines really lie
+}  # what lines are chosen by: the footprint alone, where lines really lie
 DRAFT, VERIFIED = 0.3, 1.0
 
 
 def choose_effects(run: CaptureRun, produce: Produce) -> StageRef:
-    """Decide for scene and rig which effects to simulate, and check it on the worst chips of the scene.
+    """Decide for scene and rig which effects to simulate, and check it on the worst lines of the scene.
 
     Where a rig takes the lines there is nothing to decide.
 
     Raises
     ------
-    BoundError : what would be left out changes a chip by more than its bound says.
+    BoundError : what would be left out changes light by more than its bound says.
     SceneError : the scene holds a number that is not finite.
     """
     tolerance, asked = run.settings.tol, run.settings.effects
@@ -73,7 +70,7 @@ def choose_effects(run: CaptureRun, produce: Produce) -> StageRef:
 
     params = {
         "scene": run.scene.key,
-        "seed": run.settings.seed,  # of what is drawn for the chips
+        "seed": run.settings.seed,  # of what is drawn for the lines
         "asked": asked,
         "tol": str(tolerance),
         "camera": asdict(run.camera),
@@ -127,7 +124,7 @@ def source_with(
 
 
 def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> dict[str, float]:
-    """Measure what is left out on the worst chips of the scene, in the unit of the tolerance."""
+    """Measure what is left out on the worst lines of the scene, in the unit of the tolerance."""
     scene, rig = run.scene, run.settings.simulated_rig
 
     def units(light: Light, binning: int) -> Light:
@@ -135,7 +132,7 @@ def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> d
 
     renders = 0
 
-    def render(block: Block, chosen: Mapping[Effect, str]) -> Light:
+    def render(block: SweepBlock, chosen: Mapping[Effect, str]) -> Light:
         nonlocal renders
         renders += 1
         run.report(DRAFT + (VERIFIED - DRAFT) * renders / (renders + len(EFFECTS)))  # how many there will be is open
@@ -143,15 +140,15 @@ def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> d
 
     whole = _whole_sweeps(run)
     candidates = [
-        chip
+        block
         for probe in probes
-        for chip in candidate_chips([one for one in whole if one.sweep in probe.sweeps], probe.places)
+        for block in candidate_blocks([one for one in whole if one.sweep in probe.sweeps], probe.places)
     ]
-    worst = worst_chips(candidates, lambda block: expected_light(scene, block, LOOK), units)
+    worst = worst_blocks(candidates, lambda block: expected_light(scene, block, LOOK), units)
     return verify(decision, render, worst, units)
 
 
-def _whole_sweeps(run: CaptureRun) -> list[Block]:
+def _whole_sweeps(run: CaptureRun) -> list[SweepBlock]:
     """Every sweep as one block, each after those before it."""
     scene, rig, clock = run.scene, run.settings.simulated_rig, sweep_starts(run.planned, run.camera, run.settings.cost)
     return [

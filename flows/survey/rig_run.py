@@ -19,8 +19,7 @@ from pipeline.lazy import Once
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.camera.camera_settings import CameraLimits, check_times
 from pipeline.rig.clock import SYSTEM_CLOCK, Clock
-from pipeline.simulator.raster import Light, Raster
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from pipeline.source import Line, Source
 from storage.arrays.fetched_files import FetchedFiles
 
@@ -132,8 +131,10 @@ def field_before_rig(settings: Settings) -> RasterScene:
     return RasterScene(
         name=settings.name or RIG_FIELD,
         key=f"{RIG_FIELD}/{settings.name or ''}/{width}x{height}",
-        raster=Raster.of(nothing),
-        light=Once.of(Light(np.zeros((1, bands), np.float32), np.full(bands, settings.camera.full_well_e, np.float32))),
+        raster=SceneRaster.of(nothing),
+        light=Once.of(
+            SceneLight(np.zeros((1, bands), np.float32), np.full(bands, settings.camera.full_well_e, np.float32))
+        ),
         panel=np.full(bands, settings.rig.panel, np.float32),
         wavelength_nm=np.array(settings.wavelengths, np.float64),
     )

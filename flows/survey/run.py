@@ -36,8 +36,8 @@ from pipeline.geometry.scan import Sweep
 from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView
 from pipeline.lazy import Once
-from pipeline.simulator.pointing import PointingErrors
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.effects.pointing import PointingErrors
+from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
 from storage.arrays.layout import AngularGrid

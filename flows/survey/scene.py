@@ -16,14 +16,13 @@ from models.weights.files import Description
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import Once
-from pipeline.simulator.farm_laws import FARM_SHAPE, built_in_farm, law_of_key
-from pipeline.simulator.raster import Light
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, law_of_key
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight
 from storage.readers.declared_sizes import machine_bytes
 from storage.readers.raster_files import load_raster
 from storage.readers.scene_files import load_scene_file
 
-# Peak of a survey of farm@2 without controls: 1.58 GB for 1280 x 1024 px, 4.12 GB for 2560 x 2560 px
+# Peak of a survey of the farm without controls: 1.58 GB for 1280 x 1024 px, 4.12 GB for 2560 x 2560 px
 FARM_BYTES, FARM_BYTES_PER_PX = 1_000_000_000, 490
 SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and whoever rounds it [h]
 
@@ -60,10 +59,8 @@ def _open_farm(settings: Settings) -> RasterScene:
     for name, value in {"labels": settings.labels, "wavelengths": settings.wavelengths}.items():
         if value is not None:
             raise SettingsError(f"--{name} is for scene files; the scene '{settings.scene}' brings its own")
-    farm = built_in_farm(
-        settings.scene, settings.seed, settings.shape or FARM_SHAPE,
-        camera=settings.camera, day=settings.day, hour=settings.hour,
-    )  # fmt: skip
+    shape = settings.shape or FARM_SHAPE
+    farm = farm_scene(settings.seed, shape, camera=settings.camera, day=settings.day, hour=settings.hour)
     return farm if settings.bands is None else _some_bands(farm, settings.bands)
 
 
@@ -106,7 +103,7 @@ def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
     return replace(
         scene,
         key=f"{scene.key}/only={','.join(map(str, bands))}",
-        light=Once(lambda: Light(scene.electrons[:, chosen], scene.panel_electrons[chosen])),
+        light=Once(lambda: SceneLight(scene.electrons[:, chosen], scene.panel_electrons[chosen])),
         panel=scene.panel[chosen],
         wavelength_nm=scene.wavelength_nm[chosen],
         fwhm_nm=None if scene.fwhm_nm is None else scene.fwhm_nm[chosen],

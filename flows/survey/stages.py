@@ -28,7 +28,7 @@ from models.reading.inference import CoarseLook, Glance, read_glance
 from models.reading.regions import whole_field
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.fine_pass import FinePlan, plan_fine
-from pipeline.simulator.survey_clock import sweep_starts
+from pipeline.simulator.simulated import sweep_starts
 from pipeline.source import Line, Source
 from storage.archive.archive import StageRef, stage_key
 from storage.archive.stored_tables import read_table

@@ -17,9 +17,9 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps
 from pipeline.rectify.region import mosaic_rows
-from pipeline.simulator.farm_laws import built_in_farm
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 
@@ -46,7 +46,7 @@ class FarmLook:
 def look_at_farm(seed: int, shape: tuple[int, int], *, noise_seed: int | None = None) -> FarmLook:
     """Sweep a farm of (y, x) px coarsely with the shipped weights at hand; ``noise_seed`` draws other noise on it."""
     weights = load_weights(Path(str(resources.files("models") / "shipped" / SHIPPED)))
-    camera, scene = LineCamera(), built_in_farm("farm", seed, shape)
+    camera, scene = LineCamera(), farm_scene(seed, shape)
     grid = SceneGrid(*shape, weights.config.patch, weights.config.factor)
     source = SimulatedSource(scene, Rig(camera), seed if noise_seed is None else noise_seed)
     along, full, full_s = cheapest_full(grid, camera, CostModel())

@@ -13,9 +13,9 @@ from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.rectify.calibration.calibrate import reflectance
 from pipeline.rectify.lookup import grid_lookup
 from pipeline.rectify.resample import resample
-from pipeline.simulator.farm_laws import built_in_farm
 from pipeline.simulator.instrument import QUIET
 from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 SHAPE = (192, 320)
@@ -37,7 +37,7 @@ class Captured:
 
 def _prepare(seed: int) -> Captured:
     camera = LineCamera(samples=SHAPE[1])
-    source = SimulatedSource(built_in_farm("farm", seed, SHAPE), Rig(camera), seed)
+    source = SimulatedSource(farm_scene(seed, SHAPE), Rig(camera), seed)
     sweeps = {step: _capture(source, step) for step in STEPS}
     calm = _capture(replace(source, chosen=QUIET), 1)
     full = _rectify(camera, *calm)

@@ -20,12 +20,12 @@ from flows.tradeoff.simulated_lines import (
     look_at_lines,
     with_variant,
 )
-from pipeline.simulator.choice import CHEAP_SHARE, Decision, decide
 from pipeline.simulator.effects.effect import OFF, Effect
+from pipeline.simulator.effects.line import SLIT
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.effects.slit import SLIT
 from pipeline.simulator.readout import dark_frame, read_out
 from pipeline.simulator.render import expected_light
+from pipeline.simulator.selection.choice import CHEAP_SHARE, Decision, decide
 
 EXACT = "exact"
 TOLERANCES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  # sigma

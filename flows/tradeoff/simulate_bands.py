@@ -12,11 +12,11 @@ from flows.tradeoff.entries import Setting, Tradeoff, register
 from flows.tradeoff.simulate import FOOTPRINT, Seen, prepare_footprint
 from flows.tradeoff.simulated_lines import FarmLines, Light
 from pipeline.lazy import Once
-from pipeline.simulator.effects.effect import Effect, Moments
-from pipeline.simulator.raster import Light as SceneLight
+from pipeline.simulator.effects.effect import Effect
+from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight
 
 EACH = "each band"
 GROUPS = (6, 4, 3, 2, 1)

@@ -12,13 +12,10 @@ from flows.tradeoff.entries import Level, Setting, Tradeoff, register
 from flows.tradeoff.simulated_lines import look_at_lines
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.counting import QUANTISATION, READ_NOISE, SATURATION, SHOT
 from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.effects.quantisation import QUANTISATION
-from pipeline.simulator.effects.read_noise import READ_NOISE
-from pipeline.simulator.effects.saturation import SATURATION
-from pipeline.simulator.effects.shot import SHOT
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.rig_model import Rig
 
@@ -35,7 +32,7 @@ Raw = NDArray[np.uint16]
 class Counted:
     """Even light at some levels, and how probable each number of the converter is there."""
 
-    block: Block
+    block: SweepBlock
     electrons: Floats  # (level,)
     light: NDArray[np.float32]  # (line, sample, level) [e-]
     law: Floats  # (level, DN)
@@ -64,7 +61,7 @@ def _even_light(seed: int, least_e: float, most_e: float) -> Counted:
     rig = Rig(LineCamera())
     electrons = np.geomspace(least_e, most_e, LEVELS)
     sweep = Sweep("even", "fine", "x", 0.0, 0.0, LINES)
-    block = Block(rig, sweep, range(LINES), np.arange(1.0, LEVELS + 1), (LINES, rig.camera.samples), seed)
+    block = SweepBlock(rig, sweep, range(LINES), np.arange(1.0, LEVELS + 1), (LINES, rig.camera.samples), seed)
     light = np.broadcast_to(electrons.astype(np.float32), (LINES, rig.camera.samples, LEVELS)).copy()
     law = np.stack([law_of_numbers(float(one), rig) for one in electrons])
     return Counted(block, electrons, light, law, replace(look_at_lines(seed).probe, brightest_e=most_e))

@@ -13,12 +13,11 @@ from flows.tradeoff.simulate import FOOTPRINT
 from flows.tradeoff.simulated_lines import Against, FarmLines, Light, look_at_lines
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.lazy import Once
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.line import SLIT
 from pipeline.simulator.effects.registry import RAYS
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.raster import Light as SceneLight
 from pipeline.simulator.render import expected_light
-from pipeline.simulator.scene import RasterScene, to_bands
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, to_bands
 
 LINES = 2  # of each block
 RAYS_PER_PX = (1, 2, 4, 8)
@@ -36,7 +35,7 @@ class Beside:
     name = "beside"
     variants = ("rays",)
 
-    def displaced(self, block: Block, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
+    def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
         """Give how far from the middle ray it meets the scene. [px]"""
         ifov, normal = block.rig.camera.ifov_rad, position_to_normal(block.middle)[:, None]
         rays = np.stack(np.broadcast_arrays(self.turn * ifov, block.slopes + self.run * ifov, 1.0), axis=-1)

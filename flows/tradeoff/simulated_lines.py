@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 from flows.tradeoff.entries import Level
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import full_sweeps
-from pipeline.simulator.block import Block
-from pipeline.simulator.choice import decide
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Effect
+from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.effects.registry import EFFECTS, FOOTPRINT, RAYS
-from pipeline.simulator.farm_laws import built_in_farm
 from pipeline.simulator.instrument import sweep_block
-from pipeline.simulator.probe import Probe
 from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import RasterScene
-from pipeline.simulator.stored_light import noise_electrons
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.selection.choice import decide
+from pipeline.simulator.selection.survey_probe import probe_scene
 
 SHAPE = (512, 1280)
 LINES = 8  # at each end of a sweep and in its middle
@@ -40,7 +40,7 @@ class FarmLines:
     scene: RasterScene
     rig: Rig
     probe: Probe
-    blocks: tuple[Block, ...]
+    blocks: tuple[SweepBlock, ...]
     exact: Mapping[Effect, str]  # everything that the rig has, in its exact variant
 
     @property
@@ -62,7 +62,7 @@ class FarmLines:
 
 def look_at_lines(seed: int) -> FarmLines:
     """Draw a farm and plan its full scan; take the first, middle and last lines of the sweep that is planned first."""
-    scene, rig = built_in_farm("farm", seed, SHAPE), Rig()
+    scene, rig = farm_scene(seed, SHAPE), Rig()
     sweeps = full_sweeps(SceneGrid(*SHAPE, PATCH, FACTOR), rig.camera, "x")
     probe = probe_scene(scene, rig, sweeps)
     count = sweeps[0].lines

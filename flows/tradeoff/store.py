@@ -18,8 +18,8 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps
 from pipeline.rectify.region import mosaic_rows
-from pipeline.simulator.farm_laws import built_in_farm
 from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from storage.arrays.layout import round_bits
 from storage.codec_trials import CODECS, store_in_memory
@@ -51,7 +51,7 @@ class Stored:
 
 def _prepare(seed: int) -> Captured:
     weights = load_weights(Path(str(resources.files("models") / "shipped" / SHIPPED)))
-    camera, scene = LineCamera(), built_in_farm("farm", seed, SHAPE)
+    camera, scene = LineCamera(), farm_scene(seed, SHAPE)
     grid = SceneGrid(*SHAPE, weights.config.patch, weights.config.factor)
     source = SimulatedSource(scene, Rig(camera), seed)
     along, full, _ = cheapest_full(grid, camera, CostModel())

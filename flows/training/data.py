@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.simulator.farm_laws import FARM_LAW, FARM_NAMES, SEASON_LAW, built_in_farm, farm_law, has_days
-from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, FARM_NAMES, farm_scene, refuse_removed
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene
 from storage.readers.datasets import DataSet, load_data_set
 from storage.readers.scene_files import SceneFile
 
-FARM_SCENES, FARM_VALIDATION = {FARM_LAW: 24, SEASON_LAW: 48}, 3
+FARM_SCENES, FARM_VALIDATION = 48, 3
 FARM_SHAPE = (512, 640)  # of a training scene [px]
 FARM_TRAIN_SEED, FARM_VALIDATION_SEED = 100_000, 200_000  # surveys are shown on small seeds
 FARM_TEST_SEED = 300_000  # of farm scenes to judge on: neither trained on, nor validated on, nor shown
@@ -46,7 +47,7 @@ class TrainingData:
 
     def _farm(self, name: str) -> RasterScene:
         seed, day, hour = read_farm_name(name)
-        return built_in_farm(self.law, seed, FARM_SHAPE, camera=self.camera, day=day, hour=hour)
+        return farm_scene(seed, FARM_SHAPE, camera=self.camera, day=day, hour=hour)
 
     def _file(self, name: str) -> RasterScene:
         if self.files is None:
@@ -70,28 +71,23 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
     )
 
 
-def farm_data(name: str, scenes: int | None, validation: int, camera: LineCamera) -> TrainingData:
-    """Scenes of the farm of a name, on seeds far from those that surveys are shown on, and on days if it has any."""
-    law = farm_law(name)
-    count = FARM_SCENES[law] if scenes is None else scenes
-    train = farm_looks(law, FARM_TRAIN_SEED, count)
-    return TrainingData(law, train, farm_looks(law, FARM_VALIDATION_SEED, validation, odd=True), (), camera)
+def farm_data(scenes: int | None, validation: int, camera: LineCamera) -> TrainingData:
+    """Scenes of the farm on days of the season, on seeds far from those that surveys are shown on."""
+    train = farm_looks(FARM_TRAIN_SEED, FARM_SCENES if scenes is None else scenes)
+    return TrainingData(FARM_LAW, train, farm_looks(FARM_VALIDATION_SEED, validation, odd=True), (), camera)
 
 
-def farm_test_data(name: str, scenes: int, camera: LineCamera) -> TrainingData:
-    """Scenes of the farm of a name to judge weights on, all of them in ``train``."""
-    law = farm_law(name)
-    return TrainingData(law, farm_looks(law, FARM_TEST_SEED, scenes, odd=True), (), (), camera)
+def farm_test_data(scenes: int, camera: LineCamera) -> TrainingData:
+    """Scenes of the farm to judge weights on, all of them in ``train``."""
+    return TrainingData(FARM_LAW, farm_looks(FARM_TEST_SEED, scenes, odd=True), (), (), camera)
 
 
-def farm_looks(law: str, first_seed: int, count: int, *, odd: bool = False) -> tuple[str, ...]:
-    """Name scenes of a farm: seeds one after the other, and for one with days a day of the season and an hour to each.
+def farm_looks(first_seed: int, count: int, *, odd: bool = False) -> tuple[str, ...]:
+    """Name scenes of the farm: seeds one after the other, a day of the season and an hour to each.
 
     Days go round the season by the golden section, so that any number of scenes covers it evenly. Weights learn on even
     days and are judged on odd ones.
     """
-    if not has_days(law):
-        return tuple(str(first_seed + i) for i in range(count))
     (first, last), (morning, evening) = SEASON_DAYS, SEASON_HOURS
     names = []
     for i in range(count):
@@ -101,12 +97,9 @@ def farm_looks(law: str, first_seed: int, count: int, *, odd: bool = False) -> t
     return tuple(names)
 
 
-def read_farm_name(name: str) -> tuple[int, int | None, float | None]:
-    """Seed, day and hour of a name that `farm_looks` gave; None for those that its farm has not."""
-    seed, _, rest = name.partition("-day-")
-    if not rest:
-        return int(seed), None, None
-    day, _, hour = rest.partition("-hour-")
+def read_farm_name(name: str) -> tuple[int, int, float]:
+    """Seed, day and hour of a name that `farm_looks` gave."""
+    seed, _, day, _, hour = name.split("-")
     return int(seed), int(day), float(hour)
 
 
@@ -135,11 +128,12 @@ def open_training_data(
 
     Raises
     ------
-    SettingsError : a choice that is for files was made for a farm, or the other way round.
+    SettingsError : a choice that is for files was made for a farm, or the other way round; the farm was removed.
     """
+    refuse_removed(dataset)
     if dataset in FARM_NAMES:
         _refuse_choices(choices)
-        return farm_data(dataset, scenes, FARM_VALIDATION if validation is None else validation, camera)
+        return farm_data(scenes, FARM_VALIDATION if validation is None else validation, camera)
     if scenes is not None:
         raise SettingsError(f"--scenes is for the built-in farms; {dataset} has its own scenes")
     files = load_data_set(Path(dataset), **choices)  # type: ignore[arg-type]

@@ -21,15 +21,14 @@ from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps
 from pipeline.rectify.region import mosaic_rows
-from pipeline.simulator.choice import decide
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.farm_laws import law_of_key
 from pipeline.simulator.render import Choice
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import RasterScene
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from pipeline.simulator.survey_clock import sweep_starts
-from pipeline.simulator.survey_probe import probe_survey
+from pipeline.simulator.scenes.farm.farm_scene import law_of_key
+from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.selection.choice import decide
+from pipeline.simulator.selection.survey_probe import probe_survey
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_starts
 from pipeline.source import References
 
 TOLERANCE_SIGMA = 0.1  # of a survey, unless it says otherwise

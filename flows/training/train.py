@@ -23,8 +23,8 @@ from models.weights.files import AnyWeights, save_weights, with_record
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.simulator.farm_laws import FARM_NAMES
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
+from pipeline.simulator.scenes.scene import RasterScene
 
 FRAME_CROP, FARM_CROP = 384, 256  # px
 WHOLE_CROP = 1024  # px; the paper's network counts its places along the whole scene, a crop's would be others

@@ -15,7 +15,7 @@ from models.network.spectral import Normalisation, SpectralBasis
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 NOISY = 0.25  # share of the crops that get the noise of a shorter exposure
 HALO = 8  # rows around a strip that the footprint reaches, a multiple of every factor up to 8

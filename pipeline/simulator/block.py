@@ -1,7 +1,8 @@
-"""Some lines of one sweep as a rig takes them: what every effect may ask about where and when they are taken."""
+"""Some lines of one sweep as a rig takes them: what effects may ask about where and when, and their random streams."""
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,13 +12,12 @@ from numpy.typing import NDArray
 from pipeline.geometry.mirror import position_to_normal
 from pipeline.geometry.scan import Sweep, line_positions, sweep_positions
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.streams import line_stream
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Block:
+class SweepBlock:
     """Lines ``lines`` (numbers within the sweep) and samples ``samples`` (of the camera, before binning).
 
     A line's result never depends on which others are in the block, nor a sample's. ``started_s`` is when the sweep
@@ -81,5 +81,21 @@ class Block:
         return centres
 
     def stream(self, effect: str, number: int) -> np.random.Generator:
-        """Give an effect's random stream at one line."""
-        return line_stream(self.seed, self.sweep.name, effect, number)
+        """Give an effect's random stream at one line: blocks, order and other effects never change it."""
+        return _stream(self.seed, self.sweep.name, effect, number)
+
+
+def sweep_stream(seed: int, sweep: str, effect: str) -> np.random.Generator:
+    """Give the stream of one effect for a whole sweep."""
+    return _stream(seed, sweep, effect)
+
+
+def unit_stream(unit: int, effect: str) -> np.random.Generator:
+    """Give the stream of what belongs to one copy of the rig, whatever it looks at: its fixed patterns."""
+    return _stream(unit, effect)
+
+
+def _stream(entropy: int, *key: str | int) -> np.random.Generator:
+    """Give a stream whose key is hashed to its state; words of SFC64 take half the time of a counter-based Philox."""
+    words = [zlib.crc32(one.encode()) if isinstance(one, str) else one for one in key]
+    return np.random.Generator(np.random.SFC64(np.random.SeedSequence(entropy=entropy, spawn_key=words)))

@@ -15,14 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError, ShapeError
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.dark_current import DARK_CURRENT, dark_electrons
-from pipeline.simulator.effects.defects import DEFECTS, dead_elements, hot_electrons
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.counting import EXACT, READ_NOISE, SATURATION, SHOT, well_reached
 from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.effects.read_noise import READ_NOISE
-from pipeline.simulator.effects.saturation import SATURATION, well_reached
-from pipeline.simulator.effects.shot import EXACT, SHOT
-from pipeline.simulator.noise import (
+from pipeline.simulator.effects.noise import (
     LEAST_MERGED_READ_E,
     least_expected,
     merged_noise,
@@ -30,12 +26,13 @@ from pipeline.simulator.noise import (
     photon_counts,
     rounded_counts,
 )
+from pipeline.simulator.effects.sensor import DARK_CURRENT, DEFECTS, dark_electrons, dead_elements, hot_electrons
 from pipeline.simulator.render import Choice
 
 Light = NDArray[np.float32]
 
 
-def read_out(light: Light, block: Block, chosen: Mapping[Any, str] | Choice) -> NDArray[np.uint16]:
+def read_out(light: Light, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> NDArray[np.uint16]:
     """Turn expected electrons into DN, with the readout's effects among those chosen.
 
     The converter always rounds (half to even) and never gives less than 0 or more than its full scale.
@@ -64,7 +61,7 @@ def read_out(light: Light, block: Block, chosen: Mapping[Any, str] | Choice) -> 
     return raw
 
 
-def dark_frame(block: Block, chosen: Mapping[Any, str] | Choice) -> Light:
+def dark_frame(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Light:
     """Give what the chosen readout shows without light, on average, (sample, band) float32, before rounding. [DN]"""
     readout, camera = Readout(block, Choice.of(chosen)), block.rig.camera
     dark = np.zeros((len(block.columns), len(block.wavelength_nm)), np.float32)
@@ -78,7 +75,7 @@ def dark_frame(block: Block, chosen: Mapping[Any, str] | Choice) -> Light:
 class Readout:
     """The readout of one block's samples under a choice of effects."""
 
-    block: Block
+    block: SweepBlock
     choice: Choice
 
     def electrons(self, light: Light, number: int) -> Light:
@@ -169,7 +166,7 @@ class Readout:
         return OFF if ideal else self.choice.variant(name)
 
 
-def _not_finite(expected: Light, block: Block, number: int) -> SceneError:
+def _not_finite(expected: Light, block: SweepBlock, number: int) -> SceneError:
     sample, band = np.argwhere(~np.isfinite(expected))[0]
     return SceneError(
         f"sweep {block.sweep.name}: line {number}, sample {block.columns[sample]}, band {band} expects"

@@ -13,20 +13,18 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import direction_to_scene, position_to_direction, position_to_normal
 from pipeline.geometry.scan import Sweep, line_positions, shifted_position
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.effect import OFF, Effect, Moments
-from pipeline.simulator.effects.pupil import middle_normal
-from pipeline.simulator.effects.slit import box_of, box_parts
-from pipeline.simulator.effects.smear import folded_positions, smeared_positions
-from pipeline.simulator.footprint import Footprint, fold
-from pipeline.simulator.rays import Views, exact_views, straight_views
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import OFF, Effect
+from pipeline.simulator.effects.line import box_of, box_parts, folded_positions, smeared_positions
+from pipeline.simulator.optics.footprint import fold
+from pipeline.simulator.optics.kernel_fit import Moments
+from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal, straight_views
+from pipeline.simulator.optics.scene_light import Looker
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene
-from pipeline.simulator.scene_light import Looker
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, Scene
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
-
 LOOKS = 17  # lines of a sweep and samples of a line that tell how far a footprint's shape varies
 
 
@@ -63,7 +61,7 @@ class Choice:
         return ((effect, variant) for effect, variant in self.effects if hasattr(effect, action))
 
 
-def expected_light(scene: Scene, block: Block, chosen: Mapping[Any, str] | Choice) -> Light:
+def expected_light(scene: Scene, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Light:
     """Give the electrons that the samples of some lines gather on average, before the readout.
 
     Parameters
@@ -87,12 +85,7 @@ def expected_light(scene: Scene, block: Block, chosen: Mapping[Any, str] | Choic
     return _changed(_seen(scene, block, choice), block, choice)
 
 
-def folded_footprint(block: Block, choice: Choice) -> Footprint:
-    """Fold slit, pixel, the blurs that are on and perhaps held positions: the same for all of a sweep, made once."""
-    return _looker_of(block, choice).footprint
-
-
-def held_positions(block: Block, choice: Choice) -> Floats:
+def held_positions(block: SweepBlock, choice: Choice) -> Floats:
     """Give what the mirror holds in each exposure, aims included, (line, step, 2); each for as long as the others."""
     position = smeared_positions(block, choice.variant("smear"))
     for aim, variant in choice.doing("aim"):
@@ -103,7 +96,7 @@ def held_positions(block: Block, choice: Choice) -> Floats:
     return position
 
 
-def _seen(scene: Scene, block: Block, choice: Choice) -> Light:
+def _seen(scene: Scene, block: SweepBlock, choice: Choice) -> Light:
     """Light of the block through the folded footprint, (line, sample, band)."""
     steps = [views.flat() for views in _views(block, choice, scene.shape)]
     exposures = block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
@@ -111,7 +104,7 @@ def _seen(scene: Scene, block: Block, choice: Choice) -> Light:
     return light.reshape(len(block.lines), len(block.columns), light.shape[1])
 
 
-def _changed(light: Light, block: Block, choice: Choice) -> Light:
+def _changed(light: Light, block: SweepBlock, choice: Choice) -> Light:
     """Multiply and change light as the effects do. Factors without bands are gathered: they pass through spectra."""
     pending: Light | None = None
     for effect, variant in choice.effects:
@@ -131,7 +124,7 @@ def _changed(light: Light, block: Block, choice: Choice) -> Light:
     return light
 
 
-def _views(block: Block, choice: Choice, shape: tuple[int, int]) -> Iterator[Views]:
+def _views(block: SweepBlock, choice: Choice, shape: tuple[int, int]) -> Iterator[RayViews]:
     """Where the samples look at each held position, (line, sample) each. [px of the scene]"""
     position, ifov = held_positions(block, choice), block.rig.camera.ifov_rad
     size = shape if block.sweep.along == "y" else shape[::-1]
@@ -145,13 +138,13 @@ def _views(block: Block, choice: Choice, shape: tuple[int, int]) -> Iterator[Vie
         yield replace(views, along=along + (size[0] - 1) / 2, scan=scan + (size[1] - 1) / 2)
 
 
-def _tangents(position: Floats, slopes: Floats, *, exact: bool) -> Views:
+def _tangents(position: Floats, slopes: Floats, *, exact: bool) -> RayViews:
     if exact:
         return exact_views(position_to_normal(position), 0.0, slopes)
     return straight_views(direction_to_scene(position_to_direction(position)), 0.0, slopes)
 
 
-def _looker_of(block: Block, choice: Choice) -> Looker:
+def _looker_of(block: SweepBlock, choice: Choice) -> Looker:
     moments, names = tuple(choice.doing("moments")), tuple(map(choice.variant, ("slit", "smear", "rotation")))
     return _looker(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names)
 
@@ -160,7 +153,7 @@ def _looker_of(block: Block, choice: Choice) -> Looker:
 def _looker(
     rig: Rig, sweep: Sweep, wavelengths: bytes, blurs: tuple[tuple[Any, str], ...], names: tuple[str, ...]
 ) -> Looker:
-    wavelength, normal = np.frombuffer(wavelengths), middle_normal(sweep, rig)
+    wavelength, normal = np.frombuffer(wavelengths), middle_normal(sweep, rig.camera)
     moments = [blur.moments(rig, wavelength, variant, normal) for blur, variant in blurs]
     slit, smear, rotation = names
     views = views_all_over(rig, sweep, exact=rotation != OFF)
@@ -168,7 +161,7 @@ def _looker(
     return Looker(fold(box_of(slit, rig), box_parts(slit, rig, views), folded_positions(sweep, smear), together), views)
 
 
-def views_all_over(rig: Rig, sweep: Sweep, *, exact: bool) -> Views:
+def views_all_over(rig: Rig, sweep: Sweep, *, exact: bool) -> RayViews:
     """Give views all over a sweep: the shape of a footprint varies smoothly between them."""
     whole = line_positions(replace(sweep, lines=max(sweep.lines, 1)), rig.camera)
     lines = np.linspace(0, len(whole) - 1, LOOKS).round().astype(np.intp)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.coatings import Coating
+from pipeline.simulator.optics.coatings import Coating
 
 Source = Literal["measured", "data sheet", "assumed"]
 Relief = Literal["flat", "step", "plane"]

@@ -1,8 +1,8 @@
-"""The simulated source: a scene as a rig sees it line by line, with the effects chosen."""
+"""The simulated source: a scene as a rig sees it line by line, with the effects chosen, and when each sweep starts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.simulator.block import Block
-from pipeline.simulator.instrument import BLOCK_LINES, USUAL, check_binning, render_lines, sweep_block
-from pipeline.simulator.pointing import Pointing
+from pipeline.geometry.scan import CostModel, Sweep, line_positions
+from pipeline.geometry.vector_memory import memory_loads
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.pointing import Pointing
+from pipeline.simulator.instrument import BLOCK_LINES, USUAL, check_binning, render_lines, sweep_block, take_references
 from pipeline.simulator.render import Choice
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import Scene
-from pipeline.simulator.white_panel import take_references
+from pipeline.simulator.scenes.scene import Scene
 from pipeline.source import Line, References
 
 
@@ -70,7 +70,7 @@ class SimulatedSource:
         """When a sweep starts, after the survey did [s]."""
         return 0.0 if self.clock is None else float(self.clock.get(sweep.name, 0.0))
 
-    def block(self, sweep: Sweep, lines: range) -> Block:
+    def block(self, sweep: Sweep, lines: range) -> SweepBlock:
         """Some lines of a sweep, as effects ask about them."""
         return sweep_block(self.scene, self.rig, sweep, lines, seed=self.seed, started_s=self.started_s(sweep))
 
@@ -148,3 +148,32 @@ class SimulatedSweep:
     def read(self, start: int, stop: int) -> NDArray[np.uint16]:
         """Make the lines ``start`` to ``stop``, (line, sample, band) uint16."""
         return self.source.render(self.sweep, range(start, min(stop, self.sweep.lines)))
+
+
+def sweep_starts(
+    sweeps: Sequence[Sweep], camera: LineCamera, cost: CostModel, *, after_s: float = 0.0
+) -> dict[str, float]:
+    """Give when the first line of each sweep begins, by the sweep's name, since the survey's start. [s]
+
+    Before it come the sweeps before, a set-up for each and its own, and the loads of the vector memory until then.
+    Lines of a sweep follow each other without a break: a load in the midst of one delays the next sweep only.
+
+    Parameters
+    ----------
+    sweeps
+        In the order in which they are taken.
+    after_s
+        What the survey has spent before: the fine sweeps come after the coarse ones' seconds.
+    """
+    loads_before: dict[int, int] = {}
+    for number, load in enumerate(memory_loads(sweeps, cost.vector_pairs), 1):
+        for part in load.parts:
+            loads_before.setdefault(part.sweep, number)
+    starts: dict[str, float] = {}
+    lines = loads = 0
+    for place, sweep in enumerate(sweeps):
+        loads = loads_before.get(place, loads)
+        spent = camera.scan_seconds(lines) + (place + 1) * cost.setup_seconds(camera) + loads * cost.reload_s
+        starts[sweep.name] = after_s + spent
+        lines += sweep.lines
+    return starts

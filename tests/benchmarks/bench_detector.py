@@ -16,14 +16,10 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera, digitise
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.dark_current import DARK_CURRENT
-from pipeline.simulator.effects.fixed_pattern import PRNU
-from pipeline.simulator.effects.quantisation import QUANTISATION
-from pipeline.simulator.effects.read_noise import READ_NOISE
-from pipeline.simulator.effects.saturation import SATURATION
-from pipeline.simulator.effects.shot import SHOT
-from pipeline.simulator.noise import merged_noise, normal_deviates, photon_counts, rounded_counts
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.counting import QUANTISATION, READ_NOISE, SATURATION, SHOT
+from pipeline.simulator.effects.noise import merged_noise, normal_deviates, photon_counts, rounded_counts
+from pipeline.simulator.effects.sensor import DARK_CURRENT, PRNU
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.rig_model import Detector, Rig
 
@@ -71,9 +67,9 @@ def _light_by_level() -> Light:
     return np.broadcast_to(levels, (LINES, SAMPLES, BANDS)).copy()
 
 
-def _block(rig: Rig, seed: int = 0) -> Block:
+def _block(rig: Rig, seed: int = 0) -> SweepBlock:
     sweep = Sweep("fine", "fine", "x", strip_px=0.0, start_px=0.0, lines=LINES)
-    return Block(rig, sweep, range(LINES), np.linspace(400.0, 1000.0, BANDS), (SAMPLES, SAMPLES), seed=seed)
+    return SweepBlock(rig, sweep, range(LINES), np.linspace(400.0, 1000.0, BANDS), (SAMPLES, SAMPLES), seed=seed)
 
 
 def _ours(light: Light, variant: str, seed: int = 0) -> Raw:

@@ -12,22 +12,20 @@ import numpy as np
 from measure import Clock, Row, ratio, time_in_turn
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import Block
-from pipeline.simulator.chips import candidate_chips, worst_chips
-from pipeline.simulator.choice import Decision, decide
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import Effect, Light
+from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.line import ROTATION, SLIT
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.farm import farm_scene
-from pipeline.simulator.probe import Probe
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Rig
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.stored_light import noise_electrons
-from pipeline.simulator.survey_probe import probe_scene
-from pipeline.simulator.verification import verify
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.selection.choice import Decision, decide
+from pipeline.simulator.selection.survey_probe import probe_scene
+from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
 from tests.pipeline.simulator.bound_trials import DRAWN, Trial, trials
 from tests.pipeline.simulator.random_cases import random_case
 
@@ -102,16 +100,16 @@ def _of_rig(scene: RasterScene, name: str, rig: Rig, sweeps: tuple[Sweep, ...]) 
         _cpu_row(name, "cheap", clocks, apart["cheap"]),
         _cpu_row(name, "exact", clocks, 0.0),
         _verified(scene, name, decision, probe, f"probe {probed:.1f} s, choice {decided:.2f} s"),
-        Row(f"farm@1, {name}: on", ", ".join(f"{one.name}" for one in decision.taken if one.is_on)),
+        Row(f"farm, {name}: on", ", ".join(f"{one.name}" for one in decision.taken if one.is_on)),
     ]
 
 
-def _block(scene: RasterScene, rig: Rig, sweep: Sweep, lines: range) -> Block:
+def _block(scene: RasterScene, rig: Rig, sweep: Sweep, lines: range) -> SweepBlock:
     white = scene.panel_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-    return Block(rig, sweep, lines, scene.wavelength_nm, scene.shape, fwhm_nm=scene.fwhm_nm, white_e=white)
+    return SweepBlock(rig, sweep, lines, scene.wavelength_nm, scene.shape, fwhm_nm=scene.fwhm_nm, white_e=white)
 
 
-def _image(scene: RasterScene, block: Block, chosen: Mapping[Effect, str]) -> None:
+def _image(scene: RasterScene, block: SweepBlock, chosen: Mapping[Effect, str]) -> None:
     read_out(expected_light(scene, block, chosen), block, chosen)
 
 
@@ -123,7 +121,7 @@ def _apart(light: Sequence[Light], exact: Sequence[Light], rig: Rig) -> float:
 
 def _tolerance_row(name: str, apart: Mapping[str, float], decision: Decision) -> Row:
     return Row(
-        f"farm@1 1024 x 1280 x 270, {name}, auto at {TOLERANCE} sigma: greatest change of light",
+        f"farm 1024 x 1280 x 270, {name}, auto at {TOLERANCE} sigma: greatest change of light",
         f"{apart['auto']:.3g} sigma, bound {decision.error:.3g}",
         f"<= {TOLERANCE} sigma",
         apart["auto"] <= decision.error <= TOLERANCE,
@@ -137,7 +135,7 @@ def _cpu_row(name: str, against: str, clocks: Mapping[str, Clock], apart: float)
     goal = against == "cheap" and RIGS[name] == Rig()
     what = "each as cheap as a tenth of the tolerance lets it be" if against == "cheap" else "exact"
     return Row(
-        f"farm@1, {name}, auto: processor time against everything on, {what}",
+        f"farm, {name}, auto: processor time against everything on, {what}",
         f"1/{ratio(clocks, against, 'auto'):.2f}",
         f">= {LEAST_SAVED:g} times less" if goal else "",
         ratio(clocks, against, "auto") >= LEAST_SAVED if goal else None,
@@ -152,11 +150,11 @@ def _verified(scene: RasterScene, name: str, decision: Decision, probe: Probe, b
         return noise_electrons(light, rig, binning)
 
     whole = [_block(scene, rig, sweep, range(sweep.lines)) for sweep in probe.sweeps]
-    chips = worst_chips(candidate_chips(whole, probe.places), lambda chip: expected_light(scene, chip, LOOK), units)
+    chips = worst_blocks(candidate_blocks(whole, probe.places), lambda chip: expected_light(scene, chip, LOOK), units)
     measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), chips, units)
     spent = time.process_time() - clock
     worst = max(measured.values())
     return Row(
-        f"farm@1, {name}: verification of the choice, processor time", f"{spent:.1f} s, {worst:.2g} sigma",
+        f"farm, {name}: verification of the choice, processor time", f"{spent:.1f} s, {worst:.2g} sigma",
         peers=f"{before}; {len({(chip.sweep.name, chip.lines) for chip in chips.values()})} chips",
     )  # fmt: skip

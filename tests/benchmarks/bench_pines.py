@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from models.reading.inference import Glance
     from models.training.train import TrainingSettings
     from models.weights.files import Weights
-    from pipeline.simulator.scene import RasterScene
+    from pipeline.simulator.scenes.scene import RasterScene
 
 SCENE, MASK = "Indian_pines_corrected.npy", "indianpines_disjoint_dset.mat"
 MASK_CLASSES = (2, 3, 5, 6, 8, 10, 11, 12, 14, 1, 4, 7, 9, 13, 15, 16)  # classes of the labels by the mask's numbers

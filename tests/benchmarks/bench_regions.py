@@ -30,7 +30,7 @@ from models.network.process import use_one_thread
 from models.reading.regions import HALO_CELLS, Region, most_bytes, plan_regions
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.selection import frame_seats
-from pipeline.simulator.spectra import MATERIALS, spectral_library
+from pipeline.simulator.scenes.farm.spectra import MATERIALS, spectral_library
 from storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, load_class_map
 from storage.arrays.layout import SHARD_ROWS
 from storage.arrays.mosaics import MosaicWriter
@@ -229,7 +229,7 @@ def _write_sparse(path: Path, grid: SceneGrid) -> NDArray[np.bool_]:
     """Store a coarse mosaic of clumps of maize on bare soil, some rows at a time; which pixels are maize."""
     rng, library = np.random.default_rng(0), spectral_library(MOSAIC_BANDS)
     nm = library.wavelength_nm
-    soil, maize = (library.reflectance[MATERIALS.index(name)] for name in ("soil_dry", "maize_dense"))
+    soil, maize = (library.reflectance[MATERIALS.index(name)] for name in ("soil_dry", "maize_full"))
     y, x = grid.coarse_shape
     centres = rng.uniform(0, (y, x), (BLOBS, 2))
     grown = np.zeros((y, x), np.bool_)

@@ -13,22 +13,19 @@ from measure import Clock, Row, ratio, time_in_turn
 from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import Block
-from pipeline.simulator.choice import CHEAP_SHARE, Decision, decide
-from pipeline.simulator.effects.aberration import ABERRATION
-from pipeline.simulator.effects.diffraction import DIFFRACTION
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import Effect
-from pipeline.simulator.effects.keystone import KEYSTONE
+from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.farm import farm_scene
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.stored_light import noise_electrons
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.selection.choice import CHEAP_SHARE, Decision, decide
+from pipeline.simulator.selection.survey_probe import probe_scene
 
 SIZE = 2560  # px of the scene
 LINES, AT_ONCE = 256, 16
@@ -47,12 +44,14 @@ class Survey:
     sweeps: tuple[Sweep, ...]
     decision: Decision
 
-    def blocks(self) -> list[Block]:
+    def blocks(self) -> list[SweepBlock]:
         """Lines in the middle of one half of an outer sweep, some at a time."""
         exposures = self.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
         white = self.scene.panel_electrons.astype(np.float64) * exposures
         first = SIZE // 4 - LINES // 2
-        whole = Block(self.rig, self.sweeps[0], range(SIZE), self.scene.wavelength_nm, self.scene.shape, white_e=white)
+        whole = SweepBlock(
+            self.rig, self.sweeps[0], range(SIZE), self.scene.wavelength_nm, self.scene.shape, white_e=white
+        )
         return [replace(whole, lines=range(at, at + AT_ONCE)) for at in range(first, first + LINES, AT_ONCE)]
 
     @property
@@ -100,7 +99,7 @@ def _survey() -> Survey:
     return Survey(scene, rig, sweeps, decision)
 
 
-def _simulated(survey: Survey, chosen: dict[Effect, str], blocks: list[Block]) -> None:
+def _simulated(survey: Survey, chosen: dict[Effect, str], blocks: list[SweepBlock]) -> None:
     for block in blocks:
         read_out(expected_light(survey.scene, block, chosen), block, chosen)
 

@@ -17,10 +17,11 @@ from pipeline.rectify.lookup import track_lookup
 from pipeline.rectify.registration.alignment import SweepShift, no_shifts
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX, BroadSweep, PlacedImage
 from pipeline.rectify.registration.seams import Registration, measure_windows, place_images, register_sweeps
-from pipeline.simulator.farm import farm_scene
-from pipeline.simulator.pointing import ACCURACY_PX, REPEATABILITY_PX, PointingErrors
+from pipeline.simulator.effects.pointing import ACCURACY_PX, REPEATABILITY_PX, PointingErrors
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import raster_from_values, to_bands
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import to_bands
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import References
 

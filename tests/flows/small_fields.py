@@ -14,7 +14,7 @@ from flows.evaluate.frames import Look, look_at, open_frames
 from models.network.sizes import PRESETS, Preset
 from models.weights.files import AnyWeights, Weights, load_weights, save_weights
 from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene
 from tests.models.conftest import make_any_weights
 
 FRAMES = ("001", "002", "003")

@@ -16,7 +16,7 @@ from flows.survey.run import CaptureRun
 from flows.survey.stages import VERSIONS
 from pipeline.errors import BoundError, IncompleteStoreError
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.archive import StageRef, stage_key
 
 ASKED = "rotation,vignetting,shot,read-noise"

@@ -31,8 +31,8 @@ from models.training.train import TrainingSettings
 from models.weights.files import load_weights, save_weights
 from pipeline.errors import SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.farm_fields import CLASSES
 from pipeline.simulator.instrument import USUAL
+from pipeline.simulator.scenes.farm.canvas import CLASSES
 from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_field, write_weights
 from tests.models.conftest import make_weights
 
@@ -386,7 +386,7 @@ def test_the_farm_is_judged_on_seeds_of_its_own(tmp_path: Path, monkeypatch: pyt
     save_weights(replace(made, class_names=CLASSES), weights)
     quick = {**QUICK, "policies": ("entropy",), "shares": (0.25,), "timed_frames": 0, "equal_time": True}
     content = evaluate_weights(EvaluateRequest("farm", (weights,), scenes=2, **quick))
-    assert content["frames"] == [*farm_test_data("farm", 2, LineCamera()).train]
+    assert content["frames"] == [*farm_test_data(2, LineCamera()).train]
     assert 0 <= _row(content, "none", 0.0)["miou"] <= 1
     assert content["equal_time"][0]["frames"] == 2
 

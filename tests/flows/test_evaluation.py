@@ -17,9 +17,9 @@ from models.evaluation.metrics import confusion
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.rectify.registration.illumination import LightRatio
-from pipeline.simulator.pointing import CommonOffset, PointingErrors
+from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive, StageRef
 

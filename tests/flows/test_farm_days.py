@@ -12,7 +12,7 @@ import pytest
 
 from flows.archive.compare_command import find_run, run_compare
 from flows.archive.stale_runs import asked_again, newest_runs
-from flows.settings.survey_settings import Settings, parse_settings
+from flows.settings.survey_settings import Settings, load_settings, parse_settings
 from flows.survey.scene import check_labels, farm_refusal, open_scene
 from flows.training.data import farm_data, farm_looks, farm_test_data, read_farm_name
 from flows.training.look import observe_scene
@@ -23,10 +23,10 @@ from models.weights.files import Description
 from pipeline.errors import ArchiveError, SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.simulator.farm_fields import CLASSES
-from pipeline.simulator.farm_laws import FARM_LAW, SEASON_LAW, built_in_farm
-from pipeline.simulator.farm_sun import sun_over_farm
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.farm.canvas import CLASSES
+from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, REMOVED_LAW, farm_scene
+from pipeline.simulator.scenes.farm.seasons import sun_over_farm
+from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 
@@ -35,7 +35,7 @@ BANDS = (20, 60, 110, 160, 210, 250)
 
 
 def _settings(**table: Any) -> Settings:
-    return parse_settings({"scene": SEASON_LAW, "size": "240x200", "bands": BANDS, **table})
+    return parse_settings({"scene": FARM_LAW, "size": "240x200", "bands": BANDS, **table})
 
 
 def _lines(scene: RasterScene) -> np.ndarray[Any, Any]:
@@ -53,28 +53,42 @@ def test_two_days_of_a_field_are_one_land() -> None:
 
 
 def test_day_and_hour_stand_in_the_key() -> None:
-    """Whose scene is kept is told by them; those of farm@1 stay what they were."""
+    """Whose scene is kept is told by them."""
     given: list[dict[str, int]] = [{}, {"day": 173}, {"hour": 9}, {"day": 172, "hour": 11}]
     assert len({open_scene(_settings(**moment))[0].key for moment in given}) == 3
     key = open_scene(_settings(day=173))[0].key
     assert key.startswith("farm@2/seed=0/day=173/shape=200x240/hour=11/bands=270")
-    first = open_scene(_settings(scene=FARM_LAW))[0].key
-    assert first == "farm@1/seed=0/shape=200x240/bands=270/full_well=20155/only=20,60,110,160,210,250"
 
 
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ({"scene": FARM_LAW, "day": 5}, "'day' = 5 is for the scene farm@2, whose fields grow; farm@1 is as it is"),
+        ({"scene": REMOVED_LAW}, r"farm@1 was removed: take farm \(farm@2\)"),
         ({"scene": "field.png", "hour": 9.5}, "'hour' = 9.5 is for the scene farm@2"),
-        ({"scene": SEASON_LAW, "day": 0}, "'day' must be a whole number from 1 to 366, got 0; of the year"),
-        ({"scene": SEASON_LAW, "hour": 25}, "'hour' must be a number from 0 to 24 h"),
+        ({"scene": FARM_LAW, "day": 0}, "'day' must be a whole number from 1 to 366, got 0; of the year"),
+        ({"scene": FARM_LAW, "hour": 25}, "'hour' must be a number from 0 to 24 h"),
     ],
 )
 def test_days_that_are_none_are_refused(table: dict[str, Any], words: str) -> None:
     """By the settings, before any scene is opened."""
     with pytest.raises(SettingsError, match=words):
         parse_settings(table)
+
+
+def test_a_file_that_names_the_removed_farm_is_refused(tmp_path: Path) -> None:
+    """The name is no path: it is not looked for beside the file."""
+    (tmp_path / "field.toml").write_text(f'scene = "{REMOVED_LAW}"\n')
+    with pytest.raises(SettingsError, match="farm@1 was removed"):
+        load_settings(tmp_path / "field.toml")
+
+
+def test_runs_of_the_removed_farm_are_told_apart(tmp_path: Path) -> None:
+    """By their seeds: its name is no scene's file."""
+    archive = Archive.open(tmp_path)
+    keys = [f"farm@1/seed={seed}/shape=8x8/bands=9" for seed in (0, 1)]
+    made = [_publish(archive, key, scene=REMOVED_LAW) for key in keys]
+    with pytest.raises(SceneError, match="of different fields"):
+        run_compare(tmp_path, *made)
 
 
 def test_night_is_refused_before_anything_is_drawn() -> None:
@@ -95,8 +109,8 @@ def test_two_moments_are_told_apart() -> None:
 
 def test_weights_of_another_farm_are_told() -> None:
     """They know the classes, but not how these look."""
-    scene = built_in_farm(SEASON_LAW, 0, (20, 30))
-    for law, count in ((FARM_LAW, 1), (SEASON_LAW, 0), ("folder", 0)):
+    scene = farm_scene(0, (20, 30))
+    for law, count in ((REMOVED_LAW, 1), (FARM_LAW, 0), ("folder", 0)):
         config = SegmenterConfig(classes=len(CLASSES), columns=6, patch=8, factor=2, width=4)
         weights = Description(config, SpectralBasis(450, 850, 6), CLASSES, {"data": law})
         assert len(check_labels(scene, weights)) == count
@@ -137,31 +151,30 @@ def test_a_farm_is_asked_for_again_by_its_law(tmp_path: Path) -> None:
     ]
     newest = newest_runs(Catalogue.read(tmp_path))
     assert [one.run.folder.name for one in newest] == made[2:]
-    again = [asked_again(run, tmp_path, None) for run in Catalogue.read(tmp_path).runs]
-    assert [(one.scene, one.day) for one in again] == [
-        (FARM_LAW, None), (SEASON_LAW, None), (SEASON_LAW, 172), (SEASON_LAW, 173), (FARM_LAW, None)
-    ]  # fmt: skip
+    old, *others = Catalogue.read(tmp_path).runs
+    again = [asked_again(run, tmp_path, None) for run in others[:-1]]
+    assert [(one.scene, one.day) for one in again] == [(FARM_LAW, None), (FARM_LAW, 172), (FARM_LAW, 173)]
+    for removed in (old, others[-1]):
+        with pytest.raises(SettingsError, match="farm@1 was removed"):
+            asked_again(removed, tmp_path, None)
 
 
 def test_training_days_cover_the_season() -> None:
     """Each month from April to October has some, at hours with enough sun, and none is one that is judged on."""
-    data = farm_data(SEASON_LAW, None, 3, LineCamera())
+    data = farm_data(None, 3, LineCamera())
     learnt = [read_farm_name(name) for name in data.train]
-    judged = [read_farm_name(name) for name in (*data.validation, *farm_test_data(SEASON_LAW, 4, LineCamera()).train)]
-    assert np.histogram([day or 0 for _, day, _ in learnt], np.linspace(91, 305, 8))[0].min() >= 5
+    judged = [read_farm_name(name) for name in (*data.validation, *farm_test_data(4, LineCamera()).train)]
+    assert np.histogram([day for _, day, _ in learnt], np.linspace(91, 305, 8))[0].min() >= 5
     for _, day, hour in (*learnt, *judged):
-        assert day is not None
-        assert hour is not None
         assert sun_over_farm(day, hour).elevation_deg > 15
     assert not {day for _, day, _ in learnt} & {day for _, day, _ in judged}
     assert len({seed for seed, _, _ in (*learnt, *judged)}) == len(learnt) + len(judged)
-    assert data.law == SEASON_LAW
+    assert data.law == FARM_LAW
 
 
 def test_names_of_farm_scenes_are_read_back() -> None:
-    """And the first farm's are their seeds alone."""
-    assert farm_looks(FARM_LAW, 7, 2) == ("7", "8")
-    assert read_farm_name("7") == (7, None, None)
+    """Seed, day and hour."""
+    assert [read_farm_name(name)[0] for name in farm_looks(7, 2)] == [7, 8]
     assert read_farm_name("100003-day-168-hour-14") == (100_003, 168, 14.0)
 
 

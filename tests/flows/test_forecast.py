@@ -167,8 +167,8 @@ def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
     def refuse(*_: object) -> None:
         raise AssertionError("the plan looked at the field")
 
-    monkeypatch.setattr("pipeline.simulator.farm._draw", refuse)
-    monkeypatch.setattr("pipeline.simulator.farm._light", refuse)
+    monkeypatch.setattr("pipeline.simulator.scenes.farm.farm_scene._draw", refuse)
+    monkeypatch.setattr("pipeline.simulator.scenes.farm.farm_scene.spectral_library", refuse)
     monkeypatch.setattr(
         "storage.readers.declared_sizes.os.sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**21}[name]
     )

@@ -18,7 +18,7 @@ from flows.survey.stages import patch_columns
 from models.network.spectral import SpectralBasis
 from models.reading.inference import Glance
 from pipeline.geometry.grid import SceneGrid
-from pipeline.simulator.pointing import PointingErrors
+from pipeline.simulator.effects.pointing import PointingErrors
 from storage.archive.archive import StageRef
 from storage.arrays.layout import open_group, read_array
 from storage.arrays.patches import PatchWriter

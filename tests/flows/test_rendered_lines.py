@@ -18,7 +18,7 @@ from pipeline.simulator import instrument, render
 from pipeline.simulator.effects.registry import BY_NAME
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Line
 from storage.arrays.spool import Spool

@@ -18,9 +18,9 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import coarse_sweeps, full_sweeps
 from pipeline.rectify.region import mosaic_rows
-from pipeline.simulator.farm_fields import CLASSES
-from pipeline.simulator.farm_laws import BUILT_IN_SCENE, built_in_farm
 from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.farm.canvas import CLASSES
+from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 PATH = Path(str(resources.files("models") / "shipped" / SHIPPED))
@@ -36,7 +36,7 @@ def weights() -> Weights:
 @pytest.fixture(scope="module")
 def controls(weights: Weights) -> Controls:
     """Placements judged on a farm that training has not seen, through the exact rays of the simulated rig."""
-    camera, scene = LineCamera(), built_in_farm("farm", 41, SHAPE)
+    camera, scene = LineCamera(), farm_scene(41, SHAPE)
     grid = SceneGrid(*SHAPE, weights.config.patch, weights.config.factor)
     source = SimulatedSource(scene, Rig(camera), 41)
     coarse = [SimulatedSweep(source, sweep) for sweep in coarse_sweeps(grid, camera, "x")]
@@ -58,7 +58,7 @@ def test_file_is_small_and_tells_its_making(weights: Weights) -> None:
     """At most 8 MB, with command, seed, law of the data and validation figures."""
     assert PATH.stat().st_size <= 8e6
     assert weights.record["command"].startswith("spectralzoom train farm")
-    assert weights.record["data"] == BUILT_IN_SCENE
+    assert weights.record["data"] == FARM_LAW
     assert weights.record["settings"]["seed"] == 0
     assert weights.record["validation"]["entropy"]["miou"] > 0.8
     assert weights.class_names == tuple(entry for entry in CLASSES)

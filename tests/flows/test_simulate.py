@@ -17,7 +17,7 @@ from flows.publish.effect_table import print_effects
 from flows.survey import effect_choice
 from pipeline.errors import BoundError
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
 
 ASKED = "rotation,vignetting,shot,read-noise"

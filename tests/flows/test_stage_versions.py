@@ -25,7 +25,7 @@ from tests.flows.stage_closure import Sources, Target, read_packages  # noqa: E4
 
 VERSIONS = {**stages.VERSIONS, ingest_command.STAGE: ingest_command.VERSION}
 RECORD = Path(__file__).with_name("stage_digests.json")
-LIGHT = ("built_in_farm", "raster_from_values", "make_source")  # who looks at what: runs bring it, no stage names it
+LIGHT = ("farm_scene", "raster_from_values", "make_source")  # who looks at what: runs bring it, no stage names it
 ROOTS = {
     "effects": ("choose_effects", *LIGHT),
     "capture": ("capture_coarse", "capture_fine", *LIGHT, "rig_source"),

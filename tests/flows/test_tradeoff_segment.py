@@ -13,7 +13,7 @@ from flows.tradeoff.segment import AGREEMENT, BAND_COUNT, BANDS, PRECISION, PREC
 from models.network.segmenter import Segmenter, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.weights.files import Weights
-from pipeline.simulator.farm import farm_scene
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 
 SHAPE = (128, 192)
 

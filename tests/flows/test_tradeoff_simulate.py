@@ -24,10 +24,10 @@ from flows.tradeoff.simulate_rays import SUPERSAMPLING
 from flows.tradeoff.simulated_lines import Against, FarmLines, look_at_lines, with_variant
 from flows.tradeoff.table import print_tradeoff
 from pipeline.geometry.camera import LineCamera
+from pipeline.simulator.effects.blurs import KEYSTONE
+from pipeline.simulator.effects.counting import SHOT
 from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.effects.keystone import KEYSTONE
-from pipeline.simulator.effects.shot import SHOT
-from pipeline.simulator.effects.slit import SLIT
+from pipeline.simulator.effects.line import SLIT
 from pipeline.simulator.rig_model import Rig
 
 

@@ -10,18 +10,17 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import Block
-from pipeline.simulator.choice import Decision, decide
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import Effect
+from pipeline.simulator.effects.light_units import noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.instrument import sweep_block
-from pipeline.simulator.options import acts_on_light
-from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
-from pipeline.simulator.scene import RasterScene
-from pipeline.simulator.stored_light import noise_electrons
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.selection.choice import Decision, decide
+from pipeline.simulator.selection.options import acts_on_light
+from pipeline.simulator.selection.survey_probe import probe_scene
 
 ROUNDING = 4e-6  # of the light over its noise: sums of float32 in another order
 CAMERA = LineCamera(samples=64)
@@ -42,12 +41,17 @@ def scene_of(values: NDArray[np.floating], electrons: float = 5000.0) -> RasterS
     bands = values.shape[2]
     light = np.full(bands, electrons, np.float32)
     return RasterScene(
-        "t", "t", Raster.of(values.astype(np.float32)), Once.of(Light(light, light)), np.ones(bands, np.float32),
-        np.linspace(450, 850, bands), fwhm_nm=np.full(bands, 6.0),
-    )  # fmt: skip
+        "t",
+        "t",
+        SceneRaster.of(values.astype(np.float32)),
+        Once.of(SceneLight(light, light)),
+        np.ones(bands, np.float32),
+        np.linspace(450, 850, bands),
+        fwhm_nm=np.full(bands, 6.0),
+    )
 
 
-def block_of(scene: RasterScene, rig: Rig, lines: range = range(0, 30, 5), sweep: Sweep = SWEEP) -> Block:
+def block_of(scene: RasterScene, rig: Rig, lines: range = range(0, 30, 5), sweep: Sweep = SWEEP) -> SweepBlock:
     """Some lines of a sweep."""
     return sweep_block(scene, rig, sweep, lines)
 

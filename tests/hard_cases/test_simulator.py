@@ -12,18 +12,16 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.aberration import ABERRATION
-from pipeline.simulator.effects.keystone import KEYSTONE
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.blurs import ABERRATION, KEYSTONE
+from pipeline.simulator.effects.counting import SHOT
+from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.registry import EFFECTS, READOUT
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.shot import SHOT
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.options import ALWAYS_ON
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Detector, Optics, Rig
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.selection.options import ALWAYS_ON
+from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.hard_cases.simulated_scene import CAMERA, EVERYTHING, RIG, SWEEP, block_of, decided, left_out, scene_of
 
 TOLERANCES = [0.0, 0.1, math.inf]
@@ -34,7 +32,7 @@ COUNTING = replace(CAMERA, samples=640, bits=16, read_noise_e=0.0, dark_dn=0.0)
 def counts_of(level: float, variant: str, electrons_per_dn: float = 1.0) -> NDArray[np.float64]:
     """What 1e5 samples count of so much light, by shot noise alone. [e-]"""
     rig = Rig(camera=replace(COUNTING, electrons_per_dn=electrons_per_dn))
-    block = Block(rig, SWEEP, range(8), np.linspace(400, 1000, 20), (60, 80))
+    block = SweepBlock(rig, SWEEP, range(8), np.linspace(400, 1000, 20), (60, 80))
     light = np.full((8, 640, 20), level, np.float32)
     return read_out(light, block, {SHOT: variant}).astype(np.float64) * electrons_per_dn
 

@@ -12,22 +12,22 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.simulator.choice import Decision, decide
-from pipeline.simulator.daylight import sun_elevation_deg
-from pipeline.simulator.effects.defocus import DEFOCUS
-from pipeline.simulator.effects.drift import DRIFT
-from pipeline.simulator.effects.lag import LAG
-from pipeline.simulator.effects.parallax import PARALLAX
-from pipeline.simulator.effects.path_radiance import PATH_RADIANCE
+from pipeline.simulator.effects.blurs import DEFOCUS
+from pipeline.simulator.effects.haze import PATH_RADIANCE
+from pipeline.simulator.effects.lighting import DRIFT
+from pipeline.simulator.effects.line import ROTATION
+from pipeline.simulator.effects.mirror_path import LAG
+from pipeline.simulator.effects.moving_air import TURBULENCE, turbulence_px
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.turbulence import TURBULENCE, turbulence_px
-from pipeline.simulator.farm_on_day import farm_on_day
-from pipeline.simulator.farm_sun import LOWEST_SUN_DEG, sun_over_farm
+from pipeline.simulator.effects.relief import PARALLAX
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, MirrorMotion, Optics, Rig, Sky
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.daylight import sun_elevation_deg
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.scenes.farm.seasons import LOWEST_SUN_DEG, sun_over_farm
+from pipeline.simulator.selection.choice import Decision, decide
+from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.hard_cases.simulated_scene import CAMERA, RIG, SWEEP, block_of, decided, left_out, scene_of
 
 TEXTURE = scene_of(np.random.default_rng(0).uniform(0.2, 1, (60, 80, 3)))
@@ -133,12 +133,12 @@ def test_farm_needs_a_sun_that_stands_high_enough() -> None:
             high = middle
         except SceneError:
             low = middle
-    scene = farm_on_day(0, (12, 16), bands=2, day=172, hour=high)
+    scene = farm_scene(0, (12, 16), bands=2, day=172, hour=high)
     assert sun_over_farm(172, high).elevation_deg == pytest.approx(LOWEST_SUN_DEG, abs=1e-6)
     assert np.isfinite(scene.planes).all()
     for hour in (low, 0.0, math.nan):
         with pytest.raises(SceneError, match=r"of day 172 the sun stands at .* needs at least 5; take an hour nearer"):
-            farm_on_day(0, (12, 16), bands=2, day=172, hour=hour)
+            farm_scene(0, (12, 16), bands=2, day=172, hour=hour)
 
 
 @pytest.mark.parametrize("distance_m", [30.0, 1e300, math.inf])

@@ -15,21 +15,20 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.chips import candidate_chips, worst_chips
-from pipeline.simulator.choice import decide
 from pipeline.simulator.effects.effect import Effect, Light
+from pipeline.simulator.effects.light_units import noise_electrons, stored_mean, unit_at
+from pipeline.simulator.effects.line import ROTATION, SLIT
+from pipeline.simulator.effects.probe import Unit
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
 from pipeline.simulator.instrument import sweep_block
-from pipeline.simulator.manifest import TOTAL
-from pipeline.simulator.probe import Unit
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, Rig
-from pipeline.simulator.scene import RasterScene, raster_from_values
-from pipeline.simulator.stored_light import noise_electrons, stored_mean, unit_at
-from pipeline.simulator.survey_probe import probe_survey
-from pipeline.simulator.verification import verify
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.selection.choice import decide
+from pipeline.simulator.selection.manifest import TOTAL
+from pipeline.simulator.selection.survey_probe import probe_survey
+from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
 from tests.hard_cases.simulated_scene import scene_of
 
 LOOK: dict[Effect, str] = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[-1]}
@@ -106,11 +105,11 @@ def test_every_permitted_setting_is_decided_and_verified(asked: Asked) -> None:
     chips = [
         chip
         for probe in probes
-        for chip in candidate_chips(
+        for chip in candidate_blocks(
             [sweep_block(scene, rig, sweep, range(sweep.lines)) for sweep in probe.sweeps], probe.places[:4]
         )
     ]
-    worst = worst_chips(chips, lambda chip: expected_light(scene, chip, LOOK), units)
+    worst = worst_blocks(chips, lambda chip: expected_light(scene, chip, LOOK), units)
     measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), worst, units)
     assert np.isfinite(measured[TOTAL])
 

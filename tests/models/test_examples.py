@@ -13,8 +13,8 @@ from models.training.examples import CropSampler, Example, Observation, measured
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, look
 from pipeline.geometry.grid import SceneGrid
-from pipeline.simulator.raster import Raster
-from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneRaster
 
 CAMERA = LineCamera(bits=14)
 NM = np.linspace(450, 950, 6)
@@ -75,7 +75,7 @@ def test_equal_streams_give_equal_looks():
 def test_scenes_without_labels_teach_nothing():
     """A scene without labels, and examples without one labelled pixel, are refused."""
     with pytest.raises(SceneError, match="scene s has no labels"):
-        _observed(replace(_scene(), raster=Raster.of(_scene().planes)))
+        _observed(replace(_scene(), raster=SceneRaster.of(_scene().planes)))
     blank = Example("e", np.zeros((32, 32, 1), np.float16), np.zeros((16, 16, 1), np.float32),
                     np.full((32, 32), 255, np.uint8), (32, 32))  # fmt: skip
     with pytest.raises(SceneError, match="none of 2 scenes has a labelled pixel"):

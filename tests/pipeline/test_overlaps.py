@@ -18,11 +18,11 @@ from pipeline.planning.coverage import coarse_sweeps, full_sweeps
 from pipeline.rectify.registration.alignment import no_shifts
 from pipeline.rectify.registration.overlaps import BroadSweep, PlacedImage, broad_bands, overlap_windows, places_seen
 from pipeline.rectify.registration.seams import Registration, measure_windows, place_images, register_sweeps
+from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.instrument import effects_on
-from pipeline.simulator.pointing import PointingErrors
-from pipeline.simulator.raster import Light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import SceneLight
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 CAMERA = LineCamera(samples=160)
@@ -156,7 +156,7 @@ def test_saturated_samples_are_left_out(factor: int):
     values = np.full((GRID.height, GRID.width, 1), 1.0)
     values[100:140, 120:180] = 2.0  # 60 % of the full well
     scene = raster_from_values(values, CAMERA, name="t", wavelength_nm=np.array([600.0]))
-    bright = replace(scene, light=Once.of(Light(scene.electrons * 2.4, scene.panel_electrons)))
+    bright = replace(scene, light=Once.of(SceneLight(scene.electrons * 2.4, scene.panel_electrons)))
     sweep = Sweep("s", "fine", "x", 0.0, -40.0, 80 // factor, factor, factor)
     broad = BroadSweep.read(
         SimulatedSweep(SimulatedSource(bright, Rig(CAMERA), 0, effects_on("rotation")), sweep), CAMERA

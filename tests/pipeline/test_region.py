@@ -16,7 +16,8 @@ from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.region import mosaic_rows, place, read_seats, seat_pixels
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from pipeline.source import References
 

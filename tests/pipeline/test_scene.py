@@ -10,8 +10,8 @@ import pytest
 from pipeline.errors import SceneError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.lazy import Once
-from pipeline.simulator.raster import Light, Raster
-from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 
 CAMERA = LineCamera()
 WAVELENGTH = np.array([660.0, 800.0])
@@ -36,7 +36,7 @@ def test_values_are_those_of_the_file() -> None:
     np.testing.assert_allclose(scene.values(), picture(), rtol=1e-6)
     planes, electrons = np.ones((4, 5, 3), np.float32), np.full((3, 2), 100, np.float32)
     panel, white = np.full(2, 0.5, np.float32), np.full(2, 200, np.float32)
-    mixed = RasterScene("m", "k", Raster.of(planes), Once.of(Light(electrons, white)), panel, WAVELENGTH)
+    mixed = RasterScene("m", "k", SceneRaster.of(planes), Once.of(SceneLight(electrons, white)), panel, WAVELENGTH)
     np.testing.assert_allclose(mixed.values(), np.full((4, 5, 2), 300 / 200 * 0.5))
 
 
@@ -97,20 +97,20 @@ def test_a_raster_is_drawn_when_it_is_looked_at() -> None:
         drawn.append(1)
         return np.ones((4, 5, 2), np.float32), np.zeros((4, 5), np.uint8)
 
-    light = Once.of(Light(np.ones(2, np.float32), np.ones(2, np.float32)))
+    light = Once.of(SceneLight(np.ones(2, np.float32), np.ones(2, np.float32)))
     scene = RasterScene(
-        "s", "k", Raster((4, 5, 2), labelled=True, draw=draw), light, np.ones(2, np.float32), WAVELENGTH
+        "s", "k", SceneRaster((4, 5, 2), labelled=True, draw=draw), light, np.ones(2, np.float32), WAVELENGTH
     )
     assert (scene.shape, scene.labelled, drawn) == ((4, 5), True, [])
     assert scene.labels is not None
     assert scene.labels.shape == scene.planes.shape[:2]
     assert replace(scene, key="other").planes is scene.planes
     assert drawn == [1]
-    for other in (Raster((4, 6, 2), labelled=True, draw=draw), Raster((4, 5, 2), labelled=False, draw=draw)):
+    for other in (SceneRaster((4, 6, 2), labelled=True, draw=draw), SceneRaster((4, 5, 2), labelled=False, draw=draw)):
         with pytest.raises(SceneError, match="crop or pad"):
             other.drawn()
     with pytest.raises(SceneError, match="not empty"):
-        Raster((0, 5, 2), labelled=False, draw=draw)
+        SceneRaster((0, 5, 2), labelled=False, draw=draw)
 
 
 @pytest.mark.parametrize("value", [1e30, -1e20, 2e9, 1e300])

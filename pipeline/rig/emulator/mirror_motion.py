@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.geometry.vector_memory import Ends
 from pipeline.rig.mirror.registers import Trigger, Unit
-from pipeline.simulator.effects.lag import responses
+from pipeline.simulator.effects.mirror_path import responses
 
 Floats = NDArray[np.float64]
 KEPT_STEPS = 20_000  # commands that an axis remembers; older times are given as the oldest state that is known

@@ -34,10 +34,10 @@ from pipeline.rig.emulator.camera_device import CameraDevice, CameraFaults, Came
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.mirror.steering import wire_positions
 from pipeline.rig.survey_rig import Pulses
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.effect import OFF, Bound
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import Aim, Bound
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.instrument import render_lines
-from pipeline.simulator.probe import Probe
 from pipeline.simulator.render import Choice
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource
@@ -50,20 +50,19 @@ _MOMENTS = 8  # within a held position
 
 
 @dataclass(frozen=True)
-class OffPlanAim:
+class OffPlanAim(Aim):
     """An aim of the chain: how far lines lie beside their plan, (line, step, 2) from line ``first`` on. [px]"""
 
     shift_px: Floats
     first: int
     name = "beside"
-    variants = ("exact",)
     cost_ns = MappingProxyType({"exact": 0.2})
 
-    def aim(self, block: Block, variant: str) -> Floats:
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
         """Give the shifts of a block's lines, along the line and the scan. [px]"""
         return self.shift_px[block.numbers - self.first]
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Nothing is known beforehand of where an emulated mirror goes."""
         return Bound(0.0, "follows the emulated mirror")
 

@@ -2,21 +2,22 @@
 
 An effect does its work at one of six places of the chain, in this order: the mirror looks elsewhere (``Aim``), rays
 meet the scene elsewhere (``Displacement``), the footprint is blurred or shifted band by band (``Blur``), light is
-multiplied (``Gain``) or changed (``Change``), electrons are read out (``readout.py``). All before that are linear in
-the light.
+multiplied (``Gain``) or changed (``LightChange``), electrons are read out (``readout.py``). All before that are linear
+in the light.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.block import Block
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.rig_model import Rig
 
 Floats = NDArray[np.float64]
@@ -44,7 +45,7 @@ class Merged(NamedTuple):
 
 
 class Effect(Protocol):
-    """What the decision needs to know. ``variants`` go from exact to cheap; off is none of them.
+    """What the decision needs to know, by name. Variants go from exact to cheap; off is none of them.
 
     One that shares its work with another's says so by ``merged(rig)``; one whose cost depends on the light gives it by
     ``cost_at(probe, rig)``, like ``cost_ns``.
@@ -55,49 +56,34 @@ class Effect(Protocol):
         """What flags, manifest and streams call it."""
 
     @property
-    def variants(self) -> tuple[str, ...]:
-        """Ways to compute it, the exact one first."""
+    def cost_ns(self) -> Mapping[str, float]:
+        """Measured cost of each variant per px and band, the exact one first [ns]."""
 
     @property
-    def cost_ns(self) -> Mapping[str, float]:
-        """Measured cost of each variant per px and band [ns]."""
+    def variants(self) -> tuple[str, ...]:
+        """Ways to compute it, the exact one first."""
+        return tuple(self.cost_ns)
 
     def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
         """Bound the error of leaving it out, or of a variant against the exact one; 0 where the rig lacks it."""
+        return Bound(0.0, "exact") if variant == self.variants[0] else self.missed(probe, rig, variant)
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound the error of leaving it out, or of a variant that is not the exact one."""
 
 
 class Aim(Effect, Protocol):
     """The mirror looks beside its plan."""
 
-    def aim(self, block: Block, variant: str) -> Floats:
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
         """Give how far, (line, step, 2) along the line and the scan at every held position; step may be 1. [px]"""
 
 
 class Displacement(Effect, Protocol):
     """Rays meet the scene elsewhere than at its plane's own place."""
 
-    def displaced(self, block: Block, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
+    def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
         """Give what to add to scene points (line, sample): along the line and the scan. [px]"""
-
-
-@dataclass(frozen=True)
-class Moments:
-    """What a blur does to each band, (2, band) each: along the line and the scan.
-
-    A shift [px], a Gaussian of a variance [px^2], and diffraction at an elliptic pupil, told by the wavelength over the
-    pupil's widths [px]; None without any. The pattern of a pupil has no variance: no Gaussian stands for it.
-    """
-
-    shift: Floats
-    variance: Floats
-    waves: Floats | None = None
-
-    @staticmethod
-    def together(blurs: Sequence[Moments], bands: int) -> Moments:
-        """Those of blurs one after the other. At most one of them is diffraction."""
-        none = np.zeros((2, bands))
-        shift, variance = sum((one.shift for one in blurs), none), sum((one.variance for one in blurs), none)
-        return Moments(shift, variance, next((one.waves for one in blurs if one.waves is not None), None))
 
 
 class Blur(Effect, Protocol):
@@ -110,12 +96,12 @@ class Blur(Effect, Protocol):
 class Gain(Effect, Protocol):
     """Light is multiplied."""
 
-    def gain(self, block: Block, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Light:
         """Give the factor, an array that broadcasts to (line, sample, band)."""
 
 
-class Change(Effect, Protocol):
+class LightChange(Effect, Protocol):
     """Light is changed in another linear way: spectra mixed, light added."""
 
-    def change(self, light: Light, block: Block, variant: str) -> Light:
+    def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
         """Give the changed light of a block, (line, sample, band) [e-]; may work in place."""

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.effect import OFF, Bound
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import Bound, LightChange
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Optics, Rig
 
 Light = NDArray[np.float32]
@@ -22,26 +22,25 @@ LEAST_MODE = 1e-8  # of a wide Gaussian's cosines; fainter ones are below float3
 
 
 @dataclass(frozen=True)
-class StrayLight:
-    """(1 - f) S + f K S: of the scattered light ``stray_even`` falls evenly, the rest as a Gaussian ``stray_halo_px``
-    wide (sd), reflected at the detector's edges. K has no weight below 0 and keeps all light. A band is a row.
+class StrayLight(LightChange):
+    """A share of all the light in a line is scattered over its detector: (1 - f) S + f K S. A band is a row.
+
+    Of it ``stray_even`` falls evenly, the rest as a Gaussian ``stray_halo_px`` wide (sd), reflected at the detector's
+    edges. K has no weight below 0 and keeps all light.
 
     ``halo`` is exact: the Gaussian passes only the slowest cosines of a frame, so it is a product with few of them.
     ``even`` lets all of the scattered light fall evenly.
     """
 
     name = "stray-light"
-    variants = (HALO, EVEN)
     cost_ns = MappingProxyType({HALO: 1.2, EVEN: 0.65})
     whole_line = True  # light comes from all samples: a line is made whole, then cut
 
-    def bound(self, probe: Probe, rig: Rig, variant: str = OFF) -> Bound:
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by f (S - mean), were all to fall evenly, and what the halo differs from that."""
         optics = rig.optics
         if optics.stray_share == 0:
             return Bound(0.0, "no light is scattered")
-        if variant == HALO:
-            return Bound(0.0, "exact")
         spread = float(np.max(probe.spread, initial=0))
         halo = optics.stray_share * (1 - optics.stray_even) * _most_halo(probe, rig, spread)
         why = f"{optics.stray_share:.2g} of a line's light, signals up to {spread:.3g} {probe.unit} from its mean"
@@ -49,7 +48,7 @@ class StrayLight:
             return Bound(halo, f"{why}; {1 - optics.stray_even:.2g} of it in a halo")
         return Bound(optics.stray_share * spread + halo, why)
 
-    def change(self, light: Light, block: Block, variant: str) -> Light:
+    def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
         """Give the light after scattering; works in place.
 
         Raises
@@ -65,7 +64,8 @@ class StrayLight:
                 "make whole lines and cut them afterwards, or leave stray-light out"
             )
         for line in light:  # line by line: rounding, too, does not depend on the block
-            scattered = _scattered(line, optics) if variant == HALO else _even(line, optics)
+            even = np.float32(optics.stray_share * line.mean(dtype=np.float64))
+            scattered = _scattered(line, optics) if variant == HALO else even
             line *= np.float32(1 - optics.stray_share)
             line += scattered
         return light
@@ -81,29 +81,22 @@ def _most_halo(probe: Probe, rig: Rig, spread: float) -> float:
     brightest less the darkest, and never more than twice the greatest way from the mean. That is ``spread`` units,
     each no more than the unit at the brightest sample.
     """
-    elsewhere = _uneven_share(probe, rig)
+    elsewhere = _uneven_share((rig.camera.samples, len(probe.wavelength_nm)), rig.optics.stray_halo_px)
     per_dn = rig.camera.electrons_per_dn
     range_e, least_e = max(probe.brightest_e - probe.darkest_e, 0.0), probe.unit_least_dn * per_dn
     most = math.sqrt(1 + range_e / (probe.binning * least_e**2)) if probe.unit == "sigma" else 1.0
     return min(elsewhere * probe.added(range_e, per_dn), min(2 * elsewhere, 1) * spread * most)
 
 
-def _uneven_share(probe: Probe, rig: Rig) -> float:
-    """Greatest share of a sample's halo that comes from elsewhere than if it were even: 1 narrow, 0 endless."""
-    width = rig.optics.stray_halo_px
-    even = [1 - _off_even(count, width) for count in (rig.camera.samples, len(probe.wavelength_nm))]
-    return 1 - even[0] * even[1]
-
-
 @lru_cache(maxsize=16)
-def _off_even(count: int, sd_px: float) -> float:
-    waves, passed = _cosines(count, sd_px)
-    kernel = (waves.T * passed) @ waves
-    return float(np.abs(kernel - 1 / count).sum(axis=1).max()) / 2
-
-
-def _even(line: Light, optics: Optics) -> np.float32:
-    return np.float32(optics.stray_share * line.mean(dtype=np.float64))
+def _uneven_share(counts: tuple[int, ...], sd_px: float) -> float:
+    """Greatest share of a sample's halo that comes from elsewhere than if it were even: 1 narrow, 0 endless."""
+    even = 1.0
+    for count in counts:
+        waves, passed = _cosines(count, sd_px)
+        kernel = (waves.T * passed) @ waves
+        even *= 1 - float(np.abs(kernel - 1 / count).sum(axis=1).max()) / 2
+    return 1 - even
 
 
 def _scattered(line: Light, optics: Optics) -> Light:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Effect, Light
+from pipeline.simulator.effects.light_units import noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS, READOUT
-from pipeline.simulator.options import SAFETY, Menu, list_options
 from pipeline.simulator.render import expected_light
-from pipeline.simulator.stored_light import noise_electrons
+from pipeline.simulator.selection.options import SAFETY, Menu, list_options
 from tests.pipeline.simulator.random_cases import Case
 
 ROUNDING = 4e-6  # of the light over the unit: sums of float32 in another order
@@ -98,5 +98,5 @@ def _error(menus: tuple[Menu, ...], name: str, variant: str) -> float:
     return next(option.error for option in (menu.off, *menu.variants) if option.variant == variant)
 
 
-def _light(case: Case, block: Block, chosen: dict[Effect, str]) -> Light:
+def _light(case: Case, block: SweepBlock, chosen: dict[Effect, str]) -> Light:
     return expected_light(case.scene, block, {effect: way for effect, way in chosen.items() if way != OFF})

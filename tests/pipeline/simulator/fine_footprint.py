@@ -8,15 +8,16 @@ import numpy as np
 from scipy.special import ndtr
 
 from pipeline.geometry.mirror import position_to_normal
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.pupil import middle_normal
-from pipeline.simulator.rays import exact_views
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.optics.rays import exact_views, middle_normal
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 Places = tuple[np.ndarray, np.ndarray]
 
 
-def fine_light(scene: RasterScene, block: Block, moved: Any, blurs: dict[Any, str], per_px: int = 24) -> np.ndarray:
+def fine_light(
+    scene: RasterScene, block: SweepBlock, moved: Any, blurs: dict[Any, str], per_px: int = 24
+) -> np.ndarray:
     """Electrons (line, sample, band) of a diagonal scene; ``moved`` displaces points."""
     rig, bands = block.rig, len(block.wavelength_nm)
     ifov, size = rig.camera.ifov_rad, scene.shape if block.sweep.along == "y" else scene.shape[::-1]
@@ -39,9 +40,9 @@ def fine_light(scene: RasterScene, block: Block, moved: Any, blurs: dict[Any, st
     return found * scene.electrons * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
 
 
-def _moments(block: Block, blurs: dict[Any, str]) -> tuple[np.ndarray, np.ndarray]:
+def _moments(block: SweepBlock, blurs: dict[Any, str]) -> tuple[np.ndarray, np.ndarray]:
     """Shift and variance, (band, 2) each."""
-    nm, normal = block.wavelength_nm, middle_normal(block.sweep, block.rig)
+    nm, normal = block.wavelength_nm, middle_normal(block.sweep, block.rig.camera)
     found = [blur.moments(block.rig, nm, variant, normal) for blur, variant in blurs.items()]
     none = np.zeros((2, len(nm)))
     return sum((one.shift for one in found), none).T, sum((one.variance for one in found), none).T

@@ -15,7 +15,7 @@ from scipy.special import j1
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.probe import Probe
 
 Floats = NDArray[np.float64]
 Transfer = Floats | complex

@@ -9,9 +9,9 @@ from types import MappingProxyType
 import numpy as np
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Bound, Light
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
 
 SWEEP = Sweep("fine-0", "fine", "x", 0.0, -50.0, 100)
@@ -45,7 +45,7 @@ class Brightening(MadeUp):
 
     share: float = 0.0
 
-    def gain(self, block: Block, variant: str) -> Light:
+    def gain(self, block: SweepBlock, variant: str) -> Light:
         return np.full((1, 1, 1), 1 + self.share, np.float32)
 
 

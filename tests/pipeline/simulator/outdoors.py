@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import Block
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Air, Rig, Sky
 
 Floats = NDArray[np.float64]
@@ -60,13 +60,13 @@ def probe_of(rig: Rig, *sweeps: Sweep, seconds: float = 6.0) -> Probe:
     )  # fmt: skip
 
 
-def block_of(rig: Rig, lines: range = range(60), *, sweep: Sweep = SWEEP, **more: Any) -> Block:
+def block_of(rig: Rig, lines: range = range(60), *, sweep: Sweep = SWEEP, **more: Any) -> SweepBlock:
     """Lines of a sweep."""
     more.setdefault("white_e", white_e(rig.camera.exposure_ms))
-    return Block(rig, sweep, lines, WAVELENGTH, SHAPE, **more)
+    return SweepBlock(rig, sweep, lines, WAVELENGTH, SHAPE, **more)
 
 
-def result(effect: Any, light: NDArray[np.float32], block: Block, variant: str) -> NDArray[np.float32]:
+def result(effect: Any, light: NDArray[np.float32], block: SweepBlock, variant: str) -> NDArray[np.float32]:
     """What an effect makes of the light."""
     if variant == OFF:
         return light

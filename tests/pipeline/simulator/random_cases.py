@@ -17,13 +17,12 @@ from scipy.ndimage import gaussian_filter
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import Block
-from pipeline.simulator.coatings import Coating
-from pipeline.simulator.probe import Probe
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.optics.coatings import Coating
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Relief, Rig, Sky
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.selection.survey_probe import probe_scene
 
 Floats = NDArray[np.float64]
 LONG_PX, WIDE_PX = 640, 160  # of a scene
@@ -53,16 +52,25 @@ class Case:
         probe = probe_scene(self.scene, self.rig, self.sweeps)
         return probe if self.seconds is None else replace(probe, seconds=max(self.seconds, probe.seconds))
 
-    def blocks(self, probe: Probe) -> list[Block]:
+    def blocks(self, probe: Probe) -> list[SweepBlock]:
         """All lines of every sweep: the first as the survey starts, the others as it ends."""
         scene, rig = self.scene, self.rig
         white = scene.panel_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
         ends = [0.0, *(probe.seconds - rig.camera.scan_seconds(sweep.lines) for sweep in self.sweeps[1:])]
         return [
-            Block(rig, sweep, range(sweep.lines), scene.wavelength_nm, scene.shape, seed=self.seed, started_s=start,
-                  fwhm_nm=scene.fwhm_nm, white_e=white)
+            SweepBlock(
+                rig,
+                sweep,
+                range(sweep.lines),
+                scene.wavelength_nm,
+                scene.shape,
+                seed=self.seed,
+                started_s=start,
+                fwhm_nm=scene.fwhm_nm,
+                white_e=white,
+            )
             for sweep, start in zip(self.sweeps, ends, strict=True)
-        ]  # fmt: skip
+        ]
 
 
 def random_case(number: int) -> Case:
@@ -96,9 +104,14 @@ def _scene(rng: np.random.Generator, camera: LineCamera, *, upright: bool, long_
     panel = (at_default.sum(axis=0) * rng.uniform(0.5, 2)).astype(np.float32)
     width = rng.choice([0.0, 2.0, 6.0])
     return RasterScene(
-        "random", "random", Raster.of(np.ascontiguousarray(planes, np.float32)), Once.of(Light(at_default, panel)),
-        np.ones(bands, np.float32), nm, fwhm_nm=np.full(bands, width) if width else None,
-    )  # fmt: skip
+        "random",
+        "random",
+        SceneRaster.of(np.ascontiguousarray(planes, np.float32)),
+        Once.of(SceneLight(at_default, panel)),
+        np.ones(bands, np.float32),
+        nm,
+        fwhm_nm=np.full(bands, width) if width else None,
+    )
 
 
 def _plane(rng: np.random.Generator, shape: tuple[int, int]) -> Floats:

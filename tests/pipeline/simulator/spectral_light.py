@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.band_differences import second_difference, steepest_difference
-from pipeline.simulator.block import Block
-from pipeline.simulator.probe import Probe, Unit
-from pipeline.simulator.raster import Light as SceneLight
-from pipeline.simulator.raster import Raster
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.gain_range import second_difference, steepest_difference
+from pipeline.simulator.effects.probe import Probe, Unit
 from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -49,9 +47,9 @@ def random_light(seed: int, bands: int = 90, samples: int = SAMPLES, lines: int 
 
 def block_of(
     rig: Rig, wavelength_nm: Floats, lines: range = range(6), fwhm_nm: Floats | None = None, **more: Any
-) -> Block:
+) -> SweepBlock:
     """Some lines of the usual sweep."""
-    return Block(rig, SWEEP, lines, wavelength_nm, (640, 640), fwhm_nm=fwhm_nm, **more)
+    return SweepBlock(rig, SWEEP, lines, wavelength_nm, (640, 640), fwhm_nm=fwhm_nm, **more)
 
 
 def small_scene(fwhm_nm: float | None = None) -> tuple[Floats, RasterScene]:
@@ -62,7 +60,7 @@ def small_scene(fwhm_nm: float | None = None) -> tuple[Floats, RasterScene]:
     panel = np.ones(40, np.float32)
     widths = None if fwhm_nm is None else np.full(40, fwhm_nm)
     made = Once.of(SceneLight(spectra, spectra.max(axis=0)))
-    return wavelength, RasterScene("small", "small", Raster.of(planes), made, panel, wavelength, widths)
+    return wavelength, RasterScene("small", "small", SceneRaster.of(planes), made, panel, wavelength, widths)
 
 
 def units(light: Light, unit: Unit) -> Floats:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.simulator.effects.aberration import ABERRATION
+from pipeline.simulator.effects.blurs import ABERRATION
 from pipeline.simulator.rig_model import Optics, Rig
 from tests.pipeline.simulator.fine_image import FLAT, IMAGES, change, gaussian, probe_of
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.simulator.effects.absorption import ABSORPTION, AIR_MASS_M, OXYGEN, WATER, transmission
+from pipeline.simulator.effects.haze import ABSORPTION, AIR_MASS_M, OXYGEN, WATER, transmission
 from pipeline.simulator.rig_model import Air, Optics, Rig
 from tests.pipeline.simulator.outdoors import BANDS, WAVELENGTH, block_of, measured, probe_of, rig_with
 

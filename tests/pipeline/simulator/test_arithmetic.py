@@ -10,20 +10,16 @@ import pytest
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.arithmetic import ROUNDING, contrast_about, misplaced_electrons, misplaced_share
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.aberration import ABERRATION
-from pipeline.simulator.effects.diffraction import DIFFRACTION
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import Light
-from pipeline.simulator.effects.keystone import KEYSTONE
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.effects.smear import SMEAR
+from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.instrument import sweep_block
-from pipeline.simulator.kernel_fit import NEGLIGIBLE
+from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.selection.arithmetic import ROUNDING, contrast_about, misplaced_electrons, misplaced_share
 
 RIG = Rig(camera=LineCamera(samples=64, exposure_ms=10_000.0))
 SWEEP = Sweep("s", "coarse", "x", 0.0, -24.0, 12, 4, 4)
@@ -38,7 +34,7 @@ def test_contrast_is_that_of_the_scene_about_a_sample() -> None:
     scene = raster_from_values(values, RIG.camera, name="t", wavelength_nm=np.array([550.0]))
     block = sweep_block(scene, RIG, SWEEP, range(6, 8))  # looks at rows 24 to 31
 
-    def render(block: Block, chosen: Any) -> Light:
+    def render(block: SweepBlock, chosen: Any) -> Light:
         return expected_light(scene, block, chosen)
 
     contrast = contrast_about(block, render)[0, :, 0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.simulator.band_differences import (
+from pipeline.simulator.effects.gain_range import (
     difference_rates,
     rising_gaps,
     rising_runs,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.brdf import BRDF, HOT_SPOT_RAD
+from pipeline.simulator.effects.lighting import BRDF, HOT_SPOT_RAD
 from tests.pipeline.simulator.outdoors import SWEEP, block_of, measured, probe_of, rig_with
 
 FAR = replace(SWEEP, strip_px=900.0, start_px=500.0)

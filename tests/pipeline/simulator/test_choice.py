@@ -12,14 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError
-from pipeline.simulator.choice import Decision, decide, named_effects
-from pipeline.simulator.effects.cloud import CLOUD
-from pipeline.simulator.effects.diffraction import DIFFRACTION
-from pipeline.simulator.effects.keystone import KEYSTONE
-from pipeline.simulator.effects.read_noise import READ_NOISE
-from pipeline.simulator.effects.shot import SHOT
-from pipeline.simulator.options import LEAST_COST_NS, SAFETY, cost_of, list_options
+from pipeline.simulator.effects.blurs import DIFFRACTION, KEYSTONE
+from pipeline.simulator.effects.counting import READ_NOISE, SHOT
+from pipeline.simulator.effects.lighting import CLOUD
 from pipeline.simulator.rig_model import Detector, Rig, Sky
+from pipeline.simulator.selection.choice import Decision, decide, named_effects
+from pipeline.simulator.selection.options import LEAST_COST_NS, SAFETY, cost_of, list_options
 from tests.pipeline.simulator.made_up_effects import RIG, Brightening, MadeUp, Shift, even_probe
 
 PROBE = even_probe()

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.simulator.effects.cloud import CLOUD, EDGE_SHARE, shadow
+from pipeline.simulator.effects.lighting import CLOUD, EDGE_SHARE, shadow
 from tests.pipeline.simulator.outdoors import SWEEP, block_of, measured, probe_of, rig_with
 
 SIZE = 300.0

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.simulator.band_differences import second_difference, steepest_difference
-from pipeline.simulator.coloured_light import light_through
-from pipeline.simulator.effects.diffraction import DIFFRACTION
-from pipeline.simulator.effects.keystone import KEYSTONE
-from pipeline.simulator.effects.pupil import pupil_contrast
+from pipeline.simulator.effects.blurs import DIFFRACTION, KEYSTONE
+from pipeline.simulator.effects.gain_range import second_difference, steepest_difference
+from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.rig_model import Optics, Rig
+from pipeline.simulator.selection.passed_light import light_through
 from tests.pipeline.simulator.made_up_effects import even_probe
 
 NM = np.linspace(400.0, 1000.0, 61)

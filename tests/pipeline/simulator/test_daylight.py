@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SettingsError
-from pipeline.simulator.daylight import knots_within, relative_daylight, sun_elevation_deg
 from pipeline.simulator.rig_model import Sky
+from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
 
 BANDS = np.array([400.0, 550.0, 760.0, 1000.0])
 EQUINOX = Sky(started=datetime(2026, 3, 20, 0, 0, tzinfo=UTC), latitude_deg=29.5, longitude_deg=0.0)

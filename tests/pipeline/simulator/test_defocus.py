@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.simulator.effects.defocus import DEFOCUS, defocus_px
+from pipeline.simulator.effects.blurs import DEFOCUS, defocus_px
 from pipeline.simulator.rig_model import Air, Optics, Rig
 from tests.pipeline.simulator.fine_image import IMAGES, change, disc, gaussian, probe_of
 

@@ -13,24 +13,22 @@ from scipy.special import j0, j1
 
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.aberration import ABERRATION
-from pipeline.simulator.effects.diffraction import (
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.blurs import (
+    ABERRATION,
     DIFFRACTION,
+    KEYSTONE,
     THIRD_RING,
     airy_energy,
     airy_variance,
-    diffraction_fwhm,
 )
-from pipeline.simulator.effects.effect import Moments
-from pipeline.simulator.effects.keystone import KEYSTONE
-from pipeline.simulator.effects.pupil import pupil_contrast
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.footprint import fold
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.effects.line import SLIT
+from pipeline.simulator.optics.footprint import fold
+from pipeline.simulator.optics.kernel_fit import Moments
+from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from tests.pipeline.simulator.fine_image import FLAT, IMAGES, SWEEP, airy, airy_contrast, change, gaussian, probe_of
 
 RIG = Rig()
@@ -38,9 +36,16 @@ NM = np.array([400.0, 700.0, 1000.0])
 RADIAN_PX = NM * 1e-9 / 15e-3 / RIG.camera.ifov_rad  # lambda / D
 
 
+def fwhm(normal: np.ndarray | None = None) -> np.ndarray:
+    """Full widths at half maximum of the pattern, (2, band) [px]: 1.029 of the wavelength over the pupil's widths."""
+    waves = DIFFRACTION.moments(RIG, NM, "airy", normal).waves
+    assert waves is not None
+    return 1.029 * waves
+
+
 def test_widths_at_rest():
     """0.37 px at 400 nm and 0.92 px at 1000 nm along the scan, where 10.6 mm are seen; 0.71 of it along the line."""
-    along, scan = diffraction_fwhm(RIG, NM)
+    along, scan = fwhm()
     assert scan[[0, 2]] == pytest.approx([0.37, 0.92], abs=0.005)
     assert along == pytest.approx(scan * np.sqrt(0.5))
 
@@ -48,9 +53,9 @@ def test_widths_at_rest():
 def test_width_at_grazing_incidence():
     """1.9 px at 1000 nm and 70 deg incidence, and no wider along the line than at rest."""
     normal = np.array([np.sin(np.deg2rad(70)), 0, -np.cos(np.deg2rad(70))])
-    along, scan = diffraction_fwhm(RIG, NM, normal)
+    along, scan = fwhm(normal)
     assert scan[2] == pytest.approx(1.9, abs=0.005)
-    assert along == pytest.approx(diffraction_fwhm(RIG, NM)[0])
+    assert along == pytest.approx(fwhm()[0])
 
 
 @pytest.mark.parametrize(("ring", "energy"), [(3.831706, 0.838), (7.015587, 0.910), (THIRD_RING, 0.938)])
@@ -131,10 +136,10 @@ def test_rendered_waves_are_those_of_the_pupil(axis: int, cycles: float):
     where = np.arange(900) - 449.5
     wave = 1 + np.cos(2 * np.pi * cycles * where)
     planes = np.ones((900, 900, 1), np.float32) * (wave[:, None, None] if axis == 0 else wave[None, :, None])
-    light = Light(np.full((1, 3), 1.0, np.float32), np.ones(3, np.float32))
-    scene = RasterScene("w", "w", Raster.of(planes.astype(np.float32)), Once.of(light), np.ones(3, np.float32), NM)
+    light = SceneLight(np.full((1, 3), 1.0, np.float32), np.ones(3, np.float32))
+    scene = RasterScene("w", "w", SceneRaster.of(planes.astype(np.float32)), Once.of(light), np.ones(3, np.float32), NM)
     sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=-20.0, lines=40)
-    block = Block(RIG, sweep, range(40), NM, scene.shape, samples=range(300, 340))
+    block = SweepBlock(RIG, sweep, range(40), NM, scene.shape, samples=range(300, 340))
     found = expected_light(scene, block, {SLIT: "1x1", DIFFRACTION: "airy"})
     profile = found.mean(axis=1 - axis)
     place = (np.arange(-20.0, 20.0) if axis == 0 else block.slopes / RIG.camera.ifov_rad)[:, None]

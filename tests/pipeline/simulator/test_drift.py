@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from pipeline.lazy import Once
-from pipeline.simulator.effects.drift import DRIFT, daylight_range
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.effects.lighting import DRIFT
 from pipeline.simulator.render import expected_light
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from tests.pipeline.simulator.outdoors import (
     BANDS,
     MORNING,
@@ -48,7 +47,7 @@ def test_no_time_no_drift() -> None:
     rig = rig_with()
     assert DRIFT.bound(probe_of(rig), rig).value == 0
     assert (DRIFT.gain(block_of(rig), "spectral") == 1).all()
-    assert (daylight_range(probe_of(rig), rig).greatest == 1).all()
+    assert (DRIFT.gain_range(probe_of(rig), rig).greatest == 1).all()
 
 
 @pytest.mark.parametrize("started", [NOON, MORNING, NIGHT])
@@ -94,7 +93,7 @@ def test_rendered() -> None:
     """Through the chain a flat scene is as bright as the gain says."""
     spectra = white_e().astype(np.float32)
     scene = RasterScene(
-        "flat", "flat", Raster.of(np.ones((*SHAPE, 1), np.float32)), Once.of(Light(spectra[None], spectra)),
+        "flat", "flat", SceneRaster.of(np.ones((*SHAPE, 1), np.float32)), Once.of(SceneLight(spectra[None], spectra)),
         np.ones(BANDS, np.float32), block_of(rig_with()).wavelength_nm,
     )  # fmt: skip
     block = block_of(rig_with(started=MORNING), range(0, 60, 30), started_s=600.0, samples=range(4))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.simulator.farm_seasons import (
+from pipeline.simulator.scenes.farm.seasons import (
     CROPS,
     canopy_cover,
     crop_height,
@@ -20,7 +20,7 @@ from pipeline.simulator.farm_seasons import (
     stage_shares,
     weed_size,
 )
-from pipeline.simulator.season_spectra import SEASON_MATERIALS, STAGES, season_library, wet_share
+from pipeline.simulator.scenes.farm.spectra import MATERIALS, STAGES, spectral_library, wet_share
 
 
 @given(st.sampled_from(sorted(CROPS)), st.floats(-50, 350))
@@ -29,7 +29,7 @@ def test_stages_share_the_stand(use: str, age: float) -> None:
     shares = stage_shares(CROPS[use], np.array([age]))
     assert 1 <= len(shares) <= 2
     assert sum(float(share[0]) for share in shares.values()) == pytest.approx(1, abs=1e-6)
-    assert all(share[0] >= 0 and name in SEASON_MATERIALS for name, share in shares.items())
+    assert all(share[0] >= 0 and name in MATERIALS for name, share in shares.items())
 
 
 @pytest.mark.parametrize("use", sorted(CROPS))
@@ -135,11 +135,11 @@ def test_wet_share_is_exponential_in_water() -> None:
 
 def test_spectra_are_reflectances_and_tell_stages_apart() -> None:
     """All lie between 0 and 0.8; ripening takes the red edge, lodging brightens green wheat in the near infrared."""
-    library = season_library(61)
+    library = spectral_library(61)
     assert library.reflectance.min() > 0
     assert library.reflectance.max() < 0.8
     red, near = (int(np.abs(library.wavelength_nm - nm).argmin()) for nm in (670, 800))
-    seen = dict(zip(SEASON_MATERIALS, library.reflectance, strict=True))
+    seen = dict(zip(MATERIALS, library.reflectance, strict=True))
     edge = {name: (seen[name][near] - seen[name][red]) / (seen[name][near] + seen[name][red]) for name in STAGES}
     assert edge["wheat_a_full"] > 0.85
     assert edge["wheat_a_full"] > edge["wheat_a_filling"] > edge["wheat_a_ripe"]

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import SceneError
-from pipeline.simulator.farm_sun import LATITUDE_DEG, Sun, crown_shadows, sun_over_farm
+from pipeline.simulator.scenes.farm.borders import crown_shadows
+from pipeline.simulator.scenes.farm.seasons import LATITUDE_DEG, Sun, sun_over_farm
 
 SHAPE = (161, 161)
 

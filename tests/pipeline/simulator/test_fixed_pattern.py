@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.simulator.effects.fixed_pattern import PRNU, STRIPING, response_gain, stripe_gain
+from pipeline.simulator.effects.sensor import PRNU, STRIPING, response_gain, stripe_gain
 from pipeline.simulator.rig_model import Detector, Rig
 from tests.pipeline.simulator.spectral_light import block_of, probe_of, random_light, worst
 

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.simulator.band_differences import second_difference, steepest_difference
-from pipeline.simulator.gain_range import GainRange, Growth, fixed_variance, light_after, lights_within, unit_electrons
+from pipeline.simulator.effects.gain_range import GainRange, second_difference, steepest_difference
+from pipeline.simulator.effects.light_units import fixed_variance, lights_within, unit_electrons
 from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.selection.passed_light import Growth, light_after
 from tests.pipeline.simulator.made_up_effects import RIG, even_probe
 
 NM = np.linspace(400.0, 1000.0, 25)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.hysteresis import HYSTERESIS, THERMAL_DRIFT, pointing_field, scan_sign
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.mirror_pointing import HYSTERESIS, THERMAL_DRIFT, pointing_field, scan_sign
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Detector, MirrorMotion, Rig
 
 SWEEP = Sweep("strip", "fine", "x", 640.0, -700.0, 1401)
@@ -25,9 +25,9 @@ class Returning(Sweep):
         return super().held_px()[::-1, ::-1]
 
 
-def block(lines: range = range(1401), *, sweep: Sweep = SWEEP, rig: Rig = RIG, started_s: float = 0.0) -> Block:
+def block(lines: range = range(1401), *, sweep: Sweep = SWEEP, rig: Rig = RIG, started_s: float = 0.0) -> SweepBlock:
     """Some lines of a sweep."""
-    return Block(rig, sweep, lines, np.ones(1), (64, 64), started_s=started_s)
+    return SweepBlock(rig, sweep, lines, np.ones(1), (64, 64), started_s=started_s)
 
 
 def probe(slope: tuple[float, float], sweeps: tuple[Sweep, ...] = (SWEEP,), span: float = 1e9) -> Probe:

@@ -9,9 +9,9 @@ import pytest
 
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.jitter import JITTER, tilt_to_scene
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.mirror_pointing import JITTER, tilt_to_scene
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 from tests.pipeline.second_order import pointing_error
 
@@ -22,7 +22,7 @@ REST = np.array([1.0, 0.0, -1.0]) / np.sqrt(2)
 
 def shifts(lines: range = range(1001), *, seed: int = 0, rig: Rig = RIG, sweep: Sweep = SWEEP) -> np.ndarray:
     """The shift of some lines."""
-    return JITTER.aim(Block(rig, sweep, lines, np.ones(1), (64, 64), seed), "exact")
+    return JITTER.aim(SweepBlock(rig, sweep, lines, np.ones(1), (64, 64), seed), "exact")
 
 
 def probe(slope: tuple[float, float], sweeps: tuple[Sweep, ...] = (SWEEP,), span: float = 1e9) -> Probe:
@@ -74,7 +74,7 @@ def test_blocks_do_not_change_lines(size: int):
 
 def test_samples_do_not_change_lines():
     """A block of some samples has the shifts of the whole line."""
-    some = Block(RIG, SWEEP, range(5), np.ones(1), (64, 64), samples=range(3, 9))
+    some = SweepBlock(RIG, SWEEP, range(5), np.ones(1), (64, 64), samples=range(3, 9))
     np.testing.assert_array_equal(JITTER.aim(some, "exact"), shifts(range(5)))
 
 

@@ -8,13 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.lazy import Once
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.keystone import KEYSTONE, keystone_shift
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.blurs import KEYSTONE, keystone_shift
+from pipeline.simulator.effects.line import SLIT
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from tests.pipeline.simulator.fine_image import FLAT, IMAGES, SWEEP, change, probe_of, shifted
 
 NM = np.array([400.0, 700.0, 1000.0])
@@ -51,9 +50,9 @@ def test_long_wavelengths_see_further_along_the_line():
     planes = np.repeat(np.arange(80, dtype=np.float32)[None, :, None], 30, axis=0)
     electrons = np.full((1, 3), 100.0, np.float32)
     scene = RasterScene(
-        "ramp", "ramp", Raster.of(planes), Once.of(Light(electrons, electrons[0])), np.ones(3, np.float32), NM
+        "ramp", "ramp", SceneRaster.of(planes), Once.of(SceneLight(electrons, electrons[0])), np.ones(3, np.float32), NM
     )
-    block = Block(rig_of(0.5), SWEEP, range(10, 13), NM, scene.shape, samples=range(300, 340))
+    block = SweepBlock(rig_of(0.5), SWEEP, range(10, 13), NM, scene.shape, samples=range(300, 340))
     plain = {SLIT: "3x1"}
     beside = expected_light(scene, block, {KEYSTONE: "linear", **plain}) - expected_light(scene, block, plain)
     assert beside[..., 0] == pytest.approx(-25, abs=0.05)

@@ -13,9 +13,9 @@ from scipy.linalg import expm
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.lag import LAG, responses, transient
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.mirror_path import LAG, responses, transient
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -100.0, 200)
@@ -125,10 +125,10 @@ def test_settling_takes_the_way_back_away():
 def test_blocks_do_not_change_lines(variant: str, size: int):
     """Lines are bit for bit the same in blocks of any size."""
     shift = [
-        LAG.aim(Block(rig(), SWEEP, range(a, min(a + size, 200)), np.ones(1), (9, 9)), variant)
+        LAG.aim(SweepBlock(rig(), SWEEP, range(a, min(a + size, 200)), np.ones(1), (9, 9)), variant)
         for a in range(0, 200, size)
     ]
-    whole = LAG.aim(Block(rig(), SWEEP, range(200), np.ones(1), (9, 9)), variant)
+    whole = LAG.aim(SweepBlock(rig(), SWEEP, range(200), np.ones(1), (9, 9)), variant)
     np.testing.assert_array_equal(np.concatenate(shift), whole)
     assert not whole[..., 0].any()
 

@@ -13,19 +13,14 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.aberration import ABERRATION
-from pipeline.simulator.effects.defocus import DEFOCUS
-from pipeline.simulator.effects.diffraction import DIFFRACTION
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import OFF, Effect
-from pipeline.simulator.effects.keystone import KEYSTONE
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.effects.smear import SMEAR
-from pipeline.simulator.raster import Raster
+from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig
-from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneRaster
 from tests.pipeline.simulator.bound_trials import IN_THE_LIGHT
 
 SIZE = 96
@@ -56,7 +51,7 @@ def scene_of(picture: str, dark: float = 0.0) -> RasterScene:
 
 def seen(scene: RasterScene, sweep: Sweep, chosen: dict[Any, str], rig: Rig = RIG) -> NDArray[np.float64]:
     """Light of all lines over that of the scene's brightest pixel."""
-    block = Block(rig, sweep, range(sweep.lines), NM, scene.shape)
+    block = SweepBlock(rig, sweep, range(sweep.lines), NM, scene.shape)
     light = expected_light(scene, block, {effect: variant for effect, variant in chosen.items() if variant != OFF})
     return light / scene.electrons.astype(np.float64)
 
@@ -98,7 +93,7 @@ def test_thinned_scenes_keep_their_light(level: int) -> None:
     rng = np.random.default_rng(level)
     planes = np.zeros((700, 600, 3), np.float32)
     planes[rng.integers(250, 400, 3), rng.integers(250, 350, 3), range(3)] = 1.0
-    found = Raster.of(planes).thinned(level)
+    found = SceneRaster.of(planes).thinned(level)
     assert found.min() >= 0
     np.testing.assert_allclose(found.sum(axis=(0, 1)) * level**2, 1, rtol=1e-5)
 

@@ -11,20 +11,16 @@ import pytest
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, sweep_to_scene
 from pipeline.lazy import Once
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.hysteresis import HYSTERESIS, THERMAL_DRIFT
-from pipeline.simulator.effects.jitter import JITTER
-from pipeline.simulator.effects.lag import LAG
-from pipeline.simulator.effects.parallax import PARALLAX
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.effects.staircase import STAIRCASE
-from pipeline.simulator.effects.wind import WIND
-from pipeline.simulator.probe import Probe
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.line import ROTATION, SLIT
+from pipeline.simulator.effects.mirror_path import LAG, STAIRCASE
+from pipeline.simulator.effects.mirror_pointing import HYSTERESIS, JITTER, THERMAL_DRIFT
+from pipeline.simulator.effects.moving_air import WIND
+from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.effects.relief import PARALLAX
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, MirrorMotion, Rig
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneLight, SceneRaster
 
 CAMERA = LineCamera(samples=64, exposure_ms=4.0)
 MOTION = replace(
@@ -44,14 +40,14 @@ def ramp() -> RasterScene:
     y, x = np.mgrid[:161, :161]
     plane = (2000 + SLOPE[0] * (x - 80) + SLOPE[1] * (y - 80)).astype(np.float32)[..., None]
     electrons = np.array([[1.0, 0.5]], np.float32) * np.float32(DEFAULT_EXPOSURE_MS / CAMERA.exposure_ms)
-    light = Once.of(Light(electrons, electrons[0]))
-    return RasterScene("ramp", "ramp", Raster.of(plane), light, np.ones(2, np.float32), np.array([500.0, 600.0]))
+    light = Once.of(SceneLight(electrons, electrons[0]))
+    return RasterScene("ramp", "ramp", SceneRaster.of(plane), light, np.ones(2, np.float32), np.array([500.0, 600.0]))
 
 
 def look(chosen: dict[Any, str], sweep: Sweep = STRIP, lines: range = range(40), **more: Any) -> np.ndarray:
     """Light of some lines of the ramp."""
     scene = ramp()
-    block = Block(RIG, sweep, lines, scene.wavelength_nm, scene.shape, **more)
+    block = SweepBlock(RIG, sweep, lines, scene.wavelength_nm, scene.shape, **more)
     return expected_light(scene, block, {**chosen, **PLAIN})
 
 
@@ -60,7 +56,7 @@ def look(chosen: dict[Any, str], sweep: Sweep = STRIP, lines: range = range(40),
 def test_light_changes_by_slope_times_way(effect: Any, sweep: Sweep):
     """On a ramp the light changes by the slope times the stated shift or displacement, in either orientation."""
     found = look({effect: "exact"}, sweep) - look({}, sweep)
-    block = Block(RIG, sweep, range(40), np.array([500.0, 600.0]), (161, 161))
+    block = SweepBlock(RIG, sweep, range(40), np.array([500.0, 600.0]), (161, 161))
     if hasattr(effect, "aim"):
         along, scan = np.moveaxis(effect.aim(block, "exact").mean(axis=1), -1, 0)[..., None]
     else:
@@ -111,7 +107,7 @@ def test_extreme_rigs_give_numbers(effect: Any, step: int):
     for mirror in (slow, stiff):
         rig = Rig(camera=CAMERA, mirror=mirror, air=far)
         for lines in (range(5), range(2, 2)):
-            block = Block(rig, sweep, lines, one, (161, 161))
+            block = SweepBlock(rig, sweep, lines, one, (161, 161))
             points = np.zeros((len(lines), 64)), np.ones((len(lines), 64))
             for variant in effect.variants:
                 moved = (

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.simulator.noise import (
+from pipeline.simulator.effects.noise import (
     CHIP_SAMPLES,
     MOST_VARIATION,
     PIECE,

@@ -10,9 +10,9 @@ import pytest
 
 from pipeline.geometry.mirror import scene_to_direction
 from pipeline.geometry.scan import Sweep, sweep_to_scene
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.parallax import PARALLAX, closeness
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.effects.relief import PARALLAX, closeness
 from pipeline.simulator.rig_model import Air, Rig
 from tests.pipeline.second_order import relief_error
 
@@ -25,7 +25,7 @@ def shown(air: Air, sweep: Sweep = SWEEP, lines: range = range(201)) -> tuple[np
     rig = Rig(air=air)
     along, scan = sweep_to_scene(sweep, rig.camera)
     taken = slice(lines.start, lines.stop)
-    return PARALLAX.displaced(Block(rig, sweep, lines, np.ones(1), (201, 640)), along[taken], scan[taken], "exact")
+    return PARALLAX.displaced(SweepBlock(rig, sweep, lines, np.ones(1), (201, 640)), along[taken], scan[taken], "exact")
 
 
 def probe(slope: tuple[float, float], sweeps: tuple[Sweep, ...] = (SWEEP,), span: float = 1e9) -> Probe:

@@ -15,13 +15,13 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.lazy import Once
 from pipeline.planning.coverage import full_sweeps
 from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.effects.path_radiance import PATH_RADIANCE, extinction_per_m, rayleigh_per_m
-from pipeline.simulator.gain_range import fixed_variance
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.effects.haze import PATH_RADIANCE, extinction_per_m, rayleigh_per_m
+from pipeline.simulator.effects.light_units import fixed_variance
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Rig, Sky
-from pipeline.simulator.scene import RasterScene, raster_from_values
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.outdoors import (
     BANDS,
     MORNING,
@@ -204,9 +204,13 @@ def test_rendered() -> None:
     """Through the chain a black scene is the air's own light."""
     spectra = white_e().astype(np.float32)
     scene = RasterScene(
-        "black", "black", Raster.of(np.zeros((*SHAPE, 1), np.float32)), Once.of(Light(spectra[None], spectra)),
-        np.ones(BANDS, np.float32), WAVELENGTH,
-    )  # fmt: skip
+        "black",
+        "black",
+        SceneRaster.of(np.zeros((*SHAPE, 1), np.float32)),
+        Once.of(SceneLight(spectra[None], spectra)),
+        np.ones(BANDS, np.float32),
+        WAVELENGTH,
+    )
     block = block_of(rig_with(HAZY_300_M), range(2), samples=range(4))
     light = expected_light(scene, block, {PATH_RADIANCE: "range"})
     lost = -np.expm1(-300 * extinction_per_m(HAZY_300_M, WAVELENGTH))

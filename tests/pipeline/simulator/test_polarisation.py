@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import Block
-from pipeline.simulator.coatings import reflectance
-from pipeline.simulator.effects.polarisation import POLARISATION
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.mirror_throughput import POLARISATION
+from pipeline.simulator.optics.coatings import reflectance
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 from tests.pipeline.simulator.spectral_light import probe_of, rig_with
 
@@ -36,7 +36,7 @@ RIG = coated()
 
 def factors(sweep, rig=RIG):
     """Factor of every line, (line, band)."""
-    gain = POLARISATION.gain(Block(rig, sweep, range(sweep.lines), NM, (640, 640)), "exact")
+    gain = POLARISATION.gain(SweepBlock(rig, sweep, range(sweep.lines), NM, (640, 640)), "exact")
     assert gain.shape == (sweep.lines, 1, len(NM))
     return gain[:, 0].astype(np.float64)
 
@@ -92,7 +92,7 @@ def test_bound_is_the_greatest_way_from_rest(strip_px, start_px, lines, coating)
 
 def test_incidence_is_that_of_the_mirror():
     """The factor follows the angle whose cosine is -n_z, at any place of the field."""
-    block = Block(RIG, sweep_at(-2300, 1700, 50), range(50), NM, (640, 640))
+    block = SweepBlock(RIG, sweep_at(-2300, 1700, 50), range(50), NM, (640, 640))
     incidence = np.arccos(-block.normals[:, 2])
     at_rest = reflectance("aluminium", NM, np.radians([45.0]))
     np.testing.assert_allclose(factors(block.sweep), reflectance("aluminium", NM, incidence) / at_rest, rtol=1e-6)
@@ -121,5 +121,5 @@ def test_aluminium_is_what_a_rig_has():
 def test_blocks_do_not_matter():
     """Lines one at a time have the factors of all at once."""
     sweep = sweep_at(-700, 300, 9)
-    parts = [POLARISATION.gain(Block(RIG, sweep, range(n, n + 1), NM, (9, 9)), "exact")[0, 0] for n in range(9)]
+    parts = [POLARISATION.gain(SweepBlock(RIG, sweep, range(n, n + 1), NM, (9, 9)), "exact")[0, 0] for n in range(9)]
     np.testing.assert_array_equal(parts, factors(sweep))

@@ -12,13 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from pipeline.geometry.mirror import direction_to_normal, position_to_normal, scene_to_direction
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.pupil import (
-    REST_NORMAL,
-    middle_normal,
-    normals_met,
-    spread_of_rays,
-    spread_of_waves,
-)
+from pipeline.simulator.optics.rays import REST_NORMAL, middle_normal, normals_met, spread_of_rays, spread_of_waves
 from pipeline.simulator.rig_model import Rig
 from tests.pipeline.simulator.fine_image import FLAT, SWEEP, probe_of
 
@@ -60,7 +54,7 @@ def test_ends_of_a_sweep_hold_the_extremes(strip: float, start: float, lines: in
     held = sweep.held_px().ravel()
     tangents = np.stack([np.full_like(held, strip), held], axis=-1) * RIG.camera.ifov_rad
     normals = direction_to_normal(scene_to_direction(tangents))
-    ends = normals_met(probe, RIG)[1:]
+    ends = normals_met(probe.sweeps, RIG.camera)[1:]
     for spread in (spread_of_rays, spread_of_waves):
         assert (spread(normals) <= spread(ends).max(axis=0) * (1 + 1e-12)).all()
         assert (spread(normals) >= spread(ends).min(axis=0) * (1 - 1e-12)).all()
@@ -69,5 +63,5 @@ def test_ends_of_a_sweep_hold_the_extremes(strip: float, start: float, lines: in
 def test_no_sweep_leaves_the_rest_position():
     """A probe without lines is judged at rest; the middle of a sweep round the axis is the rest position."""
     for sweeps in ((), (replace(SWEEP, lines=0),)):
-        assert normals_met(replace(PROBE, sweeps=sweeps), RIG) == pytest.approx(REST_NORMAL[None])
-    assert middle_normal(replace(SWEEP, start_px=-11.5), RIG) == pytest.approx(REST_NORMAL)
+        assert normals_met(sweeps, RIG.camera) == pytest.approx(REST_NORMAL[None])
+    assert middle_normal(replace(SWEEP, start_px=-11.5), RIG.camera) == pytest.approx(REST_NORMAL)

@@ -13,14 +13,9 @@ from scipy import stats
 from pipeline.errors import SceneError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.dark_current import DARK_CURRENT
-from pipeline.simulator.effects.defects import DEFECTS, dead_elements, hot_electrons
-from pipeline.simulator.effects.fixed_pattern import PRNU, STRIPING
-from pipeline.simulator.effects.quantisation import QUANTISATION
-from pipeline.simulator.effects.read_noise import READ_NOISE
-from pipeline.simulator.effects.saturation import SATURATION
-from pipeline.simulator.effects.shot import SHOT
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.counting import QUANTISATION, READ_NOISE, SATURATION, SHOT
+from pipeline.simulator.effects.sensor import DARK_CURRENT, DEFECTS, PRNU, STRIPING, dead_elements, hot_electrons
 from pipeline.simulator.readout import dark_frame, read_out
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Detector, Rig
@@ -39,9 +34,9 @@ ALL_EXACT = EVERYTHING | {SHOT: "exact"}
 
 def block_of(
     rig: Rig, lines: range = range(16), samples: range | None = None, seed: int = 0, bands: int = BANDS
-) -> Block:
+) -> SweepBlock:
     """Some lines of the sweep."""
-    return Block(rig, SWEEP, lines, np.linspace(400, 1000, bands), (640, 640), seed=seed, samples=samples)
+    return SweepBlock(rig, SWEEP, lines, np.linspace(400, 1000, bands), (640, 640), seed=seed, samples=samples)
 
 
 def even(level: float, lines: int = 16, bands: int = BANDS) -> NDArray[np.float32]:
@@ -200,7 +195,7 @@ def test_seeds_lines_and_sweeps_draw_anew() -> None:
     rig = Rig()
     lines = read_out(even(5000, 4), block_of(rig, range(4)), EVERYTHING).astype(np.float64).reshape(4, -1)
     other = read_out(even(5000, 1), block_of(rig, range(1), seed=1), EVERYTHING).astype(np.float64).reshape(1, -1)
-    elsewhere = Block(rig, replace(SWEEP, name="other"), range(1), np.arange(BANDS) + 400.0, (640, 640))
+    elsewhere = SweepBlock(rig, replace(SWEEP, name="other"), range(1), np.arange(BANDS) + 400.0, (640, 640))
     swept = read_out(even(5000, 1), elsewhere, EVERYTHING).astype(np.float64).reshape(1, -1)
     read = read_out(even(5000, 1), block_of(rig, range(1)), {READ_NOISE: "exact"}).astype(np.float64).reshape(1, -1)
     together = np.corrcoef(np.concatenate([lines, other, swept, read]))
@@ -225,7 +220,7 @@ def test_light_of_another_block_is_refused() -> None:
 def test_one_band_and_an_odd_number_of_elements() -> None:
     """A camera of 3 samples and one band draws like any other."""
     rig = Rig(camera=LineCamera(samples=3))
-    block = Block(rig, SWEEP, range(2), np.array([700.0]), (8, 8))
+    block = SweepBlock(rig, SWEEP, range(2), np.array([700.0]), (8, 8))
     assert read_out(np.full((2, 3, 1), 5000, np.float32), block, EVERYTHING).shape == (2, 3, 1)
 
 
@@ -236,7 +231,7 @@ def test_a_scene_through_the_whole_chain() -> None:
     chosen: dict[Any, str] = {PRNU: "exact", STRIPING: "exact"} | EVERYTHING
 
     def taken(lines: range, samples: range | None = None) -> NDArray[np.uint16]:
-        block = Block(rig, SWEEP, lines, nm, scene.shape, samples=samples)
+        block = SweepBlock(rig, SWEEP, lines, nm, scene.shape, samples=samples)
         return read_out(expected_light(scene, block, chosen), block, chosen)
 
     whole = taken(range(12))

@@ -11,14 +11,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.effects.dark_current import DARK_CURRENT
-from pipeline.simulator.effects.defects import DEFECTS, dead_elements, hot_electrons
-from pipeline.simulator.effects.quantisation import QUANTISATION
-from pipeline.simulator.effects.read_noise import READ_NOISE
-from pipeline.simulator.effects.saturation import SATURATION
-from pipeline.simulator.effects.shot import SHOT
-from pipeline.simulator.noise import CHIP_SAMPLES, MOST_VARIATION, divergence
-from pipeline.simulator.probe import Probe, Unit
+from pipeline.simulator.effects.counting import QUANTISATION, READ_NOISE, SATURATION, SHOT
+from pipeline.simulator.effects.noise import CHIP_SAMPLES, MOST_VARIATION, divergence
+from pipeline.simulator.effects.probe import Probe, Unit
+from pipeline.simulator.effects.sensor import DARK_CURRENT, DEFECTS, dead_elements, hot_electrons
 from pipeline.simulator.readout import read_out
 from pipeline.simulator.rig_model import Detector, Rig
 from tests.pipeline.simulator.spectral_light import block_of, probe_of

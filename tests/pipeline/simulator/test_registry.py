@@ -12,7 +12,7 @@ import pipeline.simulator.effects as package
 from pipeline.simulator.effects import registry
 from pipeline.simulator.effects.effect import OFF, Bound, Effect
 from pipeline.simulator.effects.registry import AIMS, BY_NAME, EFFECTS, FOOTPRINT, LIGHT, RAYS, READOUT
-from pipeline.simulator.options import ALWAYS_ON
+from pipeline.simulator.selection.options import ALWAYS_ON
 from tests.pipeline.simulator.made_up_effects import RIG, even_probe
 
 

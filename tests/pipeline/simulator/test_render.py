@@ -11,16 +11,14 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.effect import Moments
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.effects.smear import SMEAR
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.effects.stray_light import STRAY_LIGHT
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 
 CAMERA = LineCamera()
 FINE = Sweep("fine", "fine", "x", strip_px=900.0, start_px=-700.0, lines=20)
@@ -35,14 +33,18 @@ def grainy(bands: int = 5, seed: int = 0) -> RasterScene:
     wavelength = np.linspace(400, 1000, bands)
     electrons = rng.uniform(1e3, 9e3, (3, bands)).astype(np.float32)
     return RasterScene(
-        "grain", "grain", Raster.of(planes), Once.of(Light(electrons, electrons[0])), np.ones(bands, np.float32),
+        "grain",
+        "grain",
+        SceneRaster.of(planes),
+        Once.of(SceneLight(electrons, electrons[0])),
+        np.ones(bands, np.float32),
         wavelength,
-    )  # fmt: skip
+    )
 
 
-def block_of(scene: RasterScene, sweep: Sweep, lines: range, **more: object) -> Block:
+def block_of(scene: RasterScene, sweep: Sweep, lines: range, **more: object) -> SweepBlock:
     """Lines of a sweep by a rig as it is."""
-    return Block(Rig(), sweep, lines, scene.wavelength_nm, scene.shape, **more)
+    return SweepBlock(Rig(), sweep, lines, scene.wavelength_nm, scene.shape, **more)
 
 
 NEAR = replace(FINE, strip_px=20.0, start_px=-40.0)
@@ -84,7 +86,7 @@ def test_diagonal_scene_is_that_of_its_matrix() -> None:
     """A scene with a plane of its own in each band gives what its diagonal matrix of electrons gives."""
     diagonal = raster_from_values(np.random.default_rng(1).uniform(0, 1, (60, 50, 4)), CAMERA, name="d",
                                   wavelength_nm=np.linspace(400, 1000, 4))  # fmt: skip
-    light = Light(np.diag(diagonal.electrons), diagonal.panel_electrons)
+    light = SceneLight(np.diag(diagonal.electrons), diagonal.panel_electrons)
     full = replace(diagonal, light=Once.of(light))
     chosen = {**PLAIN, Widening(): "only"}
     one, other = (expected_light(s, block_of(s, NEAR, range(12, 16)), chosen) for s in (diagonal, full))

@@ -10,18 +10,14 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.aberration import ABERRATION
-from pipeline.simulator.effects.defocus import DEFOCUS
-from pipeline.simulator.effects.diffraction import DIFFRACTION
-from pipeline.simulator.effects.keystone import KEYSTONE
-from pipeline.simulator.effects.pupil import pupil_contrast
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.effects.turbulence import TURBULENCE
-from pipeline.simulator.raster import Light, Raster
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
+from pipeline.simulator.effects.line import SLIT
+from pipeline.simulator.effects.moving_air import TURBULENCE
+from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 
 NM = np.array([400.0, 600.0, 1000.0])
 RIG = Rig(optics=Optics(aberration_px=0.3, keystone_px=0.4), air=Air(distance_m=120.0))
@@ -32,8 +28,8 @@ ALL = {DIFFRACTION: "airy", DEFOCUS: "disc", ABERRATION: "gaussian", KEYSTONE: "
 def scene_of(planes: NDArray[np.float32]) -> RasterScene:
     """A raster of one component, of the same 1000 e- in all bands."""
     electrons = np.full((1, 3), 1000.0, np.float32)
-    light = Once.of(Light(electrons, electrons[0]))
-    return RasterScene("waves", "waves", Raster.of(planes), light, np.ones(3, np.float32), NM)
+    light = Once.of(SceneLight(electrons, electrons[0]))
+    return RasterScene("waves", "waves", SceneRaster.of(planes), light, np.ones(3, np.float32), NM)
 
 
 def waves(period: float) -> RasterScene:
@@ -44,7 +40,7 @@ def waves(period: float) -> RasterScene:
 
 def light_of(scene: RasterScene, lines: range, chosen: dict[Any, str], samples: range | None = None) -> NDArray[Any]:
     """Electrons of some lines through the footprint and what is chosen."""
-    block = Block(RIG, SWEEP, lines, NM, scene.shape, samples=samples)
+    block = SweepBlock(RIG, SWEEP, lines, NM, scene.shape, samples=samples)
     return expected_light(scene, block, {SLIT: "3x1", **chosen})
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.simulator.effects.response import RESPONSE, missing_variance, widen_bands
+from pipeline.simulator.effects.spectrometer import RESPONSE, missing_variance, widen_bands
 from tests.pipeline.simulator.spectral_light import block_of, probe_of, random_light, rig_with, units, worst
 
 VARIANCE_OF_6 = 36 / (8 * np.log(2))

@@ -8,14 +8,14 @@ import pytest
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import line_rotation, position_to_direction
 from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import RasterScene, raster_from_values
-from pipeline.simulator.stored_light import noise_electrons
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.selection.survey_probe import probe_scene
 
 RIG = Rig(camera=LineCamera(samples=80))
 
@@ -45,7 +45,7 @@ def test_change_is_within_the_bound_and_not_far_from_it(strip: float, start: flo
     """Straight lines at nominal scale err by at most 1.2 bounds; the bound is within 6 of the change."""
     sweep, scene = Sweep("s", "fine", "x", strip_px=strip, start_px=start, lines=30), scene_of(waves(2))
     bound = ROTATION.bound(probe_scene(scene, RIG, [sweep]), RIG)
-    block = Block(RIG, sweep, range(30), scene.wavelength_nm, scene.shape)
+    block = SweepBlock(RIG, sweep, range(30), scene.wavelength_nm, scene.shape)
     exact = expected_light(scene, block, {ROTATION: "rays", SLIT: "3x1"})
     change = np.abs(expected_light(scene, block, {SLIT: "3x1"}) - exact) / noise_electrons(exact, RIG)
     assert change.max() <= 1.2 * bound.value + 1e-3

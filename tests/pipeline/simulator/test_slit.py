@@ -9,14 +9,13 @@ import pytest
 
 from pipeline.geometry.camera import LineCamera, footprint_kernel
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.slit import SLIT, box_of, box_parts
-from pipeline.simulator.effects.turned import MARGIN
-from pipeline.simulator.parting import fewest_parts, misplaced
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.line import MARGIN, SLIT, box_of, box_parts
+from pipeline.simulator.optics.tap_sums import fewest_parts, misplaced
 from pipeline.simulator.render import expected_light, views_all_over
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import raster_from_values
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.selection.survey_probe import probe_scene
 
 RIG = Rig(camera=LineCamera(samples=64))
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-14.5, lines=30)
@@ -71,7 +70,7 @@ def test_point_is_spread_by_the_closed_form_of_the_box(variant: str) -> None:
     values = np.zeros((40, 64, 1))
     values[20, 30] = 1.0
     scene = raster_from_values(values, RIG.camera, name="p", wavelength_nm=np.array([550.0]))
-    block = Block(RIG, replace(SWEEP, start_px=-15.5), range(30), scene.wavelength_nm, scene.shape)
+    block = SweepBlock(RIG, replace(SWEEP, start_px=-15.5), range(30), scene.wavelength_nm, scene.shape)
     light = expected_light(scene, block, {SLIT: variant})[..., 0] / scene.electrons[0]
     slit, pixel = footprint_kernel(RIG.camera.slit_px), footprint_kernel(1.0)
     wanted = np.outer(slit, pixel)
@@ -100,6 +99,6 @@ def test_slit_of_no_width_sees_what_a_pixel_sees() -> None:
     probe = probe_scene(scene, narrow, [SWEEP])
     assert np.isfinite(list(probe.slit_errors.values())).all()
     assert np.isfinite(probe.slope).all()
-    block = Block(narrow, SWEEP, range(30), scene.wavelength_nm, scene.shape)
+    block = SweepBlock(narrow, SWEEP, range(30), scene.wavelength_nm, scene.shape)
     lights = [expected_light(scene, block, {SLIT: variant}) for variant in SLIT.variants]
     np.testing.assert_allclose(lights, [lights[0]] * len(lights), atol=1e-3 * np.ptp(lights[0]))

@@ -7,15 +7,13 @@ import pytest
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.effects.smear import SMEAR, folded_positions, held_variance, smeared_positions
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR, folded_positions, smeared_positions
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scene import raster_from_values
-from pipeline.simulator.stored_light import noise_electrons
-from pipeline.simulator.survey_probe import probe_scene
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.bound_trials import trials
 from tests.pipeline.simulator.random_cases import random_case
 
@@ -24,13 +22,12 @@ RIG = Rig(camera=LineCamera(samples=64))
 
 @pytest.mark.parametrize("step", [1, 2, 8])
 def test_positions_are_held_by_the_mirror_or_the_footprint(step: int) -> None:
-    """All positions of an exposure stand for it, or one in whose footprint they are; their variance is known."""
+    """All positions of an exposure stand for it, or one in whose footprint they are."""
     sweep = Sweep("s", "coarse", "x", strip_px=0.0, start_px=0.0, lines=4, step=step)
-    block = Block(RIG, sweep, range(4), np.array([550.0]), (30, 60))
+    block = SweepBlock(RIG, sweep, range(4), np.array([550.0]), (30, 60))
     found = {variant: smeared_positions(block, variant).shape[1] for variant in ("off", *SMEAR.variants)}
     assert found == {"off": 1, "positions": step, "folded": 1}
     assert [folded_positions(sweep, variant) for variant in ("off", "positions", "folded")] == [1, 1, step]
-    assert held_variance(step) == pytest.approx(np.var(np.arange(step)))
 
 
 def test_no_smear_where_every_line_has_one_position() -> None:
@@ -39,7 +36,7 @@ def test_no_smear_where_every_line_has_one_position() -> None:
     scene = raster_from_values(np.random.default_rng(0).uniform(0, 1, (30, 60, 1)), RIG.camera, name="t",
                                wavelength_nm=np.array([550.0]))  # fmt: skip
     assert SMEAR.bound(probe_scene(scene, RIG, [sweep]), RIG).value == 0
-    block = Block(RIG, sweep, range(4), scene.wavelength_nm, scene.shape)
+    block = SweepBlock(RIG, sweep, range(4), scene.wavelength_nm, scene.shape)
     np.testing.assert_array_equal(smeared_positions(block, "positions"), block.middle[:, None])
 
 
@@ -53,7 +50,7 @@ def test_change_is_within_the_bound(step: int, period: float, variant: str) -> N
     scene = raster_from_values(values[..., None], RIG.camera, name="t", wavelength_nm=np.array([550.0]))
     sweep = Sweep("s", "coarse", "x", strip_px=3.0, start_px=-36.0, lines=72 // step, step=step, binning=step)
     bound = SMEAR.bound(probe_scene(scene, RIG, [sweep]), RIG, variant).value
-    block = Block(RIG, sweep, range(sweep.lines), scene.wavelength_nm, scene.shape)
+    block = SweepBlock(RIG, sweep, range(sweep.lines), scene.wavelength_nm, scene.shape)
     exact = expected_light(scene, block, {ROTATION: "rays", SMEAR: "positions", SLIT: "3x1"})
     other = expected_light(scene, block, {ROTATION: "rays", SMEAR: variant, SLIT: "3x1"})
     change = (np.abs(other - exact) / noise_electrons(exact, RIG)).max()

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.response import RESPONSE
-from pipeline.simulator.effects.smile import SMILE, wavelength_shift
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.spectrometer import RESPONSE, SMILE, wavelength_shift
 from pipeline.simulator.effects.stray_light import STRAY_LIGHT
 from pipeline.simulator.render import expected_light
 from tests.pipeline.simulator.spectral_light import (
@@ -140,7 +139,7 @@ def test_through_the_render_after_the_response():
     """On a scene of narrow bands response, smile and stray light together stay within the sum of their bounds."""
     wavelength, scene = small_scene(fwhm_nm=2.0)
     rig = rig_with(smile_nm=0.8, stray_share=0.01)
-    block = Block(rig, SWEEP, range(316, 324), wavelength, scene.shape, fwhm_nm=scene.fwhm_nm)
+    block = SweepBlock(rig, SWEEP, range(316, 324), wavelength, scene.shape, fwhm_nm=scene.fwhm_nm)
     plain = expected_light(scene, block, {})
     probe = probe_of(plain, wavelength, fwhm_nm=scene.fwhm_nm)
     chain = (RESPONSE, SMILE, STRAY_LIGHT)

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.staircase import STAIRCASE, beside_plan
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.mirror_path import STAIRCASE, beside_plan
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 from tests.pipeline.second_order import staircase_jitter
 
@@ -24,9 +24,9 @@ def rig(positions: float) -> Rig:
     return Rig(mirror=replace(MirrorMotion(), positions_per_line=positions))
 
 
-def block(positions: float, sweep: Sweep = SWEEP, lines: range = range(41)) -> Block:
+def block(positions: float, sweep: Sweep = SWEEP, lines: range = range(41)) -> SweepBlock:
     """Some lines of a sweep."""
-    return Block(rig(positions), sweep, lines, np.array([500.0]), (64, 64))
+    return SweepBlock(rig(positions), sweep, lines, np.array([500.0]), (64, 64))
 
 
 def probe(slope: float, curvature: float, span: float = 1e9, sweep: Sweep = SWEEP) -> Probe:

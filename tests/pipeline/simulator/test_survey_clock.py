@@ -14,9 +14,8 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig, Sky
-from pipeline.simulator.scene import raster_from_values
-from pipeline.simulator.simulated import SimulatedSource
-from pipeline.simulator.survey_clock import sweep_starts
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.simulated import SimulatedSource, sweep_starts
 
 CAMERA = LineCamera()
 COST = CostModel()

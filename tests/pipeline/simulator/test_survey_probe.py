@@ -12,22 +12,19 @@ from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.aberration import ABERRATION
-from pipeline.simulator.effects.diffraction import DIFFRACTION
-from pipeline.simulator.effects.keystone import KEYSTONE
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
+from pipeline.simulator.effects.light_units import noise_electrons, stored_mean
+from pipeline.simulator.effects.line import ROTATION, SLIT
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.options import SAFETY, list_options
-from pipeline.simulator.probe import Probe
-from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Detector, Rig
-from pipeline.simulator.scene import RasterScene, raster_from_values
-from pipeline.simulator.stored_light import noise_electrons, stored_mean
-from pipeline.simulator.survey_looks import views_of_places
-from pipeline.simulator.survey_probe import probe_scene, probe_survey
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.selection.options import SAFETY, list_options
+from pipeline.simulator.selection.survey_looks import views_of_places
+from pipeline.simulator.selection.survey_probe import probe_scene, probe_survey
 
 RIG = Rig(camera=LineCamera(samples=96))
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-30.0, lines=61)
@@ -52,14 +49,18 @@ def mixed(seed: int, shape: tuple[int, int] = (80, 110), bands: int = 6) -> Rast
     planes[rng.integers(20, 60), rng.integers(20, 90)] += rng.uniform(0, 2)
     electrons = rng.uniform(50, 6e3, (3, bands)).astype(np.float32)
     return RasterScene(
-        "mixed", f"{seed}", Raster.of(planes), Once.of(Light(electrons, electrons[0])), np.ones(bands, np.float32),
+        "mixed",
+        f"{seed}",
+        SceneRaster.of(planes),
+        Once.of(SceneLight(electrons, electrons[0])),
+        np.ones(bands, np.float32),
         np.linspace(400, 1000, bands),
-    )  # fmt: skip
+    )
 
 
 def seen(scene: RasterScene, sweep: Sweep, variant: str = "3x1", blurs: dict[Any, str] | None = None) -> np.ndarray:
     """All lines of a sweep through the footprint."""
-    block = Block(RIG, sweep, range(sweep.lines), scene.wavelength_nm, scene.shape)
+    block = SweepBlock(RIG, sweep, range(sweep.lines), scene.wavelength_nm, scene.shape)
     return expected_light(scene, block, {ROTATION: "rays", SLIT: variant, **(blurs or {})})
 
 
@@ -232,7 +233,12 @@ def test_number_that_is_not_finite_is_refused_with_its_place(bad: float) -> None
     planes[41, 17, 2] = bad
     light = np.ones((3, 4), np.float32)
     scene = RasterScene(
-        "holey", "k", Raster.of(planes), Once.of(Light(light, light[0])), np.ones(4, np.float32), np.arange(4) + 400.0
+        "holey",
+        "k",
+        SceneRaster.of(planes),
+        Once.of(SceneLight(light, light[0])),
+        np.ones(4, np.float32),
+        np.arange(4) + 400.0,
     )
     with pytest.raises(SceneError, match="holey is not finite at row 41, column 17, component 2"):
         probe_scene(scene, RIG, [SWEEP])

@@ -12,23 +12,20 @@ import pytest
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import Block
-from pipeline.simulator.chips import candidate_chips, worst_chips
-from pipeline.simulator.choice import Decision, decide
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import Light as Light32
+from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.line import ROTATION, SLIT
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.manifest import TOTAL
-from pipeline.simulator.options import SAFETY
-from pipeline.simulator.probe import Probe
-from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.stored_light import noise_electrons
-from pipeline.simulator.survey_probe import probe_scene
-from pipeline.simulator.verification import verify
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.selection.choice import Decision, decide
+from pipeline.simulator.selection.manifest import TOTAL
+from pipeline.simulator.selection.options import SAFETY
+from pipeline.simulator.selection.survey_probe import probe_scene
+from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
 
 TOLERANCE = 0.1
 CAMERA = LineCamera()
@@ -57,8 +54,8 @@ def scene_of(case: Case) -> RasterScene:
     if case.roof_e:
         plane[490:510, 70:90] = case.roof_e
     spectra = np.full((1, 3), DEFAULT_EXPOSURE_MS / case.rig.camera.exposure_ms, np.float32)
-    light = Light(spectra, 2 * case.electrons * spectra[0])  # the scene reflects about half
-    raster = Raster.of(plane[..., None].astype(np.float32))
+    light = SceneLight(spectra, 2 * case.electrons * spectra[0])  # the scene reflects about half
+    raster = SceneRaster.of(plane[..., None].astype(np.float32))
     return RasterScene("case", "case", raster, Once.of(light), np.ones(3, np.float32), WAVELENGTHS)
 
 
@@ -134,16 +131,16 @@ def test_what_is_left_out_keeps_its_bounds_on_the_worst_chips(case: Case):
     white = scene.panel_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     ends = (0.0, 0.0 if case.seconds is None else case.seconds - rig.camera.scan_seconds(SWEEPS[1].lines))
     whole = [
-        Block(rig, sweep, range(sweep.lines), WAVELENGTHS, scene.shape, started_s=start, white_e=white)
+        SweepBlock(rig, sweep, range(sweep.lines), WAVELENGTHS, scene.shape, started_s=start, white_e=white)
         for sweep, start in zip(SWEEPS, ends, strict=True)
     ]
-    candidates = candidate_chips(whole, probed(case).places, lines=1)
+    candidates = candidate_blocks(whole, probed(case).places, lines=1)
 
     def units(light: Light32, binning: int) -> Light32:
         return noise_electrons(light, rig, binning)
 
     footprint = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[-1]}
-    chips = worst_chips(candidates, lambda chip: expected_light(scene, chip, footprint), units)
+    chips = worst_blocks(candidates, lambda chip: expected_light(scene, chip, footprint), units)
     measured = verify(decision, lambda chip, chosen: expected_light(scene, chip, chosen), chips, units)
     assert 0 <= measured[TOTAL] <= decision.error + 1e-3
 

@@ -11,17 +11,13 @@ import pytest
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.aberration import ABERRATION
-from pipeline.simulator.effects.diffraction import DIFFRACTION
-from pipeline.simulator.effects.keystone import KEYSTONE
-from pipeline.simulator.effects.rotation import ROTATION
-from pipeline.simulator.effects.slit import SLIT
-from pipeline.simulator.effects.smear import SMEAR
-from pipeline.simulator.raster import Light
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
+from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight
 from tests.pipeline.simulator.fine_footprint import fine_light
 
 CAMERA = LineCamera()
@@ -42,7 +38,7 @@ def error(sweep: Sweep, line: int, variant: str, blurs: dict[Any, str], rig: Rig
     """Greatest difference from the rays, over the light's standard deviation."""
     scene = grain()
     # The scene lies where the line does: a block's shape is where the scene's first pixel lies.
-    block = Block(rig, sweep, range(line, line + 1), scene.wavelength_nm, scene.shape, samples=range(0, 640, 10))
+    block = SweepBlock(rig, sweep, range(line, line + 1), scene.wavelength_nm, scene.shape, samples=range(0, 640, 10))
     moved = Moved.to(block, scene)
     light = expected_light(scene, block, {moved: "only", ROTATION: "rays", SLIT: variant, **blurs})
     wanted = fine_light(scene, block, moved, blurs)
@@ -59,11 +55,11 @@ class Moved:
     variants: tuple[str, ...] = ("only",)
 
     @staticmethod
-    def to(block: Block, scene: RasterScene) -> Moved:
+    def to(block: SweepBlock, scene: RasterScene) -> Moved:
         """So that the middle of a block's line falls on the middle of the scene."""
         return Moved(-float(block.sweep.strip_px), -float(np.rint(block.scan_px.mean())))
 
-    def displaced(self, block: Block, along_px: Any, scan_px: Any, variant: str) -> tuple[Any, Any]:
+    def displaced(self, block: SweepBlock, along_px: Any, scan_px: Any, variant: str) -> tuple[Any, Any]:
         """Give what to add."""
         return np.full_like(along_px, self.along), np.full_like(scan_px, self.scan)
 
@@ -95,7 +91,7 @@ def test_closed_form_is_what_thousands_of_rays_give(
 def test_rays_converge_to_the_closed_form() -> None:
     """Twice as many rays along either axis leave a third of the difference, or less."""
     scene, sweep = grain(), replace(CORNER, strip_px=200.0)
-    block = Block(RIG, sweep, range(1900, 1901), scene.wavelength_nm, scene.shape, samples=range(300, 340))
+    block = SweepBlock(RIG, sweep, range(1900, 1901), scene.wavelength_nm, scene.shape, samples=range(300, 340))
     moved = Moved.to(block, scene)
     light = expected_light(scene, block, {moved: "only", ROTATION: "rays", SLIT: "9x3"})
     errors = [np.abs(fine_light(scene, block, moved, {}, per_px=many) - light).max() for many in (8, 16, 32)]
@@ -107,7 +103,7 @@ def test_flat_scene_stays_flat() -> None:
     """Weights sum to 1 at any place, turn and band."""
     nm = np.linspace(400, 1000, 3)
     scene = raster_from_values(np.full((120, 160, 3), 0.7), CAMERA, name="flat", wavelength_nm=nm)
-    block = Block(RIG, CORNER, range(4), scene.wavelength_nm, scene.shape)
+    block = SweepBlock(RIG, CORNER, range(4), scene.wavelength_nm, scene.shape)
     for variant in ("off", *SLIT.variants):
         light = expected_light(scene, block, {ROTATION: "rays", SLIT: variant, **BLURS})
         np.testing.assert_allclose(light, np.broadcast_to(0.7 * scene.electrons, light.shape), rtol=3e-6)
@@ -120,7 +116,7 @@ def test_keystone_needs_no_slit(variant: str) -> None:
     ramp = raster_from_values(np.repeat((x + 0.0)[..., None], 3, axis=2), CAMERA, name="ramp",
                               wavelength_nm=np.array([400.0, 700.0, 1000.0]))  # fmt: skip
     sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=-20.0, lines=3)
-    block = Block(RIG, sweep, range(3), ramp.wavelength_nm, ramp.shape, samples=range(290, 350))
+    block = SweepBlock(RIG, sweep, range(3), ramp.wavelength_nm, ramp.shape, samples=range(290, 350))
     light = expected_light(ramp, block, {SLIT: variant, KEYSTONE: "linear"}) / ramp.electrons
     np.testing.assert_allclose(light - light[..., [1]], np.broadcast_to([-0.15, 0.0, 0.15], light.shape), atol=2e-4)
 
@@ -130,7 +126,7 @@ def test_folded_positions_are_those_held_near_the_middle(step: int) -> None:
     """Where lines do not turn, held positions in the footprint give what each of them gives by itself."""
     scene = grain()
     sweep = Sweep("s", "coarse", "x", strip_px=0.0, start_px=-20.0, lines=4, step=step, binning=step)
-    block = Block(RIG, sweep, range(4), scene.wavelength_nm, scene.shape, samples=range(300, 340))
+    block = SweepBlock(RIG, sweep, range(4), scene.wavelength_nm, scene.shape, samples=range(300, 340))
     one, other = (expected_light(scene, block, {ROTATION: "rays", SMEAR: smear, SLIT: "3x1", **BLURS})
                   for smear in SMEAR.variants)  # fmt: skip
     assert np.abs(one - other).max() / one.std() < 0.02
@@ -143,12 +139,12 @@ def test_light_is_the_same_to_the_bit_in_any_block(size: int) -> None:
     nm = np.linspace(400, 1000, 31)
     scene = raster_from_values(rng.uniform(0, 1, (90, 110, 31)), CAMERA, name="m", wavelength_nm=nm)
     light = np.ascontiguousarray(rng.uniform(10, 900, (31, 31)), np.float32)
-    scene = replace(scene, light=Once.of(Light(light, light[0])))
+    scene = replace(scene, light=Once.of(SceneLight(light, light[0])))
     sweep = Sweep("s", "fine", "x", strip_px=300.0, start_px=-300.0, lines=14)
     chosen: dict[Any, str] = {ROTATION: "rays", SLIT: "3x1", **BLURS}
 
     def made(lines: range, samples: range | None = None) -> np.ndarray:
-        return expected_light(scene, Block(RIG, sweep, lines, nm, scene.shape, samples=samples), chosen)
+        return expected_light(scene, SweepBlock(RIG, sweep, lines, nm, scene.shape, samples=samples), chosen)
 
     whole = made(range(14))
     parts = [made(range(first, first + size), range(7, 640, 9)) for first in range(0, 14, size)]

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import j0
 
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.turbulence import TURBULENCE, rytov_variance, turbulence_px
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.moving_air import TURBULENCE, rytov_variance, turbulence_px
 from pipeline.simulator.rig_model import Air, Optics, Rig
 from tests.pipeline.simulator.fine_image import IMAGES, SWEEP, change, probe_of, shifted
 
@@ -25,7 +25,7 @@ def rig_at(distance_m: float | None, **air: float) -> Rig:
 
 def drawn(lines: range, seed: int = 0, rig: Rig | None = None) -> np.ndarray:
     """Jitter of lines of the long sweep, (line, 2) [px]."""
-    block = Block(rig or rig_at(300.0), LONG, lines, np.array([700.0]), (10, 10), seed=seed)
+    block = SweepBlock(rig or rig_at(300.0), LONG, lines, np.array([700.0]), (10, 10), seed=seed)
     jitter = TURBULENCE.aim(block, "jitter")
     assert jitter.shape == (len(lines), 1, 2)
     return jitter[:, 0]

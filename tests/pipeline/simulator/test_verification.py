@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from pipeline.errors import BoundError
-from pipeline.simulator.block import Block
-from pipeline.simulator.choice import Decision, decide
+from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import Effect, Light
-from pipeline.simulator.manifest import TOTAL
-from pipeline.simulator.verification import Floats, verify
+from pipeline.simulator.selection.choice import Decision, decide
+from pipeline.simulator.selection.manifest import TOTAL
+from pipeline.simulator.selection.verification import Floats, verify
 from tests.pipeline.simulator.made_up_effects import RIG, SWEEP, Brightening, MadeUp, even_probe
 
-BLOCK = Block(RIG, SWEEP, range(20, 28), np.array([500.0, 600.0]), (200, 700))
+BLOCK = SweepBlock(RIG, SWEEP, range(20, 28), np.array([500.0, 600.0]), (200, 700))
 CHIPS = {"steepest": BLOCK, "brightest": replace(BLOCK, lines=range(40, 44))}
 
 
-def render(block: Block, chosen: Mapping[Effect, str]) -> Light:
+def render(block: SweepBlock, chosen: Mapping[Effect, str]) -> Light:
     """Light of 100 e-, brighter from line 40 on, times all gains."""
     light = np.full((len(block.lines), len(block.columns), 2), 100.0, np.float32)
     light[block.numbers >= 40] += 20
@@ -59,7 +59,7 @@ def test_broken_bound_is_named_with_its_place():
     decision = decided(Brightening("drift", 0.01, share=0.1))
     said = (
         r"drift: .* changes light by 0\.12 sigma of the noise at sweep fine-0, line 40, sample 0, band 0 of the "
-        r"brightest chip, above its bound of 0\.0145.*--tol 0 or"
+        r"brightest lines, above its bound of 0\.0145.*--tol 0 or"
     )
     with pytest.raises(BoundError, match=said):
         verify(decision, render, CHIPS, units)
@@ -68,7 +68,7 @@ def test_broken_bound_is_named_with_its_place():
 def test_light_that_is_no_number_breaks_every_bound():
     """NaN is not less than a bound."""
 
-    def broken(block: Block, chosen: Mapping[Effect, str]) -> Light:
+    def broken(block: SweepBlock, chosen: Mapping[Effect, str]) -> Light:
         return (
             render(block, chosen) if chosen else np.full((len(block.lines), len(block.columns), 2), np.nan, np.float32)
         )
@@ -92,6 +92,6 @@ def test_sums_are_held_against_the_bound_as_they_are_stored():
         return np.full(light.shape, 100.0 / np.sqrt(binning))
 
     assert verify(decided(shared), render, {"steepest": BLOCK}, noise)["drift"] == pytest.approx(0.01, rel=1e-3)
-    said = r"light by 0\.02 sigma .* sample 0 \(of 4 summed\), band 0 of the steepest chip"
+    said = r"light by 0\.02 sigma .* sample 0 \(of 4 summed\), band 0 of the steepest lines"
     with pytest.raises(BoundError, match=said):
         verify(decided(shared), render, {"steepest": coarse}, noise)

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.mirror import mirror_throughput
 from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.vignetting import MOST_BEND, VIGNETTING
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.mirror_throughput import MOST_BEND, VIGNETTING
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from tests.pipeline.simulator.spectral_light import probe_of, rig_with, small_scene, worst
@@ -28,7 +28,7 @@ def sweep_at(strip_px, start_px, lines, step=1):
 
 def factors(sweep, variant="held"):
     """Factor of every line, (line,)."""
-    gain = VIGNETTING.gain(Block(RIG, sweep, range(sweep.lines), NM, (640, 640)), variant)
+    gain = VIGNETTING.gain(SweepBlock(RIG, sweep, range(sweep.lines), NM, (640, 640)), variant)
     assert gain.shape == (sweep.lines, 1, 1)
     assert gain.dtype == np.float32
     return gain[:, 0, 0].astype(np.float64)
@@ -45,7 +45,7 @@ def test_shares_over_a_field_of_10240_px():
 def test_shares_are_those_of_the_mirror(variant, at):
     """What calibration divides by is what the lines are multiplied by, at any place of the field."""
     sweep = sweep_at(-2300, 1700, 50, 4)
-    shares = mirror_throughput(getattr(Block(RIG, sweep, range(50), NM, (640, 640)), at)).reshape(50, -1)
+    shares = mirror_throughput(getattr(SweepBlock(RIG, sweep, range(50), NM, (640, 640)), at)).reshape(50, -1)
     np.testing.assert_allclose(factors(sweep, variant), shares.mean(axis=1), rtol=1e-7)
 
 
@@ -87,7 +87,7 @@ def test_bounds_hold_and_are_tight(strip_px, start_px, lines, step):
     assert way <= bound + signal * 1e-7
     assert bound <= 1.01 * way + signal * 2e-4 * step
     middle = mirror_throughput(line_positions(sweep, RIG.camera))
-    exact = mirror_throughput(Block(RIG, sweep, range(lines), NM, (640, 640)).positions).mean(axis=1)
+    exact = mirror_throughput(SweepBlock(RIG, sweep, range(lines), NM, (640, 640)).positions).mean(axis=1)
     assert signal * np.abs(middle - exact).max() <= VIGNETTING.bound(probe, RIG, "middle").value + signal * 1e-14
 
 
@@ -105,7 +105,7 @@ def test_through_the_render():
     """Light of a scene with and without: the lines' factors, and no sample off by more than the bound."""
     wavelength, scene = small_scene()
     sweep = sweep_at(0, 900, 6)
-    block = Block(rig_with(), sweep, range(6), wavelength, scene.shape)
+    block = SweepBlock(rig_with(), sweep, range(6), wavelength, scene.shape)
     plain, made = expected_light(scene, block, {}), expected_light(scene, block, {VIGNETTING: "held"})
     np.testing.assert_allclose(made / plain, factors(sweep)[:, None, None] * np.ones(plain.shape), rtol=1e-5)
     bound = VIGNETTING.bound(probe_of(plain, wavelength, sweep=sweep), block.rig).value
@@ -128,5 +128,5 @@ def test_blocks_do_not_matter():
     for size in (1, 7):
         for start in range(0, 20, size):
             lines = range(start, min(start + size, 20))
-            part = VIGNETTING.gain(Block(RIG, sweep, lines, NM, (640, 640)), "held")[:, 0, 0]
+            part = VIGNETTING.gain(SweepBlock(RIG, sweep, lines, NM, (640, 640)), "held")[:, 0, 0]
             np.testing.assert_array_equal(part, whole[start : start + size].astype(np.float32))

@@ -11,14 +11,11 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.lazy import Once
 from pipeline.rectify.calibration.calibrate import calibrate
-from pipeline.simulator.effects.dark_current import dark_electrons
-from pipeline.simulator.effects.defects import dead_elements, hot_electrons
-from pipeline.simulator.effects.fixed_pattern import response_gain, stripe_gain
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
+from pipeline.simulator.effects.sensor import dark_electrons, dead_elements, hot_electrons, response_gain, stripe_gain
 from pipeline.simulator.instrument import USUAL, effects_on
-from pipeline.simulator.raster import Light, Raster
 from pipeline.simulator.rig_model import Detector, Rig
-from pipeline.simulator.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import References
 
@@ -33,8 +30,8 @@ def even_scene(fwhm_nm: float = 2.0) -> RasterScene:
     nm = np.linspace(740, 784, BANDS)
     panel_electrons = (30_000 * (1 - 0.6 * np.exp(-(((nm - 762) / 5) ** 2)))).astype(np.float32)
     return RasterScene(
-        "even", "even", Raster.of(np.full((20, 20, 1), 0.4, np.float32)),
-        Once.of(Light(panel_electrons[None], panel_electrons)), np.ones(BANDS, np.float32), nm,
+        "even", "even", SceneRaster.of(np.full((20, 20, 1), 0.4, np.float32)),
+        Once.of(SceneLight(panel_electrons[None], panel_electrons)), np.ones(BANDS, np.float32), nm,
         np.full(BANDS, fwhm_nm),
     )  # fmt: skip
 

@@ -10,9 +10,9 @@ import pytest
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, sweep_to_scene
-from pipeline.simulator.block import Block
-from pipeline.simulator.effects.wind import WIND, line_to_line_px, sway_px, within_exposure_px
-from pipeline.simulator.probe import Probe
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.moving_air import WIND, line_to_line_px, sway_px, within_exposure_px
+from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Air, Rig
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -100.0, 201)
@@ -24,7 +24,7 @@ def shown(air: Air, sweep: Sweep = SWEEP, lines: range = range(201), **options: 
     """Displacement of the points of some lines."""
     along, scan = sweep_to_scene(sweep, CAMERA)
     taken = slice(lines.start, lines.stop)
-    block = Block(Rig(air=air), sweep, lines, np.ones(1), (201, 640), **options)  # type: ignore[arg-type]
+    block = SweepBlock(Rig(air=air), sweep, lines, np.ones(1), (201, 640), **options)  # type: ignore[arg-type]
     return WIND.displaced(block, along[taken], scan[taken], "exact")
 
 
@@ -75,9 +75,11 @@ def test_one_wave_for_all_sweeps():
     """Sweeps of other names and either axis see the same crop at the same place and time; another seed does not."""
     point = np.array([[40.0]]), np.array([[-25.0]])
     line = replace(SWEEP, lines=1)
-    seen = WIND.displaced(Block(Rig(air=BREEZE), line, range(1), np.ones(1), (201, 640)), *point, "exact")
+    seen = WIND.displaced(SweepBlock(Rig(air=BREEZE), line, range(1), np.ones(1), (201, 640)), *point, "exact")
     across = replace(line, name="other", along="y")
-    turned = WIND.displaced(Block(Rig(air=BREEZE), across, range(1), np.ones(1), (201, 640)), *point[::-1], "exact")
+    turned = WIND.displaced(
+        SweepBlock(Rig(air=BREEZE), across, range(1), np.ones(1), (201, 640)), *point[::-1], "exact"
+    )
     np.testing.assert_allclose(turned[::-1], seen)
     assert not np.allclose(shown(BREEZE, seed=3), shown(BREEZE))
 

@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, sweep_positions
-from pipeline.simulator.scene import DEFAULT_EXPOSURE_MS, Scene, to_bands
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, Scene, to_bands
 
 
 def expected_lines(

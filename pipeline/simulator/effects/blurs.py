@@ -1,0 +1,255 @@
+"""What blurs the image or shifts it band by band: diffraction, the lens itself, defocus, keystone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.simulator.effects.effect import OFF, Blur, Bound, Merged
+from pipeline.simulator.effects.probe import UNITS, Probe
+from pipeline.simulator.optics.kernel_fit import Moments
+from pipeline.simulator.optics.rays import normals_met, pupil_contrast, spread_of_rays, spread_of_waves
+from pipeline.simulator.rig_model import Rig
+
+Floats = NDArray[np.float64]
+AIRY, GAUSSIAN, ONE_WIDTH = "airy", "gaussian", "one-width"
+THIRD_RING = 10.173468135062722  # third zero of J1
+FIRST_NM, LAST_NM = 400.0, 1000.0  # of the spectrograph
+_ALONE: Floats = np.ones(1)
+
+
+def blurred_bound(probe: Probe, cause: str, variance: Floats, share: Floats = _ALONE) -> Bound:
+    """Bound what a sum of Gaussians changes, of (kernel, 2, band) variance [px^2] and shares (kernel,).
+
+    ``cause`` says where the blur comes from; the sentence names the band that changes most.
+    """
+    change = sum((part * probe.change_blurred(one) for part, one in zip(share, variance, strict=True)), np.zeros(1))
+    value = float(change.max(initial=0.0))
+    if not variance.any():
+        return Bound(value, f"{cause}: none")
+    band = int(np.argmax(change))
+    nearest = np.sqrt(variance[int(np.argmax(share)), :, band])
+    nm, detail = probe.wavelength_nm[band], probe.curvature[:, band].max()
+    return Bound(
+        value,
+        f"{cause}: {nearest[0]:.2g} px (sd) along the line, {nearest[1]:.2g} px along the scan at {nm:.0f} nm,"
+        f" on detail of at most {detail:.3g} {UNITS[probe.unit]}/px^2",
+    )
+
+
+def even(variance: Floats, bands: int) -> Moments:
+    """Give the moments of a blur that is the same in all bands: no shift, and (2,) variance along line and scan."""
+    return Moments(np.zeros((2, bands)), np.repeat(np.asarray(variance, np.float64)[:, None], bands, axis=1))
+
+
+@dataclass(frozen=True)
+class Diffraction(Blur):
+    """Diffraction at the mirror, the aperture stop: an Airy pattern, stretched along the scan by the elliptic pupil.
+
+    The pattern has no variance: its rings hold 2 / (pi v) of the light beyond v = pi D theta / lambda, and what it
+    passes of a slow wave falls in proportion to the wave's frequency. The exact variant is the pupil's own transfer
+    function in every band, far tails included: `kernel_fit` finds few kernels for it. The others put a Gaussian in its
+    place, of each band or of the middle one, of the variance of what lies inside the third dark ring (94 % of the
+    light); they pass up to 0.08 more of a wave.
+    """
+
+    name = "diffraction"
+    # Through boxes of a few parts. Each kernel costs: of the pattern's core, of its tails, of the bands' own widths.
+    cost_ns = MappingProxyType({AIRY: 6.7, GAUSSIAN: 3.4, ONE_WIDTH: 0.3})
+
+    def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
+        """Give the blur of each band; ``normal`` (3,) is the mirror's in the camera frame, None at rest."""
+        waves, none = _waves(rig, wavelength_nm, normal), np.zeros((2, len(wavelength_nm)))
+        if variant == AIRY:
+            return Moments(none, none, waves)
+        return Moments(none, _gaussian(waves, variant))
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound the error of no blur, or of a Gaussian, over all positions of the sweeps.
+
+        The pattern is a sum of Gaussians of many widths: each changes the image, or a Gaussian in its place, by no more
+        than the difference of their variances does.
+        """
+        share, size = airy_gaussians()
+        found = [_waves(rig, probe.wavelength_nm, normal) for normal in normals_met(probe.sweeps, rig.camera)]
+        missing = []
+        for waves in found:
+            instead = _gaussian(waves, variant) if variant != OFF else np.zeros_like(waves)
+            missing.append([np.abs((one * waves) ** 2 - instead) for one in size])
+        cause = "diffraction" if variant == OFF else f"diffraction as a Gaussian, {variant},"
+        return blurred_bound(probe, cause, np.max(missing, axis=0), share)
+
+
+DIFFRACTION = Diffraction()
+
+
+def airy_energy(v: float) -> float:
+    """Give the share of the light of an Airy pattern within v = pi D theta / lambda (Rayleigh): 1 - J0^2 - J1^2."""
+    from scipy.special import j0, j1
+
+    return float(1 - j0(v) ** 2 - j1(v) ** 2)
+
+
+def airy_variance(v: float) -> float:
+    """Give the variance per axis of an Airy pattern cut off at v and scaled to sum 1, in units of v^2.
+
+    The integral of t J1(t)^2, which is v^2 (J0^2 + J1^2) / 2 - v J0 J1, over the energy; towards 0 it is v^2 / 4.
+    """
+    from scipy.special import j0, j1
+
+    if v < 1e-2:
+        return v * v / 4
+    inside = v * v / 2 * (j0(v) ** 2 + j1(v) ** 2) - v * j0(v) * j1(v)
+    return float(inside) / airy_energy(v)
+
+
+@cache  # not at import: SciPy takes its time
+def airy_gaussians() -> tuple[Floats, Floats]:
+    """Give shares, none below 0, of sum 1, and widths (sd) [lambda / D] of Gaussians whose sum is an Airy pattern.
+
+    By least squares on what the pupil passes of waves, those that a slit passes counting most: within 0.004 of it up to
+    0.6 of its cut-off. For bounds; what is rendered follows the pupil itself.
+    """
+    from scipy.optimize import nnls
+
+    size, u = np.geomspace(0.1, 160.0, 24), np.concatenate([np.geomspace(1e-3, 0.02, 30), np.linspace(0.03, 1.5, 150)])
+    weight = 1 / (1 + (u / 0.5) ** 4)
+    passed = np.exp(-2 * (np.pi * np.outer(u, size)) ** 2)
+    system = np.concatenate([passed * weight[:, None], np.full((1, len(size)), 1e3)])
+    share = nnls(system, np.append(pupil_contrast(u) * weight, 1e3))[0]
+    held = share > 0
+    return share[held] / share.sum(), size[held]
+
+
+@cache
+def _spread() -> float:
+    """Variance per axis of the Gaussian in the pattern's place [(lambda / D)^2]."""
+    return airy_variance(THIRD_RING) / math.pi**2
+
+
+def _gaussian(waves: Floats, variant: str) -> Floats:
+    """Variance (2, band) of the Gaussian: each band's, or halfway between those of the narrowest and the widest."""
+    variance = _spread() * waves**2
+    if variant == GAUSSIAN or not waves.size:
+        return variance
+    middle = (variance.min(axis=1) + variance.max(axis=1)) / 2
+    return np.repeat(middle[:, None], waves.shape[1], axis=1)
+
+
+def _waves(rig: Rig, wavelength_nm: Floats, normal: Floats | None) -> Floats:
+    """lambda over the pupil's widths along line and scan, (2, band). [px]"""
+    angle = np.asarray(wavelength_nm, np.float64) * 1e-9 / (rig.optics.aperture_mm * 1e-3)
+    waves: Floats = angle / rig.camera.ifov_rad * np.sqrt(spread_of_waves(normal))[:, None]
+    return waves
+
+
+@dataclass(frozen=True)
+class Aberration(Blur):
+    """Blur by the lens itself: a Gaussian of ``optics.aberration_px`` (sd) in all bands and both directions."""
+
+    name = "aberration"
+    cost_ns = MappingProxyType({"gaussian": 0.3})
+
+    def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
+        """Give the blur, equal in all bands."""
+        return even(np.full(2, rig.optics.aberration_px**2), len(wavelength_nm))
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound the error of no blur."""
+        return blurred_bound(probe, "blur of the lens", self.moments(rig, probe.wavelength_nm, variant).variance[None])
+
+
+ABERRATION = Aberration()
+
+
+@dataclass(frozen=True)
+class Defocus(Blur):
+    """Blur by the distance from the plane of focus, that of ``air.distance_m`` for all of the scene.
+
+    A point beside the distance of focus is an image of the pupil: a disc foreshortened along the scan.
+    """
+
+    name = "defocus"
+    cost_ns = MappingProxyType({"disc": 0.3})
+
+    def merged(self, rig: Rig) -> Merged:
+        """Give what it costs in the kernels that diffraction needs anyway."""
+        return Merged(DIFFRACTION.name, AIRY, 0.1)
+
+    def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
+        """Give the blur, equal in all bands; ``normal`` (3,) is the mirror's in the camera frame, None at rest."""
+        return even(defocus_px(rig, rig.air.distance_m, normal) ** 2 / 16, len(wavelength_nm))
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound the error of no blur over all positions of the sweeps."""
+        if rig.distances_m is None:
+            return Bound(0.0, "the scene has no distance")
+        normals = normals_met(probe.sweeps, rig.camera)
+        worst = np.max([defocus_px(rig, rig.air.distance_m, normal) ** 2 / 16 for normal in normals], axis=0)
+        cause = f"defocus at {rig.air.distance_m:g} m, focused at {rig.optics.focus_m:g} m"
+        return blurred_bound(probe, cause, even(worst, len(probe.wavelength_nm)).variance[None])
+
+
+DEFOCUS = Defocus()
+
+
+def defocus_px(rig: Rig, distance_m: float | None, normal: Floats | None = None) -> Floats:
+    """Give the axes of the blur's disc, (2,) along line and scan: pupil |1/d - 1/d_f| / IFOV; 0 without a distance.
+
+    In px; the variance of such an even disc is a sixteenth of its diameter squared.
+    """
+    if distance_m is None or distance_m == rig.optics.focus_m:
+        return np.zeros(2)
+    round_px = rig.optics.aperture_mm * 1e-3 * abs(1 / distance_m - 1 / rig.optics.focus_m) / rig.camera.ifov_rad
+    return round_px * np.sqrt(spread_of_rays(normal))
+
+
+@dataclass(frozen=True)
+class Keystone(Blur):
+    """Shift along the line, of its own in each band: a line is imaged longer at one wavelength than at another.
+
+    At the last wavelength a sample sees the scene ``keystone_px / 2`` further along the line (towards higher sample
+    numbers) than the mirror model says, at the first as much less far; so a red image lies at lower sample numbers than
+    a blue one. It is linear from 400 to 1000 nm, whatever bands the scene has of these, and stays at its ends beyond.
+    """
+
+    name = "keystone"
+    cost_ns = MappingProxyType({"linear": 2.6})
+
+    def merged(self, rig: Rig) -> Merged:
+        """Give what it costs beside diffraction, whose several widths have to be shifted each."""
+        return Merged(DIFFRACTION.name, AIRY, 5.6)
+
+    def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
+        """Give the shift of each band."""
+        shift = np.zeros((2, len(wavelength_nm)))
+        shift[0] = keystone_shift(rig, wavelength_nm)
+        return Moments(shift, np.zeros_like(shift))
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound the error of no shift: slope along the line times shift, never more than the span, band by band."""
+        shift = np.abs(keystone_shift(rig, probe.wavelength_nm))
+        change = np.minimum(probe.slope[0] * shift, probe.span)
+        if not shift.any():
+            return Bound(0.0, "no shift along the line")
+        band = int(np.argmax(change))
+        return Bound(
+            float(change[band]),
+            f"{shift[band]:.2g} px along the line at {probe.wavelength_nm[band]:.0f} nm,"
+            f" on edges of at most {probe.slope[0, band]:.3g} {UNITS[probe.unit]}/px",
+        )
+
+
+KEYSTONE = Keystone()
+
+
+def keystone_shift(rig: Rig, wavelength_nm: Floats) -> Floats:
+    """Give how far along the line each band sees beside the mirror model's place, (band,) from -k/2 to k/2. [px]"""
+    share = (np.asarray(wavelength_nm, np.float64) - FIRST_NM) / (LAST_NM - FIRST_NM)
+    shift: Floats = rig.optics.keystone_px * (np.clip(share, 0.0, 1.0) - 0.5)
+    return shift

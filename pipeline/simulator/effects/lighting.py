@@ -1,0 +1,241 @@
+"""How the scene is lit and seen: the sun's course, clouds, and reflectance by the angle of view."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, points_of_scan
+from pipeline.simulator.block import SweepBlock, sweep_stream
+from pipeline.simulator.effects.effect import OFF, Bound, Gain, Light
+from pipeline.simulator.effects.gain_range import GainRange
+from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.rig_model import Rig, Sky
+from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
+
+Floats = NDArray[np.float64]
+SPECTRAL, SCALAR, LINEAR = "spectral", "scalar", "linear"
+_RATE_OVER_S = 60.0
+_KNOTS_AT_ONCE = 512
+EDGE_SHARE = 0.1  # width of a shadow's edge, over the shadow's size (assumed)
+HOT_SPOT_RAD = float(np.deg2rad(2.0))  # from its peak to 1/e (assumed)
+_LOOKS = 65  # lines of a sweep, and samples of a line, at which angles are taken for the bound
+
+
+@dataclass(frozen=True)
+class Drift(Gain):
+    """Light at a line's mid exposure over the light at the survey's start, to which the scene is stated.
+
+    ``spectral`` is SPECTRL2 under a clear sky, band by band, by the air that the sun shines through. ``scalar`` is the
+    mean of that over the bands, ``linear`` a straight line in time by the mean's rate in the survey's first minute,
+    never below 0. A survey that starts in the night is relative to the light of a sun 1 deg high.
+    Without a time of day there is no drift. With the sun at the horizon or below the light is 0.
+    """
+
+    name = "drift"
+    cost_ns = MappingProxyType({SPECTRAL: 0.4, SCALAR: 0.2, LINEAR: 0.2})
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound by level times the greatest change of the light, or its difference to a variant, through the survey.
+
+        The light is straight between its knots, so that its extremes lie on them.
+        """
+        if rig.sky.started is None:
+            return Bound(0.0, "the survey has no time of day")
+        seconds = probe.seconds + rig.camera.frame_ms * 1e-3  # to the end of the last line
+        worst = np.zeros(len(probe.wavelength_nm))
+        times = _corners(rig.sky, probe.wavelength_nm, seconds, variant)
+        for some in np.array_split(times, len(times) // _KNOTS_AT_ONCE + 1):
+            exact = _daylight(rig.sky, probe.wavelength_nm, some, SPECTRAL)
+            missed = exact - (1 if variant == OFF else _daylight(rig.sky, probe.wavelength_nm, some, variant))
+            worst = np.maximum(worst, np.abs(missed).max(axis=0))
+        low, high = sun_elevation_deg(rig.sky, np.array([0.0, seconds]))
+        course = f"with the sun from {low:.1f} to {high:.1f} deg in {_spoken(seconds)}"
+        verb = "changes" if variant == OFF else "at this variant is wrong"
+        return Bound(probe.scaled(worst), f"light {verb} by at most {100 * worst.max(initial=0.0):.3g} % {course}")
+
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        """Give the daylight of the survey over that at its start; 1 without a time of day."""
+        nm = np.asarray(probe.wavelength_nm, np.float64)
+        if rig.sky.started is None:
+            return GainRange.between(1.0, 1.0, len(nm))
+        times = knots_within(rig.sky, probe.seconds + rig.camera.frame_ms * 1e-3)
+        light = relative_daylight(rig.sky, nm, times)
+        return GainRange.of(light, nm, uneven=float(np.ptp(light, axis=1).max(initial=0.0)))
+
+    def gain(self, block: SweepBlock, variant: str) -> Light:
+        """Give (line, 1, band), or (line, 1, 1) of the variants that take all bands as one."""
+        sky = block.rig.sky
+        if sky.started is None:
+            return np.ones((1, 1, 1), np.float32)
+        return _daylight(sky, block.wavelength_nm, block.time_s, variant)[:, None].astype(np.float32)
+
+
+DRIFT = Drift()
+
+
+def _daylight(sky: Sky, wavelength_nm: Floats, seconds: Floats, variant: str) -> Floats:
+    """Give (time, band), or (time, 1), over the light at the start."""
+    if variant == LINEAR:
+        return np.maximum(1 + _first_rate(sky, wavelength_nm) * seconds[:, None], 0.0)
+    if variant == SCALAR:
+        return _of_all(sky, wavelength_nm, seconds)
+    return relative_daylight(sky, wavelength_nm, seconds)
+
+
+def _of_all(sky: Sky, wavelength_nm: Floats, seconds: Floats) -> Floats:
+    """Mean over the bands, (time, 1): every band counts by its light at the start, so as 1."""
+    mean: Floats = relative_daylight(sky, wavelength_nm, seconds).mean(axis=1, keepdims=True)
+    return mean
+
+
+def _first_rate(sky: Sky, wavelength_nm: Floats) -> float:
+    """Change of the mean in the survey's first minute [1/s], from its own value: 0 in the night."""
+    first, later = _of_all(sky, wavelength_nm, np.array([0.0, _RATE_OVER_S])).ravel()
+    return float(later - first) / _RATE_OVER_S
+
+
+def _corners(sky: Sky, wavelength_nm: Floats, seconds: float, variant: str) -> Floats:
+    """Times between which both the light and the variant are straight, (time,) [s]."""
+    times = knots_within(sky, seconds)
+    rate = _first_rate(sky, wavelength_nm) if variant == LINEAR else 0.0
+    dark = -1 / rate if rate < 0 else np.inf  # from here on the straight line is 0
+    return np.append(times, dark) if dark < seconds else times
+
+
+def _spoken(seconds: float) -> str:
+    return f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
+
+
+@dataclass(frozen=True)
+class Cloud(Gain):
+    """Straight bands of shadow, as wide as the gaps between them, that drift over the scene at a constant speed.
+
+    Direction and place follow from the seed alone, so that all sweeps of a survey lie under the same clouds. The edge
+    is a smooth step: the light is never broken off. All bands lose the same share.
+    """
+
+    name = "cloud"
+    cost_ns = MappingProxyType({"shadow": 0.3})
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound by level times the share that a cloud takes; whether a shadow comes is up to the seed."""
+        sky = rig.sky
+        if sky.cloud_share == 0:
+            return Bound(0.0, "the sky is clear")
+        why = f"a shadow takes {sky.cloud_share:.0%} of the light and moves {sky.cloud_px_per_s:g} px/s over the scene"
+        return Bound(probe.scaled(sky.cloud_share), why)
+
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        """Give 1 less a cloud's share, to 1."""
+        share = rig.sky.cloud_share
+        return GainRange.between(1 - share, 1.0, len(probe.wavelength_nm), uneven=share)
+
+    def gain(self, block: SweepBlock, variant: str) -> Light:
+        """Give (line, sample, 1)."""
+        sky = block.rig.sky
+        if sky.cloud_share == 0:
+            return np.ones((1, 1, 1), np.float32)
+        sweep = block.sweep
+        along, scan = points_of_scan(sweep.strip_px, block.rig.camera, block.scan_px[:, None], block.slopes)
+        x, y = (along, scan) if sweep.along == "x" else (scan, along)
+        heading, place = self._course(block.seed, sky.cloud_size_px)
+        way = x * math.cos(heading) + y * math.sin(heading) - sky.cloud_px_per_s * block.time_s[:, None] + place
+        return (1 - sky.cloud_share * shadow(way, sky.cloud_size_px))[..., None].astype(np.float32)
+
+    def _course(self, seed: int, size_px: float) -> tuple[float, float]:
+        """Direction [rad] in which the shadows move, and where they are when the survey starts [px]."""
+        turn, place = sweep_stream(seed, "", self.name).random(2)  # no sweep's name: the whole survey's
+        return 2 * math.pi * float(turn), 2 * size_px * float(place)
+
+
+CLOUD = Cloud()
+
+
+def shadow(way_px: Floats, size_px: float) -> Floats:
+    """Give how much of a cloud lies between the sun and points so far along its way, 0 to 1; the period is 2 sizes.
+
+    It is 1 about every even multiple of the size, 0 about the odd ones, 1/2 in the middle of an edge.
+    """
+    from_middle = np.abs((way_px + size_px) % (2 * size_px) - size_px)
+    t = np.clip((size_px / 2 - from_middle) / (EDGE_SHARE * size_px) + 0.5, 0.0, 1.0)
+    smooth: Floats = t * t * (3 - 2 * t)
+    return smooth
+
+
+@dataclass(frozen=True)
+class Brdf(Gain):
+    """Reflectance over that in the undeflected direction: 1 + b a + h exp(-phase / 2 deg), never below 0.
+
+    The angle a of view runs along the scene's x axis, which lies in the sun's plane (assumed); b is
+    ``sky.brdf_per_rad``. The phase is the angle to the undeflected direction, along which the sun's rays come from
+    behind the rig (assumed); h is ``sky.hot_spot``, and at its peak the slope breaks: a cusp. All materials and bands
+    share it, and directions are those of the plan, right to the mirror's own faults of 1e-3 rad.
+    """
+
+    name = "brdf"
+    cost_ns = MappingProxyType({"angles": 0.2})
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound by level times the greatest slope part plus the greatest hot spot within the sweeps."""
+        slope, hot = rig.sky.brdf_per_rad, rig.sky.hot_spot
+        if slope == 0 and hot == 0:
+            return Bound(0.0, "the scene reflects alike in all directions")
+        angle, phase = _extremes(probe.sweeps, rig.camera)
+        share = slope * angle + hot * float(np.exp(-phase / HOT_SPOT_RAD))
+        peak = f" and a hot spot of {hot:.2g}" if hot else ""
+        why = f"reflectance changes by at most {share:.2%}: {slope:.2g}/rad up to {np.rad2deg(angle):.2f} deg{peak}"
+        return Bound(probe.scaled(share), why)
+
+    def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        """Give the slope's ends, the hot spot on the upper one."""
+        slope, bands = rig.sky.brdf_per_rad, len(probe.wavelength_nm)
+        if not slope and not rig.sky.hot_spot:
+            return GainRange.between(1.0, 1.0, bands)
+        angle, phase = _extremes(probe.sweeps, rig.camera)
+        least = max(1 - slope * angle, 0.0)
+        greatest = 1 + slope * angle + rig.sky.hot_spot * float(np.exp(-phase / HOT_SPOT_RAD))
+        return GainRange.between(least, greatest, bands, uneven=greatest - least)
+
+    def gain(self, block: SweepBlock, variant: str) -> Light:
+        """Give (line, sample, 1)."""
+        sky = block.rig.sky
+        if sky.brdf_per_rad == 0 and sky.hot_spot == 0:
+            return np.ones((1, 1, 1), np.float32)
+        angle, phase = _angles(block.sweep, block.rig.camera, block.scan_px, block.slopes)
+        factor = 1 + sky.brdf_per_rad * angle
+        if sky.hot_spot:
+            factor = factor + sky.hot_spot * np.exp(-phase / HOT_SPOT_RAD)
+        return np.maximum(factor, 0.0)[..., None].astype(np.float32)
+
+
+BRDF = Brdf()
+
+
+def _angles(sweep: Sweep, camera: LineCamera, scan_px: Floats, slopes: Floats) -> tuple[Floats, Floats]:
+    """Angle of view along the scene's x axis and phase, (line, sample) each [rad]."""
+    along, scan = points_of_scan(sweep.strip_px, camera, scan_px[:, None], slopes)
+    x = along if sweep.along == "x" else scan
+    return np.arctan(x * camera.ifov_rad), np.arctan(np.hypot(along, scan) * camera.ifov_rad)
+
+
+def _extremes(sweeps: tuple[Sweep, ...], camera: LineCamera) -> tuple[float, float]:
+    """Greatest angle from the undeflected direction and least phase within the sweeps [rad]."""
+    greatest, least = 0.0, np.inf
+    for sweep in (sweep for sweep in sweeps if sweep.lines):
+        angle, phase = _angles(sweep, camera, *(_looks(part) for part in (sweep.line_px(), camera.pixel_slopes())))
+        steps = [np.abs(np.diff(phase, axis=axis)).max(initial=0.0) for axis in (0, 1)]
+        greatest = max(greatest, float(np.abs(angle).max()))
+        least = min(least, float(phase.min() - sum(steps) / 2))  # no point is further from one looked at
+    return greatest, max(least, 0.0)
+
+
+def _looks(values: Floats) -> Floats:
+    """Take some of them, with both ends."""
+    some: Floats = values[np.unique(np.linspace(0, len(values) - 1, _LOOKS).round().astype(int))]
+    return some

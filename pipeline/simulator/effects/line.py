@@ -1,0 +1,225 @@
+"""Where a line lies in the scene and what its samples cover: rotation, slit and pixel, motion smear."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, points_of_scan
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import OFF, Bound, Effect
+from pipeline.simulator.effects.mirror_path import beside_plan, greatest_lag_px, transient
+from pipeline.simulator.effects.mirror_pointing import at_line_ends, end_gains
+from pipeline.simulator.effects.moving_air import sway_gradient, turbulence_px
+from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.effects.relief import PARALLAX, greatest_share
+from pipeline.simulator.optics.rays import RayViews
+from pipeline.simulator.optics.tap_sums import Parts, fewest_parts
+from pipeline.simulator.optics.tap_tables import BETWEEN_ROWS, SCALE_STEP, TABULATED
+from pipeline.simulator.rig_model import Rig
+
+MARGIN = 1.5  # over what the probe measured at the roughest places found
+UPRIGHT = "1x1"  # the slit's variant of one box that does not lie turned
+_RAY_PER_TILT = 2.6  # a ray turns by twice the tilt; the scene plane is oblique to it by up to 30 deg
+Floats = NDArray[np.float64]
+_LOOKS = 33  # lines of a sweep and samples of a line at which its course is taken; both are smooth
+_COUNTED: dict[str, Parts] = {"9x3": (9, 3), "5x2": (5, 2), "3x1": (3, 1), UPRIGHT: (1, 1)}
+_STATED = {"1-percent": 0.01, "3-percent": 0.03}  # of the light that a sweep's boxes may misplace
+POSITIONS, FOLDED = "positions", "folded"
+
+
+def beside_plan_px(probe: Probe, rig: Rig) -> tuple[float, float]:
+    """Give how far beside its plan the rig may look by drift, hysteresis, jitter, turbulence and lag. [px]
+
+    Along the line and the scan. Lines lie turned by where the mirror looks: the farther from the middle, the more.
+    """
+    mirror, lines = rig.mirror, max(probe.lines, 1)
+    drift = mirror.drift_px_per_min / 60 * (probe.seconds + rig.camera.frame_ms * 1e-3)
+    jitter = _RAY_PER_TILT * mirror.repeatability_urad * 1e-6 / rig.camera.ifov_rad
+    drawn = (jitter + turbulence_px(rig)) * math.sqrt(2 * math.log(lines / 1e-3))
+    way = drift + mirror.hysteresis_px + drawn
+    return way, way + greatest_lag_px(rig, probe.sweeps)
+
+
+@dataclass(frozen=True)
+class Rotation(Effect):
+    """Line rotation and projective scale, by rays. Off, every line lies straight along its axis at nominal scale."""
+
+    name = "rotation"
+    cost_ns = MappingProxyType({"rays": 0.0})  # straight lines take as long
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound by slope times the greatest way between where rays meet the scene and where straight lines would."""
+        along, scan = _farthest(probe.sweeps, rig.camera, beside_plan_px(probe, rig))
+        most = f"{round(along, 9):.3g} px along and {round(scan, 9):.3g} px along the scan"
+        why = f"lines are turned and stretched by at most {most}"
+        # The footprint does not lie turned either: the same as one box that does not.
+        shape = MARGIN * probe.slit_errors.get(UPRIGHT, 0.0)
+        return Bound(probe.moved(along, scan) + shape, why)
+
+
+ROTATION = Rotation()
+
+
+def _farthest(sweeps: tuple[Sweep, ...], camera: LineCamera, beside: tuple[float, float]) -> tuple[float, float]:
+    """Greatest difference along the line and the scan over all sweeps, wherever the mirror may look. [px]"""
+    ways = [
+        _course(sweep, camera, (along, scan))
+        for sweep in sweeps
+        if sweep.lines
+        for along in {-beside[0], 0.0, beside[0]}
+        for scan in {-beside[1], 0.0, beside[1]}
+    ]
+    return (max(way[0] for way in ways), max(way[1] for way in ways)) if ways else (0.0, 0.0)
+
+
+def _course(sweep: Sweep, camera: LineCamera, beside: tuple[float, float]) -> tuple[float, float]:
+    slopes = camera.pixel_slopes()
+    slopes = slopes[np.unique(np.linspace(0, len(slopes) - 1, _LOOKS).round().astype(int))]
+    numbers = np.unique(np.linspace(0, sweep.lines - 1, _LOOKS).round().astype(int))
+    strip, scan = sweep.strip_px + beside[0], sweep.line_px()[numbers][:, None] + beside[1]
+    along_px, scan_px = points_of_scan(strip, camera, scan, slopes)
+    straight = strip + slopes / camera.ifov_rad
+    return float(np.abs(along_px - straight).max()), float(np.abs(scan_px - scan).max())
+
+
+@dataclass(frozen=True)
+class SlitBox(Effect):
+    """The footprint of slit and pixel. Off, a sample sees what its middle ray meets.
+
+    The box is in closed form over the scene's pixels, as long as it does not lie turned among them. Variants tell into
+    how many boxes that do not, across and along, it is parted; from two across on they have its covariance. Those of a
+    stated error take, for each sweep, as few as misplace no more of the light than that anywhere in the sweep.
+    """
+
+    name = "slit"
+    # Beside the rig's blurs, which need eleven kernels whatever the slit, at strips of +-960 px; at +-320 less of them.
+    cost_ns = MappingProxyType({"9x3": 38.0, "5x2": 10.0, "3x1": 1.8, "1-percent": 1.4, "3-percent": 1.3, UPRIGHT: 0.3})
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound by half as much again as the probe measured; where it has not, by the box's variance and the span.
+
+        How a variant errs depends on what the scene holds within the footprint, which no derivative of the image
+        behind it tells. It was measured beside the rig's blurs: leaving one out is bounded by itself, for any slit.
+        What is rounded in tables, and what lines turn more where the mirror looks beside its plan, add a little.
+        """
+        width, bands = rig.camera.slit_px, len(probe.wavelength_nm)
+        why = f"{_words(variant)} in place of a footprint {width:.2g} px wide and 1 px long"
+        box = np.array([[1.0], [width**2]]) / 12
+        whole = probe.blurred(np.repeat(box, bands, axis=1))
+        if variant not in probe.slit_errors:
+            return Bound(whole, why)
+        value = MARGIN * probe.slit_errors[variant]
+        if variant != OFF:
+            turned = max(beside_plan_px(probe, rig)) * rig.camera.ifov_rad * (width**2 + 1) / 12
+            value += probe.blurred(np.repeat(SCALE_STEP * box + BETWEEN_ROWS, bands, axis=1))
+            value += probe.blurred(np.full((2, bands), turned)) + TABULATED * float(probe.span.max(initial=0.0))
+        return Bound(value, f"{why}, measured where the scene is roughest")
+
+
+SLIT = SlitBox()
+
+
+def box_parts(variant: str, rig: Rig, views: RayViews) -> Parts:
+    """Give into how many boxes a variant parts the footprint, across and along, for views all over a sweep."""
+    if variant in _STATED:
+        return fewest_parts(_STATED[variant], box_of(variant, rig), views)
+    return _COUNTED.get(variant, (1, 1))
+
+
+def box_of(variant: str, rig: Rig) -> tuple[float, float]:
+    """Give the widths of slit and pixel; 0 where the footprint is off. [px]"""
+    return (0.0, 0.0) if variant == OFF else (rig.camera.slit_px, 1.0)
+
+
+def _words(variant: str) -> str:
+    if variant == OFF:
+        return "its middle ray"
+    if variant in _STATED:
+        return f"boxes that are not turned and misplace at most {_STATED[variant]:.0%} of the light"
+    return f"{variant.replace('x', ' x ')} boxes that are not turned"
+
+
+@dataclass(frozen=True)
+class Smear(Effect):
+    """The positions held within an exposure while the mirror moves on. Off, it stands at mid exposure.
+
+    ``folded`` takes them into the footprint, as if all lines of an exposure lay as its middle one does.
+    """
+
+    name = "smear"
+    cost_ns = MappingProxyType({POSITIONS: 15.0, FOLDED: 5.2})
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound what a blur of the positions' variance changes; 0 where every line has one position.
+
+        They vary as the mirror runs: without them its course within an exposure is left out as well.
+        """
+        most = max((sweep.step for sweep in probe.sweeps), default=1)
+        variance = (most**2 - 1) / 12  # of positions 1 px apart
+        if variance == 0:
+            return Bound(0.0, "the mirror stands still while a line is exposed")
+        if variant == FOLDED:
+            along, scan = _beside(probe.sweeps, rig)
+            along, scan = along + sway_gradient(rig), scan + sway_gradient(rig) + greatest_share(rig.air)
+            way, area = np.abs(np.arange(most) - (most - 1) / 2).mean(), 2 * variance
+            by_scan = np.minimum(probe.slope[1] * way, probe.curvature[1] * area) * scan
+            course = at_line_ends(probe.sweeps, rig.camera, 0.0, _uneven_course(probe.sweeps, rig))
+            by_course = probe.slope[0] * course[0] + probe.slope[1] * course[1]
+            change = np.minimum(probe.slope[0] * way * along + by_scan + by_course, probe.span)
+            # at a step of the relief up to half of the positions see the other depth, at most twice as far off
+            step = PARALLAX.bound(probe, rig).value if rig.air.relief == "step" else 0.0
+            return Bound(float(change.max(initial=0.0)) + step, f"lines of an exposure lie as one, {most} px")
+        both = np.zeros(probe.slope.shape)
+        both[1] = max(variance, _greatest_variance(probe.sweeps, rig))
+        return Bound(probe.blurred(both), f"the mirror moves {most} px in an exposure")
+
+
+SMEAR = Smear()
+
+
+def _uneven_course(sweeps: tuple[Sweep, ...], rig: Rig) -> float:
+    """Greatest mean way of held positions from where the mirror's mean in the exposure would have them. [px]"""
+    uneven = (np.abs(ways - ways.mean(axis=1, keepdims=True)).mean(axis=1) for ways in _courses(sweeps, rig))
+    return max((float(one.max()) for one in uneven), default=0.0)
+
+
+def _greatest_variance(sweeps: tuple[Sweep, ...], rig: Rig) -> float:
+    """Greatest variance of the positions of an exposure as the mirror runs, not as planned. [px^2]"""
+    held = ((ways + np.arange(ways.shape[1])).var(axis=1) for ways in _courses(sweeps, rig))
+    return max((float(one.max()) for one in held), default=0.0)
+
+
+def _courses(sweeps: tuple[Sweep, ...], rig: Rig) -> Iterator[Floats]:
+    """Ways of held positions beside their plan, (line, step), of each kind of sweep that has several. [px]"""
+    for sweep in {(one.lines, one.step): one for one in sweeps if one.lines and one.step > 1}.values():
+        numbers = np.arange(sweep.lines)
+        yield transient(rig, sweep, numbers) + beside_plan(rig.mirror.positions_per_line, sweep.step, numbers)
+
+
+def smeared_positions(block: SweepBlock, variant: str) -> Floats:
+    """Give the mirror positions (line, step, 2) at which a footprint stands in an exposure."""
+    if variant == POSITIONS and block.sweep.step > 1:
+        return block.positions
+    return block.middle[:, None]
+
+
+def folded_positions(sweep: Sweep, variant: str) -> int:
+    """Give how many held positions the footprint itself holds, 1 px apart along the scan."""
+    return sweep.step if variant == FOLDED else 1
+
+
+def _beside(sweeps: tuple[Sweep, ...], rig: Rig) -> tuple[float, float]:
+    """Greatest way beside its place, along the line and the scan, of any point per px that the line's centre moves."""
+    found = np.zeros(2)
+    for sweep in sweeps:
+        if sweep.lines and sweep.step > 1:
+            moved = end_gains(sweep, rig.camera)[..., 1] - [0.0, 1.0]
+            found = np.maximum(found, np.abs(moved).max(axis=(0, 1)))
+    return float(found[0]), float(found[1])

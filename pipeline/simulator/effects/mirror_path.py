@@ -1,0 +1,290 @@
+"""How the mirror follows its commands: the staircase of the vector memory, and lag and overshoot."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from fractions import Fraction
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.scan import Sweep
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import OFF, Aim, Bound
+from pipeline.simulator.effects.mirror_pointing import at_line_ends
+from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.rig_model import MirrorMotion, Rig
+
+Floats = NDArray[np.float64]
+EXACT, CENTRES, EULER = "exact", "centres", "euler"
+MOST_PARTS = 8  # of an exposure; a jump of h px within a part goes unseen as a blur of at most h^2/32 px^2
+_SERIES_BELOW = 0.5  # of (1 + 2 zeta) tau; 20 terms then leave less than 1e-20
+_TERMS = 20
+_RAMP = 64  # steps of a line that are as good as a ramp
+
+
+@dataclass(frozen=True)
+class Staircase(Aim):
+    """Sample and hold with any number of positions per px of path. Off, each px of the path has its one position.
+
+    The memory is played at a steady rate while lines are exposed and stands still while they are read out; it is
+    timed so that in the long run lines lie where they are planned. ``exact`` gives the mean position in equal parts of
+    the exposure, chosen so that no position changes within a part wherever :data:`MOST_PARTS` are enough; ``centres``
+    gives the mean of the whole exposure. A line that holds several px of path has one part for each in either variant.
+    """
+
+    name = "staircase"
+    cost_ns = MappingProxyType({EXACT: 18.0, CENTRES: 0.01})  # exact: five positions a line instead of one
+
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
+        """Give how far beside the plan the mirror stands, (line, part, 2) along the line and the scan. [px]"""
+        positions = block.rig.mirror.positions_per_line
+        scan = beside_plan(positions, block.sweep.step, block.numbers, _parts(positions, block.sweep.step, variant))
+        return np.stack([np.zeros_like(scan), scan], axis=-1)
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound by what a shift of the mean and a blur of the second moment change, or slope times the mean way."""
+        positions = rig.mirror.positions_per_line
+        if positions == 1 or not probe.sweeps:
+            return Bound(0.0, "each px of the path has its one position")
+        mean, size, square = _moments(positions, probe.sweeps, variant)
+        both = np.zeros(probe.slope.shape)
+        ends = [at_line_ends(probe.sweeps, rig.camera, 0.0, way) for way in (size, mean, square**0.5)]
+        both[:] = np.square(ends[2])[:, None]
+        value = min(probe.moved(*ends[0]), probe.moved(*ends[1]) + probe.blurred(both))
+        return Bound(value, f"lines lie up to {mean:.3f} px off, held positions {square**0.5:.2f} px rms")
+
+
+STAIRCASE = Staircase()
+
+
+def beside_plan(positions: float, step: int, numbers: NDArray[np.int64], parts: int = 1) -> Floats:
+    """Give the mean position less the planned one in each part of each held px of path, (line, step * parts). [px]
+
+    Held positions are ``1 / positions`` px apart. Within a time t, counted in px of path, the mirror lags the ramp by
+    frac(positions * t) / positions; what that has of its mean is the result.
+    """
+    edges = np.arange(step * parts + 1) / parts
+    place = positions * (numbers[:, None] * float(step) + edges)
+    whole = np.floor(place)
+    part = place - whole
+    # Integral of frac: one half for each whole, and half the square of the rest.
+    area = np.diff(whole, axis=1) / 2 + np.diff(part**2, axis=1) / 2
+    lag = area * parts / positions
+    middle = np.tile((np.arange(parts) + 0.5) / parts - 0.5, step)
+    shift: Floats = middle + (0.5 - lag) / positions
+    return shift
+
+
+def _parts(positions: float, step: int, variant: str) -> int:
+    """Equal parts of an exposure; positions a / b change at multiples of 1 / a of it."""
+    if variant == CENTRES or step > 1:
+        return 1
+    ratio = Fraction(positions).limit_denominator(1000)
+    return min(ratio.numerator, MOST_PARTS) if abs(ratio - Fraction(positions)) < 1e-9 else MOST_PARTS
+
+
+def _moments(positions: float, sweeps: tuple[Sweep, ...], variant: str) -> tuple[float, float, float]:
+    """Greatest mean way, mean size of the way and mean square of it over all lines, beside the plan or a variant."""
+    worst = np.zeros(3)
+    for step in {sweep.step for sweep in sweeps}:
+        numbers = np.arange(max(sweep.lines for sweep in sweeps if sweep.step == step))
+        ways = beside_plan(positions, step, numbers, _parts(positions, step, EXACT))
+        if variant == CENTRES:
+            ways = ways - (ways.mean(axis=1, keepdims=True) if step == 1 else ways)
+        size = np.abs(ways).mean(axis=1)
+        # Ways of the several px of a line meet slopes of their own: they do not cancel.
+        mean = np.abs(ways.mean(axis=1)) if step == 1 else size
+        worst = np.maximum(worst, [one.max(initial=0.0) for one in (mean, size, (ways**2).mean(axis=1))])
+    return float(worst[0]), float(worst[1]), float(worst[2])
+
+
+@dataclass(frozen=True)
+class Lag(Aim):
+    """Mirror lag and overshoot: what is left of the start of a sweep, as the mean shift over each held position.
+
+    The mirror follows its commands as a second-order system. One that has long been moving at a steady rate lies a
+    steady way behind, which calibration takes away. What is left is the difference of a mirror that starts from rest to
+    that steady one: a free oscillation that dies out, exactly known at any time; x'' + 2 zeta x' + x = 0 in units of
+    1 / natural frequency.
+
+    Before a sweep the mirror has flown back along the scan by the sweep's length, has had ``settled_s`` to come to
+    rest one held position ahead of the first, and takes the first step as line 0 begins. Moves along the line, between
+    strips, are taken for no longer. Smear within a held position is left to the smear's own effect. ``euler`` takes
+    one implicit Euler step for each held position: stable at any step, right only where lines are short.
+    """
+
+    name = "lag"
+    cost_ns = MappingProxyType({EXACT: 0.15, EULER: 0.12})
+
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
+        """Give the shift, (line, step, 2) along the line and the scan. [px]"""
+        scan = transient(block.rig, block.sweep, block.numbers, variant)
+        return np.stack([np.zeros_like(scan), scan], axis=-1)
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound by slope times the greatest shift of any line, or times the greatest difference of the variants."""
+        worst = greatest_lag_px(rig, probe.sweeps, variant)
+        moved = at_line_ends(probe.sweeps, rig.camera, 0.0, worst)
+        pace = f"{rig.camera.frame_ms:g} ms a line, {rig.mirror.natural_hz:g} Hz"
+        why = f"while the mirror gets up to speed ({pace})" if variant == OFF else "where a coarse integration has them"
+        return Bound(probe.moved(*moved), f"lines lie up to {worst:.2g} px off {why}")
+
+
+LAG = Lag()
+
+
+def greatest_lag_px(rig: Rig, sweeps: Iterable[Sweep], variant: str = OFF) -> float:
+    """Give the greatest shift along the scan of any line, or the greatest difference of a variant to the exact one."""
+    worst = 0.0
+    for sweep in {(one.lines, one.step): one for one in sweeps if one.lines}.values():
+        numbers = np.arange(sweep.lines)
+        off = transient(rig, sweep, numbers, EXACT)
+        if variant == EULER:
+            off = off - transient(rig, sweep, numbers, EULER)
+        worst = max(worst, float(np.abs(off).mean(axis=1).max()))
+    return worst
+
+
+def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64], variant: str = EXACT) -> Floats:
+    """Give the mean shift along the scan over each held position of some lines, (line, step). [px]"""
+    camera, mirror = rig.camera, rig.mirror
+    pace = 2 * math.pi * mirror.natural_hz * 1e-3  # [1/ms]
+    period, held = pace * camera.frame_ms, pace * camera.exposure_ms / sweep.step
+    start = _at_start(mirror, sweep, period, held)
+    if variant == EULER:
+        return _euler(mirror.damping, start, numbers, (period, held, sweep.step))
+    time = numbers[:, None] * period + np.arange(sweep.step) * held
+    impulse, rise = responses(time, mirror.damping)
+    place = start[0] * (1 - rise) + start[1] * impulse
+    rate = -start[0] * impulse + start[1] * (1 - rise - 2 * mirror.damping * impulse)
+    return _mean_over(held, mirror.damping, place, rate)
+
+
+def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
+    """Give the responses to a unit impulse and to a unit step, of a system with natural frequency 1 rad/s.
+
+    The matrix exponential of the free system over ``time`` is [[1 - h, g], [-g, 1 - h - 2 zeta g]] with g the first
+    and h the second. By expm1 and sinc they are right below, at and above damping 1, and at any time from 0 on.
+
+    Parameters
+    ----------
+    time
+        (...) times the natural frequency. [rad]
+    """
+    impulse = _impulse(time, damping)
+    with np.errstate(under="ignore"):
+        if damping <= 1:
+            turn = math.sqrt((1 - damping) * (1 + damping)) * time
+            rest = np.exp(-damping * time) * np.cos(turn) + damping * impulse
+        else:
+            slow = _slow_rate(damping)
+            rest = np.exp(-slow * time) + slow * impulse
+    early = time * (1 + 2 * damping) < _SERIES_BELOW
+    return impulse, np.where(early, _early_rise(np.where(early, time, 0.0), damping), 1 - rest)
+
+
+def _impulse(time: Floats, damping: float) -> Floats:
+    with np.errstate(under="ignore"):
+        if damping <= 1:
+            turn = math.sqrt((1 - damping) * (1 + damping)) * time
+            wave: Floats = np.exp(-damping * time) * time * np.sinc(turn / np.pi)
+            return wave
+        apart = 2 * math.sqrt((damping - 1) * (damping + 1)) * time
+        share = np.where(apart > 0, -np.expm1(-apart) / np.where(apart > 0, apart, 1.0), 1.0)
+        decay: Floats = np.exp(-_slow_rate(damping) * time) * time * share
+        return decay
+
+
+def _slow_rate(damping: float) -> float:
+    """The smaller of the two rates of an overdamped system, zeta - sqrt(zeta^2 - 1) without its cancellation."""
+    return 1 / (damping + math.sqrt((damping - 1) * (damping + 1)))
+
+
+def _early_rise(time: Floats, damping: float) -> Floats:
+    """The step response by its Taylor series, from h'' + 2 zeta h' + h = 1: where 1 - rest would cancel."""
+    before, term = np.zeros_like(time), time**2 / 2
+    total = term.copy()
+    for order in range(3, _TERMS):
+        before, term = term, -(2 * damping * time * term + time**2 / (order - 1) * before) / order
+        total += term
+    return total
+
+
+def _at_start(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> Floats:
+    """State (place [px], rate) as line 0 begins: at rest, less steady motion; and what is left of the way back.
+
+    A mirror in steady motion has the errors of all steps before: a geometric series over lines, I - exp(A period) its
+    denominator, whose determinant h^2 + 2 zeta h g + g^2 is a sum.
+    """
+    damping = mirror.damping
+    times, height, every = _steps(mirror, sweep, period, held)
+    impulse, rise = responses(times, damping)
+    place, rate = height * float((1 - rise).sum()), -height * float(impulse.sum())
+    g, h = (one.item() for one in responses(np.array([every]), damping))
+    size = h * h + 2 * damping * h * g + g * g
+    steady = np.array([(h + 2 * damping * g) * place + g * rate, -g * place + h * rate]) / size
+    flown = float(sweep.lines * sweep.step)
+    settled = np.array([2 * math.pi * mirror.natural_hz * mirror.settled_s])
+    g, h = (one.item() for one in responses(settled, damping))
+    start: Floats = steady + flown * np.array([1 - h, -g])
+    return start
+
+
+def _steps(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> tuple[Floats, float, float]:
+    """Times from the steps of one pattern before the sweep to its start, the steps' height, the pattern's length.
+
+    A pattern is a line with its number of positions, rounded, or one position that is held for several lines.
+    """
+    wanted = mirror.positions_per_line * sweep.step
+    if wanted < 1:
+        return np.array([period / wanted]), sweep.step / wanted, period / wanted
+    count = min(max(round(wanted), 1), _RAMP)
+    exposed = held * sweep.step
+    return period - np.arange(count) * exposed / count, sweep.step / count, period
+
+
+def _mean_over(held: float, damping: float, place: Floats, rate: Floats) -> Floats:
+    """Mean of the free oscillation over a time, from its state at the beginning."""
+    if held == 0:
+        return place
+    impulse, rise = responses(np.array([held]), damping)
+    mean: Floats = (place * (impulse + 2 * damping * rise) + rate * rise) / held
+    return mean
+
+
+def _euler(damping: float, start: Floats, numbers: NDArray[np.int64], pace: tuple[float, float, int]) -> Floats:
+    """The same by implicit Euler steps, one for each held position and one for the readout."""
+    period, held, step = pace
+    one, rest = _euler_step(damping, held), _euler_step(damping, max(period - held * step, 0.0))
+    state = _advance(rest @ np.linalg.matrix_power(one, step), start, numbers)
+    means = []
+    for _ in range(step):
+        following = _times(one, *state)
+        means.append((state[0] + following[0]) / 2)
+        state = following
+    return np.stack(means, axis=1)
+
+
+def _euler_step(damping: float, time: float) -> Floats:
+    return np.linalg.inv(np.array([[1.0, -time], [time, 1 + 2 * damping * time]]))
+
+
+def _advance(matrix: Floats, start: Floats, numbers: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """State after so many steps each, by repeated squaring: the same whichever other numbers are asked for."""
+    state = np.full(len(numbers), start[0]), np.full(len(numbers), start[1])
+    left = numbers.copy()
+    while left.any():
+        moved = _times(matrix, *state)
+        odd = left % 2 == 1
+        state = np.where(odd, moved[0], state[0]), np.where(odd, moved[1], state[1])
+        matrix, left = matrix @ matrix, left // 2
+    return state
+
+
+def _times(matrix: Floats, place: Floats, rate: Floats) -> tuple[Floats, Floats]:
+    """A 2 x 2 matrix times states, written out: a library's product may round by the number of states."""
+    return matrix[0, 0] * place + matrix[0, 1] * rate, matrix[1, 0] * place + matrix[1, 1] * rate

@@ -1,0 +1,280 @@
+"""What the spectrograph does to spectra: bands wider than the scene's own, and smile."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import Bound, LightChange
+from pipeline.simulator.effects.gain_range import difference_rates, rising_gaps, rising_runs
+from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.rig_model import Rig
+
+Floats = NDArray[np.float64]
+Light = NDArray[np.float32]
+EXACT = "exact"
+FWHM2_PER_VARIANCE = 8 * math.log(2)
+BANDS_AT_ONCE = 32  # bands that one product makes
+LEAST_WEIGHT = 1e-8
+REACH_SD = 6.0  # the kernel's weight beyond it is below 1e-8
+CUBIC, LINEAR = "cubic", "linear"
+SAMPLES_AT_ONCE = 32  # samples at a time: they stay in the processor's cache
+
+
+class BandGroup(NamedTuple):
+    """Bands ``made`` are the bands ``taken`` times ``weights`` (taken, made)."""
+
+    made: slice
+    taken: slice
+    weights: Light
+
+
+@dataclass(frozen=True)
+class Response(LightChange):
+    """Each band is averaged over its neighbours so that variances add up to the rig's: fwhm_rig^2 - fwhm_scene^2.
+
+    ``exact`` is the heat kernel exp(v/2 D) of the bands' second divided difference D: no weight below 0, sum 1, mean 0
+    and variance v exactly, on bands at any distance. The first and the last band keep their light: what lies beyond
+    is not known.
+    """
+
+    name = "response"
+    cost_ns = MappingProxyType({EXACT: 2.2})
+    whole_line = True  # a product's rounding depends on how many samples it has: a line is made whole, then cut
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound it by I'' v / 2, or by I' sqrt(v) where that is less; 0 where the scene's bands are as wide.
+
+        The kernel solves a heat equation: the change is the mean of D I over the time v / 2, so the bound holds on any
+        spectrum.
+        """
+        wavelength = np.asarray(probe.wavelength_nm, np.float64)
+        variance = missing_variance(rig.optics.fwhm_nm, probe.fwhm_nm, len(wavelength))
+        if not variance.any():
+            return Bound(0.0, _why_nothing(probe, rig))
+        near = np.abs(wavelength[:, None] - wavelength) <= REACH_SD * np.sqrt(variance)[:, None]
+        curved = np.where(near, probe.spectral_curvature, 0).max(axis=1) * variance / 2
+        steep = np.where(near, probe.spectral_slope, 0).max(axis=1) * np.sqrt(variance)
+        sd, known = float(np.sqrt(variance.max())), probe.fwhm_nm
+        why = f"bands widen from {0.0 if known is None else np.nanmin(known):.3g} to {rig.optics.fwhm_nm:.3g} nm"
+        return Bound(float(np.minimum(curved, steep).max()), f"{why}: {sd:.2g} nm sd more")
+
+    def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
+        """Give the light of a block in the rig's bands."""
+        return widen_bands(light, block.wavelength_nm, block.fwhm_nm, block.rig.optics.fwhm_nm)
+
+
+RESPONSE = Response()
+
+
+def widen_bands(spectra: Light, wavelength_nm: Floats, fwhm_nm: Floats | None, wanted_nm: float) -> Light:
+    """Give spectra as bands of width ``wanted_nm`` see them; any linear measure of light, (..., band).
+
+    Factors of light serve as well as light: (component, band) electrons.
+
+    Parameters
+    ----------
+    wavelength_nm, fwhm_nm
+        (band,) centres, and widths of the spectra's own bands; None or NaN where not known, and then nothing is done.
+
+    Returns
+    -------
+    Array of the same shape and type; ``spectra`` itself where its bands are all as wide already.
+    """
+    variance = missing_variance(wanted_nm, fwhm_nm, spectra.shape[-1])
+    if not variance.any():
+        return spectra
+    out = np.empty_like(spectra)
+    for made, taken, weights in _band_groups(tuple(map(float, wavelength_nm)), tuple(map(float, variance))):
+        np.matmul(spectra[..., taken], weights.astype(spectra.dtype, copy=False), out=out[..., made])
+    return out
+
+
+def missing_variance(wanted_nm: float, fwhm_nm: Floats | None, bands: int) -> Floats:
+    """Give the variance that Gaussian bands lack to be ``wanted_nm`` wide, (band,); 0 where not known. [nm^2]"""
+    if fwhm_nm is None:
+        return np.zeros(bands)
+    widths = np.nan_to_num(np.asarray(fwhm_nm, np.float64), nan=np.inf, posinf=np.inf)
+    return np.maximum(wanted_nm**2 - np.minimum(widths, wanted_nm) ** 2, 0) / FWHM2_PER_VARIANCE
+
+
+@lru_cache(maxsize=8)
+def _band_groups(wavelength_nm: tuple[float, ...], variance: tuple[float, ...]) -> tuple[BandGroup, ...]:
+    """Cut the kernel into products of few bands each: most of its weights are 0."""
+    kernel = np.zeros((len(wavelength_nm), len(wavelength_nm)))
+    for run in rising_runs(np.array(wavelength_nm)):
+        kernel[run, run] = _heat_kernel(np.array(wavelength_nm[run]), np.array(variance[run]))
+    groups = []
+    for start in range(0, len(kernel), BANDS_AT_ONCE):
+        made = slice(start, min(start + BANDS_AT_ONCE, len(kernel)))
+        used = np.flatnonzero((np.abs(kernel[made]) > LEAST_WEIGHT).any(axis=0))
+        taken = slice(int(used[0]), int(used[-1]) + 1)
+        groups.append(BandGroup(made, taken, np.ascontiguousarray(kernel[made, taken].T, dtype=np.float32)))
+    return tuple(groups)
+
+
+def _heat_kernel(wavelength_nm: Floats, variance: Floats) -> Floats:
+    """Rows of exp(v/2 D), (band, band), each with its own variance v.
+
+    D leaves straight lines and both ends as they are. So a spectrum is parted into the line through its ends, which
+    stays, and a rest that is 0 there; on the rest D is a symmetric matrix after scaling by the root of the gaps.
+    """
+    bands = len(wavelength_nm)
+    if bands < 3:
+        return np.eye(bands)
+    from scipy.linalg import eigh_tridiagonal
+
+    gaps = np.diff(wavelength_nm)
+    root = np.sqrt((gaps[:-1] + gaps[1:]) / 2)
+    rate, mode = eigh_tridiagonal(-(1 / gaps[:-1] + 1 / gaps[1:]) / root**2, 1 / gaps[1:-1] / root[:-1] / root[1:])
+    grown = np.exp(np.minimum(rate, 0) * variance[1:-1, None] / 2) * (mode / root[:, None])
+    inner = grown @ (mode * root[:, None]).T
+    place = (wavelength_nm - wavelength_nm[0]) / (wavelength_nm[-1] - wavelength_nm[0])
+    kernel = np.eye(bands)
+    kernel[1:-1, 1:-1] = inner
+    kernel[1:-1, 0] = 1 - place[1:-1] - inner @ (1 - place[1:-1])
+    kernel[1:-1, -1] = place[1:-1] - inner @ place[1:-1]
+    return kernel
+
+
+def _why_nothing(probe: Probe, rig: Rig) -> str:
+    if probe.fwhm_nm is None or not np.isfinite(probe.fwhm_nm).any():
+        return "the width of the scene's bands is not known; they are taken as they are"
+    return f"the scene's bands are {rig.optics.fwhm_nm:g} nm wide already, or wider"
+
+
+@dataclass(frozen=True)
+class Smile(LightChange):
+    """A sample records in band b the light of wavelength lambda_b + s, s = smile_nm (u / u_end)^2.
+
+    u is the sample's way from the line's centre: s is 0 there and ``smile_nm`` at both ends. Above 0 the ends see
+    longer wavelengths than their bands are called, below 0 shorter ones (a frown). Spectra are interpolated by cubics
+    with slopes of second order, or by straight lines, and never beyond the scene's first and last band.
+    """
+
+    name = "smile"
+    within_spectra = True  # a factor of a whole spectrum passes through
+    cost_ns = MappingProxyType({CUBIC: 0.9, LINEAR: 0.5})
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound it by I' s, and a cubic beside its chord by I'' s (h - s) / 2 in a gap h between bands."""
+        wavelength = np.asarray(probe.wavelength_nm, np.float64)
+        shift = abs(rig.optics.smile_nm)
+        if shift == 0:
+            return Bound(0.0, "the slit's image is straight")
+        gaps = rising_gaps(wavelength)
+        if not gaps.size:
+            return Bound(0.0, "no two bands of rising wavelength: a shift of wavelengths shows on no single band")
+        bent = _most_bent(shift, wavelength, probe.spectral_curvature)
+        if variant == LINEAR:
+            return Bound(bent, f"{shift:.3g} nm at a line's ends, between bands {gaps.max():.3g} nm apart by lines")
+        steep = float(np.max(probe.spectral_slope, initial=0))
+        why = f"{shift:.3g} nm at a line's ends, on spectra of at most {steep:.3g} {probe.unit}/nm"
+        # No slope of the cubic at a band is above the steepest: it adds at most 2 t (1 - t) to the way, t = s / h.
+        part = min(shift / float(gaps.min()), 0.5)
+        return Bound(steep * shift + min(bent, steep * shift * 2 * part * (1 - part)), why)
+
+    def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
+        """Give the light at the wavelengths that each sample sees."""
+        camera, smile = block.rig.camera, block.rig.optics.smile_nm
+        if smile == 0 or light.shape[-1] < 2:
+            return light
+        bands = tuple(map(float, block.wavelength_nm))
+        first, weights = _tap_weights(bands, float(smile), camera.samples, variant)
+        if block.samples is not None:
+            weights = np.take(weights, block.columns, axis=1)
+        out = np.empty_like(light)
+        for start in range(0, light.shape[1], SAMPLES_AT_ONCE):
+            some = slice(start, start + SAMPLES_AT_ONCE)
+            _mix_bands(light[:, some], out[:, some], first, weights[:, some])
+        return out
+
+
+SMILE = Smile()
+
+
+def wavelength_shift(samples: int, smile_nm: float) -> Floats:
+    """Give by how much longer the wavelength of each sample is than its band's, (sample,). [nm]"""
+    half = (samples - 1) / 2
+    if half == 0:
+        return np.zeros(samples)
+    return np.asarray(smile_nm * ((np.arange(samples) - half) / half) ** 2, np.float64)
+
+
+def _mix_bands(light: Light, made: Light, first: int, weights: Light) -> None:
+    """Sum shifted bands times weights into ``made``: tap k takes band b + first + k for band b."""
+    import torch
+
+    bands, (from_light, into, shares) = light.shape[-1], map(torch.from_numpy, (light, made, weights))
+    torch.mul(from_light, shares[-first], out=into)
+    for tap, share in enumerate(shares, start=first):
+        if tap != 0:  # one pass over the light, not a product and a sum
+            low, high = max(0, -tap), bands - max(0, tap)
+            into[..., low:high].addcmul_(from_light[..., low + tap : high + tap], share[:, low:high])
+
+
+@lru_cache(maxsize=4)
+def _tap_weights(
+    wavelength_nm: tuple[float, ...], smile_nm: float, samples: int, variant: str
+) -> tuple[int, NDArray[np.float32]]:
+    """Give the offset of the first tap and the weights of all, (tap, sample, band)."""
+    wavelength, shift = np.array(wavelength_nm), wavelength_shift(samples, smile_nm)
+    taps: list[tuple[slice, NDArray[np.int64], Floats]] = []
+    for run in rising_runs(wavelength):
+        if run.stop - run.start > 1:
+            taps += [(run, off, weight) for off, weight in _run_taps(wavelength[run], shift, variant)]
+    first = min((int(off.min()) for _, off, _ in taps), default=0)
+    last = max((int(off.max()) for _, off, _ in taps), default=0)
+    first, last = min(first, 0), max(last, 0)
+    weights = np.zeros((last - first + 1, samples, len(wavelength)))
+    weights[-first] = 1
+    sample = np.arange(samples)[:, None]
+    for run in {run.start: run for run, _, _ in taps}.values():
+        weights[-first, :, run] = 0
+    for run, off, weight in taps:
+        weights[off - first, sample, np.arange(run.start, run.stop)] += weight
+    used = np.flatnonzero(weights.any(axis=(1, 2)))
+    low, high = min(used[0], -first), max(used[-1], -first)
+    return first + int(low), weights[low : high + 1].astype(np.float32)
+
+
+def _run_taps(wavelength: Floats, shift: Floats, variant: str) -> list[tuple[NDArray[np.int64], Floats]]:
+    """Taps of one run of rising wavelengths: which band beside its own, and how much of it, (sample, band) each."""
+    wanted = np.clip(wavelength + shift[:, None], wavelength[0], wavelength[-1])
+    gap = np.clip(np.searchsorted(wavelength, wanted, side="right") - 1, 0, len(wavelength) - 2)
+    width = np.diff(wavelength)[gap]
+    t = (wanted - wavelength[gap]) / width
+    here = gap - np.arange(len(wavelength))
+    near, far = 1 - t, t
+    if variant == LINEAR:
+        return [(here, near), (here + 1, far)]
+    # A cubic with these slopes lies beside its chord by -h^2/2 t (1-t) [(1-t) D I_near + t D I_far].
+    down, up = difference_rates(wavelength)
+    bend_near, bend_far = -(width**2) / 2 * t * (1 - t) * np.stack([1 - t, t])
+    after = gap + 1
+    taps = [
+        (here - 1, bend_near * down[gap]),
+        (here, near - bend_near * (down + up)[gap] + bend_far * down[after]),
+        (here + 1, far + bend_near * up[gap] - bend_far * (down + up)[after]),
+        (here + 2, bend_far * up[after]),
+    ]
+    size = len(wavelength) - 1 - np.arange(len(wavelength))
+    return [(np.clip(off, -np.arange(len(wavelength)), size), weight) for off, weight in taps]
+
+
+def _most_bent(shift: float, wavelength: Floats, bend: Floats) -> float:
+    """Greatest distance of a cubic from its chord on the way of a shift: that way times the rest of the gap, over 2."""
+    gaps = np.diff(wavelength)
+    rising = gaps > 0
+    part = np.minimum(shift, gaps / 2)
+    beside = np.maximum(bend[:-1], bend[1:])
+    if shift > gaps[rising].min():  # bands see gaps that are not next to them
+        beside = np.full_like(beside, bend.max())
+    return float((part * (gaps - part) * beside)[rising].max()) / 2

@@ -1,0 +1,1 @@
+"""Rays, footprints and the weights by which samples see a scene."""

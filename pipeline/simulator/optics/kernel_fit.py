@@ -1,0 +1,275 @@
+"""Few kernels for all bands: Gaussians, none of which counts below 0, whose sums pass waves as each band's blurs do.
+
+Bands differ in shift and width, smoothly, and the pattern of the pupil has rings and far tails. Sums of Gaussians of a
+ladder of sizes, at a few of the bands' shifts, stand for all of them. What a sum passes of a wave is compared with the
+optical transfer function, behind the footprint of slit, pixel and scene; no kernel, and so no light, is negative.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.simulator.optics.rays import pupil_contrast
+
+Floats = NDArray[np.float64]
+Transfer = NDArray[np.complex128]
+NEGLIGIBLE = 1.5e-3  # of a wave's amplitude, that kernels may pass too much or too little: .07 sigma of a full well's
+THINNED = 5 / 6  # variance that a thinned scene gains, over what its pixels' size squared grows
+_SHARPEST = 0.16  # least size on the ladder, over the wave's: 0.4 is the core of the pattern
+_RATIOS = (4.1, 2.6, 1.9)  # of sizes on the ladder's lower part
+_SMOOTH = 0.14  # variance of what looks at a level, beyond that [px^2 of it]: images are then too faint to tell
+_FARTHEST = 64  # px, or waves: the widest Gaussian
+_SHIFTED_PX = (0.5, 2.0)  # sizes above which the ends of the bands' shifts are enough, and one shift
+_NODES = (1, 2, 3, 4, 6, 8, 12, 16)  # along the curve of the bands' moments
+_MOST_NODES = 8  # beside a pupil's ladder
+_ENOUGH = 1.25  # times the least error: of what comes near it, the fewest kernels are taken
+_OWN = 4  # bands at most that have a kernel each, where there is no diffraction
+_JUDGED = 9  # bands on which a choice of kernels is judged
+_FITTED = (2, 3, 5, 7, 9, 13, 17, 25, 33, 65)  # bands that are fitted: the others are between two of them
+_LESS = 0.09  # of the square of the nodes' steps, by which each is narrower
+_SUM = 30.0  # weight of the sum of 1 in the fit
+_RADII = np.concatenate([np.geomspace(0.002, 0.1, 10), np.linspace(0.13, 1.3, 18)])  # waves [1/px]
+_TURNS = (np.arange(8) + 0.5) * np.pi / 8
+_ALONG = np.concatenate([np.outer(_RADII, np.cos(_TURNS)).ravel(), _RADII, 0 * _RADII])
+_SCAN = np.concatenate([np.outer(_RADII, np.sin(_TURNS)).ravel(), 0 * _RADII, _RADII])
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Gaussians, (2, kernel) shift and variance, and the level at which each looks: 1, or every ``level``-th pixel."""
+
+    shift: Floats
+    variance: Floats
+    level: NDArray[np.intp]
+
+    def some(self, which: list[int]) -> Kernels:
+        """Some of them."""
+        return Kernels(self.shift[:, which], self.variance[:, which], self.level[which])
+
+
+def fit_kernels(blurs: Moments, box: tuple[float, float], held: int) -> tuple[Kernels, Floats, Floats]:
+    """Choose kernels for the blurs of all bands, and how much each counts in every band.
+
+    Parameters
+    ----------
+    blurs
+        All of them together.
+    box
+        Widths of slit and pixel, across and along; 0 for none. [px]
+    held
+        Positions 1 px apart along the scan.
+
+    Returns
+    -------
+    The fewest that change no wave of any band by more than `NEGLIGIBLE` of its amplitude, or the best that were tried;
+    (kernel, node) shares of some bands, and (node, band) between which two nodes each band lies. None of the shares is
+    below 0, and they sum to 1.
+    """
+    waves = blurs.waves if blurs.waves is not None and blurs.waves.any() else np.zeros_like(blurs.shift)
+    told, band = np.unique(np.concatenate([blurs.shift, blurs.variance, waves]), axis=1, return_inverse=True)
+    kernels, shares, between = _fit(told.tobytes(), told.shape[1], box, held)
+    return kernels, shares, between[:, band.ravel()]
+
+
+@lru_cache(maxsize=64)
+def _fit(told: bytes, bands: int, box: tuple[float, float], held: int) -> tuple[Kernels, Floats, Floats]:
+    """Kernels and shares for bands (6, band), no two alike: shift, variance and waves."""
+    moments = np.frombuffer(told).reshape(6, bands)
+    if bands <= _OWN and not moments[4:].any():
+        return Kernels(moments[:2], moments[2:4], np.ones(bands, np.intp)), np.eye(bands), np.eye(bands)
+    place = _places(moments)
+    order = np.argsort(place)
+    own, judged = _footprint(box, held), _some(order, _JUDGED)
+    wanted, tried = _wanted(moments[:, judged], own), []
+    for kernels in _candidates(moments, place):
+        tried.append((kernels, _error(_passed(kernels, own), wanted)))
+        if tried[-1][1] <= NEGLIGIBLE:
+            break
+    enough = max(_ENOUGH * min(error for _, error in tried), NEGLIGIBLE)
+    chosen = next(kernels for kernels, error in tried if error <= enough)
+    chosen = chosen.some(_needed(_passed(chosen, own), wanted, enough))
+    passed = _passed(chosen, own)
+    for count in _FITTED:
+        fitted = _some(order, count)
+        shares, between = _shares(passed, _wanted(moments[:, fitted], own)), _between(place, place[fitted])
+        error = float(np.abs(passed @ (shares @ between[:, judged]) - wanted).max())
+        if error <= enough or count >= bands:
+            break
+    return chosen, shares, between
+
+
+def _needed(passed: Transfer, wanted: Transfer, enough: float) -> list[int]:
+    """Numbers of kernels without which the others err too much, the least missed left out first."""
+    kept = list(range(passed.shape[1]))
+    while len(kept) > 1:
+        without = [[one for one in kept if one != left] for left in kept]
+        errors = [_error(passed[:, some], wanted) for some in without]
+        least = int(np.argmin(errors))
+        if errors[least] > enough:
+            break
+        kept = without[least]
+    return kept
+
+
+def _error(passed: Transfer, wanted: Transfer) -> float:
+    """What the best shares err by of any wave in any band."""
+    return float(np.abs(passed @ _shares(passed, wanted) - wanted).max())
+
+
+def _between(place: Floats, nodes: Floats) -> Floats:
+    """How much each of the nodes, which ascend, counts at every place, (node, band)."""
+    shares: Floats = np.stack([np.interp(place, nodes, one) for one in np.eye(len(nodes))])
+    return shares
+
+
+def _some(order: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+    """Some bands, evenly along their curve, both ends among them."""
+    some: NDArray[np.intp] = order[np.unique(np.linspace(0, len(order) - 1, min(len(order), most)).round().astype(int))]
+    return some
+
+
+def _places(moments: Floats) -> Floats:
+    """Where bands lie along the curve of their moments, (band,)."""
+    size = np.concatenate([moments[:2], np.sqrt(moments[2:4]), moments[4:]])
+    place: Floats = np.linalg.svd(size - size.mean(axis=1, keepdims=True), full_matrices=False)[2][0]
+    return place
+
+
+def _candidates(moments: Floats, place: Floats) -> Iterator[Kernels]:
+    """Ever more kernels: at ever more nodes of the bands' curve, on a coarser and a finer ladder of sizes."""
+    waves = moments[4:]
+    widest = waves[:, waves[0].argmax()]
+    ladders = [_ladder(widest, ratio) for ratio in _RATIOS] if waves.any() else [[(0.0, 1)]]
+    stretch = widest**2 / widest.min() ** 2 if waves.any() else np.ones(2)
+    for count in _NODES:
+        if waves.any() and count > _MOST_NODES:
+            return
+        for ladder in ladders:
+            found = []
+            for size, level in ladder:
+                few = count if size <= _SHIFTED_PX[0] else min(count, 2 if size <= _SHIFTED_PX[1] else 1)
+                nodes = _nodes(moments[:4], place, few)
+                wide = (size**2 * stretch)[:, None] - _LESS * _steps(nodes[:2]) ** 2
+                variance = np.maximum(nodes[2:] + np.where(level == 1, wide, (size**2 * stretch)[:, None]), 0.0)
+                found.append((nodes[:2], variance, np.full(nodes.shape[1], level, np.intp)))
+            shift, variance, level_of = (np.concatenate(parts, axis=-1) for parts in zip(*found, strict=True))
+            yield Kernels(shift, variance, level_of)
+        if count >= moments.shape[1]:
+            return
+
+
+def _ladder(widest: Floats, ratio: float) -> list[tuple[float, int]]:
+    """Sizes [px, the smaller of along and scan] and the levels at which they are looked through."""
+    wave = float(widest.min())
+    least = _SHARPEST * wave
+    afar = 2 * _size_at(2)
+    steps = max(math.ceil(math.log(afar / least) / math.log(ratio)), 0)
+    sizes = [(float(size), 1) for size in np.geomspace(least, afar, steps + 1)[:-1]]
+    level = 2
+    while level == 2 or level <= _FARTHEST * max(wave, 1.0):
+        sizes.append((level * _size_at(level), level))
+        level *= 2 if level == 2 else 4
+    return sizes
+
+
+def _steps(shift: Floats) -> Floats:
+    """How far neighbouring nodes lie apart, (2, 1): what is between two of them is wider than either."""
+    if shift.shape[1] == 1:
+        return np.zeros((2, 1))
+    steps: Floats = np.abs(np.diff(shift, axis=1)).max(axis=1, keepdims=True)
+    return steps
+
+
+def _size_at(level: int) -> float:
+    """Size of the Gaussian that looks at a level, in its px."""
+    return math.sqrt(THINNED * (1 - 1 / level**2) + _SMOOTH)
+
+
+def _nodes(moments: Floats, place: Floats, count: int) -> Floats:
+    """Moments (4, count) at even steps along the bands' curve, both ends among them; the middle alone."""
+    order = np.argsort(place)
+    if count >= len(place):
+        return moments[:, order]
+    low, high = place[order[[0, -1]]]
+    at = np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2])
+    return np.stack([np.interp(at, place[order], one[order]) for one in moments])
+
+
+def _footprint(box: tuple[float, float], held: int) -> Floats:
+    """What slit, pixel and held positions pass of the waves, (wave,)."""
+    steps = np.arange(held) - (held - 1) / 2
+    smeared = np.cos(2 * np.pi * np.outer(_SCAN, steps)).mean(axis=1)
+    passed: Floats = np.sinc(_ALONG * box[1]) * np.sinc(_SCAN * box[0]) * smeared
+    return passed
+
+
+def _seen_at(level: int) -> Floats:
+    """What the pixels of a level, linear between each other, pass of the waves, (wave,)."""
+    passed: Floats = (np.sinc(level * _ALONG) * np.sinc(level * _SCAN)) ** 2
+    while level > 1:
+        level //= 2
+        passed *= (np.cos(np.pi * level * _ALONG) * np.cos(np.pi * level * _SCAN)) ** 8  # the binomial kernel
+    return passed
+
+
+def _gaussian(shift: Floats, variance: Floats) -> Transfer:
+    """What Gaussians pass of the waves, (wave, kernel), with their phases."""
+    turned = np.outer(_ALONG, shift[0]) + np.outer(_SCAN, shift[1])
+    spread = np.outer(_ALONG**2, variance[0]) + np.outer(_SCAN**2, variance[1])
+    found: Transfer = np.exp(-2j * np.pi * turned - 2 * np.pi**2 * spread)
+    return found
+
+
+def _passed(kernels: Kernels, own: Floats) -> Transfer:
+    """What kernels pass of the waves behind slit and pixel, (wave, kernel)."""
+    left = kernels.variance - THINNED * (kernels.level**2 - 1)
+    seen = {level: _seen_at(level) for level in set(kernels.level.tolist())}
+    through = own[:, None] * np.stack([seen[level] for level in kernels.level.tolist()], axis=1)
+    passed: Transfer = through * _gaussian(kernels.shift, left)
+    return passed
+
+
+def _wanted(moments: Floats, own: Floats) -> Transfer:
+    """What bands pass of the waves, (wave, band), for moments (6, band)."""
+    across = np.hypot(np.outer(_ALONG, moments[4]), np.outer(_SCAN, moments[5]))
+    through: Transfer = (own * _seen_at(1))[:, None] * _gaussian(moments[:2], moments[2:4]) * pupil_contrast(across)
+    return through
+
+
+def _shares(passed: Transfer, wanted: Transfer) -> Floats:
+    """Shares (kernel, band) by least squares, none below 0 and of sum 1, by what kernels and bands pass of waves."""
+    from scipy.optimize import nnls  # takes its time to import
+
+    count, bands = passed.shape[1], wanted.shape[1]
+    system = np.concatenate([passed.real, passed.imag, np.full((1, count), _SUM)])
+    right = np.concatenate([wanted.real, wanted.imag, np.full((1, bands), _SUM)])
+    basis, triangle = np.linalg.qr(system)
+    shares: Floats = np.stack([nnls(triangle, one)[0] for one in (basis.T @ right).T], axis=1)
+    shares /= shares.sum(axis=0)
+    return shares
+
+
+@dataclass(frozen=True)
+class Moments:
+    """What a blur does to each band, (2, band) each: along the line and the scan.
+
+    A shift [px], a Gaussian of a variance [px^2], and diffraction at an elliptic pupil, told by the wavelength over the
+    pupil's widths [px]; None without any. The pattern of a pupil has no variance: no Gaussian stands for it.
+    """
+
+    shift: Floats
+    variance: Floats
+    waves: Floats | None = None
+
+    @staticmethod
+    def together(blurs: Sequence[Moments], bands: int) -> Moments:
+        """Those of blurs one after the other. At most one of them is diffraction."""
+        none = np.zeros((2, bands))
+        shift, variance = sum((one.shift for one in blurs), none), sum((one.variance for one in blurs), none)
+        return Moments(shift, variance, next((one.waves for one in blurs if one.waves is not None), None))

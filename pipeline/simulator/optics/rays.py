@@ -1,0 +1,135 @@
+"""Rays of the camera over the mirror: where they meet the scene plane, how they spread there, and the pupil they pass.
+
+The aperture is the mirror's disc, foreshortened in the plane of incidence and only there. At rest that plane holds the
+scan, so the pupil is an ellipse: the whole diameter along the line, and |n_z| of it, 0.71, along the scan. Diffraction
+is then wider along the scan, defocus wider along the line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
+from pipeline.geometry.scan import Sweep
+
+Floats = NDArray[np.float64]
+REST_NORMAL: Floats = np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5)])
+
+
+@dataclass(frozen=True)
+class RayViews:
+    """Where samples look, and how far the scene point moves per px of the camera, along the line and across; (n,) each.
+
+    ``along`` and ``scan`` are tangents or px; the others are px of the scene over px of the camera: ``along_run`` and
+    ``scan_run`` for a ray moved along the line, ``along_turn`` and ``scan_turn`` for one moved across it.
+    """
+
+    along: Floats
+    scan: Floats
+    along_run: Floats
+    scan_run: Floats
+    along_turn: Floats
+    scan_turn: Floats
+
+    def __getitem__(self, which: slice | NDArray[np.intp]) -> RayViews:
+        """Some of the samples."""
+        return RayViews(*(getattr(self, one.name)[which] for one in fields(self)))
+
+    def thinned(self, level: int) -> RayViews:
+        """The same places in px of a scene of which every ``level``-th pixel is left, the first one first."""
+        return self if level == 1 else replace(self, along=self.along / level, scan=self.scan / level)
+
+    def flat(self) -> RayViews:
+        """All in one row."""
+        return RayViews(*(np.ravel(getattr(self, one.name)) for one in fields(self)))
+
+
+def exact_views(normal: Floats, across: Floats | float, slopes: Floats) -> RayViews:
+    """Give where camera rays (across, slope, 1) meet the scene after the mirror, as tangents.
+
+    ``normal`` is (..., 3), of arrays that broadcast. The reflection is written out for the two tangents; the ray's
+    length cancels. Their derivatives follow by the rule for quotients.
+    """
+    x, y, z = normal[..., 0], normal[..., 1], normal[..., 2]
+    twice = 2 * (x * across + y * slopes + z)
+    ahead = across - twice * x
+    along, scan = (slopes - twice * y) / ahead, (1 - twice * z) / ahead
+    forward_turn, forward_run = 1 - 2 * x * x, -2 * x * y
+    return RayViews(
+        along,
+        scan,
+        (1 - 2 * y * y - along * forward_run) / ahead,
+        (-2 * y * z - scan * forward_run) / ahead,
+        (-2 * x * y - along * forward_turn) / ahead,
+        (-2 * x * z - scan * forward_turn) / ahead,
+    )
+
+
+def straight_views(centre: Floats, across: Floats | float, slopes: Floats) -> RayViews:
+    """Give where the same rays would look if lines lay straight along their axis, for line centres (..., 2)."""
+    along = centre[..., 0] + slopes
+    one, none = np.ones(along.shape), np.zeros(along.shape)
+    return RayViews(along, np.broadcast_to(centre[..., 1] + across, along.shape), one, none, none, one)
+
+
+def spread_of_waves(normal: Floats | None = None) -> Floats:
+    """Give the variance that diffraction has along (line, scan), over that of a round pupil of the mirror's diameter.
+
+    A pupil |n_z| wide along (n_x, n_y) and 1 across spreads waves by 1 / n_z^2 and 1; on the camera's own axes that is
+    1 + n_y^2 / n_z^2 and 1 + n_x^2 / n_z^2. The covariance n_x n_y / n_z^2 is left out: it is 0 at rest.
+
+    Parameters
+    ----------
+    normal
+        (..., 3) mirror normals in the camera frame; None is the mirror at rest. Returns (..., 2).
+    """
+    n = REST_NORMAL if normal is None else np.asarray(normal, np.float64)
+    spread: Floats = 1 + (n[..., 1::-1] / n[..., 2:]) ** 2
+    return spread
+
+
+def spread_of_rays(normal: Floats | None = None) -> Floats:
+    """Give the variance of the pupil along (line, scan), over that of a round one: 1 - n_y^2 and 1 - n_x^2, (..., 2).
+
+    The covariance -n_x n_y is left out: it is 0 at rest.
+    """
+    n = REST_NORMAL if normal is None else np.asarray(normal, np.float64)
+    spread: Floats = 1 - n[..., 1::-1] ** 2
+    return spread
+
+
+def pupil_contrast(u: Floats) -> Floats:
+    """Give what a round pupil passes of a wave of u cycles per lambda / D: its autocorrelation, 0 from u = 1 on.
+
+    2 / pi (acos u - u sqrt(1 - u^2)) (Goodman, Introduction to Fourier Optics, section 6.3). An elliptic pupil passes a
+    wave as a round one does when u is counted along its own axes. The 6 nm of a band are too little to tell: they
+    change u by 1 %, evenly to both sides, and no contrast by more than 1e-5.
+    """
+    inside = np.minimum(np.abs(u), 1.0)
+    contrast: Floats = 2 / np.pi * (np.arccos(inside) - inside * np.sqrt(1 - inside * inside))
+    return contrast
+
+
+def normals_met(sweeps: Iterable[Sweep], camera: LineCamera) -> Floats:
+    """Give the mirror's normals at rest and at both ends of every sweep, (n, 3).
+
+    Both spreads are monotonic along a sweep (n_x / n_z = 1 / (eta - sqrt(1 + xi^2 + eta^2)) in scene tangents), so the
+    ends hold the extremes.
+    """
+    taken = [sweep for sweep in sweeps if sweep.lines > 0]
+    ends = [(sweep.strip_px, scan) for sweep in taken for scan in sweep.held_px().ravel()[[0, -1]]]
+    tangents = np.array(ends, np.float64).reshape(-1, 2) * camera.ifov_rad
+    return np.concatenate([REST_NORMAL[None], direction_to_normal(scene_to_direction(tangents))])
+
+
+def middle_normal(sweep: Sweep, camera: LineCamera) -> Floats:
+    """Give the mirror's normal in the middle of a sweep, (3,): one kernel for all its lines, whatever the block."""
+    middle = sweep.start_px + (sweep.lines * sweep.step - 1) / 2
+    tangents = np.array([sweep.strip_px, middle]) * camera.ifov_rad
+    normal: Floats = direction_to_normal(scene_to_direction(tangents))
+    return normal

@@ -1,0 +1,161 @@
+"""The farm's plan: which field lies where, how its rows run, how it is kept, what lines part it; the truth.
+
+Everything is drawn from the seed alone, so that the land of another day is the same land; day and hour only say what
+stands on it and where the sun is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from pipeline.errors import SceneError
+from pipeline.simulator.scenes.farm.land import Border, Parcel, allot, divide_land, stream, visible_area
+from pipeline.simulator.scenes.farm.seasons import (
+    CROPS,
+    Crop,
+    Land,
+    Sun,
+    foliage,
+    land_on,
+    lodged_share,
+    soil_moisture,
+    stage_shares,
+    sun_over_farm,
+)
+from pipeline.simulator.scenes.farm.spectra import MATERIALS
+
+PARCEL_AREA_PX = 95_000.0
+USE_SHARES = {
+    **{"maize": 0.16, "sugar_beet": 0.15, "wheat_a": 0.15, "wheat_b": 0.15, "stubble": 0.09, "grass": 0.08},
+    **{"soil": 0.11, "late_maize": 0.045, "late_beet": 0.045},
+}
+BORDER_SHARES = {"road": 0.20, "ditch": 0.38, "hedge": 0.17, "margin": 0.25}  # of the lines between parcels
+TWINS = {"wheat_a": "wheat_b", "wheat_b": "wheat_a"}
+UNEVEN_DAYS = 9.0  # by which plants of one field are at most ahead of or behind the rest
+_ROWS_ELSEWHERE = {"stubble": (3.4, 4.4), "grass": (36.0, 52.0), "soil": (9.0, 13.0)}
+_WEEDS_ELSEWHERE = {"stubble": (1.0, 6.0), "grass": (0.2, 2.0), "soil": (0.5, 4.0)}
+
+
+@dataclass(frozen=True)
+class Tramlines:
+    """Pairs of wheel marks: ``gauge`` apart and ``width`` wide, every ``spacing``, from ``shift`` on [px]."""
+
+    spacing: float
+    gauge: float
+    width: float
+    shift: float
+
+
+@dataclass(frozen=True)
+class FieldPlan:
+    """One field. Rows lie where y cos a - x sin a + phase is a multiple of the period, a the angle from x towards y."""
+
+    parcel: Parcel
+    use: str
+    row_angle_deg: float
+    row_period_px: float
+    row_phase_px: float
+    headland_px: float
+    tramlines: Tramlines | None
+    late_days: float
+    gap_rate: float  # share of the row's pieces that did not come up
+    lodging: float  # share of the field that lies in the end
+    weeds: float  # plants per 1000 px
+    wetter: float  # water in the topsoil against the farm's, by volume
+
+    @property
+    def crop(self) -> Crop | None:
+        """What is sown; None on grass, fallow and old stubble."""
+        return CROPS.get(self.use)
+
+    def land_on(self, day: int) -> Land:
+        """What the field is on a day."""
+        return land_on(self.use, day, self.late_days)
+
+    def materials_on(self, day: int) -> set[str]:
+        """Spectra of the crop that may stand on the field on a day."""
+        crop, land = self.crop, self.land_on(day)
+        if crop is None or land.phase != "crop":
+            return set()
+        names = set(stage_shares(crop, np.linspace(land.days - UNEVEN_DAYS, land.days + UNEVEN_DAYS, 37)))
+        if self.use in TWINS:
+            if self.lodging * lodged_share(day) > 0:
+                names |= {f"{self.use}_lodged", f"{self.use}_lodged_ripe"}
+            names |= {name.replace(self.use, TWINS[self.use]) for name in names}
+        return names
+
+
+@dataclass(frozen=True)
+class FarmPlan:
+    """The farm of a seed and shape, with the day of the year and the hour (true solar time) it is looked at."""
+
+    seed: int
+    shape: tuple[int, int]
+    day: int
+    hour: float
+    sun: Sun
+    fields: tuple[FieldPlan, ...]
+    borders: tuple[tuple[Border, str], ...]
+
+    @cached_property
+    def moisture(self) -> float:
+        """Water in the topsoil by volume, before it varies over the farm."""
+        return soil_moisture(self.seed, self.day)
+
+    @cached_property
+    def materials(self) -> tuple[str, ...]:
+        """Spectra that the scene mixes, in the order of its planes: those that the day can show."""
+        there = {"soil_dry", "soil_wet", "gravel", "water", "straw", "straw_grey", "grass_green", "grass_dry", "shade"}
+        there |= {"weed_leafy", "weed_red", "volunteer", "blossom"}
+        there |= {name for name, share in foliage(self.day).items() if share > 0}
+        for one in self.fields:
+            there |= one.materials_on(self.day)
+        return tuple(name for name in MATERIALS if name in there)
+
+
+def farm_plan(seed: int, shape: tuple[int, int] = (1024, 1280), *, day: int = 172, hour: float = 11.0) -> FarmPlan:
+    """Plan the farm: no pixel is drawn.
+
+    Raises
+    ------
+    SceneError : a negative seed, an empty shape, a day that is not 1 to 366, or the sun below 5 degrees.
+    """
+    if seed < 0 or min(shape) < 1:
+        raise SceneError(f"the farm needs a seed >= 0 and a shape of at least 1 x 1 px, got seed {seed}, shape {shape}")
+    sun = sun_over_farm(day, hour)
+    size = (max(shape[0] + 80, 640), max(shape[1] + 80, 640))
+    parcels, borders = divide_land(stream(seed, "land"), size, PARCEL_AREA_PX)
+    uses = allot(stream(seed, "use"), [visible_area(parcel, shape) for parcel in parcels], USE_SHARES)
+    kinds = allot(stream(seed, "borders"), [border.length for border in borders], BORDER_SHARES)
+    fields = tuple(
+        _plan_field(stream(seed, f"field {number}"), parcel, use)
+        for number, (parcel, use) in enumerate(zip(parcels, uses, strict=True))
+    )
+    return FarmPlan(seed, shape, day, hour, sun, fields, tuple(zip(borders, kinds, strict=True)))
+
+
+def _plan_field(rng: np.random.Generator, parcel: Parcel, use: str) -> FieldPlan:
+    """Draw how a field is kept. Rows run along its longest side, up to 3 degrees off."""
+    crop = CROPS.get(use)
+    sides = np.roll(parcel.corners, -1, axis=0) - parcel.corners
+    dy, dx = sides[np.hypot(sides[:, 0], sides[:, 1]).argmax()]
+    period = rng.uniform(*(_ROWS_ELSEWHERE[use] if crop is None else crop.row_px))
+    trams = Tramlines(rng.uniform(130, 180), rng.uniform(14, 17), rng.uniform(2.2, 3.2), rng.uniform(0, 180))
+    tram_chance = {"soil": 0.3}.get(use, 0.0) if crop is None else crop.tram_chance
+    return FieldPlan(
+        parcel=parcel,
+        use=use,
+        row_angle_deg=float((np.degrees(np.arctan2(dy, dx)) + rng.uniform(-3, 3)) % 180),
+        row_period_px=float(period),
+        row_phase_px=float(rng.uniform(0, period)),
+        headland_px=float(rng.uniform(18, 34)),
+        tramlines=trams if rng.uniform() < tram_chance else None,
+        late_days=float(rng.uniform(-6, 6)),
+        gap_rate=float(rng.uniform(0.005, 0.06)),
+        lodging=float(max(0.0, rng.uniform(-0.3, 1)) * crop.lodging) if crop else 0.0,
+        weeds=float(np.exp(rng.uniform(*np.log(_WEEDS_ELSEWHERE[use] if crop is None else crop.weeds)))),
+        wetter=float(rng.normal(0, 0.025)),
+    )

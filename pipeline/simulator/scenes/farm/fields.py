@@ -1,0 +1,271 @@
+"""What the fields look like on a day: stands in rows, lodged patches, stubble, meadows, bare soil; and how rows lie."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.simulator.scenes.farm.canvas import Ground, Mixture, Painting, blend, grass, moist_soil
+from pipeline.simulator.scenes.farm.farm_plan import TWINS, UNEVEN_DAYS, FieldPlan
+from pipeline.simulator.scenes.farm.land import (
+    Field,
+    Points,
+    edge,
+    parcel_pixels,
+    smooth_noise,
+    stream,
+    stripes,
+)
+from pipeline.simulator.scenes.farm.seasons import (
+    YEAR_DAYS,
+    Crop,
+    Sun,
+    canopy_cover,
+    crop_height,
+    lodged_share,
+    stage_shares,
+)
+
+Floats = NDArray[np.float64]
+ON_ROW = 0.97  # greatest cover
+CLOSED = 0.62  # of the period, a row's greatest width; then the gap between rows fills
+LODGED_PATCH_PX = 30.0
+PASS_ROWS = 8  # sown at a time; each pass lies a little aside
+PASS_SD = 0.03  # of the period
+PIECE_PX = 14.0  # a gap is 0.15 of this to all of it, short ones oftener
+
+
+class Content(NamedTuple):
+    """Materials and class shares of a surface, each summing to 1 per pixel."""
+
+    mixture: Mixture
+    shares: Mixture
+
+
+def paint_fields(work: Painting) -> None:
+    """Draw every field."""
+    plan = work.plan
+    lodging = _lodging_field(work)
+    for number, field in enumerate(plan.fields):
+        index, cover, centres = parcel_pixels(field.parcel, plan.shape)
+        if not index.size:
+            continue
+        here = work.ground.at(index)
+        down = np.zeros(index.size, np.float32) if lodging is None else _lodged(lodging.ravel()[index], field, plan.day)
+        content = _content(work, stream(plan.seed, f"paint {number}"), field, centres, (here, down))
+        work.canvas.add(index, cover, *content)
+
+
+def _content(
+    work: Painting, rng: np.random.Generator, field: FieldPlan, centres: Points, ground: tuple[Ground, Field]
+) -> Content:
+    """Materials and class shares of one field."""
+    here, down = ground
+    land, crop = field.land_on(work.plan.day), field.crop
+    salt = int(rng.integers(2**31))
+    rows = rows_of(rng, field, centres)
+    if land.phase == "grass":
+        return _meadow(rows, field, here, land.days, work.plan.day)
+    soil = moist_soil(work.plan, here, field.wetter)
+    if land.phase == "soil" or (crop is None and land.phase == "crop"):
+        return _bare_field(rows, field, here, soil)
+    if crop is None or land.phase == "stubble":
+        return _stubble_field(rows, field, here, soil, land.days)
+    gaps = row_gaps(salt, field, rows, here)
+    return _standing_crop(work, field, crop, (rows, here, soil), (gaps, down))
+
+
+def _standing_crop(
+    work: Painting,
+    field: FieldPlan,
+    crop: Crop,
+    place: tuple[Rows, Ground, Mixture],
+    harm: tuple[Field, Field],
+) -> Content:
+    """Plants in rows over soil that they shade; gaps, lodged patches and wheel marks."""
+    (rows, here, soil), (gaps, down) = place, harm
+    age = field.land_on(work.plan.day).days
+    local = age + np.clip(4 * here.vigour + 1.5 * here.tuft, -UNEVEN_DAYS, UNEVEN_DAYS)
+    period, closed = field.row_period_px, canopy_cover(crop, local)
+    width = np.minimum(closed * period / ON_ROW, CLOSED * period)
+    between = np.clip((closed * period - width * ON_ROW) / (period - width), 0, ON_ROW)
+    row = stripes_of(rows.place, period, width)
+    uneven = closed * (0.06 * here.tuft * row + 0.03 * here.grain)
+    growth = np.clip(1 + 0.32 * np.minimum(here.vigour + 1.9, 0), 0.15, 1)  # bare spots where vigour fails
+    plants = growth * np.clip(between + (ON_ROW - between) * row + uneven, 0, 0.99) * (1 - gaps * (1 - 0.6 * closed))
+    plants = np.asarray(plants + down * (ON_ROW - plants), np.float32)
+    shaded = row_shadow(work.plan.sun, crop_height(crop, age), rows, period, width)
+    dense = np.clip(0.2 + 0.3 * width, 0, 0.75) * (1 - gaps) * (1 - down)  # seedlings let light through
+    soil = blend(soil, {"shade": np.ones_like(plants)}, np.asarray(dense * shaded, np.float32))
+    deep = np.asarray(0.24 * (1 - row) * closed * (1 - down), np.float32)  # between rows that have closed
+    leaves = blend(_stand(field, crop, here, local, down), {"shade": np.ones_like(plants)}, deep)
+    content = Content(blend(soil, leaves, plants), {crop.label: plants, "soil": 1 - plants})
+    return _with_wheel_marks(content, field, rows, soil)
+
+
+def _stand(field: FieldPlan, crop: Crop, here: Ground, local: Points, down: Field) -> Mixture:
+    """Plants alone, by stage; wheat stands and lies, and 0.80 of a pixel has its own variety's red edge."""
+    shares = stage_shares(crop, local)
+    if field.use not in TWINS:
+        return shares
+    if down.max(initial=0) > 0:
+        ripe = shares.get(f"{field.use}_ripe", np.zeros_like(down))
+        swirl = np.clip(0.07 + 0.07 * here.tuft, 0, 0.3)  # stems lie this way and that
+        lying = {f"{field.use}_lodged": (1 - ripe) * (1 - swirl), f"{field.use}_lodged_ripe": ripe * (1 - swirl)}
+        shares = blend(shares, lying | {"shade": swirl}, down)
+    own = np.clip(0.80 + 0.05 * here.vigour + 0.17 * here.grain, 0, 1)
+    stand = {name: part * own for name, part in shares.items()}
+    for name, part in shares.items():
+        other = name.replace(field.use, TWINS[field.use])
+        stand[other] = stand.get(other, np.float32(0)) + part * (1 - own)
+    return stand
+
+
+def _with_wheel_marks(content: Content, field: FieldPlan, rows: Rows, soil: Mixture) -> Content:
+    """Lay tramlines over a field: its soil, trodden smooth, with a few stones."""
+    if field.tramlines is None:
+        return content
+    marks = wheel_marks(field, rows)
+    trodden = blend(soil, {"gravel": np.ones_like(marks)}, np.full_like(marks, 0.22))
+    mixture = blend(content.mixture, trodden, marks)
+    return Content(mixture, blend(content.shares, {"track": np.ones_like(marks)}, marks))
+
+
+def _stubble_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture, days: float) -> Content:
+    """Straw in cut rows, swaths for nine days, soil between; straw greys over months and green comes back."""
+    row = stripes(rows.place, field.row_period_px, CLOSED * field.row_period_px)
+    swath = stripes(rows.across, 44.0, 12.0) * np.float32(days < 9)
+    lying = 0.52 + 0.17 * row + 0.22 * swath + 0.05 * here.tuft + 0.03 * here.grain
+    fresh = np.clip(0.17 + 0.10 * here.vigour + 0.05 * here.tuft, 0.01, 0.5)
+    green = np.asarray(fresh * (1 - np.exp(-days / 60)), np.float32)
+    straw = np.asarray(np.clip(lying, 0.52, 0.97) * (1 - green), np.float32)
+    grey = np.float32(1 - np.exp(-days / 70))
+    mixture: Mixture = {name: part * (1 - straw - green) for name, part in soil.items()}
+    mixture |= {"straw": straw * (1 - grey), "straw_grey": straw * grey, "grass_green": green}
+    content = Content(mixture, {"stubble": straw + green, "soil": 1 - straw - green})
+    return _with_wheel_marks(content, field, rows, soil)
+
+
+def _meadow(rows: Rows, field: FieldPlan, here: Ground, days: float, day: int) -> Content:
+    """Grass mown in bands; pale for weeks after mowing, dull in winter."""
+    winter = 0.5 + 0.5 * np.cos(2 * np.pi * (day - 25) / YEAR_DAYS)
+    dryness = float(0.18 + 0.34 * np.exp(-days / 12) + 0.24 * winter)
+    bands = stripes(rows.across, field.row_period_px, field.row_period_px / 2)
+    mixture = blend(grass(here, dryness), grass(here, dryness + 0.16), bands)
+    return Content(mixture, {"grass": np.ones_like(bands)})
+
+
+def _bare_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture) -> Content:
+    """Soil as harrow or drill left it, in furrows; wheel marks on fallow."""
+    period = field.row_period_px if field.crop is None else 10.5
+    furrow = stripes(rows.place, period, 3.0)
+    mixture = blend(soil, {"shade": np.ones_like(furrow)}, 0.15 * furrow)
+    content = Content(mixture, {"soil": np.ones_like(furrow)})
+    return _with_wheel_marks(content, field, rows, soil) if field.crop is None else content
+
+
+def _lodging_field(work: Painting) -> Field | None:
+    """Random field whose highest parts lie first, (y, x); None where nothing lies on the day."""
+    plan = work.plan
+    standing = any(one.lodging > 0 and one.land_on(plan.day).phase == "crop" for one in plan.fields)
+    if lodged_share(plan.day) == 0 or not standing:
+        return None
+    return smooth_noise(stream(plan.seed, "lodging"), plan.shape, LODGED_PATCH_PX)
+
+
+def _lodged(noise: Field, field: FieldPlan, day: int) -> Field:
+    """Share of each pixel of a field that lies: patches that grow with the season."""
+    share = field.lodging * lodged_share(day)
+    crop = field.crop
+    if share <= 0 or crop is None or field.land_on(day).phase != "crop" or field.land_on(day).days < 150:
+        return np.zeros_like(noise)
+    return np.asarray(np.clip((noise - NormalDist().inv_cdf(1 - share)) / 0.2 + 0.5, 0, 1), np.float32)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Pixels against the rows, (n,) each; on headlands rows run along the field's end.
+
+    ``across`` and ``along`` are distances in the field's own frame, ``place`` the distance across the rows where the
+    pixel is, ``onward`` along them, ``ends`` to the nearest end of the field [px], ``normal`` (n, 2) across the rows.
+    """
+
+    across: Floats
+    along: Floats
+    ends: Floats
+    place: Floats
+    onward: Floats
+    normal: Points
+
+
+def rows_of(rng: np.random.Generator, field: FieldPlan, centres: Points) -> Rows:
+    """Lay a field's rows; ``rng`` gives how far each pass of the drill lies aside."""
+    angle = np.deg2rad(field.row_angle_deg)
+    normal, ahead = np.array([np.cos(angle), -np.sin(angle)]), np.array([np.sin(angle), np.cos(angle)])
+    across, along = centres @ normal + field.row_phase_px, centres @ ahead
+    ends, end_normal = np.full(len(centres), 1e4), np.tile(normal, (len(centres), 1))
+    for ny, nx, offset in field.parcel.cuts:
+        if abs(ahead @ (ny, nx)) > 0.7:
+            distance = centres @ np.array([ny, nx]) - offset
+            nearer = distance < ends
+            ends[nearer], end_normal[nearer] = distance[nearer], (ny, nx)
+    aside = rng.normal(0, PASS_SD * field.row_period_px, 512)
+    passes = np.floor(across / (PASS_ROWS * field.row_period_px) - 0.5 / PASS_ROWS).astype(int)
+    turned = ends < field.headland_px
+    place = np.where(turned, ends, across + aside[passes % 512])
+    normals = np.where(turned[:, None], end_normal, normal)
+    return Rows(across, along, ends, place, np.where(turned, across, along), normals)
+
+
+def row_gaps(salt: int, field: FieldPlan, rows: Rows, here: Ground) -> Field:
+    """Share of each pixel where nothing came up: pieces of rows, more of them where vigour is poor."""
+    number = np.rint(rows.place / field.row_period_px).astype(np.int64)
+    position = rows.onward / PIECE_PX + _scatter(number, number, salt)
+    piece = np.floor(position).astype(np.int64)
+    inside = (position - piece) * PIECE_PX
+    length = PIECE_PX * (0.15 + 0.85 * _scatter(number, piece, salt + 1) ** 2)
+    fails = _scatter(number, piece, salt + 2) < field.gap_rate * np.clip(1 - 0.6 * here.vigour, 0.2, 3)
+    onto = np.abs(rows.place - number * field.row_period_px) / field.row_period_px  # 0 on the row, 0.5 between rows
+    return np.asarray(edge(np.minimum(inside, length - inside)) * fails * np.clip(2.2 - 3.4 * onto, 0, 1), np.float32)
+
+
+def row_shadow(sun: Sun, height: float, rows: Rows, period: float, width: Floats) -> Field:
+    """Share of each pixel in the shadow of rows of a height, outside the rows themselves."""
+    room = np.maximum(period - width, 0)
+    shift = np.clip(height * (rows.normal @ sun.cast), -room, room)
+    both = stripes_of(rows.place - shift / 2, period, width + np.abs(shift))
+    return np.asarray(np.clip(both - stripes_of(rows.place, period, width), 0, 1), np.float32)
+
+
+def stripes_of(place: Floats, period: float, width: Floats) -> Field:
+    """Share of each pixel covered by stripes whose width differs from pixel to pixel (``land.stripes``)."""
+    start = place + (width - 1) / 2
+    whole, rest = np.divmod(start, period)
+    last, left = np.divmod(start + 1, period)
+    return np.asarray((last - whole) * width + np.minimum(left, width) - np.minimum(rest, width), np.float32)
+
+
+def wheel_marks(field: FieldPlan, rows: Rows) -> Field:
+    """Share of each pixel under tramlines, which also go round on the headland; 0 where the field has none."""
+    trams = field.tramlines
+    if trams is None:
+        return np.zeros(len(rows.across), np.float32)
+    shift = rows.across + trams.shift
+    pair = stripes(shift, trams.spacing, trams.width) + stripes(shift + trams.gauge, trams.spacing, trams.width)
+    middle = field.headland_px / 2
+    turn = edge(trams.width / 2 - np.abs(np.abs(rows.ends - middle) - trams.gauge / 2))
+    inner = edge(rows.ends - middle - trams.gauge / 2)
+    return np.asarray(np.clip(np.maximum(pair * inner, turn), 0, 1), np.float32)
+
+
+def _scatter(first: NDArray[np.int64], second: NDArray[np.int64], salt: int) -> Floats:
+    """Evenly spread numbers from 0 to below 1 that only depend on what is given (integer hash)."""
+    mixed = first.astype(np.uint32) * np.uint32(0x9E3779B1) ^ second.astype(np.uint32) * np.uint32(0x85EBCA6B)
+    mixed ^= np.uint32((salt * 0xC2B2AE35) & 0xFFFFFFFF)
+    for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
+        mixed = (mixed ^ (mixed >> np.uint32(shift))) * np.uint32(factor)
+    return np.asarray(mixed ^ (mixed >> np.uint32(16)), np.float64) / 2**32

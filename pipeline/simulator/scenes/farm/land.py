@@ -1,0 +1,227 @@
+"""Geometry of the built-in farm: parcels, the lines between them, and how much of a pixel a shape covers.
+
+Positions are (y, x) in px from the scene's centre. Coverage of a pixel by a straight edge is taken as if the edge
+lay along the pixel's side: exact at right angles, at most 0.043 off at 45 degrees.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Field = NDArray[np.float32]
+Points = NDArray[np.float64]
+
+_SPLINE_SD = 0.4794  # of a cubic B-spline through white noise of sd 1, mean over positions, two axes
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """A convex piece of land: ``corners`` (n, 2) and the cuts (ny, nx, offset) on whose positive side it lies."""
+
+    corners: Points
+    cuts: tuple[tuple[float, float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class Border:
+    """A straight line between parcels, from ``start`` to ``end`` (2,)."""
+
+    start: Points
+    end: Points
+
+    @property
+    def length(self) -> float:
+        """[px]."""
+        return float(np.hypot(*(self.end - self.start)))
+
+
+@dataclass(frozen=True)
+class Band:
+    """Pixels near a line: flat numbers, signed distance to it and position along it [px]."""
+
+    index: NDArray[np.intp]
+    across: Field
+    along: Field
+
+
+def stream(seed: int, name: str) -> np.random.Generator:
+    """Give the random stream of one named part: drawing more in one part does not change another."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(zlib.crc32(name.encode()),)))
+
+
+def divide_land(rng: np.random.Generator, size: tuple[float, float], area: float) -> tuple[list[Parcel], list[Border]]:
+    """Split a rectangle about the origin until every parcel has about ``area`` px; also the lines that split it."""
+    half = np.array(size) / 2
+    corners = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) * half
+    turn = rng.uniform(-0.6, 0.6)
+    waiting, parcels, borders = [Parcel(corners)], [], []
+    while waiting:
+        parcel = waiting.pop()
+        if polygon_area(parcel.corners) < area * rng.uniform(1.15, 1.9):
+            parcels.append(parcel)
+            continue
+        cut = _choose_cut(rng, parcel, turn)
+        opposite = (-cut[0], -cut[1], -cut[2])
+        for side in (cut, opposite):
+            waiting.append(Parcel(clip_polygon(parcel.corners, side), (*parcel.cuts, side)))
+        ends = clip_polygon(parcel.corners, cut)
+        on_cut = ends[np.abs(ends @ np.array(cut[:2]) - cut[2]) < 1e-6]
+        borders.append(Border(on_cut[0], on_cut[-1]))
+    return parcels, borders
+
+
+def _choose_cut(rng: np.random.Generator, parcel: Parcel, turn: float) -> tuple[float, float, float]:
+    """A line across the longer of the farm's two directions, up to 7 degrees off, in the middle third."""
+    spans = [_span(parcel.corners, turn + quarter) for quarter in (0.0, np.pi / 2)]
+    angle = turn + (np.pi / 2 if np.ptp(spans[1]) > np.ptp(spans[0]) else 0.0) + rng.uniform(-0.12, 0.12)
+    low, high = _span(parcel.corners, angle)
+    return float(np.cos(angle)), float(np.sin(angle)), float(low + (high - low) * rng.uniform(0.36, 0.64))
+
+
+def _span(corners: Points, angle: float) -> tuple[float, float]:
+    """Least and greatest offset of the corners along a direction."""
+    offset = corners @ np.array([np.cos(angle), np.sin(angle)])
+    return float(offset.min()), float(offset.max())
+
+
+def clip_polygon(corners: Points, cut: tuple[float, float, float]) -> Points:
+    """Part of a convex polygon where ny y + nx x >= offset, (m, 2); m may be 0."""
+    height = corners @ np.array(cut[:2]) - cut[2]
+    kept = []
+    for here, there, a, b in zip(corners, np.roll(corners, -1, axis=0), height, np.roll(height, -1), strict=True):
+        if a >= 0:
+            kept.append(here)
+        if (a >= 0) != (b >= 0):
+            kept.append(here + (there - here) * (a / (a - b)))
+    return np.array(kept).reshape(-1, 2)
+
+
+def polygon_area(corners: Points) -> float:
+    """Area of a polygon by the shoelace formula [px^2]; 0 for fewer than 3 corners."""
+    y, x = corners[:, 0], corners[:, 1]
+    return float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)
+
+
+def visible_area(parcel: Parcel, shape: tuple[int, int]) -> float:
+    """Area of a parcel on the scene [px^2]."""
+    corners = parcel.corners
+    for axis in ((1.0, 0.0, shape[0]), (-1.0, 0.0, shape[0]), (0.0, 1.0, shape[1]), (0.0, -1.0, shape[1])):
+        corners = clip_polygon(corners, (axis[0], axis[1], -axis[2] / 2))
+    return polygon_area(corners)
+
+
+def allot(rng: np.random.Generator, sizes: list[float], shares: dict[str, float]) -> list[str]:
+    """Give every piece a kind so that sizes approach the shares, each kind at least once where pieces suffice.
+
+    The shares are first blurred by a log-normal factor (sigma 0.25), so that no two farms are alike.
+    """
+    wanted = {kind: share * float(np.exp(0.25 * rng.standard_normal())) for kind, share in shares.items()}
+    scale = sum(sizes) / sum(wanted.values())
+    lack = {kind: share * scale for kind, share in wanted.items()}
+    kinds, missing = [""] * len(sizes), set(shares)
+    order = sorted(range(len(sizes)), key=lambda piece: -sizes[piece])
+    for rank, piece in enumerate(order):
+        forced = missing and len(order) - rank <= len(missing)
+        kind = max(sorted(missing) if forced else lack, key=lambda name: lack[name])
+        kinds[piece] = kind
+        lack[kind] -= sizes[piece]
+        missing.discard(kind)
+    return kinds
+
+
+def parcel_pixels(parcel: Parcel, shape: tuple[int, int]) -> tuple[NDArray[np.intp], Field, Points]:
+    """Pixels that a parcel covers: flat numbers (n,), coverage (n,), centres (n, 2). Parcels' coverages sum to 1."""
+    low, high = parcel.corners.min(axis=0) - 1, parcel.corners.max(axis=0) + 1
+    middle = (np.array(shape) - 1) / 2
+    first = np.clip(np.floor(low + middle), 0, shape).astype(int)
+    last = np.clip(np.ceil(high + middle) + 1, 0, shape).astype(int)
+    y = (np.arange(first[0], last[0]) - middle[0])[:, None]
+    x = (np.arange(first[1], last[1]) - middle[1])[None, :]
+    cover = np.ones((y.size, x.size), np.float32)
+    for ny, nx, offset in parcel.cuts:
+        cover *= np.clip((y * ny - offset + 0.5).astype(np.float32) + (x * nx).astype(np.float32), 0, 1)
+    rows, columns = np.nonzero(cover)
+    centres = np.stack([rows + (first[0] - middle[0]), columns + (first[1] - middle[1])], axis=-1)
+    return (rows + first[0]) * shape[1] + columns + first[1], cover[rows, columns], centres
+
+
+def band_pixels(border: Border, reach: float, shape: tuple[int, int]) -> Band:
+    """Pixels within ``reach`` of a line (and a little more at its ends), found row by row or column by column."""
+    step = (border.end - border.start) / max(border.length, 1e-9)
+    major = int(abs(step[1]) >= abs(step[0]))
+    middle = (np.array(shape) - 1) / 2
+    ends = np.sort([border.start[major], border.end[major]]) + middle[major]
+    count = np.clip([np.floor(ends[0]), np.ceil(ends[1]) + 1], 0, shape[major])
+    m = np.arange(*count.astype(int))
+    slope = step[1 - major] / step[major]
+    centre = border.start[1 - major] + (m - middle[major] - border.start[major]) * slope + middle[1 - major]
+    width = int(np.ceil(reach / abs(step[major]))) + 1
+    k = np.rint(centre)[:, None].astype(int) + np.arange(-width, width + 1)
+    inside = (k >= 0) & (k < shape[1 - major])
+    m, k = np.broadcast_to(m[:, None], k.shape)[inside], k[inside]
+    y, x = (k, m) if major else (m, k)
+    dy, dx = y - middle[0] - border.start[0], x - middle[1] - border.start[1]
+    across, along = dx * step[0] - dy * step[1], dy * step[0] + dx * step[1]
+    return Band(y * shape[1] + x, across.astype(np.float32), along.astype(np.float32))
+
+
+def stripes(position: NDArray[np.floating], period: float, width: float) -> Field:
+    """Share of each pixel covered by stripes of ``width`` centred on multiples of ``period`` (box of 1 px)."""
+    start = np.asarray(position, dtype=np.float64) + (width - 1) / 2
+    whole, rest = np.divmod(np.stack([start, start + 1]), period)
+    filled = whole * width + np.minimum(rest, width)
+    return np.asarray(filled[1] - filled[0], dtype=np.float32)
+
+
+def edge(distance: NDArray[np.floating]) -> Field:
+    """Coverage of a pixel whose centre lies ``distance`` inside an edge."""
+    return np.asarray(np.clip(np.asarray(distance, dtype=np.float32) + np.float32(0.5), 0, 1))
+
+
+def disc_pixels(
+    centres: Points, radius: NDArray[np.float64], shape: tuple[int, int]
+) -> tuple[NDArray[np.intp], Field, NDArray[np.intp]]:
+    """Pixels under discs: flat numbers, coverage and number of the disc that covers most of the pixel, (n,) each."""
+    reach = int(np.ceil(radius.max(initial=0.0) + 1))
+    offset = np.arange(-reach, reach + 1)
+    place = centres + (np.array(shape) - 1) / 2
+    base = np.rint(place).astype(int)
+    y = base[:, 0, None, None] + offset[:, None] + np.zeros_like(offset)
+    x = base[:, 1, None, None] + offset + np.zeros_like(offset)[:, None]
+    dy, dx = y - place[:, 0, None, None], x - place[:, 1, None, None]
+    cover = edge(radius[:, None, None] - np.hypot(dy, dx))
+    hit = (cover > 0) & (y >= 0) & (y < shape[0]) & (x >= 0) & (x < shape[1])
+    index, cover, disc = (y * shape[1] + x)[hit], cover[hit], np.nonzero(hit)[0]
+    order = np.lexsort((cover, index))
+    last = order[np.flatnonzero(np.diff(index[order], append=-1))]
+    return index[last], cover[last], disc[last]
+
+
+def scene_points(index: NDArray[np.intp], shape: tuple[int, int]) -> Points:
+    """Scene coordinates of flat pixel numbers, (n, 2)."""
+    return np.stack(np.divmod(index, shape[1]), axis=-1) - (np.array(shape) - 1) / 2
+
+
+def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cell: float) -> Field:
+    """Random field of sd about 1 whose bumps are about ``cell`` px wide: cubic B-spline over white noise, (y, x)."""
+    knots = [int(size / cell) + 5 for size in shape]
+    field = rng.standard_normal((knots[0], knots[1])).astype(np.float32)
+    shift = rng.uniform(0, 1, 2)
+    for axis, size in enumerate(shape):
+        field = np.moveaxis(_spline(np.moveaxis(field, axis, 0), np.arange(size) / cell + shift[axis]), 0, axis)
+    return np.ascontiguousarray(field) / np.float32(_SPLINE_SD)
+
+
+def _spline(knots: Field, position: Points) -> Field:
+    """Cubic B-spline along the first axis at ``position`` (in knots, from the second on)."""
+    first = position.astype(int)
+    t = (position - first).astype(np.float32).reshape(-1, *[1] * (knots.ndim - 1))
+    weights = ((1 - t) ** 3 / 6, (3 * t**3 - 6 * t**2 + 4) / 6, (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6, t**3 / 6)
+    total = weights[0] * knots[first]
+    for tap in (1, 2, 3):
+        total += weights[tap] * knots[first + tap]
+    return np.asarray(total, dtype=np.float32)

@@ -1,0 +1,219 @@
+"""Scenes: what the simulated rig looks at, as a few component planes and the electrons that each gives per band."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from threading import Lock
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError, ShapeError
+from pipeline.lazy import Once
+from pipeline.rectify.resample import gather
+
+Drawn = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
+_BINOMIAL = (np.array([1, 8, 28, 56, 70, 56, 28, 8, 1]) / 256).astype(np.float32)
+DEFAULT_EXPOSURE_MS = 100.0  # the exposure at which Scene.electrons is stated
+
+
+class SceneRaster:
+    """Planes (y, x, component) float32 and labels (y, x) uint8 of a scene, drawn when they are first asked for.
+
+    Their shape is known before. Raises SceneError for an empty one.
+    """
+
+    def __init__(self, shape: tuple[int, ...], *, labelled: bool, draw: Callable[[], Drawn]) -> None:
+        if len(shape) != 3 or 0 in shape:
+            raise SceneError(f"a scene must be (y, x, component) and not empty, got {shape}")
+        self.shape = (shape[0], shape[1], shape[2])
+        self.labelled = labelled
+        self._drawn = Once(lambda: self._checked(*draw()))
+        self._thinned: dict[int, Once[NDArray[np.float32]]] = {}
+        self._lock = Lock()
+
+    @staticmethod
+    def of(planes: NDArray[np.float32], labels: NDArray[np.uint8] | None = None) -> SceneRaster:
+        """Hold arrays that are there already; SceneError where they do not fit each other."""
+        raster = SceneRaster(planes.shape, labelled=labels is not None, draw=lambda: (planes, labels))
+        raster.drawn()
+        return raster
+
+    def drawn(self) -> Drawn:
+        """Planes and labels (None without any); SceneError where what is drawn is not what was announced."""
+        return self._drawn()
+
+    def thinned(self, level: int) -> NDArray[np.float32]:
+        """Give the planes blurred, and every ``level``-th pixel of them, the first one first; 1, 2, 4, 8, ...
+
+        From each level to the next every second pixel is left, after the binomial kernel of nine taps (variance 2,
+        Burt, Adelson, 1983): what it passes of waves that fewer pixels would show as others is below 2 % from 0.3
+        cycles per px on. Outside of the scene its edge is repeated; light is kept.
+        """
+        if level == 1:
+            return self.drawn()[0]
+        with self._lock:
+            once = self._thinned.setdefault(level, Once(lambda: _halved(_halved(self.thinned(level // 2), 0), 1)))
+        return once()
+
+    def _checked(self, planes: NDArray[np.float32], labels: NDArray[np.uint8] | None) -> Drawn:
+        size = None if labels is None else labels.shape
+        if planes.shape != self.shape or size != (self.shape[:2] if self.labelled else None):
+            raise SceneError(f"the scene is {self.shape} px, its planes {planes.shape}, its labels {size}; crop or pad")
+        return planes, labels
+
+
+def _halved(planes: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
+    """Every second row or column of the blurred planes; one more than half, for positions up to the last."""
+    size, count = planes.shape[axis], planes.shape[axis] // 2 + 1
+    half = len(_BINOMIAL) // 2
+    total = np.zeros((*planes.shape[:axis], count, *planes.shape[axis + 1 :]), np.float32)
+    for offset, weight in enumerate(_BINOMIAL):
+        at = np.clip(2 * np.arange(count) + offset - half, 0, size - 1)
+        total += weight * planes.take(at, axis=axis)
+    return total
+
+
+@dataclass(frozen=True)
+class SceneLight:
+    """Electrons at the default exposure: (component, band) per unit of component, and (band,) of the white panel."""
+
+    electrons: NDArray[np.float32]
+    panel_electrons: NDArray[np.float32]
+
+
+class Scene(Protocol):
+    """A field of light. Light is linear in the components: electrons = components @ ``electrons``."""
+
+    @property
+    def name(self) -> str:
+        """What the receipt calls it."""
+
+    @property
+    def key(self) -> str:
+        """Identity of the content: equal keys give equal light."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(y, x) size [px]."""
+
+    @property
+    def wavelength_nm(self) -> NDArray[np.float64]:
+        """(band,) centre wavelengths [nm]."""
+
+    @property
+    def fwhm_nm(self) -> NDArray[np.float64] | None:
+        """(band,) widths [nm], None where not known."""
+
+    @property
+    def electrons(self) -> NDArray[np.float32]:
+        """(component, band) electrons at the default exposure per unit of component; (band,) means a diagonal."""
+
+    @property
+    def panel(self) -> NDArray[np.float32]:
+        """(band,) scene value of the white panel."""
+
+    @property
+    def panel_electrons(self) -> NDArray[np.float32]:
+        """(band,) electrons that the white panel gives at the default exposure."""
+
+    def sample(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Give the components at points, (n,) rows and columns [px] -> (n, component) float32."""
+
+
+@dataclass(frozen=True)
+class RasterScene:
+    """A scene of pixels; between their centres light is linear, and outside the edge pixel is repeated.
+
+    Of the ways to join pixels that neither give light below 0 nor lose or gain any, wherever it is looked at, it is the
+    sharpest whose slope has no jump behind a pixel or a slit: what is left out is bounded by slopes and curvatures.
+    A wave of f cycles per px keeps sinc^2 f, 0.81 at a quarter, of what the pixels have of it.
+
+    ``planes`` is (y, x, component) float32 and ``electrons`` (component, band), or (band,) where each band has its own
+    plane. Labels are (y, x) uint8 with 255 for unlabelled. ``filled_px`` counts pixels that came without a value in a
+    band; ``missing`` (y, x) are those without one in most bands, of which nothing is known (None: no such pixel).
+    Planes, labels and electrons may be made when they are first asked for; all else is known at once.
+    """
+
+    name: str
+    key: str
+    raster: SceneRaster
+    light: Once[SceneLight]
+    panel: NDArray[np.float32]
+    wavelength_nm: NDArray[np.float64]
+    fwhm_nm: NDArray[np.float64] | None = None
+    class_names: tuple[str, ...] = ()
+    class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+    filled_px: int = 0
+    missing: NDArray[np.bool_] | None = None
+
+    def __post_init__(self) -> None:
+        if self.light.is_made():
+            self._checked_light()
+        self._check_bands("panel", self.panel)
+
+    def _checked_light(self) -> SceneLight:
+        light, bands, components = self.light(), len(self.wavelength_nm), self.raster.shape[2]
+        wanted = {(components, bands)} | ({(bands,)} if bands == components else set())
+        if light.electrons.shape not in wanted:
+            raise ShapeError(
+                f"scene {self.name}: electrons {light.electrons.shape} do not map {components} components "
+                f"to {bands} bands"
+            )
+        self._check_bands("panel_electrons", light.panel_electrons)
+        return light
+
+    def _check_bands(self, what: str, values: NDArray[np.float32]) -> None:
+        if values.shape != self.wavelength_nm.shape:
+            raise ShapeError(f"scene {self.name}: {what} {values.shape}, expected ({len(self.wavelength_nm)},)")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(y, x) size [px]."""
+        return self.raster.shape[:2]
+
+    @property
+    def electrons(self) -> NDArray[np.float32]:
+        """(component, band) electrons at the default exposure per unit of component; (band,) means a diagonal."""
+        return self._checked_light().electrons
+
+    @property
+    def panel_electrons(self) -> NDArray[np.float32]:
+        """(band,) electrons that the white panel gives at the default exposure."""
+        return self._checked_light().panel_electrons
+
+    @property
+    def planes(self) -> NDArray[np.float32]:
+        """(y, x, component) how much of each component a pixel has."""
+        return self.raster.drawn()[0]
+
+    @property
+    def labelled(self) -> bool:
+        """Whether there are labels; draws nothing."""
+        return self.raster.labelled
+
+    @property
+    def labels(self) -> NDArray[np.uint8] | None:
+        """(y, x) classes, 255 for unlabelled; None without any."""
+        return self.raster.drawn()[1] if self.labelled else None
+
+    def sample(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Give the components at points, (n,) rows and columns [px] -> (n, component) float32."""
+        return gather(self.planes, y, x, "bilinear")
+
+    def spectra(self) -> NDArray[np.float32]:
+        """Scene value per unit of component, shaped as ``electrons``."""
+        spectra: NDArray[np.float32] = self.electrons * (self.panel / self.panel_electrons).astype(np.float32)
+        return spectra
+
+    def values(self) -> NDArray[np.float32]:
+        """(y, x, band) float32 scene values: what a perfect survey returns. The whole cube, in memory."""
+        return to_bands(self.planes, self.spectra())
+
+
+def to_bands(components: NDArray[np.float32], spectra: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Multiply (..., component) by (component, band), or by the diagonal (band,); gives (..., band) float32."""
+    mixed: NDArray[np.float32] = components * spectra if spectra.ndim == 1 else components @ spectra
+    return mixed

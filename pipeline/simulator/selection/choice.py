@@ -1,0 +1,245 @@
+"""The decision: which effects to compute, and how, so that what is left out stays within one tolerance.
+
+The tolerance is of the numbers that are stored, sums of samples where a sweep bins them: an effect counts by what it
+does at the binning where it does most.
+
+Greedy: start with everything exact; of all cheaper options that still fit, take the one that saves most per error that
+it adds; until none fits. Because one long step may be shut out by a short one, the same is tried after each single
+step, and the cheapest end counts: it saves at least half of what can be saved.
+
+A larger tolerance never costs more: where the greedy rule under two tolerances first parts, the larger one takes a
+step that saves at least as much per error as all that the smaller can still take, and that is longer than the smaller's
+whole rest. It may switch a cheap effect on again in exchange for a dear one: what is off at one tolerance need not be
+off at every larger one.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from pipeline.errors import SettingsError
+from pipeline.simulator.effects.effect import OFF, Effect
+from pipeline.simulator.effects.probe import Probe, Unit
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.selection.options import ALWAYS_ON, Menu, Option, cost_of, list_options
+
+Reason = Literal["absent", "unseen", "small", "needed", "spent", "exact", "asked", "unasked", "always"]
+CHEAP_SHARE = 0.1  # of the tolerance: what a variant may err by itself in the reference "everything on, cheap"
+
+
+@dataclass(frozen=True)
+class Treatment:
+    """What was decided for one effect, beside what leaving it out would have done and exactness would have cost.
+
+    ``small``: off, within the tolerance. ``needed``: leaving it out exceeds the tolerance alone; ``spent``: with the
+    others. ``exact``: on, for the tolerance is 0.
+    """
+
+    menu: Menu
+    option: Option
+    reason: Reason
+
+    @property
+    def name(self) -> str:
+        """Of the effect."""
+        return self.menu.name
+
+    @property
+    def is_on(self) -> bool:
+        """Whether it is computed."""
+        return self.option.variant != OFF
+
+
+@dataclass(frozen=True)
+class Decision:
+    """For every effect an option, in the order of the chain. Errors and tolerance are in ``unit``.
+
+    ``px_bands`` is how many numbers all sweeps have, from which costs are estimated.
+    """
+
+    taken: tuple[Treatment, ...]
+    tolerance: float
+    unit: Unit
+    asked: str
+    px_bands: int
+
+    @property
+    def chosen(self) -> dict[Effect, str]:
+        """Effects that are on with their variants, as the renderer takes them."""
+        return {one.menu.effect: one.option.variant for one in self.taken if one.is_on}
+
+    @property
+    def exact(self) -> dict[Effect, str]:
+        """Everything that the rig has, in its exact variant: the reference."""
+        return {one.menu.effect: one.menu.exact.variant for one in self.taken if one.menu.present}
+
+    @property
+    def error(self) -> float:
+        """Bound on the change of any number by all that is left out or cheapened; above the tolerance only if asked."""
+        return _error([one.option for one in self.taken])
+
+    @property
+    def cost_ns(self) -> float:
+        """Per px and band, of the effects that are on [ns]."""
+        return cost_of((one.menu for one in self.taken), {one.name: one.option for one in self.taken})
+
+    def cost_of(self, one: Treatment) -> float:
+        """Per px and band, of one effect beside the others as they are taken [ns]."""
+        return one.menu.cost_beside(one.option, {other.name: other.option for other in self.taken})
+
+    @property
+    def exact_cost_ns(self) -> float:
+        """Per px and band, of everything that the rig has, exact [ns]."""
+        menus = [one.menu for one in self.taken if one.menu.present]
+        return cost_of(menus, {menu.name: menu.exact for menu in menus})
+
+    @property
+    def cheap_cost_ns(self) -> float:
+        """Per px and band, of everything that the rig has, each as cheap as a tenth of the tolerance lets it be."""
+        menus = [one.menu for one in self.taken if one.menu.present]
+        return cost_of(menus, {menu.name: menu.cheapest_within(CHEAP_SHARE * self.tolerance) for menu in menus})
+
+    @property
+    def cheap(self) -> dict[Effect, str]:
+        """Everything that the rig has, each in its cheapest variant that errs by no more than a tenth."""
+        within = CHEAP_SHARE * self.tolerance
+        return {one.menu.effect: one.menu.cheapest_within(within).variant for one in self.taken if one.menu.present}
+
+
+def decide(
+    probes: Probe | Sequence[Probe], rig: Rig, effects: Sequence[Effect], tolerance: float, asked: str = "auto"
+) -> Decision:
+    """Choose off or a variant for every effect, so that the sum of their errors stays within the tolerance.
+
+    Tolerance 0 is everything that the rig has, exact; an infinite one switches off all that may be off. Quantisation
+    and saturation are never off. What the rig has none of is always off.
+
+    Parameters
+    ----------
+    probes
+        One for each binning of the survey; the worst counts.
+    effects
+        In the order of the chain; the order does not change what is chosen.
+    tolerance
+        Greatest change of any stored number, in the unit of the probes.
+    asked
+        ``auto``; ``all``: on and exact; ``none``; or names with commas: those on, in the variants that the tolerance
+        lets them have, and the others off, whatever that changes.
+
+    Raises
+    ------
+    SettingsError : the tolerance is negative or no number, or an asked name is not known.
+    """
+    if not tolerance >= 0:
+        raise SettingsError(f"the tolerance must be 0 or more, got {tolerance}; 0 computes everything")
+    named = named_effects(asked, [effect.name for effect in effects])
+    menus = list_options(probes, rig, effects)
+    taken = {one.name: one for one in _settled(menus, tolerance, named, exact=asked == "all")}
+    open_menus = [menu for menu in menus if menu.name not in taken]
+    options = _cheapened(open_menus, tolerance, forced=named is not None)
+    for menu in open_menus:
+        option = options[menu.name]
+        taken[menu.name] = Treatment(menu, option, _reason(menu, option, tolerance, named))
+    every = [probes] if isinstance(probes, Probe) else probes
+    lines = sum(sweep.lines for probe in every for sweep in probe.sweeps)
+    px_bands = lines * rig.camera.samples * len(every[0].wavelength_nm)
+    return Decision(tuple(taken[menu.name] for menu in menus), tolerance, every[0].unit, asked, px_bands)
+
+
+def named_effects(asked: str, known: Sequence[str]) -> frozenset[str] | None:
+    """Give the effects that ``asked`` demands; None where the tolerance decides.
+
+    Raises
+    ------
+    SettingsError : a name is not known (names the nearest that is), or there is none.
+    """
+    words = [word.strip() for word in asked.split(",") if word.strip()]
+    if words in (["auto"], ["all"], ["none"]):
+        return {"auto": None, "all": frozenset(known), "none": frozenset[str]()}[words[0]]
+    for word in words:
+        if word in ("auto", "all", "none"):
+            raise SettingsError(f"{word!r} stands alone, got {asked!r}; leave it or the names out")
+        if word not in known:
+            near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+            hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
+            raise SettingsError(f"unknown effect {word!r}; {hint} (or one of auto, all, none alone)")
+    if not words:
+        raise SettingsError(f"no effect is named in {asked!r}; write auto, all, none, or names with commas")
+    return frozenset(words)
+
+
+def _settled(
+    menus: Sequence[Menu], tolerance: float, named: frozenset[str] | None, *, exact: bool
+) -> Iterator[Treatment]:
+    """Give what needs no weighing: absent, not asked for, exact, or all off."""
+    for menu in menus:
+        kept = menu.name in ALWAYS_ON
+        if not menu.present:
+            yield Treatment(menu, menu.off, "absent")
+        elif named is not None and menu.name not in named and not kept:
+            yield Treatment(menu, menu.off, "unasked")
+        elif tolerance == 0 or exact:
+            yield Treatment(menu, menu.exact, "always" if kept else "exact" if named is None else "asked")
+        elif named is None and not kept and menu.off.error == 0:
+            yield Treatment(menu, menu.off, "unseen")
+
+
+def _cheapened(menus: Sequence[Menu], tolerance: float, *, forced: bool) -> dict[str, Option]:
+    """Give the cheapest of what the greedy rule makes of everything exact, and of each one step from there."""
+    exact = {menu.name: menu.exact for menu in menus}
+    first = (step for menu in menus for step in _steps(menu, exact, menus, forced=forced))
+    starts = [exact, *(exact | {step.name: step.option} for step in sorted(first) if step.option.error <= tolerance)]
+    ends = (_greedy(menus, tolerance, start, forced=forced) for start in starts)
+    return min(ends, key=lambda end: cost_of(menus, end))  # the first among equals
+
+
+def _greedy(menus: Sequence[Menu], tolerance: float, start: Mapping[str, Option], *, forced: bool) -> dict[str, Option]:
+    """Take cheaper options, the greatest saving per added error first, while the sum of errors fits."""
+    current = dict(start)
+    while True:
+        steps = sorted(step for menu in menus for step in _steps(menu, current, menus, forced=forced))
+        fitting = (step for step in steps if _error((current | {step.name: step.option}).values()) <= tolerance)
+        if (step := next(fitting, None)) is None:
+            return current
+        current[step.name] = step.option
+
+
+class _Step(NamedTuple):
+    """Sorted by added error per saving; among equals the smaller error, then names: the order of effects is none."""
+
+    price: float
+    added: float
+    name: str
+    variant: str
+    option: Option
+
+
+def _steps(menu: Menu, taken: Mapping[str, Option], menus: Sequence[Menu], *, forced: bool) -> Iterator[_Step]:
+    """Give every option that makes all together cheaper than what is taken now."""
+    now, stays = taken[menu.name], forced or menu.name in ALWAYS_ON
+    sharing = [one for one in menus if one is menu or (one.merged is not None and one.merged.other == menu.name)]
+    for option in menu.variants if stays else (*menu.variants, menu.off):
+        then = {**taken, menu.name: option} if len(sharing) > 1 or menu.merged else {menu.name: option}
+        saved = cost_of(sharing, taken) - cost_of(sharing, then)
+        if saved > 0:
+            added = max(0.0, option.error - now.error)
+            yield _Step(added / saved, added, menu.name, option.variant, option)
+
+
+def _error(options: Iterable[Option]) -> float:
+    """Sum exactly rounded, so that the order of effects cannot change it."""
+    return math.fsum(option.error for option in options)
+
+
+def _reason(menu: Menu, option: Option, tolerance: float, named: frozenset[str] | None) -> Reason:
+    if menu.name in ALWAYS_ON:
+        return "always"
+    if named is not None:
+        return "asked"
+    if option.variant == OFF:
+        return "small"
+    return "needed" if menu.off.error > tolerance else "spent"

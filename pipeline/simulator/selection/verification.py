@@ -1,0 +1,233 @@
+"""The decision checked afterwards: the worst blocks of lines rendered with and without what was left out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import BoundError, ShapeError
+from pipeline.geometry.scan import scene_to_sweep
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import OFF, Effect, Light
+from pipeline.simulator.effects.light_units import stored_mean
+from pipeline.simulator.selection.arithmetic import contrast_about, misplaced_electrons, misplaced_share
+from pipeline.simulator.selection.choice import Decision, Treatment
+from pipeline.simulator.selection.manifest import TOTAL, UNIT_WORDS
+from pipeline.simulator.selection.options import acts_on_light
+
+Floats = NDArray[np.float64]
+Units = Callable[[Light, int], NDArray[np.floating]]  # of the mean light of so many samples that a number sums
+VERIFIED_LINES = 3  # whole ones, for stray light comes from all of a line
+MOST_CANDIDATES = 40
+Render = Callable[[SweepBlock, Mapping[Effect, str]], Light]
+
+
+def candidate_blocks(whole: Sequence[SweepBlock], places: Floats, *, lines: int = VERIFIED_LINES) -> list[SweepBlock]:
+    """Give blocks of few lines about places of the scene and about the first, middle and last line of every sweep.
+
+    Parameters
+    ----------
+    whole
+        Every sweep as one block of all its lines.
+    places
+        (place, 2) rows and columns that are steep, bright or dark. [px]
+
+    Returns
+    -------
+    At most `MOST_CANDIDATES`, evenly out of all, none twice.
+    """
+    found = [(block, first) for block in whole for first in _first_lines(block, places, lines)]
+    kept = np.unique(np.linspace(0, len(found) - 1, min(len(found), MOST_CANDIDATES)).round().astype(int))
+    chosen = [found[number] for number in kept]
+    return [replace(block, lines=range(first, min(first + lines, block.sweep.lines))) for block, first in chosen]
+
+
+def worst_blocks(
+    candidates: Sequence[SweepBlock], render: Callable[[SweepBlock], Light], units: Units
+) -> dict[str, SweepBlock]:
+    """Choose where bounds are hardest to keep: the steepest, brightest, darkest and most oblique of some blocks.
+
+    Of numbers as they are stored, and of each binning that the sweeps have its own.
+
+    Parameters
+    ----------
+    render
+        Expected electrons (line, sample, band); the footprint alone is enough.
+    units
+        From expected electrons and their binning to one unit of the tolerance at each. [e-]
+
+    Returns
+    -------
+    By name; one block may have several.
+
+    Raises
+    ------
+    ShapeError : there is nothing to choose from.
+    """
+    best: dict[str, tuple[float, SweepBlock]] = {}
+    least = min((block.sweep.binning for block in candidates), default=1)
+    for block in candidates:
+        binning = block.sweep.binning
+        light = stored_mean(render(block), binning)
+        if not light.size:
+            continue
+        for name, score in _scores(block, light / units(light, binning)).items():
+            called = name if binning == least else f"{name} in sums of {binning}"
+            if called not in best or score > best[called][0]:
+                best[called] = score, block
+    if not best:
+        raise ShapeError(
+            f"no lines to verify effects on: {len(candidates)} candidates hold no sample; give lines of a sweep"
+        )
+    return {name: block for name, (_, block) in best.items()}
+
+
+def _first_lines(block: SweepBlock, places: Floats, lines: int) -> list[int]:
+    """First lines of the blocks of one sweep, ascending."""
+    sweep, camera = block.sweep, block.rig.camera
+    middles = [0, sweep.lines // 2, sweep.lines - 1] if sweep.lines else []
+    centred = np.reshape(places, (-1, 2)) - (np.array(block.shape) - 1) / 2
+    along, scan = (centred if sweep.along == "y" else centred[:, ::-1]).T
+    line, sample = scene_to_sweep(replace(sweep, binning=1), camera, along, scan).T
+    with np.errstate(invalid="ignore"):  # places that no ray reaches
+        seen = (line > -1) & (line < sweep.lines) & (sample > -1) & (sample < camera.samples)
+    middles += np.rint(line[seen]).astype(int).tolist()
+    return sorted({max(0, min(middle - lines // 2, sweep.lines - lines)) for middle in middles})
+
+
+def _scores(block: SweepBlock, relative: Floats) -> dict[str, float]:
+    """How much a block is what it may be named for, of light in units."""
+    steps = [np.abs(np.diff(relative, axis=axis)).max(initial=0.0) for axis in (0, 1)]
+    return {
+        "steepest": float(max(steps)),
+        "brightest": float(relative.max()),
+        "darkest": -float(relative.min()),
+        "most oblique": float(block.normals[:, 2].max()),
+    }
+
+
+@dataclass(frozen=True)
+class _Rendered:
+    """A block with everything on as it is stored, and what a unit of the tolerance is at each of its numbers [e-]."""
+
+    name: str
+    block: SweepBlock
+    light: NDArray[np.floating]
+    unit: NDArray[np.floating]
+    render: Render
+
+    @cached_property
+    def contrast(self) -> NDArray[np.floating]:
+        """Range of the scene's light about each number, (1, number, band) [e-]; only asked for where it matters."""
+        return stored_mean(contrast_about(self.block, self.render), self.block.sweep.binning)
+
+
+@dataclass(frozen=True)
+class _Change:
+    """The greatest change on a block in units of the tolerance; the one that arithmetic least explains, and where."""
+
+    greatest: float
+    change: float = 0.0
+    rounding: float = 0.0  # what of it arithmetic may have made
+    place: str = ""
+
+    @property
+    def unexplained(self) -> float:
+        """What arithmetic can not have made; endless where light is no number."""
+        return math.inf if math.isnan(self.change) else self.change - self.rounding
+
+
+def verify(decision: Decision, render: Render, blocks: Mapping[str, SweepBlock], units: Units) -> dict[str, float]:
+    """Measure on blocks what every effect that is off or cheapened changes, and all together, against everything on.
+
+    What changes are numbers as they are stored: sums of neighbouring samples where a sweep bins them.
+
+    Draws are paired: streams are keyed by seed, sweep, line and effect, so that the difference is the effect's alone.
+    Effects of the readout change distributions, not expected light, and are not measured here.
+
+    Parameters
+    ----------
+    render
+        Expected electrons (line, sample, band) of a block with some effects on.
+    blocks
+        By name, as `worst_blocks` chooses them.
+    units
+        From expected electrons with everything on, and their binning, to one unit of the tolerance at each. [e-]
+
+    Returns
+    -------
+    Greatest change in the unit of the tolerance: by the name of each effect that is not exact, and of `TOTAL`.
+
+    Raises
+    ------
+    BoundError : a change exceeds the bound that the decision counted on; names effect, bound, change and place.
+    """
+    full = [_rendered(name, block, render, decision, units) for name, block in _once_each(blocks).items()]
+    changed = [one for one in decision.taken if _changes_light(one)]
+    trials = [(one.name, [one]) for one in changed] + [(TOTAL, changed)]
+    measured: dict[str, float] = {}
+    for name, inexact in trials:
+        bound, chosen = math.fsum(one.option.error for one in inexact), _with(decision, inexact)
+        share = misplaced_share(decision.exact, chosen)
+        found = [_greatest_change(one, render(one.block, chosen), bound, share) for one in full] if inexact else []
+        worst = max(found, key=lambda one: one.unexplained, default=_Change(0.0))
+        if not worst.unexplained <= bound:
+            raise BoundError(_complaint(name, worst, bound, decision))
+        measured[name] = max((one.greatest for one in found), default=0.0)
+    return measured
+
+
+def _once_each(blocks: Mapping[str, SweepBlock]) -> dict[str, SweepBlock]:
+    """Join the names of blocks that are the same lines: the brightest is often the steepest as well."""
+    names: dict[tuple[str, range], list[str]] = {}
+    for name, block in blocks.items():
+        names.setdefault((block.sweep.name, block.lines), []).append(name)
+    return {" and ".join(said): blocks[said[0]] for said in names.values()}
+
+
+def _rendered(name: str, block: SweepBlock, render: Render, decision: Decision, units: Units) -> _Rendered:
+    light = stored_mean(render(block, decision.exact), block.sweep.binning)
+    unit = np.broadcast_to(units(np.asarray(light, np.float32), block.sweep.binning), light.shape)
+    return _Rendered(name, block, light, unit, render)
+
+
+def _changes_light(one: Treatment) -> bool:
+    return acts_on_light(one.menu.effect) and one.menu.present and one.option is not one.menu.exact
+
+
+def _with(decision: Decision, inexact: Sequence[Treatment]) -> dict[Effect, str]:
+    """Everything exact but these, in the order of the chain."""
+    instead = {one.name: one.option.variant for one in inexact}
+    variants = {effect: instead.get(effect.name, variant) for effect, variant in decision.exact.items()}
+    return {effect: variant for effect, variant in variants.items() if variant != OFF}
+
+
+def _greatest_change(one: _Rendered, light: Light, bound: float, share: float) -> _Change:
+    binning = one.block.sweep.binning
+    change = np.abs(stored_mean(light, binning).astype(np.float64) - one.light) / one.unit
+    if not change.size:
+        return _Change(0.0)
+    rounding = np.zeros(change.shape)
+    if not change.max() <= bound:
+        rounding = misplaced_electrons(one.light, one.contrast, share) / one.unit
+    worst = np.unravel_index(int(np.argmax(change - rounding)), change.shape)  # the first NaN, if there is one
+    line, number, band = worst
+    block, summed = one.block, "" if binning == 1 else f" (of {binning} summed)"
+    count = number if binning > 1 else block.columns[number]
+    place = f"sweep {block.sweep.name}, line {block.numbers[line]}, sample {count}{summed}, band {band}"
+    return _Change(
+        float(change.max()), float(change[worst]), float(rounding[worst]), f"{place} of the {one.name} lines"
+    )
+
+
+def _complaint(name: str, worst: _Change, bound: float, decision: Decision) -> str:
+    return (
+        f"{name}: what was left out changes light by {worst.change:.3g} {UNIT_WORDS[decision.unit]} at {worst.place},"
+        f" above its bound of {bound:.3g}; the probe missed how bright or steep the scene is there: simulate with"
+        " --tol 0 or --effects all, and please report it with the rig's settings"
+    )
