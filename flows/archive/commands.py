@@ -113,9 +113,9 @@ def _survey_again(archive: Archive, console: Console) -> Rerun:
 
 
 def _versions() -> Mapping[str, int]:
-    from flows.survey.stages import VERSIONS
+    from flows.survey.stage import versions
 
-    return VERSIONS
+    return versions()
 
 
 def _read_again(archive: Archive, console: Console) -> list[Finding]:

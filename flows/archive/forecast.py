@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from flows.archive.stage_costs import PARTS, PastCosts
+from flows.archive.stage_costs import PastCosts
 from flows.settings.survey_settings import Settings
 from flows.survey.run import SurveyRun, open_run
-from flows.survey.stages import VERSIONS
+from flows.survey.stage import Stage, Wanted
 from flows.survey.survey import STAGES, judge, survey
 from pipeline.errors import IncompleteStoreError, PipelineError
 from storage.archive.addresses import store_at
-from storage.archive.archive import Archive, StageRef, stage_key
+from storage.archive.archive import Archive, StageRef
 from storage.archive.changes import Change, changes_between
 from storage.archive.keys import plain
 from storage.archive.lineage import Catalogue
@@ -108,47 +108,36 @@ class Planner:
         return ref
 
     def _ask(self, stage: str, inputs: Sequence[StageRef]) -> tuple[StageForecast, StageRef | None]:
-        asked: list[StageForecast] = []
-
-        def produce(
-            name: str, build: Callable[[Path], None], params: Mapping[str, Any], refs: Sequence[StageRef]
-        ) -> StageRef:
-            row, ref = self._look(stage, name, params, refs)
-            asked.append(row)
-            return ref
-
         try:
-            ref = STAGES[stage](self.run, produce, *inputs)
+            wanted = STAGES[stage](self.run, *inputs)
+            if wanted is None:
+                return StageForecast(stage, "skipped", None, "nothing to do with these settings"), None
+            return self._look(STAGES[stage], wanted)
         except _WaitsError as wait:
             return self._blocked(stage, f"waits for {wait}")
         except (PipelineError, OSError) as error:  # what is there cannot be used: the survey would stop here
             return self._blocked(stage, str(error))
-        if ref is None:
-            return StageForecast(stage, "skipped", None, "nothing to do with these settings"), None
-        return asked[-1], ref
 
     def _blocked(self, stage: str, why: str) -> tuple[StageForecast, StageRef]:
         seconds, size, basis = self._costs.estimate(stage)
         row = StageForecast(stage, "blocked", None, why, seconds, size, basis)
-        return row, _Awaited(PARTS[stage].stage, "", Path(), stage)
+        return row, _Awaited(STAGES[stage].product.name, "", Path(), stage)
 
-    def _look(
-        self, stage: str, name: str, params: Mapping[str, Any], refs: Sequence[StageRef]
-    ) -> tuple[StageForecast, StageRef]:
-        """Find the store of these facts, or say why there is none."""
-        keys = [ref.key for ref in refs]
-        key = stage_key(name, VERSIONS[name], params, keys)
-        if stage == "capture_fine":
-            self._costs.plan_fine(sum(sweep["lines"] for sweep in params["sweeps"]))
-        found = self.run.archive.find(name, key)
+    def _look(self, stage: Stage, wanted: Wanted) -> tuple[StageForecast, StageRef]:
+        """Find the store that a stage wants, or say why there is none."""
+        key = stage.key(wanted)
+        if stage.name == "capture_fine":
+            self._costs.plan_fine(sum(sweep["lines"] for sweep in wanted.params["sweeps"]))
+        found = stage.find(self.run.archive, wanted)
         if found is not None:
-            return StageForecast(stage, "cached", key, "stored"), found
-        ref = store_at(self.run.archive.root, name, key)
-        facts = {"version": VERSIONS[name], "params": plain(params), "inputs": keys}
+            return StageForecast(stage.name, "cached", key, "stored"), found
+        ref = store_at(self.run.archive.root, stage.product.name, key)
+        inputs = [one.key for one in wanted.inputs]
+        facts = {"version": stage.product.version, "params": plain(wanted.params), "inputs": inputs}
         self._planned[ref.uri] = Store(ref, facts)
-        why, changes = self._reason(stage, self._planned[ref.uri])
-        row = StageForecast(stage, "to run", key, why, *self._costs.estimate(stage), changes)
-        return row, _Awaited(name, key, ref.path, stage)
+        why, changes = self._reason(stage.name, self._planned[ref.uri])
+        row = StageForecast(stage.name, "to run", key, why, *self._costs.estimate(stage.name), changes)
+        return row, _Awaited(ref.stage, key, ref.path, stage.name)
 
     def _reason(self, stage: str, store: Store) -> tuple[str, tuple[Change, ...]]:
         """What differs from the newest store of the same stage of the same scene, in words and in full."""

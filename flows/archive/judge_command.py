@@ -14,14 +14,14 @@ from rich.markup import escape
 
 from flows.archive.compare_command import find_run
 from flows.archive.stale_runs import asked_again
-from flows.publish.receipt import JUDGING, Receipt
+from flows.publish.receipt import Receipt
 from flows.publish.run_folder import add_accuracy, load_receipt
 from flows.publish.survey_command import show_published
 from flows.settings.survey_settings import Settings
 from flows.survey.rig_run import for_rig
 from flows.survey.run import SurveyRun, open_run
-from flows.survey.stages import VERSIONS
-from flows.survey.survey import TITLES, Products, StageRunner, judge
+from flows.survey.stage import versions
+from flows.survey.survey import STAGES, TITLES, Products, StageRunner, judge
 from flows.terminal.progress import StageProgress
 from models.network.process import keep_freed_memory, use_one_thread
 from pipeline.errors import ArchiveError, SceneError, WeightsError
@@ -29,15 +29,6 @@ from storage.archive.archive import Archive, StageRef
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
 from storage.remote.opening import open_archive
-
-# products of a survey, and the stages that leave them
-MADE_BY = {
-    "effects": "choose_effects", "raw_coarse": "capture_coarse", "coarse_pointing": "register_coarse",
-    "lookup": "locate", "mosaic": "rectify", "attention": "attend", "raw_fine": "capture_fine",
-    "fine_pointing": "register_fine", "patches": "cut_patches", "class_map": "draw_map", "turned": "compare_turned",
-    "ground_map": "ground",
-}  # fmt: skip
-MAY_BE_MISSING = ("coarse_pointing", "fine_pointing", "ground_map")
 
 
 @dataclass(frozen=True)
@@ -91,7 +82,7 @@ def run_judge(request: JudgeRequest, console: Console) -> Receipt:
         with draft:
             runner = StageRunner(run, watch)
             judged = judge(runner, products)
-            published = add_accuracy(run, draft, judged, runner.records[JUDGING])
+            published = add_accuracy(run, draft, judged, runner.records["evaluate"])
     show_published(published, run.archive, console)
     return published.receipt
 
@@ -113,24 +104,24 @@ def _has(receipt: Receipt, settings: Settings, request: JudgeRequest) -> bool:
 
 def _products(catalogue: Catalogue, found: Run, run: SurveyRun) -> Products:
     """What the run's survey left, each whole by its manifest and of the present version of its stage."""
-    keys = {str(row.get("name")): str(row.get("key") or "") for row in found.stages}
-    refs: dict[str, StageRef | None] = {}
-    for product, stage in MADE_BY.items():
-        key = keys.get(stage, "")
-        if not key and product in MAY_BE_MISSING:
-            refs[product] = None
-        else:
-            refs[product] = _store(catalogue, found, run.archive, product, key)
-    return Products(**refs)  # type: ignore[arg-type]
+    rows = {str(row.get("name")): row for row in found.stages}
+    products = Products()
+    for stage in STAGES.values():
+        if not stage.judges:
+            row = rows.get(stage.name, {})
+            skipped = row.get("state") == "skipped"
+            key = str(row.get("key") or "")
+            products[stage.name] = None if skipped else _store(catalogue, found, run.archive, stage.title, key)
+    return products
 
 
-def _store(catalogue: Catalogue, found: Run, archive: Archive, product: str, key: str) -> StageRef:
+def _store(catalogue: Catalogue, found: Run, archive: Archive, title: str, key: str) -> StageRef:
     uris = [uri for uri in catalogue.by_key.get(key, []) if uri in catalogue.stores]
     store = catalogue.stores[uris[0]] if uris else None
-    what = f"{product.replace('_', ' ')} of {found.uri}"
+    what = f"{title} of {found.uri}"
     if store is None or store.problem is not None:
         raise ArchiveError(f"the {what} is missing or damaged; run verify --repair")
-    now = VERSIONS.get(store.ref.stage)
+    now = versions().get(store.ref.stage)
     if store.version != str(now):
         raise ArchiveError(
             f"the {what} was made by version {store.version} of the stage {store.ref.stage}, which is now {now}:"
@@ -145,7 +136,7 @@ def _check_same(catalogue: Catalogue, found: Run, products: Products, run: Surve
         raise SceneError(
             f"the scene {run.settings.scene} is another than {found.uri} looked at; put that one back, or survey again"
         )
-    drawn_with = _param(catalogue, products.class_map, "weights")
+    drawn_with = _param(catalogue, products.of("draw_map"), "weights")
     if run.weights_key != drawn_with:
         raise WeightsError(
             f"the weights {run.settings.weights or 'that come with SpectralZoom'} are others than the map of"

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
-from flows.survey.extent import Extent, Unit
+from flows.survey.extent import Extent
 from flows.survey.run import SurveyRun
+from flows.survey.stage import Unit
+from flows.survey.survey import STAGES
 from pipeline.errors import PipelineError
 from pipeline.geometry.grid import SceneGrid
 from storage.archive.lineage import Catalogue
@@ -16,33 +18,6 @@ from storage.archive.manifests import Cost
 from storage.archive.records import Store
 from storage.arrays.cubes import open_raw_cube
 
-
-@dataclass(frozen=True)
-class Part:
-    """A stage's stores in the archive, and the units of `Extent` that its seconds and its bytes grow with."""
-
-    stage: str
-    unit: Unit
-    inputs: int | None = None  # these two tell apart stages of one name
-    fine: bool | None = None
-    size: Unit | None = None  # the same as for seconds
-
-
-PARTS = {
-    "choose_effects": Part("effects", "surveys"),
-    "capture_coarse": Part("capture", "coarse values", fine=False),
-    "register_coarse": Part("register", "coarse values", 1),
-    "locate": Part("locate", "coarse pixels"),
-    "rectify": Part("rectify", "mosaic values"),
-    "attend": Part("attend", "pixels", 1),
-    "capture_fine": Part("capture", "fine values", fine=True),
-    "register_fine": Part("register", "fine values", 2),
-    "cut_patches": Part("patches", "patch values"),
-    "draw_map": Part("segment", "operations of the map", size="pixels"),
-    "compare_turned": Part("turned", "pixels"),
-    "ground": Part("ground", "pixels"),
-    "evaluate": Part("evaluate", "operations of a glance", size="surveys"),
-}
 MOST_RECORDS = 5  # of a stage that are looked into
 APART = 2.0  # times the work of another: then the two tell what starting takes
 CONTROLS_UNIT: Unit = "scene values"  # judging with controls scans the whole field
@@ -65,13 +40,11 @@ class PastCosts:
 
     def stored(self, stage: str) -> list[Store]:
         """Whole stores of a stage, newest first."""
-        part = PARTS[stage]
+        asked = STAGES[stage]
         found = [
             store
-            for store in self._by_stage.get(part.stage, [])
-            if store.problem is None
-            and part.inputs in (None, len(store.inputs))
-            and part.fine in (None, _is_fine(store))
+            for store in self._by_stage.get(asked.product.name, [])
+            if store.problem is None and asked.inputs in (None, len(store.inputs))
         ]
         return sorted(found, key=lambda store: store.created, reverse=True)
 
@@ -97,12 +70,12 @@ class PastCosts:
         records = [store for store in self.stored(stage) if store.cost is not None and self._alike(store)]
         if not records:
             return None, None, "no such store has a record of what it took"
-        unit = CONTROLS_UNIT if stage == "evaluate" and self._run.settings.controls else PARTS[stage].unit
+        unit = CONTROLS_UNIT if stage == "evaluate" and self._run.settings.controls else STAGES[stage].unit
         known = self._known(sorted(records, key=lambda store: not self.of_scene(store)), unit)
         if not known:
             return None, None, f"{records[0].ref.uri} does not tell how much work it was"
         seconds = self._line(known, unit, [cost.wall_s for _, cost, _ in known])
-        size = self._line(known, PARTS[stage].size or unit, [cost.size for _, cost, _ in known])
+        size = self._line(known, STAGES[stage].size or unit, [cost.size for _, cost, _ in known])
         address, first, _ = known[0]
         rest = "" if len(known) == 1 else f", and {known[1][0]}"
         times = seconds / first.wall_s if first.wall_s else 0.0

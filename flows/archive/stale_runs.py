@@ -14,7 +14,7 @@ from flows.publish.receipt import is_pending
 from flows.settings.keys import BUILT_IN_SCENES
 from flows.settings.survey_settings import OF_THE_MACHINE, Settings, of_this_version, parse_settings
 from flows.survey.run import SHIPPED
-from flows.survey.stages import VERSIONS
+from flows.survey.stage import versions
 from flows.survey.survey import STAGES
 from models.weights.files import content_key
 from pipeline.errors import SettingsError, WeightsError
@@ -28,7 +28,6 @@ OF_THE_LIGHT = (
     "scene", "bands", "wavelengths", "source", "seed", "effects", "size", "day", "hour", "camera", "pointing_px",
     "pose", "visit",
 )  # fmt: skip
-WEIGHED = ("attend", "segment", "evaluate")  # stages of which the weights are a parameter
 
 
 @dataclass(frozen=True)
@@ -97,9 +96,10 @@ def stale_stores(catalogue: Catalogue, uris: set[str], weights: str | None) -> s
 
 def _is_stale(catalogue: Catalogue, uri: str, weights: str | None) -> bool:
     store = catalogue.stores.get(uri)
-    if store is None or store.problem is not None or store.version != str(VERSIONS.get(store.ref.stage)):
+    if store is None or store.problem is not None or store.version != str(versions().get(store.ref.stage)):
         return True
-    return store.ref.stage in WEIGHED and store.params.get("weights", weights) != weights
+    by_weights = {one.product.name for one in STAGES.values() if one.product.by_weights}
+    return store.ref.stage in by_weights and store.params.get("weights", weights) != weights
 
 
 def is_whole(catalogue: Catalogue, run: Run) -> bool:
@@ -134,7 +134,7 @@ def would_remake(catalogue: Catalogue, run: Run, stage: str, settings: Settings)
 
 def check_stage(stage: str) -> None:
     """Raise SettingsError unless a stage is called so."""
-    known = sorted({*VERSIONS, *STAGES})
+    known = sorted({*versions(), *STAGES})
     if stage not in known:
         raise SettingsError(f"--stage {stage}: there is no such stage; there are {', '.join(known)}")
 

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from flows.survey.ground import STORE
-from flows.survey.orientation import load_orientation
-from flows.survey.placement import line_facts, seen_shares
-from flows.survey.pointing import load_registration
 from flows.survey.run import SurveyRun
-from flows.survey.stages import load_plan, strange_pixels
+from flows.survey.stages.attention import load_plan
+from flows.survey.stages.class_map import strange_pixels
+from flows.survey.stages.ground import STORE
+from flows.survey.stages.orientation import load_orientation
+from flows.survey.stages.placement import line_facts, seen_shares
+from flows.survey.stages.registration import load_registration
 from flows.survey.survey import Products
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.planning.fine_pass import FinePlan
@@ -26,18 +27,18 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     These are ``pointing``, ``ground``, ``pixels`` and ``lines``.
     """
     found: dict[str, Any] = {"plan": _plan(run, products)}
-    passes = {"coarse": products.coarse_pointing, "fine": products.fine_pointing}
+    passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
     if "fine" in pointing:
-        pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_shares(run, products.patches) < 1))
+        pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_shares(run, products.of("cut_patches")) < 1))
     if pointing:
         found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
-    if products.ground_map is not None:
-        found["ground"] = _ground(products.ground_map)
-    pixels = _pixels(run, products.class_map)
+    for ground_map in products.there(["ground"]):
+        found["ground"] = _ground(ground_map)
+    pixels = _pixels(run, products.of("draw_map"))
     if any(pixels.values()):
         found["pixels"] = pixels
-    troubled = {name: facts for name, facts in line_facts(products.mosaic).items() if any(facts.values())}
+    troubled = {name: facts for name, facts in line_facts(products.of("rectify")).items() if any(facts.values())}
     if troubled:
         found["lines"] = troubled
     return found
@@ -57,7 +58,7 @@ def _pixels(run: SurveyRun, class_map: StageRef) -> dict[str, int]:
 
 def _plan(run: SurveyRun, products: Products) -> dict[str, Any]:
     """How the fine pass was laid out, and what the other orientation would have shown."""
-    plan = load_plan(products.attention)
+    plan = load_plan(products.of("attend"))
     return {
         "kind": plan.kind,
         "reason": plan.reason,
@@ -67,7 +68,7 @@ def _plan(run: SurveyRun, products: Products) -> dict[str, Any]:
         "score_per_second": plan.worth_per_second,
         "full_seconds": plan.full_seconds,
         "out_of_reach": plan.out_of_reach,
-        "orientation": load_orientation(products.turned),
+        "orientation": load_orientation(products.of("compare_turned")),
         **_spared(run, plan),
     }
 

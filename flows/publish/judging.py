@@ -7,20 +7,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from typing import Any
 
-from flows.publish.receipt import JUDGING, is_pending, to_json
+from flows.publish.receipt import is_pending, to_json
 from flows.publish.run_folder import Published, add_accuracy, asked_settings, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE
 from flows.survey.run import SurveyRun
-from flows.survey.stages import VERSIONS, Build
 from flows.survey.survey import STAGES, Products, StageRunner, Step, judge
-from storage.archive.archive import StageRef, stage_key
 from storage.archive.keys import canonical_json
 from storage.archive.records import Run, read_run
 from storage.archive.run_folders import RunDraft
 
+JUDGE = STAGES["evaluate"]
 NOT_ASKED = ("notes", "out", "engine", *OF_THE_MACHINE)  # of a receipt's settings: no byte depends on them
 
 
@@ -53,26 +51,18 @@ def publish_and_judge(
         assert draft is not None
     with draft:
         judged = judge(step, products)
-        return add_accuracy(run, draft, judged, runner.records[JUDGING])
+        return add_accuracy(run, draft, judged, runner.records[JUDGE.name])
 
 
 def _takes_time(run: SurveyRun, products: Products) -> bool:
     """Whether there is a map to judge, and no stored accuracy of it."""
     if not run.scene.labelled or not run.settings.accuracy:
         return False
-    stored: list[bool] = []
-
-    def look(name: str, build: Build, params: Mapping[str, Any], refs: Any) -> StageRef:
-        key = stage_key(name, VERSIONS[name], params, [ref.key for ref in refs])
-        stored.append(run.archive.find(name, key) is not None)
-        return run.archive.ref(name, key)
-
-    def asking(stage: str, /, *inputs: StageRef) -> StageRef | None:
-        return STAGES[stage](run, look, *inputs)
-
-    with suppress(Exception):  # what is wrong is said when the map is judged: until then it is published
-        judge(asking, products)
-    return stored != [True]
+    try:
+        wanted = JUDGE(run, *products.there(JUDGE.of))
+        return wanted is not None and JUDGE.find(run.archive, wanted) is None
+    except Exception:  # what is wrong is said when the map is judged: until then it is published
+        return True
 
 
 def _draft_of_stopped(runner: StageRunner) -> RunDraft | None:

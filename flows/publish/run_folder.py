@@ -31,15 +31,14 @@ from flows.publish.receipt import (
 )
 from flows.publish.report import Picture, write_report
 from flows.settings.survey_settings import anchor_paths
-from flows.survey.accuracy import load_accuracy
-from flows.survey.effect_choice import RECORD as EFFECTS_RECORD
-from flows.survey.effect_choice import load_manifest
-from flows.survey.ground import STORE
 from flows.survey.model_work import work_done, work_of_map
-from flows.survey.placement import seen_shares
-from flows.survey.pointing import RECORD
 from flows.survey.run import SurveyRun, now
-from flows.survey.stages import SEATS_AT_ONCE, captured, load_plan
+from flows.survey.stages.accuracy import load_accuracy
+from flows.survey.stages.attention import load_plan
+from flows.survey.stages.capture import captured
+from flows.survey.stages.effects import load_manifest
+from flows.survey.stages.ground import STORE
+from flows.survey.stages.placement import SEATS_AT_ONCE, seen_shares
 from flows.survey.survey import Products, StageRunner
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
@@ -57,6 +56,21 @@ from storage.arrays.ground_maps import load_ground_map
 from storage.arrays.patches import open_patches
 from storage.arrays.stored_images import open_image
 
+IN_STORES = {  # products of a receipt: the stage that leaves them, and where in its store
+    "effects": ("choose_effects", "/effects.json"),
+    "raw_coarse": ("capture_coarse", ""),
+    "lookup": ("locate", "/lookup.zarr"),
+    "mosaic": ("rectify", "/mosaic.zarr"),
+    "attention": ("attend", "/attention.zarr"),
+    "plan": ("attend", "/plan.json"),
+    "raw_fine": ("capture_fine", ""),
+    "patches": ("cut_patches", "/patches.zarr"),
+    "class_map": ("draw_map", "/class_map.zarr"),
+    "coarse_pointing": ("register_coarse", "/registration.json"),
+    "fine_pointing": ("register_fine", "/registration.json"),
+    "ground_map": ("ground", "/ground_map.zarr"),
+    "accuracy": ("evaluate", "/accuracy.json"),
+}
 LIBRARIES = ("spectralzoom", "numpy", "torch", "zarr", "xarray", "prefect")
 
 
@@ -72,7 +86,7 @@ class Published:
 def publish_run(runner: StageRunner, products: Products, started: str) -> Published:
     """Write receipt.json, quicklook.png and report.html into a run folder and publish it as a whole."""
     run = runner.run
-    plan = load_plan(products.attention)
+    plan = load_plan(products.of("attend"))
     with run.archive.new_run(run.name) as draft:
         receipt = make_receipt(runner, products, plan, started, f"runs/{draft.id}")
         return _publish(run, draft, products, plan, receipt)
@@ -84,15 +98,14 @@ def add_accuracy(run: SurveyRun, draft: RunDraft, products: Products, stage: Sta
     ``draft`` is of `Archive.extend_run`, ``stage`` the record of the judging. All that the receipt says of the survey
     itself stays as it is.
     """
-    assert products.accuracy is not None
     before, asked = load_receipt(draft.published), asked_settings(run)
     other_labels = asked["labels"] != before["settings"].get("labels")
     names = ("accuracy", "controls", *(("labels", "notes") if other_labels else ()))
     receipt = with_accuracy(
-        before, load_accuracy(products.accuracy), stage, accuracy_address(products.accuracy),
+        before, load_accuracy(products.of("evaluate")), stage, _address("accuracy", products.of("evaluate")),
         settings={name: asked[name] for name in names}, judged=now(),
     )  # fmt: skip
-    return _publish(run, draft, products, load_plan(products.attention), receipt)
+    return _publish(run, draft, products, load_plan(products.of("attend")), receipt)
 
 
 def load_receipt(folder: Path) -> Receipt:
@@ -111,12 +124,12 @@ def load_receipt(folder: Path) -> Receipt:
 
 def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan, receipt: Receipt) -> Published:
     """Draw and write what a run's folder holds, and publish it."""
-    looked_twice = float(seen_shares(run, products.patches).sum()) / len(run.grid.valid_seats())
+    looked_twice = float(seen_shares(run, products.of("cut_patches")).sum()) / len(run.grid.valid_seats())
     draw_quicklook(draft.folder / "quicklook.png", quicklook_data(run, products, plan, receipt))
     draft.write_file("receipt.json", to_json(receipt))
     picture = (draft.folder / "quicklook.png").read_bytes()
     write_report(draft.folder / "report.html", receipt, picture, _pictures(products), looked_twice=looked_twice)
-    named = [ref for ref in vars(products).values() if ref is not None]
+    named = products.there(products)
     folder = draft.publish(
         survey=receipt["survey"], settings=receipt["settings"], rests_on=run.archive.manifest_hashes(named)
     )
@@ -125,18 +138,16 @@ def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan
 
 def _pictures(products: Products) -> list[Picture]:
     """Pictures that not every survey has."""
-    if products.ground_map is None:
-        return []
-    drawn = draw_ground(load_ground_map(products.ground_map.path / STORE))
-    return [Picture(drawn, "The map on the ground, north up.")]
+    maps = (load_ground_map(ref.path / STORE) for ref in products.there(["ground"]))
+    return [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
 
 
 def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, started: str, folder: str) -> Receipt:
     """Put together what the run has to say for itself."""
     run = runner.run
-    accuracy = None if products.accuracy is None else load_accuracy(products.accuracy)
+    accuracy = None if products.get("evaluate") is None else load_accuracy(products.of("evaluate"))
     savings = _savings(run, products, plan)
-    simulation = None if run.rig else load_manifest(products.effects)
+    simulation = None if run.rig else load_manifest(products.of("choose_effects"))
     if accuracy is not None and "segment_wall_s" in accuracy:
         savings["segment_wall_s"] = accuracy.pop("segment_wall_s")
     header = Header(
@@ -152,14 +163,9 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
 
 
 def _accuracy_is(run: SurveyRun, products: Products) -> AccuracyIs:
-    if products.accuracy is not None:
+    if products.get("evaluate") is not None:
         return "judged"
     return "without labels" if not run.scene.labelled else "pending" if run.settings.accuracy else "left out"
-
-
-def accuracy_address(accuracy: StageRef) -> str:
-    """Where a receipt says that a run's accuracy lies."""
-    return f"{accuracy.uri}/accuracy.json"
 
 
 def asked_settings(run: SurveyRun) -> dict[str, object]:
@@ -175,25 +181,14 @@ def _versions() -> dict[str, str]:
     return found
 
 
+def _address(name: str, ref: StageRef) -> str:
+    """Where a receipt says that a product lies."""
+    return f"{ref.uri}{IN_STORES[name][1]}"
+
+
 def _addresses(products: Products, folder: str) -> dict[str, str]:
-    named = {
-        "effects": f"{products.effects.uri}/{EFFECTS_RECORD}",
-        "raw_coarse": products.raw_coarse.uri,
-        "lookup": f"{products.lookup.uri}/lookup.zarr",
-        "mosaic": f"{products.mosaic.uri}/mosaic.zarr",
-        "attention": f"{products.attention.uri}/attention.zarr",
-        "plan": f"{products.attention.uri}/plan.json",
-        "raw_fine": products.raw_fine.uri,
-        "patches": f"{products.patches.uri}/patches.zarr",
-        "class_map": f"{products.class_map.uri}/class_map.zarr",
-    }
-    for name, ref in {"coarse_pointing": products.coarse_pointing, "fine_pointing": products.fine_pointing}.items():
-        if ref is not None:
-            named[name] = f"{ref.uri}/{RECORD}"
-    if products.ground_map is not None:
-        named["ground_map"] = f"{products.ground_map.uri}/{STORE}"
-    if products.accuracy is not None:
-        named["accuracy"] = accuracy_address(products.accuracy)
+    there = {name: products.get(stage) for name, (stage, _) in IN_STORES.items()}
+    named = {name: _address(name, ref) for name, ref in there.items() if ref is not None}
     return named | {name: f"{folder}/{name}" for name in ("receipt.json", "quicklook.png", "report.html")}
 
 
@@ -202,7 +197,7 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
     bands = len(run.scene.wavelength_nm)
     done = [*run.plan.coarse, *plan.sweeps]
     entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
-    stored = [run.archive.stored_bytes(ref) for ref in (products.raw_coarse, products.raw_fine)]
+    stored = [run.archive.stored_bytes(ref) for ref in (products.of("capture_coarse"), products.of("capture_fine"))]
     # Fine lines compress like the full scan's would; without any, the coarse ones have to stand for them.
     like, kept = (plan.sweeps, stored[1]) if plan.sweeps else (run.plan.coarse, stored[0])
     of_these = capture_savings(like, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
@@ -228,8 +223,8 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     """Gather what the four panels show, three bands of it."""
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
-    attention = load_attention(products.attention.path / "attention.zarr")
-    found: ClassMap = load_class_map(products.class_map.path / "class_map.zarr")
+    attention = load_attention(products.of("attend").path / "attention.zarr")
+    found: ClassMap = load_class_map(products.of("draw_map").path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")
     accuracy = receipt.get("accuracy")
     miou = None if accuracy is None else accuracy["miou"]
@@ -238,7 +233,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         seed=run.settings.seed,
         budget=run.settings.budget,
         policy=run.settings.policy,
-        raw=tuple(_calibrated(run, cube, chosen) for cube in _by_strip(captured(products.raw_coarse))),
+        raw=tuple(_calibrated(run, cube, chosen) for cube in _by_strip(captured(products.of("capture_coarse")))),
         rectified=_both_scales(run, products, chosen),
         wavelength_nm=run.scene.wavelength_nm[chosen],
         score=attention.score,
@@ -284,11 +279,11 @@ def _calibrated(run: SurveyRun, cube: RawCube, bands: list[int]) -> NDArray[np.f
 
 def _both_scales(run: SurveyRun, products: Products, bands: list[int]) -> NDArray[np.float32]:
     """The coarse mosaic at the scene's size with the fine patches laid in, (y, x, 3)."""
-    rows = open_image(products.mosaic.path / "mosaic.zarr", "values").rows()
+    rows = open_image(products.of("rectify").path / "mosaic.zarr", "values").rows()
     coarse = np.concatenate([values[..., bands] for _, values in rows])  # never all bands of all rows at once
     s, p = run.grid.factor, run.grid.patch
     canvas = np.repeat(np.repeat(coarse, s, axis=0), s, axis=1)[: run.grid.height, : run.grid.width].copy()
-    store = open_patches(products.patches.path / "patches.zarr")
+    store = open_patches(products.of("cut_patches").path / "patches.zarr")
     for first in range(0, len(store.seats), SEATS_AT_ONCE):
         values = store.read(first, first + SEATS_AT_ONCE)[..., bands]
         for patch, (y, x) in zip(values, run.grid.seat_origin(store.seats[first : first + len(values)]), strict=True):

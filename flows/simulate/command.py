@@ -16,10 +16,11 @@ from flows.publish.effect_table import print_effects
 from flows.settings.survey_settings import Settings
 from flows.simulate.effect_comparison import Comparison, compare_with_everything
 from flows.survey.capture_plan import lay_out_sweeps
-from flows.survey.effect_choice import choose_effects, load_manifest
 from flows.survey.run import CaptureRun, make_source
 from flows.survey.scene import farm_refusal, open_scene
-from flows.survey.stages import VERSIONS, Build, capture_sweeps
+from flows.survey.stage import Stage, Wanted
+from flows.survey.stages.capture import capture_coarse, sweeps_wanted
+from flows.survey.stages.effects import choose_effects, load_manifest
 from flows.terminal.figures import format_bytes, format_seconds
 from flows.terminal.progress import StageProgress
 from models.network.process import keep_freed_memory, use_one_thread
@@ -43,13 +44,11 @@ class _Maker:
     progress: StageProgress
     spent: dict[str, float | None] = field(default_factory=dict)  # CPU seconds by stage; None where it was there
 
-    def __call__(self, name: str, build: Build, params: Mapping[str, Any], inputs: Sequence[StageRef]) -> StageRef:
-        """Find or make the store of one stage."""
+    def __call__(self, name: str, stage: Stage, wanted: Wanted) -> StageRef:
+        """Find or make the store that a stage wants."""
         began = time.process_time()
         self.progress.show(name, 0.0)
-        ref, built = self.run.archive.produce(
-            name, build, version=VERSIONS[name], params=params, inputs=[given.key for given in inputs]
-        )
+        ref, built = stage.produce(self.run.archive, wanted)
         self.spent[name] = time.process_time() - began if built else None
         self.progress.show(name, 1.0, "" if built else "cached", ended=True)
         return ref
@@ -82,8 +81,8 @@ def run_simulate(
         console.print(f"[dim]note: {escape(note)}[/]", highlight=False)
     with run.archive.in_use(), StageProgress(console, TITLES) as progress:
         make = _Maker(run, progress)
-        effects = choose_effects(make.watching("effects"), make)
-        raw = capture_sweeps(make.watching("capture"), make, sweeps, [effects])
+        effects = make("effects", choose_effects, choose_effects.needed(make.watching("effects")))
+        raw = make("capture", capture_coarse, sweeps_wanted(make.watching("capture"), sweeps, [effects]))
         record = _record(run, sweeps, effects, raw, make.spent)
         found = None if picture is None else _compare(make, sweeps, effects, console)
     _print(record, console)

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.publish.colour_stretch import choose_bands
-from flows.survey.effect_choice import chosen_effects, load_manifest, source_with
 from flows.survey.run import CaptureRun
+from flows.survey.stages.effects import chosen_effects, load_manifest, source_with
 from pipeline.errors import BoundError
 from pipeline.geometry.camera import bin_samples
 from pipeline.geometry.scan import Sweep

@@ -5,20 +5,15 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 from math import ceil
-from typing import Literal
 
 from flows.survey.field_work import SHARD
+from flows.survey.stage import Unit
 from models.network.cost import multiply_adds
 from models.network.sizes import SegmenterConfig
 from models.reading.regions import plan_regions, whole_field
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel
-
-Unit = Literal[
-    "pixels", "coarse pixels", "scene values", "mosaic values", "coarse values", "fine values", "patch values",
-    "operations of the map", "operations of a glance", "surveys",
-]  # fmt: skip
 
 
 @dataclass(frozen=True)

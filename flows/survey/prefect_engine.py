@@ -13,17 +13,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from flows.survey.survey import Products, StageRunner, Step, survey
+from flows.survey.survey import STAGES, Products, StageRunner, Step, survey
 from flows.terminal.process_guard import end_with_us
 from flows.terminal.termination import terminable
 from pipeline.errors import PipelineError
 from storage.archive.archive import StageRef
 from storage.archive.staging import remove_tree, take_lock
 
-RETRIES = {
-    "capture_coarse": 2,
-    "capture_fine": 2,
-}  # a device may answer the second time; the spool goes on
 RETRY_DELAY_S = 2.0
 PASSWORD = f"spectralzoom:{secrets.token_urlsafe(24)}"  # of the ephemeral server that this process starts
 QUIET = {
@@ -107,7 +103,7 @@ def _task_step(runner: StageRunner) -> Step:
         """Run a stage as a task that comes after the last one."""
         one = task(
             name=name, task_run_name=f"{name}-{runner.run.name}", cache_policy=NO_CACHE, persist_result=False,
-            retries=RETRIES.get(name, 0), retry_delay_seconds=RETRY_DELAY_S, retry_condition_fn=_may_help,
+            retries=STAGES[name].retries, retry_delay_seconds=RETRY_DELAY_S, retry_condition_fn=_may_help,
         )(stage)  # fmt: skip
         found = one(name, {ref.uri: ref.key for ref in inputs}, before)
         if found is None:

@@ -170,7 +170,7 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
 
 
 def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
-    """Give the simulated rig before a scene, with no effect on: `flows.survey.effect_choice` decides on them.
+    """Give the simulated rig before a scene, with no effect on: `flows.survey.stages.effects` decides on them.
 
     Where a rig takes the lines it stands for the plan of them alone: sizes, paths and memory.
     """

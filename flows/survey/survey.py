@@ -4,53 +4,19 @@ from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-from flows.publish.receipt import JUDGING, StageRecord, State
-from flows.survey import placement, stages
-from flows.survey.accuracy import evaluate
-from flows.survey.effect_choice import choose_effects
-from flows.survey.ground import ground
-from flows.survey.orientation import compare_turned
-from flows.survey.pointing import register_coarse, register_fine
+from flows.publish.receipt import StageRecord, State
 from flows.survey.run import SurveyRun
+from flows.survey.stage import all_stages
 from storage.archive.archive import StageRef
 
-STAGES: dict[str, Callable[..., StageRef | None]] = {
-    "choose_effects": choose_effects,
-    "capture_coarse": stages.capture_coarse,
-    "register_coarse": register_coarse,
-    "locate": placement.locate,
-    "rectify": placement.rectify,
-    "attend": stages.attend,
-    "capture_fine": stages.capture_fine,
-    "register_fine": register_fine,
-    "cut_patches": placement.cut_patches,
-    "draw_map": stages.draw_map,
-    "compare_turned": compare_turned,
-    "ground": ground,
-    JUDGING: evaluate,
-}
-TITLES = {
-    "choose_effects": "effects that matter",
-    "capture_coarse": "coarse sweep",
-    "register_coarse": "seams of the coarse sweeps",
-    "locate": "lookup",
-    "rectify": "mosaic",
-    "attend": "attention and plan",
-    "capture_fine": "fine sweeps",
-    "register_fine": "fine sweeps on the mosaic",
-    "cut_patches": "fine patches",
-    "draw_map": "class map",
-    "compare_turned": "what lines turned by 90° would show",
-    "ground": "map on the ground",
-    JUDGING: "accuracy (not part of the survey)",
-    "publish": "pictures and report",
-}
+STAGES = all_stages()
+TITLES = {name: stage.title for name, stage in STAGES.items()}
 
 
 class Step(Protocol):
@@ -60,62 +26,38 @@ class Step(Protocol):
         """Give the stage's store, None where the stage has nothing to do."""
 
 
-@dataclass(frozen=True)
-class Products:
-    """The stores that a survey leaves; None where a stage had nothing to do."""
+class Products(dict[str, StageRef | None]):
+    """The stores that a survey leaves, by stage; None where a stage had nothing to do."""
 
-    effects: StageRef
-    raw_coarse: StageRef
-    coarse_pointing: StageRef | None
-    lookup: StageRef
-    mosaic: StageRef
-    attention: StageRef
-    raw_fine: StageRef
-    fine_pointing: StageRef | None
-    patches: StageRef
-    class_map: StageRef
-    turned: StageRef
-    ground_map: StageRef | None
-    accuracy: StageRef | None = None  # once the map is judged
+    def of(self, stage: str) -> StageRef:
+        """The store of a stage that always has something to do."""
+        ref = self[stage]
+        assert ref is not None, stage
+        return ref
+
+    def there(self, stages: Iterable[str]) -> list[StageRef]:
+        """The stores of some stages, without those that had nothing to do."""
+        return [ref for ref in (self[name] for name in stages) if ref is not None]
 
 
 def survey(step: Step) -> Products:
     """Sweep the field coarsely, decide where detail changes the map, look there again, and draw the map.
 
-    How good the map is `judge` tells.
+    Each stage of `STAGES` runs once those that it is made of have. How good the map is `judge` tells.
     """
-    effects = _needed(step("choose_effects"))
-    raw = _needed(step("capture_coarse", effects))
-    coarse_pointing = step("register_coarse", raw)
-    lookup = _needed(step("locate", raw, *_there(coarse_pointing)))
-    mosaic = _needed(step("rectify", raw, lookup, *_there(coarse_pointing)))
-    attention = _needed(step("attend", mosaic))
-    fine = _needed(step("capture_fine", attention, effects))
-    fine_pointing = step("register_fine", fine, mosaic)
-    patches = _needed(step("cut_patches", attention, fine, *_there(fine_pointing)))
-    class_map = _needed(step("draw_map", mosaic, patches))
-    turned = _needed(step("compare_turned", mosaic, attention))
-    ground_map = step("ground", class_map, mosaic)
-    return Products(
-        effects, raw, coarse_pointing, lookup, mosaic, attention, fine, fine_pointing, patches, class_map, turned,
-        ground_map,
-    )  # fmt: skip
+    return _run_all(step, Products(), judging=False)
 
 
 def judge(step: Step, products: Products) -> Products:
     """Judge the map of a survey by the labels, where there are any; none of it is part of the survey's own cost."""
-    given = (products.mosaic, products.patches, products.class_map, products.effects, *_there(products.coarse_pointing))
-    return replace(products, accuracy=step(JUDGING, *given))
+    return _run_all(step, Products(products), judging=True)
 
 
-def _there(ref: StageRef | None) -> tuple[StageRef, ...]:
-    """A reference that may be missing, as inputs."""
-    return () if ref is None else (ref,)
-
-
-def _needed(ref: StageRef | None) -> StageRef:
-    assert ref is not None
-    return ref
+def _run_all(step: Step, made: Products, *, judging: bool) -> Products:
+    for stage in STAGES.values():
+        if stage.judges == judging:
+            made[stage.name] = step(stage.name, *made.there(stage.of))
+    return made
 
 
 Watch = Callable[[str, str, float], None]  # stage, state (running, ran, cached, skipped, failed), how far
@@ -132,19 +74,7 @@ class StageRunner:
     def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef | None:
         """Run one of ``STAGES`` by its name."""
         self.watch(stage, "running", 0.0)
-        meter = _Meter()
-        made: list[bool] = []
-
-        def produce(
-            name: str, build: Callable[[Path], None], params: Mapping[str, Any], refs: Sequence[StageRef]
-        ) -> StageRef:
-            ref, ran = self.run.archive.produce(
-                name, build, version=stages.VERSIONS[name], params=params, inputs=[ref.key for ref in refs]
-            )
-            made.append(ran)
-            return ref
-
-        reached = 0.0
+        meter, reached = _Meter(), 0.0
 
         def report(done: float) -> None:
             nonlocal reached
@@ -152,11 +82,12 @@ class StageRunner:
             self.watch(stage, "running", done)
 
         try:
-            ref = STAGES[stage](replace(self.run, report=report), produce, *inputs)
+            wanted = STAGES[stage](replace(self.run, report=report), *inputs)
+            ref, built = (None, False) if wanted is None else STAGES[stage].produce(self.run.archive, wanted)
         except BaseException:
             self.watch(stage, "failed", reached)
             raise
-        state: State = "skipped" if ref is None else "ran" if made[-1] else "cached"
+        state: State = "skipped" if ref is None else "ran" if built else "cached"
         self.records[stage] = self._record(stage, ref, state, meter, inputs)
         self.watch(stage, state, 1.0)
         return ref

@@ -12,6 +12,7 @@ from pathlib import PurePath
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.errors import ArchiveError
 
@@ -86,3 +87,8 @@ def _plain_group(value: object) -> Any:
     if isinstance(value, Sequence):
         return [plain(entry) for entry in value]
     raise ArchiveError(f"{type(value).__name__} {value!r} cannot be part of a key; give numbers, text, lists or tables")
+
+
+def array_digest(array: NDArray[np.generic]) -> str:
+    """Hash of an array's shape and values."""
+    return hashlib.sha256(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes()).hexdigest()[:20]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,3 +25,8 @@ def read_table(path: Path) -> dict[str, Any]:
         raise IncompleteStoreError(f"{path} {problem}; {CURE}")
     table: dict[str, Any] = json.loads(read_plain(path))
     return table
+
+
+def write_table(path: Path, content: Mapping[str, Any]) -> None:
+    """Write plain values in their own order; numpy's numbers become floats."""
+    path.write_text(json.dumps(content, indent=1, default=float) + "\n")

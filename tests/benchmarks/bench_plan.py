@@ -85,7 +85,6 @@ def _survey(archive: Path, side: int) -> dict[str, Cost]:
     """Survey a square of the farm, or find that it was; gives its stages by name."""
     from rich.console import Console
 
-    from flows.archive.stage_costs import PARTS
     from flows.publish.survey_command import run_survey
     from flows.survey.run import open_run
     from flows.survey.survey import StageRunner, survey
@@ -93,10 +92,8 @@ def _survey(archive: Path, side: int) -> dict[str, Cost]:
     settings = _settings(archive, side)
     run_survey(settings, Console(quiet=True))
     runner = StageRunner(open_run(settings))
-    refs = [ref for ref in vars(survey(runner)).values() if ref is not None]
     stages = {}
-    for name, record in runner.records.items():
-        ref = next((ref for ref in refs if ref.key == record.key and ref.stage == PARTS[name].stage), None)
+    for name, ref in survey(runner).items():
         cost = None if ref is None else runner.run.archive.cost(ref)
         if cost is not None:
             stages[name] = cost

@@ -19,6 +19,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+RECORD = "stage"  # decorates a function with what is said of it: no byte that it stores depends on that
 PACKAGES = ("flows", "models", "pipeline", "storage")
 COMPREHENSIONS = ast.ListComp | ast.SetComp | ast.DictComp | ast.GeneratorExp
 FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef
@@ -144,7 +145,9 @@ class Definition:
 
     def __init__(self, module: Module, node: ast.stmt) -> None:
         self._module, self._node = module, node
-        self._decorators = [ast.unparse(one).partition("(")[0] for one in getattr(node, "decorator_list", ())]
+        if isinstance(node, ast.FunctionDef):
+            node.decorator_list = [one for one in node.decorator_list if _decorator(one) != RECORD]
+        self._decorators = [_decorator(one) for one in getattr(node, "decorator_list", ())]
 
     @property
     def registers(self) -> bool:
@@ -201,6 +204,10 @@ def _bound(nodes: Iterable[ast.AST]) -> set[str]:
             case ast.MatchStar(name=str(name)) | ast.MatchMapping(rest=str(name)):
                 found.add(name)
     return found
+
+
+def _decorator(node: ast.expr) -> str:
+    return ast.unparse(node).partition("(")[0]
 
 
 def _parameters(node: ast.arguments) -> set[str]:

@@ -22,6 +22,7 @@ from PIL import Image
 from flows.survey.survey import STAGES
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
+from tests.flows.stage_doubles import act_instead
 
 ROOT = Path(__file__).parents[2]
 NM = "460,500,550,600,620,640"
@@ -195,7 +196,7 @@ def test_interrupted_survey_says_how_to_go_on(
         raise KeyboardInterrupt
 
     monkeypatch.chdir(folder)
-    monkeypatch.setitem(STAGES, "attend", interrupted)
+    act_instead(monkeypatch, "attend", interrupted)
     words = survey_words("--budget 0.7", str(tmp_path / "archive"))
     ended = command_line(*words)
     assert (ended.code, ended.out) == (130, "")

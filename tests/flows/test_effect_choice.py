@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +10,13 @@ import pytest
 
 from flows.settings.survey_settings import load_settings
 from flows.simulate.command import open_simulation
-from flows.survey import effect_choice
-from flows.survey.effect_choice import choose_effects, chosen_effects, load_manifest, source_with
 from flows.survey.run import CaptureRun
-from flows.survey.stages import VERSIONS
+from flows.survey.stages import effects as effect_choice
+from flows.survey.stages.effects import choose_effects, chosen_effects, load_manifest, source_with
 from pipeline.errors import BoundError, IncompleteStoreError
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.scenes.scene import RasterScene
-from storage.archive.archive import StageRef, stage_key
+from storage.archive.archive import StageRef
 
 ASKED = "rotation,vignetting,shot,read-noise"
 Open = Callable[..., CaptureRun]
@@ -25,25 +24,12 @@ Open = Callable[..., CaptureRun]
 
 def choose(run: CaptureRun) -> StageRef:
     """The stage's store, made in the run's archive."""
-
-    def produce(
-        name: str, build: Callable[[Path], None], params: Mapping[str, Any], refs: Sequence[StageRef]
-    ) -> StageRef:
-        keys = [ref.key for ref in refs]
-        return run.archive.produce(name, build, version=VERSIONS[name], params=params, inputs=keys)[0]
-
-    return choose_effects(run, produce)
+    return choose_effects.produce(run.archive, choose_effects.needed(run))[0]
 
 
 def key_of(run: CaptureRun) -> str:
     """The key that the stage asks for, without making anything."""
-
-    def produce(
-        name: str, build: Callable[[Path], None], params: Mapping[str, Any], refs: Sequence[StageRef]
-    ) -> StageRef:
-        return run.archive.ref(name, stage_key(name, VERSIONS[name], params, []))
-
-    return choose_effects(run, produce).key
+    return choose_effects.key(choose_effects.needed(run))
 
 
 def opened(scene_files: Path, out: Path, **flags: Any) -> CaptureRun:

@@ -16,8 +16,8 @@ from flows.simulate import effect_comparison
 from flows.simulate.command import open_simulation
 from flows.simulate.effect_comparison import Comparison, View, compare_with_everything, everything
 from flows.simulate.effect_picture import Words, draw_comparison
-from flows.survey.effect_choice import load_manifest
 from flows.survey.run import CaptureRun
+from flows.survey.stages.effects import load_manifest
 from pipeline.errors import BoundError
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.registry import BY_NAME

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.survey import accuracy as evaluation
-from flows.survey import placement
-from flows.survey import pointing as pointing_stage
+from flows.survey.stages import accuracy as evaluation
+from flows.survey.stages import registration as placement
+from flows.survey.stages import registration as pointing_stage
 from models.evaluation.metrics import confusion
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED

@@ -17,10 +17,10 @@ from flows.archive.plan_command import run_plan
 from flows.archive.stage_costs import scaled_cost
 from flows.settings.survey_settings import Settings, load_settings
 from flows.survey.run import open_run
-from flows.survey.stages import VERSIONS
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
+from tests.flows.stage_doubles import be_version
 
 WAITS = {"locate": "capture_coarse", "rectify": "locate", "attend": "rectify", "capture_fine": "attend"}
 ON_REQUEST = ["register_coarse", "register_fine", "ground"]
@@ -127,7 +127,7 @@ def test_a_stage_of_another_version_is_made_again(
     settings: Settings, archive: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The reason names the version; the stage below is still read."""
-    monkeypatch.setitem(VERSIONS, "rectify", 99)
+    be_version(monkeypatch, "rectify", 99)
     planned = _plan(settings, archive)
     assert planned["locate"].state == "cached"
     assert planned["rectify"].why.startswith("version: ")

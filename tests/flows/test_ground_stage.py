@@ -13,8 +13,8 @@ import xarray as xr
 
 from flows.settings.keys import MapChoice
 from flows.settings.survey_settings import Settings
-from flows.survey.ground import STORE, coarse_colours, ground, survey_grid
 from flows.survey.run import SurveyRun
+from flows.survey.stages.ground import STORE, coarse_colours, ground, survey_grid
 from pipeline.errors import PoseError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.ground.view import RigPose, pixel_places
@@ -80,11 +80,8 @@ def stores(tmp_path: Path) -> tuple[StageRef, StageRef]:
 
 def draw(run: Run, stores: tuple[StageRef, StageRef]) -> StageRef | None:
     """Run the stage as an engine would."""
-
-    def produce(name: str, build: Any, params: Any, refs: Any) -> StageRef:
-        return run.archive.produce(name, build, version=1, params=params, inputs=[ref.key for ref in refs])[0]
-
-    return ground(cast("SurveyRun", run), produce, *stores)
+    wanted = ground(run, *stores)
+    return None if wanted is None else ground.produce(run.archive, wanted)[0]
 
 
 def test_without_a_pose_there_is_no_ground(run: Run, stores: tuple[StageRef, StageRef]) -> None:

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,12 @@ from flows.archive.judge_command import split_address
 from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.publish import run_folder as publish
 from flows.publish.receipt import check_receipt, comparable, is_pending
-from flows.survey import accuracy as evaluation
-from flows.survey import stages
+from flows.survey.stages import accuracy as evaluation
 from flows.survey.survey import STAGES
 from storage.archive.archive import Archive
 from tests.conftest import WeightsMaker
 from tests.flows.conftest import CommandLine
+from tests.flows.stage_doubles import act_instead, be_version
 from tests.storage.small_archive import flip
 
 QUIET = Console(quiet=True)
@@ -118,18 +119,17 @@ def test_the_run_is_published_before_its_map_is_judged(
     """While the map is looked at the run is there and says so; then it is the same run, and has its accuracy."""
     real, seen = STAGES["evaluate"], list[Any]()
 
-    def looking(run: Any, produce: Any, *inputs: Any) -> Any:
-        def made(name: str, build: Any, params: Any, refs: Any) -> Any:
-            def building(path: Path) -> None:
-                seen.append((Archive.open(out).runs(), *receipts(out)))
-                assert problems(out) == []
-                build(path)
+    def looking(*given: Any) -> Any:
+        wanted = real.needed(*given)
 
-            return produce(name, building, params, refs)
+        def building(path: Path) -> None:
+            seen.append((Archive.open(out).runs(), *receipts(out)))
+            assert problems(out) == []
+            wanted.build(path)
 
-        return real(run, made, *inputs)
+        return replace(wanted, build=building)
 
-    monkeypatch.setitem(STAGES, "evaluate", looking)
+    act_instead(monkeypatch, "evaluate", looking)
     published = survey()
     ((folders, receipt),) = seen
     assert folders == [published.folder]
@@ -272,7 +272,7 @@ def _mosaic_gone(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
 
 
 def _newer_stage(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
-    patch.setitem(stages.VERSIONS, "segment", 99)
+    be_version(patch, "segment", 99)
 
 
 REFUSED: dict[str, tuple[Refuse, int, str]] = {

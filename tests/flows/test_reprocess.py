@@ -26,6 +26,7 @@ from pipeline.simulator.scenes.farm.canvas import CLASSES
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from tests.conftest import Survey, WeightsMaker
+from tests.flows.stage_doubles import be_version
 from tests.storage.small_archive import flip
 
 QUIET = Console(quiet=True)
@@ -134,7 +135,7 @@ def test_a_newer_stage_is_run_for_those_that_rest_on_an_older(
     """A raised version makes it and what follows anew, and `--stage` finds the fields; light is not captured again."""
     assert reprocess(archive, stage="segment") == []
     light = _captures(archive)
-    monkeypatch.setitem(generations.VERSIONS, "segment", generations.VERSIONS["segment"] + 1)
+    be_version(monkeypatch, "segment", 99)
     assert reprocess(archive, stage="rectify") == []
     assert reprocess.states(archive, stage="draw_map", dry_run=True) == [
         ("turned", "would run"),
@@ -271,7 +272,7 @@ def test_a_stage_is_made_anew_with_what_it_rests_on(
     surveyed: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a newer mosaic come a newer map and the same raw light."""
-    monkeypatch.setitem(generations.VERSIONS, "rectify", generations.VERSIONS["rectify"] + 1)
+    be_version(monkeypatch, "rectify", 99)
     assert len(reprocess(surveyed, stage="segment", dry_run=True)) == 2
     assert reprocess(surveyed, stage="capture_coarse", dry_run=True) == []
 

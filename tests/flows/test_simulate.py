@@ -14,7 +14,7 @@ import xarray as xr
 from rich.console import Console
 
 from flows.publish.effect_table import print_effects
-from flows.survey import effect_choice
+from flows.survey.stages import effects as effect_choice
 from pipeline.errors import BoundError
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.scenes.scene import RasterScene

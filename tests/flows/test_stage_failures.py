@@ -9,7 +9,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from flows.schedule.fields import load_fields
 from flows.schedule.ledger_state import moment_words
 from flows.schedule.times import parse_timetable
 from flows.survey import prefect_engine as engine
+from flows.survey.stage import Stage, Wanted
 from flows.survey.survey import STAGES
 from pipeline.errors import ArchiveError, RigError
 from storage.archive.archive import Archive
@@ -40,24 +41,23 @@ def refusal(stage: str) -> RigError | ArchiveError:
     return RigError(NO_REPLY) if stage in CAPTURES else ArchiveError(FULL_DISK)
 
 
-def failing(stage: str, error: Exception, tried: Callable[[], None] = lambda: None) -> Callable[..., Any]:
+def failing(stage: str, error: Exception, tried: Callable[[], None] = lambda: None) -> Stage:
     """The stage, failing when its files are written and not yet published; at once where it has nothing to do."""
     real = STAGES[stage]
 
-    def fail(run: Any, produce: Any, *inputs: Any) -> Any:
+    def fail(*given: Any) -> Wanted:
         tried()
+        wanted = real(*given)
+        if wanted is None:
+            raise error
 
-        def half(name: str, build: Any, params: Any, refs: Any) -> Any:
-            def broken(path: Path) -> None:
-                build(path)
-                raise error
+        def broken(path: Path) -> None:
+            wanted.build(path)
+            raise error
 
-            return produce(name, broken, params, refs)
+        return replace(wanted, build=broken)
 
-        real(run, half, *inputs)
-        raise error
-
-    return fail
+    return replace(real, wants=fail)
 
 
 def problems(out: Path) -> list[Any]:
@@ -120,21 +120,22 @@ def walk(tmp_path_factory: pytest.TempPathFactory, survey_png: Any, scene_files:
     return found
 
 
-def counted(stage: str, builds: Counter[str]) -> Callable[..., Any]:
+def counted(stage: str, builds: Counter[str]) -> Stage:
     """The stage, counting how often its store is made."""
     real = STAGES[stage]
 
-    def count(run: Any, produce: Any, *inputs: Any) -> Any:
-        def counting(name: str, build: Any, params: Any, refs: Any) -> Any:
-            def made(path: Path) -> None:
-                builds[stage] += 1
-                build(path)
+    def count(*given: Any) -> Wanted | None:
+        wanted = real(*given)
+        if wanted is None:
+            return None
 
-            return produce(name, made, params, refs)
+        def made(path: Path) -> None:
+            builds[stage] += 1
+            wanted.build(path)
 
-        return real(run, counting, *inputs)
+        return replace(wanted, build=made)
 
-    return count
+    return replace(real, wants=count)
 
 
 def command(words: list[Any]) -> Ended:

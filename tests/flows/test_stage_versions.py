@@ -1,6 +1,6 @@
 """A stage's code does not change without its version: what an archive holds would otherwise pass for the new result.
 
-After a change, either raise the stage's number in ``flows.survey.stages.VERSIONS`` (that of ingest in its command) or,
+After a change, either raise the version of the stage's product, beside the stage (that of ingest in its command) or,
 where the change has no effect on what the stage writes, keep it; then record the code as it is:
 
     python tests/flows/test_stage_versions.py
@@ -20,29 +20,20 @@ ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT)] if __name__ == "__main__" else []
 
 from flows.archive import ingest_command  # noqa: E402
-from flows.survey import stages  # noqa: E402
+from flows.survey.stage import all_stages, versions  # noqa: E402
 from tests.flows.stage_closure import Sources, Target, read_packages  # noqa: E402
 
-VERSIONS = {**stages.VERSIONS, ingest_command.STAGE: ingest_command.VERSION}
+VERSIONS = {**versions(), ingest_command.STAGE: ingest_command.VERSION}
 RECORD = Path(__file__).with_name("stage_digests.json")
 LIGHT = ("farm_scene", "raster_from_values", "make_source")  # who looks at what: runs bring it, no stage names it
-ROOTS = {
-    "effects": ("choose_effects", *LIGHT),
-    "capture": ("capture_coarse", "capture_fine", *LIGHT, "rig_source"),
-    "register": ("register_coarse", "register_fine"),
-    "locate": ("placement.locate",),
-    "rectify": ("placement.rectify",),
-    "attend": ("stages.attend",),
-    "patches": ("cut_patches",),
-    "segment": ("draw_map",),
-    "turned": ("compare_turned",),
-    "ground": ("ground.ground",),
-    "evaluate": ("accuracy.evaluate", "judged_labels"),
-    "ingest": ("run_ingest",),
-}
+BESIDES = {"effects": LIGHT, "capture": (*LIGHT, "rig_source"), "evaluate": ("judged_labels",)}
+ROOTS = {ingest_command.STAGE: ("run_ingest",)}
+for _one in all_stages().values():
+    _function = f"{_one.wants.__module__}.{_one.wants.__name__}"
+    ROOTS[_one.product.name] = (*ROOTS.get(_one.product.name, BESIDES.get(_one.product.name, ())), _function)
 OF_RUNS = ("LineCamera", "SceneGrid", "AngularGrid", "CapturePlan")  # roots of every stage that is given a run
 BARRIERS = {
-    "VERSIONS": "the numbers that this test compares with",
+    "Product": "the numbers that this test compares with",
     "Settings": "values, which stand in the keys; what acts on them is reached where it does",
     "CaptureRun": "what stages are given; what of it they do not name themselves is in OF_RUNS, LIGHT or their roots",
     "SurveyRun": "as CaptureRun",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from flows.publish.survey_command import run_survey
 from flows.settings.survey_settings import load_settings
 from flows.survey.field_work import SHARD, FieldWork
 from flows.survey.run import open_run
-from flows.survey.stages import attend
+from flows.survey.stages.attention import attend
 from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, POLICIES, SEEDED_POLICIES
 from models.reading.regions import plan_regions
 from pipeline.errors import SettingsError
@@ -64,18 +63,9 @@ def test_every_policy_surveys(archive: Path, policy: str) -> None:
 def test_only_drawn_placements_know_the_seed(archive: Path, policy: str) -> None:
     """Another seed of the survey is another key of the scores where they are drawn, and the same where they are not."""
     run = open_run(load_settings(None, _flags(archive, policy)))
-    keys = set()
-
-    def note(name: str, build: Callable[[Path], None], params: dict[str, Any], inputs: list[StageRef]) -> StageRef:
-        keys.add(repr(params))
-        return inputs[0]
-
-    for seed in (1, 2):
-        attend(
-            replace(run, settings=replace(run.settings, seed=seed)),
-            note,
-            StageRef("rectify", "m", _mosaic(archive).parent),
-        )
+    mosaic = StageRef("rectify", "m", _mosaic(archive).parent)
+    runs = [replace(run, settings=replace(run.settings, seed=seed)) for seed in (1, 2)]
+    keys = {attend.key(attend.needed(one, mosaic)) for one in runs}
     assert len(keys) == (2 if policy in SEEDED_POLICIES else 1)
 
 

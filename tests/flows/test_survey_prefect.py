@@ -13,13 +13,14 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from flows.survey import accuracy as evaluation
 from flows.survey import prefect_engine as engine
+from flows.survey.stages import accuracy as evaluation
 from flows.survey.survey import STAGES
 from flows.terminal.termination import Terminated
 from pipeline.errors import RigError, SceneError
 from storage.archive.archive import Archive
 from tests.flows.conftest import CommandLine
+from tests.flows.stage_doubles import act_instead
 
 
 @pytest.fixture
@@ -75,7 +76,7 @@ def test_an_error_of_a_stage_comes_through(
         tries.append("rectify")
         raise SceneError("no light in the scene; switch it on")
 
-    monkeypatch.setitem(STAGES, "rectify", refuse)
+    act_instead(monkeypatch, "rectify", refuse)
     with pytest.raises(SceneError, match="switch it on"):
         survey_png(tmp_path, engine="prefect")
     assert tries == ["rectify"]
@@ -93,7 +94,7 @@ def test_a_device_that_answers_the_second_time_is_asked_again(
             raise RigError("no reply from the camera after 2 s; is it on?")
         return real(*given)
 
-    monkeypatch.setitem(STAGES, "capture_coarse", shaky)
+    act_instead(monkeypatch, "capture_coarse", shaky)
     monkeypatch.setattr(engine, "RETRY_DELAY_S", 0.0)
     states = {stage["name"]: stage["state"] for stage in survey_png(tmp_path, engine="prefect").receipt["stages"]}
     assert tries == ["capture", "capture"]
@@ -147,7 +148,7 @@ def test_sigterm_in_a_stage(
         pytest.fail("SIGTERM was not heard")
 
     words = ("survey", "--scene", scene_files / "scene.png", "--weights", weights, "--out", tmp_path / "archive")
-    monkeypatch.setitem(STAGES, "rectify", terminated)
+    act_instead(monkeypatch, "rectify", terminated)
     ended = command_line(*words)
     assert (ended.code, ended.out, ended.errors) == (143, "", [])
     assert ended.err.splitlines()[-1] == "terminated; the same command goes on from here"

@@ -25,9 +25,9 @@ import flows.terminal.progress
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.survey_settings import Settings, load_settings
-from flows.survey.effect_choice import chosen_effects
 from flows.survey.run import make_source, open_run
 from flows.survey.scene import open_scene
+from flows.survey.stages.effects import chosen_effects
 from pipeline.errors import PoseError, SettingsError
 from pipeline.geometry.mounting import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from flows.publish.run_folder import Published
-from flows.survey.stages import VERSIONS
+from flows.survey.stage import versions
 from storage.archive.archive import Archive, StageRef
 from storage.archive.records import read_run
 from tests.conftest import Survey
@@ -25,7 +25,7 @@ def _stored_as(archive: Archive, like: StageRef, params: dict[str, Any], inputs:
     def build(path: Path) -> None:
         shutil.copytree(like.path, path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("manifest.json"))
 
-    return archive.produce(like.stage, build, version=VERSIONS[like.stage], params=params, inputs=inputs)[0]
+    return archive.produce(like.stage, build, version=versions()[like.stage], params=params, inputs=inputs)[0]
 
 
 def _publish_second_round(archive: Archive, one: Published) -> None:

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.placement import sighted
 from flows.survey.run import SurveyRun
-from flows.survey.stages import Produce, write_json
+from flows.survey.stage import Product, Wanted, stage
+from flows.survey.stages.capture import captured
 from pipeline.rectify.placed import Placed
 from pipeline.rectify.registration.alignment import SweepShift
 from pipeline.rectify.registration.anchoring import Anchor, anchor_sweep
@@ -23,13 +23,28 @@ from pipeline.rectify.registration.illumination import overlap_light, solve_ligh
 from pipeline.rectify.registration.overlaps import BroadSweep, broad_bands
 from pipeline.rectify.registration.seams import Registration, SeamWindow, register_sweeps
 from storage.archive.archive import StageRef
-from storage.archive.stored_tables import read_table
+from storage.archive.stored_tables import read_table, write_table
+from storage.arrays.located_sweeps import Sighted, sight_sweeps
 from storage.arrays.mosaics import load_mosaic
 
+POINTING = Product("register", version=2)
 RECORD = "registration.json"
 
 
-def register_coarse(run: SurveyRun, produce: Produce, raw: StageRef) -> StageRef | None:
+def sighted(run: SurveyRun, raw: StageRef, registration: StageRef | None) -> list[Sighted]:
+    """Open the sweeps of a capture with what registration found of them."""
+    return sight_sweeps(captured(raw), record_of(registration), run.camera)
+
+
+def record_of(registration: StageRef | None) -> Path | None:
+    """Where a registration wrote what it found."""
+    return None if registration is None else registration.path / RECORD
+
+
+@stage(
+    "register_coarse", "seams of the coarse sweeps", POINTING, of=("capture_coarse",), inputs=1, unit="coarse values"
+)
+def register_coarse(run: SurveyRun, raw: StageRef) -> Wanted | None:
     """Find pointing and light of the coarse sweeps from what neighbours show twice."""
     prior = run.settings.pointing_px
     if not prior:
@@ -42,9 +57,9 @@ def register_coarse(run: SurveyRun, produce: Produce, raw: StageRef) -> StageRef
         found = register_sweeps(broad, run.camera, prior_px=prior)
         run.report(0.8)
         placed = [replace(one, shift=found.of(one.cube.sweep.name)).placed(run.camera) for one in sweeps]
-        write_json(path / RECORD, _seams_record(found, _gains(run, found, placed)))
+        write_table(path / RECORD, _seams_record(found, _gains(run, found, placed)))
 
-    return produce("register", build, {"prior_px": prior, "pass": "coarse"}, [raw])
+    return Wanted(build, {"prior_px": prior, "pass": "coarse"}, [raw])
 
 
 def _gains(run: SurveyRun, found: Registration, placed: Sequence[Placed]) -> dict[str, list[float]]:
@@ -83,7 +98,10 @@ def _window_record(seen: SeamWindow, names: Sequence[str]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def register_fine(run: SurveyRun, produce: Produce, raw: StageRef, mosaic: StageRef) -> StageRef | None:
+@stage(
+    "register_fine", "fine sweeps on the mosaic", POINTING, of=("capture_fine", "rectify"), inputs=2, unit="fine values"
+)
+def register_fine(run: SurveyRun, raw: StageRef, mosaic: StageRef) -> Wanted | None:
     """Find where each fine sweep lies on the coarse mosaic, which itself may be off by as much."""
     prior = run.settings.pointing_px
     if not prior:
@@ -99,9 +117,9 @@ def register_fine(run: SurveyRun, produce: Produce, raw: StageRef, mosaic: Stage
             broad = BroadSweep.read(one.cube, run.camera, usable=one.usable)
             anchors.append(anchor_sweep(broad, run.camera, run.grid, under, prior_px=2 * prior))
             run.report((number + 1) / len(sweeps))
-        write_json(path / RECORD, _anchors_record(anchors))
+        write_table(path / RECORD, _anchors_record(anchors))
 
-    return produce("register", build, {"prior_px": prior, "pass": "fine", "grid": asdict(run.grid)}, [raw, mosaic])
+    return Wanted(build, {"prior_px": prior, "pass": "fine", "grid": asdict(run.grid)}, [raw, mosaic])
 
 
 def _broad_mean(values: NDArray[np.float32], bands: NDArray[np.intp]) -> NDArray[np.float32]:

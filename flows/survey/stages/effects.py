@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from flows.publish.receipt import to_json
 from flows.settings.survey_settings import plain_value
 from flows.survey.run import CaptureRun
+from flows.survey.stage import Product, Wanted, stage
 from pipeline.errors import IncompleteStoreError
 from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import Effect, Light
@@ -32,9 +33,7 @@ from pipeline.simulator.simulated import SimulatedSource, sweep_starts
 from storage.archive.archive import StageRef
 from storage.archive.stored_tables import read_table
 
-if TYPE_CHECKING:
-    from flows.survey.stages import Produce
-
+MANIFEST = Product("effects", version=2)
 RECORD = "effects.json"
 LOOK = {
     ROTATION: ROTATION.variants[0],
@@ -43,7 +42,8 @@ LOOK = {
 DRAFT, VERIFIED = 0.3, 1.0
 
 
-def choose_effects(run: CaptureRun, produce: Produce) -> StageRef:
+@stage("choose_effects", "effects that matter", MANIFEST, unit="surveys")
+def choose_effects(run: CaptureRun) -> Wanted:
     """Decide for scene and rig which effects to simulate, and check it on the worst lines of the scene.
 
     Where a rig takes the lines there is nothing to decide.
@@ -56,7 +56,7 @@ def choose_effects(run: CaptureRun, produce: Produce) -> StageRef:
     tolerance, asked = run.settings.tol, run.settings.effects
 
     if run.rig is not None:
-        return produce("effects", _write_nothing, {"source": run.source.name}, [])
+        return Wanted(_write_nothing, {"source": run.source.name})
 
     def build(path: Path) -> None:
         rig = run.settings.simulated_rig
@@ -77,7 +77,7 @@ def choose_effects(run: CaptureRun, produce: Produce) -> StageRef:
         "rig": rig_table(run.settings.simulated_rig),
         "sweeps": [asdict(sweep) for sweep in run.planned],
     }
-    return produce("effects", build, params, [])
+    return Wanted(build, params)
 
 
 def _write_nothing(path: Path) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flows.publish.colour_stretch import choose_bands, develop, stretch
 from flows.survey.run import SurveyRun
-from flows.survey.stages import Produce
+from flows.survey.stage import Product, Wanted, stage
 from pipeline.ground.map_grid import GroundGrid, classes_at, ground_grid, image_at, map_blocks
 from pipeline.ground.view import GroundView
 from storage.archive.archive import StageRef
@@ -18,10 +18,12 @@ from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.arrays.ground_maps import BLOCK, ClassLegend, GroundMapWriter
 from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
 
+GROUND = Product("ground", version=2)
 STORE = "ground_map.zarr"
 
 
-def ground(run: SurveyRun, produce: Produce, class_map: StageRef, mosaic: StageRef) -> StageRef | None:
+@stage("ground", "map on the ground", GROUND, of=("draw_map", "rectify"), after=("compare_turned",), unit="pixels")
+def ground(run: SurveyRun, class_map: StageRef, mosaic: StageRef) -> Wanted | None:
     """Draw the class map and the coarse picture on the ground; nothing where the settings have no pose."""
     grid = survey_grid(run)
     if grid is None:
@@ -45,7 +47,7 @@ def ground(run: SurveyRun, produce: Produce, class_map: StageRef, mosaic: StageR
         "scene_shape": run.scene.shape,
         "factor": run.grid.factor,
     }
-    return produce("ground", build, params, [class_map, mosaic])
+    return Wanted(build, params, [class_map, mosaic])
 
 
 def survey_grid(run: SurveyRun) -> GroundGrid | None:

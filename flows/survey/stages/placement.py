@@ -1,4 +1,4 @@
-"""Where the lines of a capture lie, and what they show on the grid: registration, lookup, mosaic, patches."""
+"""Where the lines of a capture lie, and what they show on the grid: lookup, mosaic, patches."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 
 from flows.publish.colour_stretch import choose_bands
 from flows.survey.run import SurveyRun
-from flows.survey.stages import SEATS_AT_ONCE, Produce, captured, load_plan, write_json
+from flows.survey.stage import Product, Wanted, stage
+from flows.survey.stages.attention import load_plan
+from flows.survey.stages.capture import captured
+from flows.survey.stages.registration import record_of, sighted
 from pipeline.errors import ShapeError
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.placed import PixelGrid
@@ -20,29 +23,22 @@ from pipeline.rectify.region import read_seats
 from pipeline.rectify.tie_points import TieTable
 from pipeline.rectify.tracks import Track
 from storage.archive.archive import StageRef
-from storage.archive.stored_tables import read_table
+from storage.archive.stored_tables import read_table, write_table
 from storage.arrays.layout import read_array
-from storage.arrays.located_sweeps import Sighted, sight_sweeps
 from storage.arrays.lookups import path_digest, write_lookup
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.patches import PatchWriter, open_patches
 from storage.arrays.quicklooks import stretched
 from storage.arrays.tile_work import MosaicRecipe, Thumbnail, write_mosaic
 
+LOOKUP, MOSAIC, PATCHES = Product("locate", version=2), Product("rectify", version=3), Product("patches", version=3)
 QUICKLOOK_PX = 512
+SEATS_AT_ONCE = 64
 CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the memory
 
 
-def sighted(run: SurveyRun, raw: StageRef, registration: StageRef | None) -> list[Sighted]:
-    """Open the sweeps of a capture with what registration found of them."""
-    return sight_sweeps(captured(raw), _record(registration), run.camera)
-
-
-def _record(registration: StageRef | None) -> Path | None:
-    return None if registration is None else registration.path / "registration.json"
-
-
-def locate(run: SurveyRun, produce: Produce, raw: StageRef, *registration: StageRef) -> StageRef:
+@stage("locate", "lookup", LOOKUP, of=("capture_coarse", "register_coarse"), unit="coarse pixels")
+def locate(run: SurveyRun, raw: StageRef, *registration: StageRef) -> Wanted:
     """Look up where each coarse pixel was seen: a table that every survey along the same path shares."""
     grid = PixelGrid.of_scene(run.grid, run.grid.factor)
     sweeps = sighted(run, raw, _only(registration))
@@ -69,10 +65,11 @@ def locate(run: SurveyRun, produce: Produce, raw: StageRef, *registration: Stage
             run.report((number + 1) / len(sweeps))
         write_lookup(path / "lookup.zarr", tables, params)
 
-    return produce("locate", build, params, [])  # keyed by the paths, not by what was seen along them
+    return Wanted(build, params)  # keyed by the paths, not by what was seen along them
 
 
-def rectify(run: SurveyRun, produce: Produce, raw: StageRef, lookup: StageRef, *registration: StageRef) -> StageRef:
+@stage("rectify", "mosaic", MOSAIC, of=("capture_coarse", "locate", "register_coarse"), unit="mosaic values")
+def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: StageRef) -> Wanted:
     """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
 
     def build(path: Path) -> None:
@@ -84,7 +81,7 @@ def rectify(run: SurveyRun, produce: Produce, raw: StageRef, lookup: StageRef, *
             grid,
             run.settings.kernel,
             lookup=lookup.path / "lookup.zarr",
-            registration=_record(_only(registration)),
+            registration=record_of(_only(registration)),
         )
         writer = MosaicWriter(
             path / "mosaic.zarr",
@@ -98,15 +95,14 @@ def rectify(run: SurveyRun, produce: Produce, raw: StageRef, lookup: StageRef, *
         settings, picture = run.settings, Thumbnail(grid.shape, colours, QUICKLOOK_PX)
         write_mosaic(recipe, writer, memory=settings.memory, crew=settings.crew, seen=picture, report=run.report)
         writer.write_quicklook(stretched(picture.image).image)
-        write_json(path / "lines.json", {one.cube.sweep.name: one.facts() for one in recipe.sweeps()})
+        write_table(path / "lines.json", {one.cube.sweep.name: one.facts() for one in recipe.sweeps()})
 
     params = {"grid": asdict(run.grid), "kernel": run.settings.kernel}
-    return produce("rectify", build, params, [raw, lookup, *registration])
+    return Wanted(build, params, [raw, lookup, *registration])
 
 
-def cut_patches(
-    run: SurveyRun, produce: Produce, attention: StageRef, raw: StageRef, *registration: StageRef
-) -> StageRef:
+@stage("cut_patches", "fine patches", PATCHES, of=("attend", "capture_fine", "register_fine"), unit="patch values")
+def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, *registration: StageRef) -> Wanted:
     """Bring every chosen seat onto the scene grid, one patch a seat; NaN where a mirror off the plan did not look."""
 
     def build(path: Path) -> None:
@@ -124,7 +120,7 @@ def cut_patches(
             run.report((first + len(seats)) / len(ordered))
 
     params = {"grid": asdict(run.grid), "kernel": run.settings.kernel}
-    return produce("patches", build, params, [attention, raw, *registration])
+    return Wanted(build, params, [attention, raw, *registration])
 
 
 def seen_shares(run: SurveyRun, patches: StageRef) -> NDArray[np.float64]:

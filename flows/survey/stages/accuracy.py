@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.publish.receipt import to_json
-from flows.survey.effect_choice import source_with
 from flows.survey.full_look import columns_of_all_seats
-from flows.survey.pointing import load_registration
 from flows.survey.run import SurveyRun
-from flows.survey.stages import Produce, digest, glance_at, patch_columns
+from flows.survey.stage import Product, Wanted, stage
+from flows.survey.stages.class_map import glance_at, patch_columns
+from flows.survey.stages.effects import source_with
+from flows.survey.stages.registration import load_registration
 from models.evaluation.metrics import (
     agreement,
     average_accuracy,
@@ -41,19 +42,27 @@ from pipeline.planning.selection import frame_seats
 from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import StageRef
+from storage.archive.keys import array_digest
 from storage.archive.stored_tables import read_table
 from storage.arrays.class_maps import load_class_map
 
+ACCURACY = Product("evaluate", version=7, by_weights=True)
+RECORD = "accuracy.json"
 
+
+@stage(
+    "evaluate",
+    "accuracy (not part of the survey)",
+    ACCURACY,
+    of=("rectify", "cut_patches", "draw_map", "choose_effects", "register_coarse"),
+    after=("ground",),
+    unit="operations of a glance",
+    size="surveys",
+    judges=True,
+)
 def evaluate(
-    run: SurveyRun,
-    produce: Produce,
-    mosaic: StageRef,
-    patches: StageRef,
-    class_map: StageRef,
-    effects: StageRef,
-    *pointing: StageRef,
-) -> StageRef | None:
+    run: SurveyRun, mosaic: StageRef, patches: StageRef, class_map: StageRef, effects: StageRef, *pointing: StageRef
+) -> Wanted | None:
     """Judge the map by the labels, and what other placements would have given. Not part of the survey's own cost.
 
     What controls see has the effects of the survey.
@@ -79,16 +88,16 @@ def evaluate(
         if run.settings.controls:
             source = source_with(_sure_source(run, off), effects)
             result |= _controls(replace(run, source=source), seen, patches, judged, result)
-        (path / "accuracy.json").write_text(to_json(result), encoding="utf-8")  # no NaN, which JSON does not know
+        (path / RECORD).write_text(to_json(result), encoding="utf-8")  # no NaN, which JSON does not know
 
     params = {
         "weights": run.weights_key,
-        "labels": digest(labels),
+        "labels": array_digest(labels),
         "controls": run.settings.controls,
         "kernel": run.settings.kernel,
         **run.source_key(),
     }
-    return produce("evaluate", build, params, inputs)
+    return Wanted(build, params, inputs)
 
 
 def _wait_for(inputs: Sequence[StageRef]) -> None:
@@ -214,4 +223,4 @@ def _figures(run: SurveyRun, counts: NDArray[np.int64]) -> dict[str, Any]:
 
 def load_accuracy(evaluated: StageRef) -> dict[str, Any]:
     """Read the figures of an evaluation."""
-    return read_table(evaluated.path / "accuracy.json")
+    return read_table(evaluated.path / RECORD)

@@ -7,18 +7,28 @@ from pathlib import Path
 from typing import Any
 
 from flows.survey.run import SurveyRun
-from flows.survey.stages import Produce, load_plan, write_json
+from flows.survey.stage import Product, Wanted, stage
+from flows.survey.stages.attention import load_plan
 from pipeline.planning.crop_rows import find_rows
 from pipeline.planning.orientation import compare_orientations
 from storage.archive.archive import StageRef
-from storage.archive.stored_tables import read_table
+from storage.archive.stored_tables import read_table, write_table
 from storage.arrays.attention import load_attention
 from storage.arrays.mosaic_strips import mosaic_brightness
 
+TURNED = Product("turned", version=1)
 FILE = "orientation.json"
 
 
-def compare_turned(run: SurveyRun, produce: Produce, mosaic: StageRef, attention: StageRef) -> StageRef:
+@stage(
+    "compare_turned",
+    "the plan with lines along the other axis",
+    TURNED,
+    of=("rectify", "attend"),
+    after=("draw_map",),
+    unit="pixels",
+)
+def compare_turned(run: SurveyRun, mosaic: StageRef, attention: StageRef) -> Wanted:
     """Plan the scores with lines along the other axis, and find which way crop rows run."""
     settings = run.settings
 
@@ -38,9 +48,9 @@ def compare_turned(run: SurveyRun, produce: Produce, mosaic: StageRef, attention
             margin_px=run.plan.margin_px,
             threshold=settings.threshold,
         )
-        write_json(path / FILE, asdict(turned) | {"sentence": turned.sentence})
+        write_table(path / FILE, asdict(turned) | {"sentence": turned.sentence})
 
-    return produce("turned", build, {}, [mosaic, attention])  # all it depends on are parameters of attention
+    return Wanted(build, {}, [mosaic, attention])  # all it depends on are parameters of attention
 
 
 def load_orientation(turned: StageRef) -> dict[str, Any]:

@@ -1,0 +1,92 @@
+"""The stage of attention: a score for every seat, and the sweeps that show the most of it in the time left."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.survey.field_work import FieldWork, region_params
+from flows.survey.run import SurveyRun
+from flows.survey.stage import Product, Wanted, stage
+from models.policies.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_seats
+from models.reading.inference import Glance
+from pipeline.geometry.scan import Sweep
+from pipeline.planning.fine_pass import FinePlan, plan_fine
+from storage.archive.archive import StageRef
+from storage.archive.keys import array_digest
+from storage.archive.stored_tables import read_table, write_table
+from storage.arrays.attention import Attention, write_attention
+
+ATTENTION = Product("attend", version=7, by_weights=True)
+
+
+@stage("attend", "attention and plan", ATTENTION, of=("rectify",), unit="pixels")
+def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
+    """Score every seat by the coarse mosaic, and plan the sweeps that show the most score in the time left."""
+    settings = run.settings
+
+    def build(path: Path) -> None:
+        """Score the seats, and refuse a plan whose map would not fit the memory."""
+        work = FieldWork.of(run)
+        scores = _scores(run, work, mosaic)
+        plan = plan_fine(
+            run.grid,
+            run.camera,
+            settings.cost,
+            run.plan.along,
+            scores,
+            budget_s=run.plan.fine_s,
+            margin_px=run.plan.margin_px,
+            full=run.plan.full,
+            threshold=settings.threshold,
+        )
+        work.check_memory(plan.seats, len(run.scene.wavelength_nm))  # before the rig goes back, not after
+        rank = np.full(scores.shape, -1, np.int32)
+        rank[plan.seats[np.argsort(-scores[plan.seats], kind="stable")]] = np.arange(len(plan.seats))
+        shape = run.grid.seat_shape
+        write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), settings.policy))
+        write_plan(path, plan)
+
+    params = {
+        "weights": run.weights_key,
+        "grid": asdict(run.grid),
+        "policy": settings.policy,
+        "seed": settings.seed if settings.policy in SEEDED_POLICIES else None,
+        "mask": None if run.mask is None else array_digest(run.mask),
+        "fine_s": run.plan.fine_s,
+        "overlap_px": run.plan.overlap_px,
+        "margin_px": run.plan.margin_px,
+        "along": run.plan.along,
+        "camera": asdict(run.camera),
+        "cost": asdict(settings.cost),
+        **(region_params(run.grid) if settings.policy in SEEING_POLICIES else {}),
+        **({} if run.vgg is None else {"vgg": run.vgg.key}),
+        **({} if settings.threshold is None else {"threshold": settings.threshold}),
+    }
+    return Wanted(build, params, [mosaic])
+
+
+def _scores(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:
+    """(seat,) worth of a fine look at each seat of the padded grid."""
+    policy = run.settings.policy
+    if policy in SEEING_POLICIES + IMAGE_POLICIES:
+        return work.score(policy, mosaic.path / "mosaic.zarr", lambda done: run.report(0.5 * done)).ravel()
+    nothing = np.empty((0, 0, 0), np.float32)
+    return score_seats(policy, Glance(run.grid, nothing, nothing), seed=run.settings.seed, mask=run.mask)
+
+
+def write_plan(folder: Path, plan: FinePlan) -> None:
+    """Write the plan of an attention store; of a threshold only where there was one."""
+    content = asdict(plan) | {"seats": plan.seats.tolist()}
+    absent = [name for name in ("threshold", "spared_s") if content[name] is None]
+    write_table(folder / "plan.json", {name: value for name, value in content.items() if name not in absent})
+
+
+def load_plan(attention: StageRef) -> FinePlan:
+    """Read the plan of an attention store."""
+    plan = read_table(attention.path / "plan.json")
+    kept = {"sweeps": [Sweep(**sweep) for sweep in plan["sweeps"]], "seats": np.array(plan["seats"], np.intp)}
+    return FinePlan(**(plan | kept))

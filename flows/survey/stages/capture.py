@@ -1,0 +1,104 @@
+"""The stages that take sweeps: lines into the spool as they come, and from there into one cube a sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from flows.survey.rendered_lines import lines_again, take_lines
+from flows.survey.rig_run import RIG_RECORD, capture_source, held_lines, rig_record
+from flows.survey.run import CaptureRun, SurveyRun
+from flows.survey.stage import Product, Wanted, stage
+from flows.survey.stages.attention import load_plan
+from flows.survey.stages.effects import load_manifest, source_with
+from pipeline.geometry.scan import Sweep
+from pipeline.simulator.simulated import sweep_starts
+from pipeline.source import Line, Source
+from storage.archive.archive import StageRef, stage_key
+from storage.archive.stored_tables import write_table
+from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
+from storage.arrays.spool import Spool
+
+RAW = Product("capture", version=4)
+
+
+@stage("capture_coarse", "coarse sweep", RAW, of=("choose_effects",), inputs=1, unit="coarse values", retries=2)
+def capture_coarse(run: SurveyRun, effects: StageRef) -> Wanted:
+    """Sweep the whole field once, fast."""
+    return sweeps_wanted(run, run.plan.coarse, [effects])
+
+
+@stage("capture_fine", "fine sweeps", RAW, of=("attend", "choose_effects"), inputs=2, unit="fine values", retries=2)
+def capture_fine(run: SurveyRun, attention: StageRef, effects: StageRef) -> Wanted:
+    """Go back for the places that the plan chose."""
+    return sweeps_wanted(run, load_plan(attention).sweeps, [attention, effects], begins_s=run.plan.coarse_s)
+
+
+def sweeps_wanted(
+    run: CaptureRun, sweeps: Sequence[Sweep], inputs: Sequence[StageRef], *, begins_s: float = 0.0
+) -> Wanted:
+    """Some sweeps, one after the other from ``begins_s`` on, with the effects of the last of the inputs."""
+    clock = sweep_starts(sweeps, run.camera, run.settings.cost, after_s=begins_s)
+    params = {**run.source_key(), "sweeps": [asdict(sweep) for sweep in sweeps], "starts_s": list(clock.values())}
+    key = stage_key(RAW.name, RAW.version, params, [ref.key for ref in inputs])
+    total = sum(sweep.lines for sweep in sweeps) or 1
+
+    def build(path: Path) -> None:
+        """Take the sweeps one after the other, each into a cube of its own."""
+        before, manifest = 0, load_manifest(inputs[-1])
+        lit = replace(run, source=source_with(run.source, inputs[-1], clock))
+        with capture_source(lit, key) as source:
+            for sweep in sweeps:
+                done = partial(_report_lines, run, before / total, total)
+                _capture_sweep(lit, source, sweep, path, key=key, report=done, effects=manifest)
+                before += sweep.lines
+            if run.rig is not None:
+                write_table(path / RIG_RECORD, rig_record(source))
+
+    return Wanted(build, params, inputs, then=partial(run.archive.drop_spool, key))
+
+
+def _report_lines(run: CaptureRun, before: float, total: int, lines: int) -> None:
+    run.report(before + lines / total)
+
+
+def _capture_sweep(
+    run: CaptureRun, source: Source, sweep: Sweep, path: Path, *, key: str, report: Callable[[int], None],
+    effects: Mapping[str, Any],
+) -> None:  # fmt: skip
+    """Lines into the spool and then the cube, one by one, from where a broken capture stopped.
+
+    Lines that were lost since are asked for again; a rig captures nothing for them, and what it cannot give is invalid.
+    """
+    references = source.references(sweep)
+    simulation = None if run.rig else effects
+    header = SweepHeader(
+        sweep, references, run.scene.wavelength_nm, run.scene.fwhm_nm, source.name, simulation=simulation
+    )
+    samples, bands = references.dark.shape
+    about = {"sweep": asdict(sweep), **run.source_key()}
+    folder = run.archive.spool_folder(key)
+    with (
+        Spool.open(folder, samples, bands, header=about, name=sweep.name) as spool,
+        RawCubeWriter(path / f"{sweep.name}.zarr", header) as cube,
+    ):
+
+        def take(line: Line) -> None:
+            spool.append(line)
+            cube.write([line])
+            report(spool.count)
+
+        again = lines_again if run.rig is None else held_lines
+        spool.mend(again(source, sweep, spool.lost))
+        for block in spool.blocks():
+            cube.write(block)
+        report(spool.count)
+        take_lines(source, sweep, take, run.settings.crew, first=spool.count)
+
+
+def captured(ref: StageRef) -> list[RawCube]:
+    """Open the sweeps of a capture, in the order of their names."""
+    return [open_raw_cube(path) for path in sorted(ref.path.glob("*.zarr"))]
