@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,8 +67,15 @@ class Source(Protocol):
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
         """Give the sweep's lines one by one, from line ``first`` on."""
 
+    def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
+        """Give single lines that it gave before, in order; not valid where it has them no more."""
+
     def references(self, sweep: Sweep) -> References:
         """Dark and white frames with the sweep's binning."""
+
+    @property
+    def record(self) -> Mapping[str, Any] | None:
+        """What its captures were like, for their store; None where its effects tell all of it."""
 
 
 class SweepLines(Protocol):

@@ -18,8 +18,8 @@ from flows.publish.receipt import Receipt
 from flows.publish.run_folder import add_accuracy, load_receipt
 from flows.publish.survey_command import show_published
 from flows.settings.survey_settings import Settings
-from flows.survey.rig_run import for_rig
 from flows.survey.run import SurveyRun, open_run
+from flows.survey.sources import for_rig
 from flows.survey.stage import versions
 from flows.survey.survey import STAGES, TITLES, Products, StageRunner, judge
 from flows.terminal.progress import StageProgress

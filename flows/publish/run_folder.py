@@ -147,7 +147,7 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
     run = runner.run
     accuracy = None if products.get("evaluate") is None else load_accuracy(products.of("evaluate"))
     savings = _savings(run, products, plan)
-    simulation = None if run.rig else load_manifest(products.of("choose_effects"))
+    simulation = None if not run.source.simulates else load_manifest(products.of("choose_effects"))
     if accuracy is not None and "segment_wall_s" in accuracy:
         savings["segment_wall_s"] = accuracy.pop("segment_wall_s")
     header = Header(

@@ -62,8 +62,7 @@ def _survey_and_publish(run: SurveyRun, settings: Settings, console: Console, st
             progress.show(stage, done, "" if running else state, ended=not running)
             shown(stage, state, done)
 
-        rig = None if run.rig is None else run.rig.saying(progress.say)
-        runner = StageRunner(replace(run, rig=rig), watch)
+        runner = StageRunner(replace(run, source=run.source.saying(progress.say)), watch)
 
         def finish(step: Step, products: Products) -> Published:
             return publish_and_judge(

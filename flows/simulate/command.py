@@ -18,6 +18,7 @@ from flows.simulate.effect_comparison import Comparison, compare_with_everything
 from flows.survey.capture_plan import lay_out_sweeps
 from flows.survey.run import CaptureRun, make_source
 from flows.survey.scene import farm_refusal, open_scene
+from flows.survey.sources import SimulatedField
 from flows.survey.stage import Stage, Wanted
 from flows.survey.stages.capture import capture_coarse, sweeps_wanted
 from flows.survey.stages.effects import choose_effects, load_manifest
@@ -145,10 +146,15 @@ def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[Captur
     if scene.filled_px:
         raise SceneError(_gap(settings))
     _, coarse_pass, full = lay_out_sweeps(settings, SceneGrid(*scene.shape, PATCH, FACTOR))
+    simulated = make_source(scene, settings)
     run = CaptureRun(
-        settings=settings, archive=open_archive(settings.out), source=make_source(scene, settings), scene=scene,
+        settings=settings,
+        archive=open_archive(settings.out),
+        source=SimulatedField(simulated),
+        simulated=simulated,
+        scene=scene,
         planned=(*coarse_pass, *full),
-    )  # fmt: skip
+    )
     return run, coarse_pass if coarse else full, notes
 
 

@@ -146,7 +146,7 @@ def compare_with_everything(
     BoundError : expected light differs by more than the bound of the decision; names the place.
     """
     clock = sweep_starts(sweeps, run.camera, run.settings.cost)
-    chosen = source_with(run.source, effects, clock)
+    chosen = source_with(run.simulated, effects, clock)
     total = load_manifest(effects)["total"]
     bound = math.inf if total["bound"] is None else total["bound"]
     ways = _Ways(replace(chosen, chosen=everything(effects)), chosen, total["unit"], bound)

@@ -23,4 +23,4 @@ def emulated_source(settings: Settings) -> tuple[SimulatedSource, tuple[str, ...
         apart = replace(settings, source="sim", out=str(Path(folder) / "effects"))
         run, _, notes = open_simulation(apart)
         effects, _ = choose_effects.produce(run.archive, choose_effects.needed(run))
-        return source_with(run.source, effects), notes
+        return source_with(run.simulated, effects), notes

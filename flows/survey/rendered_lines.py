@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from itertools import islice
 from threading import Semaphore
 
 from pipeline.geometry.scan import Sweep
@@ -40,15 +39,6 @@ def take_lines(
     blocks = [range(start, min(start + at_once, sweep.lines)) for start in range(first, sweep.lines, at_once)]
     make = partial(_rendered, source, sweep, Semaphore(workers.count))
     run_blocks(make, blocks, replace(workers, workers=workers.count + 1), keep=False, each=_InOrder(take, first))
-
-
-def lines_again(source: Source, sweep: Sweep, numbers: Iterable[int]) -> Iterator[Line]:
-    """Give single lines that a source gave before: the same, bit for bit, where it is a simulation."""
-    for number in numbers:
-        if isinstance(source, SimulatedSource):
-            yield from source.lines_of(sweep, range(number, number + 1))
-        else:
-            yield from islice(source.lines(sweep, number), 1)
 
 
 def rendering_crew(crew: Crew) -> Crew:

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from flows.settings.keys import BUILT_IN_SCENES
 from flows.settings.survey_settings import Settings
 from flows.survey.capture_plan import CapturePlan, check_memory, plan_capture
-from flows.survey.rig_run import for_rig, rig_source
 from flows.survey.scene import check_labels, check_mask, farm_refusal, judged_labels, open_scene
+from flows.survey.sources import FieldSource, field_source, for_rig
 from models.policies.vgg_file import VggFile
 from models.weights.files import (
     Description,
@@ -31,7 +31,6 @@ from models.weights.files import (
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.mounting import STRAIGHT
 from pipeline.geometry.scan import Sweep
 from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView
@@ -44,9 +43,6 @@ from storage.arrays.layout import AngularGrid
 from storage.readers.raster_files import load_raster
 from storage.remote.opening import open_archive
 
-if TYPE_CHECKING:
-    from pipeline.rig.capture.rig_source import RigSource
-
 SHIPPED = "farm.safetensors"
 
 Report = Callable[[float], None]  # how far a stage is, 0..1
@@ -58,11 +54,11 @@ class CaptureRun:
 
     settings: Settings
     archive: Archive
-    source: SimulatedSource  # without effects: which there are is a stage's to decide
+    source: FieldSource  # who takes the lines
+    simulated: SimulatedSource  # without effects; beside a rig it stands for the plan: sizes, paths and memory
     scene: RasterScene
     planned: tuple[Sweep, ...]  # that stand for all the rig may take: the coarse pass and the scan of everything
     report: Report = field(default=lambda done: None)
-    rig: RigSource | None = None  # takes the lines, where one does; then ``source`` only stands for their plan
 
     @property
     def camera(self) -> LineCamera:
@@ -76,7 +72,6 @@ class CaptureRun:
 
     def source_key(self) -> dict[str, Any]:
         """What the captured light depends on, beside the sweeps and the effects."""
-        mounting = self.settings.rig.mounting
         return {
             "source": self.source.name,
             "scene": self.scene.key,
@@ -84,8 +79,7 @@ class CaptureRun:
             "camera": asdict(self.camera),
             "pointing_px": self.settings.pointing_px,
             **({} if self.settings.visit is None else {"visit": self.settings.visit}),
-            **({} if self.rig is None else {"field": self.name}),
-            **({} if self.rig is None or mounting == STRAIGHT else {"mounting": asdict(mounting)}),
+            **self.source.key(self.name),
         }
 
 
@@ -156,14 +150,13 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
         check_mask(settings.mask, scene.shape)
     sealing = () if described.sealed else (unsealed_note(path),)
     vgg_notes = _check_vgg(settings, None if planning else load)
-    source = make_source(scene, settings)
-    planned = (*plan.coarse, *plan.full)
-    rig = rig_source(scene, settings, planned) if settings.source == "rig" else None
-    check_memory(settings, source, grid, plan)
+    simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
+    source = field_source(scene, settings, simulated, planned)
+    check_memory(settings, simulated, grid, plan)
     _check_pose(settings, scene.shape)
     key = content_key(path)
     return SurveyRun(
-        settings=settings, archive=open_archive(settings.out), source=source, rig=rig, scene=scene,
+        settings=settings, archive=open_archive(settings.out), source=source, simulated=simulated, scene=scene,
         planned=planned, described=described, load=load, weights_key=key, grid=grid, plan=plan,
         notes=(*notes, *sealing, *band_notes, *vgg_notes, *label_notes), refused=refused,
     )  # fmt: skip

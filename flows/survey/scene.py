@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from flows.settings.keys import BUILT_IN_SCENES, RIG_FIELD
 from flows.settings.survey_settings import Settings
-from flows.survey.rig_run import field_before_rig
 from flows.training.data import scene_of_file, unpack_mask
 from models.weights.files import Description
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import Once
 from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, law_of_key
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from storage.readers.declared_sizes import machine_bytes
 from storage.readers.raster_files import load_raster
 from storage.readers.scene_files import load_scene_file
@@ -36,7 +35,7 @@ def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
     SettingsError : what was given does not go with a built-in scene.
     """
     if settings.scene == RIG_FIELD:
-        return field_before_rig(settings), ()
+        return _field_before_rig(settings), ()
     if settings.scene in BUILT_IN_SCENES:
         return _open_farm(settings), _notes_of_moment(settings)
     file = load_scene_file(
@@ -44,6 +43,35 @@ def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
     )
     scene = scene_of_file(file, settings.camera)
     return scene, (*file.provenance, *_gap_note(scene))
+
+
+def _field_before_rig(settings: Settings) -> RasterScene:
+    """Give a field of which only size and bands are known.
+
+    Raises
+    ------
+    SettingsError : they are not given.
+    """
+    for name, value in {"size": settings.size, "wavelengths": settings.wavelengths}.items():
+        if value is None:
+            raise SettingsError(
+                f"scene {RIG_FIELD!r} is what stands before the rig: give its {name}, which no file tells"
+            )
+    assert settings.size is not None
+    assert settings.wavelengths is not None
+    width, height = settings.size
+    bands = len(settings.wavelengths)
+    nothing = np.zeros((height, width, 1), np.float32)
+    return RasterScene(
+        name=settings.name or RIG_FIELD,
+        key=f"{RIG_FIELD}/{settings.name or ''}/{width}x{height}",
+        raster=SceneRaster.of(nothing),
+        light=Once.of(
+            SceneLight(np.zeros((1, bands), np.float32), np.full(bands, settings.camera.full_well_e, np.float32))
+        ),
+        panel=np.full(bands, settings.rig.panel, np.float32),
+        wavelength_nm=np.array(settings.wavelengths, np.float64),
+    )
 
 
 def _gap_note(scene: RasterScene) -> tuple[str, ...]:

@@ -112,6 +112,16 @@ class SimulatedSource:
             for number, data in zip(numbers, self.render(sweep, numbers), strict=True)
         ]
 
+    def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
+        """Give single lines that were given before: the same, bit for bit."""
+        for number in numbers:
+            yield from self.lines_of(sweep, range(number, number + 1))
+
+    @property
+    def record(self) -> None:
+        """Nothing: the manifest of the effects tells all."""
+        return None
+
     def references(self, sweep: Sweep) -> References:
         """Mean dark and white frames with the sweep's binning, as the effects that are on have them."""
         return take_references(self.scene, self.rig, self.choice, sweep)

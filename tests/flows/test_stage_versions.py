@@ -26,7 +26,7 @@ from tests.flows.stage_closure import Sources, Target, read_packages  # noqa: E4
 VERSIONS = {**versions(), ingest_command.STAGE: ingest_command.VERSION}
 RECORD = Path(__file__).with_name("stage_digests.json")
 LIGHT = ("farm_scene", "raster_from_values", "make_source")  # who looks at what: runs bring it, no stage names it
-BESIDES = {"effects": LIGHT, "capture": (*LIGHT, "rig_source"), "evaluate": ("judged_labels",)}
+BESIDES = {"effects": LIGHT, "capture": (*LIGHT, "field_source"), "evaluate": ("judged_labels",)}
 ROOTS = {ingest_command.STAGE: ("run_ingest",)}
 for _one in all_stages().values():
     _function = f"{_one.wants.__module__}.{_one.wants.__name__}"

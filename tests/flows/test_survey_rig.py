@@ -20,7 +20,7 @@ import pytest
 import serial
 from rich.console import Console
 
-import flows.survey.rig_run
+import flows.survey.sources
 import flows.terminal.progress
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
@@ -84,7 +84,7 @@ def emulated(
             mirror.connect()
             return RigDevices(mirror, line.camera(), line.clock)
 
-        patch.setattr(flows.survey.rig_run, "open_devices", open_devices)
+        patch.setattr(flows.survey.sources, "open_devices", open_devices)
         yield whole
 
 

@@ -87,7 +87,7 @@ def evaluate(
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
         if run.settings.controls:
             source = source_with(_sure_source(run, off), effects)
-            result |= _controls(replace(run, source=source), seen, patches, judged, result)
+            result |= _controls(replace(run, simulated=source), seen, patches, judged, result)
         (path / RECORD).write_text(to_json(result), encoding="utf-8")  # no NaN, which JSON does not know
 
     params = {
@@ -111,7 +111,7 @@ def _map_offset(run: SurveyRun, pointing: Sequence[StageRef]) -> NDArray[np.floa
 
     Overlaps tie sweeps to each other and not to the ground. Only the simulator knows the rest.
     """
-    errors = run.source.pointing
+    errors = run.simulated.pointing
     if not isinstance(errors, PointingErrors) or not pointing:
         return np.zeros(2)
     return errors.offset(load_registration(pointing[0])["reference"])
@@ -130,9 +130,9 @@ def _moved(run: SurveyRun, off: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 def _sure_source(run: SurveyRun, off: NDArray[np.float64]) -> SimulatedSource:
     """A mirror that looks as far beside the scene as the map lies, everywhere: controls share the map's pixels."""
-    if run.source.pointing is None:
-        return run.source
-    return replace(run.source, pointing=CommonOffset((float(off[0]), float(off[1]))))
+    if run.simulated.pointing is None:
+        return run.simulated
+    return replace(run.simulated, pointing=CommonOffset((float(off[0]), float(off[1]))))
 
 
 def _controls(
@@ -140,7 +140,7 @@ def _controls(
 ) -> dict[str, Any]:
     """`all`, the other placements, and how long either reading takes."""
     columns = columns_of_all_seats(
-        run.source, run.plan.full, run.grid, run.weights,
+        run.simulated, run.plan.full, run.grid, run.weights,
         memory=run.settings.memory, kernel=run.settings.kernel, report=lambda done: run.report(0.6 * done),
     )  # fmt: skip
     rows = 0

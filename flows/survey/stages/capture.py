@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flows.survey.rendered_lines import lines_again, take_lines
-from flows.survey.rig_run import RIG_RECORD, capture_source, held_lines, rig_record
+from flows.survey.rendered_lines import take_lines
 from flows.survey.run import CaptureRun, SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from flows.survey.stages.attention import load_plan
-from flows.survey.stages.effects import load_manifest, source_with
+from flows.survey.stages.effects import chosen_effects, load_manifest
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.simulated import sweep_starts
 from pipeline.source import Line, Source
@@ -23,6 +22,7 @@ from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_c
 from storage.arrays.spool import Spool
 
 RAW = Product("capture", version=4)
+RIG_RECORD = "rig.json"  # beside the cubes: what a rig's captures were like
 
 
 @stage("capture_coarse", "coarse sweep", RAW, of=("choose_effects",), inputs=1, unit="coarse values", retries=2)
@@ -48,15 +48,16 @@ def sweeps_wanted(
 
     def build(path: Path) -> None:
         """Take the sweeps one after the other, each into a cube of its own."""
-        before, manifest = 0, load_manifest(inputs[-1])
-        lit = replace(run, source=source_with(run.source, inputs[-1], clock))
-        with capture_source(lit, key) as source:
+        before, manifest = 0, load_manifest(inputs[-1]) if run.source.simulates else None
+        run.report(0.0)  # a rig is at work long before its first line is here
+        lit = run.source.lit(chosen_effects(inputs[-1]), clock)
+        with lit.opened(run.archive.spool_folder(key)) as source:
             for sweep in sweeps:
                 done = partial(_report_lines, run, before / total, total)
-                _capture_sweep(lit, source, sweep, path, key=key, report=done, effects=manifest)
+                _capture_sweep(run, source, sweep, path, key=key, report=done, effects=manifest)
                 before += sweep.lines
-            if run.rig is not None:
-                write_table(path / RIG_RECORD, rig_record(source))
+            if source.record is not None:
+                write_table(path / RIG_RECORD, source.record)
 
     return Wanted(build, params, inputs, then=partial(run.archive.drop_spool, key))
 
@@ -67,17 +68,14 @@ def _report_lines(run: CaptureRun, before: float, total: int, lines: int) -> Non
 
 def _capture_sweep(
     run: CaptureRun, source: Source, sweep: Sweep, path: Path, *, key: str, report: Callable[[int], None],
-    effects: Mapping[str, Any],
+    effects: Mapping[str, Any] | None,
 ) -> None:  # fmt: skip
     """Lines into the spool and then the cube, one by one, from where a broken capture stopped.
 
     Lines that were lost since are asked for again; a rig captures nothing for them, and what it cannot give is invalid.
     """
     references = source.references(sweep)
-    simulation = None if run.rig else effects
-    header = SweepHeader(
-        sweep, references, run.scene.wavelength_nm, run.scene.fwhm_nm, source.name, simulation=simulation
-    )
+    header = SweepHeader(sweep, references, run.scene.wavelength_nm, run.scene.fwhm_nm, source.name, simulation=effects)
     samples, bands = references.dark.shape
     about = {"sweep": asdict(sweep), **run.source_key()}
     folder = run.archive.spool_folder(key)
@@ -91,8 +89,7 @@ def _capture_sweep(
             cube.write([line])
             report(spool.count)
 
-        again = lines_again if run.rig is None else held_lines
-        spool.mend(again(source, sweep, spool.lost))
+        spool.mend(source.lines_again(sweep, spool.lost))
         for block in spool.blocks():
             cube.write(block)
         report(spool.count)

@@ -55,7 +55,7 @@ def choose_effects(run: CaptureRun) -> Wanted:
     """
     tolerance, asked = run.settings.tol, run.settings.effects
 
-    if run.rig is not None:
+    if not run.source.simulates:
         return Wanted(_write_nothing, {"source": run.source.name})
 
     def build(path: Path) -> None:
