@@ -14,12 +14,13 @@ from rich.markup import escape
 
 from flows.archive.compare_command import find_run
 from flows.archive.stale_runs import asked_again
-from flows.publish.receipt import JUDGING, Receipt
+from flows.publish.receipt import Receipt
 from flows.publish.run_folder import add_accuracy, load_receipt
 from flows.publish.survey_command import show_published
 from flows.settings.survey_settings import Settings
 from flows.survey.rig_run import for_rig
 from flows.survey.run import SurveyRun, open_run
+from flows.survey.scores import JUDGING
 from flows.survey.stages import VERSIONS
 from flows.survey.survey import TITLES, Products, StageRunner, judge
 from flows.terminal.progress import StageProgress

@@ -10,16 +10,18 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
-from flows.publish.receipt import JUDGING, is_pending, to_json
+from flows.publish.receipt import is_pending
 from flows.publish.run_folder import Published, add_accuracy, asked_settings, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE
 from flows.survey.run import SurveyRun
+from flows.survey.scores import JUDGING
 from flows.survey.stages import VERSIONS, Build
 from flows.survey.survey import STAGES, Products, StageRunner, Step, judge
 from storage.archive.archive import StageRef, stage_key
 from storage.archive.keys import canonical_json
 from storage.archive.records import Run, read_run
 from storage.archive.run_folders import RunDraft
+from storage.archive.whole_files import to_json
 
 NOT_ASKED = ("notes", "out", "engine", *OF_THE_MACHINE)  # of a receipt's settings: no byte depends on them
 

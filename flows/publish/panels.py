@@ -9,10 +9,8 @@ from matplotlib.colors import hsv_to_rgb, to_rgb
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from flows.publish.colour_stretch import choose_bands as choose_bands
-from flows.publish.colour_stretch import develop as develop
-from flows.publish.colour_stretch import stretch as stretch
 from pipeline.geometry.grid import UNLABELLED
+from storage.arrays.quicklooks import stretch
 
 INK = "#22241f"
 MUTED = "#6a6d64"

@@ -26,18 +26,16 @@ from flows.publish.panels import (
     INK,
     MUTED,
     UNLABELLED_COLOUR,
-    choose_bands,
     class_palette,
     class_rgb,
-    develop,
     draw_scale,
     grey_of,
     outline,
     panel_inches,
-    stretch,
 )
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Axis
+from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 Box = tuple[int, int, int, int]
 

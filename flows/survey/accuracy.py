@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.receipt import to_json
 from flows.survey.effect_choice import source_with
 from flows.survey.full_look import columns_of_all_seats
 from flows.survey.pointing import load_registration
@@ -42,6 +41,7 @@ from pipeline.simulator.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import StageRef
 from storage.archive.stored_tables import read_table
+from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
 
 

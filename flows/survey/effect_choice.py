@@ -11,7 +11,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flows.publish.receipt import to_json
 from flows.settings.survey_settings import plain_value
 from flows.survey.run import CaptureRun
 from pipeline.errors import IncompleteStoreError
@@ -34,6 +33,7 @@ from pipeline.simulator.survey_probe import probe_survey
 from pipeline.simulator.verification import verify
 from storage.archive.archive import StageRef
 from storage.archive.stored_tables import read_table
+from storage.archive.whole_files import to_json
 
 if TYPE_CHECKING:
     from flows.survey.stages import Produce

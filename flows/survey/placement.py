@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.colour_stretch import choose_bands
 from flows.survey.run import SurveyRun
 from flows.survey.stages import SEATS_AT_ONCE, Produce, captured, load_plan, write_json
 from pipeline.errors import ShapeError
@@ -26,7 +25,7 @@ from storage.arrays.located_sweeps import Sighted, sight_sweeps
 from storage.arrays.lookups import path_digest, write_lookup
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.patches import PatchWriter, open_patches
-from storage.arrays.quicklooks import stretched
+from storage.arrays.quicklooks import choose_bands, stretched
 from storage.arrays.tile_work import MosaicRecipe, Thumbnail, write_mosaic
 
 QUICKLOOK_PX = 512

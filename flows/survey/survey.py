@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from flows.publish.receipt import JUDGING, StageRecord, State
 from flows.survey import placement, stages
 from flows.survey.accuracy import evaluate
 from flows.survey.effect_choice import choose_effects
@@ -18,7 +17,9 @@ from flows.survey.ground import ground
 from flows.survey.orientation import compare_turned
 from flows.survey.pointing import register_coarse, register_fine
 from flows.survey.run import SurveyRun
+from flows.survey.scores import JUDGING
 from storage.archive.archive import StageRef
+from storage.archive.records import StageRecord, State
 
 STAGES: dict[str, Callable[..., StageRef | None]] = {
     "choose_effects": choose_effects,

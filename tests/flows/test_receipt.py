@@ -14,15 +14,15 @@ from flows.publish.receipt import (
     COSTS,
     Header,
     Receipt,
-    StageRecord,
     build_receipt,
     check_receipt,
     comparable,
-    to_json,
 )
 from flows.publish.receipt_table import headline, print_table
 from flows.settings.survey_settings import Settings
 from pipeline.errors import ShapeError
+from storage.archive.records import StageRecord
+from storage.archive.whole_files import to_json
 
 
 def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:

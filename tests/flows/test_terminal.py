@@ -19,9 +19,9 @@ from rich.tree import Tree
 from flows.publish.line_chart import line_chart
 from flows.publish.page_parts import page_section
 from flows.publish.prefect_artifacts import _plain
-from flows.publish.receipt import to_json
 from flows.terminal.shown_text import Terminal
 from pipeline.visible_text import is_visible
+from storage.archive.whole_files import to_json
 
 HOSTILE = "field\x1b]0;owned\x07\x1b[2J\u202egnp.map\x9b31m\u2028\udcff"
 SHOWN = "field\\x1b]0;owned\\x07\\x1b[2J\\u202egnp.map\\x9b31m\\u2028\\udcff"
