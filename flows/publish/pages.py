@@ -38,9 +38,13 @@ _environment = partial(
 def _html() -> Environment:
     found = _environment(loader=_templates(), autoescape=True)
     found.filters |= {
-        "bytes": format_bytes, "change": format_change, "percent": format_percent, "points": format_points,
-        "seconds": format_seconds, "json": partial(json.dumps, ensure_ascii=False),
-    }  # fmt: skip
+        "bytes": format_bytes,
+        "change": format_change,
+        "percent": format_percent,
+        "points": format_points,
+        "seconds": format_seconds,
+        "json": partial(json.dumps, ensure_ascii=False),
+    }
     return found
 
 

@@ -176,9 +176,14 @@ def build_receipt(
 
 
 def with_accuracy(
-    receipt: Receipt, accuracy: Mapping[str, Any], stage: StageRecord, address: str, *,
-    settings: Mapping[str, object], judged: str,
-) -> Receipt:  # fmt: skip
+    receipt: Receipt,
+    accuracy: Mapping[str, Any],
+    stage: StageRecord,
+    address: str,
+    *,
+    settings: Mapping[str, object],
+    judged: str,
+) -> Receipt:
     """The receipt of a run once its map is judged; nothing that was spent on the survey itself changes.
 
     Parameters

@@ -112,6 +112,6 @@ def _flat(settings: Mapping[str, Any]) -> dict[str, object]:
     """Tables within the settings as dotted names."""
     flat: dict[str, object] = {}
     for name, value in settings.items():
-        inner = value.items() if isinstance(value, Mapping) else ()
-        flat.update({f"{name}.{key}": item for key, item in inner} if isinstance(value, Mapping) else {name: value})
+        table = isinstance(value, Mapping)
+        flat |= {f"{name}.{key}": item for key, item in value.items()} if table else {name: value}
     return flat

@@ -62,8 +62,16 @@ def archive(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> Path:
     ledger.append({"event": "done", **due, "attempts": 2, "run": f"runs/{first.name}", "seconds": 3.0})
     ledger.append({"event": "failed", **due, "due": "2026-06-01T11:00:00Z", "reason": f"no reply {BAD}"})
     ledger.append({"event": "skipped", **due, "due": "2026-06-01T12:00:00Z", "reason": "the rig was in use"})
-    ledger.append({"event": "passed", "at": due["at"], "after": "2026-06-01T12:00:00Z", "until": "2026-07-01T12:00:00Z",
-                   "count": 720, "reason": "asleep"})  # fmt: skip
+    ledger.append(
+        {
+            "event": "passed",
+            "at": due["at"],
+            "after": "2026-06-01T12:00:00Z",
+            "until": "2026-07-01T12:00:00Z",
+            "count": 720,
+            "reason": "asleep",
+        }
+    )
     return root
 
 

@@ -40,9 +40,10 @@ def _tree(words: str) -> Tree:
 
 
 @pytest.mark.parametrize(
-    "thing", [escape, _table, _tree, lambda words: Panel(escape(words)), lambda words: [words]],
+    "thing",
+    [escape, _table, _tree, lambda words: Panel(escape(words)), lambda words: [words]],
     ids=["words", "table", "tree", "panel", "list"],
-)  # fmt: skip
+)
 def test_nothing_that_is_printed_steers_the_terminal(thing: Callable[[str], Any]) -> None:
     """Styles and borders are the console's own; in the words no control character is left."""
     file = io.StringIO()
@@ -70,8 +71,18 @@ def test_json_says_the_same_in_escapes() -> None:
 
 
 def _history(words: str) -> FieldHistory:
-    row = {"run": words, "created": "2026-06-01T10:00:00Z", "due": words, "attempts": 1, "miou": 0.5, "unit": "share",
-           "overall_accuracy": None, "savings": {"capture_s": 0.5}, "areas": {words: 1.0}, "colours": {}}  # fmt: skip
+    row = {
+        "run": words,
+        "created": "2026-06-01T10:00:00Z",
+        "due": words,
+        "attempts": 1,
+        "miou": 0.5,
+        "unit": "share",
+        "overall_accuracy": None,
+        "savings": {"capture_s": 0.5},
+        "areas": {words: 1.0},
+        "colours": {},
+    }
     return FieldHistory(words, words, [row], [{"event": "failed", "due": words, "reason": words}])
 
 
@@ -94,8 +105,15 @@ def test_pages_show_names_as_escapes(page: Callable[[str], str]) -> None:
 def test_prefects_pages_show_names_as_escapes() -> None:
     """The text of a survey has them, with its markup off."""
     words = HOSTILE + "<b>[x](y)`|"
-    text = render_markdown("survey.md", survey=words, headline=words, picture="", rows=[{words: words}],
-                           findings=[words], where="archive/runs/x_1")  # fmt: skip
+    text = render_markdown(
+        "survey.md",
+        survey=words,
+        headline=words,
+        picture="",
+        rows=[{words: words}],
+        findings=[words],
+        where="archive/runs/x_1",
+    )
     assert all(is_visible(letter) for letter in text)
     assert text.count(r"\<b\>\[x\](y)\`\|") == 5
     assert "`archive/runs/x_1/report.html`" in text
