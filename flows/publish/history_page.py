@@ -19,7 +19,7 @@ from flows.publish.field_history import FieldHistory, day_of, read_histories
 from flows.publish.finding_words import LEAST_HECTARES, area_words
 from flows.publish.pages import render_page
 from flows.schedule.ledger_state import read_moment
-from flows.terminal.figures import DASH, format_percent
+from flows.terminal.figures import DASH, counted, format_percent
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
 from storage.archive.whole_files import write_whole
@@ -73,7 +73,7 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
         "history.html",
         kicker="SpectralZoom field",
         title=history.field,
-        lead=f"{len(history.runs)} runs in the archive. Of what was due on schedule: {counts}.",
+        lead=f"{counted(len(history.runs), 'run')} in the archive. Of what was due on schedule: {counts}.",
         about=f"{history.archive}; times in UTC",
         areas=_areas(history.runs),
         savings=_savings(history.runs),
@@ -90,7 +90,7 @@ def render_index(histories: Sequence[FieldHistory], archive: str, pages: Mapping
         "fields.html",
         kicker="SpectralZoom archive",
         title="Fields",
-        lead=f"{len(histories)} fields.",
+        lead=f"{counted(len(histories), 'field')}.",
         about=f"{archive}; times in UTC",
         fields=[_field(one, pages[one.field]) for one in histories],
     )
