@@ -12,11 +12,11 @@ from rich.console import Console
 
 from flows.archive.contents import contents, explanation, verdict
 from flows.archive.tables import show_clearance, show_contents, show_explanation, show_repair, show_verdict
-from flows.publish.receipt import to_json
 from flows.terminal.progress import StageProgress
 from flows.terminal.shown_text import on_stdout
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
+from storage.archive.whole_files import to_json
 from storage.maintenance.garbage import Removal, clear_up
 from storage.maintenance.repair import Repaired, Rerun
 from storage.maintenance.verification import Finding

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from flows.archive.commands import check_outside
 from flows.archive.comparison_table import SAVINGS, change_words, panel_words, show_comparison
 from flows.archive.difference_picture import MapPair, draw_difference
-from flows.publish.receipt import to_json
 from flows.settings.keys import BUILT_IN_SCENES
 from flows.survey.scores import score_of
 from flows.terminal.shown_text import on_stdout
@@ -26,7 +25,7 @@ from storage.archive.changes import ABSENT, flatten
 from storage.archive.lineage import Catalogue
 from storage.archive.product_names import find_product
 from storage.archive.records import Run
-from storage.archive.whole_files import written_aside
+from storage.archive.whole_files import to_json, written_aside
 from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.remote.opening import open_archive
 

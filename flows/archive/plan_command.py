@@ -13,10 +13,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from flows.archive.forecast import StageForecast, forecast
-from flows.publish.receipt import to_json
 from flows.settings.survey_settings import Settings
 from flows.terminal.figures import format_bytes, format_seconds
 from flows.terminal.shown_text import on_stdout
+from storage.archive.whole_files import to_json
 
 MOST_LETTERS = 250  # of a reason
 COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow", "skipped": "dim"}

@@ -28,7 +28,6 @@ from flows.archive.stale_runs import (
     newest_runs,
     would_remake,
 )
-from flows.publish.receipt import to_json
 from flows.settings.survey_settings import Settings
 from flows.survey.scores import score_of
 from flows.terminal.figures import format_points, format_seconds
@@ -36,7 +35,7 @@ from pipeline.errors import PipelineError, SettingsError
 from pipeline.visible_text import visible
 from storage.archive.lineage import Catalogue
 from storage.archive.records import read_run
-from storage.archive.whole_files import new_file, write_whole
+from storage.archive.whole_files import new_file, to_json, write_whole
 from storage.parallel.crew import THREADS, Crew
 from storage.remote.opening import open_archive
 

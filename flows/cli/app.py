@@ -53,7 +53,7 @@ def say(message: str) -> None:
 
 def print_json(content: Mapping[str, object]) -> None:
     """Print one object on stdout; numbers that are not finite become null."""
-    from flows.publish.receipt import to_json
+    from storage.archive.whole_files import to_json
 
     sys.stdout.write(to_json(content))
 

@@ -67,7 +67,7 @@ def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_j
     out
         The page to write.
     """
-    from flows.schedule.history_command import run_report
+    from flows.publish.history_page import run_report
 
     content = run_report(archive, field, out, stderr)
     if as_json:

@@ -24,13 +24,13 @@ from flows.evaluate.series import Record, seeds_of
 from flows.evaluate.summary import summarise
 from flows.evaluate.table import print_evaluation
 from flows.evaluate.work import Judged, Work
-from flows.publish.receipt import to_json
 from flows.terminal.progress import StageProgress
 from flows.terminal.shown_text import on_stdout
 from models.evaluation.bootstrap import LEVEL
 from models.evaluation.metrics import agreement, false_pixels, iou_per_class
 from models.network.process import keep_freed_memory
 from models.weights.files import describe_weights, unsealed_note
+from storage.archive.whole_files import to_json
 
 
 def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = False) -> dict[str, Any]:

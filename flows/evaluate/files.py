@@ -10,8 +10,8 @@ from flows.evaluate.jobs import Show, scene_of
 from flows.evaluate.kept_results import writing
 from flows.evaluate.rows import Trial
 from flows.evaluate.work import Record, Work
-from flows.publish.receipt import to_json
 from models.evaluation.metrics import mean_iou
+from storage.archive.whole_files import to_json
 
 SHOWN_SHARE = 0.10  # of the seats, or the nearest one tried: what the pictures show
 

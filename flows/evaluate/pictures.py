@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from flows.evaluate.frames import Look
 from flows.evaluate.rows import Trial, placings
-from flows.publish.colour_stretch import choose_bands, stretch
 from flows.publish.panels import INK, class_palette, class_rgb, outline
 from flows.terminal.figures import format_percent
 from models.evaluation.metrics import confusion, mean_iou, overall_accuracy
@@ -22,6 +21,7 @@ from models.reading.inference import segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.planning.selection import frame_seats
+from storage.arrays.quicklooks import choose_bands, stretch
 
 LONG_SIDE = 900  # of a panel [px]; larger frames are thinned
 

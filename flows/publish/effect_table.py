@@ -53,10 +53,13 @@ def _figures(row: Row, total: Row) -> list[str]:
     beyond = row["state"] == "off" and total["tolerance"] is not None and not _within(row["bound"], total["tolerance"])
     colour = "yellow" if beyond else COLOURS[row["state"]]
     return [
-        escape(row["name"]), f"[{colour}]{escape(row['variant'] or 'off')}[/]",
-        format_change(row["left_out"], endless=True), format_change(row["bound"], endless=True),
-        "" if row["measured"] is None else format_change(row["measured"]), _cpu(row["cost_s"]),
-    ]  # fmt: skip
+        escape(row["name"]),
+        f"[{colour}]{escape(row['variant'] or 'off')}[/]",
+        format_change(row["left_out"], endless=True),
+        format_change(row["bound"], endless=True),
+        "" if row["measured"] is None else format_change(row["measured"]),
+        _cpu(row["cost_s"]),
+    ]
 
 
 def _within(bound: float | None, tolerance: float) -> bool:
@@ -73,10 +76,15 @@ def _cpu(seconds: float) -> str:
 def _words(row: Row) -> str:
     """How large an effect is, and why it is nevertheless there or left out where its figures do not tell."""
     said = {
-        "exact": "", "needed": "", "small": "", "unseen": "the scene shows nothing of it: ",
+        "exact": "",
+        "needed": "",
+        "small": "",
+        "unseen": "the scene shows nothing of it: ",
         "spent": "the tolerance is spent where it saves more: ",
-        "asked": "asked for: ", "unasked": "not asked for: ", "always": "always there: ",
-    }[row["reason"]]  # fmt: skip
+        "asked": "asked for: ",
+        "unasked": "not asked for: ",
+        "always": "always there: ",
+    }[row["reason"]]
     magnitude: str = row["magnitude"]
     return said + magnitude.removeprefix(f"{row['name']}: ")
 

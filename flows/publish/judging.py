@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from flows.publish.receipt import is_pending, to_json
+from flows.publish.receipt import is_pending
 from flows.publish.run_folder import Published, add_accuracy, asked_settings, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE
 from flows.survey.run import SurveyRun
@@ -17,6 +17,7 @@ from flows.survey.survey import STAGES, Products, StageRunner, Step, judge
 from storage.archive.keys import canonical_json
 from storage.archive.records import Run, read_run
 from storage.archive.run_folders import RunDraft
+from storage.archive.whole_files import to_json
 
 JUDGE = STAGES["evaluate"]
 NOT_ASKED = ("notes", "out", "engine", *OF_THE_MACHINE)  # of a receipt's settings: no byte depends on them

@@ -1,28 +1,47 @@
-"""What panels of a map are made of: stretched colours, class palettes, outlines of seats, scale bars."""
+"""What pictures of a map are made of: palettes, outlines of seats, scale bars; and the map on the ground."""
 
 from __future__ import annotations
+
+import io
 
 import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import hsv_to_rgb, to_rgb
-from matplotlib.patches import Rectangle
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
-from flows.publish.colour_stretch import choose_bands as choose_bands
-from flows.publish.colour_stretch import develop as develop
-from flows.publish.colour_stretch import stretch as stretch
+from flows.publish.finding_words import area_words
 from pipeline.geometry.grid import UNLABELLED
+from storage.arrays.ground_maps import GroundMap
+from storage.arrays.quicklooks import stretch
 
+GROUND_IN, GROUND_DPI, GROUND_MOST_PX = 9.0, 130, 1200
 INK = "#22241f"
 MUTED = "#6a6d64"
 UNLABELLED_COLOUR = (0.86, 0.86, 0.84)
 HALO: list[patheffects.AbstractPathEffect] = [patheffects.withStroke(linewidth=3, foreground="black")]
 # Okabe and Ito (2008), then Paul Tol's muted scheme (2021) without near twins: told apart by colour-blind readers
 _SAFE = (
-    "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#F0E442", "#0072B2", "#CC79A7", "#882255", "#44AA99", "#332288",
-    "#999933", "#DDCC77", "#AA4499", "#117733", "#88CCEE", "#CC6677",
-)  # fmt: skip
+    "#E69F00",
+    "#009E73",
+    "#56B4E9",
+    "#D55E00",
+    "#F0E442",
+    "#0072B2",
+    "#CC79A7",
+    "#882255",
+    "#44AA99",
+    "#332288",
+    "#999933",
+    "#DDCC77",
+    "#AA4499",
+    "#117733",
+    "#88CCEE",
+    "#CC6677",
+)
 
 
 def grey_of(image: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -91,3 +110,42 @@ def _round_length(px: float) -> int:
     """The largest of 1, 2, 5 times a power of ten that is not above ``px`` (at least 1)."""
     power = 10 ** int(np.floor(np.log10(max(px, 1))))
     return int(max(step * power for step in (1, 2, 5) if step * power <= max(px, 1)))
+
+
+def draw_ground(found: GroundMap) -> bytes:
+    """Draw picture and class map side by side, PNG: north up, hectares in the legend.
+
+    Axes are metres from the map's lower left corner.
+    """
+    box = found.geobox.boundingbox
+    extent = (0.0, box.right - box.left, 0.0, box.top - box.bottom)
+    tall = extent[3] / extent[1]
+    size = (GROUND_IN, GROUND_IN / 2 * min(max(tall, 0.4), 1.6) + 1.1)
+    figure = Figure(figsize=size, dpi=GROUND_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+    thin = slice(None, None, -(-max(found.classes.shape) // GROUND_MOST_PX))
+    seen = found.picture[thin, thin].any(axis=-1, keepdims=True)
+    left.imshow(np.where(seen, found.picture[thin, thin], 255), extent=extent)
+    palette = np.vstack([found.legend.colours, np.full((256 - len(found.legend.colours), 3), 255, np.uint8)])
+    right.imshow(palette[found.classes[thin, thin]], extent=extent, interpolation="nearest")
+    for axes, title in ((left, "as seen, coarse"), (right, "classes")):
+        axes.set_title(title, fontsize=10)
+        axes.set_xlabel("metres east", fontsize=9)
+        axes.tick_params(labelsize=8)
+        axes.set_facecolor("white")
+    left.set_ylabel("metres north", fontsize=9)
+    present = set(np.unique(found.classes).tolist()) - {UNLABELLED}
+    patches = [
+        Patch(facecolor=found.legend.colours[number] / 255, edgecolor="0.4", linewidth=0.5, label=_label(found, name))
+        for number, name in enumerate(found.legend.names)
+        if number in present
+    ]
+    figure.legend(handles=patches, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+def _label(found: GroundMap, name: str) -> str:
+    return f"{name.replace('_', ' ')}  {area_words(found.areas.get(name, {}).get('ha', 0.0))}"

@@ -10,11 +10,11 @@ from contextlib import suppress
 from typing import Any, cast
 
 from flows.publish.finding_words import sentences
+from flows.publish.pages import render_markdown
 from flows.publish.receipt import Receipt, Saving
 from flows.publish.receipt_table import COST_LABELS, headline
 from flows.publish.run_folder import Published
 from flows.terminal.figures import format_percent
-from pipeline.visible_text import visible
 
 MOST_BYTES = 100 * 1024  # of the picture, as it stands in the text
 WIDTHS_PX = (1200, 1000, 800, 600, 400, 200)
@@ -37,20 +37,16 @@ def artifact_key(field: str) -> str:
 
 def survey_markdown(published: Published, where: str) -> str:
     """Headline, quicklook (at most 100 KiB), receipt, and where the report lies."""
-    receipt = published.receipt
     picture = small_jpeg((published.folder / "quicklook.png").read_bytes())
-    data = base64.b64encode(picture).decode("ascii")
-    rows = savings_rows(receipt)
-    columns = list(rows[0])
-    lines = [
-        f"# {_plain(receipt['survey'])}", "", _plain(headline(receipt, published.looked_twice)), "",
-        f"![the survey at a glance](data:image/jpeg;base64,{data})", "",
-        f"| {' | '.join(columns)} |", f"|{'---|' * len(columns)}",
-        *(f"| {' | '.join(row[name] for name in columns)} |" for row in rows), "",
-        *(f"- {_plain(sentence)}" for sentence in sentences(receipt)), "",
-        f"Report: `{where}/report.html`", "", f"Receipt: `{where}/receipt.json`",
-    ]  # fmt: skip
-    return "\n".join(lines) + "\n"
+    return render_markdown(
+        "survey.md",
+        survey=published.receipt["survey"],
+        headline=headline(published.receipt, published.looked_twice),
+        picture=base64.b64encode(picture).decode("ascii"),
+        rows=savings_rows(published.receipt),
+        findings=sentences(published.receipt),
+        where=where,
+    )
 
 
 def savings_rows(receipt: Receipt) -> list[dict[str, str]]:
@@ -85,11 +81,6 @@ def small_jpeg(png: bytes) -> bytes:
             if len(file.getvalue()) * 4 / 3 <= MOST_BYTES - 4:
                 return file.getvalue()
     return file.getvalue()
-
-
-def _plain(text: str) -> str:
-    """Words in which nothing is markup."""
-    return "".join(f"\\{letter}" if letter in "\\`*_{}[]<>#|" else letter for letter in visible(text))
 
 
 def progress_shown(field: str) -> Callable[[str, str, float], None]:

@@ -26,18 +26,16 @@ from flows.publish.panels import (
     INK,
     MUTED,
     UNLABELLED_COLOUR,
-    choose_bands,
     class_palette,
     class_rgb,
-    develop,
     draw_scale,
     grey_of,
     outline,
     panel_inches,
-    stretch,
 )
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Axis
+from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 Box = tuple[int, int, int, int]
 
@@ -198,9 +196,14 @@ def _draw_attention(axes: Axes, data: QuicklookData) -> None:
     axes.imshow(grey_of(data.rectified), cmap="gray", vmin=-0.4, vmax=1.4)
     scores, low, high = _score_range(data.score)
     heat = axes.imshow(
-        scores, cmap=_heat(), alpha=0.72, vmin=low, vmax=high, interpolation="nearest",
+        scores,
+        cmap=_heat(),
+        alpha=0.72,
+        vmin=low,
+        vmax=high,
+        interpolation="nearest",
         extent=(-0.5, columns * data.patch_px - 0.5, rows * data.patch_px - 0.5, -0.5),
-    )  # fmt: skip
+    )
     for y0, y1, x0, x1 in data.blocks:
         axes.add_patch(Rectangle((x0 - 0.5, y0 - 0.5), x1 - x0, y1 - y0, **_BLOCK))
     chosen = np.zeros(rows * columns, bool)
@@ -259,9 +262,18 @@ def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
         marks.append(Patch(facecolor=UNLABELLED_COLOUR, edgecolor="#555555", linewidth=0.6))
         names.append("unlabelled")
     figure.legend(
-        marks, names, loc="lower center", ncol=min(columns, len(names)), frameon=False, fontsize=13,
-        handlelength=1.4, handleheight=1.2, columnspacing=2.0, bbox_to_anchor=(0.5, 0.0), borderaxespad=0.6,
-    )  # fmt: skip
+        marks,
+        names,
+        loc="lower center",
+        ncol=min(columns, len(names)),
+        frameon=False,
+        fontsize=13,
+        handlelength=1.4,
+        handleheight=1.2,
+        columnspacing=2.0,
+        bbox_to_anchor=(0.5, 0.0),
+        borderaxespad=0.6,
+    )
 
 
 def _share(share: float) -> str:

@@ -6,15 +6,15 @@ One plain dictionary feeds ``receipt.json``, the terminal's last block (`flows.p
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, NotRequired, TypedDict, cast, get_args
 
+from flows.survey.scores import JUDGING
 from pipeline.errors import ShapeError
-from pipeline.visible_text import is_visible
+from storage.archive.records import StageRecord, State
+from storage.archive.whole_files import to_json
 
-State = Literal["ran", "cached", "skipped", "failed"]
 AccuracyIs = Literal["judged", "pending", "left out", "without labels"]  # pending: it is worked out after the map
 
 
@@ -108,21 +108,6 @@ class Receipt(TypedDict):
 
 
 @dataclass(frozen=True)
-class StageRecord:
-    """One stage of a run. What was not measured (a stage read from the archive) is None."""
-
-    name: str
-    key: str
-    state: State
-    wall_s: float | None = None
-    cpu_s: float | None = None
-    peak_rss_bytes: int | None = None
-    bytes_in: int | None = None
-    bytes_out: int | None = None
-    manifest_sha256: str | None = None  # of the store that the stage left; receipts of before have none
-
-
-@dataclass(frozen=True)
 class Header:
     """Who looked at what, when, with which code and settings. Times are ISO 8601."""
 
@@ -146,8 +131,6 @@ _TOTAL_FIELDS = ("asked", "tolerance", "unit", "bound", "measured", "on", "off",
 _HEADER_FIELDS = ("survey", "source", "scene", "seed", "started", "finished", "versions", "settings")
 # what another run of the same seed has otherwise
 _OF_ONE_RUN = ("wall_s", "cpu_s", "peak_rss_bytes", "state", "manifest_sha256")
-_STATES = ("ran", "cached", "skipped", "failed")
-JUDGING = "evaluate"  # the stage that judges the map
 
 
 def build_receipt(
@@ -193,9 +176,14 @@ def build_receipt(
 
 
 def with_accuracy(
-    receipt: Receipt, accuracy: Mapping[str, Any], stage: StageRecord, address: str, *,
-    settings: Mapping[str, object], judged: str,
-) -> Receipt:  # fmt: skip
+    receipt: Receipt,
+    accuracy: Mapping[str, Any],
+    stage: StageRecord,
+    address: str,
+    *,
+    settings: Mapping[str, object],
+    judged: str,
+) -> Receipt:
     """The receipt of a run once its map is judged; nothing that was spent on the survey itself changes.
 
     Parameters
@@ -236,9 +224,9 @@ def check_receipt(receipt: Mapping[str, Any]) -> Receipt:
     _need(receipt, (*_HEADER_FIELDS, "stages", "savings", "products"), "receipt")
     for number, stage in enumerate(receipt["stages"]):
         _need(stage, _STAGE_FIELDS, f"receipt.stages[{number}]")
-        if stage["state"] not in _STATES:
+        if stage["state"] not in get_args(State):
             place = f"receipt.stages[{number}].state"
-            raise ShapeError(f"{place} must be one of {', '.join(_STATES)}; got {stage['state']!r}")
+            raise ShapeError(f"{place} must be one of {', '.join(get_args(State))}; got {stage['state']!r}")
     _check_savings(receipt["savings"])
     if receipt.get("accuracy_is", "judged") not in get_args(AccuracyIs):
         known = ", ".join(get_args(AccuracyIs))
@@ -286,29 +274,6 @@ def _need(part: object, names: Iterable[str], place: str) -> None:
     for name in names:
         if name not in part:
             raise ShapeError(f"{place}.{name} is missing; a receipt has every field of the design (null if not known)")
-
-
-def to_json(receipt: Mapping[str, object]) -> str:
-    (
-        """JSON text, two spaces a level, in the receipt's own order; numbers that are not finite become null.
-
-    What would steer a terminal or turn words round stands as escapes, as JSON has them.
-    """
-        ""
-    )
-    text = json.dumps(_plain(receipt), indent=2, ensure_ascii=False, allow_nan=False)
-    return "".join(letter if is_visible(letter) else json.dumps(letter)[1:-1] for letter in text) + "\n"
-
-
-def _plain(value: object) -> object:
-    """Plain lists, dictionaries and numbers; numpy's scalars by their ``item``."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if hasattr(value, "item"):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def comparable(receipt: Receipt) -> dict[str, Any]:

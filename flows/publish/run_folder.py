@@ -16,17 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.publish.findings import find_out
-from flows.publish.ground_picture import draw_ground
-from flows.publish.panels import choose_bands
+from flows.publish.panels import draw_ground
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import (
     AccuracyIs,
     Header,
     Receipt,
-    StageRecord,
     build_receipt,
     check_receipt,
-    to_json,
     with_accuracy,
 )
 from flows.publish.report import Picture, write_report
@@ -47,13 +44,15 @@ from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.savings import Entry, capture_savings
 from pipeline.rectify.calibration.calibrate import of_bands, reflectance
 from storage.archive.archive import StageRef
-from storage.archive.records import read_run
+from storage.archive.records import StageRecord, read_run
 from storage.archive.run_folders import RunDraft
+from storage.archive.whole_files import to_json
 from storage.arrays.attention import load_attention
 from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.arrays.cubes import RawCube
 from storage.arrays.ground_maps import load_ground_map
 from storage.arrays.patches import open_patches
+from storage.arrays.quicklooks import choose_bands
 from storage.arrays.stored_images import open_image
 
 IN_STORES = {  # products of a receipt: the stage that leaves them, and where in its store

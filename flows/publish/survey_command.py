@@ -66,9 +66,12 @@ def _survey_and_publish(run: SurveyRun, settings: Settings, console: Console, st
 
         def finish(step: Step, products: Products) -> Published:
             return publish_and_judge(
-                runner, step, products, started,
+                runner,
+                step,
+                products,
+                started,
                 lambda words: console.print(escape(words), highlight=False, soft_wrap=True),
-            )  # fmt: skip
+            )
 
         return _run(runner, settings.engine, console, finish)
 

@@ -14,8 +14,7 @@ from itertools import islice
 from typing import Any
 
 from flows.schedule.ledger_state import Ending, ScheduleState, moment_words, read_state
-from flows.schedule.times import Timetable
-from flows.schedule.wall_clock import WallClock
+from flows.schedule.times import Timetable, WallClock
 from storage.archive.ledger import Ledger
 
 SET_BACK = timedelta(minutes=1)  # a clock that goes back by less is being put right

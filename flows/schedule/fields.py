@@ -15,8 +15,7 @@ from rich.console import Console
 from flows.schedule.field_schedule import FieldSchedule
 from flows.schedule.ledger_state import moment_words
 from flows.schedule.rig_lock import RigLock, hold_place, rig_lock
-from flows.schedule.times import Timetable
-from flows.schedule.wall_clock import SystemWallClock, WallClock
+from flows.schedule.times import SystemWallClock, Timetable, WallClock
 from flows.settings.survey_settings import Settings, load_settings
 from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES

@@ -75,10 +75,13 @@ def _as_one(outcomes: Sequence[Outcome]) -> Outcome:
     last = max(outcomes, key=lambda one: one.due)
     counts = [one.count if isinstance(one, Several) else 1 for one in outcomes]
     return Several(
-        last.field, last.due, last.ending, f"the last one: {last.reason}",
+        last.field,
+        last.due,
+        last.ending,
+        f"the last one: {last.reason}",
         since=min(one.since if isinstance(one, Several) else one.due for one in outcomes),
         count=None if None in counts else sum(filter(None, counts)),
-    )  # fmt: skip
+    )
 
 
 def _outcome(name: str, due: datetime, line: Mapping[str, Any]) -> Outcome:

@@ -66,9 +66,15 @@ def send_notice(address: str | None, outcome: Outcome, archive: str) -> bool:
         return False
     several = {"count": outcome.count, "since": moment_words(outcome.since)} if isinstance(outcome, Several) else {}
     content = {
-        "text": outcome.words(), "field": outcome.field, "due": moment_words(outcome.due), "ending": outcome.ending,
-        "reason": outcome.reason, "archive": archive, "count": 1, **several,
-    }  # fmt: skip
+        "text": outcome.words(),
+        "field": outcome.field,
+        "due": moment_words(outcome.due),
+        "ending": outcome.ending,
+        "reason": outcome.reason,
+        "archive": archive,
+        "count": 1,
+        **several,
+    }
     request = urllib.request.Request(
         address, json.dumps(content).encode(), {"Content-Type": "application/json"}, method="POST"
     )

@@ -10,7 +10,7 @@ from flows.schedule.due_runs import Outcome, Survey, Tell, run_all
 from flows.schedule.field_schedule import FieldSchedule
 from flows.schedule.news import ScheduleNews, together
 from flows.schedule.rig_lock import RigLock
-from flows.schedule.wall_clock import SystemWallClock, WallClock
+from flows.schedule.times import SystemWallClock, WallClock
 from pipeline.errors import PipelineError
 
 LOOK_AGAIN = timedelta(seconds=30)  # a clock that jumps, or a run that died, is seen after this at the latest

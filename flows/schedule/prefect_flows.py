@@ -24,9 +24,8 @@ from flows.schedule.ledger_state import read_moment
 from flows.schedule.news import ScheduleNews, together
 from flows.schedule.notices import send_notice
 from flows.schedule.queue import SKIPPED
-from flows.schedule.request import ServeRequest
-from flows.schedule.served import read_served, served_archive, served_field, served_weights
-from flows.schedule.wall_clock import WallClock
+from flows.schedule.served import ServeRequest, read_served, served_archive, served_field, served_weights
+from flows.schedule.times import WallClock
 from flows.terminal.shown_text import on_stderr
 from pipeline.errors import PipelineError, RigError
 from storage.archive.staging import take_lock

@@ -10,11 +10,10 @@ from contextlib import suppress
 
 from flows.schedule.due_runs import Tell
 from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.request import ServeRequest
 from flows.schedule.runner import RunnerProcess
-from flows.schedule.served import write_served
+from flows.schedule.served import ServeRequest, write_served
 from flows.schedule.server import LocalServer, pages_of, server_for
-from flows.schedule.wall_clock import SystemWallClock
+from flows.schedule.times import SystemWallClock
 from flows.schedule.watcher import Watcher
 from pipeline.errors import PipelineError
 

@@ -69,10 +69,12 @@ class FlowRuns:
 
         while (number := self.tries.setdefault(due, 0)) < MOST_TRIES:
             run = client.create_flow_run_from_deployment(
-                deployment, parameters={"due": moment_words(due)}, state=Scheduled(scheduled_time=due),
+                deployment,
+                parameters={"due": moment_words(due)},
+                state=Scheduled(scheduled_time=due),
                 name=f"survey-{self.name}",
                 idempotency_key=f"{self.name} {moment_words(due)} {begun} {number}",
-            )  # fmt: skip
+            )
             if run.state is None or not run.state.is_final():
                 return True
             if run.state.is_cancelled() and run.state.name != SKIPPED:

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from flows.schedule.wall_clock import SystemWallClock, WallClock
+from flows.schedule.times import SystemWallClock, WallClock
 from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError, RigError
 from storage.archive.staging import take_lock

@@ -12,8 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from flows.schedule.request import ServeRequest
-from flows.schedule.served import NAMED_BY, read_served
+from flows.schedule.served import NAMED_BY, ServeRequest, read_served
 from flows.terminal.process_guard import KeptProcess
 
 PATIENCE_S = 15.0
@@ -56,20 +55,26 @@ def deployments(request: ServeRequest) -> list[Any]:
 
     made = [
         survey_scheduled.to_deployment(
-            one.name, schedules=[], parameters={"field": one.name}, tags=[one.settings.source, one.name],
-            description=f"Surveys of {one.name} by {one.file}, {request.timetable.words()}.", version="1",
+            one.name,
+            schedules=[],
+            parameters={"field": one.name},
+            tags=[one.settings.source, one.name],
+            description=f"Surveys of {one.name} by {one.file}, {request.timetable.words()}.",
+            version="1",
             entrypoint_type=EntrypointType.MODULE_PATH,
         )
         for one in request.fields
-    ]  # fmt: skip
+    ]
     for number, out in enumerate(dict.fromkeys(one.settings.out for one in request.fields), 1):
         made.append(
             reprocess_archive.to_deployment(
-                "archive" if number == 1 else f"archive-{number}", parameters={"archive": str(out)},
-                description=f"Surveys of {out} again, with newer weights or stages; on request.", version="1",
+                "archive" if number == 1 else f"archive-{number}",
+                parameters={"archive": str(out)},
+                description=f"Surveys of {out} again, with newer weights or stages; on request.",
+                version="1",
                 entrypoint_type=EntrypointType.MODULE_PATH,
             )
-        )  # fmt: skip
+        )
     return made
 
 

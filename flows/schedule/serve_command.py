@@ -17,7 +17,7 @@ from flows.schedule.fields import alone_on, load_fields, survey_field
 from flows.schedule.notices import notice_address, send_notice
 from flows.schedule.plain_schedule import serve_plain
 from flows.schedule.prefect_schedule import serve_prefect
-from flows.schedule.request import ServeRequest
+from flows.schedule.served import ServeRequest
 from flows.schedule.times import parse_timetable
 from pipeline.errors import SettingsError
 from storage.remote.object_places import is_remote
@@ -59,9 +59,14 @@ def run_serve(choice: ServeChoice, console: Console) -> int:
         console.print(escape(words), highlight=False, soft_wrap=True)
 
     request = ServeRequest(
-        fields=fields, timetable=timetable, late=choice.late, limit=choice.limit, port=choice.port, out=out,
+        fields=fields,
+        timetable=timetable,
+        late=choice.late,
+        limit=choice.limit,
+        port=choice.port,
+        out=out,
         notify=notify,
-    )  # fmt: skip
+    )
     with alone_on(fields), _stopped_cleanly(tell):
         if choice.engine == "prefect":
             serve_prefect(request, tell)

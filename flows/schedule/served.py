@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from flows.schedule.field_schedule import FieldSchedule
 from flows.schedule.fields import ServedField, load_field
-from flows.schedule.request import ServeRequest
-from flows.schedule.times import exact_words, parse_timetable
+from flows.schedule.times import Timetable, exact_words, parse_timetable
 from pipeline.errors import SettingsError
 from storage.archive.whole_files import write_whole
 
@@ -22,14 +23,42 @@ NAMED_BY = "SPECTRALZOOM_SERVED"  # the environment variable that names the file
 KEYS = ("files", "out", "cron", "every", "timezone", "late", "limit", "notify")
 
 
+@dataclass(frozen=True, kw_only=True)
+class ServeRequest:
+    """What is to be served, and how."""
+
+    fields: Sequence[ServedField]
+    timetable: Timetable
+    late: float
+    limit: int = 1
+    port: int = 4200
+    out: str | None = None
+    notify: str | None = None
+
+    @property
+    def headline(self) -> str:
+        """What is served, and how that is ended."""
+        names = ", ".join(one.name for one in self.fields)
+        return f"serving {names}, {self.timetable.words()}; stop with Ctrl-C, the same command goes on"
+
+    def schedules(self) -> dict[str, FieldSchedule]:
+        """The schedule of every field, by its name."""
+        return {one.name: one.schedule(self.timetable, self.late) for one in self.fields}
+
+
 def write_served(request: ServeRequest, path: Path) -> None:
     """Keep what is served, for this user's eyes; notices are left to whoever serves, who sees all ledgers."""
     table = request.timetable
     content = {
-        "files": [str(one.file) for one in request.fields], "out": request.out, "cron": table.cron,
-        "every": None if table.every is None else exact_words(table.every), "timezone": table.timezone,
-        "late": request.late, "limit": request.limit, "notify": None,
-    }  # fmt: skip
+        "files": [str(one.file) for one in request.fields],
+        "out": request.out,
+        "cron": table.cron,
+        "every": None if table.every is None else exact_words(table.every),
+        "timezone": table.timezone,
+        "late": request.late,
+        "limit": request.limit,
+        "notify": None,
+    }
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, json.dumps(content, indent=2))
 
@@ -52,9 +81,13 @@ def read_served() -> ServeRequest:
     if not fields:
         raise SettingsError(f"{path} names no field: expected files = [...], settings files")
     return ServeRequest(
-        fields=fields, timetable=parse_timetable(words["cron"], words["every"], words["timezone"]),
-        late=float(words["late"]), limit=int(words["limit"]), out=words["out"], notify=words["notify"],
-    )  # fmt: skip
+        fields=fields,
+        timetable=parse_timetable(words["cron"], words["every"], words["timezone"]),
+        late=float(words["late"]),
+        limit=int(words["limit"]),
+        out=words["out"],
+        notify=words["notify"],
+    )
 
 
 def served_field(request: ServeRequest, name: str) -> ServedField:

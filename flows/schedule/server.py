@@ -77,11 +77,15 @@ def server_for(home: Path, port: int) -> Iterator[LocalServer | None]:
     password = os.environ.get("PREFECT_SERVER_API_AUTH_STRING") or _password_in(server.password_file)
     ours = {"PREFECT_SERVER_API_AUTH_STRING": password, "PREFECT_API_AUTH_STRING": password}
     wanted = {
-        **QUIET, "PREFECT_HOME": str(home), "PREFECT_API_URL": server.url, "PREFECT_SERVER_UI_V2_ENABLED": "false",
+        **QUIET,
+        "PREFECT_HOME": str(home),
+        "PREFECT_API_URL": server.url,
+        "PREFECT_SERVER_UI_V2_ENABLED": "false",
         **place_pages(),
-        "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false", "PREFECT_RUNNER_POLL_FREQUENCY": POLL_S,
+        "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
+        "PREFECT_RUNNER_POLL_FREQUENCY": POLL_S,
         "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": ",".join(own_origins(port)),
-    }  # fmt: skip
+    }
     before = {name: os.environ.get(name) for name in (*wanted, *ours)}
     os.environ.update({name: value for name, value in wanted.items() if name not in os.environ} | ours)
     try:

@@ -1,15 +1,16 @@
-"""When surveys are due: by cron or every so often, in a time zone; and until when a late one may still begin."""
+"""When surveys are due: by cron or every so often, in a time zone; until when a late one may still begin; the clock."""
 
 from __future__ import annotations
 
 import os
 import re
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from cronsim import CronSim, CronSimError
@@ -170,3 +171,27 @@ def _zone_of_machine() -> str:
     place = Path("/etc/localtime")
     parts = place.resolve().parts if place.is_symlink() else ()
     return "/".join(parts[parts.index("zoneinfo") + 1 :]) if "zoneinfo" in parts else "UTC"
+
+
+class WallClock(Protocol):
+    """The time of day, which may jump."""
+
+    def now(self) -> datetime:
+        """The moment, with its zone."""
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass. [s]"""
+
+
+@dataclass(frozen=True)
+class SystemWallClock:
+    """The machine's clock."""
+
+    def now(self) -> datetime:
+        """The moment in UTC."""
+        return datetime.now(UTC)
+
+    def sleep(self, seconds: float) -> None:
+        """Wait; nothing for a time that is not above 0. [s]"""
+        if seconds > 0:
+            time.sleep(seconds)

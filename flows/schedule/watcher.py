@@ -19,8 +19,8 @@ from flows.schedule.fields import ServedField
 from flows.schedule.news import ScheduleNews, together
 from flows.schedule.notices import send_notice
 from flows.schedule.queue import FlowRuns
-from flows.schedule.request import ServeRequest
 from flows.schedule.rig_lock import RigLock
+from flows.schedule.served import ServeRequest
 from flows.schedule.times import Timetable
 from storage.archive.staging import take_lock
 

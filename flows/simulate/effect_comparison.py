@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.colour_stretch import choose_bands
 from flows.survey.run import CaptureRun
 from flows.survey.stages.effects import chosen_effects, load_manifest, source_with
 from pipeline.errors import BoundError
@@ -34,6 +33,7 @@ from pipeline.simulator.selection.arithmetic import contrast_about, misplaced_el
 from pipeline.simulator.selection.manifest import UNIT_WORDS
 from pipeline.simulator.simulated import SimulatedSource, sweep_starts
 from storage.archive.archive import StageRef
+from storage.arrays.quicklooks import choose_bands
 
 MOST_S = 60.0  # of processor time for both ways together; beyond, not all lines are compared
 VIEW_PX = 160  # of the camera, along the line and along the scan

@@ -17,11 +17,11 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
-from flows.publish.colour_stretch import develop, stretch
 from flows.publish.panels import INK, MUTED
 from flows.simulate.effect_comparison import Comparison, View
 from flows.terminal.figures import format_count, format_seconds
 from pipeline.simulator.effects.probe import Unit
+from storage.arrays.quicklooks import develop, stretch
 
 UNIT_SIGNS: dict[Unit, str] = {"sigma": "σ", "dn": "DN"}  # noqa: RUF001
 _OF_KEY: dict[Unit, str] = {"sigma": "σ of the noise", "dn": "DN"}  # noqa: RUF001

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from flows.terminal.figures import format_count, format_points
 
+JUDGING = "evaluate"  # the stage that judges the map
 SHOWN = "of shown"  # the column of the mean by the definition of before
 SHOWN_WORDS = f"{SHOWN.capitalize()}: the mean over all classes that truth or map show, as before."
 MAPS = {"this survey": None, "none": "none", "all": "all"}  # as they are called; where a receipt's accuracy has them

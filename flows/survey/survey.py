@@ -10,10 +10,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
-from flows.publish.receipt import StageRecord, State
 from flows.survey.run import SurveyRun
 from flows.survey.stage import all_stages
 from storage.archive.archive import StageRef
+from storage.archive.records import StageRecord, State
 
 STAGES = all_stages()
 TITLES = {name: stage.title for name, stage in STAGES.items()}

@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from storage.archive.addresses import StageRef, in_text
 from storage.archive.manifests import Cost, cost_of, extended_at, listed_bytes, try_manifest
@@ -18,7 +18,23 @@ from storage.archive.staging import MANIFEST_NAME, file_hash
 
 RECEIPT = "receipt.json"
 MANIFEST_HASH = "manifest_sha256"  # in a receipt's stages: SHA-256 of the manifest.json of the store that each left
+State = Literal["ran", "cached", "skipped", "failed"]  # of a stage of a run
 RESTS_ON = "rests_on"  # in a run's manifest: address of a store -> SHA-256 of its manifest.json
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """One stage of a run, as its receipt has it. What was not measured (a stage read from the archive) is None."""
+
+    name: str
+    key: str
+    state: State
+    wall_s: float | None = None
+    cpu_s: float | None = None
+    peak_rss_bytes: int | None = None
+    bytes_in: int | None = None
+    bytes_out: int | None = None
+    manifest_sha256: str | None = None  # of the store that the stage left; receipts of before have none
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import itertools
+import json
+import math
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pipeline.errors import ArchiveError
+from pipeline.visible_text import is_visible
 from storage.archive.staging import PART_SUFFIX, refusals, remove_tree, sync_path
 
 _PREFIX = ".export-"
@@ -73,3 +76,23 @@ def remove_leftovers(folder: Path) -> None:
     """Remove what killed writers left in a folder; nobody may be writing there."""
     for part in folder.glob(f"{_PREFIX}*{PART_SUFFIX}"):
         remove_tree(part)
+
+
+def to_json(content: Mapping[str, object]) -> str:
+    """JSON text, two spaces a level, in the content's own order; numbers that are not finite become null.
+
+    What would steer a terminal or turn words round stands as escapes, as JSON has them.
+    """
+    text = json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False)
+    return "".join(letter if is_visible(letter) else json.dumps(letter)[1:-1] for letter in text) + "\n"
+
+
+def _plain(value: object) -> object:
+    """Plain lists, dictionaries and numbers; numpy's scalars by their ``item``."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value

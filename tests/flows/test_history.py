@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from flows.publish.line_chart import line_chart
-from flows.schedule.field_history import FieldHistory, read_histories
-from flows.schedule.history_page import render_history, render_index, way_to
+from flows.publish.charts import COLOURS, line_chart
+from flows.publish.field_history import FieldHistory, read_histories
+from flows.publish.history_page import render_history, render_index, way_to
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger
 from storage.arrays.class_maps import load_class_map
@@ -35,7 +35,8 @@ class Addresses(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         """Remember addresses; tags without an end are not open."""
         self.links += [str(value) for name, value in attrs if name == "href" and tag == "a"]
-        self.loaded += [str(value) for name, value in attrs if name in ("src", "href", "xlink:href") and tag != "a"]
+        other = [str(value) for name, value in attrs if name in ("src", "href", "xlink:href") and tag != "a"]
+        self.loaded += [value for value in other if not value.startswith("#")]  # a part of the page itself
         assert tag not in ("script", "link", "iframe", "style") or tag == "style"
         if tag != "meta":
             self.open.append(tag)
@@ -61,8 +62,16 @@ def archive(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> Path:
     ledger.append({"event": "done", **due, "attempts": 2, "run": f"runs/{first.name}", "seconds": 3.0})
     ledger.append({"event": "failed", **due, "due": "2026-06-01T11:00:00Z", "reason": f"no reply {BAD}"})
     ledger.append({"event": "skipped", **due, "due": "2026-06-01T12:00:00Z", "reason": "the rig was in use"})
-    ledger.append({"event": "passed", "at": due["at"], "after": "2026-06-01T12:00:00Z", "until": "2026-07-01T12:00:00Z",
-                   "count": 720, "reason": "asleep"})  # fmt: skip
+    ledger.append(
+        {
+            "event": "passed",
+            "at": due["at"],
+            "after": "2026-06-01T12:00:00Z",
+            "until": "2026-07-01T12:00:00Z",
+            "count": 720,
+            "reason": "asleep",
+        }
+    )
     return root
 
 
@@ -131,12 +140,35 @@ def test_a_field_without_anything_has_a_page() -> None:
 
 
 def test_a_chart_has_a_line_for_each_series() -> None:
-    """One point is drawn too, and names are escaped."""
-    chart = line_chart({"soil <b>": [(0.0, 1.0), (86400.0, 0.5)], "crop": [(0.0, 0.2)]}, "Share", "%")
-    assert chart.count("<polyline") == 2
-    assert chart.count("<circle") == 3
-    assert "soil &lt;b&gt;" in chart
-    assert "100 %" in chart
+    """One point is drawn too; the same points give the same bytes, and nothing is looked for outside of the page."""
+    series = {"soil": [(0.0, 1.0), (86400.0, 0.5)], "crop": [(0.0, 0.2)]}
+    chart, again = line_chart(series, "Share", "%"), line_chart(series, "Share", "%")
+    assert chart.drawing == again.drawing
+    assert chart.drawing is not None
+    assert chart.drawing.count("<use") == 3
+    assert all(chart.drawing.count(f"fill: none; stroke: {colour}") == 1 for colour in chart.legend.values())
+    assert ">100 %<" in chart.drawing
+    assert not re.search(r"https?:|url\(|<style", chart.drawing)
+
+
+@pytest.mark.parametrize(
+    ("points", "drawn"),
+    [
+        ([(-62135596800.0, 0.5)], 1),
+        ([(-62135596800.0, 0.5), (253402300799.0, 0.5)], 2),
+        ([(0.0, 0.0), (0.0, 0.0)], 2),
+        ([(0.0, 1e-300), (1e-6, 2e-300)], 2),
+        ([(0.0, 1e308), (1.0, float("nan")), (2.0, 0.5)], 1),
+        ([(0.0, float("inf"))], 0),
+        ([(float(hour), 0.5) for hour in range(501)], 0),
+    ],
+    ids=["year 1", "all years", "nothing", "next to nothing", "claims", "endless", "very many"],
+)
+def test_whatever_a_receipt_claims_is_drawn_or_left_out(points: list[tuple[float, float]], drawn: int) -> None:
+    """Dates of any year and numbers of any size make no chart that fails or warns; many points are a line alone."""
+    chart = line_chart({"soil": points}, "Share", "%")
+    assert (chart.drawing or "").count("<use") == drawn
+    assert (chart.drawing is None) == (drawn == 0 and len(points) == 1)
 
 
 def test_classes_have_the_colours_of_the_map(archive: Path) -> None:
@@ -149,7 +181,9 @@ def test_classes_have_the_colours_of_the_map(archive: Path) -> None:
     page = render_history(north, "runs")
     seen = [name for name, share in north.runs[0]["areas"].items() if share]
     assert all(f'<i style="background:{wanted[name]}"></i>{name.replace("_", " ")}' in page for name in seen)
-    assert line_chart({"a": [(0.0, 1.0)], "b": [(0.0, 1.0)]}, "x", colours={"b": "#123456"}).count("#123456") == 3
+    chart = line_chart({"a": [(0.0, 1.0)], "b": [(0.0, 1.0)]}, "x", colours={"b": "#123456", "c": "#654321"})
+    assert chart.legend == {"a": COLOURS[0], "b": "#123456"}
+    assert "#123456" in (chart.drawing or "")
 
 
 def test_the_way_to_an_archive(tmp_path: Path) -> None:

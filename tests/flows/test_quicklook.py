@@ -10,8 +10,9 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from flows.publish.panels import choose_bands, class_palette, class_rgb, grey_of, outline, stretch
+from flows.publish.panels import class_palette, class_rgb, grey_of, outline
 from flows.publish.quicklook import QuicklookData, _draw_raw, draw_quicklook
+from storage.arrays.quicklooks import choose_bands, stretch
 
 WAVES = np.linspace(400, 1000, 61)
 

@@ -14,15 +14,15 @@ from flows.publish.receipt import (
     COSTS,
     Header,
     Receipt,
-    StageRecord,
     build_receipt,
     check_receipt,
     comparable,
-    to_json,
 )
 from flows.publish.receipt_table import headline, print_table
 from flows.settings.survey_settings import Settings
 from pipeline.errors import ShapeError
+from storage.archive.records import StageRecord
+from storage.archive.whole_files import to_json
 
 
 def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
@@ -39,27 +39,50 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         "per_class_iou": {"soil": 0.9, "bare_weed": 0.6, "wheat": float("nan")},
         "false_classes": {"wheat": 2},
         "none": {
-            "miou": 0.5, "miou_of_shown_classes": 0.5, "overall_accuracy": 0.812,
-            "per_class_iou": {"soil": 0.8, "bare_weed": 0.2, "wheat": None}, "false_classes": {},
+            "miou": 0.5,
+            "miou_of_shown_classes": 0.5,
+            "overall_accuracy": 0.812,
+            "per_class_iou": {"soil": 0.8, "bare_weed": 0.2, "wheat": None},
+            "false_classes": {},
         },
         "all": {
-            "miou": 0.875, "miou_of_shown_classes": 0.875, "overall_accuracy": 0.971,
-            "per_class_iou": {"soil": 0.95, "bare_weed": 0.8, "wheat": None}, "false_classes": {},
+            "miou": 0.875,
+            "miou_of_shown_classes": 0.875,
+            "overall_accuracy": 0.971,
+            "per_class_iou": {"soil": 0.95, "bare_weed": 0.8, "wheat": None},
+            "false_classes": {},
         },
         "gap_closed": 2 / 3,
         "controls": {
             "random": {"miou": 0.5625, "miou_of_shown_classes": 0.375, "overall_accuracy": 0.9, "spread": 0.0125},
             "sobel": {"miou": 0.6, "miou_of_shown_classes": 0.6, "overall_accuracy": 0.91, "spread": None},
         },
-    }  # fmt: skip
+    }
     row = {
-        "name": "shot", "state": "on", "variant": "exact", "bound": 0.0, "measured": None, "cost_s": 1.5,
-        "why": "asked for", "unit": "sigma",
-    }  # fmt: skip
+        "name": "shot",
+        "state": "on",
+        "variant": "exact",
+        "bound": 0.0,
+        "measured": None,
+        "cost_s": 1.5,
+        "why": "asked for",
+        "unit": "sigma",
+    }
     total = {
-        "asked": "auto", "tolerance": 0.1, "unit": "sigma", "bound": 0.08, "measured": 0.03, "within": True, "on": 1,
-        "off": 0, "cost_s": 1.5, "exact_cost_s": 9.0, "cheap_cost_s": 4.0, "saved_s": 7.5, "saved_cheap_s": 2.5,
-    }  # fmt: skip
+        "asked": "auto",
+        "tolerance": 0.1,
+        "unit": "sigma",
+        "bound": 0.08,
+        "measured": 0.03,
+        "within": True,
+        "on": 1,
+        "off": 0,
+        "cost_s": 1.5,
+        "exact_cost_s": 9.0,
+        "cheap_cost_s": 4.0,
+        "saved_s": 7.5,
+        "saved_cheap_s": 2.5,
+    }
     stages = [
         StageRecord("capture", "ab12", "ran", wall, wall, 10**9, 0, 10**8, f"{wall:064}"),  # a manifest holds times
         StageRecord("rectify", "cd34", "cached"),

@@ -83,10 +83,20 @@ def test_words_are_escaped():
 @pytest.mark.parametrize(
     "words",
     [
-        "104 s", "predicted", "50 %", "75.0", "93.4", "56.2 ± 1.2", "67 %", "budget", "torch", "Class by class",
-        "this survey wheat 2 px", "2 of 3 classes are in the truth",
+        "104 s",
+        "predicted",
+        "50 %",
+        "75.0",
+        "93.4",
+        "56.2 ± 1.2",
+        "67 %",
+        "budget",
+        "torch",
+        "Class by class",
+        "this survey wheat 2 px",
+        "2 of 3 classes are in the truth",
     ],
-)  # fmt: skip
+)
 def test_page_has_the_figures(words):
     """Savings, accuracy with its controls, settings and versions are on the page."""
     assert words in render_report(make_receipt(), PNG, looked_twice=0.23)

@@ -23,7 +23,7 @@ from flows.schedule import prefect_schedule as serve_prefect
 from flows.schedule import serve_command
 from flows.schedule.fields import ServedField, alone_on, load_fields
 from flows.schedule.plain_schedule import serve_plain
-from flows.schedule.request import ServeRequest
+from flows.schedule.served import ServeRequest
 from flows.schedule.times import parse_timetable
 from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError

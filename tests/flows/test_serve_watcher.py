@@ -19,7 +19,7 @@ from flows.schedule.due_runs import Outcome
 from flows.schedule.field_schedule import FieldSchedule
 from flows.schedule.fields import ServedField, load_fields
 from flows.schedule.ledger_state import moment_words
-from flows.schedule.request import ServeRequest
+from flows.schedule.served import ServeRequest
 from flows.schedule.times import parse_timetable
 from flows.schedule.watcher import Watcher
 from pipeline.errors import ArchiveError

@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flows.publish.receipt import to_json
 from flows.settings import keys as setting_keys
 from flows.settings.keys import MapChoice
 from flows.settings.survey_settings import Settings, load_settings, of_this_version, parse_settings
@@ -26,6 +25,7 @@ from pipeline.ground.view import RigPose
 from pipeline.rectify.resample import Kernel
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.rig_model import Air, Detector, Optics, Rig, Sky
+from storage.archive.whole_files import to_json
 
 EXAMPLE = Path(__file__).parents[2] / "survey.example.toml"
 POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 30, "tilt_deg": 40, "height_m": 12}

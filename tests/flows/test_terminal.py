@@ -16,12 +16,12 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.tree import Tree
 
-from flows.publish.line_chart import line_chart
-from flows.publish.page_parts import page_section
-from flows.publish.prefect_artifacts import _plain
-from flows.publish.receipt import to_json
+from flows.publish.field_history import FieldHistory
+from flows.publish.history_page import render_history, render_index
+from flows.publish.pages import render_markdown
 from flows.terminal.shown_text import Terminal
 from pipeline.visible_text import is_visible
+from storage.archive.whole_files import to_json
 
 HOSTILE = "field\x1b]0;owned\x07\x1b[2J\u202egnp.map\x9b31m\u2028\udcff"
 SHOWN = "field\\x1b]0;owned\\x07\\x1b[2J\\u202egnp.map\\x9b31m\\u2028\\udcff"
@@ -40,9 +40,10 @@ def _tree(words: str) -> Tree:
 
 
 @pytest.mark.parametrize(
-    "thing", [escape, _table, _tree, lambda words: Panel(escape(words)), lambda words: [words]],
+    "thing",
+    [escape, _table, _tree, lambda words: Panel(escape(words)), lambda words: [words]],
     ids=["words", "table", "tree", "panel", "list"],
-)  # fmt: skip
+)
 def test_nothing_that_is_printed_steers_the_terminal(thing: Callable[[str], Any]) -> None:
     """Styles and borders are the console's own; in the words no control character is left."""
     file = io.StringIO()
@@ -69,19 +70,53 @@ def test_json_says_the_same_in_escapes() -> None:
     assert json.loads(text) == content
 
 
+def _history(words: str) -> FieldHistory:
+    row = {
+        "run": words,
+        "created": "2026-06-01T10:00:00Z",
+        "due": words,
+        "attempts": 1,
+        "miou": 0.5,
+        "unit": "share",
+        "overall_accuracy": None,
+        "savings": {"capture_s": 0.5},
+        "areas": {words: 1.0},
+        "colours": {},
+    }
+    return FieldHistory(words, words, [row], [{"event": "failed", "due": words, "reason": words}])
+
+
 @pytest.mark.parametrize(
-    "page", [lambda words: page_section(words, ""), lambda words: line_chart({words: [(0.0, 1.0), (1.0, 2.0)]}, words)]
+    "page",
+    [
+        lambda words: render_history(_history(words), "runs"),
+        lambda words: render_index([_history(words)], words, {words: words}),
+    ],
+    ids=["history", "index"],
 )
 def test_pages_show_names_as_escapes(page: Callable[[str], str]) -> None:
-    """Words beside a name are not turned round by it."""
+    """Words beside a name are not turned round by it, and nothing in them is markup."""
     text = page(HOSTILE)
     assert all(is_visible(letter) for letter in text)
-    assert SHOWN in text
+    assert text.count(SHOWN) >= 3
+    assert '<b title="' not in page('<b title="x">')
 
 
 def test_prefects_pages_show_names_as_escapes() -> None:
     """The text of a survey has them, with its markup off."""
-    assert all(is_visible(letter) for letter in _plain(HOSTILE))
+    words = HOSTILE + "<b>[x](y)`|"
+    text = render_markdown(
+        "survey.md",
+        survey=words,
+        headline=words,
+        picture="",
+        rows=[{words: words}],
+        findings=[words],
+        where="archive/runs/x_1",
+    )
+    assert all(is_visible(letter) for letter in text)
+    assert text.count(r"\<b\>\[x\](y)\`\|") == 5
+    assert "`archive/runs/x_1/report.html`" in text
 
 
 def test_a_command_names_a_hostile_file_in_escapes(command_line: Any, tmp_path: Path) -> None:
@@ -100,6 +135,6 @@ def test_every_console_is_a_terminal() -> None:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Console":
                 made.append(path.name)
-            if isinstance(node, ast.ImportFrom) and node.module == "html" and path.name != "page_parts.py":
+            if isinstance(node, ast.ImportFrom) and node.module in ("html", "jinja2") and path.name != "pages.py":
                 made.append(path.name)
     assert made == []

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.receipt import to_json
 from flows.survey.full_look import columns_of_all_seats
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
@@ -44,6 +43,7 @@ from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import StageRef
 from storage.archive.keys import array_digest
 from storage.archive.stored_tables import read_table
+from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
 
 ACCURACY = Product("evaluate", version=7, by_weights=True)

@@ -11,7 +11,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from flows.publish.receipt import to_json
 from flows.settings.survey_settings import plain_value
 from flows.survey.run import CaptureRun
 from flows.survey.stage import Product, Wanted, stage
@@ -32,6 +31,7 @@ from pipeline.simulator.selection.verification import candidate_blocks, verify, 
 from pipeline.simulator.simulated import SimulatedSource, sweep_starts
 from storage.archive.archive import StageRef
 from storage.archive.stored_tables import read_table
+from storage.archive.whole_files import to_json
 
 MANIFEST = Product("effects", version=2)
 RECORD = "effects.json"

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.colour_stretch import choose_bands, develop, stretch
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from pipeline.ground.map_grid import GroundGrid, classes_at, ground_grid, image_at, map_blocks
@@ -17,6 +16,7 @@ from storage.archive.archive import StageRef
 from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.arrays.ground_maps import BLOCK, ClassLegend, GroundMapWriter
 from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
+from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 GROUND = Product("ground", version=2)
 STORE = "ground_map.zarr"

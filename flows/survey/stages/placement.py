@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.colour_stretch import choose_bands
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from flows.survey.stages.attention import load_plan
@@ -28,7 +27,7 @@ from storage.arrays.layout import read_array
 from storage.arrays.lookups import path_digest, write_lookup
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.patches import PatchWriter, open_patches
-from storage.arrays.quicklooks import stretched
+from storage.arrays.quicklooks import choose_bands, stretched
 from storage.arrays.tile_work import MosaicRecipe, Thumbnail, write_mosaic
 
 LOOKUP, MOSAIC, PATCHES = Product("locate", version=2), Product("rectify", version=3), Product("patches", version=3)

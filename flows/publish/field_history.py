@@ -39,8 +39,13 @@ class FieldHistory:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for --json."""
-        return {"field": self.field, "archive": self.archive, "counts": self.counts,
-                "runs": list(self.runs), "events": list(self.events)}  # fmt: skip
+        return {
+            "field": self.field,
+            "archive": self.archive,
+            "counts": self.counts,
+            "runs": list(self.runs),
+            "events": list(self.events),
+        }
 
 
 def read_histories(archive: Archive, field: str | None = None) -> list[FieldHistory]:
