@@ -30,7 +30,7 @@ from flows.publish.receipt import (
     with_accuracy,
 )
 from flows.publish.report import Picture, write_report
-from flows.settings.survey_settings import anchor_paths
+from flows.settings.load import anchor_paths
 from flows.survey.accuracy import load_accuracy
 from flows.survey.effect_choice import RECORD as EFFECTS_RECORD
 from flows.survey.effect_choice import load_manifest

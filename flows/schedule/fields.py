@@ -17,7 +17,8 @@ from flows.schedule.ledger_state import moment_words
 from flows.schedule.rig_lock import RigLock, hold_place, rig_lock
 from flows.schedule.times import Timetable
 from flows.schedule.wall_clock import SystemWallClock, WallClock
-from flows.settings.survey_settings import Settings, load_settings
+from flows.settings.load import load_settings
+from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
 from pipeline.simulator.farm_laws import has_days
 from storage.archive.ledger import Ledger

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
-from flows.settings.device_table import MOST_PAIRS
-from flows.settings.keys import BUILT_IN_SCENES, RIG_FIELD, MapChoice
+from flows.settings.survey_settings import BUILT_IN_SCENES, RIG_FIELD, MapChoice, Settings
 from models.network.vgg_sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import SettingsError
+from pipeline.rig.mirror.mirror_settings import MOST_PAIRS
 from pipeline.simulator.farm_laws import SEASON_LAW, has_days
-
-if TYPE_CHECKING:
-    from flows.settings.survey_settings import Settings
 
 IN_NAT = ("gain", "entropy")  # policies whose scores are gains, or the most that these can be
 _VGG_FROM = {"vgg-static": VGG_FROM, "vgg-trained": TRAINED_VGG_FROM}  # policies that read a file of VGG19

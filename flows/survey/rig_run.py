@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from flows.settings.keys import RIG_FIELD
-from flows.settings.survey_settings import Settings
+from flows.settings.survey_settings import RIG_FIELD, Settings
 from pipeline.errors import SettingsError
 from pipeline.geometry.mounting import STRAIGHT
 from pipeline.geometry.scan import Sweep, sweep_positions

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from flows.simulate.command import open_simulation
 from flows.survey import effect_choice
 from flows.survey.effect_choice import choose_effects, chosen_effects, load_manifest, source_with

@@ -24,7 +24,8 @@ import flows.survey.rig_run
 import flows.terminal.progress
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
-from flows.settings.survey_settings import Settings, load_settings
+from flows.settings.load import load_settings
+from flows.settings.survey_settings import Settings
 from flows.survey.effect_choice import chosen_effects
 from flows.survey.run import make_source, open_run
 from flows.survey.scene import open_scene
