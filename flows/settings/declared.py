@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import types
-from dataclasses import Field, dataclass, fields, is_dataclass
 from datetime import datetime
 from functools import cached_property
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-import pydantic
+from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 
 from flows.settings.survey_settings import Settings
-from flows.settings.values import parse_moment, unit_guess
+from flows.settings.values import parse_moment, parse_text, to_whole, unit_guess
 from pipeline.errors import BudgetError, SettingsError
 from pipeline.stated import number_words, span_of
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Declared:
     """One setting."""
 
-    item: Field[Any]
+    item: dataclasses.Field[Any]
     kind: Any  # its type, None left out
 
     @property
@@ -46,32 +47,38 @@ class Declared:
             return f"one of {self.listed}"
         low, high = span_of(self.item)
         if self.kind is float:
-            return number_words(low, high, self.told["unit"], endless=self._endless)
+            return number_words(low, high, self.told["unit"], endless=self.item.default == math.inf)
         words = {int: f"a whole number from {low} to {high}", bool: "true or false", str: "text that is not empty"}
         return words.get(self.kind, "")
 
-    @property
-    def _endless(self) -> bool:
-        return self.kind is float and self.item.default == float("inf")
-
     @cached_property
-    def _adapter(self) -> pydantic.TypeAdapter[Any]:
+    def _adapter(self) -> TypeAdapter[Any]:
         known = {name: value for name, value in self.item.metadata.items() if value is not None}
         if self.kind is float:
-            known["allow_inf_nan"] = self._endless
-        elif self.kind is str and self.item.default != "":
-            known["pattern"] = r"\S"
-        kind: Any = Annotated[self.kind, pydantic.Field(**known)]
-        return pydantic.TypeAdapter(kind)
+            known["allow_inf_nan"] = self.item.default == math.inf
+        kind: Any = Annotated[self.kind, PlainValidator(parse_text) if self.kind is str else Field(**known)]
+        return TypeAdapter(kind)
+
+    def _from_text(self, text: str) -> object:
+        """The number or switch that a flag or a receipt says; what is none stays text."""
+        if self.kind is int:
+            return to_whole(text)
+        if self.kind is bool:
+            return {"true": True, "false": False}.get(text.lower(), text)
+        try:
+            return float(text) if self.kind is float else text
+        except ValueError:
+            return text
 
     def read(self, value: object, place: str) -> object:
         """Give the value, from text or TOML; SettingsError (of the budget BudgetError) with ``place`` otherwise."""
-        given = {"true": True, "false": False}.get(str(value).lower(), value) if self.kind is bool else value
+        if self.kind is str and value == self.item.default == "":
+            return value
         try:
-            if isinstance(given, str) and self.kind in (int, float):
-                return self._adapter.validate_strings(given)
-            return self._adapter.validate_python(given, strict=True)
-        except pydantic.ValidationError as error:
+            return self._adapter.validate_python(
+                self._from_text(value) if isinstance(value, str) else value, strict=True
+            )
+        except ValidationError as error:
             cause = error.errors()[0].get("ctx", {}).get("error")
         if isinstance(cause, ValueError):  # of its own parser
             joint = ": " if isinstance(cause, SettingsError) else " "
@@ -83,18 +90,19 @@ class Declared:
 
 def _declared(make: type[Any]) -> dict[str, Declared]:
     """Every field of a dataclass."""
-    hints = get_type_hints(make, include_extras=True)
-    return {item.name: Declared(item, _kind(hints[item.name])) for item in fields(make)}
-
-
-def _kind(hint: Any) -> Any:
-    """The type without None; of a moment with its parser."""
-    if get_origin(hint) in (types.UnionType, Union):
-        (hint,) = (part for part in get_args(hint) if part is not types.NoneType)
-    return Annotated[datetime, pydantic.PlainValidator(parse_moment)] if hint is datetime else hint
+    own = {datetime: Annotated[datetime, PlainValidator(parse_moment)]}
+    found = {}
+    for item in dataclasses.fields(make):
+        hint = get_type_hints(make, include_extras=True)[item.name]
+        if get_origin(hint) in (types.UnionType, Union):
+            (hint,) = (part for part in get_args(hint) if part is not types.NoneType)
+        found[item.name] = Declared(item, own.get(hint, hint))
+    return found
 
 
 SURVEY = _declared(Settings)  # a table by the dataclass that it stands for
 TABLES = {
-    name: _declared(one.kind) for name, one in SURVEY.items() if isinstance(one.kind, type) and is_dataclass(one.kind)
+    name: _declared(one.kind)
+    for name, one in SURVEY.items()
+    if isinstance(one.kind, type) and dataclasses.is_dataclass(one.kind)
 }

@@ -25,12 +25,12 @@ def flag_help(one: Declared) -> str:
     return about(one) + ("" if one.item.default is None else f"; {shown(one).strip(chr(34))} by default")
 
 
-def about(one: Declared) -> str:
+def about(one: Declared, *, choices: bool = True) -> str:
     """The line of help of a setting, with its unit, its choices, and whether its default is assumed."""
     unit = f" [{one.told['unit']}]" if one.told["unit"] else ""
-    choices = f" ({one.listed})" if one.choices else ""
+    words = f" ({one.listed})" if one.choices and choices else ""
     source = f"; {one.told['source']}" if one.told["source"] else ""
-    return f"{one.item.metadata['description']}{unit}{choices}{source}"
+    return f"{one.item.metadata['description']}{unit}{words}{source}"
 
 
 def shown(one: Declared) -> str:
@@ -48,18 +48,17 @@ def example_toml() -> str:
     """The settings' example: every key with its default (in a comment where it has none) and its line of help."""
     lines = [HEAD, *(line for name, one in SURVEY.items() if name not in TABLES for line in _example_lines(name, one))]
     for name, keys in TABLES.items():
-        said = [f"[{name}]", *(line for key, one in keys.items() for line in _example_lines(key, one))]
-        left_out = SURVEY[name].item.default is None or not any(line[0] not in "# " for line in said[1:])
-        about_table = textwrap.wrap(SURVEY[name].item.metadata["description"], WIDTH - 2)
-        lines += ["", *(f"# {line}" for line in about_table)]
-        lines += [f"# {line.removeprefix('# ')}" for line in said] if left_out else said
+        off = SURVEY[name].item.default is None or all(one.item.default is None for one in keys.values())
+        lines += ["", *(f"# {line}" for line in textwrap.wrap(SURVEY[name].item.metadata["description"], WIDTH - 2))]
+        lines += [f"# [{name}]" if off else f"[{name}]"]
+        lines += [line for key, one in keys.items() for line in _example_lines(key, one, off=off)]
     return "\n".join(lines) + "\n"
 
 
-def _example_lines(name: str, one: Declared) -> Iterator[str]:
-    off = "# " if one.item.default in (None, MISSING, "") else ""
+def _example_lines(name: str, one: Declared, *, off: bool = False) -> Iterator[str]:
+    sign = "# " if off or one.item.default in (None, MISSING, "") else ""
     words = textwrap.wrap(about(one), WIDTH - COLUMN - 2, break_on_hyphens=False)
-    yield f"{off}{name} = {shown(one)}".ljust(COLUMN - 1) + f" # {words[0]}"
+    yield f"{sign}{name} = {shown(one)}".ljust(COLUMN - 1) + f" # {words[0]}"
     yield from (" " * COLUMN + f"# {more}" for more in words[1:])
 
 
@@ -68,7 +67,10 @@ def settings_table() -> str:
     parts = []
     for title, keys in {"": {k: v for k, v in SURVEY.items() if k not in TABLES}, **TABLES}.items():
         said = f"## [{title}]\n\n{SURVEY[title].item.metadata['description']}\n\n" if title else ""
-        rows = [f"| `{name}` | {_default(one)} | {one.expected} | {_cell(about(one))} |" for name, one in keys.items()]
+        rows = [
+            f"| `{name}` | {_default(one)} | {'' if one.kind is str else one.expected} | {about(one, choices=False)} |"
+            for name, one in keys.items()
+        ]
         parts.append(said + "\n".join(["| key | default | may be | what it is |", "|---|---|---|---|", *rows]) + "\n")
     return "\n".join(parts)
 
@@ -77,10 +79,6 @@ def _default(one: Declared) -> str:
     if one.item.default is MISSING:
         return "to be given"
     return "" if one.item.default in (None, "") else f"`{shown(one)}`"
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import MISSING
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from flows.settings.declared import SURVEY, TABLES, Declared
 from flows.settings.rules import check_together, place_of
@@ -36,10 +36,15 @@ def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | 
         raise SettingsError(f"no settings file {path}; give the path of a survey's TOML file, or none") from None
     except ValueError as error:
         raise SettingsError(f"cannot read the settings file {path}: {error}; expected TOML in UTF-8") from None
-    origin = dict.fromkeys(_flatten(table), str(path))
-    for key, value in _flatten(flags or {}).items():
+    origin = dict.fromkeys(table, str(path))
+    for name in TABLES:
+        inner = table.get(name)
+        origin |= {f"{name}.{key}": str(path) for key in inner} if isinstance(inner, Mapping) else {}
+    for key, value in (flags or {}).items():
         if value is not None:
-            _put(table, key, value)
+            head, _, tail = key.rpartition(".")
+            inner = table.get(head, {})
+            table[head or key] = {**inner, tail: value} if head and isinstance(inner, Mapping) else value
             origin[key] = "flag"
     return parse_settings(table, origin)
 
@@ -135,21 +140,3 @@ def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
         if isinstance(value, str) and value and value not in named and "://" not in value:
             anchored[key] = str(folder / Path(value).expanduser())
     return anchored
-
-
-def _flatten(table: Mapping[str, object]) -> dict[str, object]:
-    """Nested tables as dotted keys; what is no table stays."""
-    flat: dict[str, object] = {}
-    for key, value in table.items():
-        if key in TABLES and isinstance(value, Mapping):
-            flat.update({f"{key}.{inner}": item for inner, item in value.items()})
-        else:
-            flat[key] = value
-    return flat
-
-
-def _put(table: dict[str, object], key: str, value: object) -> None:
-    """Set a dotted key, without changing the inner table that came in."""
-    head, _, tail = key.partition(".")
-    inner = table.get(head, {})
-    table[head] = {**cast("Mapping[str, object]", inner), tail: value} if tail and isinstance(inner, Mapping) else value

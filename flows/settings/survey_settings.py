@@ -13,16 +13,16 @@ from typing import Annotated, Any, Literal, cast
 from pydantic import PlainValidator
 
 from flows.settings.values import (
+    Bands,
+    Budget,
+    Effects,
+    Memory,
+    Name,
+    Scheduler,
+    Size,
     Tolerance,
-    parse_bands,
-    parse_budget,
-    parse_effects,
-    parse_memory,
-    parse_name,
-    parse_scheduler,
-    parse_size,
+    Wavelengths,
     parse_tolerance,
-    parse_wavelengths,
 )
 from models.policies.policies import Policy
 from pipeline.geometry.camera import LineCamera
@@ -40,6 +40,8 @@ USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
 RIG_FIELD = "field"  # the scene of which only the rig knows more than size and bands
 OF_THE_MACHINE = ("scheduler", "workers")  # no byte depends on them; a cluster of that day need not be there today
 PATHS = ("scene", "labels", "out", "mask", "vgg", "weights")
+WORKERS = "one process or thread each; leave it out for one a core"
+EPSG = "the number after EPSG:, such as 32632"
 REPLACED = {  # keys of before
     "optics.polarisation": 'the mirror\'s coating says it now: [mirror] coating = "aluminium"',
     "rounds": "there is one round of detail: a second never paid (README, Limits) and was removed; leave it out",
@@ -51,13 +53,7 @@ class MapChoice:
     """What map to draw of a posed survey; None leaves the choice to the pose."""
 
     epsg: int | None = stated(
-        None,
-        "A projected CRS in metres; by default the rig's UTM zone",
-        "",
-        1024,
-        32_767,
-        example=32632,
-        why="the number after EPSG:, such as 32632",
+        None, "Projected CRS in metres; the rig's UTM zone by default", "", 1024, 32_767, example=32632, why=EPSG
     )
     resolution_m: float | None = stated(
         None, "By default the median footprint of a pixel", "m", 1e-4, 1000, example=0.01
@@ -74,109 +70,74 @@ def table(about: str, make: type[Any] | None) -> Any:
 class Settings:
     """All that one survey needs to know. Made by `load_settings` or `parse_settings`: they check; this does not."""
 
-    name: Annotated[str, PlainValidator(parse_name)] | None = stated(
-        None, "What the field is called; as its scene by default", example="north"
-    )
+    name: Name | None = stated(None, "What the field is called; as its scene by default", example="north")
     visit: str | None = stated(
         None,
-        "Which look at the field, in any words: another one is captured anew, the same one is gone on with",
+        "Which look at the field: another one is captured anew, the same one gone on with",
         example="first of June",
     )
     scene: str = stated(
         "farm",
-        "`farm` (built in; also `farm@1`, `farm@2`), or an image or cube file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat, "
-        "ENVI, Zarr",
+        "`farm` (built in; also `farm@1`, `farm@2`), or a file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr",
     )
     labels: str | None = stated(
-        None, "File of class colours or numbers on the scene's pixels; accuracy is reported then", example="labels.png"
+        None, "Class colours or numbers on the scene's pixels; accuracy is reported then", example="labels.png"
     )
-    bands: Annotated[tuple[int, ...], PlainValidator(parse_bands)] | None = stated(
-        None, "Bands of the file (or of the farm's 270) to use, from 0, such as 0,1", example=(0, 1)
-    )
-    wavelengths: Annotated[tuple[float, ...], PlainValidator(parse_wavelengths)] | None = stated(
-        None, "Their centre wavelengths, such as 660,800", "nm", example=(660.0, 800.0)
-    )
-    source: Literal["sim", "rig"] = stated(
-        "sim", "Who looks: the simulated rig, or the one that the settings' table [rig] names"
-    )
+    bands: Bands | None = stated(None, "Bands of the file (or of the farm's 270) to use, from 0: 0,1", example=(0, 1))
+    wavelengths: Wavelengths | None = stated(None, "Their centre wavelengths: 660,800", "nm", example=(660.0, 800.0))
+    source: Literal["sim", "rig"] = stated("sim", "Who looks: the simulated rig, or the one that the table [rig] names")
     out: str = stated("archive", "Archive: a folder, or s3://bucket/prefix")
-    budget: Annotated[float, PlainValidator(parse_budget)] = stated(
+    budget: Budget = stated(
         0.5, "Seconds of coarse and fine capture over those of the full scan, above 0 and at most 1"
     )
     policy: Policy = stated("gain", "Where to look twice")
     mask: str | None = stated(None, "Image of where to look twice, for the policy mask", example="mask.png")
     vgg: str | None = stated(None, "Weights of VGG19, for the policies vgg-static and vgg-trained", example="vgg19.pth")
-    weights: str | None = stated(
-        None, "Model weights (.safetensors); those for `farm` are built in", example="weights.safetensors"
-    )
+    weights: str | None = stated(None, "Model weights; those for `farm` are built in", example="weights.safetensors")
     threshold: float | None = stated(
         None,
-        "Least gain that a second of the fine pass is spent for (nat per px, summed over seats), as the receipt's "
-        "score_per_second; none by default. For the policies gain and entropy",
+        "Least gain (per px, summed over seats) in a second of the fine pass; for the policies gain and entropy",
         "nat per second",
         0,
         1e9,
         example=0.5,
     )
     seed: int = stated(0, "Of the scene `farm` and of all noise", "", 0, 2**63 - 1)
-    effects: Annotated[str, PlainValidator(parse_effects)] = stated(
+    effects: Effects = stated(
         "auto",
         "Of the simulated rig: auto (those that change a number by more than tol), all, none, or names with commas: "
         "rotation,slit,smear,vignetting,shot,read-noise",
     )
     tol: Annotated[Tolerance, PlainValidator(parse_tolerance)] = stated(
         Tolerance(),
-        "What leaving effects out may change any number by: in sigmas of its noise, or in DN, 0.5dn. With 0 everything "
-        "is computed exactly, with inf all is left out that can be",
+        "What leaving effects out may change any number by: sigmas of its noise, or 0.5dn in DN; 0 computes all "
+        "exactly, inf leaves out all that can be",
         example=Tolerance().value,
     )
     accuracy: bool = stated(
-        True, "Judge the map by the labels once it is published; without it, `evaluate ARCHIVE RUN` does so later"
+        True, "Judge the published map by the labels; without it, `evaluate ARCHIVE RUN` does so later"
     )
     controls: bool = stated(True, "Also judge other placements of the same number of seats (needs labels)")
-    engine: Literal["prefect", "plain"] = stated("prefect", "Who runs the stages: plain does where no server can start")
-    memory: Annotated[int, PlainValidator(parse_memory)] = stated(
-        4 * 1024**3, "How much the work on tiles and regions of the field may take", "bytes", example="4GiB"
-    )
-    scheduler: Annotated[str, PlainValidator(parse_scheduler)] = stated(
-        "threads", "Who does that work: threads, processes, or a dask scheduler elsewhere, tcp://host:port"
+    engine: Literal["prefect", "plain"] = stated("prefect", "Who runs the stages; plain where no server can start")
+    memory: Memory = stated(4 * 1024**3, "How much the work on tiles and regions of the field may take", example="4GiB")
+    scheduler: Scheduler = stated(
+        "threads", "Who does it: threads, processes, or a dask scheduler elsewhere, tcp://host:port"
     )
     workers: int | None = stated(
-        None,
-        "Tiles, regions or blocks of simulated lines at a time; one a core by default",
-        "",
-        1,
-        1024,
-        example=2,
-        why="one process or thread each; leave it out for one a core",
+        None, "Tiles, regions or blocks at a time; one a core by default", "", 1, 1024, example=2, why=WORKERS
     )
     kernel: Kernel = stated("catmull-rom", "How lines are read between samples; nearest mixes no spectra")
     pointing_px: float = stated(
-        0.0,
-        "How far off the mirror may point; above 0 sweeps overlap by more and their seams are registered",
-        "px",
-        0,
-        300,
+        0.0, "How far off the mirror may point; above 0 sweeps overlap, seams are registered", "px", 0, 300
     )
-    size: Annotated[tuple[int, int], PlainValidator(parse_size)] | None = stated(
+    size: Size | None = stated(
         None, f"Of the scene `farm`, width x height; {USUAL_SIZE} by default", "px", example=USUAL_SIZE
     )
     day: int | None = stated(
-        None,
-        f"Of the year, for the scene `farm@2`; {USUAL_DAY} by default",
-        "",
-        1,
-        366,
-        example=USUAL_DAY,
-        why="of the year, 172 is the 21st of June",
+        None, f"Of the year, for `farm@2`; {USUAL_DAY} by default, the 21st of June", "", 1, 366, example=USUAL_DAY
     )
     hour: float | None = stated(
-        None,
-        f"True solar time, for the scene `farm@2`; {USUAL_HOUR:g} by default, the sun stands in the south at 12",
-        "h",
-        0,
-        24,
-        example=USUAL_HOUR,
+        None, f"True solar time, for `farm@2`; {USUAL_HOUR:g} by default, noon is 12", "h", 0, 24, example=USUAL_HOUR
     )
     camera: LineCamera = table("The line camera.", LineCamera)
     optics: Optics = table(

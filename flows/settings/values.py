@@ -9,6 +9,9 @@ import math
 import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Annotated
+
+from pydantic import ByteSize, PlainValidator, TypeAdapter, ValidationError
 
 from pipeline.errors import BudgetError, SettingsError
 from pipeline.simulator.choice import named_effects
@@ -20,8 +23,7 @@ from storage.parallel.crew import Crew
 
 RENAMED = {"throughput": "vignetting", "read": "read-noise"}  # effects as settings of before called them
 LEAST_MEMORY = 256 * 1024**2
-_BYTES = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12,
-          "kib": 2**10, "mib": 2**20, "gib": 2**30, "tib": 2**40}  # fmt: skip
+_BYTES = TypeAdapter(ByteSize)
 # unit of a setting -> other units in which people write it, with the factor that makes it right
 _OTHER_UNITS: dict[str, tuple[tuple[str, float], ...]] = {
     "ms": (("seconds", 1e3), ("microseconds", 1e-3)),
@@ -48,13 +50,19 @@ class Tolerance:
         return f"{self.value!r}" + ("" if self.unit == "sigma" else "dn")
 
 
-def parse_name(value: object) -> str:
-    """A name that a file can have too: of letters, digits, '_', '-' and '.'."""
+def parse_text(value: object) -> str:
+    """Text that is not empty."""
     if not isinstance(value, str) or not value.strip():
         raise ValueError(f"must be text that is not empty, got {value!r}")
-    if not is_name(value):
-        raise ValueError(f"must be a name of letters, digits, '_', '-' and '.', got {value!r}")
     return value
+
+
+def parse_name(value: object) -> str:
+    """A name that a file can have too: of letters, digits, '_', '-' and '.'."""
+    name = parse_text(value)
+    if not is_name(name):
+        raise ValueError(f"must be a name of letters, digits, '_', '-' and '.', got {value!r}")
+    return name
 
 
 def parse_budget(value: object) -> float:
@@ -68,11 +76,10 @@ def parse_budget(value: object) -> float:
 
 def parse_memory(value: object) -> int:
     """Bytes, from a whole number or text such as 4GiB or 500 MB."""
-    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?i?b?)\s*", str(value).lower())
-    unit = found[2] if found and (found[2] in _BYTES) else None
-    if isinstance(value, bool) or found is None or unit is None:
-        raise ValueError(f"must be a number with a unit such as 4GiB or 800MB, got {value!r}")
-    count = int(float(found[1]) * _BYTES[unit])
+    try:
+        count = int(_BYTES.validate_python(value))
+    except ValidationError:
+        raise ValueError(f"must be a number with a unit such as 4GiB or 800MB, got {value!r}") from None
     if count < LEAST_MEMORY:
         raise ValueError(f"must be at least {LEAST_MEMORY // 2**20}MiB, got {value!r} ({count} bytes)")
     return count
@@ -80,15 +87,13 @@ def parse_memory(value: object) -> int:
 
 def parse_scheduler(value: object) -> str:
     """``threads``, ``processes``, or the address of a dask scheduler."""
-    if not isinstance(value, str) or not value.strip():
-        raise ValueError(f"must be text that is not empty, got {value!r}")
-    return Crew(value).scheduler
+    return Crew(parse_text(value)).scheduler
 
 
 def parse_size(value: object) -> tuple[int, int]:
     """(width, height) in px, from text such as 1280x1024 or from two whole numbers."""
     parts = re.split("[x,]", value.lower()) if isinstance(value, str) else value
-    sides = [_to_whole(part) for part in parts] if isinstance(parts, list | tuple) else []
+    sides = [to_whole(part) for part in parts] if isinstance(parts, list | tuple) else []
     if len(sides) != 2 or any(side is None or not 1 <= side <= 100_000 for side in sides):
         raise ValueError(f"must be WIDTHxHEIGHT in px, such as 1280x1024, got {value!r}")
     return int(sides[0] or 0), int(sides[1] or 0)
@@ -131,15 +136,15 @@ def parse_tolerance(value: object) -> Tolerance:
         amount = math.inf
     if found is None or amount is None or amount < 0:
         raise ValueError(
-            f"must be 0 or more, in sigmas of the noise such as 0.1, or in DN such as 0.5dn; inf leaves out all"
-            f" that can be; got {value!r}"
+            "must be 0 or more, in sigmas of the noise such as 0.1, or in DN such as 0.5dn; inf leaves out all that "
+            f"can be; got {value!r}"
         )
     return Tolerance(amount, "dn" if found[2] == "dn" else "sigma")
 
 
 def parse_bands(value: object) -> tuple[int, ...]:
     """Band numbers counted from 0, none of them twice; a list or text with commas."""
-    bands = [_to_whole(item) for item in _items(value)]
+    bands = [to_whole(item) for item in _items(value)]
     if not bands or any(band is None or band < 0 for band in bands):
         raise ValueError(f"must list band numbers counted from 0, such as 0,1,2; got {value!r}")
     if len(set(bands)) != len(bands):
@@ -179,7 +184,7 @@ def _to_float(value: object) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _to_whole(value: object) -> int | None:
+def to_whole(value: object) -> int | None:
     """A whole number, also from text; None for anything else, 2.0 included."""
     if isinstance(value, str) and re.fullmatch(r"\s*[+-]?\d{1,20}\s*", value):
         return int(value)
@@ -193,3 +198,13 @@ def unit_guess(value: object, low: float, high: float, unit: str) -> str:
         if number is not None and low <= number * factor <= high:
             return f"; was it given in {name}? then write {number * factor:g}"
     return ""
+
+
+Name = Annotated[str, PlainValidator(parse_name)]
+Budget = Annotated[float, PlainValidator(parse_budget)]
+Memory = Annotated[int, PlainValidator(parse_memory)]
+Scheduler = Annotated[str, PlainValidator(parse_scheduler)]
+Size = Annotated[tuple[int, int], PlainValidator(parse_size)]
+Effects = Annotated[str, PlainValidator(parse_effects)]
+Bands = Annotated[tuple[int, ...], PlainValidator(parse_bands)]
+Wavelengths = Annotated[tuple[float, ...], PlainValidator(parse_wavelengths)]

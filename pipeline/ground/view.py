@@ -45,23 +45,28 @@ class RigPose:
     PoseError : a value is not finite or out of range, or not exactly one of height and range is given.
     """
 
-    lon_deg: float = stated(MISSING, "WGS 84; west is negative", "deg", -180, 180, example=9.5)
-    lat_deg: float = stated(MISSING, "South is negative", "deg", -90, 90, example=52.1)
+    lon_deg: float = stated(MISSING, "Longitude, WGS 84; west is negative", "deg", -180, 180, example=9.5)
+    lat_deg: float = stated(MISSING, "Latitude, WGS 84; south is negative", "deg", -90, 90, example=52.1)
     heading_deg: float = stated(
-        MISSING, "Of the undeflected view direction, clockwise from north", "deg", -360, 360, example=30.0
+        MISSING, "Azimuth of the undeflected view direction, clockwise from north", "deg", -360, 360, example=30.0
     )
-    tilt_deg: float = stated(MISSING, "Below the horizon; 90 looks straight down", "deg", -90, 90, example=40.0)
+    tilt_deg: float = stated(MISSING, "Angle below the horizon; 90 looks straight down", "deg", -90, 90, example=40.0)
     height_m: float | None = stated(
-        None, "Of the mirror's pivot above the ground below it; or instead range_m", "m", 0.01, 20_000, example=12.0
+        None,
+        "Height of the mirror's pivot above the ground below it; or instead range_m",
+        "m",
+        0.01,
+        20_000,
+        example=12.0,
     )
     range_m: float | None = stated(
-        None, "To the ground along the undeflected direction; or height_m", "m", 0.01, 50_000, example=18.7
+        None, "Distance to the ground along the undeflected direction; or height_m", "m", 0.01, 50_000, example=18.7
     )
-    roll_deg: float = stated(0.0, "About the view direction; positive turns the right side down", "deg", -180, 180)
-    slope_deg: float = stated(0.0, "Of the ground", "deg", 0, 80)
+    roll_deg: float = stated(0.0, "Turn about the view direction; positive turns the right side down", "deg", -180, 180)
+    slope_deg: float = stated(0.0, "Slope of the ground", "deg", 0, 80)
     aspect_deg: float = stated(0.0, "Where the slope goes down to, clockwise from north", "deg", -360, 360)
     # 1000 m are 1.6e-4 of the map's scale
-    elevation_m: float = stated(0.0, "Of the ground below the rig above the ellipsoid", "m", -500, 9000)
+    elevation_m: float = stated(0.0, "Height of the ground below the rig above the ellipsoid", "m", -500, 9000)
 
     def __post_init__(self) -> None:
         for name, words in misfits(self):

@@ -31,12 +31,12 @@ class SurveyRig(MirrorLink):
     mirror_offset_x: float = stated(
         Mounting.offset_x, "The device's X where the mirror looks straight ahead, of -1 to 1", "", -0.5, 0.5
     )
-    mirror_offset_y: float = stated(Mounting.offset_y, "And its Y", "", -0.5, 0.5)
-    host: str = stated(CameraAddress.host, "Of the camera, as its maker sets it")
-    control_port: int = stated(CameraAddress.port, "Of its commands", "", 1, 65_535)
-    file_port: int = stated(FileServer.port, "Of its FTP server", "", 1, 65_535)
-    user: str = stated(FileServer.user, "Of its FTP server")
-    password: str = stated(FileServer.password, "Receipts do not repeat it")
+    mirror_offset_y: float = stated(Mounting.offset_y, "The device's Y there", "", -0.5, 0.5)
+    host: str = stated(CameraAddress.host, "Address of the camera, as its maker sets it")
+    control_port: int = stated(CameraAddress.port, "Port of its commands", "", 1, 65_535)
+    file_port: int = stated(FileServer.port, "Port of its FTP server", "", 1, 65_535)
+    user: str = stated(FileServer.user, "User of its FTP server")
+    password: str = stated(FileServer.password, "Password of that user; receipts do not repeat it")
     connect_s: float = stated(CameraAddress.connect_s, "Most that the camera may take to answer at all", "s", 0.1, 60)
     stall_s: float = stated(
         FileServer.stall_s,
@@ -46,10 +46,10 @@ class SurveyRig(MirrorLink):
         600,
     )
     least_kb_s: float = stated(
-        FileServer.least_kb_s, "Of the camera's files; slower counts as silence", "kB/s", 0.001, 1e6
+        FileServer.least_kb_s, "Least speed of the camera's files; slower counts as silence", "kB/s", 0.001, 1e6
     )
     read_twice: bool = stated(
-        FileServer.read_twice, "The camera's files: FTP has no checksums, so two readings have to agree"
+        FileServer.read_twice, "Read the camera's files twice: FTP has no checksums, so two readings have to agree"
     )
     pulses: Pulses = assumed(
         "position",

@@ -58,7 +58,7 @@ class Detector:
 
     dark_e_per_s: float = assumed(200.0, "Dark current at 25 deg C", "e-/s", 0.0, 1e9)
     temperature_deg_c: float = assumed(
-        25.0, "Of the sensor; the law of dark current holds from -80 to 50", "deg C", -80.0, 50.0
+        25.0, "Temperature of the sensor; the law of dark current holds from -80 to 50", "deg C", -80.0, 50.0
     )
     response_share: float = assumed(0.01, "Standard deviation of a pixel's gain (PRNU)", "", 0.0, 0.5)
     stripe_share: float = assumed(
@@ -76,10 +76,14 @@ class Detector:
 class Air:
     """What lies between rig and scene. A scene without a distance is light at the aperture: no air, no parallax."""
 
-    distance_m: float | None = stated(None, "Of the scene's middle", "m", LEAST_DISTANCE_M, example=30.0)
+    distance_m: float | None = stated(None, "Distance of the scene's middle", "m", LEAST_DISTANCE_M, example=30.0)
     relief: Relief = stated("flat", "How the scene's distance changes over it")
-    nearest_m: float | None = stated(None, "Of the scene; by default distance_m", "m", LEAST_DISTANCE_M, example=25.0)
-    farthest_m: float | None = stated(None, "Of the scene; by default distance_m", "m", LEAST_DISTANCE_M, example=40.0)
+    nearest_m: float | None = stated(
+        None, "Nearest part of the scene; by default distance_m", "m", LEAST_DISTANCE_M, example=25.0
+    )
+    farthest_m: float | None = stated(
+        None, "Farthest part of the scene; by default distance_m", "m", LEAST_DISTANCE_M, example=40.0
+    )
     lever_m: float = assumed(0.1, "Virtual pinhole behind the pivot", "m", 0.0, 10.0)
     visibility_km: float = assumed(23.0, "How far one sees", "km", 0.05, 1e6)
     airlight_share: float = assumed(0.3, "Light of endless air over the white panel's", "", 0.0, 5.0)
@@ -98,8 +102,8 @@ class Sky:
         "When the survey begins, with its time zone; without it the sun stands still",
         example="2026-06-01T10:00:00+02:00",
     )
-    latitude_deg: float = assumed(52.0, "Of the field; south is negative", "deg", -90.0, 90.0)
-    longitude_deg: float = assumed(10.0, "Of the field; west is negative", "deg", -180.0, 180.0)
+    latitude_deg: float = assumed(52.0, "Latitude of the field; south is negative", "deg", -90.0, 90.0)
+    longitude_deg: float = assumed(10.0, "Longitude of the field; west is negative", "deg", -180.0, 180.0)
     cloud_share: float = assumed(0.0, "Share of the light that a cloud takes; 0 is a clear sky", "", 0.0, 1.0)
     cloud_px_per_s: float = assumed(20.0, "Speed of the shadow's edge over the scene", "px/s", 0.0, 1e6)
     cloud_size_px: float = assumed(600.0, "Size of the clouds' shadows", "px", 1.0, 1e9)

@@ -279,7 +279,7 @@ def test_the_commented_pose_of_the_example_is_valid():
     text = EXAMPLE.read_text(encoding="utf-8")
     lines = [line.removeprefix("# ") for line in text[text.index("# [pose]") :].splitlines()]
     table = tomllib.loads(
-        "\n".join(line for line in lines if line.startswith("[") or " = " in line and not line.startswith("range_m"))
+        "\n".join(line for line in lines if line.startswith("[") or (" = " in line and not line.startswith("range_m")))
     )
     found = parse_settings(table)
     assert found.pose is not None

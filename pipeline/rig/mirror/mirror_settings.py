@@ -26,11 +26,15 @@ class Patience:
 class MirrorLink:
     """What settings say of the mirror controller."""
 
-    port: str = stated("/dev/ttyACM0", "Of the mirror controller; or socket://host:port")
+    port: str = stated("/dev/ttyACM0", "Port of the mirror controller; or socket://host:port")
     # public software opens 115200
-    baud: int = assumed(115200, "Over USB any will do; the manual of a later model says 256000", "", 1200, 4_000_000)
+    baud: int = assumed(
+        115200, "Bits a second; over USB any will do; the manual of a later model says 256000", "", 1200, 4_000_000
+    )
     expected_id: str = stated("", "Part of what the controller calls itself; any by default", example="MR-E")
-    deadline_s: float = stated(Patience.deadline_s, "Of one request to the mirror, retries included", "s", 0.01, 60)
+    deadline_s: float = stated(
+        Patience.deadline_s, "Time for one request to the mirror, retries included", "s", 0.01, 60
+    )
     retries: int = stated(Patience.retries, "Of requests that only read; motions are sent once", "", 0, 20)
     quiet_s: float = assumed(Patience.quiet_s, "Silence after which an answer that is owed will not come", "s", 0, 5)
     with_crc: bool = assumed(True, "Requests carry a CRC")
@@ -40,7 +44,7 @@ class MirrorLink:
     check_status: bool = stated(True, "Ask for the mirror's status before each motion")
     park_at_close: bool = stated(False, "Send the mirror to 0; 0 at the end")
     log_rate_hz: float = stated(
-        10000.0, "Of measured positions, at most; without pulses they place the lines", "Hz", 0.1, 10_000
+        10000.0, "Rate of measured positions, at most; without pulses they place the lines", "Hz", 0.1, 10_000
     )
     log_samples: int = assumed(2000, "Samples that the controller's log holds", "", 1, 16_383)  # not published
 

@@ -48,5 +48,5 @@ def test_numbers_beyond_their_range_are_refused_with_it():
 def test_a_distance_may_be_endless_but_not_nothing():
     """None is light at the aperture, infinity the limit of no parallax."""
     assert with_number("air", "distance_m", math.inf).distances_m == (math.inf, math.inf)
-    with pytest.raises(SettingsError, match=r"air\.distance_m must be a number of at least 0\.001 m, got nan"):
+    with pytest.raises(SettingsError, match=r"air\.distance_m must be a number of at least 0\.001 m or inf, got nan"):
         with_number("air", "distance_m", math.nan)
