@@ -197,8 +197,8 @@ def _run(arguments: list[str]) -> int:
     """Run the verb; gives the exit code, once what went wrong has been said."""
     try:
         place_caches()  # read when numba and matplotlib are first imported
-        import flows.cli.survey_verbs  # noqa: F401 - the settings' declarations import numpy
-
+        if next(iter(arguments), "") in ("rig", "--help", "-h") or not {*arguments[:1]} & {*app}:
+            import flows.cli.survey_verbs  # noqa: F401 - numpy and the declared settings; other verbs do without
         code = app(arguments, result_action="return_value", exit_on_error=False, print_error=False)
     except CycloptsError as error:
         say(_usage(error))

@@ -11,6 +11,7 @@ from flows.cli.app import AsJson, Switch, app, print_json, split_list, stderr
 from flows.cli.rig_verbs import rig
 from flows.cli.survey_flags import RenderingFlags, SimulationFlags, SurveyFlags, by_setting
 from flows.settings.load import load_settings
+from pipeline.rig.survey_rig import SurveyRig
 
 NO_FLAGS = SurveyFlags()
 NO_SIMULATION_FLAGS = SimulationFlags()
@@ -101,7 +102,7 @@ def emulate(
     flags: RenderingFlags = NO_RENDERING_FLAGS,
     settings: Path | None = None,
     faults: str | None = None,
-    baud: int = 115200,
+    baud: int = SurveyRig.baud,
     speed: float = 1.0,
     out: Annotated[Path | None, Parameter(name=("--out", "-o"))] = None,
     as_json: AsJson = False,

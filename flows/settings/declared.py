@@ -91,9 +91,10 @@ class Declared:
 def _declared(make: type[Any]) -> dict[str, Declared]:
     """Every field of a dataclass."""
     own = {datetime: Annotated[datetime, PlainValidator(parse_moment)]}
+    hints = get_type_hints(make, include_extras=True)
     found = {}
     for item in dataclasses.fields(make):
-        hint = get_type_hints(make, include_extras=True)[item.name]
+        hint = hints[item.name]
         if get_origin(hint) in (types.UnionType, Union):
             (hint,) = (part for part in get_args(hint) if part is not types.NoneType)
         found[item.name] = Declared(item, own.get(hint, hint))

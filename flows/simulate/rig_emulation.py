@@ -35,7 +35,7 @@ class EmulateRequest:
 
     settings: Settings
     faults: tuple[str, ...] = ()
-    baud: int = 115200
+    baud: int = SurveyRig.baud
     speed: float = 1.0
     out: Path | None = None  # a survey's TOML to write
 
