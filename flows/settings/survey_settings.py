@@ -73,7 +73,7 @@ class Settings:
     name: Name | None = stated(None, "What the field is called; as its scene by default", example="north")
     visit: str | None = stated(
         None,
-        "Which look at the field: another one is captured anew, the same one gone on with",
+        "Which look at the field, in any words: another one is captured anew, the same one gone on with",
         example="first of June",
     )
     scene: str = stated(
@@ -93,19 +93,22 @@ class Settings:
     policy: Policy = stated("gain", "Where to look twice")
     mask: str | None = stated(None, "Image of where to look twice, for the policy mask", example="mask.png")
     vgg: str | None = stated(None, "Weights of VGG19, for the policies vgg-static and vgg-trained", example="vgg19.pth")
-    weights: str | None = stated(None, "Model weights; those for `farm` are built in", example="weights.safetensors")
+    weights: str | None = stated(
+        None, "Model weights (.safetensors); those for `farm` are built in", example="weights.safetensors"
+    )
     threshold: float | None = stated(
         None,
-        "Least gain (per px, summed over seats) in a second of the fine pass; for the policies gain and entropy",
+        "Least gain (per px, summed over seats) in a second of the fine pass, the receipt's score_per_second; for the "
+        "policies gain and entropy",
         "nat per second",
         0,
         1e9,
         example=0.5,
     )
-    seed: int = stated(0, "Of the scene `farm` and of all noise", "", 0, 2**63 - 1)
+    seed: int = stated(0, "Seed of the scene `farm` and of all noise", "", 0, 2**63 - 1)
     effects: Effects = stated(
         "auto",
-        "Of the simulated rig: auto (those that change a number by more than tol), all, none, or names with commas: "
+        "Effects of the simulated rig: auto (those that change a number by more than tol), all, none, or names with commas: "
         "rotation,slit,smear,vignetting,shot,read-noise",
     )
     tol: Annotated[Tolerance, PlainValidator(parse_tolerance)] = stated(
@@ -121,20 +124,26 @@ class Settings:
     engine: Literal["prefect", "plain"] = stated("prefect", "Who runs the stages; plain where no server can start")
     memory: Memory = stated(4 * 1024**3, "How much the work on tiles and regions of the field may take", example="4GiB")
     scheduler: Scheduler = stated(
-        "threads", "Who does it: threads, processes, or a dask scheduler elsewhere, tcp://host:port"
+        "threads", "Who does that work: threads, processes, or a dask scheduler elsewhere, tcp://host:port"
     )
     workers: int | None = stated(
-        None, "Tiles, regions or blocks at a time; one a core by default", "", 1, 1024, example=2, why=WORKERS
+        None,
+        "Tiles, regions or blocks of simulated lines at a time; one a core by default",
+        "",
+        1,
+        1024,
+        example=2,
+        why=WORKERS,
     )
     kernel: Kernel = stated("catmull-rom", "How lines are read between samples; nearest mixes no spectra")
     pointing_px: float = stated(
         0.0, "How far off the mirror may point; above 0 sweeps overlap, seams are registered", "px", 0, 300
     )
     size: Size | None = stated(
-        None, f"Of the scene `farm`, width x height; {USUAL_SIZE} by default", "px", example=USUAL_SIZE
+        None, f"Size of the scene `farm`, width x height; {USUAL_SIZE} by default", "px", example=USUAL_SIZE
     )
     day: int | None = stated(
-        None, f"Of the year, for `farm@2`; {USUAL_DAY} by default, the 21st of June", "", 1, 366, example=USUAL_DAY
+        None, f"Day of the year, for `farm@2`; {USUAL_DAY} by default, the 21st of June", "", 1, 366, example=USUAL_DAY
     )
     hour: float | None = stated(
         None, f"True solar time, for `farm@2`; {USUAL_HOUR:g} by default, noon is 12", "h", 0, 24, example=USUAL_HOUR
