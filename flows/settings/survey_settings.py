@@ -108,8 +108,8 @@ class Settings:
     seed: int = stated(0, "Seed of the scene `farm` and of all noise", "", 0, 2**63 - 1)
     effects: Effects = stated(
         "auto",
-        "Effects of the simulated rig: auto (those that change a number by more than tol), all, none, or names with commas: "
-        "rotation,slit,smear,vignetting,shot,read-noise",
+        "Effects of the simulated rig: auto (those that change a number by more than tol), all, none, or names with "
+        "commas: rotation,slit,smear,vignetting,shot,read-noise",
     )
     tol: Annotated[Tolerance, PlainValidator(parse_tolerance)] = stated(
         Tolerance(),
