@@ -16,7 +16,7 @@ from rich.console import Console
 
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from models.network.segmenter import Segmenter, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.weights.files import Weights, save_weights

@@ -104,7 +104,8 @@ def check_outside(out: Path, archive: Archive) -> Path:
 def _survey_again(archive: Archive, console: Console) -> Rerun:
     def rerun(settings: dict[str, Any]) -> None:
         from flows.publish.survey_command import run_survey
-        from flows.settings.survey_settings import OF_THE_MACHINE, of_this_version, parse_settings
+        from flows.settings.load import of_this_version, parse_settings
+        from flows.settings.survey_settings import OF_THE_MACHINE
 
         here = {**of_this_version(settings), "out": archive.name, **dict.fromkeys(OF_THE_MACHINE)}
         run_survey(parse_settings(here), console)

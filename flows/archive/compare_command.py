@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from flows.archive.commands import check_outside
 from flows.archive.comparison_table import SAVINGS, change_words, panel_words, show_comparison
 from flows.archive.difference_picture import MapPair, draw_difference
-from flows.settings.keys import BUILT_IN_SCENES
+from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.survey.scores import score_of
 from flows.terminal.shown_text import on_stdout
 from pipeline.errors import ArchiveError, SceneError, ShapeError

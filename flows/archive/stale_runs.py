@@ -11,8 +11,8 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from flows.publish.receipt import is_pending
-from flows.settings.keys import BUILT_IN_SCENES
-from flows.settings.survey_settings import OF_THE_MACHINE, Settings, of_this_version, parse_settings
+from flows.settings.load import of_this_version, parse_settings
+from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, Settings
 from flows.survey.run import SHIPPED
 from flows.survey.stage import versions
 from flows.survey.survey import STAGES

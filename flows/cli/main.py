@@ -14,8 +14,7 @@ from cyclopts import CycloptsError, UnknownOptionError
 import flows.cli.archive_verbs
 import flows.cli.model_verbs
 import flows.cli.rig_verbs
-import flows.cli.schedule_verbs
-import flows.cli.simulation_verbs  # noqa: F401 - each registers its verbs
+import flows.cli.schedule_verbs  # noqa: F401 - each registers its verbs
 from flows.cli.app import (
     GOES_ON,
     AsJson,
@@ -28,53 +27,13 @@ from flows.cli.app import (
     split_list,
     stderr,
 )
-from flows.cli.survey_flags import SurveyFlags
 from flows.terminal.cache_places import place_caches
 from flows.terminal.system_refusals import refusal_words
 from flows.terminal.termination import EXIT_CODE as TERMINATED
 from flows.terminal.termination import Terminated, terminable
 from pipeline.errors import PipelineError, SettingsError
 
-NO_FLAGS = SurveyFlags()
 INTERRUPTED = 130
-
-
-@app.command
-def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
-    """Survey a field: a coarse look at everything, then a fine look where it changes the map.
-
-    Parameters
-    ----------
-    settings
-        A survey's TOML file; flags win over it. Without one, flags and defaults alone.
-    """
-    from flows.publish.survey_command import run_survey
-    from flows.schedule.rig_lock import rig_to_oneself
-    from flows.settings.survey_settings import load_settings
-
-    asked = load_settings(settings, flags.by_setting())
-    with rig_to_oneself(asked, "a survey by hand"):
-        published = run_survey(asked, stderr)
-    if as_json:
-        print_json(published.receipt)
-    return 0
-
-
-@app.command
-def plan(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
-    """Tell what a survey would run: what is stored, what is to be made and why, and about how long it takes.
-
-    Nothing is captured, started or written. Give the settings that you would give to `survey`.
-
-    Parameters
-    ----------
-    settings
-        A survey's TOML file; flags win over it.
-    """
-    from flows.archive.plan_command import run_plan
-    from flows.settings.survey_settings import load_settings
-
-    return run_plan(load_settings(settings, flags.by_setting()), as_json=as_json)
 
 
 @app.command
@@ -238,6 +197,8 @@ def _run(arguments: list[str]) -> int:
     """Run the verb; gives the exit code, once what went wrong has been said."""
     try:
         place_caches()  # read when numba and matplotlib are first imported
+        if next(iter(arguments), "") in ("rig", "--help", "-h") or not {*arguments[:1]} & {*app}:
+            import flows.cli.survey_verbs  # noqa: F401 - numpy and the declared settings; other verbs do without
         code = app(arguments, result_action="return_value", exit_on_error=False, print_error=False)
     except CycloptsError as error:
         say(_usage(error))
@@ -263,7 +224,7 @@ def _run(arguments: list[str]) -> int:
 
 def _usage(error: CycloptsError) -> str:
     """What was wrong with the words of a command, and where its right ones stand."""
-    from flows.settings.keys import REPLACED
+    from flows.settings.survey_settings import REPLACED
 
     what = str(error).partition(" Available commands:")[0]  # cut off in the middle: the help has them all
     verb = " ".join(("spectralzoom", *(error.command_chain or ())))

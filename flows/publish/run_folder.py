@@ -27,7 +27,7 @@ from flows.publish.receipt import (
     with_accuracy,
 )
 from flows.publish.report import Picture, write_report
-from flows.settings.survey_settings import anchor_paths
+from flows.settings.load import anchor_paths
 from flows.survey.model_work import work_done, work_of_map
 from flows.survey.run import SurveyRun, now
 from flows.survey.stages.accuracy import load_accuracy

@@ -16,7 +16,8 @@ from flows.schedule.field_schedule import FieldSchedule
 from flows.schedule.ledger_state import moment_words
 from flows.schedule.rig_lock import RigLock, hold_place, rig_lock
 from flows.schedule.times import SystemWallClock, Timetable, WallClock
-from flows.settings.survey_settings import Settings, load_settings
+from flows.settings.load import load_settings
+from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
 from storage.archive.ledger import Ledger

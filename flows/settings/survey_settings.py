@@ -1,73 +1,173 @@
-"""Settings of a survey: one TOML file and flags, every key checked. Flags win over the file, it over the defaults."""
+"""Settings of a survey, each declared once: type, default, range, unit and one line of help.
+
+`flows.settings.load` reads them; the example file, the flags and the table of the documents are made from this.
+"""
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
-from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
-from flows.settings.keys import BUILT_IN_SCENES, REPLACED, RIG_FIELD, SURVEY, TABLES, MapChoice, Parser
-from flows.settings.rules import check_together, place_of
-from flows.settings.values import Tolerance
-from pipeline.errors import PoseError, SettingsError
+from pydantic import PlainValidator
+
+from flows.settings.values import (
+    Bands,
+    Budget,
+    Effects,
+    Memory,
+    Name,
+    SceneName,
+    Scheduler,
+    Size,
+    Tolerance,
+    Wavelengths,
+    parse_tolerance,
+)
+from models.policies.policies import Policy
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel
 from pipeline.ground.view import RigPose
+from pipeline.rectify.kernels import Kernel
 from pipeline.rig.survey_rig import SurveyRig
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
-from pipeline.simulator.scenes.farm.farm_scene import REMOVED_LAW, USUAL_DAY, USUAL_HOUR
-from storage.archive.toml_files import read_toml
+from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, FARM_SHAPE, USUAL_DAY, USUAL_HOUR
+from pipeline.stated import stated
 from storage.parallel.crew import Crew
 
+BUILT_IN_SCENES = FARM_NAMES
+USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
+RIG_FIELD = "field"  # the scene of which only the rig knows more than size and bands
 OF_THE_MACHINE = ("scheduler", "workers")  # no byte depends on them; a cluster of that day need not be there today
-_PATHS = ("scene", "labels", "out", "mask", "vgg", "weights")
+PATHS = ("scene", "labels", "out", "mask", "vgg", "weights")
+WORKERS = "one process or thread each; leave it out for one a core"
+EPSG = "the number after EPSG:, such as 32632"
+REPLACED = {  # keys of before
+    "optics.polarisation": 'the mirror\'s coating says it now: [mirror] coating = "aluminium"',
+    "rounds": "there is one round of detail: a second never paid (README, Limits) and was removed; leave it out",
+}
+
+
+@dataclass(frozen=True)
+class MapChoice:
+    """What map to draw of a posed survey; None leaves the choice to the pose."""
+
+    epsg: int | None = stated(
+        None, "Projected CRS in metres; the rig's UTM zone by default", "", 1024, 32_767, example=32632, why=EPSG
+    )
+    resolution_m: float | None = stated(
+        None, "By default the median footprint of a pixel", "m", 1e-4, 1000, example=0.01
+    )
+
+
+def table(about: str, make: type[Any] | None) -> Any:
+    """A table of settings that stand for a part of the rig or of the map; None where there is none by default."""
+    metadata = {"description": about}
+    return field(default=None, metadata=metadata) if make is None else field(default_factory=make, metadata=metadata)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """All that one survey needs to know. Make it by `load_settings` or `parse_settings`: they check; this does not."""
+    """All that one survey needs to know. Made by `load_settings` or `parse_settings`: they check; this does not."""
 
-    name: str | None = None  # what the field is called; by default as its scene
-    visit: str | None = None  # which look at it: another one is captured anew, the same one is gone on with
-    scene: str = "farm"  # built-in name or a file
-    labels: str | None = None
-    bands: tuple[int, ...] | None = None  # of the file, counted from 0
-    wavelengths: tuple[float, ...] | None = None  # [nm]
-    source: str = "sim"
-    out: str = "archive"
-    budget: float = 0.5  # seconds of coarse and fine capture over those of the full scan, 0 < b <= 1
-    policy: str = "gain"
-    mask: str | None = None
-    vgg: str | None = None  # VGG19's weights, for policies vgg-static and vgg-trained
-    weights: str | None = None
-    threshold: float | None = None  # least expected gain per second of fine capture [nat per px, summed over seats]
-    seed: int = 0
-    effects: str = "auto"  # of the simulated rig: auto, all, none, or names with commas
-    tol: Tolerance = field(default_factory=Tolerance)  # what leaving effects out may change any number by
-    accuracy: bool = True  # whether a map with labels is judged by them
-    controls: bool = True
-    engine: Literal["prefect", "plain"] = "prefect"
-    memory: int = 4 * 1024**3  # [bytes]
-    scheduler: str = "threads"  # who makes blocks: threads, processes, or tcp://host:port of a dask scheduler
-    workers: int | None = None  # blocks at a time; None is one a core. A scheduler elsewhere has its own
-    kernel: Literal["catmull-rom", "bilinear", "nearest"] = "catmull-rom"
-    pointing_px: float = 0.0  # how far off the mirror may point; above 0 sweeps overlap and their seams are registered
-    size: tuple[int, int] | None = None  # (width, height) of the built-in scene [px]
-    day: int | None = None  # of the year, for the farm: 172 unless given
-    hour: float | None = None  # true solar time, for the farm: 11 unless given [h]
-    camera: LineCamera = field(default_factory=LineCamera)
-    optics: Optics = field(default_factory=Optics)
-    mirror: MirrorMotion = field(default_factory=MirrorMotion)
-    detector: Detector = field(default_factory=Detector)
-    air: Air = field(default_factory=Air)
-    sky: Sky = field(default_factory=Sky)
-    cost: CostModel = field(default_factory=CostModel)
-    rig: SurveyRig = field(default_factory=SurveyRig)  # for source "rig"
-    pose: RigPose | None = None  # without one nothing is put on the ground
-    map: MapChoice = field(default_factory=MapChoice)
+    name: Name | None = stated(None, "What the field is called; as its scene by default", example="north")
+    visit: str | None = stated(
+        None,
+        "Which look at the field, in any words: another one is captured anew, the same one gone on with",
+        example="first of June",
+    )
+    scene: SceneName = stated(
+        "farm",
+        "`farm` (built in; `farm@2`), or a file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr",
+    )
+    labels: str | None = stated(
+        None, "Class colours or numbers on the scene's pixels; accuracy is reported then", example="labels.png"
+    )
+    bands: Bands | None = stated(None, "Bands of the file (or of the farm's 270) to use, from 0: 0,1", example=(0, 1))
+    wavelengths: Wavelengths | None = stated(None, "Their centre wavelengths: 660,800", "nm", example=(660.0, 800.0))
+    source: Literal["sim", "rig"] = stated("sim", "Who looks: the simulated rig, or the one that the table [rig] names")
+    out: str = stated("archive", "Archive: a folder, or s3://bucket/prefix")
+    budget: Budget = stated(
+        0.5, "Seconds of coarse and fine capture over those of the full scan, above 0 and at most 1"
+    )
+    policy: Policy = stated("gain", "Where to look twice")
+    mask: str | None = stated(None, "Image of where to look twice, for the policy mask", example="mask.png")
+    vgg: str | None = stated(None, "Weights of VGG19, for the policies vgg-static and vgg-trained", example="vgg19.pth")
+    weights: str | None = stated(
+        None, "Model weights (.safetensors); those for `farm` are built in", example="weights.safetensors"
+    )
+    threshold: float | None = stated(
+        None,
+        "Least gain (per px, summed over seats) in a second of the fine pass, the receipt's score_per_second; for the "
+        "policies gain and entropy",
+        "nat per second",
+        0,
+        1e9,
+        example=0.5,
+    )
+    seed: int = stated(0, "Seed of the scene `farm` and of all noise", "", 0, 2**63 - 1)
+    effects: Effects = stated(
+        "auto",
+        "Effects of the simulated rig: auto (those that change a number by more than tol), all, none, or names with "
+        "commas: rotation,slit,smear,vignetting,shot,read-noise",
+    )
+    tol: Annotated[Tolerance, PlainValidator(parse_tolerance)] = stated(
+        Tolerance(),
+        "What leaving effects out may change any number by: sigmas of its noise, or 0.5dn in DN; 0 computes all "
+        "exactly, inf leaves out all that can be",
+        example=Tolerance().value,
+    )
+    accuracy: bool = stated(
+        True, "Judge the published map by the labels; without it, `evaluate ARCHIVE RUN` does so later"
+    )
+    controls: bool = stated(True, "Also judge other placements of the same number of seats (needs labels)")
+    engine: Literal["prefect", "plain"] = stated("prefect", "Who runs the stages; plain where no server can start")
+    memory: Memory = stated(4 * 1024**3, "How much the work on tiles and regions of the field may take", example="4GiB")
+    scheduler: Scheduler = stated(
+        "threads", "Who does that work: threads, processes, or a dask scheduler elsewhere, tcp://host:port"
+    )
+    workers: int | None = stated(
+        None,
+        "Tiles, regions or blocks of simulated lines at a time; one a core by default",
+        "",
+        1,
+        1024,
+        example=2,
+        why=WORKERS,
+    )
+    kernel: Kernel = stated("catmull-rom", "How lines are read between samples; nearest mixes no spectra")
+    pointing_px: float = stated(
+        0.0, "How far off the mirror may point; above 0 sweeps overlap, seams are registered", "px", 0, 300
+    )
+    size: Size | None = stated(
+        None, f"Size of the scene `farm`, width x height; {USUAL_SIZE} by default", "px", example=USUAL_SIZE
+    )
+    day: int | None = stated(
+        None, f"Day of the year, for `farm`; {USUAL_DAY} by default, the 21st of June", "", 1, 366, example=USUAL_DAY
+    )
+    hour: float | None = stated(
+        None, f"True solar time, for `farm`; {USUAL_HOUR:g} by default, noon is 12", "h", 0, 24, example=USUAL_HOUR
+    )
+    camera: LineCamera = table("The line camera.", LineCamera)
+    optics: Optics = table(
+        "The simulated rig beyond its camera: nothing of it was measured on a unit. First its optics.", Optics
+    )
+    mirror: MirrorMotion = table("How the simulated mirror follows its commands, and what coats it.", MirrorMotion)
+    detector: Detector = table("What the sensor adds to the camera's own read noise, gain and well.", Detector)
+    air: Air = table("Between rig and scene; without a distance the scene is light at the aperture.", Air)
+    sky: Sky = table("The light; without a moment the sun stands still.", Sky)
+    cost: CostModel = table("What captures cost in time.", CostModel)
+    rig: SurveyRig = table(
+        'The rig, for source = "rig". Written for documented protocols and tested against emulators, never run on '
+        "hardware: whatever is called assumed, try it on yours and say so in provenance. The scene is then what "
+        'results are judged by, or "field", of which only name, size and wavelengths are given.',
+        SurveyRig,
+    )
+    pose: RigPose | None = table(
+        "Where the rig stands: with it the map is also drawn on the ground, with hectares of each class.", None
+    )
+    map: MapChoice = table("What map to draw on the ground, for a survey with [pose].", MapChoice)
 
     @property
     def crew(self) -> Crew:
@@ -105,152 +205,3 @@ def plain_value(value: object) -> object:
     if isinstance(value, datetime):
         return value.isoformat()
     return list(value) if isinstance(value, tuple) else value
-
-
-def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | None = None) -> Settings:
-    """Read the file, lay the flags over it and check the whole.
-
-    Parameters
-    ----------
-    path
-        TOML file; None for defaults and flags alone. Relative paths in it start at its folder, those of flags at the
-        current folder.
-    flags
-        Keys as in the file, ``camera.exposure_ms`` for one in a table; None means not given.
-
-    Raises
-    ------
-    SettingsError, BudgetError : the first key that cannot be used, with its place and what it should be.
-    """
-    table = {} if path is None else anchor_paths(_read_toml(Path(path)), Path(path).parent)
-    origin = dict.fromkeys(_flatten(table), str(path))
-    for key, value in _flatten(flags or {}).items():
-        if value is not None:
-            _put(table, key, value)
-            origin[key] = "flag"
-    return parse_settings(table, origin)
-
-
-def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None = None) -> Settings:
-    """Check a table of settings and fill in the defaults.
-
-    Parameters
-    ----------
-    table
-        Keys and values as in the file, ``camera``, ``cost``, ``pose`` and the like being tables themselves; None in
-        them means not given.
-    origin
-        Where each (dotted) key came from, for the messages: a file's name or ``flag``.
-    """
-    origin = origin or {}
-    checked = _check_table({k: v for k, v in table.items() if v is not None}, SURVEY, "", origin)
-    settings = Settings(**checked)  # type: ignore[arg-type]
-    check_together(settings, origin)
-    return settings
-
-
-def _check_table(
-    table: Mapping[str, object], parsers: Mapping[str, Parser], prefix: str, origin: Mapping[str, str]
-) -> dict[str, object]:
-    """Every key of one table through its parser; an unknown one is refused with the nearest that exists."""
-    checked: dict[str, object] = {}
-    for key, value in table.items():
-        full = prefix + key
-        if key not in parsers:
-            _refuse_key(full, parsers, prefix, origin.get(full))
-        if prefix == "" and key in TABLES:
-            checked[key] = _parse_table(key, value, origin)
-        else:
-            checked[key] = parsers[key](value, place_of(full, origin.get(full)))
-    return checked
-
-
-def _parse_table(key: str, value: object, origin: Mapping[str, str]) -> object:
-    """One of the tables that stand for a dataclass of the pipeline."""
-    if not isinstance(value, Mapping):
-        place = place_of(key, origin.get(key))
-        raise SettingsError(f"{place} must be a table, [{key}] with keys below it; got {value!r}")
-    make, spans = TABLES[key]
-    given = _check_table({k: v for k, v in value.items() if v is not None}, spans, f"{key}.", origin)
-    missing = [item.name for item in fields(make) if _is_required(item) and item.name not in given]
-    if missing:
-        raise SettingsError(f"[{key}] lacks {', '.join(missing)}; give every one, or leave the table out")
-    try:
-        return make(**given)
-    except PoseError as error:
-        raise SettingsError(f"[{key}]: {error}") from None
-
-
-def _is_required(item: Field[Any]) -> bool:
-    return item.default is MISSING and item.default_factory is MISSING
-
-
-def _refuse_key(full: str, known: Mapping[str, Parser], prefix: str, origin: str | None) -> None:
-    """Raise for an unknown key, naming the nearest of its table, or of another table."""
-    everywhere = [*SURVEY, *(f"{name}.{key}" for name, (_, spans) in TABLES.items() for key in spans)]
-    short = full.removeprefix(prefix)
-    near = [name for name in everywhere if name.split(".")[-1] == short]
-    near = near or [prefix + key for key in difflib.get_close_matches(short, known, n=1, cutoff=0.5)]
-    hint = f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(prefix + key for key in known)}"
-    hint = f"; {REPLACED[full]}" if full in REPLACED else hint
-    raise SettingsError(f"unknown setting {place_of(full, origin)}{hint}")
-
-
-def of_this_version(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Give what a receipt says of settings that there are: keys of before are left out, in tables too.
-
-    Raises
-    ------
-    SettingsError : the survey had two rounds of detail, of which this version would make but one.
-    """
-    if stored.get("rounds", 1) != 1:
-        raise SettingsError(
-            f"its survey had {stored['rounds']} rounds of detail, which never paid and were removed: survey the "
-            "field by hand, without 'rounds'; what both share is in the archive; take what is damaged out first"
-        )
-    known = {key: value for key, value in stored.items() if key in SURVEY}
-    return {
-        key: {name: item for name, item in value.items() if name in TABLES[key][1]}
-        if key in TABLES and isinstance(value, Mapping)
-        else value
-        for key, value in known.items()
-    }
-
-
-def _read_toml(path: Path) -> dict[str, object]:
-    """The file's tables; a file that is not there or not TOML is an error with its place."""
-    try:
-        return read_toml(path)
-    except FileNotFoundError:
-        raise SettingsError(f"no settings file {path}; give the path of a survey's TOML file, or none") from None
-    except ValueError as error:
-        raise SettingsError(f"cannot read the settings file {path}: {error}; expected TOML in UTF-8") from None
-
-
-def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
-    """Relative paths of a file's settings, made to start at the file's folder."""
-    named = {*BUILT_IN_SCENES, REMOVED_LAW, RIG_FIELD}
-    anchored = dict(table)
-    for key in _PATHS:
-        value = table.get(key)
-        if isinstance(value, str) and value and value not in named and "://" not in value:
-            anchored[key] = str(folder / Path(value).expanduser())
-    return anchored
-
-
-def _flatten(table: Mapping[str, object]) -> dict[str, object]:
-    """Nested tables as dotted keys; what is no table stays."""
-    flat: dict[str, object] = {}
-    for key, value in table.items():
-        if key in TABLES and isinstance(value, Mapping):
-            flat.update({f"{key}.{inner}": item for inner, item in value.items()})
-        else:
-            flat[key] = value
-    return flat
-
-
-def _put(table: dict[str, object], key: str, value: object) -> None:
-    """Set a dotted key, without changing the inner table that came in."""
-    head, _, tail = key.partition(".")
-    inner = table.get(head, {})
-    table[head] = {**cast("Mapping[str, object]", inner), tail: value} if tail and isinstance(inner, Mapping) else value

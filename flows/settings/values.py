@@ -1,24 +1,30 @@
-"""Values of settings: from text or TOML to a checked value, or an error that says the range and guesses the unit."""
+"""Settings that are more than a number or a word: from text or TOML to the value, or what is wrong, without its place.
+
+A ValueError goes on from the setting's name ("must be ..."); a SettingsError is a sentence of its own.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Annotated
+
+from pydantic import ByteSize, PlainValidator, TypeAdapter, ValidationError
 
 from pipeline.errors import BudgetError, SettingsError
 from pipeline.simulator.effects.probe import Unit
 from pipeline.simulator.effects.registry import BY_NAME
 from pipeline.simulator.scenes.farm.farm_scene import refuse_removed
 from pipeline.simulator.selection.choice import named_effects
+from pipeline.stated import number_words
 from storage.archive.staging import is_name
 from storage.parallel.crew import Crew
 
 RENAMED = {"throughput": "vignetting", "read": "read-noise"}  # effects as settings of before called them
 LEAST_MEMORY = 256 * 1024**2
-_BYTES = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12,
-          "kib": 2**10, "mib": 2**20, "gib": 2**30, "tib": 2**40}  # fmt: skip
+_BYTES = TypeAdapter(ByteSize)
 # unit of a setting -> other units in which people write it, with the factor that makes it right
 _OTHER_UNITS: dict[str, tuple[tuple[str, float], ...]] = {
     "ms": (("seconds", 1e3), ("microseconds", 1e-3)),
@@ -35,21 +41,6 @@ _OTHER_UNITS: dict[str, tuple[tuple[str, float], ...]] = {
 
 
 @dataclass(frozen=True)
-class Span:
-    """Least and greatest value of a number, both allowed, and its unit ('' for none); ``endless``: infinity is one."""
-
-    low: float
-    high: float
-    unit: str
-    endless: bool = False
-
-    def __str__(self) -> str:
-        bounded = math.isfinite(self.high)
-        words = f"a number from {self.low:g} to {self.high:g}" if bounded else f"a number of at least {self.low:g}"
-        return words + (f" {self.unit}" if self.unit else "") + (" or inf" if self.endless else "")
-
-
-@dataclass(frozen=True)
 class Tolerance:
     """What a simulation may leave out: the greatest change of any number, in noise sigmas or in DN."""
 
@@ -60,165 +51,119 @@ class Tolerance:
         return f"{self.value!r}" + ("" if self.unit == "sigma" else "dn")
 
 
-def parse_number(span: Span) -> Callable[[object, str], float]:
-    """A parser for finite numbers within ``span``."""
-
-    def parse(value: object, place: str) -> float:
-        if span.endless and value in (math.inf, "inf"):
-            return math.inf
-        number = _to_float(value)
-        if number is None or not span.low <= number <= span.high:
-            raise SettingsError(f"{place} must be {span}, got {value!r}{_unit_hint(number, span)}")
-        return number
-
-    return parse
-
-
-def parse_whole(low: int, high: int, *, why: str = "") -> Callable[[object, str], int]:
-    """A parser for whole numbers from ``low`` to ``high``; ``why`` is added to the message."""
-    wanted = f"{low}" if low == high else f"a whole number from {low} to {high}"
-
-    def parse(value: object, place: str) -> int:
-        number = _to_whole(value)
-        if number is None or not low <= number <= high:
-            raise SettingsError(f"{place} must be {wanted}, got {value!r}" + (f"; {why}" if why else ""))
-        return number
-
-    return parse
-
-
-def parse_choice(choices: Sequence[str], *, separator: str = ", ") -> Callable[[object, str], str]:
-    """A parser for one word out of ``choices``; ``separator`` stands between them in the message."""
-
-    def parse(value: object, place: str) -> str:
-        if value not in choices:
-            raise SettingsError(f"{place} must be one of {separator.join(choices)}; got {value!r}")
-        return str(value)
-
-    return parse
-
-
-def parse_text(value: object, place: str) -> str:
+def parse_text(value: object) -> str:
     """Text that is not empty."""
     if not isinstance(value, str) or not value.strip():
-        raise SettingsError(f"{place} must be text that is not empty, got {value!r}")
+        raise ValueError(f"must be text that is not empty, got {value!r}")
     return value
 
 
-def parse_scene(value: object, place: str) -> str:
-    """The name of a scene or of its file; that of a farm which is drawn no more is refused."""
-    text = parse_text(value, place)
-    refuse_removed(text)
-    return text
-
-
-def parse_name(value: object, place: str) -> str:
+def parse_name(value: object) -> str:
     """A name that a file can have too: of letters, digits, '_', '-' and '.'."""
-    text = parse_text(value, place)
-    if not is_name(text):
-        raise SettingsError(f"{place} must be a name of letters, digits, '_', '-' and '.', got {value!r}")
-    return text
+    name = parse_text(value)
+    if not is_name(name):
+        raise ValueError(f"must be a name of letters, digits, '_', '-' and '.', got {value!r}")
+    return name
 
 
-def parse_switch(value: object, place: str) -> bool:
-    """True or false."""
-    if isinstance(value, str) and value.lower() in ("true", "false"):
-        return value.lower() == "true"
-    if not isinstance(value, bool):
-        raise SettingsError(f"{place} must be true or false, got {value!r}")
-    return value
-
-
-def parse_budget(value: object, place: str) -> float:
+def parse_budget(value: object) -> float:
     """A share of the full scan's seconds above 0 and at most 1; raises BudgetError."""
     number = _to_float(value)
     if number is None or not 0 < number <= 1:
         hint = f"; for {number:g} % write {number / 100:g}" if number is not None and 1 < number <= 100 else ""
-        raise BudgetError(
-            f"{place} must be a share of the full scan's seconds, above 0 and at most 1, got {value!r}{hint}"
-        )
+        raise BudgetError(f"must be a share of the full scan's seconds, above 0 and at most 1, got {value!r}{hint}")
     return number
 
 
-def parse_memory(value: object, place: str) -> int:
+def parse_memory(value: object) -> int:
     """Bytes, from a whole number or text such as 4GiB or 500 MB."""
-    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?i?b?)\s*", str(value).lower())
-    unit = found[2] if found and (found[2] in _BYTES) else None
-    if isinstance(value, bool) or found is None or unit is None:
-        raise SettingsError(f"{place} must be a number with a unit such as 4GiB or 800MB, got {value!r}")
-    count = int(float(found[1]) * _BYTES[unit])
+    try:
+        count = int(_BYTES.validate_python(value))
+    except ValidationError:
+        raise ValueError(f"must be a number with a unit such as 4GiB or 800MB, got {value!r}") from None
     if count < LEAST_MEMORY:
-        raise SettingsError(f"{place} must be at least {LEAST_MEMORY // 2**20}MiB, got {value!r} ({count} bytes)")
+        raise ValueError(f"must be at least {LEAST_MEMORY // 2**20}MiB, got {value!r} ({count} bytes)")
     return count
 
 
-def parse_scheduler(value: object, place: str) -> str:
+def parse_scheduler(value: object) -> str:
     """``threads``, ``processes``, or the address of a dask scheduler."""
-    text = parse_text(value, place)
-    try:
-        return Crew(text).scheduler
-    except SettingsError as error:
-        raise SettingsError(f"{place}: {error}") from None
+    return Crew(parse_text(value)).scheduler
 
 
-def parse_size(value: object, place: str) -> tuple[int, int]:
+def parse_size(value: object) -> tuple[int, int]:
     """(width, height) in px, from text such as 1280x1024 or from two whole numbers."""
     parts = re.split("[x,]", value.lower()) if isinstance(value, str) else value
-    sides = [_to_whole(part) for part in parts] if isinstance(parts, list | tuple) else []
+    sides = [to_whole(part) for part in parts] if isinstance(parts, list | tuple) else []
     if len(sides) != 2 or any(side is None or not 1 <= side <= 100_000 for side in sides):
-        raise SettingsError(f"{place} must be WIDTHxHEIGHT in px, such as 1280x1024, got {value!r}")
+        raise ValueError(f"must be WIDTHxHEIGHT in px, such as 1280x1024, got {value!r}")
     return int(sides[0] or 0), int(sides[1] or 0)
 
 
-def parse_effects(value: object, place: str) -> str:
+def parse_effects(value: object) -> str:
     """``auto``, ``all``, ``none`` or names of effects with commas between them, in the order of the chain."""
     names = value.split(",") if isinstance(value, str) else value
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-        raise SettingsError(f"{place} must be auto, all, none, or names of effects with commas; got {value!r}")
+        raise ValueError(f"must be auto, all, none, or names of effects with commas; got {value!r}")
     words = [str(name).strip() for name in names if str(name).strip()]
     for old in [word for word in words if word in RENAMED]:
-        raise SettingsError(f"{place}: the effect {old!r} is now called {RENAMED[old]!r}; got {value!r}")
-    try:
-        chosen = named_effects(",".join(words), list(BY_NAME))
-    except SettingsError as error:
-        raise SettingsError(f"{place}: {error}") from None
+        raise SettingsError(f"the effect {old!r} is now called {RENAMED[old]!r}; got {value!r}")
+    chosen = named_effects(",".join(words), list(BY_NAME))
     alone = words in (["auto"], ["all"], ["none"])
     return words[0] if alone or chosen is None else ",".join(name for name in BY_NAME if name in chosen)
 
 
-def parse_tolerance(value: object, place: str) -> Tolerance:
+def parse_moment(value: object) -> datetime:
+    """A date and time with its zone, as TOML writes it; given in UTC."""
+    moment = value
+    if isinstance(value, str):
+        try:
+            moment = datetime.fromisoformat(value)
+        except ValueError:
+            moment = None
+    if not isinstance(moment, datetime):
+        raise ValueError(f"must be a date and time with its zone, such as 2026-06-01T12:00:00+02:00; got {value}")
+    if moment.tzinfo is None:
+        zoned = moment.isoformat()
+        raise ValueError(f"needs a time zone: write {zoned}Z for UTC, or {zoned}+02:00; got {value}")
+    return moment.astimezone(UTC)
+
+
+def parse_tolerance(value: object) -> Tolerance:
     """A number of noise sigmas, or text such as 0.5dn for DN; 0 leaves out nothing, inf all that can be."""
     found = re.fullmatch(r"([-+0-9.e]+|inf)\s*(dn|sigmas?)?", str(value).strip().lower())
     amount = None if found is None or isinstance(value, bool) else _to_float(found[1])
     if found is not None and found[1] == "inf":
         amount = math.inf
     if found is None or amount is None or amount < 0:
-        raise SettingsError(
-            f"{place} must be 0 or more, in sigmas of the noise such as 0.1, or in DN such as 0.5dn; inf leaves out all"
-            f" that can be; got {value!r}"
+        raise ValueError(
+            "must be 0 or more, in sigmas of the noise such as 0.1, or in DN such as 0.5dn; inf leaves out all that "
+            f"can be; got {value!r}"
         )
     return Tolerance(amount, "dn" if found[2] == "dn" else "sigma")
 
 
-def parse_bands(value: object, place: str) -> tuple[int, ...]:
+def parse_bands(value: object) -> tuple[int, ...]:
     """Band numbers counted from 0, none of them twice; a list or text with commas."""
-    bands = [_to_whole(item) for item in _items(value)]
+    bands = [to_whole(item) for item in _items(value)]
     if not bands or any(band is None or band < 0 for band in bands):
-        raise SettingsError(f"{place} must list band numbers counted from 0, such as 0,1,2; got {value!r}")
+        raise ValueError(f"must list band numbers counted from 0, such as 0,1,2; got {value!r}")
     if len(set(bands)) != len(bands):
-        raise SettingsError(f"{place} names a band twice: {value!r}; name each once")
+        raise ValueError(f"names a band twice: {value!r}; name each once")
     return tuple(int(band or 0) for band in bands)
 
 
-def parse_wavelengths(value: object, place: str) -> tuple[float, ...]:
+def parse_wavelengths(value: object) -> tuple[float, ...]:
     """Wavelengths in nm, in the order of the bands; a list or text with commas."""
-    span = Span(150, 30_000, "nm")
+    low, high = 150, 30_000
     waves = [_to_float(item) for item in _items(value)]
     if not waves:
-        raise SettingsError(f"{place} must list wavelengths in nm, such as 660,800; got {value!r}")
+        raise ValueError(f"must list wavelengths in nm, such as 660,800; got {value!r}")
     for item, wave in zip(_items(value), waves, strict=True):
-        if wave is None or not span.low <= wave <= span.high:
-            raise SettingsError(f"{place} must each be {span}, got {item!r}{_unit_hint(wave, span)}")
+        if wave is None or not low <= wave <= high:
+            raise ValueError(
+                f"must each be {number_words(low, high, 'nm')}, got {item!r}{unit_guess(wave, low, high, 'nm')}"
+            )
     return tuple(wave for wave in waves if wave is not None)
 
 
@@ -240,18 +185,36 @@ def _to_float(value: object) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _to_whole(value: object) -> int | None:
+def to_whole(value: object) -> int | None:
     """A whole number, also from text; None for anything else, 2.0 included."""
     if isinstance(value, str) and re.fullmatch(r"\s*[+-]?\d{1,20}\s*", value):
         return int(value)
     return value if isinstance(value, int) and not isinstance(value, bool) else None
 
 
-def _unit_hint(number: float | None, span: Span) -> str:
-    """A guess at the unit in which the number was written, as the end of a message."""
-    if number is None:
-        return ""
-    for name, factor in _OTHER_UNITS.get(span.unit.lower(), ()):
-        if span.low <= number * factor <= span.high:
+def unit_guess(value: object, low: float, high: float, unit: str) -> str:
+    """A guess at the unit in which a number out of range was written, as the end of a message."""
+    number = _to_float(value)
+    for name, factor in _OTHER_UNITS.get(unit.lower(), ()):
+        if number is not None and low <= number * factor <= high:
             return f"; was it given in {name}? then write {number * factor:g}"
     return ""
+
+
+def parse_scene(value: object) -> str:
+    """The name of a scene or of its file; that of a farm which is drawn no more is refused."""
+    if not isinstance(value, str) or not value:
+        raise ValueError("must be the name of a scene or of its file")
+    refuse_removed(value)
+    return value
+
+
+Name = Annotated[str, PlainValidator(parse_name)]
+SceneName = Annotated[str, PlainValidator(parse_scene)]
+Budget = Annotated[float, PlainValidator(parse_budget)]
+Memory = Annotated[int, PlainValidator(parse_memory)]
+Scheduler = Annotated[str, PlainValidator(parse_scheduler)]
+Size = Annotated[tuple[int, int], PlainValidator(parse_size)]
+Effects = Annotated[str, PlainValidator(parse_effects)]
+Bands = Annotated[tuple[int, ...], PlainValidator(parse_bands)]
+Wavelengths = Annotated[tuple[float, ...], PlainValidator(parse_wavelengths)]

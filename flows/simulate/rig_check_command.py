@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flows.cli.app import print_json
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from flows.terminal.shown_text import on_stdout
 from pipeline.errors import SettingsError
 from pipeline.geometry.scan import CostModel

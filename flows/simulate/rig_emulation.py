@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.cli.app import print_json
-from flows.settings.keys import BUILT_IN_SCENES
-from flows.settings.survey_settings import Settings, load_settings
+from flows.settings.load import load_settings
+from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.simulate.emulated_scene import emulated_source
 from pipeline.errors import SettingsError
 from pipeline.geometry.mounting import STRAIGHT
@@ -35,7 +35,7 @@ class EmulateRequest:
 
     settings: Settings
     faults: tuple[str, ...] = ()
-    baud: int = 115200
+    baud: int = SurveyRig.baud
     speed: float = 1.0
     out: Path | None = None  # a survey's TOML to write
 

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.keys import BUILT_IN_SCENES
-from flows.settings.survey_settings import Settings
+from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.survey.capture_plan import CapturePlan, check_memory, plan_capture
 from flows.survey.scene import check_labels, check_mask, farm_refusal, judged_labels, open_scene
 from flows.survey.sources import FieldSource, field_source, for_rig

@@ -8,8 +8,7 @@ from datetime import UTC, timedelta
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.keys import BUILT_IN_SCENES, RIG_FIELD
-from flows.settings.survey_settings import Settings
+from flows.settings.survey_settings import BUILT_IN_SCENES, RIG_FIELD, Settings
 from flows.training.data import scene_of_file, unpack_mask
 from models.weights.files import Description
 from pipeline.errors import SceneError, SettingsError

@@ -7,6 +7,7 @@ One table of those that need neither training nor weights of their own; what sta
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +20,23 @@ from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.grid import SceneGrid
 
 Scores = NDArray[np.float64]
-POLICIES = (
-    "gain", "entropy", "margin", "sobel", "saliency", "spectral-residual", "random", "stratified", "centre", "uniform",
-    "mask", "vgg-static", "vgg-trained", "self-attention",
-)  # fmt: skip
+Policy = Literal[
+    "gain",
+    "entropy",
+    "margin",
+    "sobel",
+    "saliency",
+    "spectral-residual",
+    "random",
+    "stratified",
+    "centre",
+    "uniform",
+    "mask",
+    "vgg-static",
+    "vgg-trained",
+    "self-attention",
+]
+POLICIES: tuple[Policy, ...] = get_args(Policy)
 
 MOST_SUMMED = 1e280  # of a mask's values: larger ones are summed in a larger unit
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
+from pipeline.stated import assumed, stated
 
 ONE_DRAW_READ_NOISE_E = 10.0
 LARGEST_SUM_DN = 65535
@@ -18,22 +19,22 @@ LARGEST_SUM_DN = 65535
 
 @dataclass(frozen=True)
 class LineCamera:
-    """A pushbroom camera as the mirror sees it. Values marked assumed are not measured on a unit.
+    """A pushbroom camera as the mirror sees it. Assumed values are not measured on a unit.
 
     The defaults describe a 640 x 270 line camera behind a 70 mm lens: IFOV 105.714 urad.
     """
 
-    samples: int = 640
-    pitch_um: float = 7.4
-    focal_length_mm: float = 70.0
-    slit_um: float = 20.0  # assumed: data sheet from memory
-    exposure_ms: float = 100.0
-    readout_ms: float = 0.0
-    max_rate_hz: float = 350.0
-    bits: int = 12
-    electrons_per_dn: float = 5.0  # assumed
-    read_noise_e: float = 20.0  # assumed
-    dark_dn: float = 64.0  # assumed
+    samples: int = stated(640, "Pixels of a line", "px", 16, 65_536)
+    pitch_um: float = stated(7.4, "From pixel to pixel of the sensor", "um", 0.5, 200)
+    focal_length_mm: float = stated(70.0, "Focal length of the lens", "mm", 1, 5000)
+    slit_um: float = assumed(20.0, "Width of the spectrograph's slit", "um", 0.5, 2000)
+    exposure_ms: float = stated(100.0, "Exposure of a line", "ms", 0.5, 10_000)
+    readout_ms: float = stated(0.0, "Time after an exposure before the next one begins", "ms", 0, 1000)
+    max_rate_hz: float = stated(350.0, "Most lines in a second", "Hz", 0.1, 100_000)
+    bits: int = stated(12, "Bits of the converter; the sum of four neighbours must fit 16", "", 8, 14)
+    electrons_per_dn: float = assumed(5.0, "Electrons for one DN", "", 1e-3, 1e4)
+    read_noise_e: float = assumed(20.0, "Standard deviation of the read noise, in electrons", "", 0, 1e4)
+    dark_dn: float = assumed(64.0, "Level of the converter without light", "", 0, 16_383)
 
     @property
     def ifov_rad(self) -> float:

@@ -7,6 +7,7 @@ own axes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.errors import PoseError, SettingsError
 from pipeline.geometry.mirror import check_reach
 
-AXES = ("x,y", "x,-y", "-x,y", "-x,-y", "y,x", "y,-x", "-y,x", "-y,-x")
+Axes = Literal["x,y", "x,-y", "-x,y", "-x,-y", "y,x", "y,-x", "-y,x", "-y,-x"]
+AXES: tuple[Axes, ...] = get_args(Axes)
 _ROWS = {"x": (1, 0), "-x": (-1, 0), "y": (0, 1), "-y": (0, -1)}
 
 

@@ -23,6 +23,7 @@ from pipeline.geometry.mirror import (
     scene_to_direction,
 )
 from pipeline.geometry.vector_memory import count_loads
+from pipeline.stated import stated
 
 Axis = Literal["x", "y"]
 Floats = NDArray[np.float64]
@@ -58,12 +59,12 @@ class Sweep:
 class CostModel:
     """Seconds that a plan takes. Assumed until measured on a rig; settings carry the provenance."""
 
-    slew_s: float = 0.05
-    settle_frames: float = 2.0
-    capture_start_s: float = 0.2
-    reload_s: float = 1.6
-    vector_pairs: int = 1500
-    provenance: str = "assumed"
+    slew_s: float = stated(0.05, "Time to turn the mirror to a sweep's first line", "s", 0, 10)
+    settle_frames: float = stated(2.0, "Frames that the mirror takes to come to rest", "", 0, 1000)
+    capture_start_s: float = stated(0.2, "Time to start a capture", "s", 0, 60)
+    reload_s: float = stated(1.6, "Time to load vector_pairs positions into the mirror's memory", "s", 0, 60)
+    vector_pairs: int = stated(1500, "Positions that the mirror's memory holds", "", 1, 10_000_000)
+    provenance: str = stated("assumed", "Where measured values come from")
 
     def setup_seconds(self, camera: LineCamera) -> float:
         """Slew, settling and start of one sweep [s]."""

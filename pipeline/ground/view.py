@@ -19,31 +19,19 @@ through the foot that falls by ``slope_deg`` towards ``aspect_deg`` (clockwise f
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import PoseError, ShapeError
+from pipeline.stated import misfits, stated
 
 Floats = NDArray[np.float64]
 
 LEAST_SINK = 1e-12  # a ray that sinks less along its depth counts as parallel to the ground
 ROWS_AT_ONCE = 256
-# least and greatest value of each angle and length that stands in a pose
-LIMITS = {
-    "lon_deg": (-180.0, 180.0),
-    "lat_deg": (-90.0, 90.0),
-    "height_m": (0.01, 20_000.0),
-    "range_m": (0.01, 50_000.0),
-    "heading_deg": (-360.0, 360.0),
-    "tilt_deg": (-90.0, 90.0),
-    "roll_deg": (-180.0, 180.0),
-    "slope_deg": (0.0, 80.0),
-    "aspect_deg": (-360.0, 360.0),
-    "elevation_m": (-500.0, 9000.0),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,23 +45,32 @@ class RigPose:
     PoseError : a value is not finite or out of range, or not exactly one of height and range is given.
     """
 
-    lon_deg: float  # WGS 84
-    lat_deg: float
-    heading_deg: float
-    tilt_deg: float
-    height_m: float | None = None
-    range_m: float | None = None
-    roll_deg: float = 0.0
-    slope_deg: float = 0.0
-    aspect_deg: float = 0.0
-    elevation_m: float = 0.0  # of the foot above the ellipsoid; 1000 m are 1.6e-4 of the map's scale
+    lon_deg: float = stated(MISSING, "Longitude, WGS 84; west is negative", "deg", -180, 180, example=9.5)
+    lat_deg: float = stated(MISSING, "Latitude, WGS 84; south is negative", "deg", -90, 90, example=52.1)
+    heading_deg: float = stated(
+        MISSING, "Azimuth of the undeflected view direction, clockwise from north", "deg", -360, 360, example=30.0
+    )
+    tilt_deg: float = stated(MISSING, "Angle below the horizon; 90 looks straight down", "deg", -90, 90, example=40.0)
+    height_m: float | None = stated(
+        None,
+        "Height of the mirror's pivot above the ground below it; or instead range_m",
+        "m",
+        0.01,
+        20_000,
+        example=12.0,
+    )
+    range_m: float | None = stated(
+        None, "Distance to the ground along the undeflected direction; or height_m", "m", 0.01, 50_000, example=18.7
+    )
+    roll_deg: float = stated(0.0, "Turn about the view direction; positive turns the right side down", "deg", -180, 180)
+    slope_deg: float = stated(0.0, "Slope of the ground", "deg", 0, 80)
+    aspect_deg: float = stated(0.0, "Where the slope goes down to, clockwise from north", "deg", -360, 360)
+    # 1000 m are 1.6e-4 of the map's scale
+    elevation_m: float = stated(0.0, "Height of the ground below the rig above the ellipsoid", "m", -500, 9000)
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            low, high = LIMITS[item.name]
-            if value is not None and not low <= value <= high:  # NaN fails as well
-                raise PoseError(f"{item.name} of the rig's pose must be from {low:g} to {high:g}, got {value!r}")
+        for name, words in misfits(self):
+            raise PoseError(f"{name} of the rig's pose {words}")
         if (self.height_m is None) == (self.range_m is None):
             got = f"height_m = {self.height_m}, range_m = {self.range_m}"
             raise PoseError(f"the rig's pose needs height_m or range_m, one of the two; got {got}")

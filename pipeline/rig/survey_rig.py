@@ -6,77 +6,68 @@ the assumed values somebody has confirmed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
-from pipeline.geometry.mounting import Mounting
-from pipeline.geometry.vector_memory import Ends
+from pipeline.geometry.mounting import Axes, Mounting
 from pipeline.rig.camera.camera_settings import CameraAddress, FileServer
-from pipeline.rig.mirror.mirror_settings import MirrorSettings
-from pipeline.rig.mirror.steering import ReadBack
+from pipeline.rig.mirror.mirror_settings import MirrorLink, MirrorSettings
+from pipeline.stated import assumed, stated
 
 Pulses = Literal["position", "frame", "none"]
 
 
 @dataclass(frozen=True)
-class SurveyRig:
+class SurveyRig(MirrorLink):
     """Both devices, the cable between them, and the white panel."""
 
-    port: str = "/dev/ttyACM0"  # of the mirror controller, or an address such as socket://host:port
-    baud: int = 115200
-    expected_id: str = ""
-    deadline_s: float = 1.0
-    retries: int = 2
-    quiet_s: float = 0.1
-    with_crc: bool = True
-    strict_crc: bool = False
-    ends: Ends = "exclusive"
-    read_back: ReadBack = "sampled"
-    check_status: bool = True
-    park_at_close: bool = False
-    log_rate_hz: float = 10000.0
-    log_samples: int = 2000
-    mirror_axes: str = "x,y"  # of a mirror mounted straight that the device's X and Y are; see `Mounting`
-    mirror_clocking_deg: float = 0.0
-    mirror_offset_x: float = 0.0
-    mirror_offset_y: float = 0.0
-    host: str = "10.0.65.50"  # of the camera
-    control_port: int = 8100
-    file_port: int = 21
-    user: str = "ftpuser"
-    password: str = "ftpuser"
-    connect_s: float = 3.0
-    stall_s: float = 10.0
-    least_kb_s: float = 100.0  # of the camera's files; slower counts as stalled
-    read_twice: bool = True  # the camera's files: FTP has no checksums, so two readings have to agree
-    pulses: Pulses = "position"  # at the mirror's trigger input: one a held position, one a frame, or none
-    log_pulses: bool = False  # with pulses read the mirror's log too: lines lie where it measured, tied by its edges
-    settle_s: float = 2.0  # most that the mirror may take to come to rest
-    panel: float = 1.0  # value of the white panel
-    white_at_rest: bool = True  # the white frame was taken through the mirror at 0; 0
-    provenance: str = "assumed"
+    mirror_axes: Axes = assumed(
+        Mounting.axes,
+        "What the device's X and Y are of a mirror mounted straight: '-x,-y' is upside down, 'y,-x' turned",
+    )
+    mirror_clocking_deg: float = stated(
+        Mounting.clocking_deg, "Small turn of the mirror beyond that, anticlockwise from X to Y", "deg", -45, 45
+    )
+    mirror_offset_x: float = stated(
+        Mounting.offset_x, "The device's X where the mirror looks straight ahead, of -1 to 1", "", -0.5, 0.5
+    )
+    mirror_offset_y: float = stated(Mounting.offset_y, "The device's Y there", "", -0.5, 0.5)
+    host: str = stated(CameraAddress.host, "Address of the camera, as its maker sets it")
+    control_port: int = stated(CameraAddress.port, "Port of its commands", "", 1, 65_535)
+    file_port: int = stated(FileServer.port, "Port of its FTP server", "", 1, 65_535)
+    user: str = stated(FileServer.user, "User of its FTP server")
+    password: str = stated(FileServer.password, "Password of that user; receipts do not repeat it")
+    connect_s: float = stated(CameraAddress.connect_s, "Most that the camera may take to answer at all", "s", 0.1, 60)
+    stall_s: float = stated(
+        FileServer.stall_s,
+        "Silence after which a transfer is taken up again; most that a reply of its files may take",
+        "s",
+        0.1,
+        600,
+    )
+    least_kb_s: float = stated(
+        FileServer.least_kb_s, "Least speed of the camera's files; slower counts as silence", "kB/s", 0.001, 1e6
+    )
+    read_twice: bool = stated(
+        FileServer.read_twice, "Read the camera's files twice: FTP has no checksums, so two readings have to agree"
+    )
+    pulses: Pulses = assumed(
+        "position",
+        "At the mirror's trigger input: one a held position (a pulse generator between camera and mirror), one a frame "
+        "(steps fine sweeps only), or none",
+    )
+    log_pulses: bool = stated(
+        False, "Read the mirror's log with pulses too: lines lie where it measured, tied by edges"
+    )
+    settle_s: float = stated(2.0, "Most that the mirror may take to come to rest", "s", 0.01, 60)
+    panel: float = stated(1.0, "Value of the white panel", "", 1e-6, 1e6)
+    white_at_rest: bool = stated(True, "The white frame was taken through the mirror at 0; 0")
+    provenance: str = stated("assumed", "Who confirmed the assumed values")
 
     def mirror(self, vector_pairs: int) -> MirrorSettings:
         """Give the settings of the mirror's driver; SettingsError where they are out of range."""
-        return MirrorSettings(
-            port=self.port,
-            baud=self.baud,
-            expected_id=self.expected_id,
-            deadline_s=self.deadline_s,
-            retries=self.retries,
-            quiet_s=self.quiet_s,
-            with_crc=self.with_crc,
-            strict_crc=self.strict_crc,
-            ends=self.ends,
-            vector_pairs=vector_pairs,
-            read_back=self.read_back,
-            check_status=self.check_status,
-            park_at_close=self.park_at_close,
-            log_rate_hz=self.log_rate_hz,
-            log_samples=self.log_samples,
-            provenance=self.provenance,
-            mounting=self.mounting,
-        )
+        link = {item.name: getattr(self, item.name) for item in fields(MirrorLink)}
+        return MirrorSettings(**link, vector_pairs=vector_pairs, provenance=self.provenance, mounting=self.mounting)
 
     @property
     def mounting(self) -> Mounting:

@@ -1,107 +1,114 @@
 """What the simulated rig is like beyond its camera, and what lies between it and the scene: numbers with their source.
 
-Nothing here was measured on a unit. A field's metadata holds its unit and where its default comes from: ``measured``,
-``data sheet`` (from memory) or ``assumed``; settings and the manifest repeat them.
+Nothing here was measured on a unit: what is not of a data sheet (from memory) is assumed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import Field, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import Literal
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.optics.coatings import Coating
+from pipeline.stated import assumed, check_stated, stated
 
-Source = Literal["measured", "data sheet", "assumed"]
 Relief = Literal["flat", "step", "plane"]
-
-
-def stated(default: float, unit: str, source: Source, least: float = 0.0, most: float = math.inf) -> Any:
-    """A number of the rig: its default, its unit, where the default comes from, and the range that makes sense.
-
-    It is finite, unless its default is infinity.
-    """
-    return field(default=default, metadata={"unit": unit, "source": source, "least": least, "most": most})
+LEAST_DISTANCE_M = 1e-3
 
 
 @dataclass(frozen=True)
 class Optics:
     """Mirror as a stop, lens, slit spectrograph."""
 
-    aperture_mm: float = stated(15.0, "mm", "data sheet", 0.1, 1e3)  # of the mirror, the aperture stop
-    focus_m: float = stated(math.inf, "m", "assumed", 0.01)  # distance that is sharp
-    aberration_px: float = stated(0.2, "px", "assumed", 0.0, 1e3)  # sd of the lens's own blur
-    keystone_px: float = stated(0.15, "px", "assumed", 0.0, 1e3)  # shift along the line, first wavelength to last
-    smile_nm: float = stated(0.3, "nm", "assumed", -100.0, 100.0)  # how much longer wavelengths are at a line's ends
-    fwhm_nm: float = stated(6.0, "nm", "data sheet", 0.0, 1e3)  # width of a band
-    stray_share: float = stated(1e-3, "", "assumed", 0.0, 0.5)  # of all light of a line, spread over its detector
-    stray_even: float = stated(0.5, "", "assumed", 0.0, 1.0)  # of the stray light, falls evenly; the rest is a halo
-    stray_halo_px: float = stated(64.0, "px", "assumed", 2.0, 1e6)  # sd of the halo, over samples and bands alike
+    aperture_mm: float = stated(15.0, "Diameter of the mirror, the aperture stop", "mm", 0.1, 1e3, source="data sheet")
+    focus_m: float = assumed(math.inf, "Distance that is sharp", "m", 0.01)
+    aberration_px: float = assumed(0.2, "Standard deviation of the lens's own blur", "px", 0.0, 1e3)
+    keystone_px: float = assumed(0.15, "Shift along the line, first wavelength to last", "px", 0.0, 1e3)
+    smile_nm: float = assumed(0.3, "How much longer wavelengths are at a line's ends", "nm", -100.0, 100.0)
+    fwhm_nm: float = stated(6.0, "Width of a band", "nm", 0.0, 1e3, source="data sheet")
+    stray_share: float = assumed(1e-3, "Share of a line's light that is spread over its detector", "", 0.0, 0.5)
+    stray_even: float = assumed(0.5, "Share of the stray light that falls evenly; the rest is a halo", "", 0.0, 1.0)
+    stray_halo_px: float = assumed(64.0, "Standard deviation of the halo, over samples and bands alike", "px", 2.0, 1e6)
 
 
 @dataclass(frozen=True)
 class MirrorMotion:
     """How the mirror follows its commands, a second-order system fed from a vector memory, and what coats it."""
 
-    natural_hz: float = stated(20.0, "Hz", "data sheet", 0.1, 1e5)  # full-scale bandwidth
-    damping: float = stated(0.7, "", "assumed", 0.01, 10.0)
-    settled_s: float = stated(0.2, "s", "assumed", 0.0, 1e4)  # to come to rest one position ahead of a sweep's first
-    positions_per_line: float = stated(1.0, "", "assumed", 0.01, 1e4)  # of the vector memory, for each px of the path
-    repeatability_urad: float = stated(0.0, "urad", "assumed", 0.0, 1e5)  # sd of the tilt, line by line; vendor: 40
-    hysteresis_px: float = stated(0.0, "px", "assumed", 0.0, 1e4)  # systematic, sign by direction; vendor: 50
-    drift_px_per_min: float = stated(0.0, "px/min", "assumed", 0.0, 1e4)  # as the unit warms up
-    coating: Coating = "aluminium"  # assumed; a bare metal: protecting layers are not modelled
+    natural_hz: float = stated(20.0, "Full-scale bandwidth", "Hz", 0.1, 1e5, source="data sheet")
+    damping: float = assumed(0.7, "Damping ratio", "", 0.01, 10.0)
+    settled_s: float = assumed(0.2, "Time to come to rest one position ahead of a sweep's first", "s", 0.0, 1e4)
+    positions_per_line: float = assumed(1.0, "Positions of the vector memory for each px of the path", "", 0.01, 1e4)
+    repeatability_urad: float = assumed(
+        0.0, "Standard deviation of the tilt, line by line; vendor: 40", "urad", 0.0, 1e5
+    )
+    hysteresis_px: float = assumed(
+        0.0, "Systematic error whose sign is that of the direction; vendor: 50", "px", 0.0, 1e4
+    )
+    drift_px_per_min: float = assumed(0.0, "Drift as the unit warms up", "px/min", 0.0, 1e4)
+    coating: Coating = assumed("aluminium", "Bare metal, no protecting layer; ideal reflects everything")
 
 
 @dataclass(frozen=True)
 class Detector:
     """What the sensor adds to the camera's own read noise, gain and well."""
 
-    dark_e_per_s: float = stated(200.0, "e-/s", "assumed", 0.0, 1e9)  # at 25 deg C
-    temperature_deg_c: float = stated(25.0, "deg C", "assumed", -80.0, 50.0)  # where dark current's law holds
-    response_share: float = stated(0.01, "", "assumed", 0.0, 0.5)  # sd of a pixel's gain (PRNU)
-    stripe_share: float = stated(0.002, "", "assumed", 0.0, 0.5)  # sd of the gain that a sample's whole column shares
-    dead_share: float = stated(0.0, "", "assumed", 0.0, 0.5)
-    hot_share: float = stated(0.0, "", "assumed", 0.0, 0.5)
-    hot_e_per_s: float = stated(5e4, "e-/s", "assumed", 0.0, 1e9)  # beyond a sound element's, at 25 deg C
-    well_e: float = stated(math.inf, "e-", "assumed", 1.0)  # that an element holds; inf: the converter clips first
-    noiseless: bool = False  # an ideal sensor, for references: no shot noise, read noise or dark current
-    unit: int = 0  # which copy of the sensor: its fixed pattern follows from this number
+    dark_e_per_s: float = assumed(200.0, "Dark current at 25 deg C", "e-/s", 0.0, 1e9)
+    temperature_deg_c: float = assumed(
+        25.0, "Temperature of the sensor; the law of dark current holds from -80 to 50", "deg C", -80.0, 50.0
+    )
+    response_share: float = assumed(0.01, "Standard deviation of a pixel's gain (PRNU)", "", 0.0, 0.5)
+    stripe_share: float = assumed(
+        0.002, "Standard deviation of the gain that a sample's whole column shares", "", 0.0, 0.5
+    )
+    dead_share: float = assumed(0.0, "Pixels that give nothing", "", 0.0, 0.5)
+    hot_share: float = assumed(0.0, "Pixels that glow", "", 0.0, 0.5)
+    hot_e_per_s: float = assumed(5e4, "More than a sound pixel's dark current, at 25 deg C", "e-/s", 0.0, 1e9)
+    well_e: float = assumed(math.inf, "Electrons that a pixel holds; inf: the converter clips first", "e-", 1.0)
+    noiseless: bool = stated(False, "An ideal sensor, for references: no shot noise, read noise or dark current")
+    unit: int = stated(0, "Which copy of the sensor: its fixed pattern follows from this number", "", 0, 2**31 - 1)
 
 
 @dataclass(frozen=True)
 class Air:
     """What lies between rig and scene. A scene without a distance is light at the aperture: no air, no parallax."""
 
-    distance_m: float | None = None
-    relief: Relief = "flat"
-    nearest_m: float | None = None  # None is distance_m
-    farthest_m: float | None = None
-    lever_m: float = stated(0.1, "m", "assumed", 0.0, 10.0)  # virtual pinhole behind the pivot
-    visibility_km: float = stated(23.0, "km", "assumed", 0.05, 1e6)
-    airlight_share: float = stated(0.3, "", "assumed", 0.0, 5.0)  # light of endless air over the white panel's
-    vapour_g_per_m3: float = stated(10.0, "g/m^3", "assumed", 0.0, 100.0)  # of water, absolute humidity
-    turbulence_cn2: float = stated(1e-13, "m^(-2/3)", "assumed", 0.0, 1e-6)
-    wind_amplitude_m: float = stated(0.0, "m", "assumed", 0.0, 100.0)  # of the canopy's sway
-    wind_hz: float = stated(1.0, "Hz", "assumed", 0.0, 50.0)
+    distance_m: float | None = stated(None, "Distance of the scene's middle", "m", LEAST_DISTANCE_M, example=30.0)
+    relief: Relief = stated("flat", "How the scene's distance changes over it")
+    nearest_m: float | None = stated(
+        None, "Nearest part of the scene; by default distance_m", "m", LEAST_DISTANCE_M, example=25.0
+    )
+    farthest_m: float | None = stated(
+        None, "Farthest part of the scene; by default distance_m", "m", LEAST_DISTANCE_M, example=40.0
+    )
+    lever_m: float = assumed(0.1, "Virtual pinhole behind the pivot", "m", 0.0, 10.0)
+    visibility_km: float = assumed(23.0, "How far one sees", "km", 0.05, 1e6)
+    airlight_share: float = assumed(0.3, "Light of endless air over the white panel's", "", 0.0, 5.0)
+    vapour_g_per_m3: float = assumed(10.0, "Water in the air, absolute humidity", "g/m^3", 0.0, 100.0)
+    turbulence_cn2: float = assumed(1e-13, "Strength of the turbulence", "m^(-2/3)", 0.0, 1e-6)
+    wind_amplitude_m: float = assumed(0.0, "How far the canopy sways", "m", 0.0, 100.0)
+    wind_hz: float = assumed(1.0, "How often the canopy sways", "Hz", 0.0, 50.0)
 
 
 @dataclass(frozen=True)
 class Sky:
     """The light: sun, its course through the survey, clouds. None for the time: the sun stands still overhead."""
 
-    started: datetime | None = None  # with its time zone
-    latitude_deg: float = stated(52.0, "deg", "assumed", -90.0, 90.0)
-    longitude_deg: float = stated(10.0, "deg", "assumed", -180.0, 180.0)
-    cloud_share: float = stated(0.0, "", "assumed", 0.0, 1.0)  # light that a cloud takes; 0 is a clear sky
-    cloud_px_per_s: float = stated(20.0, "px/s", "assumed", 0.0, 1e6)  # speed of the shadow's edge over the scene
-    cloud_size_px: float = stated(600.0, "px", "assumed", 1.0, 1e9)
-    brdf_per_rad: float = stated(0.1, "1/rad", "assumed", 0.0, 5.0)  # change of reflectance with the view angle
-    hot_spot: float = stated(0.0, "", "assumed", 0.0, 2.0)  # brightening where the view looks along the sun's rays
+    started: datetime | None = stated(
+        None,
+        "When the survey begins, with its time zone; without it the sun stands still",
+        example="2026-06-01T10:00:00+02:00",
+    )
+    latitude_deg: float = assumed(52.0, "Latitude of the field; south is negative", "deg", -90.0, 90.0)
+    longitude_deg: float = assumed(10.0, "Longitude of the field; west is negative", "deg", -180.0, 180.0)
+    cloud_share: float = assumed(0.0, "Share of the light that a cloud takes; 0 is a clear sky", "", 0.0, 1.0)
+    cloud_px_per_s: float = assumed(20.0, "Speed of the shadow's edge over the scene", "px/s", 0.0, 1e6)
+    cloud_size_px: float = assumed(600.0, "Size of the clouds' shadows", "px", 1.0, 1e9)
+    brdf_per_rad: float = assumed(0.1, "Change of reflectance with the view angle", "1/rad", 0.0, 5.0)
+    hot_spot: float = assumed(0.0, "Brightening where the view looks along the sun's rays", "", 0.0, 2.0)
 
 
 @dataclass(frozen=True)
@@ -116,25 +123,13 @@ class Rig:
     sky: Sky = field(default_factory=Sky)
 
     def __post_init__(self) -> None:
-        for place, item, value in self._numbers():
-            if math.isnan(value) or (math.isinf(value) and item.default != math.inf):
-                raise SettingsError(f"{place} must be a finite number, got {value:g}")
-            least, most = item.metadata.get("least", -math.inf), item.metadata.get("most", math.inf)
-            if not least <= value <= most:
-                raise SettingsError(f"{place} must be between {least:g} and {most:g}, got {value:g}")
-        for name in ("distance_m", "nearest_m", "farthest_m"):
-            metres = getattr(self.air, name)
-            if metres is not None and not metres > 0:
-                raise SettingsError(f"air.{name} must be above 0 m, got {metres:g}")
+        for name, value in asdict(self.camera).items():
+            if not math.isfinite(value):
+                raise SettingsError(f"camera.{name} must be a finite number, got {value:g}")
+        for place in ("optics", "mirror", "detector", "air", "sky"):
+            check_stated(getattr(self, place), place)
         if self.sky.started is not None and self.sky.started.tzinfo is None:
             raise SettingsError(f"sky.started needs a time zone, got {self.sky.started}; add +00:00 for UTC")
-
-    def _numbers(self) -> Iterator[tuple[str, Field[Any], float]]:
-        """Give the camera's numbers, and all that have a range, with their places as settings name them."""
-        for part in ("camera", "optics", "mirror", "detector", "air", "sky"):
-            for item in fields(getattr(self, part)):
-                if part == "camera" or "least" in item.metadata:
-                    yield f"{part}.{item.name}", item, float(getattr(getattr(self, part), item.name))
 
     @property
     def distances_m(self) -> tuple[float, float] | None:

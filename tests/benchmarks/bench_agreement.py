@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from flows.publish.survey_command import run_survey
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from models.network.process import use_one_thread
 from storage.arrays.class_maps import load_class_map
 

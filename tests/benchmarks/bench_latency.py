@@ -70,7 +70,7 @@ def rows() -> list[Row]:
 
 def measure(px: int) -> Moments:
     """Survey a farm through an emulated rig as far as the first fine position."""
-    from flows.settings.survey_settings import load_settings
+    from flows.settings.load import load_settings
 
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         told = {"size": f"{px}x{px}", "source": "rig", "visit": "first", "out": name, "engine": "plain",

@@ -114,7 +114,7 @@ def _plan(archive: Path, side: int, clock: str = "wall_s") -> dict[str, Any]:
 
 
 def _settings(archive: Path, side: int) -> Any:
-    from flows.settings.survey_settings import load_settings
+    from flows.settings.load import load_settings
 
     flags = {"scene": "farm", "size": f"{side}x{side}", "out": str(archive), "engine": "plain", "controls": False}
     return load_settings(None, flags)

@@ -21,7 +21,7 @@ from paper_scale import peak_bytes
 from rich.console import Console
 
 from flows.publish.survey_command import run_survey
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from flows.survey.field_work import SHARD, FieldWork
 from flows.survey.region_work import WeightsFile
 from flows.survey.run import SurveyRun, open_run

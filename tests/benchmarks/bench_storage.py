@@ -107,7 +107,7 @@ def _warm(folder: Path) -> Row:
     from rich.console import Console
 
     from flows.publish.survey_command import run_survey
-    from flows.settings.survey_settings import load_settings
+    from flows.settings.load import load_settings
     from flows.survey.run import open_run
     from flows.survey.survey import StageRunner, survey
 

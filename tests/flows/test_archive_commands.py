@@ -18,7 +18,7 @@ from rich.console import Console
 from flows.archive import tables as archive_tables
 from flows.archive.commands import DONE, FAILED, PARTLY, run_explain, run_gc, run_ls, run_verify
 from flows.archive.contents import command, contents
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from flows.terminal.figures import DASH
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from flows.settings.survey_settings import parse_settings
+from flows.settings.load import parse_settings
 from flows.survey.capture_plan import plan_capture
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid

@@ -13,10 +13,11 @@ from typing import Any
 
 import pytest
 
+import flows.cli.survey_verbs  # noqa: F401 - main registers them when it runs
 from flows.cli import main as cli
 from flows.cli.app import GOES_ON, app, print_json
 from flows.cli.survey_flags import IN_TABLES
-from flows.settings.keys import SURVEY, TABLES
+from flows.settings.declared import SURVEY, TABLES
 
 ONE_THREAD = """
 import os, sys

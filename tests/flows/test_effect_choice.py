@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from flows.simulate.command import open_simulation
 from flows.survey.run import CaptureRun
 from flows.survey.stages import effects as effect_choice
@@ -58,7 +58,7 @@ def test_the_manifest_has_every_effect_and_the_totals(decided: tuple[Path, Stage
 
 def test_the_source_has_what_was_decided(scene_files: Path, decided: tuple[Path, StageRef]) -> None:
     """Effects with their variants, and the clock that is given."""
-    source = source_with(opened(scene_files, decided[0]).source, decided[1], {"a": 3.0})
+    source = source_with(opened(scene_files, decided[0]).simulated, decided[1], {"a": 3.0})
     on = {row["name"]: row["variant"] for row in load_manifest(decided[1])["effects"] if row["state"] == "on"}
     assert {effect.name: variant for effect, variant in source.choice.effects} == on
     assert (source.clock, list(chosen_effects(decided[1]))) == (

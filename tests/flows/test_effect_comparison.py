@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from flows.simulate import effect_comparison
 from flows.simulate.command import open_simulation
 from flows.simulate.effect_comparison import Comparison, View, compare_with_everything, everything

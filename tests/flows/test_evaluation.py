@@ -62,7 +62,7 @@ def test_controls_look_where_the_map_does(tmp_path: Path) -> None:
     """The offset is that of the sweep which registration held, and controls scan with the same one everywhere."""
     scene = raster_from_values(np.ones((8, 8, 1)), LineCamera(), name="t", wavelength_nm=np.array([500.0]))
     errors = PointingErrors(9.0, 0.0, 4)
-    run: Any = SimpleNamespace(source=SimulatedSource(scene, Rig(), pointing=errors))
+    run: Any = SimpleNamespace(simulated=SimulatedSource(scene, Rig(), pointing=errors))
     off = evaluation._map_offset(run, [_registration(tmp_path, {"reference": "coarse-3"})])
     np.testing.assert_array_equal(off, errors.offset("coarse-3"))
     assert evaluation._sure_source(run, off).pointing == CommonOffset((float(off[0]), float(off[1])))

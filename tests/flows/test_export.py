@@ -18,7 +18,7 @@ from rich.console import Console
 from flows.archive.export_command import run_export
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.ground.view import RigPose
 from storage.archive.archive import Archive

@@ -12,7 +12,8 @@ import pytest
 
 from flows.archive.compare_command import find_run, run_compare
 from flows.archive.stale_runs import asked_again, newest_runs
-from flows.settings.survey_settings import Settings, load_settings, parse_settings
+from flows.settings.load import load_settings, parse_settings
+from flows.settings.survey_settings import Settings
 from flows.survey.scene import check_labels, farm_refusal, open_scene
 from flows.training.data import farm_data, farm_looks, farm_test_data, read_farm_name
 from flows.training.look import observe_scene

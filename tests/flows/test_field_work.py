@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from flows.survey.field_work import SHARD, FieldWork, region_params
 from flows.survey.region_work import Scoring, WeightsFile
 from flows.survey.run import SurveyRun, open_run

@@ -15,7 +15,8 @@ import pytest
 from flows.archive.forecast import StageForecast, forecast
 from flows.archive.plan_command import run_plan
 from flows.archive.stage_costs import scaled_cost
-from flows.settings.survey_settings import Settings, load_settings
+from flows.settings.load import load_settings
+from flows.settings.survey_settings import Settings
 from flows.survey.run import open_run
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.simulator.simulated import SimulatedSource

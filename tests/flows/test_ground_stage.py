@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from flows.settings.keys import MapChoice
-from flows.settings.survey_settings import Settings
+from flows.settings.survey_settings import MapChoice, Settings
 from flows.survey.run import SurveyRun
 from flows.survey.stages.ground import STORE, coarse_colours, ground, survey_grid
 from pipeline.errors import PoseError

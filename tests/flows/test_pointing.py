@@ -13,7 +13,7 @@ from rich.console import Console
 
 from flows.publish.finding_words import sentences
 from flows.publish.survey_command import run_survey
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from flows.survey.stages.class_map import patch_columns
 from models.network.spectral import SpectralBasis
 from models.reading.inference import Glance

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from storage.archive.archive import Archive
 from storage.arrays.cubes import RawCube, open_raw_cube
 from storage.arrays.quicklooks import pictures_of

@@ -19,7 +19,7 @@ import pytest
 import serial
 from rich.console import Console
 
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from flows.simulate.rig_emulation import EmulateRequest, emulated_settings, run_emulate
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
 from pipeline.rig.emulator.fault_names import make_fault

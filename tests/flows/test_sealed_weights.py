@@ -14,7 +14,7 @@ from flows.cli import main as cli
 from flows.evaluate import command as evaluate_command
 from flows.evaluate.command import run_evaluate
 from flows.evaluate.request import EvaluateRequest
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from flows.survey.run import open_run
 from models.weights.files import UNSEALED, describe_weights
 from models.weights.sealed_files import SEAL, TENSORS

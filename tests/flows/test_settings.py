@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import json
 import tomllib
-from dataclasses import asdict, fields, replace
+from dataclasses import MISSING, asdict, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import get_args
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flows.settings import keys as setting_keys
-from flows.settings.keys import MapChoice
-from flows.settings.survey_settings import Settings, load_settings, of_this_version, parse_settings
+from flows.settings.declared import SURVEY, TABLES
+from flows.settings.documents import example_toml, settings_table
+from flows.settings.load import load_settings, of_this_version, parse_settings
+from flows.settings.survey_settings import MapChoice, Settings
 from flows.settings.values import Tolerance
-from models.policies import policies
 from pipeline.errors import BudgetError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel
 from pipeline.ground.view import RigPose
-from pipeline.rectify.resample import Kernel
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.rig_model import Air, Detector, Optics, Rig, Sky
 from storage.archive.whole_files import to_json
@@ -51,20 +49,15 @@ def test_nothing_given_is_the_default():
 
 
 def test_every_field_of_the_dataclasses_can_be_set():
-    """No field of the survey, the camera or the cost model lacks its check."""
-    assert {item.name for item in fields(Settings)} == set(setting_keys.SURVEY)
-    for name, (make, spans) in setting_keys.TABLES.items():
-        assert {item.name for item in fields(make)} == set(spans), name
+    """Every part of the survey and of the rig is read back from its plain values."""
     for name in ("camera", "cost", "optics", "mirror", "detector", "air", "sky"):
         assert parse_settings({name: asdict(getattr(Settings(), name))}) == Settings()
 
 
 def test_words_are_those_of_the_parts_that_use_them():
-    """Policies, effects and kernels that the settings accept are exactly those that exist."""
+    """Effects that the settings accept are exactly those that exist."""
     every = ",".join(effect.name for effect in EFFECTS)
     assert parse_settings({"effects": every}).effects == every
-    assert set(setting_keys.KERNELS) == set(get_args(Kernel))
-    assert setting_keys.POLICIES == policies.POLICIES
 
 
 def test_flags_win_over_the_file(toml):
@@ -90,14 +83,39 @@ def test_example_in_the_project_is_valid():
     assert replace(found, out=Settings.out) == Settings()
 
 
+def test_example_is_what_the_declarations_say():
+    """The file is made of them; after a change: python -m flows.settings.documents > survey.example.toml."""
+    assert EXAMPLE.read_text(encoding="utf-8") == example_toml()
+
+
+def test_the_table_of_documents_has_every_setting():
+    """With its default, what it may be, and a line of help, in as many cells everywhere."""
+    rows = [line.split(" | ") for line in settings_table().splitlines() if line.startswith("| `")]
+    assert [row[0].strip("| `") for row in rows] == [
+        *(name for name in SURVEY if name not in TABLES),
+        *(key for keys in TABLES.values() for key in keys),
+    ]
+    assert {len(row) for row in rows} == {4}
+    assert ["| `samples`", "`640`", "a whole number from 16 to 65536", "Pixels of a line [px] |"] in rows
+
+
+def test_every_setting_says_what_it_is_and_takes_its_default():
+    """A line of help each, and a default (or an example) that its own range does not refuse."""
+    for keys in ({name: one for name, one in SURVEY.items() if name not in TABLES}, *TABLES.values()):
+        for name, one in keys.items():
+            assert one.item.metadata["description"], name
+            value = one.told["example"] if one.item.default in (None, MISSING) else one.item.default
+            assert one.read(str(value) if isinstance(value, Tolerance) else value, name) is not None
+
+
 def test_example_lists_every_setting():
     """Those without a default, and whole tables, stand in comments."""
     lines = [line.removeprefix("# ") for line in EXAMPLE.read_text(encoding="utf-8").splitlines()]
     named = {line.partition("=")[0].strip() for line in lines if "=" in line}
-    assert {item.name for item in fields(Settings)} - set(setting_keys.TABLES) <= named
-    for name, (_, spans) in setting_keys.TABLES.items():
+    assert {item.name for item in fields(Settings)} - set(TABLES) <= named
+    for name, keys in TABLES.items():
         assert f"[{name}]" in lines
-        assert set(spans) <= named, name
+        assert set(keys) <= named, name
 
 
 @pytest.mark.parametrize(
@@ -260,7 +278,9 @@ def test_the_commented_pose_of_the_example_is_valid():
     """Taking off the comment signs of [pose] and [map] gives a posed survey (with one of height and range)."""
     text = EXAMPLE.read_text(encoding="utf-8")
     lines = [line.removeprefix("# ") for line in text[text.index("# [pose]") :].splitlines()]
-    table = tomllib.loads("\n".join(line for line in lines if not line.startswith("range_m")))
+    table = tomllib.loads(
+        "\n".join(line for line in lines if line.startswith("[") or (" = " in line and not line.startswith("range_m")))
+    )
     found = parse_settings(table)
     assert found.pose is not None
     assert (found.pose.height_m, found.map.epsg) == (12.0, 32632)

@@ -18,7 +18,7 @@ from rich.console import Console
 from flows.publish.receipt import check_receipt, comparable
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from flows.survey.scene import open_scene
 from models.reading.inference import glance
 from models.weights.files import load_weights

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from flows.publish.receipt import check_receipt
 from flows.publish.survey_command import run_survey
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from flows.survey.field_work import SHARD, FieldWork
 from flows.survey.run import open_run
 from flows.survey.stages.attention import attend

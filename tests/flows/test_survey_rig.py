@@ -24,7 +24,8 @@ import flows.survey.sources
 import flows.terminal.progress
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
-from flows.settings.survey_settings import Settings, load_settings
+from flows.settings.load import load_settings
+from flows.settings.survey_settings import Settings
 from flows.survey.run import make_source, open_run
 from flows.survey.scene import open_scene
 from flows.survey.stages.effects import chosen_effects

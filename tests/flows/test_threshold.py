@@ -10,7 +10,7 @@ import pytest
 
 from flows.publish.finding_words import sentences
 from flows.publish.run_folder import Published
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from pipeline.errors import SettingsError
 from tests.conftest import Survey
 

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from flows.cli.main import main
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from flows.survey.run import open_run
 from flows.training import train as flow
 from flows.training.command import run_train

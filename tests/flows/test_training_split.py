@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from flows.survey.run import open_run
 from flows.training.data import open_training_data, pack_mask, read_farm_name, unpack_mask
 from flows.training.train import TrainRequest, train_weights

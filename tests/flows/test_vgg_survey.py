@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from flows.settings.survey_settings import load_settings, parse_settings
+from flows.settings.load import load_settings, parse_settings
 from models.network.vgg import VggFeatures
 from models.network.vgg_sizes import saliency_multiply_adds
 from models.weights.files import describe_weights

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import Field, fields
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import PoseError, ShapeError
-from pipeline.ground.view import LEAST_SINK, LIMITS, GroundView, RigPose, pixel_places
+from pipeline.ground.view import LEAST_SINK, GroundView, RigPose, pixel_places
+from pipeline.stated import span_of
 
 IFOV = 7.4e-3 / 70
 
@@ -116,12 +118,12 @@ def test_the_outline_holds_exactly_the_pixels_that_sink_enough(rig: GroundView, 
     assert rig.count_ground((90, 120), least) == pytest.approx(area, abs=120)
 
 
-@pytest.mark.parametrize("name", sorted(LIMITS))
-def test_values_out_of_range_or_not_finite_are_named(name: str):
+@pytest.mark.parametrize("item", fields(RigPose), ids=lambda item: item.name)
+def test_values_out_of_range_or_not_finite_are_named(item: Field[float]):
     """Each field of the pose refuses NaN, infinity and what lies beyond its limits."""
-    for value in (np.nan, np.inf, LIMITS[name][1] * 1.01 + 1):
-        with pytest.raises(PoseError, match=rf"{name} of the rig's pose must be from .* got {value!r}"):
-            view(**{name: value})
+    for value in (np.nan, np.inf, span_of(item)[1] * 1.01 + 1):
+        with pytest.raises(PoseError, match=rf"{item.name} of the rig's pose must be a number from .* got {value!r}"):
+            view(**{item.name: value})
 
 
 def test_height_or_range_but_not_both():

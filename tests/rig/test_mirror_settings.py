@@ -19,7 +19,7 @@ from pipeline.rig.mirror.mirror_settings import MirrorSettings
 )  # fmt: skip
 def test_numbers_out_of_range_are_refused(name: str, value: Any):
     """A number that nothing can mean (a deadline in ms) names the setting and the range."""
-    with pytest.raises(SettingsError, match=f"mirror.{name} must lie between .* got"):
+    with pytest.raises(SettingsError, match=f"mirror.{name} must be a number from .* to .* got"):
         MirrorSettings(**{name: value})
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
-from flows.settings.survey_settings import load_settings
+from flows.settings.load import load_settings
 from flows.simulate.emulated_scene import emulated_source
 from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock

@@ -33,7 +33,7 @@ class ControlPatience:
 class FileServer:
     """The camera's FTP server, and how long it is waited for. User and password as public programs use them."""
 
-    host: str = "10.0.65.50"
+    host: str = CameraAddress.host
     port: int = 21
     user: str = "ftpuser"
     password: str = "ftpuser"

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import get_args
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.mounting import STRAIGHT, Mounting
+from pipeline.geometry.scan import CostModel
 from pipeline.geometry.vector_memory import Ends
 from pipeline.rig.mirror.steering import ReadBack
+from pipeline.stated import assumed, check_stated, stated
 
 
 @dataclass(frozen=True)
@@ -21,39 +23,46 @@ class Patience:
 
 
 @dataclass(frozen=True)
-class MirrorSettings:
-    """How to reach the mirror controller, and what to believe of it.
+class MirrorLink:
+    """What settings say of the mirror controller."""
 
-    Assumed until tried on hardware: ``baud`` (public software opens 115200, the manual of a later model says 256000;
-    over USB it does not matter), ``with_crc`` and that the CRC of replies fits (hence ``strict_crc`` off), ``ends``
-    (erratum E14), ``vector_pairs`` (2900 cells are used in public), ``log_samples`` (not published). ``provenance``
-    says who confirmed what.
-    """
+    port: str = stated("/dev/ttyACM0", "Port of the mirror controller; or socket://host:port")
+    # public software opens 115200
+    baud: int = assumed(
+        115200, "Bits a second; over USB any will do; the manual of a later model says 256000", "", 1200, 4_000_000
+    )
+    expected_id: str = stated("", "Part of what the controller calls itself; any by default", example="MR-E")
+    deadline_s: float = stated(
+        Patience.deadline_s, "Time for one request to the mirror, retries included", "s", 0.01, 60
+    )
+    retries: int = stated(Patience.retries, "Of requests that only read; motions are sent once", "", 0, 20)
+    quiet_s: float = assumed(Patience.quiet_s, "Silence after which an answer that is owed will not come", "s", 0, 5)
+    with_crc: bool = assumed(True, "Requests carry a CRC")
+    strict_crc: bool = stated(False, "Refuse replies whose CRC does not fit, which is warned of otherwise")
+    ends: Ends = assumed("exclusive", "What the mirror takes the end of a range for")  # erratum E14
+    read_back: ReadBack = stated("sampled", "How much of a path is read back and compared")
+    check_status: bool = stated(True, "Ask for the mirror's status before each motion")
+    park_at_close: bool = stated(False, "Send the mirror to 0; 0 at the end")
+    log_rate_hz: float = stated(
+        10000.0, "Rate of measured positions, at most; without pulses they place the lines", "Hz", 0.1, 10_000
+    )
+    log_samples: int = assumed(2000, "Samples that the controller's log holds", "", 1, 16_383)  # not published
 
-    port: str = "/dev/ttyACM0"
-    baud: int = 115200
-    expected_id: str = ""  # part of what GETID answers; empty takes any
-    deadline_s: float = 1.0  # of one transaction, retries included
-    retries: int = 2  # of requests that only read
-    quiet_s: float = 0.1  # silence after which an answer that is owed will not come
-    with_crc: bool = True
-    strict_crc: bool = False
-    ends: Ends = "exclusive"
-    vector_pairs: int = 1500
-    read_back: ReadBack = "sampled"
-    check_status: bool = True  # before each motion
-    park_at_close: bool = False
-    log_rate_hz: float = 10000.0
-    log_samples: int = 2000
+
+MOST_PAIRS = 8191  # cells of the vector memory are addressed by a byte offset of 16 bits
+
+
+@dataclass(frozen=True)
+class MirrorSettings(MirrorLink):
+    """How to reach the mirror controller, and what to believe of it; ``provenance`` says who confirmed what."""
+
+    vector_pairs: int = stated(CostModel.vector_pairs, "Positions that its memory holds", "", 1, MOST_PAIRS)
     provenance: str = "assumed"
     mounting: Mounting = STRAIGHT
 
     def __post_init__(self) -> None:
-        for name, low, high in _RANGES:
-            value = getattr(self, name)
-            if isinstance(value, bool) or not (math.isfinite(value) and low <= value <= high):
-                raise SettingsError(f"mirror.{name} must lie between {low:g} and {high:g}, got {value!r}")
-        for name, choices in _CHOICES.items():
+        check_stated(self, "mirror")
+        for name, choices in {"ends": get_args(Ends), "read_back": get_args(ReadBack)}.items():
             if getattr(self, name) not in choices:
                 raise SettingsError(f"mirror.{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
 
@@ -61,15 +70,3 @@ class MirrorSettings:
     def patience(self) -> Patience:
         """How long transactions may take."""
         return Patience(self.deadline_s, self.retries, self.quiet_s)
-
-
-_RANGES = (
-    ("baud", 1200, 4_000_000),
-    ("deadline_s", 0.01, 60),
-    ("retries", 0, 20),
-    ("quiet_s", 0, 5),
-    ("vector_pairs", 1, 8191),  # cells are addressed by a byte offset of 16 bits
-    ("log_rate_hz", 0.1, 10000),
-    ("log_samples", 1, 16383),
-)
-_CHOICES = {"ends": ("exclusive", "inclusive"), "read_back": ("none", "sampled", "all")}

@@ -62,5 +62,5 @@ def test_the_stated_rate_is_that_of_25_deg_c() -> None:
 @pytest.mark.parametrize("deg_c", [-80.5, 51.0])
 def test_beyond_the_laws_range_is_refused(deg_c: float) -> None:
     """Below, other leaks lead; above, what diffuses from the bulk."""
-    with pytest.raises(SettingsError, match=r"detector\.temperature_deg_c must be between -80 and 50"):
+    with pytest.raises(SettingsError, match=r"detector\.temperature_deg_c must be a number from -80 to 50 deg C"):
         Rig(detector=Detector(temperature_deg_c=deg_c))

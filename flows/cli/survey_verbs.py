@@ -1,0 +1,140 @@
+"""Verbs that take a survey's settings: survey, plan, simulate, and the emulation of a rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from flows.cli.app import AsJson, Switch, app, print_json, split_list, stderr
+from flows.cli.rig_verbs import rig
+from flows.cli.survey_flags import RenderingFlags, SimulationFlags, SurveyFlags, by_setting
+from flows.settings.load import load_settings
+from pipeline.rig.survey_rig import SurveyRig
+
+NO_FLAGS = SurveyFlags()
+NO_SIMULATION_FLAGS = SimulationFlags()
+NO_RENDERING_FLAGS = RenderingFlags()
+
+
+@app.command
+def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
+    """Survey a field: a coarse look at everything, then a fine look where it changes the map.
+
+    Parameters
+    ----------
+    settings
+        A survey's TOML file; flags win over it. Without one, flags and defaults alone.
+    """
+    from flows.publish.survey_command import run_survey
+    from flows.schedule.rig_lock import rig_to_oneself
+
+    asked = load_settings(settings, by_setting(flags))
+    with rig_to_oneself(asked, "a survey by hand"):
+        published = run_survey(asked, stderr)
+    if as_json:
+        print_json(published.receipt)
+    return 0
+
+
+@app.command
+def plan(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
+    """Tell what a survey would run: what is stored, what is to be made and why, and about how long it takes.
+
+    Nothing is captured, started or written. Give the settings that you would give to `survey`.
+
+    Parameters
+    ----------
+    settings
+        A survey's TOML file; flags win over it.
+    """
+    from flows.archive.plan_command import run_plan
+
+    return run_plan(load_settings(settings, by_setting(flags)), as_json=as_json)
+
+
+@app.command
+def simulate(
+    scene: str,
+    *,
+    out: Annotated[str, Parameter(name=("--out", "-o"))],
+    coarse: Switch = False,
+    settings: Path | None = None,
+    flags: SimulationFlags = NO_SIMULATION_FLAGS,
+    compare: Path | None = None,
+    as_json: AsJson = False,
+) -> int:
+    """Simulate a scan of all of SCENE with the effects that matter to it, and tell which were left out and why.
+
+    The same command goes on where it was stopped; a scan that is there is not made again.
+
+    Parameters
+    ----------
+    scene
+        `farm` (built in; `farm@2`), or an image or cube file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat,
+        ENVI, Zarr.
+    out
+        Archive for the raw cubes: a folder, or s3://bucket/prefix.
+    coarse
+        Take the coarse sweep instead: every fourth line, samples summed by four.
+    settings
+        A survey's TOML file, for what the rig, the air and the light are like: [camera], [optics], [mirror],
+        [detector], [air], [sky]. Flags win over it.
+    compare
+        A PNG to write: lines with everything on and exact, the same as simulated, and where they differ, with the times
+        of both. Takes all lines once more both ways, or as many as about a minute allows.
+    """
+    from flows.simulate.command import run_simulate
+
+    given = {"scene": scene, "out": out, **by_setting(flags)}
+    record = run_simulate(load_settings(settings, given), stderr, coarse=coarse, picture=compare)
+    if as_json:
+        print_json(record)
+    return 0
+
+
+@rig.command
+def emulate(
+    *,
+    scene: str | None = None,
+    size: str | None = None,
+    flags: RenderingFlags = NO_RENDERING_FLAGS,
+    settings: Path | None = None,
+    faults: str | None = None,
+    baud: int = SurveyRig.baud,
+    speed: float = 1.0,
+    out: Annotated[Path | None, Parameter(name=("--out", "-o"))] = None,
+    as_json: AsJson = False,
+) -> int:
+    """Emulate a rig that looks at a simulated scene, until Ctrl-C: a serial port and a camera's sockets.
+
+    They speak the bytes of the documented protocols. The lines of a settings file that reach them are printed.
+
+    Parameters
+    ----------
+    scene
+        What it looks at: `farm` (by default; `farm@2`), or an image or cube file.
+    size
+        Of the scene `farm`, width x height [px]: 256x256 by default.
+    settings
+        A survey's TOML file, for what camera, optics and light are like, and how the mirror is mounted. Flags win over
+        it.
+    faults
+        What goes wrong, with commas, each as name or name:seed; `list` shows all.
+    baud
+        Speed of the serial port's bytes; 0 lets them through as they come, as USB does.
+    speed
+        How many times as fast as the clock on the wall the rig's time goes.
+    out
+        A survey's TOML file to write, ready for `survey` and `rig check`.
+    """
+    from flows.simulate.rig_check_command import LIST, show_faults
+    from flows.simulate.rig_emulation import EmulateRequest, emulated_settings, run_emulate
+
+    words = split_list(faults)
+    if words == (LIST,):
+        return show_faults(as_json=as_json)
+    given = {"scene": scene, "size": size, **by_setting(flags)}
+    request = EmulateRequest(emulated_settings(settings, given), words, baud, speed, out)
+    return run_emulate(request, stderr, as_json=as_json)

@@ -1,0 +1,143 @@
+"""Read a survey's settings: one TOML file and flags, every key checked. Flags win over the file, it over defaults."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import MISSING
+from pathlib import Path
+from typing import Any
+
+from flows.settings.declared import SURVEY, TABLES, Declared
+from flows.settings.rules import check_together, place_of
+from flows.settings.survey_settings import BUILT_IN_SCENES, PATHS, REPLACED, RIG_FIELD, Settings
+from pipeline.errors import PoseError, SettingsError
+from pipeline.simulator.scenes.farm.farm_scene import REMOVED_LAW
+from storage.archive.toml_files import read_toml
+
+
+def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | None = None) -> Settings:
+    """Read the file, lay the flags over it and check the whole.
+
+    Parameters
+    ----------
+    path
+        TOML file; None for defaults and flags alone. Relative paths in it start at its folder, those of flags at the
+        current folder.
+    flags
+        Keys as in the file, ``camera.exposure_ms`` for one in a table; None means not given.
+
+    Raises
+    ------
+    SettingsError, BudgetError : the first key that cannot be used, with its place and what it should be.
+    """
+    try:
+        table = {} if path is None else anchor_paths(read_toml(Path(path)), Path(path).parent)
+    except FileNotFoundError:
+        raise SettingsError(f"no settings file {path}; give the path of a survey's TOML file, or none") from None
+    except ValueError as error:
+        raise SettingsError(f"cannot read the settings file {path}: {error}; expected TOML in UTF-8") from None
+    origin = dict.fromkeys(table, str(path))
+    for name in TABLES:
+        inner = table.get(name)
+        origin |= {f"{name}.{key}": str(path) for key in inner} if isinstance(inner, Mapping) else {}
+    for key, value in (flags or {}).items():
+        if value is not None:
+            head, _, tail = key.rpartition(".")
+            inner = table.get(head, {})
+            table[head or key] = {**inner, tail: value} if head and isinstance(inner, Mapping) else value
+            origin[key] = "flag"
+    return parse_settings(table, origin)
+
+
+def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None = None) -> Settings:
+    """Check a table of settings and fill in the defaults.
+
+    Parameters
+    ----------
+    table
+        Keys and values as in the file, ``camera``, ``cost``, ``pose`` and the like being tables themselves; None in
+        them means not given.
+    origin
+        Where each (dotted) key came from, for the messages: a file's name or ``flag``.
+    """
+    origin = origin or {}
+    settings = Settings(**_check_table(table, SURVEY, "", origin))
+    check_together(settings, origin)
+    return settings
+
+
+def _check_table(
+    table: Mapping[str, object], declared: Mapping[str, Declared], prefix: str, origin: Mapping[str, str]
+) -> dict[str, Any]:
+    """Every key of one table by its declaration; an unknown one is refused with the nearest that exists."""
+    checked: dict[str, Any] = {}
+    for key, value in table.items():
+        full = prefix + key
+        place = place_of(full, origin.get(full))
+        if value is None:
+            continue
+        if key not in declared:
+            raise SettingsError(f"unknown setting {place}{_hint(full, declared, prefix)}")
+        if not prefix and key in TABLES:
+            checked[key] = _parse_table(key, value, place, origin)
+        else:
+            checked[key] = declared[key].read(value, place)
+    return checked
+
+
+def _parse_table(key: str, value: object, place: str, origin: Mapping[str, str]) -> object:
+    """One of the tables that stand for a dataclass."""
+    if not isinstance(value, Mapping):
+        raise SettingsError(f"{place} must be a table, [{key}] with keys below it; got {value!r}")
+    given = _check_table(value, TABLES[key], f"{key}.", origin)
+    missing = [name for name, one in TABLES[key].items() if one.item.default is MISSING and name not in given]
+    if missing:
+        raise SettingsError(f"[{key}] lacks {', '.join(missing)}; give every one, or leave the table out")
+    try:
+        return SURVEY[key].kind(**given)
+    except PoseError as error:
+        raise SettingsError(f"[{key}]: {error}") from None
+
+
+def _hint(full: str, known: Mapping[str, Declared], prefix: str) -> str:
+    """What was meant by an unknown key: what replaced it, or the nearest of its table, or of another table."""
+    if full in REPLACED:
+        return f"; {REPLACED[full]}"
+    everywhere = [*SURVEY, *(f"{name}.{key}" for name, keys in TABLES.items() for key in keys)]
+    short = full.removeprefix(prefix)
+    near = [name for name in everywhere if name.split(".")[-1] == short]
+    near = near or [prefix + key for key in difflib.get_close_matches(short, known, n=1, cutoff=0.5)]
+    return f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(prefix + key for key in known)}"
+
+
+def of_this_version(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Give what a receipt says of settings that there are: keys of before are left out, in tables too.
+
+    Raises
+    ------
+    SettingsError : the survey had two rounds of detail, of which this version would make but one.
+    """
+    if stored.get("rounds", 1) != 1:
+        raise SettingsError(
+            f"its survey had {stored['rounds']} rounds of detail, which never paid and were removed: survey the "
+            "field by hand, without 'rounds'; what both share is in the archive; take what is damaged out first"
+        )
+    return {
+        key: {name: item for name, item in value.items() if name in TABLES[key]}
+        if key in TABLES and isinstance(value, Mapping)
+        else value
+        for key, value in stored.items()
+        if key in SURVEY
+    }
+
+
+def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
+    """Relative paths of a file's settings, made to start at the file's folder."""
+    named = {*BUILT_IN_SCENES, REMOVED_LAW, RIG_FIELD}
+    anchored = dict(table)
+    for key in PATHS:
+        value = table.get(key)
+        if isinstance(value, str) and value and value not in named and "://" not in value:
+            anchored[key] = str(folder / Path(value).expanduser())
+    return anchored

@@ -1,0 +1,79 @@
+"""Numbers and words that settings give, stated where they are used: default, range, unit, meaning, where it is from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import Field, field, fields
+from functools import partial
+from typing import Any, Literal
+
+from pipeline.errors import SettingsError
+
+Source = Literal["", "measured", "data sheet", "assumed"]
+
+
+def stated(
+    default: Any,
+    about: str,
+    unit: str = "",
+    ge: float | None = None,
+    le: float | None = None,
+    *,
+    source: Source = "",
+    example: object = None,
+    why: str = "",
+) -> Any:
+    """A dataclass's field that says all there is to know of it; nothing else repeats it.
+
+    Parameters
+    ----------
+    default
+        ``dataclasses.MISSING`` where it has to be given. A number is finite, unless its default is infinite.
+    about
+        One line of help.
+    ge, le
+        Least and greatest value, both allowed. [unit]
+    source
+        Where the default comes from: nothing here was measured on a unit unless it says so.
+    example
+        What to show where there is no default, or where it is written in another way.
+    why
+        What a refusal adds to the range.
+    """
+    known = {"description": about, "ge": ge, "le": le}  # as pydantic's Field calls them
+    told = {"unit": unit, "source": source, "example": example, "why": why}
+    return field(default=default, metadata={**known, "json_schema_extra": told})
+
+
+assumed = partial(stated, source="assumed")  # nobody has confirmed the default on a unit
+
+
+def number_words(low: float, high: float, unit: str = "", *, endless: bool = False) -> str:
+    """What a number may be, for a message."""
+    words = f"a number from {low:g} to {high:g}" if math.isfinite(high) else f"a number of at least {low:g}"
+    return words + (f" {unit}" if unit else "") + (" or inf" if endless else "")
+
+
+def span_of(item: Field[Any]) -> tuple[float, float]:
+    """Least and greatest value of a number."""
+    low, high = item.metadata.get("ge"), item.metadata.get("le")
+    return (-math.inf if low is None else low), (math.inf if high is None else high)
+
+
+def misfits(part: Any) -> Iterator[tuple[str, str]]:
+    """Names of the numbers of a dataclass that are out of range or not finite, with what is wrong of each."""
+    for item in fields(part):
+        value, (low, high) = getattr(part, item.name), span_of(item)
+        if value is None or (low, high) == (-math.inf, math.inf):
+            continue
+        endless = item.default in (None, math.inf)
+        if isinstance(value, bool) or not low <= value <= high or (math.isinf(value) and not endless):
+            words = number_words(low, high, item.metadata["json_schema_extra"]["unit"], endless=endless)
+            yield item.name, f"must be {words}, got {value!r}"
+
+
+def check_stated(part: Any, place: str) -> None:
+    """Refuse a dataclass with a number out of range or not finite; messages name it as ``place.name``."""
+    for name, words in misfits(part):
+        raise SettingsError(f"{place}.{name} {words}")
