@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal, NotRequired, TypedDict, cast, get_args
 
 from pipeline.errors import ShapeError
-from pipeline.visible_text import is_visible
+from pipeline.visible_text import visible
 
 State = Literal["ran", "cached", "skipped", "failed"]
 AccuracyIs = Literal["judged", "pending", "left out", "without labels"]  # pending: it is worked out after the map
@@ -289,15 +289,12 @@ def _need(part: object, names: Iterable[str], place: str) -> None:
 
 
 def to_json(receipt: Mapping[str, object]) -> str:
-    (
-        """JSON text, two spaces a level, in the receipt's own order; numbers that are not finite become null.
+    """JSON text, two spaces a level, in the receipt's own order; numbers that are not finite become null.
 
     What would steer a terminal or turn words round stands as escapes, as JSON has them.
     """
-        ""
-    )
     text = json.dumps(_plain(receipt), indent=2, ensure_ascii=False, allow_nan=False)
-    return "".join(letter if is_visible(letter) else json.dumps(letter)[1:-1] for letter in text) + "\n"
+    return visible(text, lambda letter: json.dumps(letter)[1:-1]) + "\n"
 
 
 def _plain(value: object) -> object:
