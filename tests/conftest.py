@@ -17,13 +17,13 @@ from rich.console import Console
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.survey_settings import load_settings
-from flows.survey.survey import STAGES
+from flows.survey import effect_choice
 from models.network.segmenter import Segmenter, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.weights.files import Weights, save_weights
 from storage.readers.labels import default_colour
 from tests.object_server import bucket, machine, s3_server  # noqa: F401 - fixtures
-from tests.remembered_choices import CHOICE, remembering, worked_out
+from tests.remembered_choices import WORKED_OUT, remember
 
 RGB_NM = (640.0, 550.0, 460.0)
 CLASSES = ("class_0", "class_1", "class_2")  # as a label file of the numbers 0..2 names them
@@ -65,17 +65,17 @@ def patchy_scene(shape: tuple[int, int], bands: int, seed: int) -> tuple[NDArray
 def remembered_choices(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Surveys of one scene and rig choose the rig's effects once for all workers of a session."""
     base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(
-            STAGES, CHOICE, remembering((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "choices")
-        )
+        remember(shared / "choices", patch.setattr)
         yield
 
 
 @pytest.fixture
 def choosing_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every survey of this test works out its choice of effects by itself."""
-    monkeypatch.setitem(STAGES, CHOICE, worked_out)
+    for name, real in WORKED_OUT.items():
+        monkeypatch.setattr(effect_choice, name, real)
 
 
 @pytest.fixture(scope="session")

@@ -1,46 +1,46 @@
-"""The choice of a rig's effects remembered: half of a small survey's time, and the same for the same question."""
+"""What a choice of effects rests on, remembered: half of a small survey's time, and the same for the same question.
+
+Only what is pure is kept, the look at the scene and the measured changes; the decision itself and its store are made
+each time. Tests whose subject is the choice, or that surveys repeat themselves, put `WORKED_OUT` back.
+"""
 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
-from functools import wraps
+import pickle
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from flows.survey.effect_choice import RECORD
-from flows.survey.survey import STAGES
+from flows.survey import effect_choice
 
-CHOICE = "choose_effects"
-worked_out = STAGES[CHOICE]  # the product's own stage
+WORKED_OUT: dict[str, Callable[..., Any]] = {
+    name: getattr(effect_choice, name) for name in ("probe_survey", "_verified")
+}
 
 
-def remembering(folder: Path) -> Any:
-    """The stage that works out each choice once, and writes the same bytes where it is asked for again.
-
-    Questions are told apart by what the stage itself keys its store with. Tests whose subject is the choice, or that a
-    survey is repeatable, put `worked_out` back.
-    """
+def remember(folder: Path, put: Callable[[object, str, Any], None] = setattr) -> None:
+    """Have the stage look each question up in a folder, which several processes may share, before it works it out."""
     folder.mkdir(parents=True, exist_ok=True)
 
-    @wraps(worked_out)
-    def choose(run: Any, produce: Any) -> Any:
-        def ask(name: str, build: Any, params: Any, refs: Any) -> Any:
-            question = json.dumps(params, sort_keys=True, default=str).encode()
-            known = folder / hashlib.sha256(question).hexdigest()
+    def known(question: object, work_out: Callable[[], Any]) -> Any:
+        path = folder / hashlib.sha256(repr(question).encode()).hexdigest()
+        if path.exists():
+            return pickle.loads(path.read_bytes())
+        found = work_out()
+        fresh = path.with_suffix(f".{os.getpid()}")
+        fresh.write_bytes(pickle.dumps(found))
+        fresh.replace(path)
+        return found
 
-            def answer(path: Path) -> None:
-                if known.exists():
-                    (path / RECORD).write_bytes(known.read_bytes())
-                    return
-                build(path)
-                fresh = known.with_suffix(f".{os.getpid()}")
-                fresh.write_bytes((path / RECORD).read_bytes())
-                fresh.replace(known)
+    def probed(scene: Any, *given: Any) -> Any:
+        return known((scene.key, given), lambda: WORKED_OUT["probe_survey"](scene, *given))
 
-            return produce(name, answer, params, refs)
+    def verified(run: Any, decision: Any, probes: Any) -> Any:
+        told = run.settings
+        question = run.scene.key, run.planned, told.simulated_rig, told.seed, told.cost, told.effects, told.tol
+        return known(question, lambda: WORKED_OUT["_verified"](run, decision, probes))
 
-        return worked_out(run, ask)
-
-    return choose
+    put(effect_choice, "probe_survey", probed)
+    put(effect_choice, "_verified", verified)

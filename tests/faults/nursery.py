@@ -133,8 +133,7 @@ def serve(choices: Path) -> None:
         "matplotlib.backends.backend_agg",
     ):
         importlib.import_module(name)
-    remembered = importlib.import_module("tests.remembered_choices")
-    importlib.import_module("flows.survey.survey").STAGES[remembered.CHOICE] = remembered.remembering(choices)
+    importlib.import_module("tests.remembered_choices").remember(choices)
     for line in sys.stdin:
         request = json.loads(line)
         if "wait" in request:
