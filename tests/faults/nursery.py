@@ -131,6 +131,7 @@ def serve(choices: Path) -> None:
         "flows.publish.survey_command",
         "flows.cli.archive_verbs",
         "matplotlib.backends.backend_agg",
+        "scipy.optimize",
     ):
         importlib.import_module(name)
     importlib.import_module("tests.remembered_choices").remember(choices)
