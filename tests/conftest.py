@@ -17,13 +17,12 @@ from rich.console import Console
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.survey_settings import load_settings
-from flows.survey import effect_choice
 from models.network.segmenter import Segmenter, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.weights.files import Weights, save_weights
 from storage.readers.labels import default_colour
 from tests.object_server import bucket, machine, s3_server  # noqa: F401 - fixtures
-from tests.remembered_choices import WORKED_OUT, remember
+from tests.remembered_work import WORKED_OUT, remember
 
 RGB_NM = (640.0, 550.0, 460.0)
 CLASSES = ("class_0", "class_1", "class_2")  # as a label file of the numbers 0..2 names them
@@ -62,20 +61,20 @@ def patchy_scene(shape: tuple[int, int], bands: int, seed: int) -> tuple[NDArray
 
 
 @pytest.fixture(scope="session", autouse=True)
-def remembered_choices(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Surveys of one scene and rig choose the rig's effects once for all workers of a session."""
+def remembered_work(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What surveys of one scene and rig have in common is worked out once for all workers of a session."""
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     with pytest.MonkeyPatch.context() as patch:
-        remember(shared / "choices", patch.setattr)
+        remember(shared / "remembered", patch.setattr)
         yield
 
 
 @pytest.fixture
 def choosing_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every survey of this test works out its choice of effects by itself."""
-    for name, real in WORKED_OUT.items():
-        monkeypatch.setattr(effect_choice, name, real)
+    """Every survey of this test works out its choice of effects, and draws its picture, by itself."""
+    for name, (module, real) in WORKED_OUT.items():
+        monkeypatch.setattr(module, name, real)
 
 
 @pytest.fixture(scope="session")

@@ -134,7 +134,7 @@ def serve(choices: Path) -> None:
         "scipy.optimize",
     ):
         importlib.import_module(name)
-    importlib.import_module("tests.remembered_choices").remember(choices)
+    importlib.import_module("tests.remembered_work").remember(choices)
     for line in sys.stdin:
         request = json.loads(line)
         if "wait" in request:

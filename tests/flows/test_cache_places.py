@@ -18,7 +18,7 @@ from pipeline.errors import SettingsError
 
 ROOT = Path(__file__).parents[2]
 NOWHERE = "/proc/nonexistent"  # where not even root can write
-FARM = ["--scene", "farm", "--size", "64x64", "--bands", "40,90,150"]
+FARM = ["--scene", "farm", "--size", "64x64", "--effects", "shot"]
 VERBS = """
 from flows.cli.main import main
 for words in ({survey}, {plan}, {report}):

@@ -8,7 +8,9 @@ from tests.pipeline.simulator.bound_trials import trials
 from tests.pipeline.simulator.random_cases import random_case
 
 
-@pytest.mark.parametrize("number", [1, 2, 4, 7, 8, 10, 11])  # which have every effect twice at least
+@pytest.mark.parametrize(
+    "number", [2, 3, 5, 8, 10, 11]
+)  # the fewest of the first twelve that find each of 177 bounds too low that those find
 def test_no_change_exceeds_what_the_decision_counts(number: int):
     """Each effect left out, and each variant taken, beside all others exact, as samples and in sums of 2 to 8.
 
