@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections.abc import Callable
 
 _LAYOUT = "\n\t"  # control characters that text for people has
 _DIRECTION = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
@@ -11,12 +12,16 @@ _UNSEEN = "\u00ad\u061c\u200b\u200e\u200f\u2060\ufeff"  # marks of direction, an
 _SUSPECT = re.compile(r"[^\n\t\x20-\x7e\u00a1-\u00ac\u00ae-\u02ff\u0370-\u058f\u2010-\u2027\u2030-\u205e\u4e00-\u9fff]")
 
 
-def visible(text: str) -> str:
+def _escaped(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")
+
+
+def visible(text: str, escaped: Callable[[str], str] = _escaped) -> str:
     r"""Text in which control characters, marks of direction and unseen ones stand as escapes: ``\x1b``, ``\u202e``.
 
     Lines, tabs and the letters of all scripts stay; so do the joiners that some scripts are written with.
     """
-    return _SUSPECT.sub(lambda found: _shown(found[0]), text)
+    return _SUSPECT.sub(lambda found: found[0] if is_visible(found[0]) else escaped(found[0]), text)
 
 
 def is_visible(character: str) -> bool:
@@ -27,7 +32,3 @@ def is_visible(character: str) -> bool:
         return False
     tag = "\U000e0000" <= character <= "\U000e007f"
     return not tag and unicodedata.category(character) not in ("Cc", "Cs", "Zl", "Zp")
-
-
-def _shown(character: str) -> str:
-    return character if is_visible(character) else character.encode("unicode_escape").decode("ascii")

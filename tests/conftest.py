@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from models.network.spectral import Normalisation, SpectralBasis
 from models.weights.files import Weights, save_weights
 from storage.readers.labels import default_colour
 from tests.object_server import bucket, machine, s3_server  # noqa: F401 - fixtures
+from tests.remembered_work import WORKED_OUT, remember
 
 RGB_NM = (640.0, 550.0, 460.0)
 CLASSES = ("class_0", "class_1", "class_2")  # as a label file of the numbers 0..2 names them
@@ -57,6 +58,23 @@ def patchy_scene(shape: tuple[int, int], bands: int, seed: int) -> tuple[NDArray
     colours = rng.uniform(50, 200, (3, bands))
     values = colours[labels] + rng.normal(0, 12, (*shape, bands))
     return np.clip(values, 0, 255).astype(np.float32), labels
+
+
+@pytest.fixture(scope="session", autouse=True)
+def remembered_work(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What surveys of one scene and rig have in common is worked out once for all workers of a session."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    with pytest.MonkeyPatch.context() as patch:
+        remember(shared / "remembered", patch.setattr)
+        yield
+
+
+@pytest.fixture
+def choosing_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every survey of this test works out its choice of effects, and draws its picture, by itself."""
+    for name, (module, real) in WORKED_OUT.items():
+        monkeypatch.setattr(module, name, real)
 
 
 @pytest.fixture(scope="session")

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -287,8 +288,9 @@ def _amount(value: object) -> float | None:
     return float(value)
 
 
-def library_versions() -> dict[str, str]:
-    """Versions of the libraries that a stored result may depend on, as installed."""
+@cache
+def library_versions() -> Mapping[str, str]:
+    """Versions of the libraries that a stored result may depend on, as installed when they were asked for first."""
     found: dict[str, str] = {}
     for name in _DISTRIBUTIONS:
         with suppress(importlib.metadata.PackageNotFoundError):

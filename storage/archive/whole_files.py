@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pipeline.errors import ArchiveError
-from pipeline.visible_text import is_visible
+from pipeline.visible_text import visible
 from storage.archive.staging import PART_SUFFIX, refusals, remove_tree, sync_path
 
 _PREFIX = ".export-"
@@ -84,7 +84,7 @@ def to_json(content: Mapping[str, object]) -> str:
     What would steer a terminal or turn words round stands as escapes, as JSON has them.
     """
     text = json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False)
-    return "".join(letter if is_visible(letter) else json.dumps(letter)[1:-1] for letter in text) + "\n"
+    return visible(text, lambda letter: json.dumps(letter)[1:-1]) + "\n"
 
 
 def _plain(value: object) -> object:

@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from tests.faults.fault_table import Clock, Row
 from tests.faults.injection import errors_by_name, label
 from tests.faults.nursery import ROOT, Ended, Nursery
-from tests.faults.small_survey import Subject, changing_calls, prepare, words, wrong_after_fault, wrong_after_rerun
+from tests.faults.small_survey import Subject, prepare, words, wrong_after_fault, wrong_after_rerun
 
 SIZES, EACH = 30, 2
 LARGE = 64 << 20  # bytes: more than a survey takes
@@ -34,7 +34,7 @@ PAGE = 4096
 IN_NAMESPACE = "SPECTRALZOOM_FAULTS_IN_NAMESPACE"
 QUICK = ("spool", "segment manifest", "run")  # kinds for the quick part
 FULL = ("disk is full", "No space left")
-WHERE = {"spool": "spool.", "manifest": "manifests.write_manifest", "run": "publish.publish_run"}  # in our functions
+WHERE = {"spool": "spool.", "manifest": "manifests.write_manifest", "run": "run_folder.publish_run"}  # in our functions
 
 
 @dataclass
@@ -83,7 +83,7 @@ def grow(folder: Path) -> None:
 
 def openings_by_label(subject: Subject) -> dict[str, int]:
     """How many files are opened to be written, by what they belong to."""
-    labels = (label(path) for _, call, path in changing_calls(subject) if call == "open")
+    labels = (label(path) for _, call, path in subject.changing_calls if call == "open")
     return dict(Counter(name for name in labels if name is not None))
 
 

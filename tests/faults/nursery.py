@@ -79,7 +79,7 @@ class Nursery:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._number = 0
-        command = [sys.executable, "-m", "tests.faults.nursery"]
+        command = [sys.executable, "-m", "tests.faults.nursery", str(folder / "choices")]
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
         self._process = subprocess.Popen(
             command, cwd=ROOT, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -123,16 +123,18 @@ class Nursery:
 # --- in the nursery's own process -------------------------------------------------------------------------------------
 
 
-def serve() -> None:
-    """Fork a child for each request on stdin, or wait for one."""
+def serve(choices: Path) -> None:
+    """Fork a child for each request on stdin, or wait for one; what effects they choose is remembered in a folder."""
     for name in (
         "flows.cli.main",
         "flows.publish.run_folder",
         "flows.publish.survey_command",
         "flows.cli.archive_verbs",
         "matplotlib.backends.backend_agg",
+        "scipy.optimize",
     ):
         importlib.import_module(name)
+    importlib.import_module("tests.remembered_work").remember(choices)
     for line in sys.stdin:
         request = json.loads(line)
         if "wait" in request:
@@ -184,4 +186,4 @@ def _keep_place(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    serve()
+    serve(Path(sys.argv[1]))

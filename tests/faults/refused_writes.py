@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from tests.faults.fault_table import Clock, Row
 from tests.faults.injection import errors_by_name, logged_calls
 from tests.faults.nursery import Nursery
-from tests.faults.small_survey import Subject, changing_calls, prepare, words, wrong_after_fault, wrong_after_rerun
+from tests.faults.small_survey import Subject, prepare, words, wrong_after_fault, wrong_after_rerun
 
 PLACES = 150
 
@@ -47,7 +47,7 @@ class Refusals:
 
 def refuse_places(subject: Subject, count: int, seed: int = 0) -> Refusals:
     """Refuse at ``count`` random places, one survey each, and run every survey again without."""
-    chance, places = random.Random(seed), len(changing_calls(subject))
+    chance, places = random.Random(seed), len(subject.changing_calls)
     found = Refusals(places)
     for at in _spread(places, count, chance):
         name, lasting = chance.choice(list(errors_by_name())), chance.random() < 0.5

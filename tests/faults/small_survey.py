@@ -20,11 +20,15 @@ Stored = dict[str, dict[str, str]]  # address of a store -> SHA-256 of each of i
 
 @dataclass(frozen=True)
 class Subject:
-    """A survey to disturb, a nursery to run it in, and what an undisturbed one left."""
+    """A survey to disturb, a nursery to run it in, and what an undisturbed one left.
+
+    ``changing_calls`` are all calls by which it changes its archive: number, name, and path below the archive.
+    """
 
     nursery: Nursery
     truth: Stored
     whole_s: float
+    changing_calls: list[tuple[int, str, Path]]
 
     @property
     def folder(self) -> Path:
@@ -47,20 +51,15 @@ def prepare(nursery: Nursery) -> Subject:
     Image.fromarray(values.astype(np.uint8)).save(folder / "scene.png")
     Image.fromarray(labels).save(folder / "labels.png")
     save_weights(random_weights(RGB_NM), folder / "weights.safetensors")
-    ended = nursery.run(words(folder / "undisturbed"))
-    assert ended.code == 0, f"the undisturbed survey failed: {ended.text}"
-    return Subject(nursery, stored(folder / "undisturbed"), ended.seconds)
-
-
-def changing_calls(subject: Subject) -> list[tuple[int, str, Path]]:
-    """Every call by which an undisturbed survey changes its archive: number, name, and path below the archive."""
-    out, log = subject.folder / "counted", subject.folder / "counted.calls"
-    ended = subject.nursery.run(words(out), "refuse", root=str(out), at=0, number=0, log=str(log))
-    assert ended.code == 0, ended.text
-    calls = [(number, name, Path(path).relative_to(out)) for number, name, path in logged_calls(log)]
-    shutil.rmtree(out)
+    counted, out, log = folder / "counted", folder / "undisturbed", folder / "counted.calls"
+    first = nursery.run(words(counted), "refuse", root=str(counted), at=0, number=0, log=str(log))
+    ended = nursery.run(words(out))  # the first alone works out which effects there are
+    for one in (first, ended):
+        assert one.code == 0, f"the undisturbed survey failed: {one.text}"
+    calls = [(number, name, Path(path).relative_to(counted)) for number, name, path in logged_calls(log)]
+    shutil.rmtree(counted)
     log.unlink()
-    return calls
+    return Subject(nursery, stored(out), ended.seconds, calls)
 
 
 def stored(archive: Path) -> Stored:

@@ -22,7 +22,7 @@ from tests.faults import (
 )
 from tests.faults.fault_table import Row, markdown_table, plain_table
 from tests.faults.nursery import Nursery
-from tests.faults.small_survey import Subject, changing_calls, prepare, stored, words
+from tests.faults.small_survey import Subject, prepare, stored, words
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def test_writes_refused_at_random_calls(subject: Subject) -> None:
 
 def test_refused_writes_are_counted_in_zarr_too(subject: Subject) -> None:
     """Else nothing would be refused where most is written."""
-    names = {name for _, name, _ in changing_calls(subject)}
+    names = {name for _, name, _ in subject.changing_calls}
     assert {"open", "write", "fsync", "fdatasync", "mkdir", "rename", "replace", "unlink"} <= names
 
 

@@ -19,7 +19,7 @@ from tests.faults.small_survey import problems
 
 KILLS = 6
 MOMENTS = [(number + random.Random(number).random()) / KILLS for number in range(KILLS)]  # of the time it takes
-LIVES = (0.75, 0.2, 0.2, 0.2) * 3  # of it too: the choice of effects, half of it, begins anew when killed
+LIVES = (0.5, 0.35, 0.35, 0.35) * 3  # of it too: what was not published begins anew
 
 Runner = Callable[[Path, float | None], tuple[int, float]]
 
@@ -55,6 +55,7 @@ def run(scene_files: Path, weights: Path, tmp_path_factory: pytest.TempPathFacto
 @pytest.fixture(scope="module")
 def whole(run: Runner, tmp_path_factory: pytest.TempPathFactory) -> Whole:
     """The same survey, left alone."""
+    assert run(tmp_path_factory.mktemp("first"), None)[0] == 0  # which works out the effects for all that follow
     out = tmp_path_factory.mktemp("whole")
     code, seconds = run(out, None)
     assert code == 0

@@ -155,6 +155,7 @@ def test_ranks_follow_the_scores(farm: Done) -> None:
     assert (np.diff(score[ordered]) <= 0).all()
 
 
+@pytest.mark.usefixtures("choosing_anew")
 def test_same_seed_gives_the_same_receipt(picture: Done, survey_png: Any, tmp_path: Path) -> None:
     """In another archive, but for times and memory; another seed gives other light along the same path."""
     again = survey_png(tmp_path / "again").receipt

@@ -7,8 +7,10 @@ import pytest
 from tests.pipeline.simulator.bound_trials import trials
 from tests.pipeline.simulator.random_cases import random_case
 
+CASES = (2, 3, 5, 8, 10, 11)  # the fewest of the first twelve that find each of the 177 low bounds that those find
 
-@pytest.mark.parametrize("number", range(12))
+
+@pytest.mark.parametrize("number", CASES)
 def test_no_change_exceeds_what_the_decision_counts(number: int):
     """Each effect left out, and each variant taken, beside all others exact, as samples and in sums of 2 to 8.
 
