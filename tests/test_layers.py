@@ -160,6 +160,14 @@ def test_folders_can_be_held_in_mind() -> None:
     assert {folder.as_posix(): files for folder, files in count.items() if files > MOST_FILES} == {}
 
 
+def test_class_names_are_unique() -> None:
+    """Whoever reads the name of a class knows which one is meant."""
+    names = Counter(
+        node.name for tree in source().values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)
+    )
+    assert {name: count for name, count in names.items() if count > 1} == {}
+
+
 def test_packages_are_those_of_this_folder() -> None:
     """An import takes the rooms of this project, not packages of the same name from elsewhere."""
     for room in ROOMS:

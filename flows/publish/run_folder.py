@@ -41,7 +41,7 @@ from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
-from pipeline.planning.savings import Entry, capture_savings
+from pipeline.planning.savings import SavingEntry, capture_savings
 from pipeline.rectify.calibration.calibrate import of_bands, reflectance
 from storage.archive.archive import StageRef
 from storage.archive.records import StageRecord, read_run
@@ -205,9 +205,9 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
     cells, each = int(np.prod(run.grid.padded_shape)) // (config.patch * config.factor) ** 2, config.token_side**2
     return {
         **{name: entry.as_dict() for name, entry in entries.items()},
-        "capture_s": Entry(run.plan.coarse_s + plan.seconds, run.plan.full_s, "predicted").as_dict(),
-        "bytes_stored": Entry(sum(stored), round(full_stored), "predicted").as_dict(),
-        "tokens": Entry(each * (cells + len(plan.seats)), each * (cells + valid), "predicted").as_dict(),
+        "capture_s": SavingEntry(run.plan.coarse_s + plan.seconds, run.plan.full_s, "predicted").as_dict(),
+        "bytes_stored": SavingEntry(sum(stored), round(full_stored), "predicted").as_dict(),
+        "tokens": SavingEntry(each * (cells + len(plan.seats)), each * (cells + valid), "predicted").as_dict(),
         "multiply_adds": _multiply_adds(run, plan),
     }
 
@@ -215,7 +215,7 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
 def _multiply_adds(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
     """What the model did, beside the map of a full scan."""
     done, full = work_done(run, plan.seats), work_of_map(run, run.grid.valid_seats())
-    return {**Entry(done.total, full.total, "predicted").as_dict(), **asdict(done)}
+    return {**SavingEntry(done.total, full.total, "predicted").as_dict(), **asdict(done)}
 
 
 def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: Receipt) -> QuicklookData:

@@ -43,7 +43,7 @@ Raw = NDArray[np.uint16]
 
 
 @dataclass(frozen=True)
-class Place:
+class ViewPlace:
     """A stored number: a band of a sample, or of some that are summed."""
 
     sweep: str
@@ -80,7 +80,7 @@ class Comparison:
     bound: float | None  # None: there is none
     measured: float  # greatest change of expected light
     rms: float
-    place: Place  # of the greatest
+    place: ViewPlace  # of the greatest
     raw_unequal: float  # share of raw numbers that differ where light alone does: noise and digits as chosen
     raw_most_dn: int
     left_out: tuple[str, ...]  # of what the rig has
@@ -99,14 +99,14 @@ class Comparison:
 
 
 @dataclass
-class _Sums:
+class _ChangeSums:
     """What blocks add up to."""
 
     exact_cpu_s: float = 0.0
     cpu_s: float = 0.0
     greatest: float = -1.0
     unexplained: float = -1.0  # of the greatest change, what arithmetic can not have made
-    place: Place | None = None
+    place: ViewPlace | None = None
     squares: float = 0.0
     numbers: int = 0
     unequal: int = 0
@@ -152,7 +152,7 @@ def compare_with_everything(
     ways = _Ways(replace(chosen, chosen=everything(effects)), chosen, total["unit"], bound)
     blocks = _blocks(sweeps)
     taken = _affordable(ways, blocks, say)
-    sums = _Sums()
+    sums = _ChangeSums()
     for number, (sweep, lines) in enumerate(taken):
         ways.add(sweep, lines, sums)
         run.report((number + 1) / (len(taken) + 1))
@@ -196,7 +196,7 @@ def _count(blocks: Sequence[tuple[Sweep, range]]) -> int:
 
 
 @dataclass(frozen=True)
-class _Taken:
+class _LinesTaken:
     """A block one way: expected electrons without and with those of the dark, raw numbers of all samples."""
 
     light: Light
@@ -205,13 +205,13 @@ class _Taken:
     cpu_s: float
 
 
-def _taken(source: SimulatedSource, block: SweepBlock) -> _Taken:
+def _taken(source: SimulatedSource, block: SweepBlock) -> _LinesTaken:
     began = time.process_time()
     light = expected_light(source.scene, block, source.choice)
     raw = read_out(light, block, source.choice)
     spent = time.process_time() - began
     shown = light + dark_frame(block, source.choice) * np.float32(block.rig.camera.electrons_per_dn)
-    return _Taken(light, shown, raw, spent)
+    return _LinesTaken(light, shown, raw, spent)
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ class _Ways:
     def _unit(self, both: _Both, sweep: Sweep) -> NDArray[np.floating]:
         return unit_at(both.exact, self.exact.rig, self.unit, sweep.binning)
 
-    def add(self, sweep: Sweep, lines: range, sums: _Sums) -> None:
+    def add(self, sweep: Sweep, lines: range, sums: _ChangeSums) -> None:
         """Take some lines both ways and add up how they differ."""
         both = self.take(sweep, lines)
         change = self.change(both, sweep)
@@ -257,7 +257,7 @@ class _Ways:
         line, sample, band = (int(one) for one in np.unravel_index(int(np.argmax(change)), change.shape))
         if change[line, sample, band] > sums.greatest:
             sums.greatest = float(change[line, sample, band])
-            sums.place = Place(sweep.name, lines[line], sample * sweep.binning, band)
+            sums.place = ViewPlace(sweep.name, lines[line], sample * sweep.binning, band)
         if change.max() > self.bound:
             change -= self._arithmetic(both, sweep, lines) / self._unit(both, sweep)
         sums.unexplained = max(sums.unexplained, float(change.max()))
@@ -270,7 +270,7 @@ class _Ways:
 def _compared(
     run: CaptureRun,
     ways: _Ways,
-    sums: _Sums,
+    sums: _ChangeSums,
     taken: list[tuple[Sweep, range]],
     blocks: list[tuple[Sweep, range]],
     effects: StageRef,
@@ -298,7 +298,7 @@ def _inexact(effects: StageRef) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return left_out, cheaper
 
 
-def _view(run: CaptureRun, ways: _Ways, sweep: Sweep, place: Place) -> View:
+def _view(run: CaptureRun, ways: _Ways, sweep: Sweep, place: ViewPlace) -> View:
     """Take the lines about a place once more and keep what a picture shows of them."""
     binning, camera = sweep.binning, run.camera
     lines = _about(place.line, VIEW_PX // sweep.step, sweep.lines)
@@ -332,7 +332,7 @@ def _strongest(change: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.take_along_axis(change, band, axis=2)[..., 0]
 
 
-def _check(found: Comparison, sums: _Sums) -> None:
+def _check(found: Comparison, sums: _ChangeSums) -> None:
     if found.bound is None or sums.unexplained <= found.bound:
         return
     place = found.place

@@ -12,7 +12,7 @@ from flows.tradeoff.entries import Setting, Tradeoff, register
 from flows.tradeoff.farm import FarmLook, look_at_farm
 from models.evaluation.metrics import confusion, mean_iou
 from models.policies.policies import score_seats
-from models.reading.inference import ClassMap, Glance, glance, segment
+from models.reading.inference import DrawnMap, Glance, glance, segment
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.fine_pass import FinePlan, plan_fine
 
@@ -21,7 +21,7 @@ BUDGETS = (1.0, 0.8, 0.65, 0.5, 0.4, 0.33)
 
 
 @dataclass(frozen=True)
-class Field:
+class FarmToSpendOn:
     """A farm seen coarsely and, for whatever the plan will ask, finely."""
 
     farm: FarmLook
@@ -30,29 +30,29 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Surveyed:
+class SpentSurvey:
     """The map at one budget and what was captured for it."""
 
     plan: FinePlan
-    drawn: ClassMap
+    drawn: DrawnMap
 
 
-def _prepare(seed: int) -> Field:
+def _prepare(seed: int) -> FarmToSpendOn:
     farm = look_at_farm(seed, SHAPE)
     columns = columns_of_all_seats(
         farm.source, farm.full, farm.grid, farm.weights, memory=2**31, kernel="catmull-rom"
     )  # fmt: skip
-    return Field(farm, glance(farm.weights, farm.mosaic, farm.scene.wavelength_nm, farm.grid), columns)
+    return FarmToSpendOn(farm, glance(farm.weights, farm.mosaic, farm.scene.wavelength_nm, farm.grid), columns)
 
 
-def _run(state: Field, budget: Setting) -> Surveyed:
+def _run(state: FarmToSpendOn, budget: Setting) -> SpentSurvey:
     farm, scores = state.farm, score_seats("entropy", state.seen)
     left = max(float(budget) * farm.full_s - farm.coarse_s, 0.0)
     plan = plan_fine(farm.grid, farm.source.camera, CostModel(), farm.along, scores, budget_s=left)
-    return Surveyed(plan, segment(farm.weights, state.seen, state.columns[plan.seats], plan.seats))
+    return SpentSurvey(plan, segment(farm.weights, state.seen, state.columns[plan.seats], plan.seats))
 
 
-def _judge(state: Field, _budget: Setting, made: Surveyed) -> float:
+def _judge(state: FarmToSpendOn, _budget: Setting, made: SpentSurvey) -> float:
     return 1 - mean_iou(confusion(state.farm.labels, made.drawn.classes, state.farm.weights.config.classes))
 
 

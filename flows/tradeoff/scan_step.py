@@ -26,7 +26,7 @@ Values = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Captured:
+class CapturedAtStep:
     """Sweeps of one strip by their step, calibrated, and what a full scan without noise makes of the scene."""
 
     camera: LineCamera
@@ -35,14 +35,14 @@ class Captured:
     noise: float  # of one line over the scene's standard deviation
 
 
-def _prepare(seed: int) -> Captured:
+def _prepare(seed: int) -> CapturedAtStep:
     camera = LineCamera(samples=SHAPE[1])
     source = SimulatedSource(farm_scene(seed, SHAPE), Rig(camera), seed)
     sweeps = {step: _capture(source, step) for step in STEPS}
     calm = _capture(replace(source, chosen=QUIET), 1)
     full = _rectify(camera, *calm)
     noise = float(np.nanstd(sweeps[1][1] - calm[1]) / np.nanstd(full))
-    return Captured(camera, sweeps, full, noise)
+    return CapturedAtStep(camera, sweeps, full, noise)
 
 
 def _capture(source: SimulatedSource, step: int) -> tuple[SimulatedSweep, Values]:
@@ -62,7 +62,7 @@ def _rectify(camera: LineCamera, lines: SimulatedSweep, values: Values) -> Value
     return seen.reshape(*SHAPE, -1)
 
 
-def _judge(state: Captured, _step: Setting, out: Values) -> float:
+def _judge(state: CapturedAtStep, _step: Setting, out: Values) -> float:
     return float(np.sqrt(np.nanmean((out - state.full) ** 2)) / np.nanstd(state.full))
 
 

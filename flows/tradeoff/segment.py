@@ -12,7 +12,7 @@ from flows.tradeoff.entries import Level, Setting, Tradeoff, register
 from flows.tradeoff.farm import FarmLook, look_at_farm
 from models.evaluation.metrics import confusion, mean_iou
 from models.policies.policies import score_seats
-from models.reading.inference import ClassMap, CoarseLook, Precision, glance, look_coarsely, read_glance, segment
+from models.reading.inference import CoarseLook, DrawnMap, Precision, glance, look_coarsely, read_glance, segment
 from pipeline.planning.selection import frame_seats
 from pipeline.rectify.region import read_seats
 from pipeline.simulator.simulated import SimulatedSweep
@@ -45,8 +45,8 @@ class Farm:
     look: CoarseLook
     columns: Values  # (seat, p, p, column) of them
     pixels: Mapping[Setting, Pixels]
-    reference: ClassMap
-    again: ClassMap  # of everything as well, with the noise drawn anew
+    reference: DrawnMap
+    again: DrawnMap  # of everything as well, with the noise drawn anew
 
 
 def _prepare(seed: int) -> Farm:
@@ -75,7 +75,7 @@ def _fine_values(farm: FarmLook) -> Values:
     return np.asarray(values, np.float32)
 
 
-def _with_seats(state: Farm, share: Setting) -> ClassMap:
+def _with_seats(state: Farm, share: Setting) -> DrawnMap:
     """Glance, score and draw; with every seat there is nothing to choose."""
     weights, wanted = state.farm.weights, float(share)
     if wanted == 1:
@@ -86,23 +86,23 @@ def _with_seats(state: Farm, share: Setting) -> ClassMap:
     return segment(weights, seen, state.columns[np.searchsorted(state.seats, chosen)], chosen)
 
 
-def _in_precision(state: Farm, precision: Setting) -> ClassMap:
+def _in_precision(state: Farm, precision: Setting) -> DrawnMap:
     chosen: Precision = "bfloat16" if precision == "bfloat16" else "float32"
     return segment(state.farm.weights, state.look, state.columns, state.seats, precision=chosen)
 
 
-def _with_bands(state: Farm, bands: Setting) -> ClassMap:
+def _with_bands(state: Farm, bands: Setting) -> DrawnMap:
     """From scene values on: fewer bands are fewer values to bring to spectral columns."""
     weights, pixels = state.farm.weights, state.pixels[bands]
     seen = glance(weights, pixels.coarse, pixels.wavelength_nm, state.farm.grid)
     return segment(weights, seen, weights.columns(pixels.fine, pixels.wavelength_nm), state.seats)
 
 
-def _miss(state: Farm, _setting: Setting, drawn: ClassMap) -> float:
+def _miss(state: Farm, _setting: Setting, drawn: DrawnMap) -> float:
     return 1 - mean_iou(confusion(state.farm.labels, drawn.classes, state.farm.weights.config.classes))
 
 
-def _disagreement(state: Farm, _setting: Setting, drawn: ClassMap) -> float:
+def _disagreement(state: Farm, _setting: Setting, drawn: DrawnMap) -> float:
     return float(np.mean(drawn.classes != state.reference.classes))
 
 

@@ -30,7 +30,7 @@ KEPT_BITS = (23.0, 13.0, 11.0, 9.0, 7.0, 5.0)
 
 
 @dataclass(frozen=True)
-class Captured:
+class CapturedToStore:
     """Raw lines of a farm, its coarse mosaic, and the map that the mosaic gives as it is."""
 
     raw: NDArray[np.uint16]  # (line, sample, band)
@@ -49,7 +49,7 @@ class Stored:
     values: NDArray[np.generic]
 
 
-def _prepare(seed: int) -> Captured:
+def _prepare(seed: int) -> CapturedToStore:
     weights = load_weights(Path(str(resources.files("models") / "shipped" / SHIPPED)))
     camera, scene = LineCamera(), farm_scene(seed, SHAPE)
     grid = SceneGrid(*SHAPE, weights.config.patch, weights.config.factor)
@@ -59,7 +59,7 @@ def _prepare(seed: int) -> Captured:
     mosaic = np.concatenate([values for _, values, _ in mosaic_rows(sweeps, camera, grid, rows=64)])
     raw = SimulatedSweep(source, full[0]).read(0, RAW_LINES)
     classes = _map_of(weights, mosaic, scene.wavelength_nm, grid)
-    return Captured(raw, mosaic, weights, grid, scene.wavelength_nm, classes)
+    return CapturedToStore(raw, mosaic, weights, grid, scene.wavelength_nm, classes)
 
 
 def _map_of(
@@ -69,25 +69,25 @@ def _map_of(
     return segment(weights, glance(weights, mosaic, wavelength_nm, grid), empty, np.empty(0, np.int64)).classes
 
 
-def _write_raw(state: Captured, codec: Setting) -> Stored:
+def _write_raw(state: CapturedToStore, codec: Setting) -> Stored:
     return Stored(*store_in_memory(state.raw, str(codec)))
 
 
-def _bytes_a_sample(state: Captured, _codec: Setting, made: Stored) -> float:
+def _bytes_a_sample(state: CapturedToStore, _codec: Setting, made: Stored) -> float:
     assert np.array_equal(made.values, state.raw), "a codec of raw numbers must give them back"
     return made.size / state.raw.size
 
 
-def _write_rounded(state: Captured, bits: Setting) -> Stored:
+def _write_rounded(state: CapturedToStore, bits: Setting) -> Stored:
     kept = int(bits)
     return Stored(*store_in_memory(round_bits(state.mosaic, kept) if kept < 23 else state.mosaic, "zstd-3"))
 
 
-def _rounded_bytes(state: Captured, _bits: Setting, made: Stored) -> float:
+def _rounded_bytes(state: CapturedToStore, _bits: Setting, made: Stored) -> float:
     return made.size / state.mosaic.size
 
 
-def _disagreement(state: Captured, _bits: Setting, made: Stored) -> float:
+def _disagreement(state: CapturedToStore, _bits: Setting, made: Stored) -> float:
     drawn = _map_of(state.weights, np.asarray(made.values, np.float32), state.wavelength_nm, state.grid)
     return float(np.mean(drawn != state.classes))
 

@@ -20,7 +20,7 @@ GOAL_PX = 2e-3
 
 
 @dataclass(frozen=True)
-class Looked:
+class TiesLookedUp:
     """A sweep over a grid, and the exact line and sample of every pixel."""
 
     camera: LineCamera
@@ -28,14 +28,14 @@ class Looked:
     exact: NDArray[np.float64]  # (y, x, 2)
 
 
-def _prepare(_seed: int) -> Looked:
+def _prepare(_seed: int) -> TiesLookedUp:
     camera = LineCamera()
     (track,) = make_tracks(line_positions(SWEEP, camera), camera)
     y, x = (origin + np.arange(size) for origin, size in zip(ORIGIN_PX, SHAPE, strict=True))
-    return Looked(camera, track, scene_to_sweep(SWEEP, camera, *np.broadcast_arrays(x[None, :], y[:, None])))
+    return TiesLookedUp(camera, track, scene_to_sweep(SWEEP, camera, *np.broadcast_arrays(x[None, :], y[:, None])))
 
 
-def _run(state: Looked, spacing: Setting) -> list[NDArray[np.float64]]:
+def _run(state: TiesLookedUp, spacing: Setting) -> list[NDArray[np.float64]]:
     table = tie_table(
         state.track,
         state.camera,
@@ -51,7 +51,7 @@ def _run(state: Looked, spacing: Setting) -> list[NDArray[np.float64]]:
     return [table.coordinates(slice(row, min(row + ROWS, SHAPE[0])), columns) for row in range(0, SHAPE[0], ROWS)]
 
 
-def _judge(state: Looked, _spacing: Setting, out: list[NDArray[np.float64]]) -> float:
+def _judge(state: TiesLookedUp, _spacing: Setting, out: list[NDArray[np.float64]]) -> float:
     return float(np.abs(np.concatenate(out) - state.exact).max())
 
 

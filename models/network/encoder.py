@@ -18,7 +18,7 @@ LAST_QUERIES: ContextVar[list[Tensor] | None] = ContextVar("LAST_QUERIES", defau
 Memory = tuple[Tensor, Tensor]  # keys and values of one layer, (B, heads, N, d / heads)
 
 
-class Attention(nn.Module):
+class TokenAttention(nn.Module):
     """Multi-head attention with normalised queries and keys: bounded logits, safe in half precision."""
 
     def __init__(self, dim: int, heads: int) -> None:
@@ -54,13 +54,13 @@ class Attention(nn.Module):
         return asked, (self.key_norm(k), v)
 
 
-class Block(nn.Module):
+class EncoderBlock(nn.Module):
     """Pre-norm transformer block."""
 
     def __init__(self, dim: int, heads: int, mlp_ratio: int) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(dim)
-        self.attention = Attention(dim, heads)
+        self.attention = TokenAttention(dim, heads)
         self.norm2 = nn.LayerNorm(dim)
         self.mlp = nn.Sequential(nn.Linear(dim, mlp_ratio * dim), nn.GELU(), nn.Linear(mlp_ratio * dim, dim))
 
@@ -76,7 +76,7 @@ class Encoder(nn.Module):
 
     def __init__(self, dim: int, layers: int, heads: int, mlp_ratio: int) -> None:
         super().__init__()
-        self.blocks = nn.ModuleList(Block(dim, heads, mlp_ratio) for _ in range(layers))
+        self.blocks = nn.ModuleList(EncoderBlock(dim, heads, mlp_ratio) for _ in range(layers))
         self.norm = nn.LayerNorm(dim)
 
     def forward(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.network.cost import control_multiply_adds as control_multiply_adds
-from models.reading.inference import PATCHES_AT_ONCE, ClassMap, CoarseLook, check_seats, decide, draw_coarse, origin_of
+from models.reading.inference import PATCHES_AT_ONCE, CoarseLook, DrawnMap, check_seats, decide, draw_coarse, origin_of
 from models.weights.files import AnyWeights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid, pad_by_reflection
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 def draw_with_control(
     weights: AnyWeights, look: CoarseLook, fine: NDArray[np.floating], seats: NDArray[np.integer]
-) -> ClassMap:
+) -> DrawnMap:
     """Draw the class map of a scene with a control.
 
     Parameters
@@ -68,12 +68,12 @@ def draw_with_control(
         else:
             drawn = _draw_dense(network, look, fine, numbers)
     scene = np.s_[: look.grid.height, : look.grid.width]
-    return ClassMap(drawn.classes[scene].copy(), drawn.confidence[scene].copy())
+    return DrawnMap(drawn.classes[scene].copy(), drawn.confidence[scene].copy())
 
 
 def _draw_paper(
     network: PaperNetwork, look: CoarseLook, fine: NDArray[np.floating], seats: NDArray[np.int64]
-) -> ClassMap:
+) -> DrawnMap:
     import torch
 
     coarse = torch.from_numpy(look.columns).permute(2, 0, 1)[None].contiguous()
@@ -84,11 +84,11 @@ def _draw_paper(
 
 def _draw_dense(
     network: DenseNetwork, look: CoarseLook, fine: NDArray[np.floating], seats: NDArray[np.int64]
-) -> ClassMap:
+) -> DrawnMap:
     """Read every valid seat, from the fine image or from the coarse one brought up; classes decided patch by patch."""
     grid, p = look.grid, look.grid.patch
     y, x = grid.padded_shape
-    drawn = ClassMap(np.empty((y, x), np.uint8), np.empty((y, x), np.float32))
+    drawn = DrawnMap(np.empty((y, x), np.uint8), np.empty((y, x), np.float32))
     valid = grid.valid_seats()
     if network.config.sight == "coarse":
         chunks: Iterator[Tensor] = _brought_up(look)
@@ -106,7 +106,7 @@ def _draw_dense(
 
 def _draw_halved(
     network: DenseNetwork, look: CoarseLook, fine: NDArray[np.floating], seats: NDArray[np.int64]
-) -> ClassMap:
+) -> DrawnMap:
     """Read means of 2 x 2 px and bring the map up."""
     import torch
 

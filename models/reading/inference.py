@@ -67,7 +67,7 @@ class Glance(CoarseLook):
 
 
 @dataclass(frozen=True)
-class ClassMap:
+class DrawnMap:
     """The map of a scene: class of each pixel and the probability given to it."""
 
     classes: NDArray[np.uint8]  # (y, x), 255 where nothing can be said
@@ -203,7 +203,7 @@ def _glance(
 def segment(
     weights: Weights, seen: CoarseLook, patches: NDArray[np.floating], seats: NDArray[np.integer],
     *, precision: Precision = "float32",
-) -> ClassMap:  # fmt: skip
+) -> DrawnMap:  # fmt: skip
     """Draw the class map from the coarse look and the fine patches.
 
     Parameters
@@ -230,7 +230,7 @@ def segment(
 def segment_batch(
     weights: Weights, seen: Sequence[CoarseLook], patches: Sequence[NDArray[np.floating]],
     seats: Sequence[NDArray[np.integer]], *, precision: Precision = "float32",
-) -> list[ClassMap]:  # fmt: skip
+) -> list[DrawnMap]:  # fmt: skip
     """Draw the maps of scenes of any sizes and numbers of seats together, as ``segment`` one by one, but faster.
 
     Fine patches of all scenes are packed, nothing is padded. For the rest see ``segment``.
@@ -255,7 +255,7 @@ def segment_batch(
 
 def _draw_pack(
     weights: Weights, pack: Sequence[tuple[CoarseLook, NDArray[np.floating], NDArray[np.int64]]], precision: Precision
-) -> Iterator[ClassMap]:
+) -> Iterator[DrawnMap]:
     """Maps of scenes that are read together."""
     import torch
 
@@ -278,7 +278,7 @@ def _draw_pack(
             drawn.confidence[y : y + p, x : x + p] = sure
     for drawn, look in zip(padded, looks, strict=True):
         scene = np.s_[: look.grid.height, : look.grid.width]
-        yield ClassMap(drawn.classes[scene].copy(), drawn.confidence[scene].copy())
+        yield DrawnMap(drawn.classes[scene].copy(), drawn.confidence[scene].copy())
 
 
 def captured(patches: NDArray[np.floating], seats: NDArray[np.int64]) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
@@ -361,13 +361,13 @@ def origin_of(look: CoarseLook) -> Tensor | None:
     return torch.tensor([look.origin]) if any(look.origin) else None
 
 
-def draw_coarse(logits: Tensor, grid: SceneGrid) -> ClassMap:
+def draw_coarse(logits: Tensor, grid: SceneGrid) -> DrawnMap:
     """Bring coarse logits up to the padded fine grid and decide, in strips of rows."""
     import torch
     import torch.nn.functional as F  # noqa: N812 - its usual name
 
     y, x = grid.padded_shape
-    drawn = ClassMap(np.empty((y, x), np.uint8), np.empty((y, x), np.float32))
+    drawn = DrawnMap(np.empty((y, x), np.uint8), np.empty((y, x), np.float32))
     cell = grid.patch
     padded = F.pad(logits, (0, 0, 1, 1), mode="replicate").contiguous(memory_format=torch.channels_last)
     for top in range(0, y // grid.factor, cell):

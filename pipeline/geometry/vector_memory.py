@@ -28,7 +28,7 @@ class Held(Protocol):
 
 
 @dataclass(frozen=True)
-class Part:
+class MemoryPart:
     """Lines ``lines[0]`` to ``lines[1]`` of a sweep in the pairs ``pairs[0]`` to ``pairs[1]`` of a load, half open."""
 
     sweep: int  # place in the list of sweeps
@@ -40,14 +40,14 @@ class Part:
 class Load:
     """What the memory holds at one time. A pair is an X and a Y; both channels lie in one vector, Y behind X."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[MemoryPart, ...]
 
     @property
     def pairs(self) -> int:
         """Pairs in the memory."""
         return self.parts[-1].pairs[1]
 
-    def channels(self, part: Part) -> tuple[tuple[int, int], tuple[int, int]]:
+    def channels(self, part: MemoryPart) -> tuple[tuple[int, int], tuple[int, int]]:
         """Give the cells (start, stop) of a part's X and of its Y in the one vector, half open."""
         start, stop = part.pairs
         return (start, stop), (self.pairs + start, self.pairs + stop)
@@ -68,7 +68,7 @@ def memory_loads(sweeps: Sequence[Held], vector_pairs: int) -> list[Load]:
     SettingsError : the positions of one line do not fit the memory.
     """
     loads: list[Load] = []
-    parts: list[Part] = []
+    parts: list[MemoryPart] = []
     used = 0
     for number, sweep in enumerate(sweeps):
         _check_line(sweep, vector_pairs)
@@ -80,7 +80,7 @@ def memory_loads(sweeps: Sequence[Held], vector_pairs: int) -> list[Load]:
                 parts, used = [], 0
                 continue
             taken = min(room, sweep.lines - line)
-            parts.append(Part(number, (line, line + taken), (used, used + taken * sweep.step)))
+            parts.append(MemoryPart(number, (line, line + taken), (used, used + taken * sweep.step)))
             line, used = line + taken, used + taken * sweep.step
     return [*loads, Load(tuple(parts))] if parts else loads
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.planning.line_cover import NEGLIGIBLE, Cover, Field, Floats, best_cover
-from pipeline.planning.scan_runs import Run, joined
+from pipeline.planning.scan_runs import ScanRun, joined
 
 HALVINGS = 4
 PEELS = 8
@@ -102,12 +102,12 @@ def _peeled(field: Field, cover: Cover) -> Iterator[Cover]:
         yield cover
 
 
-def _cuts(field: Field, run: Run, own: Floats) -> list[tuple[float, list[Run]]]:
+def _cuts(field: Field, run: ScanRun, own: Floats) -> list[tuple[float, list[ScanRun]]]:
     """Best way to shorten a run from its start, from its end, and to drop it: worth lost per second, what remains."""
     views, prices = field.shown(run), field.prices
     worth = own[field.views.seat[views]]
     whole = prices.even_seconds(run.stop - run.first, 1)
-    found: list[tuple[float, list[Run]]] = [(float(worth.sum()) / whole, [])]
+    found: list[tuple[float, list[ScanRun]]] = [(float(worth.sum()) / whole, [])]
     for from_start in (True, False):
         away = field.views.first[views] - run.first if from_start else run.stop - field.views.stop[views]
         order = np.argsort(away, kind="stable")
@@ -188,21 +188,21 @@ def _one_more(field: Field, cover: Cover, budget_s: float) -> Cover:
     """Spend what a cover leaves on a run more or a run made longer, whichever shows more."""
     prices, views, runs = field.prices, field.views, list(cover.runs)
     tables = field.tables(field.left(runs))
-    options: list[tuple[float, list[Run]]] = []
+    options: list[tuple[float, list[ScanRun]]] = []
     cells = (prices.most_lines(budget_s, len(runs) + 1) - cover.lines) // tables.unit
     if cells > 0:
         cells = min(cells, tables.closed.shape[1] - 1)
         gain = tables.closed[:, cells:] - tables.begun[:, : tables.begun.shape[1] - cells]
         strip, at = (int(place) for place in np.unravel_index(int(gain.argmax()), gain.shape))
-        new = Run(strip, at * tables.unit, (at + cells) * tables.unit)
+        new = ScanRun(strip, at * tables.unit, (at + cells) * tables.unit)
         options.append((float(gain[strip, at]), [*runs, new]))
     lines = prices.most_lines(budget_s, len(runs)) - cover.lines
     for place, run in enumerate(runs if lines > 0 else []):
-        for grown in (Run(run.strip, run.first, run.stop + lines), Run(run.strip, run.first - lines, run.stop)):
+        for grown in (ScanRun(run.strip, run.first, run.stop + lines), ScanRun(run.strip, run.first - lines, run.stop)):
             first, stop = max(grown.first, 0), min(grown.stop, views.lines)
             at, end = -(-first // tables.unit), stop // tables.unit
             gained = float(tables.closed[run.strip, end] - tables.begun[run.strip, at])
-            options.append((gained, [*runs[:place], Run(run.strip, first, stop), *runs[place + 1 :]]))
+            options.append((gained, [*runs[:place], ScanRun(run.strip, first, stop), *runs[place + 1 :]]))
     if not options:
         return cover
     gained, chosen = max(options, key=lambda option: option[0])
@@ -213,7 +213,7 @@ def _one_more(field: Field, cover: Cover, budget_s: float) -> Cover:
     return Cover(found.runs, cover.worth + gained, found.even_s)
 
 
-def _completed(field: Field, runs: Sequence[Run]) -> list[Run]:
+def _completed(field: Field, runs: Sequence[ScanRun]) -> list[ScanRun]:
     """Add, for each seat that no run shows, the shortest run that does."""
     views, found = field.views, list(runs)
     lengths = views.stop - views.first
@@ -222,5 +222,5 @@ def _completed(field: Field, runs: Sequence[Run]) -> list[Run]:
     left = field.left(found)
     for view in shortest[left[views.seat[shortest]] > 0].tolist():
         strip = int(np.searchsorted(views.edges, view, side="right")) - 1
-        found.append(Run(strip, int(views.first[view]), int(views.stop[view])))
+        found.append(ScanRun(strip, int(views.first[view]), int(views.stop[view])))
     return joined(found, field.gap)

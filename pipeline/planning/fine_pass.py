@@ -17,7 +17,7 @@ from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.budget_search import cheapest_cover, full_scan_pays, spend
 from pipeline.planning.coverage import check_reach, full_sweeps
 from pipeline.planning.line_cover import NEGLIGIBLE, Cover, Field
-from pipeline.planning.scan_runs import Prices, Run
+from pipeline.planning.scan_runs import ScanPrices, ScanRun
 from pipeline.planning.selection import check_threshold
 from pipeline.planning.strips import covered_seats, look_from, strips_at_seats
 
@@ -231,9 +231,9 @@ def _field(
     return Field(views, worth, column if along == "x" else row, prices_of(camera, cost))
 
 
-def prices_of(camera: LineCamera, cost: CostModel) -> Prices:
+def prices_of(camera: LineCamera, cost: CostModel) -> ScanPrices:
     """Give the cost model's prices of fine lines (one held position each) and runs."""
-    return Prices(camera.frame_ms * 1e-3, cost.setup_seconds(camera), cost.reload_s, cost.vector_pairs)
+    return ScanPrices(camera.frame_ms * 1e-3, cost.setup_seconds(camera), cost.reload_s, cost.vector_pairs)
 
 
 def _sweeps(field: Field, cover: Cover) -> list[Sweep]:
@@ -241,7 +241,7 @@ def _sweeps(field: Field, cover: Cover) -> list[Sweep]:
     return [_cut(field.views.strips[run.strip], run) for run in sorted(cover.runs)]
 
 
-def _cut(strip: Sweep, run: Run) -> Sweep:
+def _cut(strip: Sweep, run: ScanRun) -> Sweep:
     name = f"{strip.name}-{run.first:05d}"
     return replace(strip, name=name, start_px=strip.start_px + run.first, lines=run.stop - run.first)
 

@@ -22,7 +22,7 @@ WIDTHS = (1, 2, 3, 4, 6, 8, 16)  # rows of seats in a block
 
 
 @dataclass(frozen=True)
-class Block:
+class LineBlock:
     """Lines ``first`` to ``stop`` of one strip: what rows of its seats need."""
 
     strip: int
@@ -46,12 +46,12 @@ class LineBlocks:
     camera: LineCamera
     cost: CostModel
     strips: tuple[Sweep, ...]
-    blocks: tuple[Block, ...]
+    blocks: tuple[LineBlock, ...]
 
-    def sweeps(self, chosen: Sequence[Block]) -> list[Sweep]:
+    def sweeps(self, chosen: Sequence[LineBlock]) -> list[Sweep]:
         """Blocks as sweeps; those closer than a second set-up takes are scanned through."""
         setup = self.cost.setup_seconds(self.camera) / (self.camera.frame_ms * 1e-3)
-        runs: list[Block] = []
+        runs: list[LineBlock] = []
         for block in sorted(chosen, key=lambda one: (one.strip, one.first)):
             if runs and runs[-1].strip == block.strip and block.first - runs[-1].stop <= setup:
                 runs[-1] = replace(runs[-1], stop=max(runs[-1].stop, block.stop))
@@ -67,19 +67,19 @@ class LineBlocks:
             for run in runs
         ]
 
-    def seconds(self, chosen: Sequence[Block]) -> float:
+    def seconds(self, chosen: Sequence[LineBlock]) -> float:
         """Price of some blocks [s]."""
         return self.cost.seconds(self.sweeps(chosen), self.camera)
 
-    def seats(self, chosen: Sequence[Block]) -> NDArray[np.intp]:
+    def seats(self, chosen: Sequence[LineBlock]) -> NDArray[np.intp]:
         """Give the seats that blocks show, ascending."""
         return covered_seats(self.grid, self.camera, self.sweeps(chosen))
 
-    def evenly(self, budget_s: float) -> list[Block]:
+    def evenly(self, budget_s: float) -> list[LineBlock]:
         """Choose the most evenly spaced blocks that the seconds pay for."""
         total = len(self.blocks)
 
-        def spaced(count: int) -> list[Block]:
+        def spaced(count: int) -> list[LineBlock]:
             return [self.blocks[int((number + 0.5) * total / count)] for number in range(count)]
 
         for count in range(total, 0, -1):
@@ -87,9 +87,9 @@ class LineBlocks:
                 return spaced(count)
         return []
 
-    def at_random(self, budget_s: float, rng: np.random.Generator) -> list[Block]:
+    def at_random(self, budget_s: float, rng: np.random.Generator) -> list[LineBlock]:
         """Choose blocks in a random order, leaving out those that the seconds do not pay for any more."""
-        chosen: list[Block] = []
+        chosen: list[LineBlock] = []
         for number in rng.permutation(len(self.blocks)):
             grown = [*chosen, self.blocks[number]]
             if self.seconds(grown) <= budget_s:
@@ -97,7 +97,7 @@ class LineBlocks:
         return chosen
 
 
-def most_shown(options: Sequence[LineBlocks], choose: Callable[[LineBlocks], list[Block]]) -> Lines:
+def most_shown(options: Sequence[LineBlocks], choose: Callable[[LineBlocks], list[LineBlock]]) -> Lines:
     """Choose blocks of every width, and give the lines of the one that shows the most seats."""
     chosen = [Lines(blocks.sweeps(some), blocks.seats(some)) for blocks in options for some in [choose(blocks)]]
     return max(chosen, key=lambda lines: len(lines.seats))
@@ -114,7 +114,7 @@ def line_blocks(grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axi
     for number, strip in enumerate(strips):
         own = slice(views.edges[strip], views.edges[strip + 1])
         row, first, stop = down[views.seat[own]] // rows, views.first[own], views.stop[own]
-        blocks += [Block(number, int(first[row == at].min()), int(stop[row == at].max())) for at in np.unique(row)]
+        blocks += [LineBlock(number, int(first[row == at].min()), int(stop[row == at].max())) for at in np.unique(row)]
     return LineBlocks(grid, camera, cost, tuple(views.strips[strip] for strip in strips), tuple(blocks))
 
 

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.planning.scan_runs import Prices, Run, Tables, best_chains, joined
+from pipeline.planning.scan_runs import ScanPrices, ScanRun, Tables, best_chains, joined
 from pipeline.planning.strips import Views
 
 Floats = NDArray[np.float64]
@@ -30,7 +30,7 @@ NEGLIGIBLE = 1e-12  # of the total worth
 class Cover:
     """Runs, what the seats they show are worth together, and their additive price."""
 
-    runs: tuple[Run, ...] = ()
+    runs: tuple[ScanRun, ...] = ()
     worth: float = 0.0
     even_s: float = 0.0
 
@@ -39,7 +39,7 @@ class Cover:
         """Lines of all runs."""
         return sum(run.stop - run.first for run in self.runs)
 
-    def seconds(self, prices: Prices) -> float:
+    def seconds(self, prices: ScanPrices) -> float:
         """True price, whole reloads [s]."""
         return prices.seconds(self.lines, len(self.runs))
 
@@ -51,7 +51,7 @@ class Field:
     views: Views
     worth: Floats  # (seat,), 0 for seats that are not wanted
     column: Ints  # (seat,) place along the line: strips that share none are planned apart
-    prices: Prices
+    prices: ScanPrices
 
     @cached_property
     def total(self) -> float:
@@ -85,41 +85,41 @@ class Field:
         block = max(length // self.unit, LEAST_BLOCK)
         return Tables(np.cumsum(closed, axis=1), np.cumsum(begun, axis=1), self.unit, block)
 
-    def shown(self, run: Run) -> Ints:
+    def shown(self, run: ScanRun) -> Ints:
         """Numbers of the views that lie in a run, (view,)."""
         low, high = self.views.edges[run.strip : run.strip + 2]
         inside = (self.views.first[low:high] >= run.first) & (self.views.stop[low:high] <= run.stop)
         shown: Ints = low + np.flatnonzero(inside)
         return shown
 
-    def shown_seats(self, run: Run) -> Ints:
+    def shown_seats(self, run: ScanRun) -> Ints:
         """Seats that lie in a run, (seat,)."""
         seats: Ints = self.views.seat[self.shown(run)]
         return seats
 
-    def left(self, runs: Sequence[Run]) -> Floats:
+    def left(self, runs: Sequence[ScanRun]) -> Floats:
         """Worth of each seat that no run shows, 0 for the others, (seat,)."""
         left = self.worth.copy()
         for run in runs:
             left[self.shown_seats(run)] = 0.0
         return left
 
-    def cover(self, runs: Sequence[Run]) -> Cover:
+    def cover(self, runs: Sequence[ScanRun]) -> Cover:
         """Price runs and count what they show."""
         seats = self._seats(runs)
         return Cover(tuple(runs), float(self.worth[seats].sum()), self._even_seconds(runs))
 
-    def net(self, runs: Sequence[Run], left: Floats, rate: float) -> float:
+    def net(self, runs: Sequence[ScanRun], left: Floats, rate: float) -> float:
         """Worth less price of runs, given what is left to show and that a second costs ``rate``."""
         return float(left[self._seats(runs)].sum()) - rate * self._even_seconds(runs)
 
-    def _seats(self, runs: Sequence[Run]) -> Ints:
+    def _seats(self, runs: Sequence[ScanRun]) -> Ints:
         return np.unique(np.concatenate([np.zeros(0, np.intp), *map(self.shown_seats, runs)]))
 
-    def _even_seconds(self, runs: Sequence[Run]) -> float:
+    def _even_seconds(self, runs: Sequence[ScanRun]) -> float:
         return self.prices.even_seconds(sum(run.stop - run.first for run in runs), len(runs))
 
-    def trimmed(self, runs: Sequence[Run], left: Floats) -> list[Run]:
+    def trimmed(self, runs: Sequence[ScanRun], left: Floats) -> list[ScanRun]:
         """Shorten runs to the views that each adds to what is left, one after the other; drop those that add none."""
         left, kept = left.copy(), []
         for run in runs:
@@ -169,7 +169,7 @@ class Field:
         return np.minimum.accumulate(low[::-1])[::-1], np.maximum.accumulate(high)
 
 
-def best_cover(field: Field, start: Sequence[Run], rate: float) -> Cover:
+def best_cover(field: Field, start: Sequence[ScanRun], rate: float) -> Cover:
     """Find the runs with the most worth less price when a second costs ``rate`` of worth.
 
     The search goes from ``start``, and from the strips of a full scan where the field is up to about three of them wide
@@ -183,7 +183,7 @@ def best_cover(field: Field, start: Sequence[Run], rate: float) -> Cover:
     return max(found, key=lambda cover: cover.worth - rate * cover.even_s)
 
 
-def _settle(field: Field, start: Sequence[Run], rate: float) -> list[Run]:
+def _settle(field: Field, start: Sequence[ScanRun], rate: float) -> list[ScanRun]:
     """Choose chain after chain anew until a round changes none."""
     runs = joined(start, field.gap)
     for _ in range(MOST_ROUNDS if len(field.windows) == 1 else WIDE_ROUNDS):
@@ -195,7 +195,7 @@ def _settle(field: Field, start: Sequence[Run], rate: float) -> list[Run]:
     return runs
 
 
-def _round(field: Field, runs: list[Run], windows: Ints, rate: float) -> list[Run]:
+def _round(field: Field, runs: list[ScanRun], windows: Ints, rate: float) -> list[ScanRun]:
     """Choose each chain of each window anew, and try one chain more."""
     members = [set(window.tolist()) for window in windows]
     layer, layers = 0, 1
@@ -208,9 +208,9 @@ def _round(field: Field, runs: list[Run], windows: Ints, rate: float) -> list[Ru
     return runs
 
 
-def _chains(runs: Sequence[Run]) -> list[list[Run]]:
+def _chains(runs: Sequence[ScanRun]) -> list[list[ScanRun]]:
     """Share runs among as few chains as it takes."""
-    chains: list[list[Run]] = []
+    chains: list[list[ScanRun]] = []
     for run in sorted(runs, key=lambda run: (run.first, run.strip)):
         home = next((chain for chain in chains if chain[-1].stop <= run.first), None)
         if home is None:
@@ -220,7 +220,7 @@ def _chains(runs: Sequence[Run]) -> list[list[Run]]:
     return chains
 
 
-def _again(field: Field, runs: list[Run], windows: Ints, chosen: list[list[Run]], rate: float) -> list[Run]:
+def _again(field: Field, runs: list[ScanRun], windows: Ints, chosen: list[list[ScanRun]], rate: float) -> list[ScanRun]:
     """Choose one chain of each window anew, the other runs held; keep the old one where it is not bettered."""
     old = {run for chain in chosen for run in chain}
     kept = [run for run in runs if run not in old]

@@ -20,7 +20,7 @@ WORDS: dict[Axis, str] = {"x": "across the picture", "y": "down the picture"}  #
 
 
 @dataclass(frozen=True)
-class Outcome:
+class OrientationOutcome:
     """Both passes with lines along one axis: seconds of either, fine lines, and the share of the score bought."""
 
     along: Axis
@@ -37,8 +37,8 @@ class OrientationReport:
     ``other`` is None where that is not possible: ``why_not`` says why.
     """
 
-    taken: Outcome
-    other: Outcome | None
+    taken: OrientationOutcome
+    other: OrientationOutcome | None
     rows: CropRows | None
     why_not: str = ""
 
@@ -141,9 +141,9 @@ def _turned(along: Axis) -> Axis:
     return "y" if along == "x" else "x"
 
 
-def _outcome(along: Axis, coarse_s: float, plan: FinePlan) -> Outcome:
+def _outcome(along: Axis, coarse_s: float, plan: FinePlan) -> OrientationOutcome:
     share = plan.worth / plan.wanted_worth if plan.wanted_worth else None
-    return Outcome(along, coarse_s, plan.seconds, plan.lines, share)
+    return OrientationOutcome(along, coarse_s, plan.seconds, plan.lines, share)
 
 
 def _percent(share: float) -> str:

@@ -19,7 +19,7 @@ BYTES_PER_SAMPLE = 2  # raw samples are uint16
 
 
 @dataclass(frozen=True)
-class Entry:
+class SavingEntry:
     """One line of the receipt's savings: what was done, what full resolution takes, and how that figure is known."""
 
     done: float
@@ -62,7 +62,7 @@ def capture_savings(
     cost: CostModel,
     bands: int,
     full_is: FullIs = "predicted",
-) -> dict[str, Entry]:
+) -> dict[str, SavingEntry]:
     """Compare sweeps with those of a full scan.
 
     Returns
@@ -70,8 +70,8 @@ def capture_savings(
     ``lines``, ``samples`` (on the scene), ``bytes_raw`` and ``capture_s`` (by the cost model, in seconds).
     """
 
-    def entry(of_done: float, of_full: float) -> Entry:
-        return Entry(of_done, of_full, full_is)
+    def entry(of_done: float, of_full: float) -> SavingEntry:
+        return SavingEntry(of_done, of_full, full_is)
 
     return {
         "lines": entry(count_lines(done), count_lines(full)),

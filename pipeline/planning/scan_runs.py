@@ -13,7 +13,7 @@ Ints = NDArray[np.intp]
 
 
 @dataclass(frozen=True, order=True)
-class Run:
+class ScanRun:
     """Lines ``first`` to ``stop`` (half open) of one strip."""
 
     strip: int
@@ -22,7 +22,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Prices:
+class ScanPrices:
     """Seconds of a line, of opening a run, and of a reload that is due once every ``lines_per_reload`` lines."""
 
     line_s: float
@@ -69,7 +69,7 @@ class Tables:
     block: int  # borders closer than this hold no view between them
 
 
-def best_chains(tables: Tables, windows: Ints, line_price: float, run_price: float) -> list[list[Run]]:
+def best_chains(tables: Tables, windows: Ints, line_price: float, run_price: float) -> list[list[ScanRun]]:
     """Find, for each window of strips, the chain of runs with the most worth less price, one run after the other.
 
     best(e) = max(best(e - 1), max over strips and c of best(c) + closed(e) - begun(c) - (e - c) line - run), a block
@@ -110,23 +110,23 @@ def best_chains(tables: Tables, windows: Ints, line_price: float, run_price: flo
     return [_traced(*each, tables.unit) for each in zip(windows, pick, since, strict=True)]
 
 
-def _traced(strips: Ints, pick: Ints, since: Ints, unit: int) -> list[Run]:
+def _traced(strips: Ints, pick: Ints, since: Ints, unit: int) -> list[ScanRun]:
     """Runs of a chain, found from the last one back."""
     closes = np.maximum.accumulate(np.where(pick >= 0, np.arange(len(pick)), 0))
     runs, at = [], int(closes[-1])
     while at > 0:
         first = int(since[at])
-        runs.append(Run(int(strips[pick[at]]), first * unit, at * unit))
+        runs.append(ScanRun(int(strips[pick[at]]), first * unit, at * unit))
         at = int(closes[first])
     return runs[::-1]
 
 
-def joined(runs: Sequence[Run], gap: int) -> list[Run]:
+def joined(runs: Sequence[ScanRun], gap: int) -> list[ScanRun]:
     """Join runs of one strip that meet or lie at most ``gap`` lines apart, sorted."""
-    found: list[Run] = []
+    found: list[ScanRun] = []
     for run in sorted(runs):
         if found and found[-1].strip == run.strip and run.first <= found[-1].stop + gap:
             last = found.pop()
-            run = Run(last.strip, last.first, max(last.stop, run.stop))
+            run = ScanRun(last.strip, last.first, max(last.stop, run.stop))
         found.append(run)
     return found

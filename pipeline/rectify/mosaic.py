@@ -16,7 +16,7 @@ BLOCK_POINTS = 1024  # what is mixed at once stays in cache
 
 
 @dataclass(frozen=True)
-class Part:
+class MosaicPart:
     """One sweep on the mosaic's pixels: (n, band) values, (n,) weight of the resampling, (n,) distance to its edge.
 
     A point of weight 0 has no value at all; one of more may still be NaN in single bands.
@@ -36,7 +36,7 @@ def edge_distance(coordinates: NDArray[np.float64], lines: int, samples: int) ->
     return distance
 
 
-def mosaic(parts: Sequence[Part]) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+def mosaic(parts: Sequence[MosaicPart]) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     """Blend sweeps by weights that grow linearly from each sweep's edge.
 
     The weights are the same for all bands, so every spectrum is a convex mixture of captured ones; only a band that a
@@ -71,7 +71,7 @@ def mosaic(parts: Sequence[Part]) -> tuple[NDArray[np.float32], NDArray[np.intp]
     return blended, coverage
 
 
-def _blend_shared(blended: NDArray[np.float32], parts: Sequence[Part], points: NDArray[np.intp]) -> None:
+def _blend_shared(blended: NDArray[np.float32], parts: Sequence[MosaicPart], points: NDArray[np.intp]) -> None:
     """Write the mixtures at ``points``, which several parts reach."""
     shares = np.stack([_share(part, points) for part in parts])
     total = reduce(np.add, shares)  # part by part: ndarray.sum takes another order where there is one point alone
@@ -88,7 +88,9 @@ def _blend_shared(blended: NDArray[np.float32], parts: Sequence[Part], points: N
         blended[block] = mixed
 
 
-def _by_band(parts: Sequence[Part], weights: NDArray[np.floating], points: NDArray[np.intp]) -> NDArray[np.floating]:
+def _by_band(
+    parts: Sequence[MosaicPart], weights: NDArray[np.floating], points: NDArray[np.intp]
+) -> NDArray[np.floating]:
     """Mixtures at points where a part has no value in some bands: there the others count alone."""
     values = np.stack([part.values[points] for part in parts])
     counts = np.where(np.isnan(values), 0, weights[..., None])
@@ -99,7 +101,7 @@ def _by_band(parts: Sequence[Part], weights: NDArray[np.floating], points: NDArr
     return found
 
 
-def _share(part: Part, points: NDArray[np.intp]) -> NDArray[np.float64]:
+def _share(part: MosaicPart, points: NDArray[np.intp]) -> NDArray[np.float64]:
     """What a part counts at points: its weight times the distance to its edge, 0 where it does not reach."""
     weight = part.weight[points]
     share: NDArray[np.float64] = np.where(
@@ -108,7 +110,7 @@ def _share(part: Part, points: NDArray[np.intp]) -> NDArray[np.float64]:
     return share
 
 
-def _check_parts(parts: Sequence[Part]) -> None:
+def _check_parts(parts: Sequence[MosaicPart]) -> None:
     if not parts:
         raise ShapeError("a mosaic needs at least one sweep, got none")
     for number, part in enumerate(parts):

@@ -17,7 +17,7 @@ from pipeline.rectify.placed import place as place
 from pipeline.rectify.reach import TAPS, ColumnReach, TrackReach, member_lines
 from pipeline.rectify.resample import Kernel
 from pipeline.rectify.tracks import Track
-from pipeline.rectify.window import Looked, cut_runs, read_part
+from pipeline.rectify.window import LookedUp, cut_runs, read_part
 from pipeline.source import SweepLines
 
 GROUP_COLUMNS = 32  # tiles are cut between groups of so many columns
@@ -69,7 +69,7 @@ def mosaic_tile(
                 continue
             track = one.tracks[number][0]
             coordinates = one.coordinates(number, camera, grid, rows, columns)
-            looked.append(Looked(one, track, coordinates, _reader(one, track, coordinates, cache, near.samples)))
+            looked.append(LookedUp(one, track, coordinates, _reader(one, track, coordinates, cache, near.samples)))
     shape = rows.stop - rows.start, columns.stop - columns.start
     bands = len(placed[0].lines.references.panel)
     values, coverage = np.empty((*shape, bands), np.float32), np.zeros(shape, np.intp)
@@ -154,7 +154,7 @@ def read_seats(
             coordinates = one.look_up(track, camera, points)
             if np.isfinite(coordinates[..., 0]).any():
                 whole = slice(0, len(one.lines.references.dark))
-                looked.append(Looked(one, track, coordinates, _reader(one, track, coordinates, cache, whole)))
+                looked.append(LookedUp(one, track, coordinates, _reader(one, track, coordinates, cache, whole)))
     bands = len(placed[0].lines.references.panel)
     values = np.full((*points.shape[:3], bands), np.nan, np.float32)
     coverage = np.zeros(points.shape[:3], np.intp)
@@ -165,7 +165,7 @@ def read_seats(
 
 
 def _blend(
-    looked: Sequence[tuple[Looked, NDArray[np.float64]]], camera: LineCamera, kernel: Kernel
+    looked: Sequence[tuple[LookedUp, NDArray[np.float64]]], camera: LineCamera, kernel: Kernel
 ) -> tuple[Values, Counts]:
     """Read every track that reaches some of the points and blend them, (n, band) and (n,)."""
     read = [read_part(one, coordinates.reshape(-1, 2), camera, kernel) for one, coordinates in looked]

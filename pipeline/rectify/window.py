@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.rectify.line_cache import Raw, ReadWindow
-from pipeline.rectify.mosaic import Part, edge_distance
+from pipeline.rectify.mosaic import MosaicPart, edge_distance
 from pipeline.rectify.placed import Placed
 from pipeline.rectify.reach import TAPS, member_lines
 from pipeline.rectify.resample import Kernel, merge_lines, resample
@@ -21,7 +21,7 @@ RUN_ELEMENTS = 250_000  # what one more window costs, in elements (sample and ba
 
 
 @dataclass(frozen=True)
-class Looked:
+class LookedUp:
     """A track and the (..., 2) knots and samples at which it saw some points, NaN off it."""
 
     placed: Placed
@@ -30,7 +30,9 @@ class Looked:
     read: ReadWindow
 
 
-def read_part(looked: Looked, coordinates: NDArray[np.float64], camera: LineCamera, kernel: Kernel) -> Part | None:
+def read_part(
+    looked: LookedUp, coordinates: NDArray[np.float64], camera: LineCamera, kernel: Kernel
+) -> MosaicPart | None:
     """Calibrate and resample one track at lookup coordinates (n, 2); None where it reaches none of them.
 
     Lines that are not valid or that nothing saw, saturated and uncalibrated elements count nothing; where they leave
@@ -58,7 +60,7 @@ def read_part(looked: Looked, coordinates: NDArray[np.float64], camera: LineCame
     if len(starts) < len(members):
         values, valid = merge_lines(values, valid, starts)
     values_at, weight = resample(values, valid, coordinates - np.array([knots.start, samples.start]), kernel)
-    return Part(values_at, weight, edge_distance(coordinates, len(track), count))
+    return MosaicPart(values_at, weight, edge_distance(coordinates, len(track), count))
 
 
 def cut_runs(looked: Sequence[NDArray[np.float64]], bands: int) -> list[slice]:

@@ -28,7 +28,7 @@ from pipeline.errors import RigError
 from pipeline.source import Line
 from storage.archive.plain_files import open_plain, plain_reader, read_plain
 from storage.archive.staging import sync_path
-from storage.arrays.spool_index import FORMAT, Entry, Head, difference, read_head
+from storage.arrays.spool_index import FORMAT, Head, SpoolEntry, difference, read_head
 
 SYNC_LINES = 64
 MOST_NAMED = 8
@@ -138,7 +138,7 @@ class Spool:
         """
         if not self.lost:
             return
-        waiting, lost = list[Entry](), list(self.lost)
+        waiting, lost = list[SpoolEntry](), list(self.lost)
         for number, line in zip(lost, lines, strict=True):
             self._check_line(line, number)
             content = _to_bytes(line.data)
@@ -254,9 +254,9 @@ class Spool:
             f"finish that capture, or remove the folder to start anew"
         )
 
-    def _good_entries(self, index: bytes) -> dict[int, Entry]:
+    def _good_entries(self, index: bytes) -> dict[int, SpoolEntry]:
         """Entries by number, in order, of the lines whose numbers are those that were written."""
-        good: dict[int, Entry] = {}
+        good: dict[int, SpoolEntry] = {}
         with plain_reader(self.path) as data:
             for number, entry in sorted(self._head.entries(index).items()):
                 content = self._read(data, number)
@@ -264,7 +264,7 @@ class Spool:
                     good[number] = entry
         return good
 
-    def _keep_entries(self, index: bytes, entries: Mapping[int, Entry]) -> None:
+    def _keep_entries(self, index: bytes, entries: Mapping[int, SpoolEntry]) -> None:
         """Have the index begin with these entries and nothing else, without a write where it does so already."""
         wanted = self._head.text + b"".join(entries[number].text for number in sorted(entries))
         self._index_end = len(wanted)
@@ -281,7 +281,7 @@ class Spool:
             file.seek(number * self._line_bytes)
             _write_all(file, content)
 
-    def _add_entries(self, entries: list[Entry]) -> None:
+    def _add_entries(self, entries: list[SpoolEntry]) -> None:
         """Enter lines that were put back, once the disk has their numbers."""
         sync_path(self.path)
         index = read_plain(self.index_path)
@@ -294,7 +294,7 @@ class Spool:
         data.seek(number * self._line_bytes)
         return data.read(self._line_bytes)
 
-    def _line(self, number: int, entry: Entry | None, data: BinaryIO) -> Line:
+    def _line(self, number: int, entry: SpoolEntry | None, data: BinaryIO) -> Line:
         content = self._read(data, number)
         if entry is None or not entry.fits(content):
             what = "its entry in the index" if entry is None else "CRC-32"

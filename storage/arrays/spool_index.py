@@ -24,7 +24,7 @@ _KINDS = {
 
 
 @dataclass(frozen=True)
-class Entry:
+class SpoolEntry:
     """What the index says of a line, and as which text."""
 
     facts: Mapping[str, Any]
@@ -54,7 +54,7 @@ class Head:
         text = json.dumps(facts).encode()
         return cls(json.loads(text), with_check(text))
 
-    def entry(self, line: Line, content: bytes) -> Entry:
+    def entry(self, line: Line, content: bytes) -> SpoolEntry:
         """Give the entry of a line whose numbers are written as ``content``."""
         facts = {
             "line": int(line.number),
@@ -65,9 +65,9 @@ class Head:
             "valid": bool(line.valid),
             "crc32": zlib.crc32(content),
         }
-        return Entry(facts, with_check(json.dumps(facts).encode(), zlib.crc32(self.text)))
+        return SpoolEntry(facts, with_check(json.dumps(facts).encode(), zlib.crc32(self.text)))
 
-    def entries(self, index: bytes) -> dict[int, Entry]:
+    def entries(self, index: bytes) -> dict[int, SpoolEntry]:
         """Entries of an index that are whole and belong to this head, by number; whatever else it holds is passed over.
 
         Of two of one number the later counts.
@@ -106,13 +106,13 @@ def difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
     return "its header differs"
 
 
-def _entry(line: CheckedLine) -> Entry | None:
+def _entry(line: CheckedLine) -> SpoolEntry | None:
     facts = line.content
     if facts is None or line.state != "whole" or facts.keys() != _KINDS.keys():
         return None
     if any(type(facts[name]) is not kind for name, kind in _KINDS.items()) or facts["line"] < 0:
         return None
-    return Entry(facts, line.text + b"\n")
+    return SpoolEntry(facts, line.text + b"\n")
 
 
 def _table(value: object) -> Mapping[str, Any]:

@@ -15,7 +15,7 @@ from storage.archive.ledger import FOLDER, SUFFIX
 from storage.archive.plain_files import NotPlainError, kind_of, plain_reader, read_plain
 from storage.arrays.fetched_files import SUMS, first_unlike
 from storage.arrays.spool import envi_header, line_words
-from storage.arrays.spool_index import FORMAT, Entry, Head, known_head, read_head
+from storage.arrays.spool_index import FORMAT, Head, SpoolEntry, known_head, read_head
 
 SPOOLS = "spool"
 _LINES = re.compile(rb"\nlines = (\d{1,9})\n")
@@ -112,17 +112,17 @@ def _head_problems(index: bytes, name: str) -> Iterator[str]:
         yield f"{name}: its header has changed; lines that belong to it are told when the capture goes on"
 
 
-def _text(head: Head, entries: dict[int, Entry]) -> bytes:
+def _text(head: Head, entries: dict[int, SpoolEntry]) -> bytes:
     return head.text + b"".join(entries[number].text for number in sorted(entries))
 
 
-def _changed_behind(index: bytes, head: Head, entries: dict[int, Entry]) -> bool:
+def _changed_behind(index: bytes, head: Head, entries: dict[int, SpoolEntry]) -> bool:
     """Whether behind the last whole entry there is one that was whole once."""
     last = entries[max(entries)].text[:-1] if entries else head.text[:-1]
     return any(line.state == "changed" for line in read_checked(index[index.rfind(last) + len(last) :]))
 
 
-def _unlike(path: Path, head: Head, entries: dict[int, Entry]) -> Iterator[int]:
+def _unlike(path: Path, head: Head, entries: dict[int, SpoolEntry]) -> Iterator[int]:
     size = head.facts["samples"] * head.facts["bands"] * 2
     with plain_reader(path) as file:
         for number, entry in sorted(entries.items()):

@@ -32,7 +32,7 @@ _INDEX = re.compile(r"frameindex_(\d{1,12})\.txt", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
-class Part:
+class CubePart:
     """One file of a cube: its lines begin at line ``start`` of the whole."""
 
     start: int
@@ -48,7 +48,7 @@ class Part:
 class PartedCube:
     """Files that follow each other as one cube of ``lines``, some of which may be in none of them."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[CubePart, ...]
     lines: int
     times: LineTimes | None
     index_files: tuple[Path, ...]
@@ -106,7 +106,7 @@ def open_parts(folder: Path) -> PartedCube:
 def one_part(cube: EnviCube) -> PartedCube:
     """A single file as a cube of parts; the lines that it lost are its last."""
     notes: list[str] = []
-    parts = [Part(0, cube)]
+    parts = [CubePart(0, cube)]
     return PartedCube(tuple(parts), len(cube.values) + _lost_at_end(parts, notes), None, (), (*cube.notes, *notes))
 
 
@@ -172,8 +172,8 @@ def _check_alike(opened: Sequence[tuple[int, EnviCube]]) -> None:
             raise SceneError(f"{cube.path} has other wavelengths than {first.path.name}; ingest them by themselves")
 
 
-def _placed(opened: Sequence[tuple[int, EnviCube]], notes: list[str]) -> list[Part]:
-    parts: list[Part] = []
+def _placed(opened: Sequence[tuple[int, EnviCube]], notes: list[str]) -> list[CubePart]:
+    parts: list[CubePart] = []
     end = missing = 0
     for number, cube in opened:
         start = number - opened[0][0]
@@ -187,13 +187,13 @@ def _placed(opened: Sequence[tuple[int, EnviCube]], notes: list[str]) -> list[Pa
                 f"{missing} lines before {cube.path} are in no file, more than {MOST_MISSING}; ingest the parts by "
                 "themselves"
             )
-        parts.append(Part(max(start, end), cube))
+        parts.append(CubePart(max(start, end), cube))
         end = parts[-1].stop
         notes.extend(cube.notes)
     return parts
 
 
-def _lost_at_end(parts: Sequence[Part], notes: list[str]) -> int:
+def _lost_at_end(parts: Sequence[CubePart], notes: list[str]) -> int:
     """Lines that the last file promises and does not hold; none where a header promises more than can be meant."""
     lost = parts[-1].cube.lost_lines
     if lost <= MOST_MISSING:
@@ -202,7 +202,7 @@ def _lost_at_end(parts: Sequence[Part], notes: list[str]) -> int:
     return 0
 
 
-def _with_times(folder: Path, numbers: Sequence[int], parts: Sequence[Part], notes: list[str]) -> PartedCube:
+def _with_times(folder: Path, numbers: Sequence[int], parts: Sequence[CubePart], notes: list[str]) -> PartedCube:
     lines = parts[-1].stop + _lost_at_end(parts, notes)
     entries = [entry for entry in folder.iterdir() if entry.is_file()]
     found = {int(match[1]): entry for entry in entries if (match := _INDEX.fullmatch(entry.name))}

@@ -18,7 +18,7 @@ from pipeline.planning.budget_search import cheapest_cover, covers, spend
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps
 from pipeline.planning.fine_pass import check_budget, plan_fine, price_of_seats, prices_of
 from pipeline.planning.line_cover import Cover, Field
-from pipeline.planning.scan_runs import Prices
+from pipeline.planning.scan_runs import ScanPrices
 from pipeline.planning.strips import Views, look_from, strips_at_seats
 
 CAMERA, COST = LineCamera(), CostModel()
@@ -44,7 +44,7 @@ def _frames() -> list[Row]:
     whole = FRAMES * sum(sweep.lines for sweep in full)
     found, plans = [], []
     for along in ("y", "x"):
-        blocks = [_block_field(grid, along, seat, Prices(0.1, 0.0, 0.0, 1500)) for seat in seats]
+        blocks = [_block_field(grid, along, seat, ScanPrices(0.1, 0.0, 0.0, 1500)) for seat in seats]
         real = [_real_field(grid, along, seat, prices_of(CAMERA, COST)) for seat in seats]
         plans.append(_plans(real))
         free, exact = _curve(_plans(blocks), FRAMES * 2592), _curve(plans[-1], whole)
@@ -87,7 +87,7 @@ def _vegetation(folder: Path) -> tuple[SceneGrid, list[Worth]]:
     return grid, seats
 
 
-def _real_field(grid: SceneGrid, along: Axis, worth: Worth, prices: Prices) -> Field:
+def _real_field(grid: SceneGrid, along: Axis, worth: Worth, prices: ScanPrices) -> Field:
     """Seats as the rays show them."""
     views = look_from(grid, CAMERA, strips_at_seats(grid, CAMERA, along), worth > 0)
     return Field(views, worth, _columns(grid, along), prices)
@@ -98,7 +98,7 @@ def _columns(grid: SceneGrid, along: Axis) -> NDArray[np.intp]:
     return column if along == "x" else row
 
 
-def _block_field(grid: SceneGrid, along: Axis, worth: Worth, prices: Prices) -> Field:
+def _block_field(grid: SceneGrid, along: Axis, worth: Worth, prices: ScanPrices) -> Field:
     """Seats in blocks of lines, 640 px wide and neither turned nor tapped: how the design counts."""
     column = _columns(grid, along)
     row = _columns(grid, "y" if along == "x" else "x")
@@ -166,7 +166,7 @@ def _slope(one: Cover, other: Cover) -> float:
 
 def _greedy_curve(grid: SceneGrid, along: Axis, seats: list[Worth]) -> list[float]:
     """Peer: the block of lines that shows most new seats is taken next, over all frames."""
-    fields = [_block_field(grid, along, seat, Prices(0.1, 0.0, 0.0, 1500)) for seat in seats]
+    fields = [_block_field(grid, along, seat, ScanPrices(0.1, 0.0, 0.0, 1500)) for seat in seats]
     steps: list[float] = []
     for field in fields:
         strips, rows_, views = len(field.views.strips), -(-field.views.lines // SEAT), field.views
@@ -248,7 +248,7 @@ def _optimum() -> list[Row]:
     ]  # fmt: skip
 
 
-def _milp(field: Field, prices: Prices, budget_s: float) -> float:
+def _milp(field: Field, prices: ScanPrices, budget_s: float) -> float:
     """Most worth for a budget: is a strip on in a row, does it start there, is a seat shown, loads of the memory."""
     from scipy import sparse
     from scipy.optimize import Bounds, LinearConstraint, milp

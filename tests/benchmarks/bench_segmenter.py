@@ -21,8 +21,8 @@ from models.network.segmenter import Segmenter, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.policies.policies import score_seats
 from models.reading.inference import (
-    ClassMap,
     CoarseLook,
+    DrawnMap,
     Glance,
     draw_coarse,
     glance,
@@ -133,23 +133,23 @@ def _rate(clock: Clock) -> float:
     return FRAMES / clock.cpu_min_s
 
 
-def _packed(weights: Weights, frames: Sequence[Frame]) -> list[ClassMap]:
+def _packed(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
     looks, patches, seats = zip(*((one.look, one.patches, one.seats) for one in frames), strict=True)
     return segment_batch(weights, looks, patches, seats)
 
 
-def _one_by_one(weights: Weights, frames: Sequence[Frame]) -> list[ClassMap]:
+def _one_by_one(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
     return [segment(weights, one.look, one.patches, one.seats) for one in frames]
 
 
-def _padded(weights: Weights, frames: Sequence[Frame]) -> list[ClassMap]:
+def _padded(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
     """The usual way: batches of equal shapes, what is missing filled with zeros and masked in attention."""
     with torch.inference_mode():
         starts = range(0, len(frames), PADDED_AT_ONCE)
         return [drawn for first in starts for drawn in _padded_batch(weights, frames[first : first + PADDED_AT_ONCE])]
 
 
-def _padded_batch(weights: Weights, frames: Sequence[Frame]) -> list[ClassMap]:
+def _padded_batch(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
     model, config, p = weights.segmenter, weights.config, weights.config.patch
     rows, columns = (max(one.look.columns.shape[axis] for one in frames) // p for axis in (0, 1))
     most = max(len(one.seats) for one in frames)
@@ -194,7 +194,7 @@ def _masked(
     return encoder.norm(x), memory
 
 
-def _drawn(frame: Frame, coarse: torch.Tensor, fine: torch.Tensor) -> ClassMap:
+def _drawn(frame: Frame, coarse: torch.Tensor, fine: torch.Tensor) -> DrawnMap:
     """The map of one frame of a padded batch."""
     grid, p = frame.look.grid, frame.look.grid.patch
     y, x = frame.look.columns.shape[:2]
@@ -204,7 +204,7 @@ def _drawn(frame: Frame, coarse: torch.Tensor, fine: torch.Tensor) -> ClassMap:
         drawn.classes[top : top + p, left : left + p] = values
         drawn.confidence[top : top + p, left : left + p] = sure
     scene = np.s_[: grid.height, : grid.width]
-    return ClassMap(drawn.classes[scene].copy(), drawn.confidence[scene].copy())
+    return DrawnMap(drawn.classes[scene].copy(), drawn.confidence[scene].copy())
 
 
 def _bands() -> list[Row]:
@@ -218,7 +218,7 @@ def _bands() -> list[Row]:
     some = np.linspace(0, MANY - 1, FEW).astype(int)
     few = np.ascontiguousarray(coarse[..., some]), np.ascontiguousarray(fine[..., some])
 
-    def draw(coarse: NDArray[np.float32], fine: NDArray[np.float32], nm: NDArray[np.float64]) -> ClassMap:
+    def draw(coarse: NDArray[np.float32], fine: NDArray[np.float32], nm: NDArray[np.float64]) -> DrawnMap:
         seen = glance(weights, coarse, nm, FIELD)
         return segment(weights, seen, weights.columns(fine, nm), seats)
 
@@ -277,7 +277,7 @@ def _shares() -> list[Row]:
     ]
 
 
-def _adaptive(weights: Weights, every: Frame, count: int, precision: str = "float32") -> ClassMap:
+def _adaptive(weights: Weights, every: Frame, count: int, precision: str = "float32") -> DrawnMap:
     """Glance, score by the learned gain, and draw with so many seats."""
     seen: Glance = read_glance(weights, every.look, precision=precision)  # type: ignore[arg-type]
     scores = score_seats("gain", seen).ravel()[every.seats]

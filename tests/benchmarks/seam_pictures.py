@@ -10,7 +10,7 @@ from measure import data_folder
 from numpy.typing import NDArray
 from scipy.ndimage import shift as spline_shift
 
-from pipeline.rectify.mosaic import Part, edge_distance, mosaic
+from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.registration.shifts import pair_shift
 from pipeline.rectify.resample import Kernel, resample
 
@@ -34,7 +34,7 @@ class Picture:
     origin_px: Floats  # (2,) row and column of the grid, whole or not
     valid: NDArray[np.bool_] | None = None  # (row, column); None where every pixel counts
 
-    def on_grid(self, rows: range, columns: range, kernel: Kernel) -> Part:
+    def on_grid(self, rows: range, columns: range, kernel: Kernel) -> MosaicPart:
         """Resample the picture at a part of the grid's pixels."""
         row, column = np.arange(rows.start, rows.stop), np.arange(columns.start, columns.stop)
         at = np.stack(np.meshgrid(row - self.origin_px[0], column - self.origin_px[1], indexing="ij"), axis=-1)
@@ -43,7 +43,7 @@ class Picture:
         at[~(edge >= 0)] = np.nan
         mask = np.ones((height, width), bool) if self.valid is None else self.valid
         values, weight = resample(self.values, mask, at.reshape(-1, 2), kernel)
-        return Part(values, weight, edge.ravel())
+        return MosaicPart(values, weight, edge.ravel())
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from torch import nn
 
 from models.evaluation.metrics import mean_iou
 from models.evaluation.placement_metrics import captured_gain, gain_sums, oracle_gain
-from models.network.encoder import Attention
+from models.network.encoder import TokenAttention
 from models.network.pixel_side import ChannelNorm
 from models.network.scorer import MOST_GAIN, scoring_loss
 from models.network.segmenter import Segmenter, SegmenterConfig
@@ -60,7 +60,7 @@ def test_4_a_crop_without_a_label_is_no_step():
 @pytest.mark.parametrize("size", [0.0, 1e-30, 1e-6])
 def test_13_norms_of_nothing_are_nothing(size: float):
     """There is no cosine decoder; the norms that there are give 0 for zero tokens, with bounded gradients."""
-    attention, norm = Attention(16, 2), ChannelNorm(8)
+    attention, norm = TokenAttention(16, 2), ChannelNorm(8)
     pixels, tokens = torch.full((1, 8, 2, 2), size).requires_grad_(), torch.full((1, 3, 8), size).requires_grad_()
     for x, layer in ((pixels, norm), (tokens, attention.query_norm), (tokens, attention.key_norm)):
         out = layer(x)
@@ -72,7 +72,7 @@ def test_13_norms_of_nothing_are_nothing(size: float):
 
 def test_13_an_encoder_of_zero_tokens_has_finite_gradients():
     """Attention over tokens that are all 0 is finite forward and backward."""
-    attention, x = Attention(16, 2), torch.zeros(1, 5, 16, requires_grad=True)
+    attention, x = TokenAttention(16, 2), torch.zeros(1, 5, 16, requires_grad=True)
     attention(x, None, None)[0].square().sum().backward()
     assert x.grad is not None
     assert x.grad.isfinite().all()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flows.survey.region_work import seat_columns
 from models.network.dead_pixels import MOST_COLUMN
 from models.policies.policies import score_seats
-from models.reading.inference import ClassMap, Glance, decide, glance, glance_of_columns, look_coarsely, segment
+from models.reading.inference import DrawnMap, Glance, decide, glance, glance_of_columns, look_coarsely, segment
 from models.reading.regions import whole_field
 from models.weights.files import Weights
 from pipeline.geometry.camera import LineCamera
@@ -39,7 +39,7 @@ STRANGE = st.one_of(
 )
 
 
-def _drawn(coarse: NDArray[np.float32], fine: NDArray[np.float32]) -> tuple[Glance, ClassMap]:
+def _drawn(coarse: NDArray[np.float32], fine: NDArray[np.float32]) -> tuple[Glance, DrawnMap]:
     """Glance and map as a survey makes them of stored values."""
     seen = glance(WEIGHTS, coarse, NM, GRID)
     store: Any = SimpleNamespace(seats=SEATS, pick=lambda entries: fine[entries])
@@ -47,7 +47,7 @@ def _drawn(coarse: NDArray[np.float32], fine: NDArray[np.float32]) -> tuple[Glan
     return seen, segment(WEIGHTS, seen, columns, seats)
 
 
-def _alike(one: tuple[Glance, ClassMap], other: tuple[Glance, ClassMap]) -> bool:
+def _alike(one: tuple[Glance, DrawnMap], other: tuple[Glance, DrawnMap]) -> bool:
     parts = [
         (a.columns, a.probability, a.gain, score_seats("entropy", a), b.classes, b.confidence) for a, b in (one, other)
     ]

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.network.encoder import Attention, Encoder
+from models.network.encoder import Encoder, TokenAttention
 from pipeline.errors import ShapeError
 
 
@@ -73,4 +73,4 @@ def test_logits_stay_bounded(encoder: Encoder):
 def test_heads_must_share_the_width():
     """The message says width and heads."""
     with pytest.raises(ShapeError, match="width 16 do not divide by 3 heads"):
-        Attention(16, 3)
+        TokenAttention(16, 3)

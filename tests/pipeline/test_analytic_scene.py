@@ -13,7 +13,7 @@ from pipeline.geometry.scan import Axis, Sweep
 from pipeline.planning.coverage import on_scene
 from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.rectify.lookup import grid_lookup
-from pipeline.rectify.mosaic import Part, edge_distance, mosaic
+from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.resample import Kernel, resample
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig
@@ -94,7 +94,7 @@ def rectified(
     return mosaic(parts)[0].reshape(*shape, 2), truth.reshape(*shape, 2)
 
 
-def rectified_strip(scene: Waves, strip: float, along: Axis, *, step: int, kernel: Kernel, spoil: bool) -> Part:
+def rectified_strip(scene: Waves, strip: float, along: Axis, *, step: int, kernel: Kernel, spoil: bool) -> MosaicPart:
     """One sweep on the grid of the scene: captured, calibrated, looked up, resampled."""
     source = SimulatedSource(scene, Rig(CAMERA), chosen=effects_on("rotation", "slit", "smear"))
     sweep = sweep_over(scene, strip, along, step)
@@ -114,7 +114,7 @@ def rectified_strip(scene: Waves, strip: float, along: Axis, *, step: int, kerne
         spacing_px=step,
         shape=(scene.shape[0] // step, scene.shape[1] // step),
     ).reshape(-1, 2)
-    return Part(*resample(values, valid, at, kernel), edge_distance(at, raw.shape[0], raw.shape[1]))
+    return MosaicPart(*resample(values, valid, at, kernel), edge_distance(at, raw.shape[0], raw.shape[1]))
 
 
 def sweep_over(scene: Waves, strip: float, along: Axis, step: int) -> Sweep:

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.line_cover import Cover, Field, best_cover
-from pipeline.planning.scan_runs import Prices, Run
+from pipeline.planning.scan_runs import ScanPrices, ScanRun
 from pipeline.planning.strips import Views
 
-PRICES = Prices(line_s=1.0, run_s=3.0, reload_s=0.0, lines_per_reload=1500)
+PRICES = ScanPrices(line_s=1.0, run_s=3.0, reload_s=0.0, lines_per_reload=1500)
 
 
-def blocks(worth: np.ndarray, most: int, lines: int = 4, prices: Prices = PRICES) -> Field:
+def blocks(worth: np.ndarray, most: int, lines: int = 4, prices: ScanPrices = PRICES) -> Field:
     """A field of (row, column) seats of ``lines`` lines, seen ``most`` columns at a time from every offset."""
     rows, columns = worth.shape
     strips = range(max(columns - most, 0) + 1)
@@ -63,14 +63,14 @@ def test_a_strip_between_two_layouts_is_found():
     """Worth in the middle columns takes one run at its own offset, which strips side by side would need two for."""
     worth = np.zeros((3, 8))
     worth[1, 2:6] = 5.0
-    assert best_cover(blocks(worth, 4), (), 0.5) == Cover((Run(2, 4, 8),), 20.0, 7.0)
+    assert best_cover(blocks(worth, 4), (), 0.5) == Cover((ScanRun(2, 4, 8),), 20.0, 7.0)
 
 
 def test_each_run_has_its_own_offset():
     """Two groups of seats below each other and apart in columns are shown by two runs at two offsets."""
     worth = np.zeros((9, 8))
     worth[0, :4], worth[8, 3:7] = 5.0, 5.0
-    assert best_cover(blocks(worth, 4), (), 0.5).runs == (Run(0, 0, 4), Run(3, 32, 36))
+    assert best_cover(blocks(worth, 4), (), 0.5).runs == (ScanRun(0, 0, 4), ScanRun(3, 32, 36))
 
 
 def test_strips_overlap_where_the_field_is_no_multiple_of_them():
@@ -84,9 +84,12 @@ def test_strips_overlap_where_the_field_is_no_multiple_of_them():
 def test_runs_are_cut_to_what_they_add():
     """Lines that show only what another run shows are dropped, and so are runs that add nothing."""
     field = blocks(np.ones((4, 6)), 4)
-    left = field.left([Run(0, 0, 8)])
-    assert field.trimmed([Run(2, 0, 12), Run(1, 0, 8), Run(0, 0, 8)], left) == [Run(2, 0, 12), Run(1, 8, 12)][:1]
-    assert field.trimmed([Run(0, 0, 16)], left) == [Run(0, 8, 16)]
+    left = field.left([ScanRun(0, 0, 8)])
+    assert (
+        field.trimmed([ScanRun(2, 0, 12), ScanRun(1, 0, 8), ScanRun(0, 0, 8)], left)
+        == [ScanRun(2, 0, 12), ScanRun(1, 8, 12)][:1]
+    )
+    assert field.trimmed([ScanRun(0, 0, 16)], left) == [ScanRun(0, 8, 16)]
 
 
 @pytest.mark.parametrize("columns", [13, 20, 41])
@@ -129,7 +132,7 @@ def test_coarser_tables_lose_little(seed: int, unit: int):
 
 def test_the_gap_that_is_scanned_through_costs_no_more_than_a_set_up():
     """Its lines, with their share of reloads, stay within a set-up; one more would not."""
-    prices = Prices(line_s=0.1, run_s=0.9, reload_s=1.6, lines_per_reload=150)
+    prices = ScanPrices(line_s=0.1, run_s=0.9, reload_s=1.6, lines_per_reload=150)
     gap = blocks(np.ones((2, 2)), 2, prices=prices).gap
     assert gap == 8
     assert gap * prices.even_line_s <= prices.run_s < (gap + 1) * prices.even_line_s

@@ -8,16 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import ShapeError
-from pipeline.rectify.mosaic import Part, edge_distance, mosaic
+from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 
 
-def part(seed: int, points: int = 20, bands: int = 4) -> Part:
+def part(seed: int, points: int = 20, bands: int = 4) -> MosaicPart:
     """A sweep of random values with some points not reached, which hold NaN."""
     rng = np.random.default_rng(seed)
     values, weight = rng.random((points, bands), np.float32), rng.random(points).astype(np.float32)
     weight[rng.random(points) < 0.3] = 0
     values[weight == 0] = np.nan
-    return Part(values, weight, np.where(weight > 0, rng.uniform(0, 300, points), np.nan))
+    return MosaicPart(values, weight, np.where(weight > 0, rng.uniform(0, 300, points), np.nan))
 
 
 def test_one_sweep_comes_back_bit_by_bit() -> None:
@@ -43,7 +43,7 @@ def test_spectra_are_convex_mixtures(seeds: list[int]) -> None:
 def test_weights_are_linear_in_edge_distance() -> None:
     """A point 30 px inside one sweep and 10 px inside another is three quarters of the first."""
     ones, zeros, full = np.ones((1, 2), np.float32), np.zeros((1, 2), np.float32), np.ones(1, np.float32)
-    values, coverage = mosaic([Part(ones, full, np.array([30.0])), Part(zeros, full, np.array([10.0]))])
+    values, coverage = mosaic([MosaicPart(ones, full, np.array([30.0])), MosaicPart(zeros, full, np.array([10.0]))])
     np.testing.assert_allclose(values, 0.75)
     assert coverage.tolist() == [2]
 
@@ -51,7 +51,9 @@ def test_weights_are_linear_in_edge_distance() -> None:
 def test_weights_follow_the_resampling() -> None:
     """At equal distance from the edges a point of which a fifth of the taps was missing counts four fifths."""
     ones, zeros, edge = np.ones((1, 2), np.float32), np.zeros((1, 2), np.float32), np.array([20.0])
-    values, _ = mosaic([Part(ones, np.array([0.8], np.float32), edge), Part(zeros, np.ones(1, np.float32), edge)])
+    values, _ = mosaic(
+        [MosaicPart(ones, np.array([0.8], np.float32), edge), MosaicPart(zeros, np.ones(1, np.float32), edge)]
+    )
     np.testing.assert_allclose(values, 0.8 / 1.8, rtol=1e-6)
 
 
@@ -66,7 +68,7 @@ def test_a_band_without_a_value_is_the_other_sweeps() -> None:
     one, other = np.ones((1, 3), np.float32), np.full((1, 3), 3, np.float32)
     one[0, 1:], other[0, 2] = np.nan, np.nan
     full, edge = np.ones(1, np.float32), np.array([20.0])
-    values, coverage = mosaic([Part(one, full, edge), Part(other, full, edge)])
+    values, coverage = mosaic([MosaicPart(one, full, edge), MosaicPart(other, full, edge)])
     np.testing.assert_array_equal(values[0], [2, 3, np.nan])
     assert coverage.tolist() == [2]
 
@@ -77,7 +79,7 @@ def test_points_do_not_see_each_other(seed: int, cut: int) -> None:
     """Blending some of the points gives what blending all of them gives there, bit by bit."""
     parts = [part(seed), part(seed + 1)]
     whole = mosaic(parts)[0]
-    some = mosaic([Part(one.values[:cut], one.weight[:cut], one.edge_px[:cut]) for one in parts])[0]
+    some = mosaic([MosaicPart(one.values[:cut], one.weight[:cut], one.edge_px[:cut]) for one in parts])[0]
     np.testing.assert_array_equal(some, whole[:cut])
 
 
@@ -86,23 +88,24 @@ def test_a_point_alone_is_summed_as_among_others() -> None:
     rng = np.random.default_rng(5)
     full = np.ones(40, np.float32)
     parts = [
-        Part(np.where(rng.random((40, 1)) < 0.3, np.nan, rng.random((40, 1))).astype(np.float32), full,
+        MosaicPart(np.where(rng.random((40, 1)) < 0.3, np.nan, rng.random((40, 1))).astype(np.float32), full,
              rng.uniform(0, 300, 40))
         for _ in range(12)
     ]  # fmt: skip
     whole = mosaic(parts)[0]
     alone = [
-        mosaic([Part(one.values[[at]], one.weight[[at]], one.edge_px[[at]]) for one in parts])[0] for at in range(40)
+        mosaic([MosaicPart(one.values[[at]], one.weight[[at]], one.edge_px[[at]]) for one in parts])[0]
+        for at in range(40)
     ]
     np.testing.assert_array_equal(np.concatenate(alone), whole)
 
 
 def test_very_edge_counts_where_nothing_else_reaches() -> None:
     """A point exactly on a sweep's edge keeps its value, and on the edges of two it is their mean."""
-    values, coverage = mosaic([Part(np.full((1, 1), 7, np.float32), np.ones(1, np.float32), np.zeros(1))])
+    values, coverage = mosaic([MosaicPart(np.full((1, 1), 7, np.float32), np.ones(1, np.float32), np.zeros(1))])
     assert values[0, 0] == 7
     assert coverage[0] == 1
-    parts = [Part(np.full((1, 1), level, np.float32), np.ones(1, np.float32), np.zeros(1)) for level in (2, 4)]
+    parts = [MosaicPart(np.full((1, 1), level, np.float32), np.ones(1, np.float32), np.zeros(1)) for level in (2, 4)]
     assert mosaic(parts)[0].tolist() == [[3]]
 
 

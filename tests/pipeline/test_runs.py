@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.planning.scan_runs import Prices, Run, Tables, best_chains, joined
+from pipeline.planning.scan_runs import ScanPrices, ScanRun, Tables, best_chains, joined
 
 LINES = 7
-PRICES = Prices(line_s=1.0, run_s=1.5, reload_s=2.0, lines_per_reload=5)
+PRICES = ScanPrices(line_s=1.0, run_s=1.5, reload_s=2.0, lines_per_reload=5)
 Seat = tuple[int, int, float]  # first line, length, worth
 
 
@@ -26,7 +26,7 @@ def tables(strips: list[list[Seat]], block: int = 1) -> Tables:
     return Tables(closed, begun, 1, block)
 
 
-def shown(strips: list[list[Seat]], runs: tuple[Run, ...]) -> float:
+def shown(strips: list[list[Seat]], runs: tuple[ScanRun, ...]) -> float:
     """Worth of the seats that lie in one of the runs of their strip."""
     return sum(
         worth
@@ -36,10 +36,10 @@ def shown(strips: list[list[Seat]], runs: tuple[Run, ...]) -> float:
     )
 
 
-def every_chain(count: int) -> list[tuple[Run, ...]]:
+def every_chain(count: int) -> list[tuple[ScanRun, ...]]:
     """Every chain of up to two runs over some strips."""
     spans = list(combinations(range(LINES + 1), 2))
-    single = [Run(strip, a, b) for strip in range(count) for a, b in spans]
+    single = [ScanRun(strip, a, b) for strip in range(count) for a, b in spans]
     pairs = [pair for pair in product(single, repeat=2) if all(x.stop <= y.first for x, y in pairwise(pair))]
     return [(), *((run,) for run in single), *pairs]
 
@@ -52,7 +52,7 @@ seats_of_one_length = st.lists(st.tuples(st.integers(0, LINES - 2), st.just(2), 
 def test_the_best_chain_beats_every_other(strips: list[list[Seat]], line: float, run: float, block: int):
     """No chain of runs over two strips has more worth less price than the programme's, in blocks or not."""
 
-    def net(runs: tuple[Run, ...]) -> float:
+    def net(runs: tuple[ScanRun, ...]) -> float:
         return shown(strips, runs) - sum((r.stop - r.first) * line + run for r in runs)
 
     (found,) = best_chains(tables(strips, block), np.array([[0, 1]]), line, run)
@@ -65,14 +65,14 @@ def test_windows_are_chosen_apart():
     strips = [[(0, 2, 9.0)], [(3, 2, 9.0)], [(1, 2, 9.0)], [(5, 2, 0.1)]]
     both = best_chains(tables(strips), np.array([[0, 1], [2, 3]]), 1.0, 1.0)
     alone = [best_chains(tables(strips), np.array([pair]), 1.0, 1.0)[0] for pair in ([0, 1], [2, 3])]
-    assert both == alone == [[Run(0, 0, 2), Run(1, 3, 5)], [Run(2, 1, 3)]]
+    assert both == alone == [[ScanRun(0, 0, 2), ScanRun(1, 3, 5)], [ScanRun(2, 1, 3)]]
 
 
 def test_near_runs_are_one_and_far_ones_are_not():
     """A gap shorter than a set-up is scanned through; a longer one is not."""
     near, far = [[(0, 2, 9.0), (3, 2, 9.0)]], [[(0, 2, 9.0), (5, 2, 9.0)]]
-    assert best_chains(tables(near), np.array([[0]]), 1.0, 1.5) == [[Run(0, 0, 5)]]
-    assert best_chains(tables(far), np.array([[0]]), 1.0, 1.5) == [[Run(0, 0, 2), Run(0, 5, 7)]]
+    assert best_chains(tables(near), np.array([[0]]), 1.0, 1.5) == [[ScanRun(0, 0, 5)]]
+    assert best_chains(tables(far), np.array([[0]]), 1.0, 1.5) == [[ScanRun(0, 0, 2), ScanRun(0, 5, 7)]]
 
 
 @given(st.floats(0, 60), st.integers(0, 6))
@@ -94,7 +94,7 @@ def test_true_and_additive_prices(lines: int, reloads: int):
 
 def test_runs_that_meet_are_joined():
     """Runs of one strip that overlap, touch or lie within the gap become one; other strips and far runs stay."""
-    runs = [Run(1, 0, 4), Run(0, 8, 9), Run(0, 0, 4), Run(0, 5, 6), Run(0, 2, 3)]
-    assert joined(runs, 1) == [Run(0, 0, 6), Run(0, 8, 9), Run(1, 0, 4)]
-    assert joined(runs, 0) == [Run(0, 0, 4), Run(0, 5, 6), Run(0, 8, 9), Run(1, 0, 4)]
+    runs = [ScanRun(1, 0, 4), ScanRun(0, 8, 9), ScanRun(0, 0, 4), ScanRun(0, 5, 6), ScanRun(0, 2, 3)]
+    assert joined(runs, 1) == [ScanRun(0, 0, 6), ScanRun(0, 8, 9), ScanRun(1, 0, 4)]
+    assert joined(runs, 0) == [ScanRun(0, 0, 4), ScanRun(0, 5, 6), ScanRun(0, 8, 9), ScanRun(1, 0, 4)]
     assert joined([], 3) == []

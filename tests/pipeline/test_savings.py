@@ -11,15 +11,15 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import coarse_sweeps, full_sweeps
-from pipeline.planning.savings import Entry, capture_savings, count_lines, count_samples, raw_bytes
+from pipeline.planning.savings import SavingEntry, capture_savings, count_lines, count_samples, raw_bytes
 
 CAMERA, COST = LineCamera(), CostModel()
 
 
 def test_entries_have_a_ratio_unless_full_is_nothing():
     """Done over full, or None, and the receipt's four keys."""
-    assert Entry(3, 12, "predicted").as_dict() == {"done": 3, "full": 12, "ratio": 0.25, "full_is": "predicted"}
-    assert Entry(3, 0, "measured").ratio is None
+    assert SavingEntry(3, 12, "predicted").as_dict() == {"done": 3, "full": 12, "ratio": 0.25, "full_is": "predicted"}
+    assert SavingEntry(3, 0, "measured").ratio is None
 
 
 def test_samples_beside_the_scene_are_not_counted():

@@ -12,14 +12,14 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.budget_search import cheapest_cover, spend
 from pipeline.planning.line_cover import Field
-from pipeline.planning.scan_runs import Prices
+from pipeline.planning.scan_runs import ScanPrices
 from pipeline.planning.strips import Views
 
-PRICES = Prices(line_s=0.1, run_s=0.9, reload_s=1.6, lines_per_reload=150)
+PRICES = ScanPrices(line_s=0.1, run_s=0.9, reload_s=1.6, lines_per_reload=150)
 LINES = 8  # of a seat
 
 
-def blocks(worth: np.ndarray, most: int, prices: Prices = PRICES) -> Field:
+def blocks(worth: np.ndarray, most: int, prices: ScanPrices = PRICES) -> Field:
     """A field of (row, column) seats seen ``most`` columns at a time from every offset."""
     rows, columns = worth.shape
     strips = range(max(columns - most, 0) + 1)

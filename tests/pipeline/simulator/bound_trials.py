@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -12,29 +13,33 @@ from pipeline.simulator.effects.effect import OFF, Effect, Light
 from pipeline.simulator.effects.light_units import noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS, READOUT
 from pipeline.simulator.render import expected_light
+from pipeline.simulator.selection.arithmetic import ROUNDING, contrast_about, misplaced_electrons, misplaced_share
 from pipeline.simulator.selection.options import SAFETY, Menu, list_options
 from tests.pipeline.simulator.random_cases import Case
 
-ROUNDING = 4e-6  # of the light over the unit: sums of float32 in another order
 DRAWN = frozenset({"jitter", "turbulence"})  # one survey of 1000 may go beyond their bounds
 IN_THE_LIGHT: tuple[Effect, ...] = tuple(effect for effect in EFFECTS if effect not in READOUT)
 
 
 @dataclass(frozen=True)
 class Trial:
-    """``bound`` is the composed one, with gains of other effects and without `SAFETY`; both in sigma as stored."""
+    """``bound`` is the composed one, with gains of other effects and without `SAFETY`; all in sigma as stored.
+
+    ``unexplained`` is the most that is left of the change at any number without what arithmetic may misplace there.
+    """
 
     effect: str
     variant: str
     binning: int
     bound: float
     measured: float
+    unexplained: float
     rounding: float
 
     @property
     def is_broken(self) -> bool:
         """Whether the change exceeds what the decision counts."""
-        return not self.measured <= self.bound * SAFETY + self.rounding
+        return not self.unexplained <= self.bound * SAFETY
 
     @property
     def looseness(self) -> float:
@@ -49,12 +54,18 @@ class _Stored:
     binning: int
     menus: tuple[Menu, ...]
     noise: list[Light]  # of each block with everything on, of the sums (line, number, band) [e-]
+    contrast: list[Light]  # of the scene about each sum (1, number, band) [e-]
     rounding: float
 
-    def change(self, light: list[Light], full: list[Light]) -> float:
-        """Greatest change of a stored number in its own sigmas."""
-        sums = (_summed(one - other, self.binning) for one, other in zip(light, full, strict=True))
-        return max(float((np.abs(one) / noise).max()) for one, noise in zip(sums, self.noise, strict=True))
+    def change(self, light: list[Light], full: list[Light], share: float) -> tuple[float, float]:
+        """Greatest change of a stored number in its own sigmas, and what of it arithmetic does not explain."""
+        most, left = 0.0, 0.0
+        for one, other, noise, contrast in zip(light, full, self.noise, self.contrast, strict=True):
+            change = np.abs(_summed(one - other, self.binning))
+            misplaced = misplaced_electrons(_summed(other, self.binning), contrast, share)
+            most = max(most, float((change / noise).max()))
+            left = max(left, float(((change - misplaced) / noise).max()))
+        return most, left
 
 
 def trials(case: Case, binnings: Sequence[int] = (1,)) -> Iterator[Trial]:
@@ -69,21 +80,24 @@ def trials(case: Case, binnings: Sequence[int] = (1,)) -> Iterator[Trial]:
     exact: dict[Effect, str] = {menu.effect: menu.exact.variant for menu in present}
     blocks = case.blocks(probes[0])
     full = [expected_light(case.scene, block, exact) for block in blocks]
-    stored = [_stored(full, case, binning, found) for binning, found in zip(binnings, menus, strict=True)]
+    render = partial(expected_light, case.scene)
+    contrast = [np.asarray(contrast_about(block, render)) for block in blocks]
+    stored = [_stored(full, contrast, case, binning, found) for binning, found in zip(binnings, menus, strict=True)]
     for menu in present:
         for variant in (OFF, *(option.variant for option in menu.variants[1:])):
             chosen = {effect: variant if effect is menu.effect else way for effect, way in exact.items()}
             light = [_light(case, block, chosen) for block in blocks]
+            share = misplaced_share(exact, {one: way for one, way in chosen.items() if way != OFF})
             for one in stored:
                 bound = _error(one.menus, menu.name, variant) / SAFETY
-                yield Trial(menu.name, variant, one.binning, bound, one.change(light, full), one.rounding)
+                yield Trial(menu.name, variant, one.binning, bound, *one.change(light, full, share), one.rounding)
 
 
-def _stored(full: list[Light], case: Case, binning: int, menus: tuple[Menu, ...]) -> _Stored:
+def _stored(full: list[Light], contrast: list[Light], case: Case, binning: int, menus: tuple[Menu, ...]) -> _Stored:
     noise = [np.sqrt(_summed(np.square(noise_electrons(light, case.rig)), binning)) for light in full]
     sums = [_summed(np.abs(light), binning) for light in full]
     level = max(float((light / one).max()) for light, one in zip(sums, noise, strict=True))
-    return _Stored(binning, menus, noise, ROUNDING * level)
+    return _Stored(binning, menus, noise, [_summed(one, binning) for one in contrast], ROUNDING * level)
 
 
 def _summed(values: Light, binning: int) -> Light:
