@@ -66,7 +66,7 @@ def test_day_and_hour_stand_in_the_key() -> None:
     [
         ({"scene": REMOVED_LAW}, r"farm@1 was removed: take farm \(farm@2\)"),
         ({"scene": "field.png", "hour": 9.5}, "'hour' = 9.5 is for the scene farm@2"),
-        ({"scene": FARM_LAW, "day": 0}, "'day' must be a whole number from 1 to 366, got 0; of the year"),
+        ({"scene": FARM_LAW, "day": 0}, "'day' must be a whole number from 1 to 366, got 0"),
         ({"scene": FARM_LAW, "hour": 25}, "'hour' must be a number from 0 to 24 h"),
     ],
 )

@@ -120,5 +120,5 @@ def test_part_of_a_line_is_refused():
 @pytest.mark.parametrize("value", [np.inf, -1e9, np.nan])
 def test_numbers_without_sense_are_refused(number, value):
     """Optics that would make NaN of light are refused with their place and range."""
-    with pytest.raises(SettingsError, match=rf"optics.{number} must be (between|a finite number)"):
+    with pytest.raises(SettingsError, match=rf"optics.{number} must be a number from "):
         rig_with(**{number: value})
