@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -49,13 +47,6 @@ GOES_ON = (
 def say(message: str) -> None:
     """Print an error on stderr, as one message."""
     stderr.print(f"[bold red]error[/]: {escape(message)}", highlight=False, soft_wrap=True)
-
-
-def print_json(content: Mapping[str, object]) -> None:
-    """Print one object on stdout; numbers that are not finite become null."""
-    from storage.archive.whole_files import to_json
-
-    sys.stdout.write(to_json(content))
 
 
 def split_list(text: str | None) -> tuple[str, ...]:

@@ -14,9 +14,9 @@ from flows.cli.app import (
     Workers,
     app,
     parse_numbers,
-    print_json,
     stderr,
 )
+from flows.terminal.shown_text import print_json
 
 
 @app.command

@@ -15,19 +15,9 @@ import flows.cli.archive_verbs
 import flows.cli.model_verbs
 import flows.cli.rig_verbs
 import flows.cli.schedule_verbs  # noqa: F401 - each registers its verbs
-from flows.cli.app import (
-    GOES_ON,
-    AsJson,
-    OutFile,
-    app,
-    parse_numbers,
-    parse_wholes,
-    print_json,
-    say,
-    split_list,
-    stderr,
-)
+from flows.cli.app import GOES_ON, AsJson, OutFile, app, parse_numbers, parse_wholes, say, split_list, stderr
 from flows.terminal.cache_places import place_caches
+from flows.terminal.shown_text import print_json
 from flows.terminal.system_refusals import refusal_words
 from flows.terminal.termination import EXIT_CODE as TERMINATED
 from flows.terminal.termination import Terminated, terminable

@@ -9,7 +9,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from flows.cli.app import AsJson, OutFolder, Switch, app, parse_numbers, parse_wholes, print_json, split_list, stderr
+from flows.cli.app import AsJson, OutFolder, Switch, app, parse_numbers, parse_wholes, split_list, stderr
+from flows.terminal.shown_text import print_json
 from pipeline.errors import SettingsError
 
 

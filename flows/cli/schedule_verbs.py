@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from flows.cli.app import ArchiveName, AsJson, OutFile, app, print_json, stderr
+from flows.cli.app import ArchiveName, AsJson, OutFile, app, stderr
+from flows.terminal.shown_text import print_json
 
 
 @app.command
@@ -67,7 +68,7 @@ def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_j
     out
         The page to write.
     """
-    from flows.publish.history_page import run_report
+    from flows.schedule.history_page import run_report
 
     content = run_report(archive, field, out, stderr)
     if as_json:

@@ -7,10 +7,11 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from flows.cli.app import AsJson, Switch, app, print_json, split_list, stderr
+from flows.cli.app import AsJson, Switch, app, split_list, stderr
 from flows.cli.rig_verbs import rig
 from flows.cli.survey_flags import RenderingFlags, SimulationFlags, SurveyFlags, by_setting
 from flows.settings.load import load_settings
+from flows.terminal.shown_text import print_json
 from pipeline.rig.survey_rig import SurveyRig
 
 NO_FLAGS = SurveyFlags()

@@ -12,9 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.cli.app import print_json
 from flows.settings.load import load_settings
-from flows.terminal.shown_text import on_stdout
+from flows.terminal.shown_text import on_stdout, print_json
 from pipeline.errors import SettingsError
 from pipeline.geometry.scan import CostModel
 from pipeline.rig.camera.headwall_camera import HeadwallCamera

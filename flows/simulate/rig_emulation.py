@@ -14,10 +14,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from flows.cli.app import print_json
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.simulate.emulated_scene import emulated_source
+from flows.terminal.shown_text import print_json
 from pipeline.errors import SettingsError
 from pipeline.geometry.mounting import STRAIGHT
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -36,3 +36,10 @@ def on_stderr() -> Terminal:
 def on_stdout() -> Terminal:
     """Where results go."""
     return Terminal(file=sys.stdout, width=None if sys.stdout.isatty() else PIPED_WIDTH)
+
+
+def print_json(content: Mapping[str, object]) -> None:
+    """Print one object on stdout; numbers that are not finite become null."""
+    from storage.archive.whole_files import to_json  # a command line that only refuses loads no storage
+
+    sys.stdout.write(to_json(content))

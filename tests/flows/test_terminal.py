@@ -16,9 +16,9 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.tree import Tree
 
-from flows.publish.field_history import FieldHistory
-from flows.publish.history_page import render_history, render_index
 from flows.publish.pages import render_markdown
+from flows.schedule.field_history import FieldHistory
+from flows.schedule.history_page import render_history, render_index
 from flows.terminal.shown_text import Terminal
 from pipeline.visible_text import is_visible
 from storage.archive.whole_files import to_json

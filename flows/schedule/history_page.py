@@ -15,9 +15,9 @@ from rich.markup import escape
 
 from flows.archive.commands import check_outside
 from flows.publish.charts import Chart, line_chart
-from flows.publish.field_history import FieldHistory, day_of, read_histories
 from flows.publish.finding_words import LEAST_HECTARES, area_words
 from flows.publish.pages import render_page
+from flows.schedule.field_history import FieldHistory, day_of, read_histories
 from flows.schedule.ledger_state import read_moment
 from flows.terminal.figures import DASH, counted, format_percent
 from pipeline.errors import SettingsError
