@@ -18,9 +18,8 @@ import flows.cli.schedule_verbs  # noqa: F401 - each registers its verbs
 from flows.cli.app import GOES_ON, AsJson, OutFile, app, parse_numbers, parse_wholes, say, split_list, stderr
 from flows.terminal.cache_places import place_caches
 from flows.terminal.shown_text import print_json
-from flows.terminal.system_refusals import refusal_words
 from flows.terminal.termination import EXIT_CODE as TERMINATED
-from flows.terminal.termination import Terminated, terminable
+from flows.terminal.termination import Terminated, refusal_words, terminable
 from pipeline.errors import PipelineError, SettingsError
 
 INTERRUPTED = 130

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from flows.evaluate.capture_costs import plan_seconds
+from flows.evaluate.costs import plan_seconds
 from flows.evaluate.frames import Look, look_at
 from flows.evaluate.rig_plans import BUDGETS, PLANNED
 from flows.evaluate.rows import Seats, Trial

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from flows.evaluate.capture_costs import capture_seconds
 from flows.evaluate.controls import design_of, judge_control
+from flows.evaluate.costs import capture_seconds
 from flows.evaluate.equal_time import judge_equal_time
 from flows.evaluate.frames import Candidate, Look, Sight, look_at, sight_of
 from flows.evaluate.jobs import Job, Jobs, Show, scene_of

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -16,13 +17,15 @@ from rich.markup import escape
 
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
-from flows.simulate.emulated_scene import emulated_source
+from flows.simulate.command import open_simulation
+from flows.survey.stages.effects import choose_effects, source_with
 from flows.terminal.shown_text import print_json
 from pipeline.errors import SettingsError
 from pipeline.geometry.mounting import STRAIGHT
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
 from pipeline.rig.emulator.fault_names import read_faults
 from pipeline.rig.survey_rig import SurveyRig
+from pipeline.simulator.simulated import SimulatedSource
 
 EVERY_S = 0.2
 KEPT_CAPTURES = 64
@@ -175,3 +178,17 @@ def _ending(event: threading.Event) -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def emulated_source(settings: Settings) -> tuple[SimulatedSource, tuple[str, ...]]:
+    """Give the scene through the simulated rig, and what was assumed of it. Nothing is kept.
+
+    Raises
+    ------
+    PipelineError : the scene or the effects cannot be used.
+    """
+    with tempfile.TemporaryDirectory(prefix="spectralzoom-") as folder:
+        apart = replace(settings, source="sim", out=str(Path(folder) / "effects"))
+        run, _, notes = open_simulation(apart)
+        effects, _ = choose_effects.produce(run.archive, choose_effects.needed(run))
+        return source_with(run.simulated, effects), notes

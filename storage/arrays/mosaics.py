@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ChunkError, ShapeError
 from storage.arrays.layout import (
+    SHARD_ROWS,
     AngularGrid,
     create_array,
     create_group,
@@ -166,3 +167,29 @@ def load_mosaic(path: Path) -> Mosaic:
         grid=grid_of(dict(group.attrs)),
         quicklook=read_array(group, "quicklook") if "quicklook" in group else None,
     )
+
+
+def mosaic_strips(path: Path, rows: slice = slice(None), columns: slice = slice(None)) -> Iterator[NDArray[np.float32]]:
+    """Read a window of a mosaic from the top down, (y, x, band) strips that end where shards do.
+
+    Raises
+    ------
+    IncompleteStoreError : the mosaic is missing or damaged.
+    """
+    group = open_group(path)
+    with damage_named(f"{path}/values"):
+        first, last, _ = rows.indices(group["values"].shape[0])  # type: ignore[union-attr]
+    while first < last:
+        below = min((first // SHARD_ROWS + 1) * SHARD_ROWS, last)
+        yield read_array(group, "values", (slice(first, below), columns))
+        first = below
+
+
+def mosaic_wavelengths(path: Path) -> NDArray[np.float64]:
+    """(band,) wavelengths of a mosaic [nm]. Raises IncompleteStoreError where it is missing or damaged."""
+    return read_bands(open_group(path))[0]
+
+
+def mosaic_brightness(path: Path) -> NDArray[np.float32]:
+    """Mean over the bands, (y, x). Raises IncompleteStoreError where the mosaic is missing or damaged."""
+    return np.concatenate([strip.mean(axis=-1) for strip in mosaic_strips(path)])

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import logging
 import secrets
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pipeline.errors import ArchiveError
 from storage.archive.addresses import StageRef, in_text, store_at
@@ -28,7 +29,6 @@ from storage.maintenance.verification import Finding, Progress, verify_growing
 from storage.remote.object_copies import KNOWN, WorkingCopy
 from storage.remote.object_leases import Lease, take_lease
 from storage.remote.object_places import UnreachableError, connect, parse_place
-from storage.remote.object_refs import RemoteRef, RemoteRun
 from storage.remote.object_stores import Objects
 from storage.remote.object_transfers import BEGUN
 
@@ -296,3 +296,36 @@ def _find_mark(objects: Objects, *, create: bool) -> None:
         raise ArchiveError(f"{name} is not there; check the name, or make an archive with survey --out")
     if found != MARK_TEXT:
         raise ArchiveError(f"{name}/{MARK} is not as expected: what answers is no archive, or one of a later version")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RemoteRef(StageRef):
+    """A store that may not be on this machine yet: whoever asks for its path has it fetched, and waits."""
+
+    fetch: Callable[[str], None]
+
+    def __getattribute__(self, name: str) -> Any:
+        if name == "path":
+            object.__getattribute__(self, "fetch")(self.uri)
+        return object.__getattribute__(self, name)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, StageRef) and (self.stage, self.key) == (other.stage, other.key)
+
+    def __hash__(self) -> int:
+        return hash((self.stage, self.key))
+
+    def __repr__(self) -> str:
+        return f"RemoteRef({self.uri!r})"
+
+
+class RemoteRun(RunDraft):
+    """A run that is uploaded once it is published in the working copy."""
+
+    send: Callable[[str], None]
+
+    def publish(self, *, rests_on: Mapping[str, str] | None = None, **facts: Any) -> Path:
+        """Publish the run here and in the bucket; gives its folder here."""
+        folder = super().publish(rests_on=rests_on, **facts)
+        self.send(f"runs/{self.id}")
+        return folder

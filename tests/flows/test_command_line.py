@@ -16,7 +16,7 @@ import pytest
 import flows.cli.survey_verbs  # noqa: F401 - main registers them when it runs
 from flows.cli import main as cli
 from flows.cli.app import GOES_ON, app
-from flows.cli.survey_flags import IN_TABLES
+from flows.cli.survey_verbs import IN_TABLES
 from flows.settings.declared import SURVEY, TABLES
 from flows.terminal.shown_text import print_json
 

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from flows.evaluate.budget_table import budget_tables
 from flows.evaluate.budgets import summarise_equal_time, summarise_rig
-from flows.evaluate.capture_costs import plan_seconds
+from flows.evaluate.costs import plan_seconds
 from flows.evaluate.equal_time import camera_of_equal_time, judge_equal_time
 from flows.evaluate.frames import Look
 from flows.evaluate.rig_plans import BUDGETS, judge_rig

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.terminal.system_refusals import refusal_words
+from flows.terminal.termination import refusal_words
 
 ROOT = Path(__file__).parents[2]
 

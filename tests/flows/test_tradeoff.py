@@ -16,7 +16,7 @@ from rich.console import Console
 
 from flows.tradeoff import entries as tradeoff_module
 from flows.tradeoff import machine as tradeoff_machine
-from flows.tradeoff.command import run_tradeoff
+from flows.tradeoff.command import print_tradeoff, run_tradeoff
 from flows.tradeoff.entries import (
     Level,
     Point,
@@ -30,7 +30,6 @@ from flows.tradeoff.entries import (
     registered,
 )
 from flows.tradeoff.plots import draw_tradeoffs, tradeoff_figure
-from flows.tradeoff.table import print_tradeoff
 from pipeline.errors import ArchiveError, SettingsError
 
 

@@ -15,6 +15,7 @@ from flows.tradeoff import simulate as tradeoff_simulate
 from flows.tradeoff import simulate_noise as tradeoff_simulate_noise
 from flows.tradeoff import simulate_rays as tradeoff_simulate_rays
 from flows.tradeoff import simulated_lines
+from flows.tradeoff.command import print_tradeoff
 from flows.tradeoff.entries import Level, Point, Tradeoff, find_tradeoffs, mark_pareto, measure_tradeoff
 from flows.tradeoff.plots import tradeoff_figure
 from flows.tradeoff.simulate import ALL_CHEAP, EXACT, FOOTPRINT, TOLERANCE, TOLERANCES, Seen
@@ -22,7 +23,6 @@ from flows.tradeoff.simulate_bands import BAND_COUNT, EACH, GROUP_COUNT, InBands
 from flows.tradeoff.simulate_noise import DIM_NOISE, NOISE, law_of_numbers
 from flows.tradeoff.simulate_rays import SUPERSAMPLING
 from flows.tradeoff.simulated_lines import Against, FarmLines, look_at_lines, with_variant
-from flows.tradeoff.table import print_tradeoff
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.effects.blurs import KEYSTONE
 from pipeline.simulator.effects.counting import SHOT

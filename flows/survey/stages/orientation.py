@@ -14,7 +14,7 @@ from pipeline.planning.orientation import compare_orientations
 from storage.archive.archive import StageRef
 from storage.archive.stored_tables import read_table, write_table
 from storage.arrays.attention import load_attention
-from storage.arrays.mosaic_strips import mosaic_brightness
+from storage.arrays.mosaics import mosaic_brightness
 
 TURNED = Product("turned", version=1)
 FILE = "orientation.json"
