@@ -1,4 +1,4 @@
-"""What ends a command from outside: SIGTERM, which breaks it off as Ctrl-C does, and refusals of the machine, in words."""
+"""What ends a command from outside: SIGTERM, which breaks it off as Ctrl-C does, and what a machine refuses."""
 
 from __future__ import annotations
 
