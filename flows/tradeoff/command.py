@@ -1,4 +1,4 @@
-"""What `spectralzoom tradeoff` shows: a table for each stage (to be right to X you pay Y), JSON, and a plot in a folder."""
+"""What `spectralzoom tradeoff` shows: for each stage a table (to be right to X you pay Y), JSON and a plot."""
 
 from __future__ import annotations
 
