@@ -113,9 +113,14 @@ def survey_png(scene_files: Path, weights: Path) -> Survey:
 
     def survey(out: Path, console: Console | None = None, **flags: Any) -> Published:
         given = {
-            "scene": str(scene_files / "scene.png"), "labels": str(scene_files / "labels.png"),
-            "weights": str(weights), "engine": "plain", "out": str(out), "budget": "0.8", "controls": False,
-        }  # fmt: skip
+            "scene": str(scene_files / "scene.png"),
+            "labels": str(scene_files / "labels.png"),
+            "weights": str(weights),
+            "engine": "plain",
+            "out": str(out),
+            "budget": "0.8",
+            "controls": False,
+        }
         return run_survey(load_settings(None, given | flags), console or Console(quiet=True))
 
     return survey

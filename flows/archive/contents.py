@@ -116,10 +116,18 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str], path: tuple[str, ...]
         return {"uri": uri, "problem": "is not there", "inputs": []}
     wall, cpu = _took(catalogue, store)
     node = {
-        "uri": uri, "stage": store.ref.stage, "key": store.ref.key, "version": store.version,
-        "called": sorted(catalogue.roles(uri)), "created": store.created, "bytes": store.size,
-        "wall_s": wall, "cpu_s": cpu, "problem": store.problem, "inputs": [],
-    }  # fmt: skip
+        "uri": uri,
+        "stage": store.ref.stage,
+        "key": store.ref.key,
+        "version": store.version,
+        "called": sorted(catalogue.roles(uri)),
+        "created": store.created,
+        "bytes": store.size,
+        "wall_s": wall,
+        "cpu_s": cpu,
+        "problem": store.problem,
+        "inputs": [],
+    }
     if uri in shown or uri in path or len(path) >= DEEPEST:
         return node | {"see": "in a circle" if uri in path else "above" if uri in shown else "too deep"}
     shown.add(uri)

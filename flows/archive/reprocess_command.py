@@ -77,9 +77,13 @@ def run_reprocess(
     wanted = _chosen(catalogue, request, opened.name)
     rows: list[dict[str, Any]] = []
     content: dict[str, Any] = {
-        "archive": opened.name, "started": f"{datetime.now(UTC):%Y%m%dT%H%M%S}", "finished": None,
-        "dry_run": request.dry_run, "asked": _asked(request), "fields": rows,
-    }  # fmt: skip
+        "archive": opened.name,
+        "started": f"{datetime.now(UTC):%Y%m%dT%H%M%S}",
+        "finished": None,
+        "dry_run": request.dry_run,
+        "asked": _asked(request),
+        "fields": rows,
+    }
     file = None
     if wanted and not request.dry_run:
         file = new_file(folder, f"reprocess-{content['started']}", ".json")
@@ -115,9 +119,13 @@ def _asked(request: ReprocessRequest) -> dict[str, Any]:
     """What was asked for, as it can be told years later: the weights by their content too."""
     weights = None if request.weights is None else str(request.weights.absolute())
     return {
-        "since": request.since, "stage": request.stage, "field": request.field, "failed": request.failed,
-        "weights": weights, "weights_key": None if weights is None else file_key(Path(weights)),
-    }  # fmt: skip
+        "since": request.since,
+        "stage": request.stage,
+        "field": request.field,
+        "failed": request.failed,
+        "weights": weights,
+        "weights_key": None if weights is None else file_key(Path(weights)),
+    }
 
 
 def _chosen(catalogue: Catalogue, request: ReprocessRequest, out: str) -> list[Generation]:
@@ -163,9 +171,16 @@ def _again(
     """One field surveyed again; an error is said in its row."""
     run, begun = generation.run, time.perf_counter()
     row: dict[str, Any] = {
-        "field": generation.field, "scene": run.settings.get("scene"), "old": run.folder.name, "new": None,
-        "state": "failed", "message": None, **_scores(run.receipt, "before"), **_scores({}, "after"), "seconds": None,
-    }  # fmt: skip
+        "field": generation.field,
+        "scene": run.settings.get("scene"),
+        "old": run.folder.name,
+        "new": None,
+        "state": "failed",
+        "message": None,
+        **_scores(run.receipt, "before"),
+        **_scores({}, "after"),
+        "seconds": None,
+    }
     try:
         settings = asked_again(run, str(request.archive), request.weights)
         settings = replace(settings, scheduler=request.crew.scheduler, workers=request.crew.workers)

@@ -29,9 +29,14 @@ class PastCosts:
     def __init__(self, catalogue: Catalogue, run: SurveyRun) -> None:
         self._catalogue, self._run = catalogue, run
         self._extent = Extent(
-            run.described.config, run.grid, run.camera, run.settings.cost, run.plan.along,
-            len(run.scene.wavelength_nm), sum(sweep.lines for sweep in run.plan.coarse),
-        )  # fmt: skip
+            run.described.config,
+            run.grid,
+            run.camera,
+            run.settings.cost,
+            run.plan.along,
+            len(run.scene.wavelength_nm),
+            sum(sweep.lines for sweep in run.plan.coarse),
+        )
         self._fine_lines: int | None = None
 
     def plan_fine(self, lines: int) -> None:

@@ -25,9 +25,20 @@ from storage.archive.records import Run
 
 # what the light of a field depends on; surveys that agree in these are generations of one
 OF_THE_LIGHT = (
-    "scene", "bands", "wavelengths", "source", "seed", "effects", "size", "day", "hour", "camera", "pointing_px",
-    "pose", "visit",
-)  # fmt: skip
+    "scene",
+    "bands",
+    "wavelengths",
+    "source",
+    "seed",
+    "effects",
+    "size",
+    "day",
+    "hour",
+    "camera",
+    "pointing_px",
+    "pose",
+    "visit",
+)
 
 
 @dataclass(frozen=True)

@@ -29,18 +29,28 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
         miou = run["miou"] if isinstance(run["miou"], int | float) else None
         scored = "not yet" if is_pending(run) else format_points(miou)
         runs.add_row(
-            escape(run["id"]), escape(_file_name(run["scene"])), _plain(run["seed"]), _plain(run["budget"]),
-            scored, format_bytes(run["bytes"]), _age(run["age_s"]), _state(run["state"]),
-        )  # fmt: skip
+            escape(run["id"]),
+            escape(_file_name(run["scene"])),
+            _plain(run["seed"]),
+            _plain(run["budget"]),
+            scored,
+            format_bytes(run["bytes"]),
+            _age(run["age_s"]),
+            _state(run["state"]),
+        )
     console.print(runs if content["runs"] else "no runs")
     stores = _table("Stores", "stage", "key", "version", "size", "age", "runs that name it")
     for stage, rows in content["stages"].items():
         for number, row in enumerate(rows[-MOST_ROWS:]):
             size = "[bold red]damaged[/]" if row["problem"] else format_bytes(row["bytes"])
             stores.add_row(
-                escape(stage) if number == 0 else "", escape(row["key"]), escape(row["version"]), size,
-                _age(row["age_s"]), str(row["runs"] or "none"),
-            )  # fmt: skip
+                escape(stage) if number == 0 else "",
+                escape(row["key"]),
+                escape(row["version"]),
+                size,
+                _age(row["age_s"]),
+                str(row["runs"] or "none"),
+            )
         if len(rows) > MOST_ROWS:
             stores.add_row("", f"[dim]and {len(rows) - MOST_ROWS} older[/]", "", "", "", "")
     console.print(stores if content["stages"] else "no stores")
@@ -137,8 +147,11 @@ def show_verdict(content: dict[str, Any], console: Console) -> None:
 def show_repair(content: dict[str, Any], console: Console) -> None:
     """Print what a repair did."""
     done = content["repair"]
-    for title, part in (("not remade and put back", done["put_back"]), ("failed", done["failed"]),
-                        ("left as it is", done["hopeless"])):  # fmt: skip
+    for title, part in (
+        ("not remade and put back", done["put_back"]),
+        ("failed", done["failed"]),
+        ("left as it is", done["hopeless"]),
+    ):
         for uri, why in part.items():
             console.print(f"[bold yellow]{title}[/] {escape(uri)}: {escape(why)}", highlight=False, soft_wrap=True)
     left = "nothing broken is left" if done["complete"] else "some is left as it was"
@@ -146,8 +159,14 @@ def show_repair(content: dict[str, Any], console: Console) -> None:
 
 
 def _table(title: str, *columns: str, left: int = 3) -> Table:
-    table = Table(title=escape(title), title_justify="left", title_style="bold", header_style="dim", box=SIMPLE_HEAD,
-                  collapse_padding=True)  # fmt: skip
+    table = Table(
+        title=escape(title),
+        title_justify="left",
+        title_style="bold",
+        header_style="dim",
+        box=SIMPLE_HEAD,
+        collapse_padding=True,
+    )
     for number, column in enumerate(columns):
         justify: Literal["left", "right"] = "left" if number < left else "right"
         table.add_column(column, justify=justify, overflow="fold", no_wrap=column in WHOLE)

@@ -43,12 +43,7 @@ def explain(archive: ArchiveName, product: str, *, as_json: AsJson = False) -> i
 
 
 @app.command
-def verify(
-    archive: ArchiveName,
-    *,
-    repair: Switch = False,
-    as_json: AsJson = False,
-) -> int:
+def verify(archive: ArchiveName, *, repair: Switch = False, as_json: AsJson = False) -> int:
     """Read every byte of an archive again and compare it with what was published.
 
     Parameters
@@ -88,12 +83,7 @@ def gc(
 
 @app.command
 def export(
-    archive: ArchiveName,
-    run: str | None = None,
-    *,
-    out: OutFile,
-    envi: Switch = False,
-    as_json: AsJson = False,
+    archive: ArchiveName, run: str | None = None, *, out: OutFile, envi: Switch = False, as_json: AsJson = False
 ) -> int:
     """Export a run: maps as cloud-optimised GeoTIFF, a STAC catalogue of them, and on request cubes as ENVI.
 
@@ -150,14 +140,7 @@ def ingest(
 
 
 @app.command
-def compare(
-    archive: ArchiveName,
-    old: str,
-    new: str,
-    *,
-    out: OutFolder = None,
-    as_json: AsJson = False,
-) -> int:
+def compare(archive: ArchiveName, old: str, new: str, *, out: OutFolder = None, as_json: AsJson = False) -> int:
     """Compare two runs of one field: classes, where they differ, what was asked and spent, and a picture.
 
     Parameters

@@ -162,11 +162,21 @@ def train(
         "mask_classes": parse_wholes(mask_classes, "--mask-classes"),
     }
     request = TrainRequest(
-        dataset, out, split_list(hold_out), validation, scenes, patch, factor, columns, positions=positions,
-        preset=preset, tokens={"dim": dim, "layers": layers, "heads": heads, "mlp_ratio": mlp_ratio}, init=init,
+        dataset,
+        out,
+        split_list(hold_out),
+        validation,
+        scenes,
+        patch,
+        factor,
+        columns,
+        positions=positions,
+        preset=preset,
+        tokens={"dim": dim, "layers": layers, "heads": heads, "mlp_ratio": mlp_ratio},
+        init=init,
         choices=choices,
         settings=TrainingSettings(steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch),
-    )  # fmt: skip
+    )
     record = run_train(request, stderr)
     if as_json:
         print_json(record)

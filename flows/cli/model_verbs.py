@@ -118,10 +118,23 @@ def evaluate(
     address = _run_address(dataset, run, given=bool(weights))
     if address is not None:
         for_weights = {
-            "weights": weights, "out": out, "shares": shares, "policies": policies, "frames": frames, "scenes": scenes,
-            "seed": seed, "draws": draws, "timed-frames": timed_frames, "timed-runs": timed_runs, "control": control,
-            "rig": rig, "equal-time": equal_time, "pooled": pooled, "bands": bands, "wavelengths": wavelengths,
-        }  # fmt: skip
+            "weights": weights,
+            "out": out,
+            "shares": shares,
+            "policies": policies,
+            "frames": frames,
+            "scenes": scenes,
+            "seed": seed,
+            "draws": draws,
+            "timed-frames": timed_frames,
+            "timed-runs": timed_runs,
+            "control": control,
+            "rig": rig,
+            "equal-time": equal_time,
+            "pooled": pooled,
+            "bands": bands,
+            "wavelengths": wavelengths,
+        }
         return _evaluate_run(*address, for_weights, controls=controls, labels=labels, as_json=as_json)
     if controls is not None:
         raise SettingsError("--controls is for a run of an archive; weights are judged beside others by --control FILE")
@@ -135,10 +148,23 @@ def evaluate(
     }
     given = parse_numbers(shares, "--shares")
     request = EvaluateRequest(
-        dataset, weights, out, SHARES if given is None else tuple(given), split_list(policies) or USUAL,
-        split_list(frames), scenes, seed, draws, timed_frames, timed_runs, control, rig, equal_time,
-        pooled, choices,
-    )  # fmt: skip
+        dataset,
+        weights,
+        out,
+        SHARES if given is None else tuple(given),
+        split_list(policies) or USUAL,
+        split_list(frames),
+        scenes,
+        seed,
+        draws,
+        timed_frames,
+        timed_runs,
+        control,
+        rig,
+        equal_time,
+        pooled,
+        choices,
+    )
     run_evaluate(request, stderr, as_json=as_json)
     return 0
 
@@ -166,9 +192,14 @@ def _run_address(dataset: str, run: str | None, *, given: bool) -> tuple[str, st
 
 
 def _evaluate_run(
-    archive: str, run: str, for_weights: Mapping[str, object], *, controls: bool | None, labels: str | None,
+    archive: str,
+    run: str,
+    for_weights: Mapping[str, object],
+    *,
+    controls: bool | None,
+    labels: str | None,
     as_json: bool,
-) -> int:  # fmt: skip
+) -> int:
     from flows.archive.judge_command import JudgeRequest, run_judge
 
     usual = inspect.signature(evaluate).parameters

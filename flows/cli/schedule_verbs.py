@@ -51,9 +51,17 @@ def serve(
     from flows.schedule.serve_command import ServeChoice, run_serve
 
     choice = ServeChoice(
-        files=fields, cron=cron, every=every, timezone=timezone, out=out, limit=limit, late=late, engine=engine,
-        port=port, notify=notify,
-    )  # fmt: skip
+        files=fields,
+        cron=cron,
+        every=every,
+        timezone=timezone,
+        out=out,
+        limit=limit,
+        late=late,
+        engine=engine,
+        port=port,
+        notify=notify,
+    )
     return run_serve(choice, stderr)
 
 

@@ -32,9 +32,15 @@ def format_difference(interval: dict[str, float | None] | None, digits: int = 1)
 
 def _table(title: str, caption: str, first: str, *columns: str) -> Table:
     table = Table(
-        title=title, title_justify="left", title_style="", caption=caption or None, caption_justify="left",
-        header_style="dim", box=SIMPLE_HEAD, collapse_padding=True,
-    )  # fmt: skip
+        title=title,
+        title_justify="left",
+        title_style="",
+        caption=caption or None,
+        caption_justify="left",
+        header_style="dim",
+        box=SIMPLE_HEAD,
+        collapse_padding=True,
+    )
     table.add_column(first, no_wrap=True)
     for name in columns:
         table.add_column(name, justify="right", no_wrap=True)
@@ -45,16 +51,22 @@ def _pooled(content: dict[str, Any]) -> Table:
     names = ("K", "least", "most", "threshold", "mIoU", "to K on every frame")
     table = _table(
         "pooled: one threshold for the scores of all frames, and the seats that a frame then has",
-        content["notes"]["pooled"], "placement", *names,
-    )  # fmt: skip
+        content["notes"]["pooled"],
+        "placement",
+        *names,
+    )
     for row in content["rows"]:
         if row["thresholds"]:
             seats = row["seats_per_frame"]
             table.add_row(
-                row["policy"], format_percent(row["share"]), str(seats["least"]), str(seats["most"]),
+                row["policy"],
+                format_percent(row["share"]),
+                str(seats["least"]),
+                str(seats["most"]),
                 ", ".join(DASH if one is None else f"{one:.3g}" for one in row["thresholds"]),
-                format_points(row["miou"]), format_difference(row["against_share_per_frame"], 2),
-            )  # fmt: skip
+                format_points(row["miou"]),
+                format_difference(row["against_share_per_frame"], 2),
+            )
     return table
 
 
@@ -64,11 +76,18 @@ def _rig(content: dict[str, Any]) -> Table:
     table = _table("rig mode: mIoU at equal capture seconds", _left_out(rig["left_out"]), "plan", *names)
     for row in sorted(rig["rows"], key=lambda row: row["budget"]):
         table.add_row(
-            row["policy"], format_percent(row["budget"]), _whole(row["seconds"]),
-            _part(row["seconds"], row["full_s"]), _whole(row["lines"]), _part(row["lines"], row["full_lines"]),
-            _whole(row["seats"]), format_points(row["miou"]), format_points(row["pixel_accuracy"]),
-            format_difference(row["against_uniform"]), format_difference(row["against_random"]),
-        )  # fmt: skip
+            row["policy"],
+            format_percent(row["budget"]),
+            _whole(row["seconds"]),
+            _part(row["seconds"], row["full_s"]),
+            _whole(row["lines"]),
+            _part(row["lines"], row["full_lines"]),
+            _whole(row["seats"]),
+            format_points(row["miou"]),
+            format_points(row["pixel_accuracy"]),
+            format_difference(row["against_uniform"]),
+            format_difference(row["against_random"]),
+        )
     return table
 
 
@@ -91,11 +110,17 @@ def _equal_time(content: dict[str, Any]) -> Table:
     )
     for row in content["equal_time"]:
         table.add_row(
-            row["policy"], format_percent(row["share"]), f"x {row['exposure']:.2f}", _whole(row["seconds"]),
-            _part(row["seconds"], row["full_s"]), format_points(row["miou"]), format_points(row["pixel_accuracy"]),
-            format_difference(row["against_all"]), format_points(row["equal_exposure_miou"]),
+            row["policy"],
+            format_percent(row["share"]),
+            f"x {row['exposure']:.2f}",
+            _whole(row["seconds"]),
+            _part(row["seconds"], row["full_s"]),
+            format_points(row["miou"]),
+            format_points(row["pixel_accuracy"]),
+            format_difference(row["against_all"]),
+            format_points(row["equal_exposure_miou"]),
             format_difference(row["against_equal_exposure"]),
-        )  # fmt: skip
+        )
     return table
 
 

@@ -32,9 +32,14 @@ ROUNDS = 3  # set-ups do not grow with the exposure, so that one step falls shor
 
 
 def judge_equal_time(
-    trial: Trial, scene: RasterScene, look: Look, weights: Weights, camera: LineCamera, cost: CostModel,
+    trial: Trial,
+    scene: RasterScene,
+    look: Look,
+    weights: Weights,
+    camera: LineCamera,
+    cost: CostModel,
     report: Callable[[float], None] = lambda done: None,
-) -> dict[str, Any] | None:  # fmt: skip
+) -> dict[str, Any] | None:
     """Judge each policy at each share, and plans of lines, with the exposure of equal time; None beyond the mirror.
 
     Glance, scores and seats are those of the longer exposure. Of random placements the first draw stands for all. Where

@@ -198,7 +198,10 @@ def sight_of(scene: RasterScene, name: str, weights: AnyWeights, camera: LineCam
     labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))
     assert labels is not None  # check_frame
     return Sight(
-        name, CoarseLook(grid, np.ascontiguousarray(example.coarse, np.float32)),
-        patches_of(example.fine, config.patch).astype(np.float32), labels,
-        len(scene.wavelength_nm), observed.fine[: grid.height, : grid.width],
-    )  # fmt: skip
+        name,
+        CoarseLook(grid, np.ascontiguousarray(example.coarse, np.float32)),
+        patches_of(example.fine, config.patch).astype(np.float32),
+        labels,
+        len(scene.wavelength_nm),
+        observed.fine[: grid.height, : grid.width],
+    )

@@ -46,9 +46,12 @@ def scene_of(data: TrainingData, name: str) -> RasterScene:
 
 
 def sort_frames(
-    request: EvaluateRequest, data: TrainingData, weights: Sequence[Candidate], controls: Sequence[Candidate],
+    request: EvaluateRequest,
+    data: TrainingData,
+    weights: Sequence[Candidate],
+    controls: Sequence[Candidate],
     show: Show,
-) -> Jobs:  # fmt: skip
+) -> Jobs:
     """Look at every frame for who was trained on it.
 
     Raises

@@ -98,10 +98,16 @@ def _point_down(axes: Axes, far: list[dict[str, Any]], what: str, unit: float) -
         x = row["cost"][what]["done"] / unit
         side, away = ("left", 7) if x**2 < left * right else ("right", -7)  # towards the middle of the axis
         axes.annotate(
-            f"{row['policy']} {100 * row['miou']:.1f}", (x, 0.025), (away, 13 * number - 3), xycoords=edge,
-            textcoords="offset points", color=INK, size=9, ha=side,
+            f"{row['policy']} {100 * row['miou']:.1f}",
+            (x, 0.025),
+            (away, 13 * number - 3),
+            xycoords=edge,
+            textcoords="offset points",
+            color=INK,
+            size=9,
+            ha=side,
             arrowprops={"arrowstyle": "-", "color": MUTED, "linewidth": 0.6, "shrinkB": 4},
-        )  # fmt: skip
+        )
 
 
 def _mark(axes: Axes, row: dict[str, Any], what: str, unit: float, named: bool) -> None:
@@ -120,9 +126,16 @@ def _draw_line(axes: Axes, own: list[dict[str, Any]], what: str, unit: float, co
     oracle, control = own[0]["uses_labels"], own[0]["control"]
     named = f"{own[0]['policy']} (uses labels)" if oracle else own[0]["policy"]
     axes.plot(
-        x, [100 * row["miou"] for row in own], marker="x" if control else "o", markersize=5, linewidth=1.5, zorder=3,
-        linestyle="--" if oracle else ":" if control else "-", color=INK if oracle else colour, label=named,
-    )  # fmt: skip
+        x,
+        [100 * row["miou"] for row in own],
+        marker="x" if control else "o",
+        markersize=5,
+        linewidth=1.5,
+        zorder=3,
+        linestyle="--" if oracle else ":" if control else "-",
+        color=INK if oracle else colour,
+        label=named,
+    )
     bounds = [row["against_baseline"] for row in own]
     if oracle or any(one is None or one["low"] is None for one in bounds):
         return
@@ -145,4 +158,4 @@ def _name_shares(axes: Axes, rows: list[dict[str, Any]], what: str, unit: float)
         place = (lowest["cost"][what]["done"] / unit, 100 * lowest["miou"])
         axes.annotate(
             format_percent(share), place, (0, -14), textcoords="offset points", color=INK, size=9, ha="center"
-        )  # fmt: skip
+        )

@@ -55,9 +55,11 @@ def checked_request(request: EvaluateRequest) -> EvaluateRequest:
                 f"--policies: {policy!r} is none that can be judged on a data set; choose of {', '.join(JUDGED)}"
             )
     for flag, value, least in (
-        ("--seed", request.seed, 0), ("--draws", request.draws, 1), ("--timed-frames", request.timed_frames, 0),
+        ("--seed", request.seed, 0),
+        ("--draws", request.draws, 1),
+        ("--timed-frames", request.timed_frames, 0),
         ("--timed-runs", request.timed_runs, 1),
-    ):  # fmt: skip
+    ):
         if value < least:
             raise SettingsError(f"{flag} must be at least {least}, got {value}")
     shares = tuple(sorted({share for share in request.shares if 0 < share < 1}))

@@ -29,9 +29,13 @@ Spend = Callable[[float], tuple[Seats, float, int]]  # seconds of the fine pass 
 
 
 def judge_rig(
-    look: Look, weights: Weights, camera: LineCamera, cost: CostModel, seed: int,
+    look: Look,
+    weights: Weights,
+    camera: LineCamera,
+    cost: CostModel,
+    seed: int,
     report: Callable[[float], None] = lambda done: None,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Judge the map of every plan at every budget that pays for the coarse pass; all plans read the same glance.
 
     ``left_out`` says why a budget is missing: it does not pay for the coarse pass, or the mirror does not reach.
@@ -56,11 +60,17 @@ def judge_rig(
             counts = confusion(look.labels, drawn, weights.config.classes)
             rows.append(
                 {
-                    "policy": plan, "share": budget, "draw": draw, "seats": len(seats), "seconds": coarse_s + seconds,
-                    "full_s": full_s, "lines": count_lines(coarse) + lines, "full_lines": count_lines(full),
+                    "policy": plan,
+                    "share": budget,
+                    "draw": draw,
+                    "seats": len(seats),
+                    "seconds": coarse_s + seconds,
+                    "full_s": full_s,
+                    "lines": count_lines(coarse) + lines,
+                    "full_lines": count_lines(full),
                     "counts": counts.tolist(),
                 }
-            )  # fmt: skip
+            )
             report((number + (at + 1) / len(spends)) / len(BUDGETS))
     return {"frame": look.name, "rows": rows, "left_out": left_out}
 

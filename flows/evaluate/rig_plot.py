@@ -41,9 +41,16 @@ def rig_figure(content: dict[str, Any]) -> Figure:
         colour, line, marker = _STYLES[plan]
         seconds = [row["seconds"] for row in own]
         axes.plot(
-            seconds, [100 * row["miou"] for row in own], color=colour, linestyle=line, marker=marker, markersize=5,
-            linewidth=1.6, label=plan, zorder=3,
-        )  # fmt: skip
+            seconds,
+            [100 * row["miou"] for row in own],
+            color=colour,
+            linestyle=line,
+            marker=marker,
+            markersize=5,
+            linewidth=1.6,
+            label=plan,
+            zorder=3,
+        )
         bounds = [row["against_uniform"] for row in own]
         if all(one is not None and one["low"] is not None for one in bounds):
             low, high = (

@@ -103,9 +103,12 @@ def difference(row: Row, other: Row, trial: Record) -> Record:
     if not both.any():
         return {"difference": None, "low": None, "high": None, "frames": 0}
     found = paired_interval(
-        row.counts[:, both], other.counts[:, both],
-        seeds=(row.of_seed, other.of_seed), draws=trial["draws"], seed=trial["seed"],
-    )  # fmt: skip
+        row.counts[:, both],
+        other.counts[:, both],
+        seeds=(row.of_seed, other.of_seed),
+        draws=trial["draws"],
+        seed=trial["seed"],
+    )
     return {**found.as_dict(), "frames": int(both.sum())}
 
 

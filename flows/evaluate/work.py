@@ -29,8 +29,15 @@ from pipeline.simulator.scenes.scene import RasterScene
 Record = dict[str, Any]
 Report = Callable[[float], None]
 UNITS = {  # rough shares of time
-    "frame": 1.0, "time": 3.0, "capture": 0.5, "control": 0.7, "rig": 1.5, "equal": 1.5, "scores": 0.05, "pooled": 0.4,
-}  # fmt: skip
+    "frame": 1.0,
+    "time": 3.0,
+    "capture": 0.5,
+    "control": 0.7,
+    "rig": 1.5,
+    "equal": 1.5,
+    "scores": 0.05,
+    "pooled": 0.4,
+}
 
 
 @dataclass
@@ -123,9 +130,13 @@ class Work:
 
     def _make(self, tasks: Sequence[Task], judged: Judged, show: Show) -> None:
         places = {
-            "frame": judged.runs, "control": judged.controls, "rig": judged.rig, "equal": judged.equal,
-            "scores": judged.scores, "pooled": judged.pooled,
-        }  # fmt: skip
+            "frame": judged.runs,
+            "control": judged.controls,
+            "rig": judged.rig,
+            "equal": judged.equal,
+            "scores": judged.scores,
+            "pooled": judged.pooled,
+        }
         for task in tasks:
 
             def report(part: float, task: Task = task) -> None:
@@ -150,10 +161,19 @@ class Work:
     def _record(self, task: Task, report: Report) -> Record | None:
         if self._scene is None or self._last_name != task.name:
             self._scene, self._last_name = scene_of(self.data, task.name), task.name
-        scene, makers = self._scene, {
-            "frame": self._frame, "time": self._time, "capture": self._capture, "control": self._control,
-            "rig": self._rig, "equal": self._equal, "scores": self._scores, "pooled": self._pooled,
-        }  # fmt: skip
+        scene, makers = (
+            self._scene,
+            {
+                "frame": self._frame,
+                "time": self._time,
+                "capture": self._capture,
+                "control": self._control,
+                "rig": self._rig,
+                "equal": self._equal,
+                "scores": self._scores,
+                "pooled": self._pooled,
+            },
+        )
 
         def make() -> Record | None:
             start = time.monotonic()
@@ -169,9 +189,13 @@ class Work:
         labels = None if self.data.files is None or scene.labels is None else zlib.crc32(scene.labels.tobytes())
         one = (self.controls if task.kind == "control" else self.candidates)[task.index]
         own: Record = {
-            "weights": one.key, "frame": task.name, "scene": scene.key, "labels": labels,
-            "camera": asdict(self.camera), **asdict(self.trial),
-        }  # fmt: skip
+            "weights": one.key,
+            "frame": task.name,
+            "scene": scene.key,
+            "labels": labels,
+            "camera": asdict(self.camera),
+            **asdict(self.trial),
+        }
         if task.kind in ("capture", "rig", "equal"):
             own["cost"] = asdict(COST)
         if task.kind in ("rig", "equal"):

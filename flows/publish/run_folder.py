@@ -18,14 +18,7 @@ from numpy.typing import NDArray
 from flows.publish.findings import find_out
 from flows.publish.panels import draw_ground
 from flows.publish.quicklook import QuicklookData, draw_quicklook
-from flows.publish.receipt import (
-    AccuracyIs,
-    Header,
-    Receipt,
-    build_receipt,
-    check_receipt,
-    with_accuracy,
-)
+from flows.publish.receipt import AccuracyIs, Header, Receipt, build_receipt, check_receipt, with_accuracy
 from flows.publish.report import Picture, write_report
 from flows.settings.load import anchor_paths
 from flows.survey.model_work import work_done, work_of_map
@@ -101,9 +94,13 @@ def add_accuracy(run: SurveyRun, draft: RunDraft, products: Products, stage: Sta
     other_labels = asked["labels"] != before["settings"].get("labels")
     names = ("accuracy", "controls", *(("labels", "notes") if other_labels else ()))
     receipt = with_accuracy(
-        before, load_accuracy(products.of("evaluate")), stage, _address("accuracy", products.of("evaluate")),
-        settings={name: asked[name] for name in names}, judged=now(),
-    )  # fmt: skip
+        before,
+        load_accuracy(products.of("evaluate")),
+        stage,
+        _address("accuracy", products.of("evaluate")),
+        settings={name: asked[name] for name in names},
+        judged=now(),
+    )
     return _publish(run, draft, products, load_plan(products.of("attend")), receipt)
 
 
@@ -150,15 +147,19 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
     if accuracy is not None and "segment_wall_s" in accuracy:
         savings["segment_wall_s"] = accuracy.pop("segment_wall_s")
     header = Header(
-        run.name, run.source.name, run.scene.key, run.settings.seed, started, now(),
-        _versions(),
-        asked_settings(run),
-    )  # fmt: skip
+        run.name, run.source.name, run.scene.key, run.settings.seed, started, now(), _versions(), asked_settings(run)
+    )
     return build_receipt(
-        header, runner.records.values(), savings, _addresses(products, folder),
-        accuracy=accuracy, accuracy_is=_accuracy_is(run, products), judged=None if accuracy is None else now(),
-        simulation=simulation, findings=find_out(run, products),
-    )  # fmt: skip
+        header,
+        runner.records.values(),
+        savings,
+        _addresses(products, folder),
+        accuracy=accuracy,
+        accuracy_is=_accuracy_is(run, products),
+        judged=None if accuracy is None else now(),
+        simulation=simulation,
+        findings=find_out(run, products),
+    )
 
 
 def _accuracy_is(run: SurveyRun, products: Products) -> AccuracyIs:

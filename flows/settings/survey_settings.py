@@ -78,8 +78,7 @@ class Settings:
         example="first of June",
     )
     scene: SceneName = stated(
-        "farm",
-        "`farm` (built in; `farm@2`), or a file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr",
+        "farm", "`farm` (built in; `farm@2`), or a file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr"
     )
     labels: str | None = stated(
         None, "Class colours or numbers on the scene's pixels; accuracy is reported then", example="labels.png"

@@ -281,13 +281,24 @@ def _compared(
     sweep = next(sweep for sweep, _ in blocks if sweep.name == place.sweep)
     left_out, cheaper = _inexact(effects)
     return Comparison(
-        lines=_count(taken), of_lines=_count(blocks), exact_cpu_s=sums.exact_cpu_s, cpu_s=sums.cpu_s,
-        effects_exact=len(everything(effects)), effects_on=len(chosen_effects(effects)),
-        unit=total["unit"], tolerance=total["tolerance"], bound=total["bound"],
-        measured=sums.greatest, rms=float(np.sqrt(sums.squares / sums.numbers)), place=place,
-        raw_unequal=sums.unequal / sums.raw_numbers, raw_most_dn=sums.most_dn,
-        left_out=left_out, cheaper=cheaper, view=_view(run, ways, sweep, place),
-    )  # fmt: skip
+        lines=_count(taken),
+        of_lines=_count(blocks),
+        exact_cpu_s=sums.exact_cpu_s,
+        cpu_s=sums.cpu_s,
+        effects_exact=len(everything(effects)),
+        effects_on=len(chosen_effects(effects)),
+        unit=total["unit"],
+        tolerance=total["tolerance"],
+        bound=total["bound"],
+        measured=sums.greatest,
+        rms=float(np.sqrt(sums.squares / sums.numbers)),
+        place=place,
+        raw_unequal=sums.unequal / sums.raw_numbers,
+        raw_most_dn=sums.most_dn,
+        left_out=left_out,
+        cheaper=cheaper,
+        view=_view(run, ways, sweep, place),
+    )
 
 
 def _inexact(effects: StageRef) -> tuple[tuple[str, ...], tuple[str, ...]]:

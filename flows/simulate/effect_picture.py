@@ -127,8 +127,11 @@ def _draw_change(axes: Axes, found: Comparison) -> AxesImage:
     left, right, bottom, top = _extent(view)
     circle = Circle(
         (place.sample + 0.5, (place.line - view.lines.start + 0.5) * view.sweep.step),
-        radius=0.03 * (right - left), facecolor="none", edgecolor=INK, linewidth=1.4,
-    )  # fmt: skip
+        radius=0.03 * (right - left),
+        facecolor="none",
+        edgecolor=INK,
+        linewidth=1.4,
+    )
     if found.measured:
         axes.add_patch(circle)
     axes.set(xlim=(left, right), ylim=(bottom, top))

@@ -85,9 +85,13 @@ def run_emulate(
     for note in notes:
         console.print(f"[dim]note: {escape(note)}[/]", highlight=False)
     rig = EmulatedRig(
-        source, FastClock(request.speed), mirror_faults=mirror_faults, camera_faults=camera_faults, kept=KEPT_CAPTURES,
+        source,
+        FastClock(request.speed),
+        mirror_faults=mirror_faults,
+        camera_faults=camera_faults,
+        kept=KEPT_CAPTURES,
         mounting=request.settings.rig.mounting,
-    )  # fmt: skip
+    )
     with _ending(ended or threading.Event()) as end, rig.serve(baud=request.baud) as served:
         _tell(request, served, console, as_json=as_json)
         with console.status(_state(rig)) as line:
@@ -115,9 +119,14 @@ def _tell(request: EmulateRequest, served: ServedRig, console: Console, *, as_js
 def _rig_table(served: ServedRig) -> dict[str, object]:
     panel = served.rig.camera.view.source.scene.panel
     return {
-        "port": served.port, "host": served.host, "control_port": served.camera_port, "file_port": served.file_port,
-        "pulses": served.rig.camera.wired, "panel": round(float(panel.mean()), 6), "provenance": "emulated",
-    }  # fmt: skip
+        "port": served.port,
+        "host": served.host,
+        "control_port": served.camera_port,
+        "file_port": served.file_port,
+        "pulses": served.rig.camera.wired,
+        "panel": round(float(panel.mean()), 6),
+        "provenance": "emulated",
+    }
 
 
 def _mounting_table(rig: SurveyRig) -> dict[str, object]:
@@ -130,10 +139,17 @@ def _survey_toml(settings: Settings, table: dict[str, object]) -> str:
     """A survey of the emulated rig: the scene says how large the field is, and what is true there."""
     size = None if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
     wanted = {
-        "scene": settings.scene, "size": size, "day": settings.day, "hour": settings.hour, "bands": settings.bands,
-        "wavelengths": settings.wavelengths, "seed": settings.seed, "effects": settings.effects,
-        "tol": str(settings.tol), "source": "rig",
-    }  # fmt: skip
+        "scene": settings.scene,
+        "size": size,
+        "day": settings.day,
+        "hour": settings.hour,
+        "bands": settings.bands,
+        "wavelengths": settings.wavelengths,
+        "seed": settings.seed,
+        "effects": settings.effects,
+        "tol": str(settings.tol),
+        "source": "rig",
+    }
     given = [f"{key} = {_toml_value(value)}" for key, value in wanted.items() if value is not None]
     return "\n".join(
         ["# A survey of an emulated rig, for as long as that runs.", *given, "", _toml_table("rig", table)]

@@ -102,9 +102,14 @@ def _task_step(runner: StageRunner) -> Step:
     def step(name: str, /, *inputs: StageRef) -> StageRef | None:
         """Run a stage as a task that comes after the last one."""
         one = task(
-            name=name, task_run_name=f"{name}-{runner.run.name}", cache_policy=NO_CACHE, persist_result=False,
-            retries=STAGES[name].retries, retry_delay_seconds=RETRY_DELAY_S, retry_condition_fn=_may_help,
-        )(stage)  # fmt: skip
+            name=name,
+            task_run_name=f"{name}-{runner.run.name}",
+            cache_policy=NO_CACHE,
+            persist_result=False,
+            retries=STAGES[name].retries,
+            retry_delay_seconds=RETRY_DELAY_S,
+            retry_condition_fn=_may_help,
+        )(stage)
         found = one(name, {ref.uri: ref.key for ref in inputs}, before)
         if found is None:
             return None

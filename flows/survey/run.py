@@ -155,10 +155,20 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     _check_pose(settings, scene.shape)
     key = content_key(path)
     return SurveyRun(
-        settings=settings, archive=open_archive(settings.out), source=source, simulated=simulated, scene=scene,
-        planned=planned, described=described, load=load, weights_key=key, grid=grid, plan=plan,
-        notes=(*notes, *sealing, *band_notes, *vgg_notes, *label_notes), refused=refused,
-    )  # fmt: skip
+        settings=settings,
+        archive=open_archive(settings.out),
+        source=source,
+        simulated=simulated,
+        scene=scene,
+        planned=planned,
+        described=described,
+        load=load,
+        weights_key=key,
+        grid=grid,
+        plan=plan,
+        notes=(*notes, *sealing, *band_notes, *vgg_notes, *label_notes),
+        refused=refused,
+    )
 
 
 def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:

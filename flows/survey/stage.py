@@ -22,9 +22,17 @@ from storage.archive.archive import Archive, StageRef, stage_key
 
 Build = Callable[[Path], None]
 Unit = Literal[
-    "pixels", "coarse pixels", "scene values", "mosaic values", "coarse values", "fine values", "patch values",
-    "operations of the map", "operations of a glance", "surveys",
-]  # fmt: skip
+    "pixels",
+    "coarse pixels",
+    "scene values",
+    "mosaic values",
+    "coarse values",
+    "fine values",
+    "patch values",
+    "operations of the map",
+    "operations of a glance",
+    "surveys",
+]
 
 
 @dataclass(frozen=True)
@@ -86,17 +94,29 @@ class Stage:
     def produce(self, archive: Archive, wanted: Wanted) -> tuple[StageRef, bool]:
         """Find the store, or have it built; the second value says whether it was built."""
         ref, built = archive.produce(
-            self.product.name, wanted.build, version=self.product.version, params=wanted.params,
+            self.product.name,
+            wanted.build,
+            version=self.product.version,
+            params=wanted.params,
             inputs=[ref.key for ref in wanted.inputs],
-        )  # fmt: skip
+        )
         wanted.then()
         return ref, built
 
 
 def stage(
-    name: str, title: str, product: Product, *, unit: Unit, of: tuple[str, ...] = (), size: Unit | None = None,
-    after: tuple[str, ...] = (), inputs: int | None = None, retries: int = 0, judges: bool = False,
-) -> Callable[[Callable[..., Wanted | None]], Stage]:  # fmt: skip
+    name: str,
+    title: str,
+    product: Product,
+    *,
+    unit: Unit,
+    of: tuple[str, ...] = (),
+    size: Unit | None = None,
+    after: tuple[str, ...] = (),
+    inputs: int | None = None,
+    retries: int = 0,
+    judges: bool = False,
+) -> Callable[[Callable[..., Wanted | None]], Stage]:
     """Make a function a stage; see `Stage` for what is said of it. Its module lies in `flows.survey.stages`."""
 
     def record(wants: Callable[..., Wanted | None]) -> Stage:

@@ -38,14 +38,14 @@ class StageProgress:
         room = max(console.width - TITLE - bar - TIME - 3, TIME)
         self._bars = Progress(
             TextColumn(
-                "{task.description}", markup=False,
-                table_column=Column(width=TITLE, no_wrap=True, overflow="ellipsis"),
+                "{task.description}", markup=False, table_column=Column(width=TITLE, no_wrap=True, overflow="ellipsis")
             ),
             BarColumn(bar, table_column=Column(width=bar)),
             TimeElapsedColumn(table_column=Column(width=TIME)),
             _WordsOrLeft(table_column=Column(max_width=room, no_wrap=True, overflow="ellipsis")),
-            console=console, disable=not console.is_terminal,
-        )  # fmt: skip
+            console=console,
+            disable=not console.is_terminal,
+        )
 
     def __enter__(self) -> StageProgress:
         self._bars.start()

@@ -39,9 +39,7 @@ class SpentSurvey:
 
 def _prepare(seed: int) -> FarmToSpendOn:
     farm = look_at_farm(seed, SHAPE)
-    columns = columns_of_all_seats(
-        farm.source, farm.full, farm.grid, farm.weights, memory=2**31, kernel="catmull-rom"
-    )  # fmt: skip
+    columns = columns_of_all_seats(farm.source, farm.full, farm.grid, farm.weights, memory=2**31, kernel="catmull-rom")
     return FarmToSpendOn(farm, glance(farm.weights, farm.mosaic, farm.scene.wavelength_nm, farm.grid), columns)
 
 

@@ -38,9 +38,14 @@ def print_tradeoff(result: Result, console: Console) -> None:
     narrow = len(figures) > 1
     table = Table(
         title=f"{escape(result.stage)}, {escape(result.knob)}: to be right to ... you pay ...",
-        title_justify="left", title_style="bold", header_style="dim", box=SIMPLE_HEAD,
-        caption=_caption(result), caption_justify="left", collapse_padding=narrow,
-    )  # fmt: skip
+        title_justify="left",
+        title_style="bold",
+        header_style="dim",
+        box=SIMPLE_HEAD,
+        caption=_caption(result),
+        caption_justify="left",
+        collapse_padding=narrow,
+    )
     walls = () if narrow else ("wall, least", "wall, median")
     for number, name in enumerate(("", result.knob, *figures, f"per {result.unit}", "price", "x first", *walls)):
         left, whole = number < 2, 0 < number < 2 + len(figures)

@@ -188,10 +188,12 @@ def _time_in_turn(
 
 
 def _point(
-    tradeoff: Tradeoff[State, Output], state: State, number: int,
+    tradeoff: Tradeoff[State, Output],
+    state: State,
+    number: int,
     judged: Sequence[tuple[float, float | None, dict[str, float]]],
     clocks: Sequence[Sequence[tuple[float, float]]],
-) -> Point:  # fmt: skip
+) -> Point:
     cpu, wall = zip(*clocks[number], strict=True)
     (error, modelled, beside), first_modelled = judged[number], judged[0][1]
     prices = zip(cpu, (first for first, _ in clocks[0]), strict=True)
@@ -199,11 +201,17 @@ def _point(
         prices = zip((modelled,), (first_modelled,), strict=True)
     ratios = [own / first for own, first in prices if first > 0]
     return Point(
-        setting=tradeoff.settings[number], error=error, work=tradeoff.work(state, tradeoff.settings[number]),
-        cpu_min_s=min(cpu), cpu_median_s=statistics.median(cpu),
-        wall_min_s=min(wall), wall_median_s=statistics.median(wall),
-        ratio=statistics.median(ratios) if ratios else math.nan, modelled_s=modelled, beside=beside,
-    )  # fmt: skip
+        setting=tradeoff.settings[number],
+        error=error,
+        work=tradeoff.work(state, tradeoff.settings[number]),
+        cpu_min_s=min(cpu),
+        cpu_median_s=statistics.median(cpu),
+        wall_min_s=min(wall),
+        wall_median_s=statistics.median(wall),
+        ratio=statistics.median(ratios) if ratios else math.nan,
+        modelled_s=modelled,
+        beside=beside,
+    )
 
 
 def mark_pareto(points: Sequence[Point]) -> tuple[Point, ...]:

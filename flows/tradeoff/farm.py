@@ -53,6 +53,4 @@ def look_at_farm(seed: int, shape: tuple[int, int], *, noise_seed: int | None = 
     coarse = coarse_sweeps(grid, camera, along)
     rows = mosaic_rows([SimulatedSweep(source, sweep) for sweep in coarse], camera, grid, rows=64)
     mosaic = np.concatenate([values for _, values, _ in rows])
-    return FarmLook(
-        weights, scene, source, grid, along, full, full_s, CostModel().seconds(coarse, camera), mosaic
-    )  # fmt: skip
+    return FarmLook(weights, scene, source, grid, along, full, full_s, CostModel().seconds(coarse, camera), mosaic)

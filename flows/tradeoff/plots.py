@@ -69,9 +69,15 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
     for (x, y), together in _by_place(axes, [(place[id(point)], point) for point in points]):
         beside = (7, 7) if any(point.pareto for point in together) else (9, -4)
         axes.annotate(
-            ", ".join(str(point.setting) for point in together), (x, y), beside, textcoords="offset points", color=INK,
-            size=10.5, zorder=4, path_effects=[withStroke(linewidth=3, foreground=_PAPER)],
-        )  # fmt: skip
+            ", ".join(str(point.setting) for point in together),
+            (x, y),
+            beside,
+            textcoords="offset points",
+            color=INK,
+            size=10.5,
+            zorder=4,
+            path_effects=[withStroke(linewidth=3, foreground=_PAPER)],
+        )
     axes.set_title(f"{result.stage}: {result.knob}", loc="left", weight="bold", color=INK, size=13)
     axes.set_xlabel("seconds by the cost model" if unit == "s" else f"{unit} / {result.unit}", color=INK)
     axes.set_ylabel(result.error, color=INK)
@@ -132,10 +138,15 @@ def _draw_levels(axes: Axes, result: Result, places: Sequence[tuple[float, float
         below = min(above, default=height) < 0.06 * height  # there is no room between two lines
         axes.axhline(level.error, color=colour, linewidth=1.1, linestyle=(0, (5, 3)), zorder=1)
         axes.annotate(
-            level.name, (start if left else axes.get_xlim()[1], level.error), (3 if left else -2, -3 if below else 3),
-            textcoords="offset points", ha="left" if left else "right", va="top" if below else "baseline",
-            color=colour, size=9,
-        )  # fmt: skip
+            level.name,
+            (start if left else axes.get_xlim()[1], level.error),
+            (3 if left else -2, -3 if below else 3),
+            textcoords="offset points",
+            ha="left" if left else "right",
+            va="top" if below else "baseline",
+            color=colour,
+            size=9,
+        )
 
 
 def _draw_memory_floor(axes: Axes, floor: float) -> None:
@@ -143,10 +154,18 @@ def _draw_memory_floor(axes: Axes, floor: float) -> None:
     axes.axvspan(axes.get_xlim()[0], floor, color=_FLOOR, alpha=0.07, linewidth=0, zorder=0)
     axes.axvline(floor, color=_FLOOR, linewidth=1.1, zorder=1)
     axes.annotate(
-        "bytes copied alone", (floor, 0.98), (-3, 0), textcoords="offset points", rotation=90, ha="right", va="top",
-        xycoords=blended_transform_factory(axes.transData, axes.transAxes), color=_FLOOR, size=9,
+        "bytes copied alone",
+        (floor, 0.98),
+        (-3, 0),
+        textcoords="offset points",
+        rotation=90,
+        ha="right",
+        va="top",
+        xycoords=blended_transform_factory(axes.transData, axes.transAxes),
+        color=_FLOOR,
+        size=9,
         path_effects=[withStroke(linewidth=3, foreground=_PAPER, alpha=0.8)],
-    )  # fmt: skip
+    )
 
 
 def _logarithmic(axes: Axes, result: Result, places: Sequence[tuple[float, float]], floor: float) -> float:

@@ -129,8 +129,10 @@ def _in_bands(state: InBands, count: Setting) -> Light:
     fewer = state.in_bands(count)
     if len(fewer.bands) == len(lines.scene.wavelength_nm):
         return lines.light(lines.footprint)
-    blocks = [replace(block, wavelength_nm=fewer.scene.wavelength_nm, fwhm_nm=fewer.scene.fwhm_nm, white_e=None)
-              for block in lines.blocks]  # fmt: skip
+    blocks = [
+        replace(block, wavelength_nm=fewer.scene.wavelength_nm, fwhm_nm=fewer.scene.fwhm_nm, white_e=None)
+        for block in lines.blocks
+    ]
     light = np.concatenate([expected_light(fewer.scene, block, lines.footprint) for block in blocks])
     made: Light = np.matmul(light, fewer.spline)
     return made

@@ -87,8 +87,11 @@ def law_of_numbers(electrons: float, rig: Rig) -> Floats:
 
 
 def _run(state: Counted, variant: Setting) -> Raw:
-    chosen: dict[Any, str] = {READ_NOISE: READ_NOISE.variants[0], SATURATION: SATURATION.variants[0],
-                              QUANTISATION: QUANTISATION.variants[0]}  # fmt: skip
+    chosen: dict[Any, str] = {
+        READ_NOISE: READ_NOISE.variants[0],
+        SATURATION: SATURATION.variants[0],
+        QUANTISATION: QUANTISATION.variants[0],
+    }
     shot: dict[Any, str] = {} if variant == OFF else {SHOT: str(variant)}
     return read_out(state.light, state.block, {**shot, **chosen})
 

@@ -85,10 +85,17 @@ def _by_rays(state: Rough, per_px: int) -> Light:
     lines, width = state.lines, state.lines.rig.camera.slit_px
     turns, runs = _middles(width, per_px), _middles(1.0, per_px)
     rays: dict[Any, str] = {effect: its for effect, its in lines.exact.items() if effect in RAYS}
-    blocks = [replace(one, wavelength_nm=state.components.wavelength_nm, fwhm_nm=None, white_e=None)
-              for one in lines.blocks]  # fmt: skip
-    parts = [sum(expected_light(state.components, block, {**rays, Beside(run, turn): "rays"})
-                 for turn in turns for run in runs) for block in blocks]  # fmt: skip
+    blocks = [
+        replace(one, wavelength_nm=state.components.wavelength_nm, fwhm_nm=None, white_e=None) for one in lines.blocks
+    ]
+    parts = [
+        sum(
+            expected_light(state.components, block, {**rays, Beside(run, turn): "rays"})
+            for turn in turns
+            for run in runs
+        )
+        for block in blocks
+    ]
     scale = np.float32(1 / (len(turns) * len(runs)))
     return to_bands(np.concatenate(parts) * scale, lines.scene.electrons)
 

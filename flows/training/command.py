@@ -42,10 +42,16 @@ def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
 def _check_counts(request: TrainRequest) -> None:
     settings = request.settings
     counts = {
-        "--steps": settings.steps, "--minutes": settings.minutes, "--batch": settings.batch, "--crop": settings.crop,
-        "--scenes": request.scenes, "--patch": request.patch, "--factor": request.factor, "--columns": request.columns,
+        "--steps": settings.steps,
+        "--minutes": settings.minutes,
+        "--batch": settings.batch,
+        "--crop": settings.crop,
+        "--scenes": request.scenes,
+        "--patch": request.patch,
+        "--factor": request.factor,
+        "--columns": request.columns,
         **{"--" + name.replace("_", "-"): size for name, size in request.tokens.items()},
-    }  # fmt: skip
+    }
     for name, value in counts.items():
         if value is not None and not value > 0:
             raise SettingsError(f"{name} must be above 0, got {value}")

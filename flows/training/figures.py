@@ -41,9 +41,14 @@ def validate(weights: AnyWeights, examples: Iterable[Example], seed: int, show: 
 def _rows(weights: Weights, example: Example, seed: int, show: Show) -> Controls:
     grid, cells, labels = _parts(weights, example)
     return run_controls(
-        weights, glance_of_columns(weights, example.coarse, grid), cells, labels,
-        share=CONTROL_SHARE, seed=seed, report=show,
-    )  # fmt: skip
+        weights,
+        glance_of_columns(weights, example.coarse, grid),
+        cells,
+        labels,
+        share=CONTROL_SHARE,
+        seed=seed,
+        report=show,
+    )
 
 
 def _parts(weights: AnyWeights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:

@@ -69,9 +69,13 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
     read_checkpoint(checkpoint)  # refuses a damaged one before minutes are spent
     start = open_start(request.init, request.tokens, request.preset)
     data = open_training_data(
-        request.dataset, request.validation, request.scenes, request.camera,
-        hold_out=request.hold_out, **request.choices,
-    )  # fmt: skip
+        request.dataset,
+        request.validation,
+        request.scenes,
+        request.camera,
+        hold_out=request.hold_out,
+        **request.choices,
+    )
     refuse_seen(start, data)
     seen, about = _observe_all(request, data, data.train, "looking at scenes", report)
     normalisation = measured_normalisation(seen)
@@ -147,9 +151,13 @@ def _split(about: _About, data: TrainingData) -> dict[str, Any]:
 
 
 def _observe_all(
-    request: TrainRequest, data: TrainingData, names: tuple[str, ...], what: str, report: Report,
+    request: TrainRequest,
+    data: TrainingData,
+    names: tuple[str, ...],
+    what: str,
+    report: Report,
     about: _About | None = None,
-) -> tuple[list[Observation], _About]:  # fmt: skip
+) -> tuple[list[Observation], _About]:
     seen = []
     for number, (name, scene) in enumerate(zip(names, data.scenes(names), strict=True)):
         report(what, number / len(names), name)

@@ -33,12 +33,7 @@ class Interval:
 
 
 def paired_interval(
-    first: Counts,
-    second: Counts,
-    *,
-    seeds: tuple[Numbers, Numbers] | None = None,
-    draws: int = DRAWS,
-    seed: int = 0,
+    first: Counts, second: Counts, *, seeds: tuple[Numbers, Numbers] | None = None, draws: int = DRAWS, seed: int = 0
 ) -> Interval:
     """Bootstrap the difference of two rows over frames, and over seeds of the training where there are several.
 

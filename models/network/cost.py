@@ -26,9 +26,17 @@ class MultiplyAdds:
 
 
 SCORE_PER_PIXEL = {  # per coarse pixel; entropy also per class
-    "entropy": 2, "margin": 4, "sobel": 19, "saliency": 75, "spectral-residual": 120,
-    "random": 0, "stratified": 0, "centre": 0, "uniform": 0, "mask": 0,
-}  # fmt: skip
+    "entropy": 2,
+    "margin": 4,
+    "sobel": 19,
+    "saliency": 75,
+    "spectral-residual": 120,
+    "random": 0,
+    "stratified": 0,
+    "centre": 0,
+    "uniform": 0,
+    "mask": 0,
+}
 AVERAGED = {"sobel": 1, "saliency": 2, "spectral-residual": 1}  # how often these go through all columns
 
 

@@ -23,9 +23,7 @@ class SeatScorer(nn.Module):
         inputs = scorer_inputs(config)
         self.norm = ChannelNorm(inputs)
         self.enter = nn.Conv2d(inputs, SCORER_WIDTH, 1)
-        self.around = nn.Conv2d(
-            SCORER_WIDTH, SCORER_WIDTH, 3, padding=1, padding_mode="replicate", groups=SCORER_WIDTH
-        )  # fmt: skip
+        self.around = nn.Conv2d(SCORER_WIDTH, SCORER_WIDTH, 3, padding=1, padding_mode="replicate", groups=SCORER_WIDTH)
         self.mix = nn.Conv2d(SCORER_WIDTH, SCORER_WIDTH, 1)
         self.leave = nn.Conv2d(SCORER_WIDTH, 1, 1)
         nn.init.zeros_(self.leave.weight)

@@ -25,9 +25,16 @@ PRESETS: dict[Preset, dict[str, Any]] = {
 MOST_CLASSES = 255  # maps are uint8 and 255 stands for unlabelled
 # What nobody builds: sizes beyond these are damage, or an attempt to have memory filled.
 MOST = {
-    "columns": 4096, "patch": 1024, "factor": 1024, "width": 4096, "coarse_width": 4096, "dim": 16384, "layers": 256,
-    "heads": 1024, "mlp_ratio": 64,
-}  # fmt: skip
+    "columns": 4096,
+    "patch": 1024,
+    "factor": 1024,
+    "width": 4096,
+    "coarse_width": 4096,
+    "dim": 16384,
+    "layers": 256,
+    "heads": 1024,
+    "mlp_ratio": 64,
+}
 BOTTOM = 4  # pixels a side at the lowest level of a patch
 PATCHES_AT_ONCE = 64  # their features fit the caches; larger chunks go to memory and back at every layer
 TOKEN_PX = 16  # a token stands for at most so many pixels a side

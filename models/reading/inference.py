@@ -201,9 +201,13 @@ def _glance(
 
 
 def segment(
-    weights: Weights, seen: CoarseLook, patches: NDArray[np.floating], seats: NDArray[np.integer],
-    *, precision: Precision = "float32",
-) -> DrawnMap:  # fmt: skip
+    weights: Weights,
+    seen: CoarseLook,
+    patches: NDArray[np.floating],
+    seats: NDArray[np.integer],
+    *,
+    precision: Precision = "float32",
+) -> DrawnMap:
     """Draw the class map from the coarse look and the fine patches.
 
     Parameters
@@ -228,9 +232,13 @@ def segment(
 
 
 def segment_batch(
-    weights: Weights, seen: Sequence[CoarseLook], patches: Sequence[NDArray[np.floating]],
-    seats: Sequence[NDArray[np.integer]], *, precision: Precision = "float32",
-) -> list[DrawnMap]:  # fmt: skip
+    weights: Weights,
+    seen: Sequence[CoarseLook],
+    patches: Sequence[NDArray[np.floating]],
+    seats: Sequence[NDArray[np.integer]],
+    *,
+    precision: Precision = "float32",
+) -> list[DrawnMap]:
     """Draw the maps of scenes of any sizes and numbers of seats together, as ``segment`` one by one, but faster.
 
     Fine patches of all scenes are packed, nothing is padded. For the rest see ``segment``.
@@ -264,8 +272,11 @@ def _draw_pack(
     looks = [look for look, _, _ in pack]
     readings = readings_of(weights, looks, precision=precision)
     padded = [draw_coarse(reading.logits.float(), look.grid) for reading, look in zip(readings, looks, strict=True)]
-    places = ((drawn, place) for drawn, (look, _, seats) in zip(padded, pack, strict=True)
-              for place in look.grid.seat_origin(seats))  # fmt: skip
+    places = (
+        (drawn, place)
+        for drawn, (look, _, seats) in zip(padded, pack, strict=True)
+        for place in look.grid.seat_origin(seats)
+    )
     scenes = [
         FineScene(reading, own, torch.from_numpy(seats), origin_of(look))
         for reading, (look, own, seats) in zip(readings, pack, strict=True)

@@ -60,13 +60,7 @@ def class_weights(examples: list[Example], classes: int, cap: float) -> Tensor:
 
 
 def batch_loss(
-    model: Network,
-    batch: Batch,
-    weight: Tensor,
-    rng: np.random.Generator,
-    phase: Phase,
-    *,
-    soft_dice: bool,
+    model: Network, batch: Batch, weight: Tensor, rng: np.random.Generator, phase: Phase, *, soft_dice: bool
 ) -> Tensor:
     """Loss of one batch: the map with a drawn share of seats, the glance alone, and what the scorer said of them."""
     if not isinstance(model, Segmenter):

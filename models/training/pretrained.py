@@ -51,12 +51,7 @@ class LoadReport:
         return counts + (f" ({'; '.join(reasons[:3])}{'; ...' if len(reasons) > 3 else ''})" if reasons else "")
 
 
-def load_into(
-    module: nn.Module,
-    state: Mapping[str, Tensor],
-    *,
-    names: Mapping[str, str] | None = None,
-) -> LoadReport:
+def load_into(module: nn.Module, state: Mapping[str, Tensor], *, names: Mapping[str, str] | None = None) -> LoadReport:
     """Put every tensor that has a place into ``module``, in place; nothing is changed where none has.
 
     Parameters

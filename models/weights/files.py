@@ -112,11 +112,7 @@ def save_weights(weights: AnyWeights, path: Path) -> None:
     about = {
         "format": FORMAT,
         "config": weights.config.as_dict(),
-        "basis": {
-            "low_nm": weights.basis.low_nm,
-            "high_nm": weights.basis.high_nm,
-            "columns": weights.basis.columns,
-        },
+        "basis": {"low_nm": weights.basis.low_nm, "high_nm": weights.basis.high_nm, "columns": weights.basis.columns},
         "class_names": list(weights.class_names),
         "record": weights.record,
     }
@@ -202,9 +198,13 @@ def _read(path: Path, described: Description) -> AnyWeights:
     network.load_state_dict({name: tensors[name] for name in network.state_dict()})
     normalisation = Normalisation(*(tensors[f"normalisation.{name}"].numpy() for name in NORMALISATION))
     return AnyWeights(
-        network.eval(), described.basis, normalisation, described.class_names, tensors["class_colours"].numpy(),
+        network.eval(),
+        described.basis,
+        normalisation,
+        described.class_names,
+        tensors["class_colours"].numpy(),
         described.record,
-    )  # fmt: skip
+    )
 
 
 def read_tensors(path: Path, described: Description) -> dict[str, Tensor]:

@@ -20,9 +20,19 @@ from pipeline.errors import WeightsError
 
 WRAPPERS = ("model", "state_dict", "model_state_dict", "model_ema", "module")
 DAMAGED = (  # what the readers raise over bytes that are not what they should be
-    SafetensorError, RuntimeError, EOFError, OSError, ValueError, TypeError, LookupError, AttributeError,
-    AssertionError, BadZipFile, struct.error, MemoryError,
-)  # fmt: skip
+    SafetensorError,
+    RuntimeError,
+    EOFError,
+    OSError,
+    ValueError,
+    TypeError,
+    LookupError,
+    AttributeError,
+    AssertionError,
+    BadZipFile,
+    struct.error,
+    MemoryError,
+)
 PREFIX = "module."  # what training on several devices puts before every name
 
 
@@ -134,9 +144,14 @@ def read_variant(checkpoint: Path) -> Variant:
     try:
         net = _nested_values(path.read_text(encoding="utf-8"))["net_kwargs"]
         return Variant(
-            str(net["backbone"]), int(net["patch_size"]), int(net["d_model"]), int(net["n_layers"]),
-            int(net["n_heads"]), int(net["n_cls"]), str(net["decoder"]["name"]),
-        )  # fmt: skip
+            str(net["backbone"]),
+            int(net["patch_size"]),
+            int(net["d_model"]),
+            int(net["n_layers"]),
+            int(net["n_heads"]),
+            int(net["n_cls"]),
+            str(net["decoder"]["name"]),
+        )
     except FileNotFoundError:
         raise WeightsError(
             f"no variant.yml beside {checkpoint}; copy it there, it says how many heads it has"

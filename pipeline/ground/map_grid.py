@@ -95,11 +95,7 @@ class GroundGrid:
 
 
 def ground_grid(
-    view: GroundView,
-    scene_shape: tuple[int, int],
-    *,
-    epsg: int | None = None,
-    resolution_m: float | None = None,
+    view: GroundView, scene_shape: tuple[int, int], *, epsg: int | None = None, resolution_m: float | None = None
 ) -> GroundGrid:
     """Lay a map's grid over the footprint of a field of (y, x) px. Its pixels start at multiples of their side.
 

@@ -186,18 +186,24 @@ def plan_fine(
             f"{whole[1]:.1f} s; the full scan is taken, which shows all of the field"
         )
         total = field.total * told
-        return FinePlan(
-            whole[0], grid.valid_seats(), whole[1], total, "full", reason, total, full_s, missed, threshold
-        )  # fmt: skip
+        return FinePlan(whole[0], grid.valid_seats(), whole[1], total, "full", reason, total, full_s, missed, threshold)
     sweeps = _sweeps(field, plan)
     check_reach(sweeps, camera)
     seconds = cost.seconds(sweeps, camera)
     seats = covered_seats(grid, camera, sweeps, margin_px=margin_px)
     return FinePlan(
-        sweeps, seats, seconds, plan.worth * told, "lines", _lines_reason(seconds, full_s),
-        field.total * told, full_s, missed, threshold,
+        sweeps,
+        seats,
+        seconds,
+        plan.worth * told,
+        "lines",
+        _lines_reason(seconds, full_s),
+        field.total * told,
+        full_s,
+        missed,
+        threshold,
         budget_s - seconds if floor and not everything else None,
-    )  # fmt: skip
+    )
 
 
 def _lines_reason(seconds: float, full_s: float | None) -> str:

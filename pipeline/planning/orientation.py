@@ -113,7 +113,7 @@ def compare_orientations(
     """
     here = plan or plan_fine(
         grid, camera, cost, along, scores, budget_s=budget_s, margin_px=margin_px, threshold=threshold
-    )  # fmt: skip
+    )
 
     def coarse_seconds(axis: Axis) -> float:
         sweeps = coarse_sweeps(grid, camera, axis, overlap_px=overlap_px)
@@ -129,9 +129,7 @@ def compare_orientations(
         if left < 0:
             reason = f"the coarse pass alone takes {other_coarse_s:.1f} s"
             return OrientationReport(taken, None, rows, reason)
-        turned = plan_fine(
-            grid, camera, cost, other, scores, budget_s=left, margin_px=margin_px, threshold=threshold
-        )  # fmt: skip
+        turned = plan_fine(grid, camera, cost, other, scores, budget_s=left, margin_px=margin_px, threshold=threshold)
     except PoseError as error:
         return OrientationReport(taken, None, rows, str(error))
     return OrientationReport(taken, _outcome(other, other_coarse_s, turned), rows)

@@ -48,13 +48,7 @@ def check_threshold(threshold: float) -> float:
     return threshold
 
 
-def select_seats(
-    score: Scores,
-    count: int,
-    valid: NDArray[np.bool_] | None = None,
-    *,
-    clip: bool = False,
-) -> Selection:
+def select_seats(score: Scores, count: int, valid: NDArray[np.bool_] | None = None, *, clip: bool = False) -> Selection:
     """Choose the ``count`` valid seats with the highest scores.
 
     Equal scores go to the lowest number; +inf comes first, NaN and -inf last. The choice is nested: the first K of a

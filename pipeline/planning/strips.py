@@ -164,12 +164,7 @@ def _strip_from(low: float, end: float, scan: int, camera: LineCamera) -> float:
 
 
 def look_from(
-    grid: SceneGrid,
-    camera: LineCamera,
-    strips: Sequence[Sweep],
-    wanted: NDArray[np.bool_],
-    *,
-    margin_px: float = 0.0,
+    grid: SceneGrid, camera: LineCamera, strips: Sequence[Sweep], wanted: NDArray[np.bool_], *, margin_px: float = 0.0
 ) -> Views:
     """List what strips show of the wanted seats with lines that the mirror can point.
 

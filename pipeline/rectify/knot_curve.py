@@ -130,9 +130,9 @@ def _catmull_rom_pieces(knots: Floats, alone: float) -> Floats:
     padded = np.concatenate([[knots[0] - before], knots, [knots[-1] + after]])
     tangent = np.concatenate([[before], (padded[2:] - padded[:-2]) / 2, [after]])
     step = np.diff(padded)
-    pieces = np.stack([
-        padded[:-1], tangent[:-1], 3 * step - 2 * tangent[:-1] - tangent[1:], tangent[:-1] + tangent[1:] - 2 * step,
-    ])  # fmt: skip
+    pieces = np.stack(
+        [padded[:-1], tangent[:-1], 3 * step - 2 * tangent[:-1] - tangent[1:], tangent[:-1] + tangent[1:] - 2 * step]
+    )
     pieces[2:, [0, -1]] = 0
     pieces[1, [0, -1]] = before, after
     return pieces

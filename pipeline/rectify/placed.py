@@ -105,9 +105,13 @@ def place(
     """
     sweep = lines.sweep
     tracks = make_tracks(
-        lines.position, camera, usable=lines.valid_line if usable is None else usable, shift_px=shift_px,
-        binning=sweep.binning, step_px=sweep.step,
-    )  # fmt: skip
+        lines.position,
+        camera,
+        usable=lines.valid_line if usable is None else usable,
+        shift_px=shift_px,
+        binning=sweep.binning,
+        step_px=sweep.step,
+    )
     tables = [None if grid is None else _table(track, lines, camera, grid) for track in tracks]
     return Placed(lines, tuple(zip(tracks, tables, strict=True)), gain)
 
@@ -117,9 +121,14 @@ def _table(track: Track, lines: SweepLines, camera: LineCamera, grid: PixelGrid)
 
     def of_shape(shape: tuple[int, int]) -> TieTable:
         return tie_table(
-            track, camera, along=lines.sweep.along, binning=lines.sweep.binning,
-            origin_px=grid.origin_px, spacing_px=grid.spacing_px, shape=shape,
-        )  # fmt: skip
+            track,
+            camera,
+            along=lines.sweep.along,
+            binning=lines.sweep.binning,
+            origin_px=grid.origin_px,
+            spacing_px=grid.spacing_px,
+            shape=shape,
+        )
 
     if of_shape((1, 1)).spacing < LEAST_TIE_PX:
         return None

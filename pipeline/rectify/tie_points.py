@@ -154,10 +154,7 @@ def tie_table(
 
 
 def _within_reach(
-    curve: KnotCurve,
-    camera: LineCamera,
-    along: Axis,
-    grid: tuple[int, tuple[float, float], float, tuple[int, int]],
+    curve: KnotCurve, camera: LineCamera, along: Axis, grid: tuple[int, tuple[float, float], float, tuple[int, int]]
 ) -> tuple[tuple[int, int], tuple[int, int]]:
     """First row and column of the pixels that lie between the ends of any of the track's lines, and how many."""
     binning, origin_px, spacing_px, shape = grid

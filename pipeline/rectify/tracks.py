@@ -101,10 +101,7 @@ def make_tracks(
 
 
 def line_centres(
-    position: Floats,
-    camera: LineCamera,
-    usable: NDArray[np.bool_] | None = None,
-    shift_px: Floats | None = None,
+    position: Floats, camera: LineCamera, usable: NDArray[np.bool_] | None = None, shift_px: Floats | None = None
 ) -> tuple[Floats, Floats, NDArray[np.intp]]:
     """Give where the usable lines of a sweep have their centres, in the order of capture.
 
@@ -140,8 +137,9 @@ def single_track(position: Floats, camera: LineCamera, binning: int = 1) -> Trac
     step = _usual_step(scan, lines, camera.ifov_rad * binning)
     order = np.argsort(scan, kind="stable")
     scan = scan[order]
-    return Track(scan, across[order], lines[order], np.arange(len(lines)), np.ones(len(lines), np.bool_),
-                 _width(scan, step))  # fmt: skip
+    return Track(
+        scan, across[order], lines[order], np.arange(len(lines)), np.ones(len(lines), np.bool_), _width(scan, step)
+    )
 
 
 def _check_positions(place: Floats, lines: NDArray[np.intp]) -> None:

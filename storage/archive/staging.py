@@ -130,9 +130,7 @@ def file_hash(path: Path) -> str:
     return digest.hexdigest()
 
 
-def take_lock(
-    path: Path, *, wait: bool = True, shared: bool = False, words: str = ""
-) -> Callable[[], None] | None:  # fmt: skip
+def take_lock(path: Path, *, wait: bool = True, shared: bool = False, words: str = "") -> Callable[[], None] | None:
     """Hold ``path`` against other processes and threads until the function returned is called, or the process dies.
 
     None where another holds it and ``wait`` is false. Holders of a ``shared`` lock keep out only those that want it

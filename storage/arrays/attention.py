@@ -9,12 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
-from storage.arrays.layout import (
-    create_group,
-    open_group,
-    read_array,
-    write_image,
-)
+from storage.arrays.layout import create_group, open_group, read_array, write_image
 
 
 @dataclass(frozen=True)

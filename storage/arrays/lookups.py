@@ -97,11 +97,15 @@ def _write_track(sweep: zarr.Group, name: str, track: Track, table: TieTable) ->
     group = sweep.create_group(
         name,
         attributes={
-            "width": track.width, "spacing": table.spacing, "shape": list(table.shape),
-            "corner": list(table.corner), "kept": list(table.kept), "bound_px": table.bound_px,
+            "width": track.width,
+            "spacing": table.spacing,
+            "shape": list(table.shape),
+            "corner": list(table.corner),
+            "kept": list(table.kept),
+            "bound_px": table.bound_px,
             "samples": table.samples,
         },
-    )  # fmt: skip
+    )
     about = {"long_name": "line centre on the scan axis", "units": "1", "comment": _TANGENT}
     write_small(group, "scan", ("knot",), track.scan, about)
     about = {"long_name": "line centre along the line", "units": "1", "comment": _TANGENT}

@@ -61,15 +61,7 @@ class Spool:
         self._index: BinaryIO | None = None
 
     @classmethod
-    def open(
-        cls,
-        folder: Path,
-        samples: int,
-        bands: int,
-        *,
-        header: Mapping[str, Any],
-        name: str = "lines",
-    ) -> Spool:
+    def open(cls, folder: Path, samples: int, bands: int, *, header: Mapping[str, Any], name: str = "lines") -> Spool:
         """Open the spool in ``folder``, or begin it; lines from an earlier, broken capture are kept and counted.
 
         Parameters

@@ -18,9 +18,14 @@ from storage.archive.keys import plain
 
 FORMAT = "spectralzoom line spool 2"
 _KINDS = {
-    "line": int, "mirror_x": float, "mirror_y": float, "time_s": float, "exposure_ms": float, "valid": bool,
+    "line": int,
+    "mirror_x": float,
+    "mirror_y": float,
+    "time_s": float,
+    "exposure_ms": float,
+    "valid": bool,
     "crc32": int,
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)

@@ -179,19 +179,27 @@ def write_mosaic(
     if crew.shares_memory:
         made = OpenMosaic(opened, writer, LineCache(budget.cache), cut)
         run_blocks(
-            made.tile, tiles, Crew(workers=budget.workers), keep=False, report=report,
+            made.tile,
+            tiles,
+            Crew(workers=budget.workers),
+            keep=False,
+            report=report,
             each=lambda tile, part: show(tile.rows, tile.columns, part),
-        )  # fmt: skip
+        )
         return budget
     if not isinstance(work, MosaicRecipe):
         raise TypeError(f"crew {crew.scheduler!r} needs a MosaicRecipe, whose paths each process opens; got MosaicWork")
     maker = TileMaker(work, writer.path.absolute(), budget.cache, cut)
     fewer = not crew.elsewhere and budget.workers < min(crew.count, len(tiles))
     run_blocks(
-        maker, [(tile.rows, tile.columns) for tile in tiles], Crew(crew.scheduler, budget.workers) if fewer else crew,
-        keep=False, report=report, paths=[*work.folders, maker.out],
+        maker,
+        [(tile.rows, tile.columns) for tile in tiles],
+        Crew(crew.scheduler, budget.workers) if fewer else crew,
+        keep=False,
+        report=report,
+        paths=[*work.folders, maker.out],
         each=lambda place, part: show(*place, part),
-    )  # fmt: skip
+    )
     return budget
 
 
@@ -251,12 +259,7 @@ def _opened(maker: TileMaker) -> OpenMosaic:
 
 
 def tile_budget(
-    work: MosaicWork,
-    tiles: Sequence[Tile],
-    tile_shape: tuple[int, int],
-    *,
-    memory: int,
-    crew: Crew = THREADS,
+    work: MosaicWork, tiles: Sequence[Tile], tile_shape: tuple[int, int], *, memory: int, crew: Crew = THREADS
 ) -> TileBudget:
     """Choose how many tiles to make at a time: as many as are allowed and memory holds; elsewhere memory is no matter.
 

@@ -113,10 +113,16 @@ def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> 
     """An uncompressed TIFF in strips, block by block, from which GDAL makes the other."""
     y, x = image.shape
     profile = {
-        "driver": "GTiff", "height": y, "width": x, "count": len(image.bands), "dtype": image.dtype,
-        "nodata": image.nodata, "transform": rasterio.Affine(*image.place.transform), "crs": image.place.crs_wkt,
+        "driver": "GTiff",
+        "height": y,
+        "width": x,
+        "count": len(image.bands),
+        "dtype": image.dtype,
+        "nodata": image.nodata,
+        "transform": rasterio.Affine(*image.place.transform),
+        "crs": image.place.crs_wkt,
         "BIGTIFF": "IF_SAFER",
-    }  # fmt: skip
+    }
     with rasterio.open(path, "w", **profile) as file:
         file.descriptions = image.bands
         file.update_tags(**image.tags)

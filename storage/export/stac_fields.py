@@ -90,10 +90,7 @@ def angular(transform: Sequence[float], shape: Sequence[int]) -> dict[str, Any]:
 
 def wavelengths(centre_nm: NDArray[np.float64]) -> dict[str, float]:
     """Fields of the hyperspectral extension [micrometres]."""
-    return {
-        "hsi:wavelength_min": float(centre_nm.min()) / 1000,
-        "hsi:wavelength_max": float(centre_nm.max()) / 1000,
-    }
+    return {"hsi:wavelength_min": float(centre_nm.min()) / 1000, "hsi:wavelength_max": float(centre_nm.max()) / 1000}
 
 
 def spectral_bands(centre_nm: NDArray[np.float64], fwhm_nm: NDArray[np.float64] | None, about: Any) -> dict[str, Any]:

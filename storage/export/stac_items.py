@@ -63,9 +63,13 @@ def write_stac(folder: Path, collection: Collection, item: Item) -> tuple[Path, 
     pystac = need_pystac()
     check_owner(folder, collection.id)
     root = pystac.Collection(
-        collection.id, collection.description, _extent(pystac, []), title=collection.title, license="other",
+        collection.id,
+        collection.description,
+        _extent(pystac, []),
+        title=collection.title,
+        license="other",
         catalog_type=pystac.CatalogType.SELF_CONTAINED,
-    )  # fmt: skip
+    )
     mine = _item(pystac, item)
     others = [other for other in _items_there(pystac, folder) if other.id != item.id]
     items = sorted([mine, *others], key=lambda one: (str(one.datetime), one.id))
@@ -117,9 +121,14 @@ def _items_there(pystac: Any, folder: Path) -> list[Any]:
 def _item(pystac: Any, item: Item) -> Any:
     start, end = (datetime.fromisoformat(text) for text in (item.started, item.finished))
     made = pystac.Item(
-        item.id, None if item.footprint is None else dict(item.footprint), None, start, dict(item.properties),
-        start_datetime=start, end_datetime=end,
-    )  # fmt: skip
+        item.id,
+        None if item.footprint is None else dict(item.footprint),
+        None,
+        start,
+        dict(item.properties),
+        start_datetime=start,
+        end_datetime=end,
+    )
     if item.footprint is not None:
         made.bbox = bounds(item.footprint)
     for key, about in item.assets.items():

@@ -74,11 +74,7 @@ def plan_repair(
 
 
 def repair(
-    archive: Archive,
-    findings: Iterable[Finding],
-    rerun: Rerun,
-    *,
-    versions: Mapping[str, int | str] | None = None,
+    archive: Archive, findings: Iterable[Finding], rerun: Rerun, *, versions: Mapping[str, int | str] | None = None
 ) -> Repaired:
     """Set aside what is broken and all that was made of it, and run the surveys that name any of it again.
 

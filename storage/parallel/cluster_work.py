@@ -28,8 +28,10 @@ AHEAD = 2  # blocks sent to a worker: one in the making, one waiting
 # one thread of arithmetic a worker, and freed memory kept: large arrays cost more page faults than arithmetic
 _ENVIRONMENT = {
     **ONE_THREAD,
-    "MALLOC_MMAP_THRESHOLD_": f"{2**30}", "MALLOC_TRIM_THRESHOLD_": f"{2**31 - 1}", "MALLOC_TOP_PAD_": f"{2**26}",
-}  # fmt: skip
+    "MALLOC_MMAP_THRESHOLD_": f"{2**30}",
+    "MALLOC_TRIM_THRESHOLD_": f"{2**31 - 1}",
+    "MALLOC_TOP_PAD_": f"{2**26}",
+}
 _QUIET = {
     "distributed.nanny.pre-spawn-environ": _ENVIRONMENT,
     "distributed.scheduler.http.routes": [],

@@ -134,10 +134,7 @@ def split_labels(
         raise SceneError(f"mask {train_mask} is {_size(mask)} px, the scene is {_size(scene.labels)} px (y x x)")
     wanted = _mask_to_index(scene, train_mask, int(mask.max(initial=0)), mask_classes)[np.maximum(mask, 0)]
     trains = (wanted == scene.labels) & (wanted != UNLABELLED)
-    return (
-        np.where(trains, scene.labels, np.uint8(UNLABELLED)),
-        np.where(trains, np.uint8(UNLABELLED), scene.labels),
-    )
+    return (np.where(trains, scene.labels, np.uint8(UNLABELLED)), np.where(trains, np.uint8(UNLABELLED), scene.labels))
 
 
 def _mask_to_index(

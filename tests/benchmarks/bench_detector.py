@@ -76,8 +76,12 @@ def _ours(light: Light, variant: str, seed: int = 0) -> Raw:
     """PRNU, dark current, shot noise, well, read noise, converter."""
     block = _block(_rig(), seed)
     chosen: dict[Any, str] = {
-        DARK_CURRENT: "exact", SHOT: variant, READ_NOISE: "exact", SATURATION: "exact", QUANTISATION: "exact"
-    }  # fmt: skip
+        DARK_CURRENT: "exact",
+        SHOT: variant,
+        READ_NOISE: "exact",
+        SATURATION: "exact",
+        QUANTISATION: "exact",
+    }
     return read_out(light * PRNU.gain(block, "exact"), block, chosen)
 
 
@@ -185,7 +189,7 @@ def _draws() -> list[Row]:
         "numpy poisson, SFC64": partial(sfc.poisson, light),
         "rounded": partial(rounded_counts, light, deviate),
         "merged": partial(merged_noise, light, LineCamera().read_noise_e, deviate),
-    } | _torch_draws(light)  # fmt: skip
+    } | _torch_draws(light)
     clocks = time_in_turn(calls, rounds=5)
     ns = {name: f"{1e9 * clock.cpu_min_s / count:.1f}" for name, clock in clocks.items()}
     others = ", ".join(f"{name} {ns[name]}" for name in ns if name.startswith(("numpy ziggurat", "torch normal")))

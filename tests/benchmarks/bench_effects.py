@@ -54,10 +54,16 @@ def _bounds(numbers: Sequence[int]) -> list[Row]:
     kept = [_of_effect(*key, cases) for key, cases in found.items()]
     broken = sum(trial.is_broken for cases in found.values() for _, trial in cases)
     count = sum(map(len, found.values()))
-    return [*kept, Row(
-        f"bounds over {len(numbers)} random scenes and rigs, each as samples and in sums of 2 to {MOST_BINNING}",
-        f"{broken} of {count} broken", "0", broken == 0, f"{spent:.0f} s of processor time",
-    )]  # fmt: skip
+    return [
+        *kept,
+        Row(
+            f"bounds over {len(numbers)} random scenes and rigs, each as samples and in sums of 2 to {MOST_BINNING}",
+            f"{broken} of {count} broken",
+            "0",
+            broken == 0,
+            f"{spent:.0f} s of processor time",
+        ),
+    ]
 
 
 def _of_effect(name: str, variant: str, cases: list[tuple[int, Trial]]) -> Row:
@@ -155,6 +161,7 @@ def _verified(scene: RasterScene, name: str, decision: Decision, probe: Probe, b
     spent = time.process_time() - clock
     worst = max(measured.values())
     return Row(
-        f"farm, {name}: verification of the choice, processor time", f"{spent:.1f} s, {worst:.2g} sigma",
+        f"farm, {name}: verification of the choice, processor time",
+        f"{spent:.1f} s, {worst:.2g} sigma",
         peers=f"{before}; {len({(chip.sweep.name, chip.lines) for chip in chips.values()})} chips",
-    )  # fmt: skip
+    )

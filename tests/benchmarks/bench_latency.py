@@ -73,8 +73,15 @@ def measure(px: int) -> Moments:
     from flows.settings.load import load_settings
 
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
-        told = {"size": f"{px}x{px}", "source": "rig", "visit": "first", "out": name, "engine": "plain",
-                "controls": False, "rig.panel": 0.99}  # fmt: skip
+        told = {
+            "size": f"{px}x{px}",
+            "source": "rig",
+            "visit": "first",
+            "out": name,
+            "engine": "plain",
+            "controls": False,
+            "rig.panel": 0.99,
+        }
         settings = load_settings(None, told)
         moments = Moments()
         stack.enter_context(_watched(moments))

@@ -189,8 +189,13 @@ def _field() -> Row:
             spacings.append(table.spacing)
     share = np.mean(np.array(spacings) == 16)
     what = f"ties at {len(spacings)} places of a field of 10240 px: worst error; places over their bound"
-    return Row(what, f"{worst:.2g} px; {over}", "< 2e-3 px; none", worst < 2e-3 and not over,
-               f"16 px apart at {share:.0%} of the places, {min(spacings)} at the least")  # fmt: skip
+    return Row(
+        what,
+        f"{worst:.2g} px; {over}",
+        "< 2e-3 px; none",
+        worst < 2e-3 and not over,
+        f"16 px apart at {share:.0%} of the places, {min(spacings)} at the least",
+    )
 
 
 def _uneven(clocks: dict[str, Clock]) -> Row:

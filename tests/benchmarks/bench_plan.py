@@ -170,10 +170,15 @@ def _sums(words: str, found: list[Compared], *, quiet: bool) -> list[Row]:
     for what, (pairs, judged) in kinds.items():
         share = sum(guess for guess, _ in pairs) / sum(real for _, real in pairs)
         worst = max(zip(found, pairs, strict=True), key=lambda one: abs(_ratio(one[1]) - 1))
-        made.append(Row(
-            f"estimated {what} of {words}, over measured", f"{share:.2f}", "0.75 to 1.25" if judged else "",
-            abs(share - 1) <= MOST_OFF if judged else None, f"farthest off: {worst[0].stage} {_ratio(worst[1]):.2f}",
-        ))  # fmt: skip
+        made.append(
+            Row(
+                f"estimated {what} of {words}, over measured",
+                f"{share:.2f}",
+                "0.75 to 1.25" if judged else "",
+                abs(share - 1) <= MOST_OFF if judged else None,
+                f"farthest off: {worst[0].stage} {_ratio(worst[1]):.2f}",
+            )
+        )
     return made
 
 

@@ -54,11 +54,20 @@ def _frames() -> list[Row]:
         side = "short side" if along == "y" else "long side"
         goal = ("50/80/90/95 %: 90 % <= 0.27", free[2] <= 0.27) if along == "y" else ("", None)
         found += [
-            Row(f"CWFID, fine lines over full, line along the {side}, blocks of 32 lines as geometry.md counts",
-                _shares(free), *goal, f"fixed strips {_shares(fixed)}; greedy {_shares(greedy)}; all frames pooled"),
-            Row(f"the same, true lines: rotation, taps, default prices, line along the {side}", _shares(exact),
-                "90 % <= 0.27", exact[2] <= 0.27, f"fixed strips {_shares(fixed_real)}"),
-        ]  # fmt: skip
+            Row(
+                f"CWFID, fine lines over full, line along the {side}, blocks of 32 lines as geometry.md counts",
+                _shares(free),
+                *goal,
+                f"fixed strips {_shares(fixed)}; greedy {_shares(greedy)}; all frames pooled",
+            ),
+            Row(
+                f"the same, true lines: rotation, taps, default prices, line along the {side}",
+                _shares(exact),
+                "90 % <= 0.27",
+                exact[2] <= 0.27,
+                f"fixed strips {_shares(fixed_real)}",
+            ),
+        ]
     coarse = [coarse_sweeps(replace(grid, factor=factor), CAMERA, "y") for factor in (4, 8)]
     shares = [FRAMES * sum(sweep.lines for sweep in sweeps) / whole for sweeps in coarse]
     turned = _shares(_curve([one + other for one, other in zip(*plans, strict=True)], whole))
@@ -216,11 +225,21 @@ def _many_patches(grid: SceneGrid, coarse: int, full: int) -> list[Row]:
     share = (coarse + price_of_seats(grid, CAMERA, COST, "x", seats).least[0]) / full
     wide = price_of_seats(SceneGrid(600, 1280, 400, 1), CAMERA, COST, "x", np.arange(8))
     return [
-        Row("400 patches of 320 px, with the coarse pass", f"{share:.1%} of the full scan's lines", "<= 100 %",
-            share <= 1, f"one sweep per patch {(coarse + alone) / full:.1%}"),
-        Row("8 patches of 400 px, of which a line shows one, in 1280 x 600 px", f"{wide.least[0]} lines ({wide.kind})",
-            "never above the full scan", wide.least[0] <= (wide.full_lines or 0), f"by runs of lines {wide.lines}"),
-    ]  # fmt: skip
+        Row(
+            "400 patches of 320 px, with the coarse pass",
+            f"{share:.1%} of the full scan's lines",
+            "<= 100 %",
+            share <= 1,
+            f"one sweep per patch {(coarse + alone) / full:.1%}",
+        ),
+        Row(
+            "8 patches of 400 px, of which a line shows one, in 1280 x 600 px",
+            f"{wide.least[0]} lines ({wide.kind})",
+            "never above the full scan",
+            wide.least[0] <= (wide.full_lines or 0),
+            f"by runs of lines {wide.lines}",
+        ),
+    ]
 
 
 # --- the optimum of an integer programme ---
@@ -243,9 +262,14 @@ def _optimum() -> list[Row]:
         spent[1] += time.perf_counter() - began
     shares = [a / b for a, b in zip(ours, best, strict=True)]
     return [
-        Row("worth over the optimum, 240 seats, budget .08/.2/.4/.7", "/".join(f"{share:.2%}" for share in shares), "",
-            None, f"four plans {spent[0]:.2f} s; scipy milp (HiGHS, gap 1e-4) {spent[1]:.1f} s")
-    ]  # fmt: skip
+        Row(
+            "worth over the optimum, 240 seats, budget .08/.2/.4/.7",
+            "/".join(f"{share:.2%}" for share in shares),
+            "",
+            None,
+            f"four plans {spent[0]:.2f} s; scipy milp (HiGHS, gap 1e-4) {spent[1]:.1f} s",
+        )
+    ]
 
 
 def _milp(field: Field, prices: ScanPrices, budget_s: float) -> float:
@@ -261,22 +285,32 @@ def _milp(field: Field, prices: ScanPrices, budget_s: float) -> float:
     cell = views.strip * rows_ + views.first // height
     started = sparse.eye(on) - sparse.eye(on, k=-1).multiply((np.arange(on) % rows_ > 0)[:, None])
     starts = sparse.hstack([started, -sparse.eye(on), sparse.csr_matrix((on, len(seats) + 1))])
-    shown = sparse.hstack([
-        -sparse.csr_matrix((np.ones(len(cell)), (place, cell)), (len(seats), on)),
-        sparse.csr_matrix((len(seats), on)), sparse.eye(len(seats)), sparse.csr_matrix((len(seats), 1)),
-    ])  # fmt: skip
+    shown = sparse.hstack(
+        [
+            -sparse.csr_matrix((np.ones(len(cell)), (place, cell)), (len(seats), on)),
+            sparse.csr_matrix((len(seats), on)),
+            sparse.eye(len(seats)),
+            sparse.csr_matrix((len(seats), 1)),
+        ]
+    )
     value, seconds, loads = np.zeros(size), np.zeros(size), np.zeros(size)
     value[2 * on : -1] = field.worth[seats]
     seconds[:on], seconds[on : 2 * on], seconds[-1] = height * prices.line_s, prices.run_s, prices.reload_s
     loads[:on], loads[-1] = height, -prices.lines_per_reload
     limits = LinearConstraint(
         sparse.vstack([starts, shown, sparse.csr_matrix(seconds), sparse.csr_matrix(loads)]),
-        -np.inf, np.concatenate([np.zeros(on + len(seats)), [budget_s, 0.0]]),
-    )  # fmt: skip
+        -np.inf,
+        np.concatenate([np.zeros(on + len(seats)), [budget_s, 0.0]]),
+    )
     top, whole = np.ones(size), np.zeros(size)
     top[-1], whole[:on], whole[-1] = 99, 1, 1
-    found = milp(-value, constraints=limits, bounds=Bounds(0, top), integrality=whole,
-                 options={"mip_rel_gap": 1e-4, "time_limit": 20})  # fmt: skip
+    found = milp(
+        -value,
+        constraints=limits,
+        bounds=Bounds(0, top),
+        integrality=whole,
+        options={"mip_rel_gap": 1e-4, "time_limit": 20},
+    )
     return float(-found.fun)
 
 

@@ -74,11 +74,15 @@ def _over_take(scene: Turned) -> list[Row]:
     found = []
     for kernel in KERNELS:
         times, goal = ratio(clocks, kernel, "take"), 3.0 if kernel == "catmull-rom" else None
-        found.append(Row(
-            f"{kernel}, {BANDS} bands, over np.take of the same rows", f"{times:.2f} x",
-            f"<= {goal:g} x" if goal else "", times <= goal if goal else None,
-            f"{_ns(clocks[kernel], TILES * out.size):.2f} ns/(px*band), np.take {take:.2f}",
-        ))  # fmt: skip
+        found.append(
+            Row(
+                f"{kernel}, {BANDS} bands, over np.take of the same rows",
+                f"{times:.2f} x",
+                f"<= {goal:g} x" if goal else "",
+                times <= goal if goal else None,
+                f"{_ns(clocks[kernel], TILES * out.size):.2f} ns/(px*band), np.take {take:.2f}",
+            )
+        )
     return [*found, _over_take_cached(scene)]
 
 
@@ -153,9 +157,10 @@ def _beside_spline(natural: Turned) -> Row:
     ours, theirs = _ns(clocks["ours"], natural.truth.size), _ns(clocks["spline"], smooth.bands * len(natural.truth))
     errors = natural.error(_call(natural, "catmull-rom")()[0]), natural.error(smooth.by_pixel(smooth.call()))
     return Row(
-        "catmull-rom beside the order-3 spline", f"{ours:.2f} ns, {errors[0]:.4f}",
+        "catmull-rom beside the order-3 spline",
+        f"{ours:.2f} ns, {errors[0]:.4f}",
         peers=f"scipy spline {theirs:.0f} ns, {errors[1]:.4f}",
-    )  # fmt: skip
+    )
 
 
 def _listed(figures: Mapping[str, float], form: str) -> str:
@@ -185,9 +190,10 @@ def _by_bands(scene: Turned) -> Row:
         figures.append([f"{_ns(clocks[kernel], times * out.size):.2g}" for kernel in KERNELS])
     nearest, bilinear, cubic = ("/".join(column) for column in zip(*figures, strict=True))
     return Row(
-        f"catmull-rom, ns/(px*band), {'/'.join(map(str, many))} bands", cubic,
+        f"catmull-rom, ns/(px*band), {'/'.join(map(str, many))} bands",
+        cubic,
         peers=f"ours bilinear {bilinear}, nearest {nearest}",
-    )  # fmt: skip
+    )
 
 
 def _masked(scene: Turned) -> Row:
@@ -205,8 +211,9 @@ def _masked(scene: Turned) -> Row:
     times = [f"{ratio(clocks, name, 'none'):.2f}" for name in ("samples", "elements", "zeroed")]
     return Row(
         "catmull-rom, 0.1 % of the samples / of the detector's elements / of elements that are 0 already out",
-        " / ".join(times) + " x", peers="of the time with none out",
-    )  # fmt: skip
+        " / ".join(times) + " x",
+        peers="of the time with none out",
+    )
 
 
 def _engines(scene: Turned) -> Row:
@@ -219,13 +226,15 @@ def _engines(scene: Turned) -> Row:
             (placed.flat_index(scene.samples.shape[:2]), placed.joint_weight(), torch.from_numpy(placed.weight))
         )
     calls = {
-        name: (lambda engine=engine: [engine(table, *block) for block in blocks])
-        for name, engine in ENGINES.items()
-    }  # fmt: skip
+        name: (lambda engine=engine: [engine(table, *block) for block in blocks]) for name, engine in ENGINES.items()
+    }
     clocks = time_in_turn(calls, ROUNDS)
     spent = {name: _ns(clock, len(blocks) * BLOCK * BANDS) for name, clock in clocks.items()}
     first = spent.pop("embedding_bag 16 taps")
     return Row(
-        f"engine of 16 taps, {BANDS} bands: embedding_bag", f"{first:.2f} ns/(px*band)", "least of all",
-        all(first < ns for ns in spent.values()), _listed(spent, "{:.2f}"),
-    )  # fmt: skip
+        f"engine of 16 taps, {BANDS} bands: embedding_bag",
+        f"{first:.2f} ns/(px*band)",
+        "least of all",
+        all(first < ns for ns in spent.values()),
+        _listed(spent, "{:.2f}"),
+    )

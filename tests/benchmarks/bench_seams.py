@@ -93,11 +93,16 @@ def _survey() -> list[Row]:
     jitter = np.concatenate(line_errors(survey)).std()
     what = f"survey of {LINES} lines x {SAMPLES} samples, {len(survey.sweeps)} strips, 50 px and 0.8 px per line off"
     return [
-        Row(f"{what}: mean offset left at the worst seam", f"{worst[1]:.3f} px", "< 0.2 px", worst[1] < 0.2,
-            f"not registered {worst[0]:.1f} px"),
+        Row(
+            f"{what}: mean offset left at the worst seam",
+            f"{worst[1]:.3f} px",
+            "< 0.2 px",
+            worst[1] < 0.2,
+            f"not registered {worst[0]:.1f} px",
+        ),
         Row("the same, seams registered again", f"{again:.3f} px", "< 0.2 px", again < 0.2),
         Row("the same: what remains per line, rms", f"{jitter:.2f} px"),
-    ]  # fmt: skip
+    ]
 
 
 def _pictures() -> list[Row]:
@@ -105,11 +110,20 @@ def _pictures() -> list[Row]:
         return [not_run("two parts of rgbn.tif put together", RGBN)]
     exact, smooth = cut_and_join()
     rows = [
-        Row("two parts of rgbn.tif, 3 and 4 px out of place, put together by nearest: pixels that differ",
-            f"{exact.differing}", "0", exact.differing == 0),
-        Row("the same by Catmull-Rom, one cut between pixels: rms error over the deviation",
-            f"{100 * smooth.relative:.2f} %", "", None, f"bilinear {100 * smooth.bilinear:.2f} %"),
-    ]  # fmt: skip
+        Row(
+            "two parts of rgbn.tif, 3 and 4 px out of place, put together by nearest: pixels that differ",
+            f"{exact.differing}",
+            "0",
+            exact.differing == 0,
+        ),
+        Row(
+            "the same by Catmull-Rom, one cut between pixels: rms error over the deviation",
+            f"{100 * smooth.relative:.2f} %",
+            "",
+            None,
+            f"bilinear {100 * smooth.bilinear:.2f} %",
+        ),
+    ]
     pair = join_neighbours()
     apart = ("rgbn_subb.tif on rgbn_suba.tif", pair.shift, float(np.sqrt(np.nanmean(pair.difference**2))))
     for name, shift, left in [*given_neighbours(), apart]:

@@ -78,18 +78,34 @@ def rows() -> list[Row]:
     rate = 1e9 / ns["auto"]
     on = ", ".join(f"{effect.name} {variant}" for effect, variant in decision.chosen.items())
     return [
-        Row(f"{LINES} lines of a {SIZE} x {SIZE} x 270 sweep, auto at {TOLERANCE} sigma: px*bands per CPU second",
-            f"{rate / 1e6:.1f} million ({ns['auto']:.1f} ns)", f">= {RATE / 1e6:.0f} million", rate >= RATE, on),
-        Row("the same over np.take of as many bytes", f"{ratio(clocks, 'auto', 'take'):.1f} x",
-            peers=f"np.take {ns['take']:.2f} ns/px*band"),
-        Row("everything on, each as cheap as a tenth of the tolerance allows, over auto",
-            f"{ns['cheap'] / ns['auto']:.2f} x", f">= {SAVED:g} x", ns["cheap"] >= SAVED * ns["auto"],
-            f"{ns['cheap']:.1f} ns"),
+        Row(
+            f"{LINES} lines of a {SIZE} x {SIZE} x 270 sweep, auto at {TOLERANCE} sigma: px*bands per CPU second",
+            f"{rate / 1e6:.1f} million ({ns['auto']:.1f} ns)",
+            f">= {RATE / 1e6:.0f} million",
+            rate >= RATE,
+            on,
+        ),
+        Row(
+            "the same over np.take of as many bytes",
+            f"{ratio(clocks, 'auto', 'take'):.1f} x",
+            peers=f"np.take {ns['take']:.2f} ns/px*band",
+        ),
+        Row(
+            "everything on, each as cheap as a tenth of the tolerance allows, over auto",
+            f"{ns['cheap'] / ns['auto']:.2f} x",
+            f">= {SAVED:g} x",
+            ns["cheap"] >= SAVED * ns["auto"],
+            f"{ns['cheap']:.1f} ns",
+        ),
         Row("everything on and exact, over auto", f"{ns['exact'] / ns['auto']:.2f} x", peers=f"{ns['exact']:.1f} ns"),
-        Row("most memory of the process, scene included", f"{peak:.2f} GiB", f"<= {MEMORY_GIB:g} GiB",
-            peak <= MEMORY_GIB),
+        Row(
+            "most memory of the process, scene included",
+            f"{peak:.2f} GiB",
+            f"<= {MEMORY_GIB:g} GiB",
+            peak <= MEMORY_GIB,
+        ),
         *_footprints(survey),
-    ]  # fmt: skip
+    ]
 
 
 def _survey() -> Survey:
@@ -140,11 +156,15 @@ def _footprints(survey: Survey) -> list[Row]:
         exact, *others = (expected_light(survey.scene, corner, chosen) for chosen in choices.values())
         errors = [_error(other, exact, survey.rig) for other in others]
         met = ns["3x1"] <= RENDER_NS if blurs else None
-        found.append(Row(
-            f"footprint, {name}: ns/px*band with {', '.join(SLIT.variants)} boxes",
-            ", ".join(f"{one:.1f}" for one in ns.values()), f"3x1 <= {RENDER_NS:g} ns" if blurs else "", met,
-            "at the survey's corner against 9x3: " + ", ".join(f"{one:.3f}" for one in errors) + " sigma",
-        ))  # fmt: skip
+        found.append(
+            Row(
+                f"footprint, {name}: ns/px*band with {', '.join(SLIT.variants)} boxes",
+                ", ".join(f"{one:.1f}" for one in ns.values()),
+                f"3x1 <= {RENDER_NS:g} ns" if blurs else "",
+                met,
+                "at the survey's corner against 9x3: " + ", ".join(f"{one:.3f}" for one in errors) + " sigma",
+            )
+        )
     return found
 
 

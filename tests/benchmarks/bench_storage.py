@@ -61,9 +61,13 @@ def _against_zarr(folder: Path, raw: NDArray[np.uint16]) -> list[Row]:
         shutil.rmtree(folder / "plain.zarr", ignore_errors=True)
         blosc = BloscCodec(cname="zstd", clevel=3, shuffle=BloscShuffle.bitshuffle, typesize=2)
         array = zarr.create_array(
-            folder / "plain.zarr", shape=spec.shape, dtype="<u2", chunks=spec.chunk, shards=spec.shard,
+            folder / "plain.zarr",
+            shape=spec.shape,
+            dtype="<u2",
+            chunks=spec.chunk,
+            shards=spec.shard,
             compressors=(blosc, Crc32cCodec()),
-        )  # fmt: skip
+        )
         for first in range(0, LINES, SHARD_ROWS):
             array[first : first + SHARD_ROWS] = raw[first : first + SHARD_ROWS]
 
@@ -75,11 +79,15 @@ def _against_zarr(folder: Path, raw: NDArray[np.uint16]) -> list[Row]:
     found = []
     for what, clocks in (("write", writes), ("read", reads)):
         share = ratio(clocks, "plain", "ours")
-        found.append(Row(
-            f"{what} a raw cube of {size:.0f} MB: speed over plain zarr-python's", f"{share:.0%}", ">= 80 %",
-            share >= 0.8,
-            f"{size / clocks['ours'].wall_min_s:.0f} MB/s, plain {size / clocks['plain'].wall_min_s:.0f} MB/s",
-        ))  # fmt: skip
+        found.append(
+            Row(
+                f"{what} a raw cube of {size:.0f} MB: speed over plain zarr-python's",
+                f"{share:.0%}",
+                ">= 80 %",
+                share >= 0.8,
+                f"{size / clocks['ours'].wall_min_s:.0f} MB/s, plain {size / clocks['plain'].wall_min_s:.0f} MB/s",
+            )
+        )
     return found
 
 
@@ -97,9 +105,12 @@ def _spool(folder: Path, raw: NDArray[np.uint16]) -> Row:
         cpu, wall = time.process_time() - cpu, time.perf_counter() - began
     share = cpu / SPOOLED * RATE_HZ
     return Row(
-        f"spool, lines of {raw[0].nbytes / 1e3:.0f} KB at {RATE_HZ:.0f} Hz: share of one core", f"{share:.0%}",
-        "<= 20 %", share <= 0.2, f"{wall / SPOOLED * 1e3:.2f} ms a line, the slowest {slowest * 1e3:.0f} ms",
-    )  # fmt: skip
+        f"spool, lines of {raw[0].nbytes / 1e3:.0f} KB at {RATE_HZ:.0f} Hz: share of one core",
+        f"{share:.0%}",
+        "<= 20 %",
+        share <= 0.2,
+        f"{wall / SPOOLED * 1e3:.2f} ms a line, the slowest {slowest * 1e3:.0f} ms",
+    )
 
 
 def _warm(folder: Path) -> Row:
@@ -121,6 +132,9 @@ def _warm(folder: Path) -> Row:
     before = sum(stage["cpu_s"] for stage in first.values() if stage["cpu_s"])
     cached = all(record.state in ("cached", "skipped") for record in runner.records.values())
     return Row(
-        "a finished survey's stages again, over their first run", f"{cpu / before:.1%}", "<= 1 %, nothing made",
-        cached and cpu <= 0.01 * before, f"{cpu * 1e3:.0f} ms of {before:.1f} s of processor",
-    )  # fmt: skip
+        "a finished survey's stages again, over their first run",
+        f"{cpu / before:.1%}",
+        "<= 1 %, nothing made",
+        cached and cpu <= 0.01 * before,
+        f"{cpu * 1e3:.0f} ms of {before:.1f} s of processor",
+    )

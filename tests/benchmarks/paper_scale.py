@@ -121,14 +121,20 @@ def run_field(folder: Path, side: int, bands: int, workers: int | None) -> Spent
         wall = time.perf_counter()
         paths = write_raw(place_of, sweeps, bands)
         lines = sum(sweep.lines for sweep in sweeps)
-        print(f"{side} px, {bands} bands: {len(sweeps)} strips, {lines} lines; raw written in "
-              f"{time.perf_counter() - wall:.0f} s", flush=True)  # fmt: skip
+        print(
+            f"{side} px, {bands} bands: {len(sweeps)} strips, {lines} lines; raw written in "
+            f"{time.perf_counter() - wall:.0f} s",
+            flush=True,
+        )
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
             spent = pool.submit(measured, paths, place_of / "mosaic.zarr", grid, MEMORY, workers).result()
     finally:
         shutil.rmtree(place_of, ignore_errors=True)
-    print(f"{side} px: processor {spent.cpu_s:.1f} s, wall {spent.wall_s:.1f} s, {spent.cpu_ns:.1f} ns a pixel and "
-          f"band, peak memory {spent.peak_bytes / 2**30:.2f} GiB", flush=True)  # fmt: skip
+    print(
+        f"{side} px: processor {spent.cpu_s:.1f} s, wall {spent.wall_s:.1f} s, {spent.cpu_ns:.1f} ns a pixel and "
+        f"band, peak memory {spent.peak_bytes / 2**30:.2f} GiB",
+        flush=True,
+    )
     return spent
 
 

@@ -70,9 +70,13 @@ def turned_waves(falloff: float, bands: int = BANDS) -> Turned:
 def peers(scene: Turned, order: int, only: str | None = None) -> list[Peer]:
     """Each library at one order (0 nearest, 1 linear, 3 cubic convolution), or ``only`` one of them."""
     makers = {
-        "cv2.remap": _cv2_remap, "torch grid_sample": _grid_sample, "skimage warp": _skimage_warp,
-        "rasterio reproject": _rasterio_reproject, "scipy map_coordinates": _map_coordinates, "pyresample": _pyresample,
-    }  # fmt: skip
+        "cv2.remap": _cv2_remap,
+        "torch grid_sample": _grid_sample,
+        "skimage warp": _skimage_warp,
+        "rasterio reproject": _rasterio_reproject,
+        "scipy map_coordinates": _map_coordinates,
+        "pyresample": _pyresample,
+    }
     without_cubic = {"scipy map_coordinates", "pyresample"}
     return [
         maker(scene, order)
@@ -96,8 +100,10 @@ def _cv2_remap(scene: Turned, order: int) -> Peer:
     return Peer(
         "cv2.remap",
         lambda: np.concatenate(parts(), axis=2, out=joined),
-        lambda _: joined.reshape(-1, BANDS), BANDS, warm=True,
-    )  # fmt: skip
+        lambda _: joined.reshape(-1, BANDS),
+        BANDS,
+        warm=True,
+    )
 
 
 def cv2_parts(scene: Turned, order: int) -> Callable[[], list[NDArray[np.float32]]]:

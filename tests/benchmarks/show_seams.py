@@ -61,8 +61,10 @@ def show_survey(survey: Survey, path: Path) -> None:
     print(f"{len(survey.sweeps)} strips, held: {survey.found.reference}; offset left at seams, along and scan [px]")
     for number, seams in enumerate(zip(before, after, again, strict=True)):
         first, last = (seam.mean(axis=0) for seam in seams[:2])
-        print(f"  seam {number}-{number + 1}: before {first.round(2)}, after {last.round(3)}, measured again "
-              f"{seams[2].round(3)}; from line to line {seams[1].std(axis=0).round(2)} rms")  # fmt: skip
+        print(
+            f"  seam {number}-{number + 1}: before {first.round(2)}, after {last.round(3)}, measured again "
+            f"{seams[2].round(3)}; from line to line {seams[1].std(axis=0).round(2)} rms"
+        )
     errors = line_errors(survey)
     for one, error in zip(survey.sweeps, errors, strict=True):
         print(f"  {one.sweep.name}: what remains per line, rms along and scan {error.std(axis=0).round(3)} px")
@@ -95,8 +97,9 @@ def _draw_survey(survey: Survey, before: list[Any], after: list[Any], path: Path
         _draw_residual(lines[number], after[number], first=number == 0, name=f"Left at seam {number}-{number + 1}")
     figure.suptitle(
         "Five strips that look up to 50 px beside the plan, with 0.8 px of jitter from line to line",
-        weight="bold", fontsize=13,
-    )  # fmt: skip
+        weight="bold",
+        fontsize=13,
+    )
     figure.savefig(path, dpi=110)
     plt.close(figure)
     print(path)

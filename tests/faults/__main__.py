@@ -102,22 +102,31 @@ def _flips(quick: bool) -> Sequence[Row]:
 FAULTS: dict[str, Callable[[bool], Sequence[Row]]] = {
     "kills": _script(
         "kills",
-        ("survey killed", "SIGKILL at random moments of a survey of 256 x 256 px and 32 bands",
-         "archive verifies, nothing published is lost, rerun bit-identical"),
+        (
+            "survey killed",
+            "SIGKILL at random moments of a survey of 256 x 256 px and 32 bands",
+            "archive verifies, nothing published is lost, rerun bit-identical",
+        ),
         (100, 3),
     ),
     "terminations": _module("terminations"),
     "flips": _flips,
     "headers": _script(
         "mutated_headers",
-        ("mutated headers", "random changes in ENVI headers, real and made", "a cube or one clear error, soon, in no "
-         "more memory than the file's size"),
+        (
+            "mutated headers",
+            "random changes in ENVI headers, real and made",
+            "a cube or one clear error, soon, in no more memory than the file's size",
+        ),
         (10_000, 500),
     ),
     "files": _script(
         "mutated_files",
-        ("mutated files", "random changes in files of every kind that is ingested", "a cube or one clear error, soon, "
-         "in bounded memory"),
+        (
+            "mutated files",
+            "random changes in files of every kind that is ingested",
+            "a cube or one clear error, soon, in bounded memory",
+        ),
         (5000, 100),
     ),
     "disk_full": _module("disk_full"),
@@ -129,7 +138,7 @@ FAULTS: dict[str, Callable[[bool], Sequence[Row]]] = {
     "spool_rate": _module("spool_rate"),
     "hostile_rig": _module("hostile_rig"),
     "sealed_flips": _module("sealed_flips"),
-}  # fmt: skip
+}
 
 if __name__ == "__main__":
     raise SystemExit(main(sys.argv[1:]))

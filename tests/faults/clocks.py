@@ -23,14 +23,7 @@ from storage.archive.staging import MANIFEST_NAME
 from storage.maintenance.garbage import clear_up
 from tests.faults.fault_table import Clock, Row
 from tests.faults.nursery import Nursery
-from tests.faults.small_survey import (
-    Subject,
-    prepare,
-    problems,
-    words,
-    wrong_after_fault,
-    wrong_after_rerun,
-)
+from tests.faults.small_survey import Subject, prepare, problems, words, wrong_after_fault, wrong_after_rerun
 
 DAY_S = 86400.0
 FAR = 400 * DAY_S
@@ -104,12 +97,15 @@ def cleared_up(subject: Subject, out: Path, clock: dict[str, Any]) -> list[str]:
 
 
 CASES: dict[str, tuple[Case, tuple[str, ...], str]] = {
-    "clock wrong in surveys": (same_keys, tuple(WRONG), "keys and bytes as ever, nothing made twice, runs in the order "
-                               "of their dates, archive verifies"),
+    "clock wrong in surveys": (
+        same_keys,
+        tuple(WRONG),
+        "keys and bytes as ever, nothing made twice, runs in the order of their dates, archive verifies",
+    ),
     "clock stands": (same_moment, ("standing still",), "three surveys at once: a run listed for each"),
     "clock wrong in a repair": (made_anew, tuple(WRONG), "verify does not doubt what was made again"),
     "clock set back, then gc": (cleared_up, ("an hour back", "400 days back"), "nothing fresh, in use or named goes"),
-}  # fmt: skip
+}
 
 
 def _order(out: Path) -> list[str]:
@@ -134,8 +130,11 @@ def _redate(folder: Path, shift_s: float) -> None:
     facts = json.loads((folder / MANIFEST_NAME).read_text())
     created = datetime.fromtimestamp(datetime.fromisoformat(facts["created"]).timestamp() + shift_s).astimezone()
     (folder / MANIFEST_NAME).unlink()
-    write_manifest(folder, {name: facts[name] for name in facts if name not in ("files", "format", "seal")}
-                   | {"created": created.isoformat(timespec="milliseconds")})  # fmt: skip
+    write_manifest(
+        folder,
+        {name: facts[name] for name in facts if name not in ("files", "format", "seal")}
+        | {"created": created.isoformat(timespec="milliseconds")},
+    )
     for path in (*folder.rglob("*"), folder):
         os.utime(path, (created.timestamp(), created.timestamp()))
 
@@ -156,8 +155,15 @@ def _row(subject: Subject, fault: str, quick: bool) -> Row:
         wrong += [f"{name}: {one}" for one in case(subject, out, WRONG[name])]
         shutil.rmtree(out)
     found = f"{len(wrong)} wrong{': ' + '; '.join(wrong[:3]) if wrong else ''}"
-    return Row(fault, f"the time that the process sees: {', '.join(chosen)}", len(chosen), demanded, found, not wrong,
-               timer.seconds)  # fmt: skip
+    return Row(
+        fault,
+        f"the time that the process sees: {', '.join(chosen)}",
+        len(chosen),
+        demanded,
+        found,
+        not wrong,
+        timer.seconds,
+    )
 
 
 if __name__ == "__main__":

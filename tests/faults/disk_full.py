@@ -186,9 +186,14 @@ def _rows(quick: bool, kind: str) -> list[Row]:
     if not kind:
         injected = "ENOSPC refused from the inside (no tmpfs can be mounted here), from each kind of file on"
     row = Row(
-        "disk full", injected, found.told + found.fitted, "one message and exit 1, archive verifies, nothing published "
-        "is lost, rerun bit-identical", found.words(), not found.wrong and (quick or _everywhere(found)), clock.seconds,
-    )  # fmt: skip
+        "disk full",
+        injected,
+        found.told + found.fitted,
+        "one message and exit 1, archive verifies, nothing published is lost, rerun bit-identical",
+        found.words(),
+        not found.wrong and (quick or _everywhere(found)),
+        clock.seconds,
+    )
     return [row]
 
 

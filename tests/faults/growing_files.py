@@ -171,11 +171,17 @@ def rows(quick: bool = False) -> Sequence[Row]:
     with tempfile.TemporaryDirectory(prefix="growing-") as name:
         found = rot_everything(200 if quick else FLIPS, Path(name))
     met = not any(one.wrong for one in found.values())
-    return [Row(
-        "a bit flips in a file that grows", "one bit of a spool's index, numbers or ENVI header, of a ledger, of a "
-        "rig's journal", sum(one.flips for one in found.values()), "no other number, no defect, no other line lost",
-        "; ".join(f"{kind}: {one.words()}" for kind, one in found.items()), met, clock.seconds,
-    )]  # fmt: skip
+    return [
+        Row(
+            "a bit flips in a file that grows",
+            "one bit of a spool's index, numbers or ENVI header, of a ledger, of a rig's journal",
+            sum(one.flips for one in found.values()),
+            "no other number, no defect, no other line lost",
+            "; ".join(f"{kind}: {one.words()}" for kind, one in found.items()),
+            met,
+            clock.seconds,
+        )
+    ]
 
 
 if __name__ == "__main__":

@@ -32,16 +32,7 @@ from pipeline.rig.rig_check import CheckRow, check_camera, check_mirror
 from tests.faults.fault_table import Clock, Row
 from tests.rig.chaos_line import Mangler
 from tests.rig.chaotic_surveys import is_message, survey_in_chaos
-from tests.rig.hostile_camera import (
-    REPLIES,
-    Answers,
-    Hostile,
-    HostileControl,
-    HostileFiles,
-    Pieces,
-    flood,
-    trickled,
-)
+from tests.rig.hostile_camera import REPLIES, Answers, Hostile, HostileControl, HostileFiles, Pieces, flood, trickled
 
 FULL_S, QUICK_S = 600.0, 6.0  # both devices together
 SURVEYS, FEW_SURVEYS = 100, 4
@@ -89,10 +80,19 @@ def random_pieces(rng: np.random.Generator, valid: bytes, harmless: float = 0.7)
     cut = int(rng.integers(len(valid))) if valid else 0
     some = rng.bytes(int(rng.integers(1, 200)))
     chosen: list[Pieces] = [
-        [Mangler(rng, max(len(valid) / 3, 1.0)).feed(valid)], [valid[:cut]], [some], [9.0], [],
-        trickled(valid[cut : cut + 1] or b"x"), trickled(some), flood(valid or b"x"), flood(some[:9]),
-        [piece for at in range(0, len(valid), 7) for piece in (valid[at : at + 7], 0.01)], [valid, some], [some, valid],
-    ]  # fmt: skip
+        [Mangler(rng, max(len(valid) / 3, 1.0)).feed(valid)],
+        [valid[:cut]],
+        [some],
+        [9.0],
+        [],
+        trickled(valid[cut : cut + 1] or b"x"),
+        trickled(some),
+        flood(valid or b"x"),
+        flood(some[:9]),
+        [piece for at in range(0, len(valid), 7) for piece in (valid[at : at + 7], 0.01)],
+        [valid, some],
+        [some, valid],
+    ]
     return chosen[int(rng.integers(len(chosen)))]
 
 
@@ -106,9 +106,11 @@ def meet_camera(rng: np.random.Generator, found: Outcome) -> None:
     says = {name: replies(valid) for name, valid in REPLIES.items()}
     says["SIZE"] = random_pieces(rng, f"213 {SIZE}\r\n".encode())
     files = HostileFiles(
-        says, random_pieces(rng, bytes(SIZE), 0.4), greeting=random_pieces(rng, b"220 camera\r\n", 0.8),
+        says,
+        random_pieces(rng, bytes(SIZE), 0.4),
+        greeting=random_pieces(rng, b"220 camera\r\n", 0.8),
         end=random_pieces(rng, b"226 done\r\n", 0.9),
-    )  # fmt: skip
+    )
     answers = Answers(
         random_pieces(rng, b"hpi> ", 0.8), {"listFiles": random_pieces(rng, LISTING)}, random_pieces(rng, TRUE)
     )
@@ -192,11 +194,17 @@ def rows(quick: bool = False) -> list[Row]:
     with _quiet():
         chaos = survey_in_chaos(range(2000, 2000 + (FEW_SURVEYS if quick else SURVEYS)))
     told = f"{len(chaos.wrong)} wrong, {chaos.told} told; {chaos.strikes} strikes; {'; '.join(chaos.wrong[:3])}"
-    found.append(Row(
-        "line of the camera", "bytes put in, doubled and cut out, control, FTP and its transfers, both ways",
-        chaos.surveys, "bytes of the undisturbed survey or one message; the rerun gives them all", told.strip("; "),
-        not chaos.wrong, clock.seconds,
-    ))  # fmt: skip
+    found.append(
+        Row(
+            "line of the camera",
+            "bytes put in, doubled and cut out, control, FTP and its transfers, both ways",
+            chaos.surveys,
+            "bytes of the undisturbed survey or one message; the rerun gives them all",
+            told.strip("; "),
+            not chaos.wrong,
+            clock.seconds,
+        )
+    )
     return found
 
 

@@ -23,9 +23,19 @@ from pathlib import Path
 from typing import Any
 
 WATCHED = (
-    "open", "write", "fsync", "fdatasync", "rename", "replace", "link", "mkdir", "unlink", "rmdir", "truncate",
+    "open",
+    "write",
+    "fsync",
+    "fdatasync",
+    "rename",
+    "replace",
+    "link",
+    "mkdir",
+    "unlink",
+    "rmdir",
+    "truncate",
     "ftruncate",
-)  # fmt: skip
+)
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 
 

@@ -19,8 +19,21 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from tests.faults.small_survey import problems, stored
 
 BANDS = ",".join(str(band) for band in range(4, 268, 8)[:32])
-SURVEY = ("--scene", "farm", "--size", "256x256", "--bands", BANDS, "--seed", "5", "--budget", "0.8",
-          "--engine", "plain", "--no-controls")  # fmt: skip
+SURVEY = (
+    "--scene",
+    "farm",
+    "--size",
+    "256x256",
+    "--bands",
+    BANDS,
+    "--seed",
+    "5",
+    "--budget",
+    "0.8",
+    "--engine",
+    "plain",
+    "--no-controls",
+)
 START_S = 0.3  # of importing, in which nothing can go wrong
 
 

@@ -213,17 +213,31 @@ def rows(quick: bool = False) -> list[Row]:
     with tempfile.TemporaryDirectory(prefix="lost-") as name:
         clock, kills = Clock(), 3 if quick else KILLS
         killed = try_kills(kills, Path(name))
-        found.append(Row(
-            "capture killed", "SIGKILL of the process that appends lines", kills, "no appended line lost",
-            killed.words(), not killed.wrong, clock.seconds,
-        ))  # fmt: skip
+        found.append(
+            Row(
+                "capture killed",
+                "SIGKILL of the process that appends lines",
+                kills,
+                "no appended line lost",
+                killed.words(),
+                not killed.wrong,
+                clock.seconds,
+            )
+        )
         clock, cuts = Clock(), 40 if quick else CUTS
         cut = try_power(cuts, Path(name))
-        found.append(Row(
-            "power fails in a capture", "both files as of the last fdatasync, what came later cut off, zeroed, "
-            "garbled or kept, each in its own way", cuts, f"at most {SYNC_LINES} lines lost, the capture goes on to "
-            "the same bytes", cut.words(), not cut.wrong, clock.seconds,
-        ))  # fmt: skip
+        found.append(
+            Row(
+                "power fails in a capture",
+                "both files as of the last fdatasync, what came later cut off, zeroed, "
+                "garbled or kept, each in its own way",
+                cuts,
+                f"at most {SYNC_LINES} lines lost, the capture goes on to the same bytes",
+                cut.words(),
+                not cut.wrong,
+                clock.seconds,
+            )
+        )
     return found
 
 

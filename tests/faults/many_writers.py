@@ -42,8 +42,16 @@ class Writings:
         )
 
 
-def write_together(subject: Subject, out: Path, commands: Sequence[tuple[str, ...]], truth: Stored, found: Writings,
-                   chance: random.Random, *, kill: bool = False) -> None:  # fmt: skip
+def write_together(
+    subject: Subject,
+    out: Path,
+    commands: Sequence[tuple[str, ...]],
+    truth: Stored,
+    found: Writings,
+    chance: random.Random,
+    *,
+    kill: bool = False,
+) -> None:
     """Start surveys within a moment of each other, kill the first half-way where asked, and look at the archive."""
     children = []
     for more in commands:
@@ -101,7 +109,7 @@ def rows(quick: bool = False) -> list[Row]:
             ("four writers", "the same survey four times at once", ((), (), (), ()), subject.truth, False),
             ("shared stages", "two surveys that begin alike at once, each twice", ((), OTHER, (), OTHER), both, False),
             ("a writer killed", "SIGKILL of the first of three at a random moment", ((), (), ()), subject.truth, True),
-        ]  # fmt: skip
+        ]
         return [_row(subject, case, rounds) for case in (cases[::3] if quick else cases)]
 
 
@@ -115,9 +123,14 @@ def _row(
         write_together(subject, out, commands, truth, found, chance, kill=kill)
     demanded = "every other one exit 0" if kill else "exit 0 each"
     return Row(
-        fault, injected, rounds, f"{demanded}, one copy of each store, same bytes, a run listed for each, nothing left",
-        found.words(rounds), not found.wrong, clock.seconds,
-    )  # fmt: skip
+        fault,
+        injected,
+        rounds,
+        f"{demanded}, one copy of each store, same bytes, a run listed for each, nothing left",
+        found.words(rounds),
+        not found.wrong,
+        clock.seconds,
+    )
 
 
 if __name__ == "__main__":

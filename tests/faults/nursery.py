@@ -38,9 +38,12 @@ class Ended:
         """Whether it failed with one message that says what to do, and nothing else that is meant for developers."""
         errors = [line for line in self.text.splitlines() if line.startswith("error: ")]
         return (
-            self.code == 1 and len(errors) == 1 and any(word in errors[0] for word in ADVICE)
-            and "defect" not in errors[0] and "Traceback" not in self.text
-        )  # fmt: skip
+            self.code == 1
+            and len(errors) == 1
+            and any(word in errors[0] for word in ADVICE)
+            and "defect" not in errors[0]
+            and "Traceback" not in self.text
+        )
 
     @property
     def message(self) -> str:
@@ -65,9 +68,11 @@ class Child:
         code = int(self._nursery.ask({"wait": self.pid}))
         place = self._log.with_suffix(".place")
         ended = Ended(
-            code, time.monotonic() - self._began, self._log.read_text(errors="replace"),
+            code,
+            time.monotonic() - self._began,
+            self._log.read_text(errors="replace"),
             place.read_text() if place.exists() else "",
-        )  # fmt: skip
+        )
         self._log.unlink()
         place.unlink(missing_ok=True)
         return ended
@@ -102,8 +107,12 @@ class Nursery:
         self._number += 1
         log = self.folder / f"child-{self._number}.log"
         request = {
-            "words": list(words), "fault": fault, "arguments": arguments, "log": str(log), "folder": str(self.folder)
-        }  # fmt: skip
+            "words": list(words),
+            "fault": fault,
+            "arguments": arguments,
+            "log": str(log),
+            "folder": str(self.folder),
+        }
         return Child(self, int(self.ask(request)), log)
 
     def run(self, words: Iterable[str], fault: str | None = None, **arguments: Any) -> Ended:

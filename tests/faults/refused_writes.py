@@ -94,11 +94,15 @@ def rows(quick: bool = False) -> list[Row]:
         found = refuse_places(prepare(nursery), count)
     return [
         Row(
-            "writes refused", "EACCES, EROFS, EIO, ENOSPC or EDQUOT at a random call that changes the archive, once or "
-            "from there on", count, "one message and exit 1, archive verifies, rerun bit-identical", found.words(),
-            not found.wrong and found.told > count // 2, clock.seconds,
+            "writes refused",
+            "EACCES, EROFS, EIO, ENOSPC or EDQUOT at a random call that changes the archive, once or from there on",
+            count,
+            "one message and exit 1, archive verifies, rerun bit-identical",
+            found.words(),
+            not found.wrong and found.told > count // 2,
+            clock.seconds,
         )
-    ]  # fmt: skip
+    ]
 
 
 if __name__ == "__main__":

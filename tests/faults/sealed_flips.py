@@ -124,8 +124,12 @@ def rows(quick: bool) -> Sequence[Row]:
     words = f"{found.refused} refused in one message, {found.same} as written, {len(found.wrong)} otherwise"
     return [
         Row(
-            "a bit flips in weights", "one bit of weights or of a training run's state", count,
-            "refused in one message, or the numbers that were written", "; ".join([words, *found.wrong[:3]]),
-            not found.wrong and found.tried == count, clock.seconds,
+            "a bit flips in weights",
+            "one bit of weights or of a training run's state",
+            count,
+            "refused in one message, or the numbers that were written",
+            "; ".join([words, *found.wrong[:3]]),
+            not found.wrong and found.tried == count,
+            clock.seconds,
         )
-    ]  # fmt: skip
+    ]

@@ -39,9 +39,22 @@ class Subject:
 def words(out: Path, *more: str) -> list[str]:
     """The survey's command into an archive; flags given later win."""
     return [
-        "survey", "--scene", "scene.png", "--labels", "labels.png", "--weights", "weights.safetensors",
-        "--engine", "plain", "--no-controls", "--budget", "0.8", "--out", str(out), *more,
-    ]  # fmt: skip
+        "survey",
+        "--scene",
+        "scene.png",
+        "--labels",
+        "labels.png",
+        "--weights",
+        "weights.safetensors",
+        "--engine",
+        "plain",
+        "--no-controls",
+        "--budget",
+        "0.8",
+        "--out",
+        str(out),
+        *more,
+    ]
 
 
 def prepare(nursery: Nursery) -> Subject:

@@ -88,9 +88,16 @@ def keep_pace(folder: Path, seconds: float, *, samples: int = SAMPLES, bands: in
         kept = sum(_as_captured(block, frames) for block in spool.blocks()) if check else number
     slowest = float(taken.max(initial=0.0))
     return Pace(
-        count, dropped, int((taken > period).sum()), int(slowest / period), slowest, float(np.median(taken)), cpu, wall,
+        count,
+        dropped,
+        int((taken > period).sum()),
+        int(slowest / period),
+        slowest,
+        float(np.median(taken)),
+        cpu,
+        wall,
         kept,
-    )  # fmt: skip
+    )
 
 
 def _frames(samples: int, bands: int) -> list[NDArray[np.uint16]]:
@@ -139,11 +146,17 @@ def rows(quick: bool = False) -> list[Row]:
             else:
                 pace = keep_pace(Path(name) / "spool", seconds)
         beside = ", another process writing and syncing beside it" if busy else ""
-        found.append(Row(
-            "camera's pace", f"lines of {SAMPLES} x {BANDS} at {RATE_HZ:.0f} Hz for {seconds:.0f} s{beside}",
-            pace.lines, f"none dropped ({HELD} held by the camera), at most {MOST_CORE:.0%} of a core", pace.words(),
-            pace.met, clock.seconds,
-        ))  # fmt: skip
+        found.append(
+            Row(
+                "camera's pace",
+                f"lines of {SAMPLES} x {BANDS} at {RATE_HZ:.0f} Hz for {seconds:.0f} s{beside}",
+                pace.lines,
+                f"none dropped ({HELD} held by the camera), at most {MOST_CORE:.0%} of a core",
+                pace.words(),
+                pace.met,
+                clock.seconds,
+            )
+        )
     return found
 
 

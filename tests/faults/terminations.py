@@ -160,10 +160,15 @@ def rows(quick: bool = False) -> list[Row]:
         with tempfile.TemporaryDirectory(prefix="terminations-") as name:
             done = terminate_surveys(Path(name), engine, count, random.Random(0))
         row = Row(
-            f"SIGTERM, {engine}", "to all processes of a survey, at a random moment or while its map is judged", count,
+            f"SIGTERM, {engine}",
+            "to all processes of a survey, at a random moment or while its map is judged",
+            count,
             f"one sentence, exit {EXIT_CODE}, no process left, archive verifies, the rerun goes on and adds accuracy "
-            "to the run that is there", done.words(), not done.wrong and done.told > count // 2, clock.seconds,
-        )  # fmt: skip
+            "to the run that is there",
+            done.words(),
+            not done.wrong and done.told > count // 2,
+            clock.seconds,
+        )
         found.append(row)
     return found
 

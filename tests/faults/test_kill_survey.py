@@ -36,9 +36,18 @@ class Whole:
 def run(scene_files: Path, weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runner]:
     """Survey into a folder and kill it after some seconds (None: never); gives exit code and seconds."""
     words = [
-        "survey", "--scene", str(scene_files / "scene.png"), "--labels", str(scene_files / "labels.png"),
-        "--weights", str(weights), "--engine", "plain", "--budget", "0.8",
-    ]  # fmt: skip
+        "survey",
+        "--scene",
+        str(scene_files / "scene.png"),
+        "--labels",
+        str(scene_files / "labels.png"),
+        "--weights",
+        str(weights),
+        "--engine",
+        "plain",
+        "--budget",
+        "0.8",
+    ]
     with Nursery(tmp_path_factory.mktemp("nursery")) as nursery:
 
         def survey(out: Path, delay: float | None) -> tuple[int, float]:

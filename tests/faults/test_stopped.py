@@ -86,8 +86,28 @@ def test_a_capture_keeps_every_line(subject: Subject, tmp_path: Path) -> None:
 def test_training_goes_on(subject: Subject, tmp_path: Path) -> None:
     """It is broken off in a step; the same command ends well."""
     field, out = write_field(tmp_path / "field", (16, 16)), tmp_path / "w.safetensors"
-    asked = ["train", str(field), "-o", str(out), "--validation", "0", "--steps", "4", "--crop", "16", "--patch", "8",
-             "--factor", "2", "--dim", "16", "--layers", "1", "--batch", "1"]  # fmt: skip
+    asked = [
+        "train",
+        str(field),
+        "-o",
+        str(out),
+        "--validation",
+        "0",
+        "--steps",
+        "4",
+        "--crop",
+        "16",
+        "--patch",
+        "8",
+        "--factor",
+        "2",
+        "--dim",
+        "16",
+        "--layers",
+        "1",
+        "--batch",
+        "1",
+    ]
     ended = subject.nursery.run(asked, "end_before", place="models.training.train:_step", number=signal.SIGTERM, call=2)
     assert told(ended), ended.text
     assert not out.exists()
@@ -98,8 +118,24 @@ def test_training_goes_on(subject: Subject, tmp_path: Path) -> None:
 def test_an_evaluation_goes_on(subject: Subject, tmp_path: Path) -> None:
     """Frames that were judged are kept, and not judged again."""
     field, file, out = write_field(tmp_path / "field"), tmp_path / "w.safetensors", tmp_path / "out"
-    asked = ["evaluate", str(field), "--weights", str(write_weights(file)), "-o", str(out), "--shares", "0.5",
-             "--policies", "random", "--timed-frames", "0", "--draws", "20", "--no-rig", "--no-pooled"]  # fmt: skip
+    asked = [
+        "evaluate",
+        str(field),
+        "--weights",
+        str(write_weights(file)),
+        "-o",
+        str(out),
+        "--shares",
+        "0.5",
+        "--policies",
+        "random",
+        "--timed-frames",
+        "0",
+        "--draws",
+        "20",
+        "--no-rig",
+        "--no-pooled",
+    ]
     place = {"place": "flows.evaluate.work:judge_frame", "number": signal.SIGTERM}
     ended = subject.nursery.run(asked, "end_before", call=3, **place)
     assert told(ended), ended.text

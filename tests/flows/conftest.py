@@ -60,9 +60,12 @@ def field_file(tmp_path: Path, scene_files: Path, weights: Path) -> Callable[...
 
     def write(stem: str = "north", lines: str = "", **changes: str | None) -> Path:
         values: dict[str, str | None] = {
-            "scene": str(scene_files / "scene.png"), "weights": str(weights), "budget": "0.8",
-            "out": str(tmp_path / "archive"), **changes,
-        }  # fmt: skip
+            "scene": str(scene_files / "scene.png"),
+            "weights": str(weights),
+            "budget": "0.8",
+            "out": str(tmp_path / "archive"),
+            **changes,
+        }
         path = tmp_path / f"{stem}.toml"
         told = "\n".join(f'{key} = "{value}"' for key, value in values.items() if value is not None)
         path.write_text(f"{lines}\n{told}\n")

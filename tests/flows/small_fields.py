@@ -20,8 +20,12 @@ from tests.models.conftest import make_any_weights
 FRAMES = ("001", "002", "003")
 NAMES = ("soil", "crop")
 QUICK: dict[str, Any] = {
-    "shares": (0.25, 0.5), "policies": ("entropy", "random"), "draws": 20, "timed_runs": 1, "rig": False,
-}  # fmt: skip
+    "shares": (0.25, 0.5),
+    "policies": ("entropy", "random"),
+    "draws": 20,
+    "timed_runs": 1,
+    "rig": False,
+}
 
 
 def write_field(root: Path, size: tuple[int, int] = (24, 40), names: Sequence[str] = FRAMES) -> Path:

@@ -93,10 +93,18 @@ def test_ages_are_told_in_days(surveyed: Path) -> None:
 @pytest.mark.parametrize(
     ("seconds", "words"),
     [
-        (None, DASH), (-5, "0.00 s"), (59, "59 s"), (119, "119 s"), (120, "2 min"), (7199, "119 min"), (7200, "2 h"),
-        (2 * 86400 - 1, "47 h"), (2 * 86400, "2 days"), (4000 * 86400.0, "4000 days"),
+        (None, DASH),
+        (-5, "0.00 s"),
+        (59, "59 s"),
+        (119, "119 s"),
+        (120, "2 min"),
+        (7199, "119 min"),
+        (7200, "2 h"),
+        (2 * 86400 - 1, "47 h"),
+        (2 * 86400, "2 days"),
+        (4000 * 86400.0, "4000 days"),
     ],
-)  # fmt: skip
+)
 def test_ages_are_short(seconds: float | None, words: str) -> None:
     """One number and one unit."""
     assert archive_tables._age(seconds) == words
@@ -123,8 +131,10 @@ def test_explain_shows_lineage_and_what_changed(surveyed: Path, capsys: pytest.C
     content = _json(capsys, lambda: run_explain(surveyed, "class_map", as_json=True))
     (top,) = content["lineage"]
     assert (top["stage"], top["called"], [one["stage"] for one in top["inputs"]]) == (
-        "segment", ["draw_map"], ["rectify", "patches"],
-    )  # fmt: skip
+        "segment",
+        ["draw_map"],
+        ["rectify", "patches"],
+    )
     assert top["wall_s"] > 0
     assert content["before"].startswith("stages/segment/")
     kinds = {(one["where"], one["kind"], one["name"]) for one in content["changes"]}

@@ -42,8 +42,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory, scene_files: Path, weights:
     (here / "a_file").write_text("no folder")
     picture, labels = (np.asarray(Image.open(here / name)) for name in ("scene.png", "labels.png"))
     for name, values in {
-        "small": labels[:50], "tiny": picture[:5, :6], "odd": picture[:37, :53], "black": np.zeros_like(picture[:64])
-    }.items():  # fmt: skip
+        "small": labels[:50],
+        "tiny": picture[:5, :6],
+        "odd": picture[:37, :53],
+        "black": np.zeros_like(picture[:64]),
+    }.items():
         Image.fromarray(values).save(here / f"{name}.png")
     cube = np.load(here / "cube.npy")
     np.save(here / "one.npy", cube[..., :1])
@@ -240,10 +243,13 @@ def test_training_refused_with_one_message(
     assert not list(folder.glob("new.safetensors*"))
 
 
-@pytest.mark.parametrize(("words", "code", "says"), [
-    (survey_words("--scene none.png", "never_made"), 1, "error: there is no file none.png"),
-    (survey_words("--budget 1.5", "never_made"), 2, "error: --budget must be a share of the full scan's seconds"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        (survey_words("--scene none.png", "never_made"), 1, "error: there is no file none.png"),
+        (survey_words("--budget 1.5", "never_made"), 2, "error: --budget must be a share of the full scan's seconds"),
+    ],
+)
 def test_real_process_ends_with_the_code(words: list[str], code: int, says: str, folder: Path) -> None:
     """What the shell sees: exit code, one message on stderr, nothing on stdout."""
     command = [sys.executable, "-m", "flows.cli.main", *words]
@@ -312,9 +318,13 @@ def undisturbed(folder: Path, tmp_path_factory: pytest.TempPathFactory, survey_p
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="tells a descriptor's file by /proc")
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 0.8, 0.985, 0.9999])
 def test_full_disk_anywhere_in_a_survey(
-    share: float, undisturbed: tuple[int, np.ndarray], folder: Path, tmp_path: Path, command_line: Any,
+    share: float,
+    undisturbed: tuple[int, np.ndarray],
+    folder: Path,
+    tmp_path: Path,
+    command_line: Any,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     """One message, exit 1, published stores whole and nothing half-made; with space again the rerun ends well."""
     monkeypatch.chdir(folder)
     writes, expected = undisturbed

@@ -78,8 +78,10 @@ def test_frames_of_one_seed_buy_together():
     ]
     bought = buy_by_seed(runs, (0.5,))
     assert {key: (own[0]["seats"], own[0]["threshold"]) for key, own in bought.items()} == {
-        (0, "a"): (0, 0.8), (1, "b"): (2, 0.8), (2, "a"): (1, 5.0),
-    }  # fmt: skip
+        (0, "a"): (0, 0.8),
+        (1, "b"): (2, 0.8),
+        (2, "a"): (1, 5.0),
+    }
     assert buy_by_seed([[]], (0.5,)) == {}
 
 

@@ -137,9 +137,12 @@ def test_a_farm_is_surveyed_by_a_user_without_a_home(tmp_path: Path) -> None:
         report=["report", out, "-o", str(tmp_path / "index.html")],
     )
     environment = {
-        "PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "HOME": NOWHERE, "TMPDIR": str(temporary),
+        "PATH": os.environ["PATH"],
+        "PYTHONPATH": str(ROOT),
+        "HOME": NOWHERE,
+        "TMPDIR": str(temporary),
         "OMP_NUM_THREADS": "1",
-    }  # fmt: skip
+    }
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

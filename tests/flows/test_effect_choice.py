@@ -50,8 +50,11 @@ def test_the_manifest_has_every_effect_and_the_totals(decided: tuple[Path, Stage
     manifest = load_manifest(decided[1])
     rows = {row["name"]: row for row in manifest["effects"]}
     assert list(rows) == [effect.name for effect in EFFECTS]
-    assert {name for name, row in rows.items() if row["state"] == "on"} == {*ASKED.split(","), "quantisation",
-                                                                            "saturation"}  # fmt: skip
+    assert {name for name, row in rows.items() if row["state"] == "on"} == {
+        *ASKED.split(","),
+        "quantisation",
+        "saturation",
+    }
     assert rows["diffraction"]["bound"] >= rows["diffraction"]["measured"] > 0
     assert (manifest["total"]["asked"], manifest["total"]["tolerance"]) == (ASKED, 0.1)
 
@@ -83,10 +86,17 @@ def test_a_decision_that_is_there_draws_nothing(
 
 @pytest.mark.parametrize(
     "flags",
-    [{"tol": "0.2"}, {"tol": "0.1dn"}, {"effects": "auto"}, {"seed": "1"}, {"camera.exposure_ms": "50"},
-     {"optics.smile_nm": 0.5}, {"sky.started": "2026-06-01T12:00:00Z"}],
+    [
+        {"tol": "0.2"},
+        {"tol": "0.1dn"},
+        {"effects": "auto"},
+        {"seed": "1"},
+        {"camera.exposure_ms": "50"},
+        {"optics.smile_nm": 0.5},
+        {"sky.started": "2026-06-01T12:00:00Z"},
+    ],
     ids=str,
-)  # fmt: skip
+)
 def test_what_the_decision_depends_on_is_its_key(
     scene_files: Path, decided: tuple[Path, StageRef], flags: dict[str, Any]
 ) -> None:

@@ -57,12 +57,24 @@ def made_up(measured: float = 0.02, tolerance: float | None = 0.1) -> Comparison
     change = rng.uniform(-measured, measured, (160, 160))
     sweep = Sweep("full-0", "fine", "x", 0.0, 0.0, 1000)
     return Comparison(
-        lines=1000, of_lines=2000, exact_cpu_s=21.0, cpu_s=7.0, effects_exact=19, effects_on=18, unit="sigma",
-        tolerance=tolerance, bound=tolerance, measured=measured, rms=measured / 2,
-        place=effect_comparison.Place("full-0", 120, 180, 7), raw_unequal=0.05, raw_most_dn=1,
-        left_out=("polarisation",), cheaper=("slit as 1x1",),
+        lines=1000,
+        of_lines=2000,
+        exact_cpu_s=21.0,
+        cpu_s=7.0,
+        effects_exact=19,
+        effects_on=18,
+        unit="sigma",
+        tolerance=tolerance,
+        bound=tolerance,
+        measured=measured,
+        rms=measured / 2,
+        place=effect_comparison.Place("full-0", 120, 180, 7),
+        raw_unequal=0.05,
+        raw_most_dn=1,
+        left_out=("polarisation",),
+        cheaper=("slit as 1x1",),
         view=View(image, image, change, "true colour, 640 / 550 / 460 nm", lines, samples, sweep),
-    )  # fmt: skip
+    )
 
 
 def test_everything_is_what_the_rig_has_in_exact_variants(scan: tuple[CaptureRun, list[Sweep], StageRef]) -> None:
@@ -148,9 +160,12 @@ def test_views_of_small_scenes_are_flat_or_narrow(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "code", "message"),
-    [("made.jpg", 2, "--compare writes a PNG"), ("folder.png", 2, "is a folder; name a file in it, such as"),
-     ("file/made.png", 1, "choose another --compare")],
-)  # fmt: skip
+    [
+        ("made.jpg", 2, "--compare writes a PNG"),
+        ("folder.png", 2, "is a folder; name a file in it, such as"),
+        ("file/made.png", 1, "choose another --compare"),
+    ],
+)
 def test_pictures_that_cannot_be_written_are_refused_first(
     command_line: Any, scene_files: Path, tmp_path: Path, name: str, code: int, message: str
 ) -> None:

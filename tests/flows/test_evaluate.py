@@ -88,8 +88,10 @@ def test_costs_stand_beside_all(drawn: tuple[Path, dict[str, Any]]):
     for column in ("samples", "bytes", "multiply_adds"):
         assert cost[0.25][column]["done"] < cost[0.5][column]["done"]
     assert _row(content, "all", 1.0)["cost"]["samples"] == {
-        "done": 24 * 40 + 12 * 20, "full": 24 * 40 + 12 * 20, "ratio": 1.0,
-    }  # fmt: skip
+        "done": 24 * 40 + 12 * 20,
+        "full": 24 * 40 + 12 * 20,
+        "ratio": 1.0,
+    }
     assert _row(content, "all", 1.0)["cost"]["rig_s"]["ratio"] == 1
     adds = cost[0.25]["multiply_adds"]
     assert sum(adds[part] for part in ("glance", "score", "encode", "decode")) == adds["done"]
@@ -212,11 +214,13 @@ def test_files_that_leave_different_pixels_are_not_compared(data: Path, tmp_path
     halves[0][:12], halves[1][12:] = True, True
     paths = [
         write_weights(
-            tmp_path / f"{number}.safetensors", number, "dense" if number == 1 else "two-scale",
+            tmp_path / f"{number}.safetensors",
+            number,
+            "dense" if number == 1 else "two-scale",
             split={"train": {"001": scene.key}, "pixels": {scene.key: pack_mask(half)}},
         )
         for number, half in enumerate((halves[0], halves[1], halves[0]))
-    ]  # fmt: skip
+    ]
     quick = {**QUICK, "timed_frames": 0, "frames": ("001",)}
     with pytest.raises(SettingsError, match=r"were trained on different pixels of 001"):
         evaluate_weights(EvaluateRequest(str(data), (paths[0],), controls=(paths[1],), **quick))
@@ -346,22 +350,34 @@ def test_the_ends_are_those_of_the_present_definition():
 def _record(name: str, rng: np.random.Generator) -> dict[str, Any]:
     rows = [
         {
-            "policy": policy, "draw": 0, "share": share, "seats": 2, "counts": rng.integers(1, 9, (2, 2)).tolist(),
-            "inside": [[0, 0], [0, 0]], "boundary": [[1, 2], [1, 3]], "samples": 1.0, "bytes": 2.0,
-            "multiply_adds": 3, "adds": {"glance": 1, "score": 0, "encode": 1, "decode": 1},
-            "gain": 1.0, "best_gain": 2.0, "ap_top": None,
+            "policy": policy,
+            "draw": 0,
+            "share": share,
+            "seats": 2,
+            "counts": rng.integers(1, 9, (2, 2)).tolist(),
+            "inside": [[0, 0], [0, 0]],
+            "boundary": [[1, 2], [1, 3]],
+            "samples": 1.0,
+            "bytes": 2.0,
+            "multiply_adds": 3,
+            "adds": {"glance": 1, "score": 0, "encode": 1, "decode": 1},
+            "gain": 1.0,
+            "best_gain": 2.0,
+            "ap_top": None,
         }
         for policy, share in (("none", 0.0), ("oracle", 0.5), ("all", 1.0))
-    ]  # fmt: skip
+    ]
     return {"frame": name, "seats": 4, "rows": rows, "ranking": [], "positive_seats": 1}
 
 
 def test_seconds_of_a_row():
     """Glance, scores and map together; `all`, `none` and a control are the map alone."""
     timed = {
-        "glance": 1.0, "score": {"entropy": 0.5}, "segment": {"0": 2.0, "0.1": 3.0, "1": 9.0},
+        "glance": 1.0,
+        "score": {"entropy": 0.5},
+        "segment": {"0": 2.0, "0.1": 3.0, "1": 9.0},
         "control": {"dense 1": 7.0},
-    }  # fmt: skip
+    }
     assert row_seconds(timed, "dense", 1.0) == 7
     assert row_seconds(timed, "margin", 0.1) is row_seconds(timed, "coarser", 1.1) is None
     assert row_seconds(timed, "entropy", 0.1) == 4.5

@@ -115,9 +115,11 @@ def test_controls_that_do_not_fit_are_refused(data: Path, tmp_path: Path):
     save_weights(replace(sized, class_names=("soil", "crop")), wide)
     save_weights(make_any_weights(classes=2, columns=3, design="dense"), other)
     for paths, words in (
-        ((again,), "is of two scales, and no control"), ((other,), "has other classes than"),
-        ((dense, wide), "both dense and differ in sizes"), ((dense, dense), "given twice in --control"),
-    ):  # fmt: skip
+        ((again,), "is of two scales, and no control"),
+        ((other,), "has other classes than"),
+        ((dense, wide), "both dense and differ in sizes"),
+        ((dense, dense), "given twice in --control"),
+    ):
         with pytest.raises(SettingsError, match=words):
             open_controls(paths, ours)
     with pytest.raises(SettingsError, match="holds the control 'dense'; give it as --control"):

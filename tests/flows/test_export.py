@@ -67,9 +67,14 @@ def surveys(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Publis
     """One archive with the same farm twice: without a pose and with one."""
     archive = tmp_path_factory.mktemp("surveys") / "field-a"
     flags = {
-        "size": "192x128", "bands": "20,60,100,150,200", "budget": "0.9", "engine": "plain", "out": str(archive),
-        "controls": False, "seed": "1",
-    }  # fmt: skip
+        "size": "192x128",
+        "bands": "20,60,100,150,200",
+        "budget": "0.9",
+        "engine": "plain",
+        "out": str(archive),
+        "controls": False,
+        "seed": "1",
+    }
     settings = load_settings(None, flags)
     return archive, [run_survey(settings, QUIET), run_survey(replace(settings, pose=POSE), QUIET)]
 

@@ -117,8 +117,9 @@ def test_the_reason_is_what_differs(settings: Settings, archive: Path, make_weig
     effects = _plan(settings, archive, effects="none")["capture_coarse"].why
     assert effects == "asked of effects: auto before, none now"
     assert {(change.where, change.kind) for change in planned["attend"].changes} == {
-        ("attend", "input"), ("rectify", "parameter"),
-    }  # fmt: skip
+        ("attend", "input"),
+        ("rectify", "parameter"),
+    }
     other = _plan(settings, archive, weights=str(make_weights(layers=2)))
     assert other["rectify"].state == "cached"
     assert other["attend"].why == "other weights than in the newest store"

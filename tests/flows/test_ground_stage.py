@@ -68,9 +68,11 @@ def stores(tmp_path: Path) -> tuple[StageRef, StageRef]:
     write_class_map(tmp_path / "map" / "class_map.zarr", ClassMap(classes, confidence, *legend))
     rows, columns = SHAPE[0] // 4, SHAPE[1] // 4
     writer = MosaicWriter(
-        tmp_path / "mosaic" / "mosaic.zarr", (rows, columns), np.array([460.0, 550.0, 640.0, 800.0]),
+        tmp_path / "mosaic" / "mosaic.zarr",
+        (rows, columns),
+        np.array([460.0, 550.0, 640.0, 800.0]),
         grid=AngularGrid(1e-4, SHAPE, 4),
-    )  # fmt: skip
+    )
     values = np.linspace(0.1, 0.9, rows)[:, None, None] * np.ones((rows, columns, 4))
     values[:5, :5] = np.nan
     writer.write_rows(0, values, np.ones((rows, columns)))

@@ -71,9 +71,14 @@ def test_no_verb_leaves_the_archive(
     for path in secrets:
         path.write_bytes(SECRET)
     for verb in (
-        ["ls"], ["explain", "class_map"], ["explain", "rectify"], ["verify"], ["export"],
-        ["gc", "--keep-days", "0", "--raw-too"], ["verify", "--repair"],
-    ):  # fmt: skip
+        ["ls"],
+        ["explain", "class_map"],
+        ["explain", "rectify"],
+        ["verify"],
+        ["export"],
+        ["gc", "--keep-days", "0", "--raw-too"],
+        ["verify", "--repair"],
+    ):
         with pytest.raises(SystemExit) as ended:
             main([verb[0], str(root), *verb[1:]])
         assert ended.value.code in (0, 1, 2, 3), verb
@@ -90,9 +95,13 @@ def test_no_verb_waits_or_follows(case: Case, tmp_path: Path, capsys: pytest.Cap
     root, out = tmp_path / "archive", str(tmp_path / "out")
     uri = case(small_survey(Archive.open(root)))
     for verb, *more in (
-        ("ls",), ("explain", "class_map"), ("report", "--out", f"{out}.html"), ("export", "--out", out),
-        ("gc", "--dry-run"), ("verify",),
-    ):  # fmt: skip
+        ("ls",),
+        ("explain", "class_map"),
+        ("report", "--out", f"{out}.html"),
+        ("export", "--out", out),
+        ("gc", "--dry-run"),
+        ("verify",),
+    ):
         with pytest.raises(SystemExit) as ended:
             main([verb, str(root), *more])
         shown = capsys.readouterr()

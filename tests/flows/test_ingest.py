@@ -92,9 +92,16 @@ def test_all_that_is_known_is_stored(tmp_path: Path, raw: NDArray[np.uint16]) ->
 
 @pytest.mark.parametrize(
     ("kind", "high", "stored"),
-    [("u1", 255, "u1"), ("u2", 65535, "u2"), ("i2", 30000, "u2"), ("i4", 65535, "u2"), ("i4", 65536, "f4"),
-     ("f4", 100, "f4"), ("f8", 100, "f4")],
-)  # fmt: skip
+    [
+        ("u1", 255, "u1"),
+        ("u2", 65535, "u2"),
+        ("i2", 30000, "u2"),
+        ("i4", 65535, "u2"),
+        ("i4", 65536, "f4"),
+        ("f4", 100, "f4"),
+        ("f8", 100, "f4"),
+    ],
+)
 def test_types(tmp_path: Path, kind: str, high: int, stored: str) -> None:
     """Whole numbers that fit stay whole; the rest are float32. No number changes."""
     values = np.random.default_rng(1).integers(0, high + 1, (70, 5, 3)).astype(kind)

@@ -20,9 +20,12 @@ CONFIG, BANDS = SegmenterConfig(classes=4), 8
 def _run(side: int, policy: str) -> SurveyRun:
     """As much of a survey as is asked for its sizes."""
     made: Any = SimpleNamespace(
-        grid=SceneGrid(side, side, 16, 4), described=SimpleNamespace(config=CONFIG), vgg=None,
-        scene=SimpleNamespace(wavelength_nm=np.linspace(400, 1000, BANDS)), settings=SimpleNamespace(policy=policy),
-    )  # fmt: skip
+        grid=SceneGrid(side, side, 16, 4),
+        described=SimpleNamespace(config=CONFIG),
+        vgg=None,
+        scene=SimpleNamespace(wavelength_nm=np.linspace(400, 1000, BANDS)),
+        settings=SimpleNamespace(policy=policy),
+    )
     return cast("SurveyRun", made)
 
 

@@ -95,10 +95,16 @@ def surveyed(
     def survey(scene: Waves) -> Stored:
         np.save(tmp_path / "waves.npy", scene.raster())
         found = survey_png(
-            tmp_path / "archive", scene=str(tmp_path / "waves.npy"), labels=None, wavelengths="500,700",
-            weights=str(make_weights((500.0, 700.0))), effects="rotation,slit,smear", tol="0", policy="random",
+            tmp_path / "archive",
+            scene=str(tmp_path / "waves.npy"),
+            labels=None,
+            wavelengths="500,700",
+            weights=str(make_weights((500.0, 700.0))),
+            effects="rotation,slit,smear",
+            tol="0",
+            policy="random",
             budget="1",
-        ).receipt  # fmt: skip
+        ).receipt
         mosaic, patches = (
             xr.open_zarr(tmp_path / "archive" / found["products"][name], consolidated=False)
             for name in ("mosaic", "patches")

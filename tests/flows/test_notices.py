@@ -99,11 +99,20 @@ def test_a_named_server_that_speaks_another_protocol(stranger: str, monkeypatch:
 @pytest.mark.parametrize(
     "address",
     [
-        "http://127.0.0.1:port/x", "http://127.0.0.1/hook 1", "http://127.0.0.1/hook\t1", "http://127.0.0.1/hook\x7f",
-        "http://127.0.0.1:0/", "http://127.0.0.1:99999/", "http://[::1/", "https://user:word@127.0.0.1/", "https://",
-        "ftp://127.0.0.1/", "", "\nhttp://127.0.0.1/",
+        "http://127.0.0.1:port/x",
+        "http://127.0.0.1/hook 1",
+        "http://127.0.0.1/hook\t1",
+        "http://127.0.0.1/hook\x7f",
+        "http://127.0.0.1:0/",
+        "http://127.0.0.1:99999/",
+        "http://[::1/",
+        "https://user:word@127.0.0.1/",
+        "https://",
+        "ftp://127.0.0.1/",
+        "",
+        "\nhttp://127.0.0.1/",
     ],
-)  # fmt: skip
+)
 def test_an_address_that_cannot_be_asked_is_refused(address: str) -> None:
     """A port that is none, blanks, control characters, a password: notices to it would be lost without a word."""
     with pytest.raises(SettingsError, match="is no address; expected https://HOST/PATH"):
@@ -192,9 +201,14 @@ def test_an_outage_is_one_notice_and_the_next_run_does_not_wait(tmp_path: Path) 
     schedule.open()
     clock.sleep(33 * 3600)
     serve_plain(
-        {"north": schedule}, {"north": RigLock(tmp_path / "lock")}, lambda name, due: tmp_path / "run",
-        lambda words: None, clock=clock, note=noted.append, until=LATER + timedelta(minutes=1),
-    )  # fmt: skip
+        {"north": schedule},
+        {"north": RigLock(tmp_path / "lock")},
+        lambda name, due: tmp_path / "run",
+        lambda words: None,
+        clock=clock,
+        note=noted.append,
+        until=LATER + timedelta(minutes=1),
+    )
     notices = [one for one in noted if one.ending != "done"]
     assert [(type(one), one.ending) for one in notices] == [(Several, "skipped")]
     assert "north, 98 due between 2026-06-01 12:20:00 and 2026-06-02 20:40:00 UTC, skipped" in notices[0].words()
@@ -214,9 +228,11 @@ def test_very_many_due_times_are_news(tmp_path: Path, hours: int, count: int | N
     assert (outcome.count, outcome.since, outcome.ending) == (count, NOON, "skipped")
     told = "very many" if count is None else str(count)
     assert f"north, {told} due between 2026-06-01 12:00:00 and " in outcome.words()
-    assert together([outcome, Outcome("north", NOON, "skipped", "too late")])[0].words().startswith(
-        f"north, {told if count is None else count + 1} due between"
-    )  # fmt: skip
+    assert (
+        together([outcome, Outcome("north", NOON, "skipped", "too late")])[0]
+        .words()
+        .startswith(f"north, {told if count is None else count + 1} due between")
+    )
     assert news.fresh() == []
     assert ScheduleNews({"north": schedule}, lambda name, error: refused.append(error)).fresh() == []
     assert refused == []

@@ -32,9 +32,16 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
     """Receipt and archive of a farm in two strips, seen by such a mirror."""
     archive = tmp_path_factory.mktemp("pointing")
     flags = {
-        "scene": "farm", "size": "768x512", "bands": BANDS, "seed": str(SEED), "budget": "0.7",
-        "pointing_px": str(OFF_PX), "out": str(archive), "engine": "plain", "controls": False,
-    }  # fmt: skip
+        "scene": "farm",
+        "size": "768x512",
+        "bands": BANDS,
+        "seed": str(SEED),
+        "budget": "0.7",
+        "pointing_px": str(OFF_PX),
+        "out": str(archive),
+        "engine": "plain",
+        "controls": False,
+    }
     found = run_survey(load_settings(None, flags), Console(quiet=True)).receipt
     return json.loads(json.dumps(found)), archive
 
@@ -52,8 +59,9 @@ def test_fine_sweeps_are_put_right_on_the_mosaic(surveyed: tuple[dict[str, Any],
     """Every fine sweep that could be compared lies on the mosaic within half a pixel."""
     pointing, errors = surveyed[0]["pointing"], PointingErrors(OFF_PX, 0.0, SEED)
     held = errors.offset(pointing["coarse"]["held"])
-    told = {name: offset for name, offset in pointing["fine"]["sweeps"].items() if name not in
-            pointing["fine"]["not_found"]}  # fmt: skip
+    told = {
+        name: offset for name, offset in pointing["fine"]["sweeps"].items() if name not in pointing["fine"]["not_found"]
+    }
     assert told
     for name, offset in told.items():
         assert np.abs(errors.offset(name) - held - offset).max() < 0.5
@@ -131,7 +139,7 @@ TOLD: dict[str, tuple[dict[str, Any], str]] = {
         "The coarse sweeps were put right by up to 5.0 px. 1 overlaps were too narrow to compare. 7 chosen places were "
         "not seen whole; what is missing of them is mapped by the coarse look.",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", TOLD)

@@ -18,9 +18,10 @@ from tests.soak.processes import children_of, is_alive
 
 SLEEPS = [sys.executable, "-c", "import time; print('up', flush=True); time.sleep(60)"]
 DEAF = [
-    sys.executable, "-c",
+    sys.executable,
+    "-c",
     "import signal, time; signal.signal(15, signal.SIG_IGN); print('up', flush=True); time.sleep(5); print('over')",
-]  # fmt: skip
+]
 ENDS = """
 import os, signal, subprocess, sys
 from flows.terminal.process_guard import end_with_us

@@ -103,11 +103,14 @@ def test_bands_nearest_to_true_colour():
     assert choose_bands(WAVES[order])[0] == tuple(np.argsort(order)[[24, 15, 6]])
 
 
-@pytest.mark.parametrize(("waves", "bands", "word"), [
-    ([660.0, 800.0], (1, 0, 0), "false colour, 800 / 660 / 660"),
-    ([800.0], (0, 0, 0), "grey, 800"),
-    ([1500.0, 900.0, 1100.0], (0, 2, 1), "false colour"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("waves", "bands", "word"),
+    [
+        ([660.0, 800.0], (1, 0, 0), "false colour, 800 / 660 / 660"),
+        ([800.0], (0, 0, 0), "grey, 800"),
+        ([1500.0, 900.0, 1100.0], (0, 2, 1), "false colour"),
+    ],
+)
 def test_fewer_bands_are_false_colour_or_grey(waves, bands, word):
     """Without red, green and blue the longest band is red and the shortest blue; one band is grey."""
     chosen, words = choose_bands(np.array(waves))

@@ -31,9 +31,14 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Published]
 def _survey(root: Path) -> Published:
     """A small farm in as many bands as light with a spectrum needs."""
     flags = {
-        "scene": "farm", "size": "384x288", "bands": ",".join(map(str, range(5, 265, 10))), "engine": "plain",
-        "controls": False, "budget": "0.95", "out": str(root),
-    }  # fmt: skip
+        "scene": "farm",
+        "size": "384x288",
+        "bands": ",".join(map(str, range(5, 265, 10))),
+        "engine": "plain",
+        "controls": False,
+        "budget": "0.95",
+        "out": str(root),
+    }
     return run_survey(load_settings(None, flags), Console(quiet=True))
 
 

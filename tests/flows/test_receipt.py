@@ -10,14 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flows.publish.receipt import (
-    COSTS,
-    Header,
-    Receipt,
-    build_receipt,
-    check_receipt,
-    comparable,
-)
+from flows.publish.receipt import COSTS, Header, Receipt, build_receipt, check_receipt, comparable
 from flows.publish.receipt_table import headline, print_table
 from flows.settings.survey_settings import Settings
 from pipeline.errors import ShapeError

@@ -323,8 +323,13 @@ def test_fields_of_one_file_name_are_told_apart(
     assert reprocess.states(tmp_path / "archive") == [("scene", "skipped")] * 2
 
 
-def test_an_older_farm_law_is_not_current(tmp_path: Path, survey_png: Survey, make_weights: WeightsMaker,
-                                          reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+def test_an_older_farm_law_is_not_current(
+    tmp_path: Path,
+    survey_png: Survey,
+    make_weights: WeightsMaker,
+    reprocess: Reprocess,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The farm's light is made by rules that have a version of their own."""
     weights = make_weights(tuple(np.linspace(450, 850, 6)), names=CLASSES)
     survey_png(

@@ -51,9 +51,12 @@ def takers(folder: Path, count: int) -> Iterator[list[tuple[subprocess.Popen[str
             temporary.mkdir(mode=0o777)
             environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(temporary), "HOME": str(temporary)}
             process = subprocess.Popen(
-                [sys.executable, "-c", TAKES, PORT], env=environment, text=True,
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            )  # fmt: skip
+                [sys.executable, "-c", TAKES, PORT],
+                env=environment,
+                text=True,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+            )
             assert process.stdout is not None
             tried.append((process, process.stdout.readline() == "True\n"))
         yield tried

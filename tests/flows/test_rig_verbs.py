@@ -160,12 +160,20 @@ def test_one_of_two_devices_is_partly(command_line: CommandLine) -> None:
 @pytest.mark.parametrize(
     "words",
     [
-        ("check", "--camera", "host:99999"), ("check", "--camera", ":80"), ("check", "no.toml"),
-        ("check", "--port", "nonsense://x"), ("check", "--prot", "x"), ("nonsense",),
-        ("emulate", "--faults", "nonsense"), ("emulate", "--speed", "0"), ("emulate", "--baud", "-1"),
-        ("emulate", "--size", "12"), ("emulate", "-o", "/nowhere/x.toml"), ("emulate", "--seed", "x"),
+        ("check", "--camera", "host:99999"),
+        ("check", "--camera", ":80"),
+        ("check", "no.toml"),
+        ("check", "--port", "nonsense://x"),
+        ("check", "--prot", "x"),
+        ("nonsense",),
+        ("emulate", "--faults", "nonsense"),
+        ("emulate", "--speed", "0"),
+        ("emulate", "--baud", "-1"),
+        ("emulate", "--size", "12"),
+        ("emulate", "-o", "/nowhere/x.toml"),
+        ("emulate", "--seed", "x"),
     ],
-)  # fmt: skip
+)
 def test_usage_errors(command_line: CommandLine, words: tuple[str, ...]) -> None:
     """One message and exit code 2, before anything is drawn or connected."""
     ended = command_line("rig", *words)
@@ -209,8 +217,12 @@ def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: Comman
         assert (rig.provenance, rig.mirror_axes) == ("emulated", "y,-x")
         told = tomllib.loads(file.read_text())
         assert {key: told[key] for key in ("scene", "size", "bands", "seed", "source")} == {
-            "scene": "farm", "size": "64x48", "bands": [40, 90], "seed": 3, "source": "rig",
-        }  # fmt: skip
+            "scene": "farm",
+            "size": "64x48",
+            "bands": [40, 90],
+            "seed": 3,
+            "source": "rig",
+        }
         assert command_line("rig", "check", file).code == 0
     finally:
         ended.set()

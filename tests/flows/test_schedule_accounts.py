@@ -155,9 +155,7 @@ def test_a_later_run_in_the_place_of_an_earlier_one(tmp_path: Path, ending: str)
     assert schedule.end(SECOND, ending)  # type: ignore[arg-type]
     assert schedule.pending() == []
     first = schedule.state().ended[FIRST]
-    assert (first["event"], first["reason"]) == (
-        "skipped", "a later one came first (noted 20.0 min after it was due)",
-    )  # fmt: skip
+    assert (first["event"], first["reason"]) == ("skipped", "a later one came first (noted 20.0 min after it was due)")
     schedule.close()
     assert accounted(schedule.ledger.lines(), schedule.timetable) == {FIRST: 1, SECOND: 1}
 

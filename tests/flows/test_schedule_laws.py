@@ -67,17 +67,26 @@ def do(schedule: FieldSchedule, clock: HandClock, step: tuple[str, object], lock
 
 
 @given(
-    cron=st.sampled_from(CRONS), zone=st.sampled_from(ZONES), start=st.sampled_from(CHANGES), steps=steps,
+    cron=st.sampled_from(CRONS),
+    zone=st.sampled_from(ZONES),
+    start=st.sampled_from(CHANGES),
+    steps=steps,
     late=st.sampled_from([0.1, 0.5, 1.0]),
-)  # fmt: skip
+)
 @example(  # set back while a due time waits to be begun
-    cron="30 2 * * *", zone="UTC", start=CHANGES[0], late=0.1,
+    cron="30 2 * * *",
+    zone="UTC",
+    start=CHANGES[0],
+    late=0.1,
     steps=[*[("wait", 1)] * 3, ("jump", 109_858), ("start", 0), ("jump", -61), ("start", 0)],
-)  # fmt: skip
+)
 @example(  # a run that died is resumed in what is its past by a clock that was set back
-    cron="*/20 * * * *", zone="UTC", start=CHANGES[0], late=0.1,
+    cron="*/20 * * * *",
+    zone="UTC",
+    start=CHANGES[0],
+    late=0.1,
     steps=[("wait", 2400), ("run", "killed"), ("jump", -1231), ("run", "well")],
-)  # fmt: skip
+)
 @settings(max_examples=120, deadline=None)
 def test_every_due_time_is_accounted_for_exactly_once(
     cron: str, zone: str, start: datetime, steps: list[tuple[str, object]], late: float
@@ -170,10 +179,17 @@ def test_long_spans_keep_every_second(every: str) -> None:
 @pytest.mark.parametrize(
     ("every", "words"),
     [
-        ("30m", "30m"), ("1.5h", "90m"), ("48h", "2d"), ("90.5s", "90.5s"), ("1234567s", "1234567s"),
-        ("100000.5s", "100000.5s"), ("0.1d", "144m"), ("366d", "366d"), ("10.000001s", "10.000001s"),
+        ("30m", "30m"),
+        ("1.5h", "90m"),
+        ("48h", "2d"),
+        ("90.5s", "90.5s"),
+        ("1234567s", "1234567s"),
+        ("100000.5s", "100000.5s"),
+        ("0.1d", "144m"),
+        ("366d", "366d"),
+        ("10.000001s", "10.000001s"),
     ],
-)  # fmt: skip
+)
 def test_a_span_is_told_exactly(every: str, words: str) -> None:
     """In its largest unit, with every digit: what is told can be given again."""
     table = parse_timetable(None, every, "UTC")

@@ -98,18 +98,18 @@ def test_two_serves_of_one_rig(field_file: Callable[..., Path], tmp_path: Path, 
 @pytest.mark.parametrize(
     ("url", "words", "message"),
     [
-        (
-            "http://127.0.0.1:9/api",
-            (),
-            "no Prefect server answers at http://127.0.0.1:9/api, which PREFECT_",
-        ),
+        ("http://127.0.0.1:9/api", (), "no Prefect server answers at http://127.0.0.1:9/api, which PREFECT_"),
         ("", ("--port", 70000), "--port 70000 cannot be used"),
     ],
 )
 def test_a_server_that_cannot_be_had(
-    url: str, words: Sequence[object], message: str, field_file: Callable[..., Path], command_line: Any,
+    url: str,
+    words: Sequence[object],
+    message: str,
+    field_file: Callable[..., Path],
+    command_line: Any,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     """One message, before anything is said to be served; the field's ledger has no line."""
     monkeypatch.setenv("PREFECT_API_URL", url)
     file = field_file()
@@ -206,9 +206,13 @@ def test_plain_serving_surveys_fields_in_turn_and_each_visit_anew(
         return Path(survey_png(tmp_path / "archive", name=name, visit=asked.visit).folder)
 
     serve_plain(
-        schedules, {name: one.lock() for name, one in fields.items()}, survey, lambda words: None, clock=clock,
+        schedules,
+        {name: one.lock() for name, one in fields.items()},
+        survey,
+        lambda words: None,
+        clock=clock,
         until=NOON + timedelta(minutes=41),
-    )  # fmt: skip
+    )
     archive = Archive.open(tmp_path / "archive")
     assert [path.name.split("-")[1] for path in archive.runs()] == ["north", "south", "north", "south"]
     for name, schedule in schedules.items():

@@ -86,8 +86,10 @@ def test_only_what_is_served_can_be_named(
     ]
     told = ["the field 'south' is not served here", f"the archive '{elsewhere}' is not served", "are of no field that"]
     assert [state.is_failed() and words in str(state.message) for state, words in zip(states, told, strict=True)] == [
-        True, True, True,
-    ]  # fmt: skip
+        True,
+        True,
+        True,
+    ]
     assert not {"settings", "out", "notify"} & set(survey_scheduled.parameters.properties)
 
 
@@ -131,8 +133,9 @@ def test_a_run_that_prefect_begins_early_waits(
     assert (state.name, state.message) == ("Completed", "runs/1220")
     lines = load_fields([file])[0].schedule(parse_timetable(None, "20m", "UTC"), 0.5).ledger.lines()
     assert [(line["event"], line.get("due")) for line in lines[1:]] == [
-        ("begun", "2026-06-01T12:20:00Z"), ("done", "2026-06-01T12:20:00Z"),
-    ]  # fmt: skip
+        ("begun", "2026-06-01T12:20:00Z"),
+        ("done", "2026-06-01T12:20:00Z"),
+    ]
     far = moment_words(due + timedelta(hours=1))
     state = serve_flow.survey_scheduled("north", far, return_state=True)
     assert state.is_completed()
@@ -195,6 +198,8 @@ def test_deployments_of_serve_fit_the_flows(prefect_home: Path, field_file: Call
     made = deployments(ServeRequest(fields=fields, timetable=table, late=0.5))
     assert [f"{one.flow_name}/{one.name}" for one in made] == ["survey/north", "survey/south", "reprocess/archive"]
     assert [one.parameters for one in made] == [
-        {"field": "north"}, {"field": "south"}, {"archive": fields[0].settings.out},
-    ]  # fmt: skip
+        {"field": "north"},
+        {"field": "south"},
+        {"archive": fields[0].settings.out},
+    ]
     assert not any(one.schedules for one in made)

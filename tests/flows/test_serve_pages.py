@@ -23,10 +23,16 @@ from tests.soak.prefect_schedule import free_port
 
 CHROMIUM = shutil.which("chromium")
 QUIETLY = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
     "--host-resolver-rules=MAP rebound.example 127.0.0.1",
-)  # fmt: skip
+)
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed: no page can be tried")
 
 # What a page of somebody else tries: to read, to ask for a run, to do so without asking for leave, and by a web socket.
@@ -132,9 +138,7 @@ def test_a_page_of_another_address_gets_nothing(
             found = told.get(timeout=60)
         finally:
             process.terminate()
-    assert found == {
-        "health": "refused", "list": "refused", "run": "refused", "blind": "opaque", "socket": "refused",
-    }  # fmt: skip
+    assert found == {"health": "refused", "list": "refused", "run": "refused", "blind": "opaque", "socket": "refused"}
     assert status(server[0], "/api/work_pools/", Origin="http://127.0.0.1:1") == 403
 
 

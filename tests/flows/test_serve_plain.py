@@ -38,9 +38,14 @@ def test_what_waited_too_long_for_another_field_is_told_with_its_reason(tmp_path
         return tmp_path / "run"
 
     serve_plain(
-        schedules, dict.fromkeys(schedules, lock), survey, told.append, clock=clock, note=noted.append,
+        schedules,
+        dict.fromkeys(schedules, lock),
+        survey,
+        told.append,
+        clock=clock,
+        note=noted.append,
         until=NOON + timedelta(minutes=35),
-    )  # fmt: skip
+    )
     assert told == [
         "north, due 2026-06-01 12:20:00 UTC, done: runs/run",
         "south, due 2026-06-01 12:20:00 UTC, skipped: it could not begin in time (noted 11.0 min after it was due)",
@@ -84,9 +89,7 @@ def test_a_schedule_that_cannot_be_closed_is_told_of_and_the_others_are_closed(
     schedules = {name: field_schedule(tmp_path, clock, name) for name in ("north", "south")}
     locks = dict.fromkeys(schedules, RigLock(tmp_path / "rig.lock"))
     refuse(monkeypatch, "north", "closed")
-    serve_plain(
-        schedules, locks, lambda *given: tmp_path, told.append, clock=clock, until=NOON + timedelta(minutes=1)
-    )  # fmt: skip
+    serve_plain(schedules, locks, lambda *given: tmp_path, told.append, clock=clock, until=NOON + timedelta(minutes=1))
     assert {name: schedule.state().serving for name, schedule in schedules.items()} == {"north": True, "south": False}
     assert told == ["north: the disk is full"]
 

@@ -90,9 +90,7 @@ def watcher(file: Path, clock: HandClock, client: AClient) -> tuple[Watcher, Fie
     schedule = one.schedule(EVERY, 0.5, clock)
     schedule.open()
     request = ServeRequest(fields=[one], timetable=EVERY, late=0.5)
-    return (
-        Watcher(request, {one.name: schedule}, lambda words: None, lambda: nullcontext(client)), schedule, one
-    )  # fmt: skip
+    return (Watcher(request, {one.name: schedule}, lambda words: None, lambda: nullcontext(client)), schedule, one)
 
 
 def two_rigs(
@@ -169,8 +167,10 @@ def test_a_run_that_somebody_cancelled_is_skipped(field_file: Callable[..., Path
     watch.look()
     line = schedule.ledger.lines()[-1]
     assert (line["event"], line["due"], line["reason"]) == (
-        "skipped", "2026-06-01T12:20:00Z", "it was cancelled in Prefect",
-    )  # fmt: skip
+        "skipped",
+        "2026-06-01T12:20:00Z",
+        "it was cancelled in Prefect",
+    )
 
 
 @pytest.mark.parametrize("stopped", [1, 5])
@@ -256,8 +256,9 @@ def test_notice_is_given_of_whatever_the_ledger_says(
     watch.tell_news()
     watch.tell_news()
     assert [(address, ending) for address, ending, _ in noted] == [
-        ("http://127.0.0.1:9/", "failed"), ("http://127.0.0.1:9/", "skipped"),
-    ]  # fmt: skip
+        ("http://127.0.0.1:9/", "failed"),
+        ("http://127.0.0.1:9/", "skipped"),
+    ]
     assert told == [words for _, _, words in noted]
     assert "its process was gone before it ended" in told[0]
     assert "it could not begin in time" in told[1]
@@ -374,10 +375,19 @@ def test_a_field_that_cannot_be_read_is_told_of_and_the_others_go_on(
 @pytest.mark.parametrize(
     ("limit", "looking", "reprocessing", "busy"),
     [
-        (1, 0, 0, False), (1, 1, 0, True), (1, 0, 1, True), (2, 1, 0, False), (2, 0, 1, False), (2, 1, 1, True),
-        (2, 2, 0, True), (3, 1, 1, False), (3, 2, 0, True), (3, 0, 2, False), (2, 0, 2, True),
+        (1, 0, 0, False),
+        (1, 1, 0, True),
+        (1, 0, 1, True),
+        (2, 1, 0, False),
+        (2, 0, 1, False),
+        (2, 1, 1, True),
+        (2, 2, 0, True),
+        (3, 1, 1, False),
+        (3, 2, 0, True),
+        (3, 0, 2, False),
+        (2, 0, 2, True),
     ],
-)  # fmt: skip
+)
 def test_who_would_have_to_wait(
     field_file: Callable[..., Path], tmp_path: Path, limit: int, looking: int, reprocessing: int, busy: bool
 ) -> None:

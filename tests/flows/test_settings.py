@@ -178,13 +178,7 @@ def test_budget_in_percent_is_guessed():
 
 
 @pytest.mark.parametrize(
-    ("text", "count"),
-    [
-        ("4GiB", 2**32),
-        ("500 MB", 500_000_000),
-        ("1.5gib", 3 * 2**29),
-        (2**30, 2**30),
-    ],
+    ("text", "count"), [("4GiB", 2**32), ("500 MB", 500_000_000), ("1.5gib", 3 * 2**29), (2**30, 2**30)]
 )
 def test_memory_reads_units(text, count):
     """Binary and decimal units are told apart."""

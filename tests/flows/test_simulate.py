@@ -165,10 +165,31 @@ def test_a_scene_of_one_band_is_simulated(command_line: Any, tmp_path: Path) -> 
     assert (rows["smile"]["reason"], rows["smear"]["state"]) == ("absent", "on")
 
 
-ROW = {"name": "smile", "state": "on", "variant": "cubic", "bound": 0.0, "measured": None, "cost_s": 0.004,
-       "why": "", "reason": "needed", "left_out": 1.4, "magnitude": "smile: 0.3 nm", "unit": "sigma"}  # fmt: skip
-TOTAL = {"asked": "auto", "tolerance": 0.1, "unit": "sigma", "bound": 0.0, "measured": 0.0, "within": True, "on": 1,
-         "off": 1, "saved_s": 1.0, "saved_cheap_s": 0.5}  # fmt: skip
+ROW = {
+    "name": "smile",
+    "state": "on",
+    "variant": "cubic",
+    "bound": 0.0,
+    "measured": None,
+    "cost_s": 0.004,
+    "why": "",
+    "reason": "needed",
+    "left_out": 1.4,
+    "magnitude": "smile: 0.3 nm",
+    "unit": "sigma",
+}
+TOTAL = {
+    "asked": "auto",
+    "tolerance": 0.1,
+    "unit": "sigma",
+    "bound": 0.0,
+    "measured": 0.0,
+    "within": True,
+    "on": 1,
+    "off": 1,
+    "saved_s": 1.0,
+    "saved_cheap_s": 0.5,
+}
 
 
 @pytest.mark.parametrize("width", [72, 80, 100, 120])

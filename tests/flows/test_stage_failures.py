@@ -101,9 +101,21 @@ def walk(tmp_path_factory: pytest.TempPathFactory, survey_png: Any, scene_files:
     keys = {stage["name"]: stage["key"] for stage in receipt["stages"] if stage["state"] == "ran"}
     found = Walk(folder / "undisturbed", folder / "archive", keys, {}, {}, Counter(), {})
     words = [
-        "survey", "--scene", scene_files / "scene.png", "--labels", scene_files / "labels.png", "--weights", weights,
-        "--engine", "plain", "--budget", "0.8", "--no-controls", "--out", found.out,
-    ]  # fmt: skip
+        "survey",
+        "--scene",
+        scene_files / "scene.png",
+        "--labels",
+        scene_files / "labels.png",
+        "--weights",
+        weights,
+        "--engine",
+        "plain",
+        "--budget",
+        "0.8",
+        "--no-controls",
+        "--out",
+        found.out,
+    ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tempfile, "tempdir", str(folder))
         for stage in STAGES:
@@ -262,9 +274,13 @@ def test_a_stage_that_fails_by_prefect(
 
 
 def test_a_due_run_of_which_a_stage_fails(
-    server: None, scene_files: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    server: None,
+    scene_files: Path,
+    weights: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     served: Callable[..., Path],
-) -> None:  # fmt: skip
+) -> None:
     """The scheduled flow ends Failed with the stage's words alone, the ledger has them, and no run is published."""
     from flows.schedule.prefect_flows import survey_scheduled
 
@@ -289,9 +305,13 @@ def test_a_due_run_of_which_a_stage_fails(
 
 
 def test_a_reprocessing_of_which_a_stage_fails(
-    server: None, walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, field_file: Callable[..., Path],
+    server: None,
+    walk: Walk,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    field_file: Callable[..., Path],
     served: Callable[..., Path],
-) -> None:  # fmt: skip
+) -> None:
     """It ends Failed and says where the reason stands; the next one makes what was missing, and completes."""
     from flows.schedule.prefect_flows import reprocess_archive
 

@@ -30,9 +30,17 @@ from pipeline.simulator.effects.registry import BY_NAME
 from storage.archive.archive import Archive
 
 STAGES = [
-    "choose_effects", "capture_coarse", "locate", "rectify", "attend", "capture_fine", "cut_patches", "draw_map",
-    "compare_turned", "evaluate",
-]  # fmt: skip
+    "choose_effects",
+    "capture_coarse",
+    "locate",
+    "rectify",
+    "attend",
+    "capture_fine",
+    "cut_patches",
+    "draw_map",
+    "compare_turned",
+    "evaluate",
+]
 ON_REQUEST = ["register_coarse", "register_fine", "ground"]  # skipped without --pointing-px and [pose]
 FARM = (128, 192)
 

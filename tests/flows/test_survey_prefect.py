@@ -137,9 +137,13 @@ def test_the_run_is_published_before_its_map_is_judged(
 
 
 def test_sigterm_in_a_stage(
-    scene_files: Path, weights: Path, tmp_path: Path, prefect_home: Path, monkeypatch: pytest.MonkeyPatch,
+    scene_files: Path,
+    weights: Path,
+    tmp_path: Path,
+    prefect_home: Path,
+    monkeypatch: pytest.MonkeyPatch,
     command_line: CommandLine,
-) -> None:  # fmt: skip
+) -> None:
     """143 and one sentence, whatever Prefect makes of it; the same command goes on."""
     real = STAGES["rectify"]
 

@@ -57,10 +57,14 @@ from tests.flows.conftest import CommandLine
 
 QUIET = Console(quiet=True)
 SMALL: dict[str, Any] = {
-    "size": "128x128", "bands": "40,90,150,200", "engine": "plain", "controls": False,
-    "budget": 0.8, "rig.panel": 0.99,  # of the farm's white panel
+    "size": "128x128",
+    "bands": "40,90,150,200",
+    "engine": "plain",
+    "controls": False,
+    "budget": 0.8,
+    "rig.panel": 0.99,  # of the farm's white panel
     "effects": "rotation,slit,smear,vignetting,shot,read-noise",
-}  # fmt: skip
+}
 
 
 def small_settings(out: Path, **changed: Any) -> Settings:
@@ -70,9 +74,13 @@ def small_settings(out: Path, **changed: Any) -> Settings:
 
 @contextmanager
 def emulated(
-    settings: Settings, effects: Any, patch: pytest.MonkeyPatch, *, scene: RasterScene | None = None,
+    settings: Settings,
+    effects: Any,
+    patch: pytest.MonkeyPatch,
+    *,
+    scene: RasterScene | None = None,
     mounting: Mounting = STRAIGHT,
-) -> Iterator[EmulatedRig]:  # fmt: skip
+) -> Iterator[EmulatedRig]:
     """Devices of surveys are emulated ones before a scene, the settings' by default, with effects, mounted somehow."""
     seen = open_scene(settings)[0] if scene is None else scene
     source = replace(make_source(seen, settings), chosen=effects)
@@ -173,8 +181,9 @@ def test_a_mirror_mounted_otherwise_gives_the_same_survey_once_it_is_told(
         wrong = run_survey(untold, QUIET)
         right = run_survey(told, QUIET)
         assert coarse_captures(rig) == 2
-    expected, found, other = (rows_of(Path(out), one) for out, one in
-                              ((usual.out, straight), (told.out, right), (told.out, wrong)))  # fmt: skip
+    expected, found, other = (
+        rows_of(Path(out), one) for out, one in ((usual.out, straight), (told.out, right), (told.out, wrong))
+    )
     assert list(found) == list(expected)
     for name, rows in expected.items():
         np.testing.assert_array_equal(found[name], rows, err_msg=name)
@@ -289,8 +298,12 @@ def test_survey_over_a_pty_and_sockets_gives_the_same_lines(tmp_path: Path):
     scene, _ = open_scene(settings)
     source = replace(make_source(scene, settings), chosen=effects_on("rotation", "slit", "smear", "shot"))
     with EmulatedRig(source, FastClock(40)).serve() as served:
-        rig = {"port": served.port, "host": served.host, "control_port": served.camera_port,
-               "file_port": served.file_port}  # fmt: skip
+        rig = {
+            "port": served.port,
+            "host": served.host,
+            "control_port": served.camera_port,
+            "file_port": served.file_port,
+        }
         told = {f"rig.{name}": value for name, value in rig.items()}
         published = run_survey(small_settings(tmp_path, source="rig", visit="first", budget=0.5, **told), QUIET)
     cube = open_raw_cube(tmp_path / published.receipt["products"]["raw_coarse"] / "coarse-0.zarr")
@@ -316,13 +329,15 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "no such source": ({"source": "rigg"}, r"source must be one of sim, rig; got 'rigg'"),
     "memory too large": ({"source": "rig", "cost.vector_pairs": 9000}, r"cost.vector_pairs = 9000: .* 2 to 8191 pairs"),
     "field without size": (
-        {"source": "rig", "scene": "field", "bands": None, "size": None, "weights": "x"}, r"give its size"
+        {"source": "rig", "scene": "field", "bands": None, "size": None, "weights": "x"},
+        r"give its size",
     ),
     "field without rig": ({"scene": "field", "bands": None}, r"scene 'field' is what stands before a rig"),
     "frame period of the camera": (
-        {"source": "rig", "camera.exposure_ms": 9500, "camera.readout_ms": 900}, r"frame period of 10400 ms is above"
+        {"source": "rig", "camera.exposure_ms": 9500, "camera.readout_ms": 900},
+        r"frame period of 10400 ms is above",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("changed", "message"), BAD.values(), ids=BAD)
@@ -382,10 +397,12 @@ def test_port_without_permission(command_line: CommandLine, tmp_path: Path, monk
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ("wrong-firmware", "firmware not known on /dev/"), ("modem", "is this the mirror controller?"),
-        ("echo", "is this the mirror controller?"), ("mute", "no answer to"),
+        ("wrong-firmware", "firmware not known on /dev/"),
+        ("modem", "is this the mirror controller?"),
+        ("echo", "is this the mirror controller?"),
+        ("mute", "no answer to"),
     ],
-)  # fmt: skip
+)
 def test_another_device_is_not_moved(command_line: CommandLine, tmp_path: Path, fault: str, words: str):
     """What answers as no mirror controller does, or as none that is known, is told nothing but who it should say."""
     settings = small_settings(tmp_path)

@@ -96,9 +96,13 @@ def test_errors_are_judged_against_the_reference():
 def test_only_run_is_timed(clock):
     """Preparing, warming up and judging take long without a setting's price knowing of it."""
     timed = replace(
-        SERIES, settings=(1.0, 4.0), prepare=lambda seed: spend(clock, 100), work=lambda truth, terms: 5.0,
-        run=lambda truth, terms: spend(clock, terms), judge=lambda truth, terms, out: spend(clock, 100),
-    )  # fmt: skip
+        SERIES,
+        settings=(1.0, 4.0),
+        prepare=lambda seed: spend(clock, 100),
+        work=lambda truth, terms: 5.0,
+        run=lambda truth, terms: spend(clock, terms),
+        judge=lambda truth, terms, out: spend(clock, 100),
+    )
     first, second = measure_tradeoff(timed, repeats=2).points
     assert (first.cpu_min_s, first.wall_min_s, second.cpu_min_s, second.wall_min_s) == (1, 2, 4, 8)
     assert (second.price_s, second.ratio, second.ns_per_unit) == (4, 4, 0.8e9)
@@ -144,9 +148,11 @@ def test_settings_run_on_one_thread():
 def test_modelled_seconds_are_the_price(clock):
     """A stage whose time is not spent here is priced by its model, ratio included; the clock's figures stay beside."""
     modelled = replace(
-        SERIES, settings=(1.0, 3.0), modelled_s=lambda truth, terms, out: 60 * terms,
+        SERIES,
+        settings=(1.0, 3.0),
+        modelled_s=lambda truth, terms, out: 60 * terms,
         run=lambda truth, terms: spend(clock, 0.5),
-    )  # fmt: skip
+    )
     point = measure_tradeoff(modelled, repeats=1).points[1]
     assert (point.price_s, point.ratio, point.wall_min_s) == (180, 3, 1)
 

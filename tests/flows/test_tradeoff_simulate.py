@@ -169,11 +169,18 @@ def test_cheap_noise_is_told_from_exact_noise_by_no_test_and_none_at_all_by_ever
 
 
 SERIES: Tradeoff[None, float] = Tradeoff(
-    stage="series", knob="terms", error="remainder", unit="sum", reference="0", settings=(0.5, 0.25),
-    prepare=lambda seed: None, run=lambda state, setting: float(setting), judge=lambda state, setting, out: out,
+    stage="series",
+    knob="terms",
+    error="remainder",
+    unit="sum",
+    reference="0",
+    settings=(0.5, 0.25),
+    prepare=lambda seed: None,
+    run=lambda state, setting: float(setting),
+    judge=lambda state, setting, out: out,
     work=lambda state, setting: 1.0,
     beside={"squared": lambda state, setting, out: out**2, "none": lambda state, setting, out: math.nan},
-)  # fmt: skip
+)
 
 
 def test_further_figures_are_in_json_and_in_the_table():
@@ -181,8 +188,9 @@ def test_further_figures_are_in_json_and_in_the_table():
     result = measure_tradeoff(SERIES, repeats=1)
     found = json.loads(json.dumps(result.to_dict(), allow_nan=False))
     assert [point["beside"] for point in found["points"]] == [
-        {"squared": 0.25, "none": None}, {"squared": 0.0625, "none": None},
-    ]  # fmt: skip
+        {"squared": 0.25, "none": None},
+        {"squared": 0.0625, "none": None},
+    ]
     console = Console(file=io.StringIO(), width=80)
     print_tradeoff(replace(result, points=result.points[1:]), console)
     words = console.file.getvalue()  # type: ignore[attr-defined]

@@ -35,9 +35,11 @@ def _publish_second_round(archive: Archive, one: Published) -> None:
     refs = {ref.key: ref for ref in archive.refs()}
     of = {name: refs[row["key"]] for name, row in rows.items() if row["key"]}
     again = _stored_as(
-        archive, of["attend"], {"weights": "a", "round": 2},
+        archive,
+        of["attend"],
+        {"weights": "a", "round": 2},
         [of[name].key for name in ("rectify", "attend", "cut_patches")],
-    )  # fmt: skip
+    )
     light = archive.manifest(of["capture_fine"])["params"]
     raw = _stored_as(archive, of["capture_fine"], {**light, "starts_s": [9.0]}, [again.key, of["choose_effects"].key])
     params = {"round": 2, "kernel": "catmull-rom"}
@@ -53,9 +55,11 @@ def _publish_second_round(archive: Archive, one: Published) -> None:
     round_of = {"seats": 4, "lines": 9, "sweeps": 1, "seconds": 2.0, "score": 1.0, "score_share": 0.5}
     receipt["plan"] |= {"rounds": [round_of, round_of], "second_move_s": 0.1}
     receipt["products"] |= {
-        "attention": f"{again.uri}/attention.zarr", "plan_again": f"{again.uri}/plan.json", "raw_again": raw.uri,
+        "attention": f"{again.uri}/attention.zarr",
+        "plan_again": f"{again.uri}/plan.json",
+        "raw_again": raw.uri,
         "patches": f"{patches.uri}/patches.zarr",
-    }  # fmt: skip
+    }
     with archive.new_run("scene") as draft:
         for name in ("quicklook.png", "report.html"):
             draft.write_file(name, (one.folder / name).read_bytes())

@@ -26,8 +26,17 @@ NM = np.linspace(400, 1000, 9)
 
 
 def _weights(**sizes: Any) -> Weights:
-    small = {"classes": 3, "columns": 4, "patch": 8, "factor": 2, "width": 8, "coarse_width": 8, "dim": 16, "layers": 2,
-             "heads": 2}  # fmt: skip
+    small = {
+        "classes": 3,
+        "columns": 4,
+        "patch": 8,
+        "factor": 2,
+        "width": 8,
+        "coarse_width": 8,
+        "dim": 16,
+        "layers": 2,
+        "heads": 2,
+    }
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         model = Segmenter(SegmenterConfig(**{**small, **sizes})).eval()

@@ -31,8 +31,16 @@ from models.weights.files import Weights, load_weights, save_weights
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.selection import frame_seats, select_seats
 
-SIZES: dict[str, Any] = {"classes": 3, "columns": 4, "patch": 8, "factor": 2, "width": 8, "coarse_width": 8, "dim": 16,
-                         "heads": 2}  # fmt: skip
+SIZES: dict[str, Any] = {
+    "classes": 3,
+    "columns": 4,
+    "patch": 8,
+    "factor": 2,
+    "width": 8,
+    "coarse_width": 8,
+    "dim": 16,
+    "heads": 2,
+}
 NONE = torch.zeros(1, 0, dtype=torch.int64)
 
 
@@ -470,9 +478,8 @@ def test_30_a_checkpoint_reads_other_bands(tmp_path: Path):
     save_weights(weights, path)
     loaded = load_weights(path)
     assert all(
-        torch.equal(a, b)
-        for a, b in zip(weights.segmenter.parameters(), loaded.segmenter.parameters(), strict=True)
-    )  # fmt: skip
+        torch.equal(a, b) for a, b in zip(weights.segmenter.parameters(), loaded.segmenter.parameters(), strict=True)
+    )
     for bands in (1, 3, 200):
         seen = glance(loaded, np.full((8, 8, bands), 0.3), np.linspace(500, 900, bands), SceneGrid(16, 16, 8, 2))
         assert np.isfinite(seen.probability).all()

@@ -199,8 +199,10 @@ def test_uneven_path_shows_the_scene_at_its_own_places() -> None:
     (track,) = make_tracks(aim(scan), CAMERA, step_px=1.0)
     points = points_between(scan[2], scan[-3])
     error = np.abs(seen_through(track, captured(scan), points) - wave(*points.T))
-    even = np.abs(seen_through(make_tracks(aim(np.linspace(scan[0], scan[-1], 60)), CAMERA)[0], captured(scan), points)
-                  - wave(*points.T))  # fmt: skip
+    even = np.abs(
+        seen_through(make_tracks(aim(np.linspace(scan[0], scan[-1], 60)), CAMERA)[0], captured(scan), points)
+        - wave(*points.T)
+    )
     assert error.max() < 5e-3
     assert even.max() > 20 * error.max()
 

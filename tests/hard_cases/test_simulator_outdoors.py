@@ -71,9 +71,10 @@ def test_stiff_mirror_stands_where_it_is_told(damping: float) -> None:
     assert LAG not in decided(TEXTURE, rig).chosen
 
 
-@pytest.mark.parametrize(("natural_hz", "damping", "exposure_ms"), [
-    (1e5, 10.0, 1000.0), (1e5, 0.01, 3.0), (5.0, 0.01, 100.0), (5.0, 2.0, 3.0), (1.0, 10.0, 3.0), (0.1, 10.0, 3.0)
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("natural_hz", "damping", "exposure_ms"),
+    [(1e5, 10.0, 1000.0), (1e5, 0.01, 3.0), (5.0, 0.01, 100.0), (5.0, 2.0, 3.0), (1.0, 10.0, 3.0), (0.1, 10.0, 3.0)],
+)
 def test_mirrors_stiff_and_slack_keep_every_bound(natural_hz: float, damping: float, exposure_ms: float) -> None:
     """From a lag of nothing to one of 10,000 px, where lines lie turned otherwise than planned."""
     for change, counted in left_out(TEXTURE, moving(exposure_ms, damping=damping, natural_hz=natural_hz)).values():

@@ -61,10 +61,16 @@ class Asked:
         y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
         rng = np.random.default_rng(self.seed)
         plane = {
-            "black": np.zeros(SHAPE), "even": np.ones(SHAPE), "rows": y % 2, "columns": x % 2, "checkers": (x + y) % 2,
-            "pixel": (y == 20) & (x == 30), "disc": np.hypot(y - 20, x - 30) < 4, "noise": rng.random(SHAPE),
+            "black": np.zeros(SHAPE),
+            "even": np.ones(SHAPE),
+            "rows": y % 2,
+            "columns": x % 2,
+            "checkers": (x + y) % 2,
+            "pixel": (y == 20) & (x == 30),
+            "disc": np.hypot(y - 20, x - 30) < 4,
+            "noise": rng.random(SHAPE),
             "decades": 10 ** rng.uniform(-2, 2, SHAPE),
-        }[self.pattern]  # fmt: skip
+        }[self.pattern]
         values = plane[..., None] * rng.uniform(0.3, 1, len(self.wavelengths))
         return raster_from_values(values, self.rig().camera, name="t", wavelength_nm=np.array(self.wavelengths))
 

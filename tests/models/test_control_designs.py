@@ -190,8 +190,13 @@ def test_the_twin_has_the_fine_sides_parts():
     two, twin = (build_network(_config(preset, patch=32, layers=2)) for preset in ("two-scale", "dense"))
     assert isinstance(two, Segmenter)
     assert isinstance(twin, DenseNetwork)
-    pairs = ((two.fine_stem, twin.stem), (two.encoder, twin.encoder), (two.fine_head, twin.head),
-             (two.fine_mix, twin.mix), (two.fine_classes, twin.classes))  # fmt: skip
+    pairs = (
+        (two.fine_stem, twin.stem),
+        (two.encoder, twin.encoder),
+        (two.fine_head, twin.head),
+        (two.fine_mix, twin.mix),
+        (two.fine_classes, twin.classes),
+    )
     sizes = [[{name: value.shape for name, value in part.state_dict().items()} for part in pair] for pair in pairs]
     assert all(ours == theirs for ours, theirs in sizes)
 

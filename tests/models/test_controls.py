@@ -73,9 +73,15 @@ def test_rows_are_reported_as_they_start(tiny: Maker):
     weights, (seen, fine, labels) = tiny(), _scene()
     said: list[str] = []
     run_controls(
-        weights, glance_of_columns(weights, seen.columns, seen.grid), fine, labels,
-        share=0.1, seed=0, policies=("entropy",), report=said.append,
-    )  # fmt: skip
+        weights,
+        glance_of_columns(weights, seen.columns, seen.grid),
+        fine,
+        labels,
+        share=0.1,
+        seed=0,
+        policies=("entropy",),
+        report=said.append,
+    )
     assert said == ["none", "all", "entropy"] + ["random"] * RANDOM_DRAWS
 
 

@@ -24,9 +24,7 @@ def _scene(shape: tuple[int, int] = (40, 50), camera: LineCamera = CAMERA) -> Ra
     rng = np.random.default_rng(1)
     labels = rng.integers(0, 3, shape, dtype=np.uint8)
     values = (rng.uniform(0.2, 0.8, (*shape, 6)) + labels[..., None]).astype(np.float32)
-    return raster_from_values(
-        values, camera, name="s", wavelength_nm=NM, labels=labels, class_names=("a", "b", "c")
-    )  # fmt: skip
+    return raster_from_values(values, camera, name="s", wavelength_nm=NM, labels=labels, class_names=("a", "b", "c"))
 
 
 def _observed(scene: RasterScene, camera: LineCamera = CAMERA, seed: int = 0) -> Observation:
@@ -76,8 +74,13 @@ def test_scenes_without_labels_teach_nothing():
     """A scene without labels, and examples without one labelled pixel, are refused."""
     with pytest.raises(SceneError, match="scene s has no labels"):
         _observed(replace(_scene(), raster=SceneRaster.of(_scene().planes)))
-    blank = Example("e", np.zeros((32, 32, 1), np.float16), np.zeros((16, 16, 1), np.float32),
-                    np.full((32, 32), 255, np.uint8), (32, 32))  # fmt: skip
+    blank = Example(
+        "e",
+        np.zeros((32, 32, 1), np.float16),
+        np.zeros((16, 16, 1), np.float32),
+        np.full((32, 32), 255, np.uint8),
+        (32, 32),
+    )
     with pytest.raises(SceneError, match="none of 2 scenes has a labelled pixel"):
         CropSampler([blank, blank], 8, 2, 32)
 

@@ -129,8 +129,11 @@ def test_tokens_are_laid_out_patch_by_patch():
     """Four tokens of a patch lie row by row inside it, patches row by row."""
     image = token_image(np.arange(24.0), (2, 3), 2)
     assert image.tolist() == [
-        [0, 1, 4, 5, 8, 9], [2, 3, 6, 7, 10, 11], [12, 13, 16, 17, 20, 21], [14, 15, 18, 19, 22, 23],
-    ]  # fmt: skip
+        [0, 1, 4, 5, 8, 9],
+        [2, 3, 6, 7, 10, 11],
+        [12, 13, 16, 17, 20, 21],
+        [14, 15, 18, 19, 22, 23],
+    ]
 
 
 @pytest.mark.parametrize(("side", "factor"), [(1, 1), (1, 2), (1, 4), (2, 1), (2, 2), (2, 4), (4, 2)])

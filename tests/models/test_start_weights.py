@@ -21,8 +21,9 @@ from models.weights.files import Weights, save_weights, with_record
 from pipeline.errors import SettingsError, WeightsError
 
 DIM, HEADS = 128, 2
-CONFIG = SegmenterConfig(3, columns=4, patch=8, factor=2, width=8, coarse_width=8, dim=DIM, layers=2, heads=HEADS,
-                         mlp_ratio=4)  # fmt: skip
+CONFIG = SegmenterConfig(
+    3, columns=4, patch=8, factor=2, width=8, coarse_width=8, dim=DIM, layers=2, heads=HEADS, mlp_ratio=4
+)
 BASIS = SpectralBasis(400.0, 1000.0, 4)
 PLAIN = Normalisation(np.zeros(4, np.float32), np.ones(4, np.float32), np.eye(4, dtype=np.float32))
 NAMES = ("soil", "crop", "weed")
@@ -42,22 +43,34 @@ def transformer(layers: int = 3, dim: int = DIM) -> dict[str, Tensor]:
     """A vision transformer's tensors as timm names them."""
     rng = torch.Generator().manual_seed(0)
     sizes = {
-        "norm1.weight": (dim,), "norm1.bias": (dim,), "norm2.weight": (dim,), "norm2.bias": (dim,),
-        "attn.qkv.weight": (3 * dim, dim), "attn.qkv.bias": (3 * dim,), "attn.proj.weight": (dim, dim),
-        "attn.proj.bias": (dim,), "mlp.fc1.weight": (4 * dim, dim), "mlp.fc1.bias": (4 * dim,),
-        "mlp.fc2.weight": (dim, 4 * dim), "mlp.fc2.bias": (dim,),
-    }  # fmt: skip
+        "norm1.weight": (dim,),
+        "norm1.bias": (dim,),
+        "norm2.weight": (dim,),
+        "norm2.bias": (dim,),
+        "attn.qkv.weight": (3 * dim, dim),
+        "attn.qkv.bias": (3 * dim,),
+        "attn.proj.weight": (dim, dim),
+        "attn.proj.bias": (dim,),
+        "mlp.fc1.weight": (4 * dim, dim),
+        "mlp.fc1.bias": (4 * dim,),
+        "mlp.fc2.weight": (dim, 4 * dim),
+        "mlp.fc2.bias": (dim,),
+    }
     state = {
         f"blocks.{layer}.{name}": torch.randn(*size, generator=rng)
         for layer in range(layers)
         for name, size in sizes.items()
     }
     return state | {
-        "cls_token": torch.zeros(1, 1, dim), "pos_embed": torch.zeros(1, 5, dim),
-        "patch_embed.proj.weight": torch.zeros(dim, 3, 4, 4), "patch_embed.proj.bias": torch.zeros(dim),
-        "norm.weight": torch.randn(dim, generator=rng), "norm.bias": torch.randn(dim, generator=rng),
-        "head.weight": torch.zeros(9, dim), "head.bias": torch.zeros(9),
-    }  # fmt: skip
+        "cls_token": torch.zeros(1, 1, dim),
+        "pos_embed": torch.zeros(1, 5, dim),
+        "patch_embed.proj.weight": torch.zeros(dim, 3, 4, 4),
+        "patch_embed.proj.bias": torch.zeros(dim),
+        "norm.weight": torch.randn(dim, generator=rng),
+        "norm.bias": torch.randn(dim, generator=rng),
+        "head.weight": torch.zeros(9, dim),
+        "head.bias": torch.zeros(9),
+    }
 
 
 def saved(path: Path, content: object) -> Path:

@@ -185,8 +185,10 @@ def test_late_in_a_run_the_scorer_places_seats_too():
     score[0, 41] = 5.0
 
     def first(done: float) -> float:
-        draws = (draw_seats(torch.zeros(1, 3, 32, 32), score, CONFIG, np.random.default_rng(seed), phase_at(done))
-                 for seed in range(60))  # fmt: skip
+        draws = (
+            draw_seats(torch.zeros(1, 3, 32, 32), score, CONFIG, np.random.default_rng(seed), phase_at(done))
+            for seed in range(60)
+        )
         return float(np.mean([row[0, 0] == 41 for row in draws]))
 
     assert first(0.0) < 0.1

@@ -64,8 +64,11 @@ def test_everything_comes_back_bit_by_bit(tiny: Maker, saved: Path):
     assert list(old) == list(new)
     assert all(torch.equal(old[name], new[name]) for name in old)
     assert (after.config, after.basis, after.class_names, after.record) == (
-        before.config, before.basis, before.class_names, before.record,
-    )  # fmt: skip
+        before.config,
+        before.basis,
+        before.class_names,
+        before.record,
+    )
     for name in ("centre", "spread", "whitening"):
         assert (getattr(after.normalisation, name) == getattr(before.normalisation, name)).all()
     assert (after.class_colours == before.class_colours).all()

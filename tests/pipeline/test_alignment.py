@@ -28,12 +28,16 @@ def windows_of(truth: list[SweepShift], rng: np.random.Generator, noise: float) 
     lines = [shift.of_lines(LINES) for shift in truth]
     return [
         WindowShift(
-            one, one + 1, (line, line), np.stack([np.eye(2)] * 2),
-            lines[one + 1][line] - lines[one][line] + rng.normal(0, noise, 2), np.full(2, noise),
+            one,
+            one + 1,
+            (line, line),
+            np.stack([np.eye(2)] * 2),
+            lines[one + 1][line] - lines[one][line] + rng.normal(0, noise, 2),
+            np.full(2, noise),
         )
         for one in range(len(truth) - 1)
         for line in range(250, LINES, 500)
-    ]  # fmt: skip
+    ]
 
 
 def farthest(found: tuple[SweepShift, ...], wanted: tuple[SweepShift, ...] | list[SweepShift]) -> float:

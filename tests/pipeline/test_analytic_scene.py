@@ -133,9 +133,10 @@ def share_of_spread(
     return float(np.sqrt(((got - truth) ** 2).mean()) / truth.std(axis=(0, 1)).mean())
 
 
-@pytest.mark.parametrize(("shape", "along", "strips"), [
-    ((120, 900), "x", [-200, 200]), ((900, 120), "y", [-200, 200]), ((40, 1800), "x", [-620, 0, 620])
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("shape", "along", "strips"),
+    [((120, 900), "x", [-200, 200]), ((900, 120), "y", [-200, 200]), ((40, 1800), "x", [-620, 0, 620])],
+)
 def test_mosaic_meets_the_analytic_scene(shape: tuple[int, int], along: Axis, strips: list[float]) -> None:
     """Waves of 4 to 40 px with the fall of natural scenes come back within 0.5 % of their spread, seams included."""
     assert share_of_spread(waves(shape, (4, 40), slope=1.0), strips, along) < 0.005

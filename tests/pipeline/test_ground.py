@@ -27,8 +27,12 @@ poses = st.builds(
     lambda heading, tilt, roll, slope, aspect: view(
         heading_deg=heading, tilt_deg=tilt, roll_deg=roll, slope_deg=slope, aspect_deg=aspect
     ),
-    st.floats(-360, 360), st.floats(20, 90), st.floats(-180, 180), st.floats(0, 10), st.floats(-180, 180),
-)  # fmt: skip
+    st.floats(-360, 360),
+    st.floats(20, 90),
+    st.floats(-180, 180),
+    st.floats(0, 10),
+    st.floats(-180, 180),
+)
 places = st.tuples(st.floats(-900, 900), st.floats(-900, 900))
 
 

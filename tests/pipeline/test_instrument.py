@@ -154,10 +154,14 @@ def grainy(kind: str) -> RasterScene:
         return scene_of(rng.uniform(0, 1, (60, 90, 4)))
     electrons = rng.uniform(1e3, 6e3, (3, 7)).astype(np.float32)
     return RasterScene(
-        "grain", "grain", SceneRaster.of(rng.uniform(0, 1, (60, 90, 3)).astype(np.float32)),
-        Once.of(SceneLight(electrons, electrons.sum(axis=0))), np.ones(7, np.float32), np.linspace(400, 1000, 7),
+        "grain",
+        "grain",
+        SceneRaster.of(rng.uniform(0, 1, (60, 90, 3)).astype(np.float32)),
+        Once.of(SceneLight(electrons, electrons.sum(axis=0))),
+        np.ones(7, np.float32),
+        np.linspace(400, 1000, 7),
         np.full(7, 3.0),
-    )  # fmt: skip
+    )
 
 
 @cache

@@ -88,10 +88,13 @@ def test_a_point_alone_is_summed_as_among_others() -> None:
     rng = np.random.default_rng(5)
     full = np.ones(40, np.float32)
     parts = [
-        MosaicPart(np.where(rng.random((40, 1)) < 0.3, np.nan, rng.random((40, 1))).astype(np.float32), full,
-             rng.uniform(0, 300, 40))
+        MosaicPart(
+            np.where(rng.random((40, 1)) < 0.3, np.nan, rng.random((40, 1))).astype(np.float32),
+            full,
+            rng.uniform(0, 300, 40),
+        )
         for _ in range(12)
-    ]  # fmt: skip
+    ]
     whole = mosaic(parts)[0]
     alone = [
         mosaic([MosaicPart(one.values[[at]], one.weight[[at]], one.edge_px[[at]]) for one in parts])[0]

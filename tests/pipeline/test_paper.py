@@ -168,10 +168,15 @@ def test_e7_equation_4_loses_its_digits_at_grazing(grazing: float, view_px: floa
 @pytest.mark.parametrize(
     ("position", "psi_deg", "seed_deg"),
     [
-        ((0, 0.3), 13.8, 10.4), ((0.4, 0.3), 10.8, 7.6), ((-0.4, 0.3), 16.7, 11.3), ((0.8, 0.3), 8.5, 4.9),
-        ((-0.8, 0.3), 18.9, 10.3), ((0, 0.7), 27.1, 25.3), ((-0.4, 0.8), 34.2, 28.6),
+        ((0, 0.3), 13.8, 10.4),
+        ((0.4, 0.3), 10.8, 7.6),
+        ((-0.4, 0.3), 16.7, 11.3),
+        ((0.8, 0.3), 8.5, 4.9),
+        ((-0.8, 0.3), 18.9, 10.3),
+        ((0, 0.7), 27.1, 25.3),
+        ((-0.4, 0.8), 34.2, 28.6),
     ],
-)  # fmt: skip
+)
 def test_e8_rotation_and_slope_at_seven_positions(position, psi_deg: float, seed_deg: float):
     """What the line really turns by, and what the slope of the path says."""
     xi, eta = looked_at(np.array(position))
@@ -309,10 +314,13 @@ def greatest_errors(field_deg: float) -> list[float]:
 @pytest.mark.parametrize(
     ("field_deg", "px"),
     [
-        (5, (19.9, 6.0, 1.9, 0.67)), (10, (40, 12.9, 6.4, 1.37)), (25, (111, 47, 39, 3.9)),
-        (40, (217, 130, 119, 8.0)), (50, (337, 243, 227, 13.3)),
+        (5, (19.9, 6.0, 1.9, 0.67)),
+        (10, (40, 12.9, 6.4, 1.37)),
+        (25, (111, 47, 39, 3.9)),
+        (40, (217, 130, 119, 8.0)),
+        (50, (337, 243, 227, 13.3)),
     ],
-)  # fmt: skip
+)
 def test_line_models_err_as_tabulated(field_deg: float, px: tuple[float, ...]):
     """Rotation is not rectification: even the exact rotation with the local scale errs; rays do not."""
     errors = greatest_errors(field_deg)

@@ -44,9 +44,13 @@ def test_metres_around_the_foot_are_the_textbooks(lon: float, lat: float):
 
 @settings(max_examples=40)
 @given(
-    st.floats(-180, 180), st.floats(-89.9, 89.9), st.floats(-2000, 2000), st.floats(-2000, 2000),
-    st.floats(0, 15), st.floats(-180, 180),
-)  # fmt: skip
+    st.floats(-180, 180),
+    st.floats(-89.9, 89.9),
+    st.floats(-2000, 2000),
+    st.floats(-2000, 2000),
+    st.floats(0, 15),
+    st.floats(-180, 180),
+)
 def test_map_and_ground_undo_each_other(lon: float, lat: float, east: float, north: float, slope: float, aspect: float):
     """Points of the plane come back from the map to a tenth of a micrometre, wherever the rig stands."""
     around = frame(lon, lat, slope_deg=slope, aspect_deg=aspect, elevation_m=700.0)

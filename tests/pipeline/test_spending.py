@@ -77,8 +77,13 @@ def optimum(worth: np.ndarray, most: int, budget_s: float | None) -> float:
     most_of[loads] = 99
     whole = np.zeros(loads + 1)
     whole[:on] = whole[loads] = 1
-    found = milp(seconds if budget_s is None else -value, constraints=limits, bounds=Bounds(least, most_of),
-                 integrality=whole, options={"mip_rel_gap": 1e-6})  # fmt: skip
+    found = milp(
+        seconds if budget_s is None else -value,
+        constraints=limits,
+        bounds=Bounds(least, most_of),
+        integrality=whole,
+        options={"mip_rel_gap": 1e-6},
+    )
     return float(found.fun if budget_s is None else -found.fun)
 
 

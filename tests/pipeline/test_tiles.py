@@ -280,9 +280,12 @@ def test_lines_that_are_missing_count_nothing() -> None:
     whole = taken(Sweep("straight", "fine", "x", 0.0, -30.0, 60))
     came = np.arange(60) != 30
     lines = replace(
-        whole, raw=whole.raw[came], position=whole.position[came], valid_line=whole.valid_line[came],
+        whole,
+        raw=whole.raw[came],
+        position=whole.position[came],
+        valid_line=whole.valid_line[came],
         sweep=replace(whole.sweep, lines=59),
-    )  # fmt: skip
+    )
     seen, coverage = in_tiles([place(lines, CAMERA)], PixelGrid((-0.7, -59.5), 1, (1, 120)), (64, 640))
     assert (coverage == 1).all()
     number, weight = kernel_taps(np.array([29.3]), "catmull-rom")

@@ -111,8 +111,12 @@ def differences(survey: Survey, truth: Survey) -> list[str]:
         for number, line in enumerate(lines):
             other = truth.lines[name][number]
             alike = (line.number, line.mirror_x, line.mirror_y, line.valid, line.exposure_ms) == (
-                other.number, other.mirror_x, other.mirror_y, other.valid, other.exposure_ms
-            )  # fmt: skip
+                other.number,
+                other.mirror_x,
+                other.mirror_y,
+                other.valid,
+                other.exposure_ms,
+            )
             if not (alike and np.array_equal(line.data, other.data)):
                 wrong.append(f"line {number} of {name}")
     return wrong

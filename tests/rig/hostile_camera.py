@@ -17,9 +17,12 @@ Piece = bytes | float
 Pieces = Iterable[Piece] | Callable[[], Iterable[Piece]]
 GREETING = b"220 camera\r\n"
 REPLIES: dict[str, Pieces] = {
-    "USER": [b"331 go on\r\n"], "PASS": [b"230 logged in\r\n"], "TYPE": [b"200 binary\r\n"],
-    "REST": [b"350 from there\r\n"], "RETR": [b"150 here it comes\r\n"],
-}  # fmt: skip
+    "USER": [b"331 go on\r\n"],
+    "PASS": [b"230 logged in\r\n"],
+    "TYPE": [b"200 binary\r\n"],
+    "REST": [b"350 from there\r\n"],
+    "RETR": [b"150 here it comes\r\n"],
+}
 
 
 def trickled(word: bytes = b"x", pause_s: float = 0.02) -> Callable[[], Iterator[Piece]]:
@@ -106,9 +109,13 @@ class HostileFiles(Hostile):
     """A file server: ``says`` are its replies by their command, ``data`` what a transfer brings, then ``end``."""
 
     def __init__(
-        self, says: Mapping[str, Pieces] | None = None, data: Pieces = (), *, greeting: Pieces = (GREETING,),
+        self,
+        says: Mapping[str, Pieces] | None = None,
+        data: Pieces = (),
+        *,
+        greeting: Pieces = (GREETING,),
         end: Pieces = (b"226 done\r\n",),
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__()
         self.says, self.data, self.greeting, self.end = {**REPLIES, **(says or {})}, data, greeting, end
 

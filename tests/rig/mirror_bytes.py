@@ -15,9 +15,7 @@ def pair(sent: str, received: str) -> Pair:
 
 
 GREET: Pair = (b"START\r\n", b"OK\r\n")
-WHO: list[Pair] = [
-    (b"GETID\r\n", b"MR-E-2\r\n"), (b"GETVERSION\r\n", b"1.2.4065\r\n"), (b"GETSN\r\n", b"ABCD0123\r\n"),
-]  # fmt: skip
+WHO: list[Pair] = [(b"GETID\r\n", b"MR-E-2\r\n"), (b"GETVERSION\r\n", b"1.2.4065\r\n"), (b"GETSN\r\n", b"ABCD0123\r\n")]
 ENTER: Pair = (b"GOPROCRC\r\n", b"OK\r\n")
 LEAVE = pair("7E 00 06 02 00 00 A1 48 7E", "7E 00 06 00 03 A0 7E")
 WELL = pair("7E 00 02 02 00 00 A0 78 7E", "7E 00 02 04 00 00 00 00 F0 22 7E")

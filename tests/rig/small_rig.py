@@ -73,22 +73,35 @@ class SmallRig:
     def source(self, kept: Kept | None = None) -> RigSource:
         """A source that looks through the rig; another call is another process."""
         return RigSource(
-            self.view, self.devices, KeptInMemory() if kept is None else kept, rig=self.settings,
+            self.view,
+            self.devices,
+            KeptInMemory() if kept is None else kept,
+            rig=self.settings,
             vector_pairs=self.vector_pairs,
-        )  # fmt: skip
+        )
 
 
 @contextmanager
 def small_rig(
-    source: SimulatedSource | None = None, *, faults: dict[CameraFault, int] | None = None, passes: int = 0,
-    mirror_faults: Sequence[Fault] = (), vector_pairs: int = 1500, mounting: Mounting = STRAIGHT, **settings: Any,
-) -> Iterator[SmallRig]:  # fmt: skip
+    source: SimulatedSource | None = None,
+    *,
+    faults: dict[CameraFault, int] | None = None,
+    passes: int = 0,
+    mirror_faults: Sequence[Fault] = (),
+    vector_pairs: int = 1500,
+    mounting: Mounting = STRAIGHT,
+    **settings: Any,
+) -> Iterator[SmallRig]:
     """An emulated rig before a source's scene, until the context ends; its mirror is mounted as ``mounting`` says."""
     looked = small_source() if source is None else source
     rig = EmulatedRig(
-        looked, ManualClock(50.0), mirror_faults=mirror_faults, wired=settings.get("pulses", "position"),
-        camera_faults=CameraFaults(dict(faults or {}), 0, passes), mounting=mounting,
-    )  # fmt: skip
+        looked,
+        ManualClock(50.0),
+        mirror_faults=mirror_faults,
+        wired=settings.get("pulses", "position"),
+        camera_faults=CameraFaults(dict(faults or {}), 0, passes),
+        mounting=mounting,
+    )
     view = RigView(looked.camera, looked.wavelength_nm, looked.field_shape)
     with rig.in_process() as line:
         assert isinstance(line.server, CameraServer)

@@ -119,13 +119,14 @@ def test_another_file_of_the_same_name() -> None:
 
 
 @pytest.mark.parametrize("read_twice", [True, False])
-@pytest.mark.parametrize(("more", "words"), [
-    (-100, r"goes on after its 380 bytes; is the capture still running"),
-    (100, r"ended at byte 480 of 580; look at the file there"),
-])  # fmt: skip
-def test_transfer_of_another_length(
-    more: int, words: str, read_twice: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:  # fmt: skip
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (-100, r"goes on after its 380 bytes; is the capture still running"),
+        (100, r"ended at byte 480 of 580; look at the file there"),
+    ],
+)
+def test_transfer_of_another_length(more: int, words: str, read_twice: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file that is longer, or shorter, than the server said is not taken for whole, and nothing of it is kept."""
     with camera(tries=2, read_twice=read_twice) as (driver, device, _):
         driver.capture(10)

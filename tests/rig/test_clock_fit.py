@@ -76,9 +76,7 @@ def test_matching(quiet_before: float, quiet_after: float, near: float | None) -
     edges = mirror(stamps(6000), 400)
     first, last = (0 if quiet_before else 100), (6000 if quiet_after else 5500)
     log = (edges[first] - max(quiet_before, 0.004), edges[last - 1] + max(quiet_after, 0.004))
-    found = match_edges(
-        stamps(6000)[frames], frames, edges[first:last], log_s=log, period_s=0.01, first_near_s=near
-    )  # fmt: skip
+    found = match_edges(stamps(6000)[frames], frames, edges[first:last], log_s=log, period_s=0.01, first_near_s=near)
     expected = np.where((frames >= first) & (frames < last), frames - first, -1)
     if near is not None:  # from frame 0 on the drift is followed only where there are edges
         assert np.count_nonzero(found != expected) == 0

@@ -117,11 +117,18 @@ class Session:
     def run(self) -> None:
         """Do what a survey does, until something fails, and let go."""
         steps: list[tuple[Callable[[], object], int]] = [
-            (self.driver.connect, 0), (self.driver.status, 0), (lambda: self.goes(0.1, -0.2), 1),
-            (lambda: self.driver.settle(1.0), 0), (self.loads, 0), (lambda: self.driver.start_log(100.0), 0),
-            (self.plays, 1), (self.driver.index, 0), (self.driver.read_log, 0), (self.driver.temperature, 0),
+            (self.driver.connect, 0),
+            (self.driver.status, 0),
+            (lambda: self.goes(0.1, -0.2), 1),
+            (lambda: self.driver.settle(1.0), 0),
+            (self.loads, 0),
+            (lambda: self.driver.start_log(100.0), 0),
+            (self.plays, 1),
+            (self.driver.index, 0),
+            (self.driver.read_log, 0),
+            (self.driver.temperature, 0),
             (self.driver.park, 1),
-        ]  # fmt: skip
+        ]
         for act, motions in steps:
             if not self.does(act, motions):
                 break

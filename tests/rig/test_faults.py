@@ -23,17 +23,23 @@ from pipeline.rig.mirror.pro_payloads import (
 from pipeline.rig.mirror.registers import VECTOR_MEMORY, Status, X
 
 CODES = {
-    "error-frame": ErrorCode.FRAME_INVALID, "error-length": ErrorCode.LENGTH_MISMATCH,
-    "error-crc": ErrorCode.CRC_WRONG, "error-no-register": ErrorCode.NO_REGISTER,
-    "error-range": ErrorCode.OUT_OF_RANGE, "error-read-only": ErrorCode.READ_ONLY, "error-chain": ErrorCode.CHAIN,
+    "error-frame": ErrorCode.FRAME_INVALID,
+    "error-length": ErrorCode.LENGTH_MISMATCH,
+    "error-crc": ErrorCode.CRC_WRONG,
+    "error-no-register": ErrorCode.NO_REGISTER,
+    "error-range": ErrorCode.OUT_OF_RANGE,
+    "error-read-only": ErrorCode.READ_ONLY,
+    "error-chain": ErrorCode.CHAIN,
     "error-unknown": 0xBEEF,
-}  # fmt: skip
+}
 BITS = {
-    "never-stable": Status.NOT_STABLE, "trimmed": Status.TRIMMED | Status.WAS_TRIMMED,
+    "never-stable": Status.NOT_STABLE,
+    "trimmed": Status.TRIMMED | Status.WAS_TRIMMED,
     "mirror-warm": Status.MIRROR_WARM | Status.WAS_MIRROR_WARM,
     "electronics-warm": Status.ELECTRONICS_WARM | Status.WAS_ELECTRONICS_WARM,
-    "disconnected": Status.DISCONNECTED | Status.WAS_DISCONNECTED, "eeprom-invalid": Status.EEPROM_INVALID,
-}  # fmt: skip
+    "disconnected": Status.DISCONNECTED | Status.WAS_DISCONNECTED,
+    "eeprom-invalid": Status.EEPROM_INVALID,
+}
 
 
 def device_with(name: str, at: int = 0, seed: int = 0, mode: Mode = Mode.SIMPLE) -> MirrorDevice:
@@ -93,8 +99,7 @@ def test_a_fault_that_never_strikes_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "expected"),
-    [("request-byte-lost", b"NO\r\nOK\r\n"), ("request-byte-doubled", b"NO\r\nOK\r\n")],
+    ("name", "expected"), [("request-byte-lost", b"NO\r\nOK\r\n"), ("request-byte-doubled", b"NO\r\nOK\r\n")]
 )
 def test_one_byte_to_the_controller_is_changed(name: str, expected: bytes) -> None:
     """The third byte of a line is lost, or comes twice; the next line is as it was sent."""

@@ -49,13 +49,21 @@ def test_every_command(echo: bool) -> None:
     def answer(command: bytes, response: bytes) -> Pair:
         return command, said(command if echo else b"", response)
 
-    listing = b'[{"name": "/captured//a/raw_0", "size": 12, "mtime": 1.5, "isDirectory": false}, ' \
-              b'{"name": "/captured/a/b", "isDirectory": true}]'  # fmt: skip
-    with talk([
-        answer(b'configure({"exposure": 10.5, "framePeriod": 11})\r', b"{}"), answer(LIST_ROOT, b"[]"),
-        answer(CAPTURE, b'{"folder": "/captured/f1_0"}'), answer(IS_CAPTURING, b"true"),
-        answer(b"stopCapture\r", b"true"), answer(b'listFiles("/captured/a")\r', listing), (b"exit\r", b""),
-    ]) as control:  # fmt: skip
+    listing = (
+        b'[{"name": "/captured//a/raw_0", "size": 12, "mtime": 1.5, "isDirectory": false}, '
+        b'{"name": "/captured/a/b", "isDirectory": true}]'
+    )
+    with talk(
+        [
+            answer(b'configure({"exposure": 10.5, "framePeriod": 11})\r', b"{}"),
+            answer(LIST_ROOT, b"[]"),
+            answer(CAPTURE, b'{"folder": "/captured/f1_0"}'),
+            answer(IS_CAPTURING, b"true"),
+            answer(b"stopCapture\r", b"true"),
+            answer(b'listFiles("/captured/a")\r', listing),
+            (b"exit\r", b""),
+        ]
+    ) as control:
         control.configure(10.5, 11)
         assert control.capture(500, prefix="f1").folder == "/captured/f1_0"
         assert control.is_capturing()
@@ -75,8 +83,7 @@ def test_greeting_in_pieces() -> None:
 
 
 @pytest.mark.parametrize(
-    "stale",
-    [said(b"stopCapture\r", b"true"), said(b"", b'{"folder": "/captured/x"}'), said(b"", b"[]")],
+    "stale", [said(b"stopCapture\r", b"true"), said(b"", b'{"folder": "/captured/x"}'), said(b"", b"[]")]
 )
 def test_replies_to_others_are_passed_over(stale: bytes) -> None:
     """A reply that names another command, or that cannot be one to this, is not taken for it; merged ones neither."""
@@ -87,9 +94,7 @@ def test_replies_to_others_are_passed_over(stale: bytes) -> None:
 
 def test_late_reply_is_never_the_next_ones() -> None:
     """After a reply that did not come in time the connection is a new one."""
-    with talk(
-        [(b"isCapturing\r", b"")], [(b"isCapturing\r", said(IS_CAPTURING, b"true"))]
-    ) as control:  # fmt: skip
+    with talk([(b"isCapturing\r", b"")], [(b"isCapturing\r", said(IS_CAPTURING, b"true"))]) as control:
         assert control.is_capturing()
         assert control.clock.now() == pytest.approx(5.5)
 
@@ -117,10 +122,12 @@ def test_wrong_device() -> None:
 @pytest.mark.parametrize(
     ("why", "remedy"),
     [
-        (b"disk full", "copy the folders"), (b"busy capturing", "stop it with its own program"),
-        (b"exposure longer than frame period", "not longer than the frame period"), (b"oh", "manual"),
+        (b"disk full", "copy the folders"),
+        (b"busy capturing", "stop it with its own program"),
+        (b"exposure longer than frame period", "not longer than the frame period"),
+        (b"oh", "manual"),
     ],
-)  # fmt: skip
+)
 def test_refusals(why: bytes, remedy: str) -> None:
     """A capture that is refused did not begin: told once with what to do, nothing frozen, nothing sent again."""
     with (
@@ -137,10 +144,11 @@ def test_capture_without_a_reply() -> None:
     with talk(
         [(LIST_ROOT, said(LIST_ROOT, b"[]")), (CAPTURE, b"")],
         [
-            (IS_CAPTURING, said(IS_CAPTURING, b"true")), (LIST_ROOT, said(LIST_ROOT, listed)),
+            (IS_CAPTURING, said(IS_CAPTURING, b"true")),
+            (LIST_ROOT, said(LIST_ROOT, listed)),
             (b"stopCapture\r", said(b"stopCapture\r", b"true")),
         ],
-    ) as control:  # fmt: skip
+    ) as control:
         with pytest.raises(CaptureUnknown, match=r"asked again it captures, .*/captured/f1_0") as caught:
             control.capture(500, prefix="f1")
         assert (caught.value.capturing, caught.value.folders) == (True, ("/captured/f1_0",))
@@ -155,8 +163,9 @@ def test_folders_that_were_there_are_not_the_lost_captures() -> None:
     old, new = (b'{"name": "/captured/%s", "isDirectory": true}' % name for name in (b"f0_0", b"f1_1"))
     pairs = [(LIST_ROOT, said(LIST_ROOT, b"[" + old + b"]")), (CAPTURE, b"")]
     after = [
-        (IS_CAPTURING, said(IS_CAPTURING, b"false")), (LIST_ROOT, said(LIST_ROOT, b"[" + old + b", " + new + b"]")),
-    ]  # fmt: skip
+        (IS_CAPTURING, said(IS_CAPTURING, b"false")),
+        (LIST_ROOT, said(LIST_ROOT, b"[" + old + b", " + new + b"]")),
+    ]
     with (
         talk(pairs, after) as control,
         pytest.raises(CaptureUnknown, match=r"does not capture, and new are the folders /captured/f1_1\.") as caught,
@@ -218,9 +227,9 @@ def test_stale_bytes_are_dropped(caplog: pytest.LogCaptureFixture) -> None:
 
 def test_stop_where_none_runs() -> None:
     """A refusal to stop where nothing runs is no failure."""
-    with talk([
-        (b"stopCapture\r", refused(b"stopCapture\r", b"not capturing")), (IS_CAPTURING, said(IS_CAPTURING, b"false")),
-    ]) as control:  # fmt: skip
+    with talk(
+        [(b"stopCapture\r", refused(b"stopCapture\r", b"not capturing")), (IS_CAPTURING, said(IS_CAPTURING, b"false"))]
+    ) as control:
         assert not control.stop_capture()
 
 

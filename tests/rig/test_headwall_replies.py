@@ -16,7 +16,8 @@ REPLY = b'isCapturing\r\n{"success": true, "response": false, "errorMessage": ""
     [
         ("configure", {"exposure": 10.5, "framePeriod": 11}, b'configure({"exposure": 10.5, "framePeriod": 11})\r'),
         (
-            "capture", {"prefix": "a", "maxCubes": 1, "maxFramesPerCube": 500},
+            "capture",
+            {"prefix": "a", "maxCubes": 1, "maxFramesPerCube": 500},
             b'capture({"prefix": "a", "maxCubes": 1, "maxFramesPerCube": 500})\r',
         ),
         ("isCapturing", None, b"isCapturing\r"),
@@ -24,7 +25,7 @@ REPLY = b'isCapturing\r\n{"success": true, "response": false, "errorMessage": ""
         ("listFiles", "/captured", b'listFiles("/captured")\r'),
         ("exit", None, b"exit\r"),
     ],
-)  # fmt: skip
+)
 def test_requests(name: str, argument: object, sent: bytes) -> None:
     """Each command is its line and a carriage return."""
     assert to_request(name, argument) == sent

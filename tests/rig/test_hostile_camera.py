@@ -104,12 +104,7 @@ def test_size_beyond_what_was_asked_for() -> None:
 
 @pytest.mark.parametrize(
     ("data", "kind"),
-    [
-        (flood(b"x"), RigError),
-        (trickled(), DeadlinePassed),
-        ((9.0,), DeadlinePassed),
-        ((b"x" * 900,), RigError),
-    ],
+    [(flood(b"x"), RigError), (trickled(), DeadlinePassed), ((9.0,), DeadlinePassed), ((b"x" * 900,), RigError)],
     ids=["without end", "a byte now and then", "silence", "short"],
 )
 def test_transfers(data: Pieces, kind: type[RigError]) -> None:
@@ -182,9 +177,7 @@ def test_control_sockets(name: str) -> None:
     case = CONTROL[name]
     patience = ControlPatience(STALL_S, 1, 0.01)
     with HostileControl(case.answers) as control, HostileFiles() as files:
-        camera = HeadwallCamera.at(
-            CameraAddress("127.0.0.1", control.port), server(files.port), patience=patience
-        )  # fmt: skip
+        camera = HeadwallCamera.at(CameraAddress("127.0.0.1", control.port), server(files.port), patience=patience)
         began = time.monotonic()
         rows = check_camera(camera, camera.server)
         assert time.monotonic() - began < 12 * STALL_S + 2

@@ -75,9 +75,7 @@ def test_missing_and_repeated_frames() -> None:
     """Frames that were dropped, numbered or not, and one that is there twice, do not move the others."""
     whole = frames()
     lines = np.concatenate([np.arange(50), np.arange(53, 200), [199], np.arange(200, 400)])
-    found = lines_by_log(
-        replace(whole, number=whole.number[lines], stamp_us=whole.stamp_us[lines]), CAMERA, track()
-    )  # fmt: skip
+    found = lines_by_log(replace(whole, number=whole.number[lines], stamp_us=whole.stamp_us[lines]), CAMERA, track())
     check_truth(found, lines)
     assert "3 frames are missing between the lines" in found.notes
     assert "1 frames are there twice or out of order" in found.notes

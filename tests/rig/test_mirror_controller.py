@@ -35,7 +35,7 @@ from tests.rig.mirror_bytes import (
     WELL,
     connected,
     pair,
-)  # fmt: skip
+)
 from tests.rig.scripted import Late, ScriptedTransport, scripted
 
 

@@ -57,12 +57,11 @@ PRO = {
     "set value": ("7e 00 10 06 50 02 3f 00 00 00 1e 88 7e", "7e 00 10 00 0d c0 7e"),
     "escapes": ("7e 00 10 06 50 02 3e 7d 5e 7d 5d 00 5e 3c 7e", "7e 00 10 00 0d c0 7e"),
     "set cycles": ("7e 00 10 06 68 07 ff ff ff ff db b0 7e", "7e 00 10 00 0d c0 7e"),
-    "set two": (
-        "7e 00 12 0e 00 02 50 02 51 02 3e 80 00 00 bf 00 00 00 a3 f3 7e", "7e 00 12 00 0c a0 7e"
-    ),
+    "set two": ("7e 00 12 0e 00 02 50 02 51 02 3e 80 00 00 bf 00 00 00 a3 f3 7e", "7e 00 12 00 0c a0 7e"),
     "set eight": (
         "7e 00 12 32 00 08 68 00 68 02 68 03 68 04 68 07 68 08 40 00 40 02 00 00 00 02 00 00 00 00 00 00 00 03 42 c8 "
-        "00 00 00 00 00 01 00 00 00 00 00 00 00 68 00 00 00 c0 07 06 7e", "7e 00 12 00 0c a0 7e"
+        "00 00 00 00 00 01 00 00 00 00 00 00 00 68 00 00 00 c0 07 06 7e",
+        "7e 00 12 00 0c a0 7e",
     ),
     "get eight": (
         "7e 00 13 12 00 08 68 00 68 01 68 02 68 03 68 04 68 05 68 06 68 08 50 5c 7e",
@@ -81,7 +80,8 @@ PRO = {
     "read only": ("7e 00 10 06 23 02 00 00 00 00 19 9f 7e", "7e 00 90 04 00 00 01 06 6d 02 7e"),
     "read beyond the vector": ("7e 00 15 05 26 00 2e e0 04 65 59 7e", "7e 00 95 04 00 00 01 07 ac 97 7e"),
     "write beyond the vector": (
-        "7e 00 14 0d 26 00 2e dc 08 00 00 00 00 00 00 00 00 52 1a 7e", "7e 00 94 04 00 00 01 07 ad 46 7e"
+        "7e 00 14 0d 26 00 2e dc 08 00 00 00 00 00 00 00 00 52 1a 7e",
+        "7e 00 94 04 00 00 01 07 ad 46 7e",
     ),
     "a run of nothing": ("7e 00 10 06 68 01 00 00 00 01 93 e4 7e", "7e 00 90 04 00 00 01 07 ac c2 7e"),
     "length": ("7e 00 11 01 50 51 a9 7e", "7e 00 91 04 00 00 00 03 ad 40 7e"),
@@ -90,7 +90,7 @@ PRO = {
     "CRC": ("7e 00 02 02 00 00 00 00 7e", "7e 00 82 04 00 00 00 04 ee 21 7e"),
     "no frame": ("7e 00 11 05 50 7e", "7e 00 91 04 00 00 00 01 2c 81 7e"),
     "a system that is no input": ("7e 00 10 06 40 00 00 00 00 99 a9 a6 7e", "7e 00 90 04 00 00 02 02 6c 31 7e"),
-}  # fmt: skip
+}
 STORY = "set vector", "get value", "set two", "get eight", "no frame", "escapes", "unknown command", "simple mode"
 
 
@@ -192,11 +192,14 @@ def test_a_target_beyond_the_rim_goes_to_the_rim_and_is_told() -> None:
 @pytest.mark.parametrize(
     ("now", "was"),
     [
-        (Status.DISCONNECTED, Status.WAS_DISCONNECTED), (Status.ELECTRONICS_WARM, Status.WAS_ELECTRONICS_WARM),
-        (Status.MIRROR_WARM, Status.WAS_MIRROR_WARM), (Status.OUTPUT_LIMIT, Status.WAS_OUTPUT_LIMIT),
-        (Status.AVERAGE_LIMIT, Status.WAS_AVERAGE_LIMIT), (Status.EEPROM_INVALID, Status(0)),
+        (Status.DISCONNECTED, Status.WAS_DISCONNECTED),
+        (Status.ELECTRONICS_WARM, Status.WAS_ELECTRONICS_WARM),
+        (Status.MIRROR_WARM, Status.WAS_MIRROR_WARM),
+        (Status.OUTPUT_LIMIT, Status.WAS_OUTPUT_LIMIT),
+        (Status.AVERAGE_LIMIT, Status.WAS_AVERAGE_LIMIT),
+        (Status.EEPROM_INVALID, Status(0)),
     ],
-)  # fmt: skip
+)
 def test_what_was_stays_until_it_is_acknowledged(now: Status, was: Status) -> None:
     """A bit that came and went leaves its copy; one that still is, is latched again at once."""
     device = MirrorDevice(ManualClock())

@@ -23,7 +23,7 @@ from pipeline.rig.mirror.pro_payloads import (
     set_value,
     set_values,
     set_vector,
-)  # fmt: skip
+)
 from pipeline.rig.mirror.registers import Status
 from pipeline.rig.mirror.simple_mode import go_x, go_xy, go_y
 from pipeline.rig.mirror.transactions import Wire
@@ -52,26 +52,34 @@ PRO_READS = [
     (get_value(0x680A), cell_int, "7E 00 11 02 68 0A 0B 3B 7E", "7E 00 11 04 00 00 01 2C F2 CC 7E", 300),
     (get_value(0x2302), cell_float, "7E 00 11 02 23 02 3C 0D 7E", "7E 00 11 04 00 00 00 00 F2 81 7E", 0.0),
     (
-        get_values([0x2302, 0x2303]), read_values, "7E 00 13 06 00 02 23 02 23 03 AD AC 7E",
-        "7E 00 13 0A 00 02 3F 00 00 00 BE 80 00 00 9B D7 7E", [HALF, MINUS_QUARTER],
+        get_values([0x2302, 0x2303]),
+        read_values,
+        "7E 00 13 06 00 02 23 02 23 03 AD AC 7E",
+        "7E 00 13 0A 00 02 3F 00 00 00 BE 80 00 00 9B D7 7E",
+        [HALF, MINUS_QUARTER],
     ),
     (
-        get_vector(0x2600, 10, 2), bytes, "7E 00 15 05 26 00 00 28 08 52 95 7E",
-        "7E 00 15 08 3F 00 00 00 BE 80 00 00 10 D1 7E", HALF + MINUS_QUARTER,
+        get_vector(0x2600, 10, 2),
+        bytes,
+        "7E 00 15 05 26 00 00 28 08 52 95 7E",
+        "7E 00 15 08 3F 00 00 00 BE 80 00 00 10 D1 7E",
+        HALF + MINUS_QUARTER,
     ),
-]  # fmt: skip
+]
 PRO_WRITES = [
     (go_simple(), "7E 00 06 02 00 00 A1 48 7E", "7E 00 06 00 03 A0 7E"),
     (set_value(0x5002, 0.5), "7E 00 10 06 50 02 3F 00 00 00 1E 88 7E", "7E 00 10 00 0D C0 7E"),
     (
-        set_values({0x6801: 1, 0x6901: 1}), "7E 00 12 0E 00 02 68 01 69 01 00 00 00 01 00 00 00 01 42 49 7E",
+        set_values({0x6801: 1, 0x6901: 1}),
+        "7E 00 12 0E 00 02 68 01 69 01 00 00 00 01 00 00 00 01 42 49 7E",
         "7E 00 12 00 0C A0 7E",
     ),
     (
-        set_vector(0x2600, 10, HALF + MINUS_QUARTER), "7E 00 14 0D 26 00 00 28 08 3F 00 00 00 BE 80 00 00 EF B0 7E",
+        set_vector(0x2600, 10, HALF + MINUS_QUARTER),
+        "7E 00 14 0D 26 00 00 28 08 3F 00 00 00 BE 80 00 00 EF B0 7E",
         "7E 00 14 00 0F 00 7E",
     ),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("frame", "parse", "sent", "received", "answer"), PRO_READS)
@@ -182,9 +190,7 @@ SIMPLE_MOTIONS = [
 
 def test_greeting_status_and_temperature_in_simple_mode():
     """START, STATUS and GETTEMP with their replies."""
-    pairs: list[Pair] = [
-        (b"START\r\n", b"OK\r\n"), (b"STATUS\r\n", b"00000110\r\n"), (b"GETTEMP\r\n", b"31.5\r\n"),
-    ]  # fmt: skip
+    pairs: list[Pair] = [(b"START\r\n", b"OK\r\n"), (b"STATUS\r\n", b"00000110\r\n"), (b"GETTEMP\r\n", b"31.5\r\n")]
     with scripted(pairs) as transport:
         link = SimpleLink(wire(transport))
         link.start()

@@ -13,10 +13,17 @@ from pipeline.rig.mirror.mirror_settings import MirrorSettings
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("baud", 0), ("deadline_s", 1000), ("deadline_s", float("nan")), ("retries", -1), ("quiet_s", -1),
-        ("vector_pairs", 0), ("vector_pairs", 8192), ("log_rate_hz", 20000), ("log_samples", True),
+        ("baud", 0),
+        ("deadline_s", 1000),
+        ("deadline_s", float("nan")),
+        ("retries", -1),
+        ("quiet_s", -1),
+        ("vector_pairs", 0),
+        ("vector_pairs", 8192),
+        ("log_rate_hz", 20000),
+        ("log_samples", True),
     ],
-)  # fmt: skip
+)
 def test_numbers_out_of_range_are_refused(name: str, value: Any):
     """A number that nothing can mean (a deadline in ms) names the setting and the range."""
     with pytest.raises(SettingsError, match=f"mirror.{name} must be a number from .* to .* got"):

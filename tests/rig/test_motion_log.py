@@ -56,9 +56,11 @@ def test_a_log_ends_where_the_device_says(caplog: pytest.LogCaptureFixture):
     """An index outside the log ends it; both channels are as long as the shorter."""
     zeros = "7E 00 15 28" + " 00" * 40 + " 39 6E 7E"
     script = [
-        pair("7E 00 15 05 24 00 00 00 28 34 8D 7E", zeros), pair("7E 00 15 05 24 00 00 28 08 2B 55 7E", OUT_OF_RANGE),
-        pair("7E 00 15 05 24 01 00 00 28 35 71 7E", zeros), pair("7E 00 15 05 24 01 00 28 08 2A A9 7E", OUT_OF_RANGE),
-    ]  # fmt: skip
+        pair("7E 00 15 05 24 00 00 00 28 34 8D 7E", zeros),
+        pair("7E 00 15 05 24 00 00 28 08 2B 55 7E", OUT_OF_RANGE),
+        pair("7E 00 15 05 24 01 00 00 28 35 71 7E", zeros),
+        pair("7E 00 15 05 24 01 00 28 08 2A A9 7E", OUT_OF_RANGE),
+    ]
     with scripted([*CONNECT, *START, STOP_LOG, *script]) as transport:
         mirror = connected(transport)
         mirror.start_log(1000.0)

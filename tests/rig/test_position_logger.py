@@ -21,7 +21,7 @@ from pipeline.rig.mirror.pro_payloads import (
     set_value,
     set_values,
     set_vector,
-)  # fmt: skip
+)
 from pipeline.rig.mirror.registers import (
     FEEDBACK_X,
     FEEDBACK_Y,
@@ -34,7 +34,7 @@ from pipeline.rig.mirror.registers import (
     X,
     Y,
     log_slot,
-)  # fmt: skip
+)
 
 PATH = np.array([(0.1, 0.0), (0.2, 0.1), (0.3, -0.1), (0.2, 0.2)])
 
@@ -59,9 +59,13 @@ def loaded(clock: ManualClock, trigger: Trigger = Trigger.OFF, cycles: int = 1) 
     do(device, set_vector(VECTOR_MEMORY, 0, PATH.T.astype(">f4").tobytes()))
     for number, channel in enumerate((X, Y)):
         values: dict[VectorRegister, Value] = {
-            VectorRegister.UNIT: int(Unit.XY), VectorRegister.START: 4 * number, VectorRegister.END: 4 * number + 4,
-            VectorRegister.FREQUENCY: 50.0, VectorRegister.CYCLES: cycles, VectorRegister.TRIGGER: int(trigger),
-        }  # fmt: skip
+            VectorRegister.UNIT: int(Unit.XY),
+            VectorRegister.START: 4 * number,
+            VectorRegister.END: 4 * number + 4,
+            VectorRegister.FREQUENCY: 50.0,
+            VectorRegister.CYCLES: cycles,
+            VectorRegister.TRIGGER: int(trigger),
+        }
         do(device, set_values({channel.vector(name): value for name, value in values.items()}))
     return device
 

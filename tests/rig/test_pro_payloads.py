@@ -31,7 +31,7 @@ from pipeline.rig.mirror.pro_payloads import (
     split_cells,
     to_cell,
     values_reply,
-)  # fmt: skip
+)
 
 HALF, MINUS_QUARTER = b"\x3f\x00\x00\x00", b"\xbe\x80\x00\x00"
 

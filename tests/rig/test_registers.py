@@ -20,12 +20,24 @@ def test_registers_have_the_published_ids():
 @pytest.mark.parametrize(
     ("bit", "words"),
     [
-        (0, "not connected"), (1, "electronics are too warm"), (2, "mirror is too warm"), (3, "calibration"),
-        (4, "not at rest"), (5, "drive is at its limit"), (6, "average is at"), (7, "trimmed"),
-        (8, "was not connected"), (9, "electronics were"), (10, "mirror was too warm"), (11, "drive was at"),
-        (12, "average was at"), (13, "target was trimmed"), (14, "bit 14, whose meaning"), (31, "bit 31"),
+        (0, "not connected"),
+        (1, "electronics are too warm"),
+        (2, "mirror is too warm"),
+        (3, "calibration"),
+        (4, "not at rest"),
+        (5, "drive is at its limit"),
+        (6, "average is at"),
+        (7, "trimmed"),
+        (8, "was not connected"),
+        (9, "electronics were"),
+        (10, "mirror was too warm"),
+        (11, "drive was at"),
+        (12, "average was at"),
+        (13, "target was trimmed"),
+        (14, "bit 14, whose meaning"),
+        (31, "bit 31"),
     ],
-)  # fmt: skip
+)
 def test_every_bit_has_words(bit: int, words: str):
     """An operator reads what is the case, not a number."""
     status = Status(1 << bit)

@@ -191,8 +191,10 @@ def test_camera_in_order() -> None:
     with rig() as line:
         rows = check_camera(line.camera(), line.files)
         assert [row.asked.partition(",")[0] for row in rows] == [
-            "whether it captures", "list its files", "log in to its files",
-        ]  # fmt: skip
+            "whether it captures",
+            "list its files",
+            "log in to its files",
+        ]
         assert {row.verdict for row in rows} == {"ok"}
         line.camera().capture(5, prefix=capture_prefix(FINE))
         assert told(check_camera(line.camera(), line.files), "warn") == ["whether it captures"]

@@ -19,7 +19,7 @@ from pipeline.rig.mirror.simple_mode import (
     read_temperature,
     read_text,
     to_line,
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize(

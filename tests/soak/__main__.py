@@ -24,9 +24,11 @@ os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.g
 from tests.faults.fault_table import Clock, Row, markdown_table, plain_table  # noqa: E402
 
 PARTS = {
-    "survey-rig": "rig_beside_simulation", "day": "day_of_surveys", "scheduler": "prefect_schedule",
+    "survey-rig": "rig_beside_simulation",
+    "day": "day_of_surveys",
+    "scheduler": "prefect_schedule",
     "loaded": "loaded_schedule",
-}  # fmt: skip
+}
 SOAK = ("day", "scheduler", "loaded")  # where no part is named
 HEADINGS = ("what", "how", "times", "demanded", "found", "met", "s")
 

@@ -222,26 +222,62 @@ def judged(
     first = next((one for part in problems for one in part), "")
     whole = f"{len(problems[0])} problems before gc, {len(problems[1])} after{': ' + first if first else ''}"
     return [
-        Row("a day of surveys", "three fields in turn through an emulated rig, by a clock turned by hand", account.due,
-            "each due run done, skipped by rule, or failed with a reason", account.words(), not account.wrong, seconds),
-        Row("kills", "SIGKILL of the process that serves, within a survey", len(struck["kill"]),
+        Row(
+            "a day of surveys",
+            "three fields in turn through an emulated rig, by a clock turned by hand",
+            account.due,
+            "each due run done, skipped by rule, or failed with a reason",
+            account.words(),
+            not account.wrong,
+            seconds,
+        ),
+        Row(
+            "kills",
+            "SIGKILL of the process that serves, within a survey",
+            len(struck["kill"]),
             "begun again under the same due time, or failed once the next was due",
             f"of the runs that were killed {again} begun again, {gone} failed for it",
-            again + gone == len(struck["kill"]) == wanted["kill"], 0.0),
-        Row("pulled cables", "pty, or the camera's sockets, closed within a capture", sum(pulls.values()),
+            again + gone == len(struck["kill"]) == wanted["kill"],
+            0.0,
+        ),
+        Row(
+            "pulled cables",
+            "pty, or the camera's sockets, closed within a capture",
+            sum(pulls.values()),
             "failed, and the reason names that device",
             ", ".join(f"{which}: {named[which]} of {pulls[which]} runs" for which in DEVICES),
-            all(named[which] == pulls[which] == wanted[which] for which in DEVICES), 0.0),
-        Row("full disks", "the archive's disk (a tmpfs) filled up as a survey begins", len(struck["disk"]),
-            "failed, or told and resumed, in words that say so", f"{disks} failed by it, told {refused} times",
-            refused >= len(struck["disk"]) == wanted["disk"], 0.0),
+            all(named[which] == pulls[which] == wanted[which] for which in DEVICES),
+            0.0,
+        ),
+        Row(
+            "full disks",
+            "the archive's disk (a tmpfs) filled up as a survey begins",
+            len(struck["disk"]),
+            "failed, or told and resumed, in words that say so",
+            f"{disks} failed by it, told {refused} times",
+            refused >= len(struck["disk"]) == wanted["disk"],
+            0.0,
+        ),
         Row("the archive", "verify_all, before and after gc", 2, "whole", whole, not first, 0.0),
-        Row("clearing up", "gc --keep-days 0", 1, "what stays is named by a run, or is of a failed one", left.words(),
-            not left.unexplained, 0.0),
-        Row("memory", "resident, after each survey of the process that serves", len(day.samples),
-            "not judged: too few" if quick else "last quarter within 5 % of the second", grown.words(),
-            quick or grown.is_flat, 0.0),
-    ]  # fmt: skip
+        Row(
+            "clearing up",
+            "gc --keep-days 0",
+            1,
+            "what stays is named by a run, or is of a failed one",
+            left.words(),
+            not left.unexplained,
+            0.0,
+        ),
+        Row(
+            "memory",
+            "resident, after each survey of the process that serves",
+            len(day.samples),
+            "not judged: too few" if quick else "last quarter within 5 % of the second",
+            grown.words(),
+            quick or grown.is_flat,
+            0.0,
+        ),
+    ]
 
 
 if __name__ == "__main__":

@@ -83,16 +83,35 @@ def judged(lines: list[dict[str, Any]], runs: list[dict[str, Any]], seconds: flo
     half = len(delays) // 2
     trend = f"{_mean(delays[:half]):.1f} s in the first half, {_mean(delays[half:]):.1f} s in the second"
     return [
-        Row("a loaded machine", how, due, f"at least {LEAST_DONE:.0%} of the due runs done, none failed",
+        Row(
+            "a loaded machine",
+            how,
+            due,
+            f"at least {LEAST_DONE:.0%} of the due runs done, none failed",
             ", ".join(f"{count} {name}" for name, count in ended.items()),
-            due > 0 and ended["done"] >= LEAST_DONE * due and not ended["failed"], seconds),
+            due > 0 and ended["done"] >= LEAST_DONE * due and not ended["failed"],
+            seconds,
+        ),
         Row("asked once", "flow runs of a due time", len(asked), "one", f"{len(twice)} had more", not twice, 0.0),
-        Row("nothing in vain", "processes started for what was skipped before", len(skipped), "none", str(len(started)),
-            not started, 0.0),
-        Row("delay", "from due to begun", len(delays), f"at most {LATEST_S:.0f} s, not growing",
+        Row(
+            "nothing in vain",
+            "processes started for what was skipped before",
+            len(skipped),
+            "none",
+            str(len(started)),
+            not started,
+            0.0,
+        ),
+        Row(
+            "delay",
+            "from due to begun",
+            len(delays),
+            f"at most {LATEST_S:.0f} s, not growing",
             f"at most {max(delays, default=0.0):.1f} s; {trend}",
-            max(delays, default=0.0) <= LATEST_S and _mean(delays[half:]) <= _mean(delays[:half]) + 5.0, 0.0),
-    ]  # fmt: skip
+            max(delays, default=0.0) <= LATEST_S and _mean(delays[half:]) <= _mean(delays[:half]) + 5.0,
+            0.0,
+        ),
+    ]
 
 
 def late_start(run: dict[str, Any]) -> bool:

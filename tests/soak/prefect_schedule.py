@@ -200,25 +200,54 @@ def judged(
     )
     away = "none came" if seen.away_s is None else f"another listens after {seen.away_s:.0f} s"
     return [
-        Row("Prefect's scheduler", f"{len(FIELDS)} fields every {EVERY_S} s for {max(seen.serve) / 60:.0f} min",
-            account.due, "each due run done, skipped by rule, or failed with a reason; of each field one done at the "
+        Row(
+            "Prefect's scheduler",
+            f"{len(FIELDS)} fields every {EVERY_S} s for {max(seen.serve) / 60:.0f} min",
+            account.due,
+            "each due run done, skipped by rule, or failed with a reason; of each field one done at the "
             f"latest {LONGEST_GAP_S:.0f} s after the last",
             f"{account.words()}; {served.under_way} under way at the stop; longest time without a done one "
             f"{served.gap_s:.0f} s",
-            not account.wrong and account.endings["done"] > 0 and served.gap_s <= LONGEST_GAP_S, seconds),
-        Row("server killed", "SIGKILL of the Prefect server", int(seen.killed is not None),
+            not account.wrong and account.endings["done"] > 0 and served.gap_s <= LONGEST_GAP_S,
+            seconds,
+        ),
+        Row(
+            "server killed",
+            "SIGKILL of the Prefect server",
+            int(seen.killed is not None),
             "started again, and runs that begin then are done",
             f"{away}; done since: {', '.join(f'{count} {name}' for name, count in served.after.items())}",
-            seen.away_s is not None and sum(served.after.values()) > 0, 0.0),
-        Row("stopped", "SIGTERM", 1, "exit code 0, no process left",
+            seen.away_s is not None and sum(served.after.values()) > 0,
+            0.0,
+        ),
+        Row(
+            "stopped",
+            "SIGTERM",
+            1,
+            "exit code 0, no process left",
             f"exit code {seen.code}, {len(left)} processes left{': ' + left[0][:80] if left else ''}",
-            seen.code == 0 and not left, 0.0),
-        Row("the archive", "verify_all", 1, "whole",
-            f"{len(problems)} problems{': ' + problems[0] if problems else ''}", not problems, 0.0),
-        Row("memory of serve", f"resident, every {LOOK_S:g} s", len(seen.serve),
+            seen.code == 0 and not left,
+            0.0,
+        ),
+        Row(
+            "the archive",
+            "verify_all",
+            1,
+            "whole",
+            f"{len(problems)} problems{': ' + problems[0] if problems else ''}",
+            not problems,
+            0.0,
+        ),
+        Row(
+            "memory of serve",
+            f"resident, every {LOOK_S:g} s",
+            len(seen.serve),
             "not judged: too short" if quick else "last quarter within 5 % of the second",
-            f"{memory}; serve: {grown.words()}", quick or grown.is_flat, 0.0),
-    ]  # fmt: skip
+            f"{memory}; serve: {grown.words()}",
+            quick or grown.is_flat,
+            0.0,
+        ),
+    ]
 
 
 def _at(values: dict[float, int], moment: float) -> int:

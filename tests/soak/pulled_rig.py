@@ -53,9 +53,13 @@ class PulledRig:
         """The settings' table [rig]."""
         panel = self.rig.camera.view.source.scene.panel
         return {
-            "port": str(self._folder / LINK), "host": "127.0.0.1", "control_port": self._address[0],
-            "file_port": self._address[1], "panel": round(float(panel.mean()), 6), "provenance": "emulated",
-        }  # fmt: skip
+            "port": str(self._folder / LINK),
+            "host": "127.0.0.1",
+            "control_port": self._address[0],
+            "file_port": self._address[1],
+            "panel": round(float(panel.mean()), 6),
+            "provenance": "emulated",
+        }
 
     def look(self, field: str) -> None:
         """Stand before another field."""
@@ -142,9 +146,12 @@ class RigProcess:
         self.control = RigControl(folder)
         words = json.dumps({"folder": str(folder), "fields": fields, "speed": speed})
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.soak.pulled_rig", words], cwd=ROOT, stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            [sys.executable, "-m", "tests.soak.pulled_rig", words],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         assert self._process.stdout is not None
         told = self._process.stdout.readline()
         assert told, "the emulated rig did not begin"

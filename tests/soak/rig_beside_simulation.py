@@ -161,10 +161,14 @@ def _size(folder: Path) -> int:
 def _of_check(checked: subprocess.CompletedProcess[str]) -> Row:
     mended = "nothing to mend" in checked.stdout
     return Row(
-        "rig check", "on the emulated rig, by the file that it wrote", 1, "exit code 0, nothing to mend",
-        f"exit code {checked.returncode}{', nothing to mend' if mended else ''}", checked.returncode == 0 and mended,
+        "rig check",
+        "on the emulated rig, by the file that it wrote",
+        1,
+        "exit code 0, nothing to mend",
+        f"exit code {checked.returncode}{', nothing to mend' if mended else ''}",
+        checked.returncode == 0 and mended,
         0.0,
-    )  # fmt: skip
+    )
 
 
 def _of_lines(one: Surveyed, other: Surveyed, seconds: float) -> Row:
@@ -177,9 +181,14 @@ def _of_lines(one: Surveyed, other: Surveyed, seconds: float) -> Row:
             lines += count
             odd += _odd_lines(seen[name], wanted[name]) if there else count
     return Row(
-        "raw lines", "coarse and fine, rig beside simulated", lines, "equal bit for bit",
-        f"{odd} of {lines} lines differ", odd == 0, seconds,
-    )  # fmt: skip
+        "raw lines",
+        "coarse and fine, rig beside simulated",
+        lines,
+        "equal bit for bit",
+        f"{odd} of {lines} lines differ",
+        odd == 0,
+        seconds,
+    )
 
 
 def _odd_lines(one: zarr.Array[Any], other: zarr.Array[Any]) -> int:
@@ -191,9 +200,14 @@ def _of_maps(one: Surveyed, other: Surveyed, how: str, most: float) -> Row:
     odd = int((seen != wanted).sum()) if seen.shape == wanted.shape else seen.size
     demanded = f"at most {100 * most:g} % of the pixels differ" if most else "equal bit for bit"
     return Row(
-        "class map", f"{seen.shape[1]} x {seen.shape[0]} px, rig beside simulated {how}", 1, demanded,
-        f"{odd} of {seen.size} pixels differ ({100 * odd / seen.size:.2g} %)", odd <= most * seen.size, 0.0,
-    )  # fmt: skip
+        "class map",
+        f"{seen.shape[1]} x {seen.shape[0]} px, rig beside simulated {how}",
+        1,
+        demanded,
+        f"{odd} of {seen.size} pixels differ ({100 * odd / seen.size:.2g} %)",
+        odd <= most * seen.size,
+        0.0,
+    )
 
 
 def _of_end(code: int) -> Row:

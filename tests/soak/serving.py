@@ -29,9 +29,12 @@ EVERY, LATE = "1h", 0.5
 SURVEY_S = 400.0  # of the hand clock
 BANDS = ",".join(map(str, range(8, 264, 16)))  # 16 of the farm's 270
 SCENE: dict[str, Any] = {
-    "scene": "farm", "size": "128x128", "bands": BANDS, "day": 172,
+    "scene": "farm",
+    "size": "128x128",
+    "bands": BANDS,
+    "day": 172,
     "camera": {"exposure_ms": 9.0, "readout_ms": 1.0},
-}  # fmt: skip
+}
 TIMETABLE = parse_timetable(None, EVERY, "UTC")
 QUIET = Console(quiet=True)
 
@@ -47,9 +50,15 @@ def write_fields(folder: Path, archive: Path, rig: Mapping[str, Any]) -> None:
     """Write the settings of each field, NAME.toml."""
     for name, scene in scene_settings().items():
         told = {
-            "name": name, **scene, "source": "rig", "out": str(archive), "engine": "plain", "controls": False,
-            "budget": 0.8, "rig": dict(rig),
-        }  # fmt: skip
+            "name": name,
+            **scene,
+            "source": "rig",
+            "out": str(archive),
+            "engine": "plain",
+            "controls": False,
+            "budget": 0.8,
+            "rig": dict(rig),
+        }
         tables = {key: value for key, value in told.items() if isinstance(value, dict)}
         lines = [f"{key} = {_toml(value)}" for key, value in told.items() if key not in tables]
         for table, values in tables.items():

@@ -37,9 +37,12 @@ def ending(event: str, number: int, **facts: object) -> dict[str, object]:
 def test_one_ending_for_each_due_time() -> None:
     """Done, resumed and done, skipped and failed are counted, and the failed ones are named with their reasons."""
     lines: list[dict[str, object]] = [
-        {"event": "begun", "due": moment_words(DUE[0])}, ending("done", 0), ending("done", 1, attempts=2),
-        ending("skipped", 2, reason="too late"), ending("failed", 3, reason="the mirror went away"),
-    ]  # fmt: skip
+        {"event": "begun", "due": moment_words(DUE[0])},
+        ending("done", 0),
+        ending("done", 1, attempts=2),
+        ending("skipped", 2, reason="too late"),
+        ending("failed", 3, reason="the mirror went away"),
+    ]
     account = Account()
     account.add("north", lines, DUE)
     assert account.words() == "4 due: 2 done, 1 skipped, 1 failed (1 done after being resumed)"
@@ -52,8 +55,10 @@ def test_missing_double_and_unexplained_endings_are_wrong() -> None:
     account = Account()
     account.add("north", [ending("done", 1), ending("failed", 1, reason="x"), ending("skipped", 2)], DUE[:3])
     assert account.wrong == [
-        "north 12:00:00 has 0 endings", "north 13:00:00 has 2 endings", "north 14:00:00 skipped without a reason",
-    ]  # fmt: skip
+        "north 12:00:00 has 0 endings",
+        "north 13:00:00 has 2 endings",
+        "north 14:00:00 skipped without a reason",
+    ]
 
 
 def test_an_ending_of_what_was_never_due_is_wrong() -> None:
@@ -61,16 +66,19 @@ def test_an_ending_of_what_was_never_due_is_wrong() -> None:
     account = Account()
     account.add("north", [ending("done", 0), ending("done", 3), ending("skipped", 1, due="then", reason="x")], DUE[:1])
     assert account.wrong == [
-        "north 2026-06-01T15:00:00Z done, which was never due", "north then skipped, which was never due",
-    ]  # fmt: skip
+        "north 2026-06-01T15:00:00Z done, which was never due",
+        "north then skipped, which was never due",
+    ]
 
 
 def test_what_became_of_the_run_that_trouble_struck() -> None:
     """Begun again is said of that due time only, and a reason must name the device that was pulled."""
     lines = [
-        ending("done", 0, attempts=2), ending("failed", 1, attempts=1, reason="its process was gone"),
-        ending("failed", 2, attempts=2, reason="/rig/mirror went away"), ending("skipped", 3, reason="too late"),
-    ]  # fmt: skip
+        ending("done", 0, attempts=2),
+        ending("failed", 1, attempts=1, reason="its process was gone"),
+        ending("failed", 2, attempts=2, reason="/rig/mirror went away"),
+        ending("skipped", 3, reason="too late"),
+    ]
     account = Account()
     account.add("north", lines, DUE)
     assert [account.begun_again("north", due) for due in DUE] == [True, False, True, False]
@@ -90,18 +98,44 @@ def struck_day(tmp_path: Path, **struck: list[int]) -> Day:
 @pytest.mark.parametrize(
     ("lines", "missed"),
     [
-        ([ending("done", 0, attempts=2), ending("failed", 1, reason="/rig/mirror went away"),
-          ending("failed", 2, reason="no connection to 127.0.0.1:5000 within 3 s")], []),
-        ([ending("failed", 0, reason="its process was gone"), ending("failed", 1, reason="/rig/mirror went away"),
-          ending("failed", 2, reason="127.0.0.1:5000 hung up")], []),
-        ([ending("done", 0, attempts=1), ending("failed", 1, reason="/rig/mirror went away"),
-          ending("failed", 2, reason="127.0.0.1:5000 hung up")], ["kills"]),
-        ([ending("done", 0, attempts=2), ending("failed", 1, reason="/rig/mirror went away"),
-          ending("failed", 2, reason="/rig/mirror went away")], ["pulled cables"]),
-        ([ending("done", 0, attempts=2), ending("done", 1),
-          ending("failed", 2, reason="127.0.0.1:5000 hung up")], ["pulled cables"]),
+        (
+            [
+                ending("done", 0, attempts=2),
+                ending("failed", 1, reason="/rig/mirror went away"),
+                ending("failed", 2, reason="no connection to 127.0.0.1:5000 within 3 s"),
+            ],
+            [],
+        ),
+        (
+            [
+                ending("failed", 0, reason="its process was gone"),
+                ending("failed", 1, reason="/rig/mirror went away"),
+                ending("failed", 2, reason="127.0.0.1:5000 hung up"),
+            ],
+            [],
+        ),
+        (
+            [
+                ending("done", 0, attempts=1),
+                ending("failed", 1, reason="/rig/mirror went away"),
+                ending("failed", 2, reason="127.0.0.1:5000 hung up"),
+            ],
+            ["kills"],
+        ),
+        (
+            [
+                ending("done", 0, attempts=2),
+                ending("failed", 1, reason="/rig/mirror went away"),
+                ending("failed", 2, reason="/rig/mirror went away"),
+            ],
+            ["pulled cables"],
+        ),
+        (
+            [ending("done", 0, attempts=2), ending("done", 1), ending("failed", 2, reason="127.0.0.1:5000 hung up")],
+            ["pulled cables"],
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_day_is_judged_by_the_runs_that_trouble_struck(
     tmp_path: Path, lines: list[dict[str, object]], missed: list[str]
 ) -> None:

@@ -39,10 +39,11 @@ def small_survey(
     if not named:
         return Small(raw, mosaic, drawn, None)
     receipt = {
-        "survey": "farm", "settings": settings(seed, kernel=kernel, source="sim" if simulated else "rig"),
+        "survey": "farm",
+        "settings": settings(seed, kernel=kernel, source="sim" if simulated else "rig"),
         "stages": [{"name": "capture_coarse", "key": raw.key, "state": "ran", "wall_s": 1.5, "cpu_s": 1.0}],
         "products": {"class_map": f"{drawn.uri}/class_map.zarr", "mosaic": f"{mosaic.uri}/mosaic.zarr"},
-    }  # fmt: skip
+    }
     with archive.new_run("farm") as draft:
         draft.write_file("receipt.json", json.dumps(receipt))
         folder = draft.publish(survey="farm", rests_on=archive.manifest_hashes([drawn]))

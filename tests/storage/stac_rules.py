@@ -42,9 +42,12 @@ FIELDS: Mapping[str, Mapping[str, Any]] = {
     "classification:classes": {"type": "array", "items": CLASS, "minItems": 1, "uniqueItems": True},
 }
 PREFIXES = {
-    "proj": "projection/v2.0.0", "processing": "processing/v1.2.0", "hsi": "hsi/v1.0.0", "eo": "eo/v2.0.0",
+    "proj": "projection/v2.0.0",
+    "processing": "processing/v1.2.0",
+    "hsi": "hsi/v1.0.0",
+    "eo": "eo/v2.0.0",
     "classification": "classification/v2.0.0",
-}  # fmt: skip
+}
 PLACES = {  # where the fields of each extension may stand in an item
     "proj": {"properties", "asset"},
     "processing": {"properties", "asset"},

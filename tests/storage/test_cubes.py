@@ -308,10 +308,7 @@ def test_a_flipped_bit_is_an_error_and_is_named(tmp_path: Path) -> None:
     shard.write_bytes(content)
     with pytest.raises(IncompleteStoreError, match=r"values cannot be read.*run verify"):
         load_mosaic(ref.path / "m.zarr")
-    with (
-        xr.open_zarr(ref.path / "m.zarr", consolidated=False) as data,
-        pytest.raises(ValueError, match="checksum"),
-    ):
+    with xr.open_zarr(ref.path / "m.zarr", consolidated=False) as data, pytest.raises(ValueError, match="checksum"):
         data["values"].load()
     with pytest.raises(IncompleteStoreError, match=r"values/c/0/0/0 has changed"):
         archive.verify(ref)

@@ -23,9 +23,14 @@ def _hyko(path: Path, **more: Any) -> tuple[NDArray[np.float32], NDArray[np.uint
     cube = rng.random((6, 7, 5)).astype(np.float32)
     labels = rng.integers(0, 11, (6, 7), dtype=np.uint8)
     content = {
-        "data": cube, "wavelengths": NM[None], HYKO_LABELS: labels, "label_spectral_reflectances": labels // 2,
-        "image": np.zeros((6, 7, 3), np.uint8), "stats": {"mean": 1.0}, "id_spectral_reflectances": np.arange(9)[None],
-    }  # fmt: skip
+        "data": cube,
+        "wavelengths": NM[None],
+        HYKO_LABELS: labels,
+        "label_spectral_reflectances": labels // 2,
+        "image": np.zeros((6, 7, 3), np.uint8),
+        "stats": {"mean": 1.0},
+        "id_spectral_reflectances": np.arange(9)[None],
+    }
     scipy.io.savemat(path, {**content, **more}, long_field_names=True)
     return cube, labels
 
@@ -65,9 +70,7 @@ def _ranus(root: Path, *, named: bool = True) -> Path:
     endings = ("_rgb", "_nir", "_gt") if named else ("", "", "")
     truth = np.array(list(RANUS_CLASSES.values()), np.uint8)[rng.integers(0, 10, (5, 6))]
     truth[0, 0], truth[0, 1], truth[0, 2] = 0, (123, 2, 3), (1, 250, 3)  # black, almost ground, no class
-    images = (
-        rng.integers(0, 255, (5, 6, 3), dtype=np.uint8), rng.integers(0, 255, (5, 6), dtype=np.uint8), truth,
-    )  # fmt: skip
+    images = (rng.integers(0, 255, (5, 6, 3), dtype=np.uint8), rng.integers(0, 255, (5, 6), dtype=np.uint8), truth)
     for kind, ending, image in zip(("RGB", "NIR", "GT"), endings, images, strict=True):
         (root / kind / "01").mkdir(parents=True, exist_ok=True)
         Image.fromarray(image).save(root / kind / "01" / f"01_0001{ending}.png")

@@ -100,9 +100,13 @@ def test_a_file_that_lost_its_last_lines(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("heading", "ms"),
-    [("Frame Number\tTime Stamp\tExposure (ms)\tGain", 4.5), ("Frame#, Time, Exposure (us), Gain", 0.0045),
-     ("frame  time  exposure [s]  gain", 4500), ("frame time exposure gain", 4.5)],
-)  # fmt: skip
+    [
+        ("Frame Number\tTime Stamp\tExposure (ms)\tGain", 4.5),
+        ("Frame#, Time, Exposure (us), Gain", 0.0045),
+        ("frame  time  exposure [s]  gain", 4500),
+        ("frame time exposure gain", 4.5),
+    ],
+)
 def test_titles_of_several_words(tmp_path: Path, heading: str, ms: float) -> None:
     """Spaces within a title do not shift the columns, and the title's unit counts."""
     between = "\t" if "\t" in heading else "," if "," in heading else " "

@@ -49,9 +49,10 @@ def test_young_stores_stay_with_what_they_rest_on(tmp_path: Path) -> None:
     plan = plan_clearance(archive, keep_days=2)
     assert {one.uri for one in plan.removals} == {other.raw.uri, other.mosaic.uri, other.map.uri}
     assert plan.kept == {
-        small.raw.uri: "what stays was made of it", small.mosaic.uri: "what stays was made of it",
+        small.raw.uri: "what stays was made of it",
+        small.mosaic.uri: "what stays was made of it",
         small.map.uri: "younger than 2 days",
-    }  # fmt: skip
+    }
     assert len(plan_clearance(archive, keep_days=4).removals) == 0
 
 

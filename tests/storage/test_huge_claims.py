@@ -213,8 +213,18 @@ def test_lists_of_other_files_are_no_tiff(tmp_path: Path) -> None:
 
 def hollow_tiff(path: Path, side: int, tile: int) -> None:
     """A TIFF that says its size, and holds nothing."""
-    entries = [(256, 4, side), (257, 4, side), (258, 3, 8), (259, 3, 1), (262, 3, 1), (277, 3, 1), (322, 4, tile),
-               (323, 4, tile), (324, 4, 0), (325, 4, 0)]  # fmt: skip
+    entries = [
+        (256, 4, side),
+        (257, 4, side),
+        (258, 3, 8),
+        (259, 3, 1),
+        (262, 3, 1),
+        (277, 3, 1),
+        (322, 4, tile),
+        (323, 4, tile),
+        (324, 4, 0),
+        (325, 4, 0),
+    ]
     body = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in entries)
     path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(entries)) + body + bytes(4))
 

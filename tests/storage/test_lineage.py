@@ -56,9 +56,18 @@ def test_work_that_is_no_amount_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "content",
-    ["", "{", "[]", '{"files": []}', "[" * 100_000, '{"files": {"../../x": {"sha256": "0", "size": 1}}}',
-     '{"files": {"a": 3}}', '{"files": {"/etc/passwd": {"sha256": "0", "size": 1}}}', '{"files": {}, "format": 2}'],
-)  # fmt: skip
+    [
+        "",
+        "{",
+        "[]",
+        '{"files": []}',
+        "[" * 100_000,
+        '{"files": {"../../x": {"sha256": "0", "size": 1}}}',
+        '{"files": {"a": 3}}',
+        '{"files": {"/etc/passwd": {"sha256": "0", "size": 1}}}',
+        '{"files": {}, "format": 2}',
+    ],
+)
 def test_any_manifest_can_be_read_or_is_told_damaged(tmp_path: Path, content: str) -> None:
     """Nothing a manifest says ends in a traceback, or in reading a file elsewhere."""
     archive = Archive.open(tmp_path)
@@ -147,8 +156,12 @@ def test_raw_lines_of_which_nobody_says_where_they_come_from_are_the_only_copy(t
 def test_nested_parameters_have_dotted_names() -> None:
     """Lists of tables by number, lists of numbers as one value."""
     assert flatten({"a": {"b": 1}, "s": [{"x": 1}, {"x": 2}], "l": [1, 2], "e": {}}) == {
-        "a.b": 1, "s[0].x": 1, "s[1].x": 2, "l": [1, 2], "e": {},
-    }  # fmt: skip
+        "a.b": 1,
+        "s[0].x": 1,
+        "s[1].x": 2,
+        "l": [1, 2],
+        "e": {},
+    }
 
 
 def test_products_go_by_many_names(tmp_path: Path) -> None:
@@ -218,8 +231,13 @@ def test_a_products_name_is_of_the_newest_run_that_can_be_read(tmp_path: Path) -
 def test_a_version_before_is_of_the_same_scene_and_can_be_read(tmp_path: Path) -> None:
     """The newest of those; a store that says no scene may be of any."""
     archive = Archive.open(tmp_path)
-    for key, params in (("old1", {}), ("old2", {"scene": "a"}), ("bad1", {"scene": "a"}), ("oth1", {"scene": "b"}),
-                        ("new1", {"scene": "a"})):  # fmt: skip
+    for key, params in (
+        ("old1", {}),
+        ("old2", {"scene": "a"}),
+        ("bad1", {"scene": "a"}),
+        ("oth1", {"scene": "b"}),
+        ("new1", {"scene": "a"}),
+    ):
         time.sleep(0.01)
         with archive.publish("segment", key, params=params):
             pass
@@ -232,12 +250,17 @@ def test_a_version_before_is_of_the_same_scene_and_can_be_read(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("../x", "cannot be a name"), ("stages/../../etc", "cannot be a name"), ("/etc/passwd", "cannot be a name"),
-        ("", "cannot be a name"), ("stages/segment/none", "no store stages/segment/none in this archive; there is"),
-        ("stages/nothing/none", "no store of this stage"), ("runs/none", "there is no run none"),
-        ("class_mop", "did you mean class_map"), ("xyz", "products of the newest run: class_map, mosaic"),
+        ("../x", "cannot be a name"),
+        ("stages/../../etc", "cannot be a name"),
+        ("/etc/passwd", "cannot be a name"),
+        ("", "cannot be a name"),
+        ("stages/segment/none", "no store stages/segment/none in this archive; there is"),
+        ("stages/nothing/none", "no store of this stage"),
+        ("runs/none", "there is no run none"),
+        ("class_mop", "did you mean class_map"),
+        ("xyz", "products of the newest run: class_map, mosaic"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_product_is_refused(tmp_path: Path, text: str, words: str) -> None:
     """With the nearest that there is."""
     small_survey(Archive.open(tmp_path))

@@ -88,9 +88,12 @@ def test_digest_follows_what_counts(line: int, change: float) -> None:
     moved[line, 1] += change
     off[line] = False
     names = {
-        path_digest(position, usable, shift), path_digest(moved, usable, shift), path_digest(position, off, shift),
-        path_digest(position, usable, shift + change), path_digest(position[:4], usable[:4], shift[:4]),
-    }  # fmt: skip
+        path_digest(position, usable, shift),
+        path_digest(moved, usable, shift),
+        path_digest(position, off, shift),
+        path_digest(position, usable, shift + change),
+        path_digest(position[:4], usable[:4], shift[:4]),
+    }
     assert len(names) == 5
     assert path_digest(moved, off, shift) == path_digest(position, off, shift)
 

@@ -111,9 +111,19 @@ def pipe_spool(small: Small) -> str:
 
 
 CASES = [
-    link_store, link_nowhere, link_manifest, link_file, pipe_file, pipe_more, pipe_manifest, pipe_store,
-    pipe_receipt, link_run, link_run_manifest, pipe_spool,
-]  # fmt: skip
+    link_store,
+    link_nowhere,
+    link_manifest,
+    link_file,
+    pipe_file,
+    pipe_more,
+    pipe_manifest,
+    pipe_store,
+    pipe_receipt,
+    link_run,
+    link_run_manifest,
+    pipe_spool,
+]
 Case = Callable[[Small], str]
 
 

@@ -15,14 +15,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.mosaics import MosaicWriter
-from storage.arrays.quicklooks import (
-    LineThumbnail,
-    load_quicklook,
-    picture_bands,
-    picture_step,
-    pictures_of,
-    stretched,
-)
+from storage.arrays.quicklooks import LineThumbnail, load_quicklook, picture_bands, picture_step, pictures_of, stretched
 from storage.readers.scan_files import open_cube_source
 
 WAVES = np.linspace(400, 900, 12)

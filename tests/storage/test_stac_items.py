@@ -177,9 +177,7 @@ def test_wavelengths_are_in_micrometres() -> None:
     """Of the whole cube, and of every band beside its width."""
     assert wavelengths(WAVE) == {"hsi:wavelength_min": 0.4445, "hsi:wavelength_max": 0.8}
     bands = spectral_bands(WAVE, np.array([5.0, 6.0, 7.0]), {"unit": "1"})["bands"]
-    assert bands[2] == {
-        "name": "B002", "eo:center_wavelength": 0.8, "unit": "1", "eo:full_width_half_max": 0.007,
-    }  # fmt: skip
+    assert bands[2] == {"name": "B002", "eo:center_wavelength": 0.8, "unit": "1", "eo:full_width_half_max": 0.007}
     assert "eo:full_width_half_max" not in spectral_bands(WAVE, None, {})["bands"][0]
 
 

@@ -127,9 +127,13 @@ def test_progress_and_tiles_are_told(tmp_path: Path, cubes: list[RawCube]) -> No
             seen.append((rows.start, columns.start))
 
     write_mosaic(
-        work_of(cubes), MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS),
-        memory=PLENTY, crew=TWO, seen=Watched(GRID.shape, [0, 1, 2], 900), report=shares.append,
-    )  # fmt: skip
+        work_of(cubes),
+        MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS),
+        memory=PLENTY,
+        crew=TWO,
+        seen=Watched(GRID.shape, [0, 1, 2], 900),
+        report=shares.append,
+    )
     assert sorted(seen) == [(y, x) for y in (0, 64, 128) for x in (0, 640)]
     assert shares == sorted(shares)
     assert shares[-1] == 1

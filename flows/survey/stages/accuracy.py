@@ -140,9 +140,14 @@ def _controls(
 ) -> dict[str, Any]:
     """`all`, the other placements, and how long either reading takes."""
     columns = columns_of_all_seats(
-        run.simulated, run.plan.full, run.grid, run.weights,
-        memory=run.settings.memory, kernel=run.settings.kernel, report=lambda done: run.report(0.6 * done),
-    )  # fmt: skip
+        run.simulated,
+        run.plan.full,
+        run.grid,
+        run.weights,
+        memory=run.settings.memory,
+        kernel=run.settings.kernel,
+        report=lambda done: run.report(0.6 * done),
+    )
     rows = 0
 
     def report(row: str) -> None:

@@ -67,9 +67,15 @@ def _report_lines(run: CaptureRun, before: float, total: int, lines: int) -> Non
 
 
 def _capture_sweep(
-    run: CaptureRun, source: Source, sweep: Sweep, path: Path, *, key: str, report: Callable[[int], None],
+    run: CaptureRun,
+    source: Source,
+    sweep: Sweep,
+    path: Path,
+    *,
+    key: str,
+    report: Callable[[int], None],
     effects: Mapping[str, Any] | None,
-) -> None:  # fmt: skip
+) -> None:
     """Lines into the spool and then the cube, one by one, from where a broken capture stopped.
 
     Lines that were lost since are asked for again; a rig captures nothing for them, and what it cannot give is invalid.

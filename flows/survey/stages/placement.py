@@ -108,9 +108,14 @@ def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, *registratio
         """Read the seats in the order in which lines show them."""
         ordered = _along_scan(run, load_plan(attention).seats)
         writer = PatchWriter(
-            path / "patches.zarr", ordered, run.grid.seat_origin(ordered), run.grid.patch,
-            run.scene.wavelength_nm, fwhm_nm=run.scene.fwhm_nm, grid=run.angular_grid(),
-        )  # fmt: skip
+            path / "patches.zarr",
+            ordered,
+            run.grid.seat_origin(ordered),
+            run.grid.patch,
+            run.scene.wavelength_nm,
+            fwhm_nm=run.scene.fwhm_nm,
+            grid=run.angular_grid(),
+        )
         sweeps = [one.placed(run.camera) for one in sighted(run, raw, _only(registration))]
         cache = LineCache(run.settings.memory // CACHE_SHARE)
         for first in range(0, len(ordered), SEATS_AT_ONCE):

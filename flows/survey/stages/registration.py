@@ -93,9 +93,13 @@ def _window_record(seen: SeamWindow, names: Sequence[str]) -> dict[str, Any]:
     status = "too narrow" if seen.found is None else seen.found.status
     window = seen.window
     return {
-        "reference": names[window.reference], "moving": names[window.moving], "along_px": window.along_px,
-        "scan_px": window.scan_px, "status": status, "residual_px": left,
-    }  # fmt: skip
+        "reference": names[window.reference],
+        "moving": names[window.moving],
+        "along_px": window.along_px,
+        "scan_px": window.scan_px,
+        "status": status,
+        "residual_px": left,
+    }
 
 
 @stage(

@@ -41,12 +41,7 @@ class BroadSweep:
 
     @classmethod
     def read(
-        cls,
-        lines: SweepLines,
-        camera: LineCamera,
-        *,
-        bands: int = BROAD_BANDS,
-        usable: NDArray[np.bool_] | None = None,
+        cls, lines: SweepLines, camera: LineCamera, *, bands: int = BROAD_BANDS, usable: NDArray[np.bool_] | None = None
     ) -> BroadSweep:
         """Read and calibrate a sweep's lines, 64 at a time, keeping the mean of ``bands`` bands spread over all.
 
@@ -74,9 +69,13 @@ class BroadSweep:
     def tracks(self, camera: LineCamera, shift_px: Floats | None = None) -> tuple[Track, ...]:
         """Where the lines lie, with a correction (line, 2) of their centres."""
         return make_tracks(
-            self.position, camera, usable=self.usable, shift_px=shift_px,
-            binning=self.sweep.binning, step_px=self.sweep.step,
-        )  # fmt: skip
+            self.position,
+            camera,
+            usable=self.usable,
+            shift_px=shift_px,
+            binning=self.sweep.binning,
+            step_px=self.sweep.step,
+        )
 
 
 @dataclass(frozen=True)
@@ -230,6 +229,10 @@ def broad_bands(references: References, bands: int = BROAD_BANDS) -> NDArray[np.
 def _of_bands(references: References, chosen: NDArray[np.intp]) -> References:
     bad, flat = references.bad, references.flat
     return replace(
-        references, dark=references.dark[:, chosen], white=references.white[:, chosen], panel=references.panel[chosen],
-        bad=None if bad is None else bad[:, chosen], flat=None if flat is None else flat[:, chosen],
-    )  # fmt: skip
+        references,
+        dark=references.dark[:, chosen],
+        white=references.white[:, chosen],
+        panel=references.panel[chosen],
+        bad=None if bad is None else bad[:, chosen],
+        flat=None if flat is None else flat[:, chosen],
+    )

@@ -26,10 +26,7 @@ _NEGOTIATION = re.compile(rb"\xff[\xfb-\xfe].", re.DOTALL)
 # words of a refusal -> what to do about it
 _REMEDIES = (
     (("full", "space", "storage"), "copy the folders on the camera's disk to another and delete them there"),
-    (
-        ("busy", "already", "progress", "in use"),
-        "wait until it is done, or stop it with its own program; run again",
-    ),
+    (("busy", "already", "progress", "in use"), "wait until it is done, or stop it with its own program; run again"),
     (("exposure", "period"), "give an exposure that is not longer than the frame period, both in ms"),
     (("folder", "directory", "file", "path"), "list the folder above it and take a name from there"),
 )

@@ -58,8 +58,11 @@ def points() -> Floats:
 
 
 IMAGES: dict[str, Callable[[], Floats]] = {
-    "edges": edges, "texture": texture, "points": points, "both": lambda: edges() + texture()
-}  # fmt: skip
+    "edges": edges,
+    "texture": texture,
+    "points": points,
+    "both": lambda: edges() + texture(),
+}
 FLAT: Floats = np.ones(ALONG.shape)
 
 
@@ -103,11 +106,23 @@ def probe_of(image: Floats, wavelength_nm: Floats | None = None, lines: int = 24
     curvature = [np.abs(convolved(seen, wave**2)).max() for wave in waves]
     one, no = np.ones(len(nm)), np.zeros(len(nm))
     return Probe(
-        unit="dn", sweeps=(SWEEP,), wavelength_nm=nm, fwhm_nm=None, level=one * np.abs(seen).max(),
-        spread=one * np.abs(seen - seen.mean(axis=0)).max(), span=one * np.ptp(seen), slope=np.outer(slope, one),
-        curvature=np.outer(curvature, one), spectral_slope=no, spectral_curvature=no, brightest_e=0.0, darkest_e=0.0,
-        unit_least_dn=1.0, lines=lines, seconds=1.0,
-    )  # fmt: skip
+        unit="dn",
+        sweeps=(SWEEP,),
+        wavelength_nm=nm,
+        fwhm_nm=None,
+        level=one * np.abs(seen).max(),
+        spread=one * np.abs(seen - seen.mean(axis=0)).max(),
+        span=one * np.ptp(seen),
+        slope=np.outer(slope, one),
+        curvature=np.outer(curvature, one),
+        spectral_slope=no,
+        spectral_curvature=no,
+        brightest_e=0.0,
+        darkest_e=0.0,
+        unit_least_dn=1.0,
+        lines=lines,
+        seconds=1.0,
+    )
 
 
 def change(image: Floats, transfer: NDArray[Any]) -> float:

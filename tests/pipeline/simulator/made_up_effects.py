@@ -62,8 +62,21 @@ def even_probe(**values: object) -> Probe:
     """A probe of one band and level 1 without detail."""
     zeros, ones = np.zeros(1), np.ones(1)
     probe = Probe(
-        unit="sigma", sweeps=(SWEEP,), wavelength_nm=np.array([550.0]), fwhm_nm=None, level=ones, spread=ones,
-        span=ones, slope=np.zeros((2, 1)), curvature=np.zeros((2, 1)), spectral_slope=zeros, spectral_curvature=zeros,
-        brightest_e=1e4, darkest_e=1e2, unit_least_dn=20.0, lines=100, seconds=10.0,
-    )  # fmt: skip
+        unit="sigma",
+        sweeps=(SWEEP,),
+        wavelength_nm=np.array([550.0]),
+        fwhm_nm=None,
+        level=ones,
+        spread=ones,
+        span=ones,
+        slope=np.zeros((2, 1)),
+        curvature=np.zeros((2, 1)),
+        spectral_slope=zeros,
+        spectral_curvature=zeros,
+        brightest_e=1e4,
+        darkest_e=1e2,
+        unit_least_dn=20.0,
+        lines=100,
+        seconds=10.0,
+    )
     return replace(probe, **values)  # type: ignore[arg-type]

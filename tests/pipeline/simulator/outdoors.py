@@ -52,12 +52,24 @@ def probe_of(rig: Rig, *sweeps: Sweep, seconds: float = 6.0) -> Probe:
     span = np.ptp(light, axis=0) / _sigma(light.min(axis=0))
     flat, both = np.zeros(BANDS), np.zeros((2, BANDS))
     return Probe(
-        unit="sigma", sweeps=sweeps or (SWEEP,), wavelength_nm=WAVELENGTH, fwhm_nm=None,
-        level=(light / _sigma(light)).max(axis=0), spread=flat, span=span, slope=both, curvature=both,
-        spectral_slope=flat, spectral_curvature=flat, brightest_e=float(light.max()), darkest_e=float(light.min()),
-        unit_least_dn=float(_sigma(light).min()) / CAMERA.electrons_per_dn, lines=SWEEP.lines, seconds=seconds,
+        unit="sigma",
+        sweeps=sweeps or (SWEEP,),
+        wavelength_nm=WAVELENGTH,
+        fwhm_nm=None,
+        level=(light / _sigma(light)).max(axis=0),
+        spread=flat,
+        span=span,
+        slope=both,
+        curvature=both,
+        spectral_slope=flat,
+        spectral_curvature=flat,
+        brightest_e=float(light.max()),
+        darkest_e=float(light.min()),
+        unit_least_dn=float(_sigma(light).min()) / CAMERA.electrons_per_dn,
+        lines=SWEEP.lines,
+        seconds=seconds,
         white_e=white_e(rig.camera.exposure_ms),
-    )  # fmt: skip
+    )
 
 
 def block_of(rig: Rig, lines: range = range(60), *, sweep: Sweep = SWEEP, **more: Any) -> SweepBlock:

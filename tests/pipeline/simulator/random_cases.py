@@ -84,10 +84,17 @@ def random_case(number: int) -> Case:
     count = int(rng.integers(LINES[0], LINES[1] + 1))
     axis = "y" if upright else "x"
     sweeps = tuple(
-        Sweep(name, "fine" if step == 1 else "coarse", axis, float(rng.uniform(-20, 20)), start - count * step / 2,
-              count, step)
+        Sweep(
+            name,
+            "fine" if step == 1 else "coarse",
+            axis,
+            float(rng.uniform(-20, 20)),
+            start - count * step / 2,
+            count,
+            step,
+        )
         for name, start in (("first", far), ("last", float(rng.uniform(-200, 200))))
-    )  # fmt: skip
+    )
     seconds = float(np.exp(rng.uniform(np.log(60), np.log(LONGEST_S)))) if rng.random() < 0.5 else None
     return Case(scene, rig, sweeps, seconds, number)
 
@@ -201,12 +208,17 @@ def _air(rng: np.random.Generator) -> Air:
     distance = float(np.exp(rng.uniform(np.log(20), np.log(1000))))
     relief: Relief = rng.choice(["flat", "step", "plane"])
     return Air(
-        distance_m=distance, relief=relief, nearest_m=distance * float(rng.uniform(0.5, 1)),
-        farthest_m=distance * float(rng.uniform(1, 2)), visibility_km=float(rng.uniform(1, 50)),
-        airlight_share=float(rng.uniform(0, 1)), vapour_g_per_m3=float(rng.uniform(0, 30)),
-        turbulence_cn2=float(10 ** rng.uniform(-15, -12)), wind_amplitude_m=_some(rng, 1e-3, 0.05),
+        distance_m=distance,
+        relief=relief,
+        nearest_m=distance * float(rng.uniform(0.5, 1)),
+        farthest_m=distance * float(rng.uniform(1, 2)),
+        visibility_km=float(rng.uniform(1, 50)),
+        airlight_share=float(rng.uniform(0, 1)),
+        vapour_g_per_m3=float(rng.uniform(0, 30)),
+        turbulence_cn2=float(10 ** rng.uniform(-15, -12)),
+        wind_amplitude_m=_some(rng, 1e-3, 0.05),
         wind_hz=float(rng.uniform(0.2, 3)),
-    )  # fmt: skip
+    )
 
 
 def _sky(rng: np.random.Generator) -> Sky:

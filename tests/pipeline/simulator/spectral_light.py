@@ -78,13 +78,23 @@ def probe_of(
     means = signal.mean(axis=(1, 2), keepdims=True)
     none = np.zeros((2, len(wavelength_nm)))
     return Probe(
-        unit=unit, sweeps=(sweep,), wavelength_nm=wavelength_nm, fwhm_nm=fwhm_nm, level=(signal / one).max(axis=most),
-        spread=(np.abs(signal - means) / one).max(axis=most), span=np.ptp(signal / one, axis=most), slope=none,
-        curvature=none, spectral_slope=(steepest_difference(signal, wavelength_nm) / one).max(axis=most),
+        unit=unit,
+        sweeps=(sweep,),
+        wavelength_nm=wavelength_nm,
+        fwhm_nm=fwhm_nm,
+        level=(signal / one).max(axis=most),
+        spread=(np.abs(signal - means) / one).max(axis=most),
+        span=np.ptp(signal / one, axis=most),
+        slope=none,
+        curvature=none,
+        spectral_slope=(steepest_difference(signal, wavelength_nm) / one).max(axis=most),
         spectral_curvature=(np.abs(second_difference(signal, wavelength_nm)) / one).max(axis=most),
-        brightest_e=float(signal.max()), darkest_e=float(signal.min()),
-        unit_least_dn=float(one.min()) / LineCamera().electrons_per_dn, lines=sweep.lines, seconds=64.0,
-    )  # fmt: skip
+        brightest_e=float(signal.max()),
+        darkest_e=float(signal.min()),
+        unit_least_dn=float(one.min()) / LineCamera().electrons_per_dn,
+        lines=sweep.lines,
+        seconds=64.0,
+    )
 
 
 def worst(changed: Light, light: Light, unit: Unit, like: Light | None = None) -> float:

@@ -23,8 +23,14 @@ from pipeline.simulator.selection.arithmetic import ROUNDING, contrast_about, mi
 
 RIG = Rig(camera=LineCamera(samples=64, exposure_ms=10_000.0))
 SWEEP = Sweep("s", "coarse", "x", 0.0, -24.0, 12, 4, 4)
-EXACT: dict[Any, str] = {ROTATION: "rays", SLIT: "9x3", SMEAR: "positions", DIFFRACTION: "airy", ABERRATION: "gaussian",
-                         KEYSTONE: "linear"}  # fmt: skip
+EXACT: dict[Any, str] = {
+    ROTATION: "rays",
+    SLIT: "9x3",
+    SMEAR: "positions",
+    DIFFRACTION: "airy",
+    ABERRATION: "gaussian",
+    KEYSTONE: "linear",
+}
 
 
 def test_contrast_is_that_of_the_scene_about_a_sample() -> None:

@@ -35,7 +35,10 @@ def test_worst_chips_are_about_the_worst_places():
     chips = [replace(WHOLE, lines=range(first, first + 5)) for first in range(0, 50, 5)]
     found = worst_blocks(chips, light, ones)
     assert {name: chip.lines.start for name, chip in found.items() if name != "most oblique"} == {
-        "steepest": 20, "brightest": 10, "darkest": 45}  # fmt: skip
+        "steepest": 20,
+        "brightest": 10,
+        "darkest": 45,
+    }
     assert found["most oblique"].normals[:, 2].max() == WHOLE.normals[:, 2].max()
 
 
@@ -61,7 +64,11 @@ def test_candidates_are_about_places_that_the_sweep_sees():
     here = np.array([along[30, 12], scan[30, 12]]) + (np.array(WHOLE.shape) - 1) / 2
     places = np.array([here, here + np.array([0, 300]), [0, 1e6]])
     assert [chip.lines for chip in candidate_blocks([WHOLE], places)] == [
-        range(3), range(24, 27), range(29, 32), range(47, 50)]  # fmt: skip
+        range(3),
+        range(24, 27),
+        range(29, 32),
+        range(47, 50),
+    ]
 
 
 def test_candidates_stay_few_and_within_short_sweeps():

@@ -144,8 +144,11 @@ def test_at_least_half_of_what_can_be_saved_is_saved(effects: list[MadeUp], tole
 
 def test_dearest_per_bound_goes_first():
     """Of three that fit two by two, the two that save most per bound are left out; worked by hand."""
-    effects = [MadeUp("blur", 0.05, (("exact", 0.0, 0.9),)), MadeUp("noise", 0.04, (("exact", 0.0, 7.7),)),
-               MadeUp("smile", 0.03, (("exact", 0.0, 0.3),))]  # fmt: skip
+    effects = [
+        MadeUp("blur", 0.05, (("exact", 0.0, 0.9),)),
+        MadeUp("noise", 0.04, (("exact", 0.0, 7.7),)),
+        MadeUp("smile", 0.03, (("exact", 0.0, 0.3),)),
+    ]
     decision = decide(PROBE, RIG, effects, 0.11)  # 1.2 * (0.05 + 0.04) = 0.108
     assert variants(decision) == {"blur": "off", "noise": "off", "smile": "exact"}
     assert decision.error == pytest.approx(0.108)
@@ -266,13 +269,16 @@ def test_even_scene_shows_no_geometry_but_the_rig_has_it():
     assert decide(PROBE, RIG, [Shift("shift", 1.0)], 0.0).taken[0].reason == "exact"
 
 
-@pytest.mark.parametrize(("asked", "words"), [
-    ("vigneting", r"unknown effect 'vigneting'; did you mean 'vignetting'\?"),
-    ("shot,jittr", r"unknown effect 'jittr'; did you mean 'jitter'\?"),
-    ("zzz", "unknown effect 'zzz'; known are shot, jitter, vignetting"),
-    ("auto,shot", "'auto' stands alone, got 'auto,shot'"),
-    (" , ", "no effect is named in ' , '; write auto, all, none, or names"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ("vigneting", r"unknown effect 'vigneting'; did you mean 'vignetting'\?"),
+        ("shot,jittr", r"unknown effect 'jittr'; did you mean 'jitter'\?"),
+        ("zzz", "unknown effect 'zzz'; known are shot, jitter, vignetting"),
+        ("auto,shot", "'auto' stands alone, got 'auto,shot'"),
+        (" , ", "no effect is named in ' , '; write auto, all, none, or names"),
+    ],
+)
 def test_unknown_names_are_refused_with_the_nearest(asked: str, words: str):
     """One error that says what was meant."""
     with pytest.raises(SettingsError, match=words):

@@ -54,10 +54,14 @@ def test_glass_by_hand() -> None:
 @pytest.mark.parametrize(
     ("coating", "nm", "share"),
     [
-        ("aluminium", 550, 0.916), ("aluminium", 800, 0.867), ("aluminium", 1000, 0.94), ("gold", 600, 0.919),
-        ("gold", 700, 0.97), ("silver", 550, 0.983),
+        ("aluminium", 550, 0.916),
+        ("aluminium", 800, 0.867),
+        ("aluminium", 1000, 0.94),
+        ("gold", 600, 0.919),
+        ("gold", 700, 0.97),
+        ("silver", 550, 0.983),
     ],
-)  # fmt: skip
+)
 def test_published_reflectances_head_on(coating: str, nm: float, share: float) -> None:
     """Of evaporated films (Hass in the American Institute of Physics Handbook, table 6g): within 2 points."""
     found = reflectance(coating, np.array([nm]), np.zeros(1))  # type: ignore[arg-type]

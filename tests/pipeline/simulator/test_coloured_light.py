@@ -22,9 +22,16 @@ def grey_probe(slope: float, curvature: float):
     bands = np.ones(len(NM))
     both = np.ones((2, len(NM)))
     return even_probe(
-        unit="dn", wavelength_nm=NM, level=bands, spread=bands, span=bands, spectral_slope=0 * bands,
-        spectral_curvature=0 * bands, slope=slope * both, curvature=curvature * both,
-    )  # fmt: skip
+        unit="dn",
+        wavelength_nm=NM,
+        level=bands,
+        spread=bands,
+        span=bands,
+        spectral_slope=0 * bands,
+        spectral_curvature=0 * bands,
+        slope=slope * both,
+        curvature=curvature * both,
+    )
 
 
 @pytest.mark.parametrize("px", [3.0, 8.0, 30.0])

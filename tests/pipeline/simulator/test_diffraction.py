@@ -14,14 +14,7 @@ from scipy.special import j0, j1
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
 from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.blurs import (
-    ABERRATION,
-    DIFFRACTION,
-    KEYSTONE,
-    THIRD_RING,
-    airy_energy,
-    airy_variance,
-)
+from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE, THIRD_RING, airy_energy, airy_variance
 from pipeline.simulator.effects.line import SLIT
 from pipeline.simulator.optics.footprint import fold
 from pipeline.simulator.optics.kernel_fit import Moments

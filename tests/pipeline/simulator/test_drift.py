@@ -93,9 +93,13 @@ def test_rendered() -> None:
     """Through the chain a flat scene is as bright as the gain says."""
     spectra = white_e().astype(np.float32)
     scene = RasterScene(
-        "flat", "flat", SceneRaster.of(np.ones((*SHAPE, 1), np.float32)), Once.of(SceneLight(spectra[None], spectra)),
-        np.ones(BANDS, np.float32), block_of(rig_with()).wavelength_nm,
-    )  # fmt: skip
+        "flat",
+        "flat",
+        SceneRaster.of(np.ones((*SHAPE, 1), np.float32)),
+        Once.of(SceneLight(spectra[None], spectra)),
+        np.ones(BANDS, np.float32),
+        block_of(rig_with()).wavelength_nm,
+    )
     block = block_of(rig_with(started=MORNING), range(0, 60, 30), started_s=600.0, samples=range(4))
     light = expected_light(scene, block, {DRIFT: "spectral"})
     np.testing.assert_allclose(light, DRIFT.gain(block, "spectral") * spectra + 0 * light, rtol=1e-6)

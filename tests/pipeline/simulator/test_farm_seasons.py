@@ -53,13 +53,21 @@ def test_cover_by_hand() -> None:
 @pytest.mark.parametrize(
     ("use", "day", "phase", "days"),
     [
-        ("wheat_a", 213, "stubble", 0), ("wheat_a", 212, "crop", 281), ("wheat_a", 280, "soil", 16),
-        ("wheat_a", 1, "crop", 70), ("maize", 127, "soil", 42), ("maize", 128, "crop", 0),
+        ("wheat_a", 213, "stubble", 0),
+        ("wheat_a", 212, "crop", 281),
+        ("wheat_a", 280, "soil", 16),
+        ("wheat_a", 1, "crop", 70),
+        ("maize", 127, "soil", 42),
+        ("maize", 128, "crop", 0),
         ("maize", 20, "stubble", 116),
-        ("sugar_beet", 289, "crop", 184), ("sugar_beet", 290, "soil", 0), ("grass", 150, "grass", 9),
-        ("soil", 150, "soil", 2), ("stubble", 211, "stubble", 365), ("late_maize", 172, "crop", 20),
+        ("sugar_beet", 289, "crop", 184),
+        ("sugar_beet", 290, "soil", 0),
+        ("grass", 150, "grass", 9),
+        ("soil", 150, "soil", 2),
+        ("stubble", 211, "stubble", 365),
+        ("late_maize", 172, "crop", 20),
     ],
-)  # fmt: skip
+)
 def test_calendars(use: str, day: int, phase: str, days: float) -> None:
     """Each field is what the calendar says, through the turn of the year."""
     assert land_on(use, day, 0.0) == (phase, days)

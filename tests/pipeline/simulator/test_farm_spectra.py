@@ -7,14 +7,7 @@ import pytest
 
 from pipeline.errors import WavelengthError
 from pipeline.geometry.camera import LineCamera, digitise
-from pipeline.simulator.scenes.farm.spectra import (
-    FWHM_NM,
-    MATERIALS,
-    OTHERS,
-    STAGES,
-    band_response,
-    spectral_library,
-)
+from pipeline.simulator.scenes.farm.spectra import FWHM_NM, MATERIALS, OTHERS, STAGES, band_response, spectral_library
 
 LEAFY = [name for name in (*OTHERS, *STAGES) if not name.endswith(("dry", "ripe", "autumn", "old"))]
 

@@ -10,17 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import j1
 
-from tests.pipeline.simulator.fine_image import (
-    ALONG,
-    BOX,
-    IMAGES,
-    SCAN,
-    convolved,
-    disc,
-    gaussian,
-    probe_of,
-    shifted,
-)
+from tests.pipeline.simulator.fine_image import ALONG, BOX, IMAGES, SCAN, convolved, disc, gaussian, probe_of, shifted
 
 # Transfer functions of unit variance at the angular frequency w, and their fourth moments less that of a Gaussian.
 KERNELS: dict[str, tuple[Callable[[float], float], float]] = {

@@ -19,11 +19,14 @@ NM = np.linspace(400.0, 1000.0, 25)
 def spectra_probe(spectra: np.ndarray, unit_e: float):
     """A probe in a unit that is the same everywhere."""
     return even_probe(
-        unit="dn", wavelength_nm=NM, level=spectra.max(axis=0) / unit_e, spread=np.ptp(spectra, axis=0) / unit_e,
+        unit="dn",
+        wavelength_nm=NM,
+        level=spectra.max(axis=0) / unit_e,
+        spread=np.ptp(spectra, axis=0) / unit_e,
         spectral_slope=steepest_difference(spectra, NM).max(axis=0) / unit_e,
         spectral_curvature=np.abs(second_difference(spectra, NM)).max(axis=0) / unit_e,
         unit_least_dn=unit_e / RIG.camera.electrons_per_dn,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("seed", range(10))

@@ -36,17 +36,19 @@ PICTURES = {
     "checkerboard": (np.indices((SIZE, SIZE)).sum(axis=0) % 2 == 0),
 }
 CHOICES = st.fixed_dictionaries(
-    {SLIT: st.sampled_from((*SLIT.variants, OFF)), SMEAR: st.sampled_from((*SMEAR.variants, OFF)),
-     ROTATION: st.sampled_from(("rays", OFF))}
+    {
+        SLIT: st.sampled_from((*SLIT.variants, OFF)),
+        SMEAR: st.sampled_from((*SMEAR.variants, OFF)),
+        ROTATION: st.sampled_from(("rays", OFF)),
+    }
     | {blur: st.sampled_from((*blur.variants, OFF)) for blur in BLURS}
-)  # fmt: skip
+)
 
 
 def scene_of(picture: str, dark: float = 0.0) -> RasterScene:
     """The picture in all bands: 1 on ``dark``."""
     values = np.where(PICTURES[picture], 1.0, dark)
-    return raster_from_values(np.repeat(values[..., None], len(NM), axis=2), RIG.camera, name=picture,
-                              wavelength_nm=NM)  # fmt: skip
+    return raster_from_values(np.repeat(values[..., None], len(NM), axis=2), RIG.camera, name=picture, wavelength_nm=NM)
 
 
 def seen(scene: RasterScene, sweep: Sweep, chosen: dict[Any, str], rig: Rig = RIG) -> NDArray[np.float64]:
@@ -57,9 +59,16 @@ def seen(scene: RasterScene, sweep: Sweep, chosen: dict[Any, str], rig: Rig = RI
 
 
 @settings(max_examples=12, deadline=None)
-@given(picture=st.sampled_from(sorted(PICTURES)), dark=st.sampled_from((0.0, 0.3)), chosen=CHOICES,
-       strip=st.floats(-1.0, 1.0), start=st.floats(-13.0, -11.0), along=st.sampled_from("xy"),
-       step=st.sampled_from((1, 4)), turned=st.booleans())  # fmt: skip
+@given(
+    picture=st.sampled_from(sorted(PICTURES)),
+    dark=st.sampled_from((0.0, 0.3)),
+    chosen=CHOICES,
+    strip=st.floats(-1.0, 1.0),
+    start=st.floats(-13.0, -11.0),
+    along=st.sampled_from("xy"),
+    step=st.sampled_from((1, 4)),
+    turned=st.booleans(),
+)
 def test_light_is_within_that_of_the_scene(
     picture: str, dark: float, chosen: dict[Any, str], strip: float, start: float, along: Any, step: int, turned: bool
 ) -> None:
@@ -73,8 +82,13 @@ def test_light_is_within_that_of_the_scene(
 
 
 @settings(max_examples=8, deadline=None)
-@given(picture=st.sampled_from(("pixel", "disc")), chosen=CHOICES, strip=st.floats(-1.0, 1.0),
-       start=st.floats(-20.0, -18.0), along=st.sampled_from("xy"))  # fmt: skip
+@given(
+    picture=st.sampled_from(("pixel", "disc")),
+    chosen=CHOICES,
+    strip=st.floats(-1.0, 1.0),
+    start=st.floats(-20.0, -18.0),
+    along=st.sampled_from("xy"),
+)
 def test_light_of_what_is_swept_is_kept(
     picture: str, chosen: dict[Any, str], strip: float, start: float, along: Any
 ) -> None:
@@ -114,9 +128,10 @@ def test_tails_of_diffraction_reach_as_far_as_the_pupil_says() -> None:
 
 
 @pytest.mark.parametrize(
-    ("effect", "variant"), [(one, variant) for one in IN_THE_LIGHT for variant in one.variants],
+    ("effect", "variant"),
+    [(one, variant) for one in IN_THE_LIGHT for variant in one.variants],
     ids=lambda one: getattr(one, "name", one),
-)  # fmt: skip
+)
 def test_no_variant_makes_light_negative(effect: Effect, variant: str) -> None:
     """A bright pixel on black through every variant of every effect, beside slit, turned lines and blurs."""
     chosen = {ROTATION: "rays", SLIT: "3x1"} | {blur: blur.variants[0] for blur in BLURS} | {effect: variant}

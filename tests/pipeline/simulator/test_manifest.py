@@ -69,17 +69,26 @@ def test_asked_effects_may_leave_the_tolerance():
     assert totals["bound"] == pytest.approx(1.2 * (0.05 + 2.0 + 0.06 + 0.02))
 
 
-@pytest.mark.parametrize(("name", "why"), [
-    ("wind", "the rig has none of it: wind as off"),
-    ("rotation", "the scene shows nothing of it: 2 px aside"),
-    ("blur", "left out it changes a stored number by at most 0.06 sigma of the noise: blur as off"),
-    ("shot", "left out it could change a stored number by 2.4 sigma of the noise, more than the tolerance of 0.1: shot"
-     " as off; gauss differs from exact by at most 0.012 sigma of the noise: shot as gauss"),
-    ("smile", "left out it could change a stored number by 0.072 sigma of the noise, and the tolerance of 0.1 is spent"
-     " where it saves more: smile as off"),
-    ("throughput", "left out it changes a stored number by at most 0.024 sigma of the noise: throughput as off"),
-    ("saturation", "always there, for raw lines are whole numbers of limited size: saturation as off"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("wind", "the rig has none of it: wind as off"),
+        ("rotation", "the scene shows nothing of it: 2 px aside"),
+        ("blur", "left out it changes a stored number by at most 0.06 sigma of the noise: blur as off"),
+        (
+            "shot",
+            "left out it could change a stored number by 2.4 sigma of the noise, more than the tolerance of 0.1: shot"
+            " as off; gauss differs from exact by at most 0.012 sigma of the noise: shot as gauss",
+        ),
+        (
+            "smile",
+            "left out it could change a stored number by 0.072 sigma of the noise, and the tolerance of 0.1 is spent"
+            " where it saves more: smile as off",
+        ),
+        ("throughput", "left out it changes a stored number by at most 0.024 sigma of the noise: throughput as off"),
+        ("saturation", "always there, for raw lines are whole numbers of limited size: saturation as off"),
+    ],
+)
 def test_reasons_say_why_in_words_and_numbers(name: str, why: str):
     """Every case of the rule."""
     assert whys(0.1)[name] == why

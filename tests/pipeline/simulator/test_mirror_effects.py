@@ -75,9 +75,23 @@ def test_the_change_stays_below_the_bound(effect: Any):
     one, none = np.ones(2), np.zeros(2)
     slope = np.array([[SLOPE[0]] * 2, [SLOPE[1]] * 2])
     probe = Probe(
-        "dn", (STRIP,), 500 * one, None, 4000 * one, one, 4000 * one, slope, none * slope, none, none, 1e4, 0.0, 1.0,
-        40, 40 * 4e-3,
-    )  # fmt: skip
+        "dn",
+        (STRIP,),
+        500 * one,
+        None,
+        4000 * one,
+        one,
+        4000 * one,
+        slope,
+        none * slope,
+        none,
+        none,
+        1e4,
+        0.0,
+        1.0,
+        40,
+        40 * 4e-3,
+    )
     measured = np.abs(look({effect: "exact"}) - look({})).max()
     bound = effect.bound(probe, RIG).value
     assert measured <= bound + 2e-3

@@ -162,9 +162,13 @@ def merged_chances(level: float, read: float, edges: NDArray[np.float64]) -> NDA
 
 @pytest.mark.parametrize(
     ("level", "read"),
-    [(level, read) for read in (5.0, 10.0, 20.0, 40.0) for level in (2.0, 40.0, 200.0, 700.0, 5000.0)
-     if level >= least_expected(read)],
-)  # fmt: skip
+    [
+        (level, read)
+        for read in (5.0, 10.0, 20.0, 40.0)
+        for level in (2.0, 40.0, 200.0, 700.0, 5000.0)
+        if level >= least_expected(read)
+    ],
+)
 def test_divergence_bounds_the_distributions(level: float, read: float) -> None:
     """Chi-square divergence of the cheap draw's DN from the exact one's is no more than stated, nor much less."""
     reach = 12 * np.sqrt(level + read**2)

@@ -156,9 +156,12 @@ def test_air_as_bright_as_the_scene_is_not_seen() -> None:
     rig = rig_with(HAZY_300_M, brdf_per_rad=0.0)
     light = 0.3 * white_e()
     probe = replace(
-        probe_of(rig), level=light / np.sqrt(light + fixed_variance(rig)), span=0 * light,
-        darkest_e=float(light.min()), brightest_e=float(light.max()),
-    )  # fmt: skip
+        probe_of(rig),
+        level=light / np.sqrt(light + fixed_variance(rig)),
+        span=0 * light,
+        darkest_e=float(light.min()),
+        brightest_e=float(light.max()),
+    )
     assert PATH_RADIANCE.bound(probe, rig).value == pytest.approx(0, abs=1e-6)
     shaded = rig_with(HAZY_300_M, cloud_share=0.5)
     assert PATH_RADIANCE.bound(probe, shaded).value > 1

@@ -73,9 +73,7 @@ def test_off_axis_incidence_follows_the_mirror():
     np.testing.assert_allclose(factors(sweep_at(3000, 0, 1)), 1, atol=1e-6)
 
 
-@given(
-    st.integers(-4500, 4500), st.integers(-11_000, 10_000), st.integers(1, 900), st.sampled_from(METALS),
-)  # fmt: skip
+@given(st.integers(-4500, 4500), st.integers(-11_000, 10_000), st.integers(1, 900), st.sampled_from(METALS))
 @settings(max_examples=50, deadline=None)
 def test_bound_is_the_greatest_way_from_rest(strip_px, start_px, lines, coating):
     """The bound holds for every line between the ends of a sweep, extremes of the metal included, and is reached."""

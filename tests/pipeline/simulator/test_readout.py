@@ -26,9 +26,13 @@ BANDS = 20
 # Read noise of 0 and wells without end where a test says nothing else; 1 e- is 1 DN, so that DN are counts.
 COUNTING = LineCamera(electrons_per_dn=1.0, bits=16, dark_dn=0.0, read_noise_e=0.0)
 EVERYTHING: dict[Any, str] = {
-    DARK_CURRENT: "exact", DEFECTS: "exact", SHOT: "gaussian", READ_NOISE: "exact", SATURATION: "exact",
+    DARK_CURRENT: "exact",
+    DEFECTS: "exact",
+    SHOT: "gaussian",
+    READ_NOISE: "exact",
+    SATURATION: "exact",
     QUANTISATION: "exact",
-}  # fmt: skip
+}
 ALL_EXACT = EVERYTHING | {SHOT: "exact"}
 
 

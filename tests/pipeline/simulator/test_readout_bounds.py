@@ -135,8 +135,10 @@ def test_defects_of_bands_that_are_not_used_do_not_matter() -> None:
 
 def test_more_defects_keep_those_there_were() -> None:
     """A larger share adds elements; a sensor of another number has others; dead and hot are drawn apart."""
-    few, many, other = (Rig(detector=Detector(dead_share=share, hot_share=share, unit=unit)) for share, unit in
-                        ((0.01, 0), (0.05, 0), (0.05, 1)))  # fmt: skip
+    few, many, other = (
+        Rig(detector=Detector(dead_share=share, hot_share=share, unit=unit))
+        for share, unit in ((0.01, 0), (0.05, 0), (0.05, 1))
+    )
     assert (dead_elements(many, 20) >= dead_elements(few, 20)).all()
     assert not np.array_equal(dead_elements(many, 20), dead_elements(other, 20))
     assert not np.array_equal(dead_elements(many, 20), hot_electrons(many, 20) > 0)

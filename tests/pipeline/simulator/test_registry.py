@@ -58,8 +58,10 @@ def test_effects_are_complete(effect: Effect):
     assert effect.bound(even_probe(), RIG, effect.variants[0]).value == 0
 
 
-@pytest.mark.parametrize(("part", "actions"), [(AIMS, {"aim"}), (RAYS, {"displaced"}), (FOOTPRINT, {"moments"}),
-                                               (LIGHT, {"gain", "change"}), (READOUT, set())])  # fmt: skip
+@pytest.mark.parametrize(
+    ("part", "actions"),
+    [(AIMS, {"aim"}), (RAYS, {"displaced"}), (FOOTPRINT, {"moments"}), (LIGHT, {"gain", "change"}), (READOUT, set())],
+)
 def test_effects_stand_where_they_act(part: tuple[Effect, ...], actions: set[str]):
     """Each has one action of its part of the chain; the renderer and the readout do the rest themselves."""
     by_renderer = {"rotation", "slit", "smear"}

@@ -84,8 +84,9 @@ def test_lines_and_samples_do_not_depend_on_their_block(chosen: dict, sweep: Swe
 
 def test_diagonal_scene_is_that_of_its_matrix() -> None:
     """A scene with a plane of its own in each band gives what its diagonal matrix of electrons gives."""
-    diagonal = raster_from_values(np.random.default_rng(1).uniform(0, 1, (60, 50, 4)), CAMERA, name="d",
-                                  wavelength_nm=np.linspace(400, 1000, 4))  # fmt: skip
+    diagonal = raster_from_values(
+        np.random.default_rng(1).uniform(0, 1, (60, 50, 4)), CAMERA, name="d", wavelength_nm=np.linspace(400, 1000, 4)
+    )
     light = SceneLight(np.diag(diagonal.electrons), diagonal.panel_electrons)
     full = replace(diagonal, light=Once.of(light))
     chosen = {**PLAIN, Widening(): "only"}
@@ -110,8 +111,9 @@ def test_blurs_widen_and_shift_each_band_by_its_moments() -> None:
     """On a wave every band keeps the contrast of its Gaussian, and is seen from the shifted place."""
     x = np.arange(160)
     wave = 1 + 0.5 * np.sin(2 * np.pi * x / 20)
-    scene = raster_from_values(np.broadcast_to(wave[None, :, None], (40, 160, 6)), CAMERA, name="w",
-                               wavelength_nm=np.linspace(400, 1000, 6))  # fmt: skip
+    scene = raster_from_values(
+        np.broadcast_to(wave[None, :, None], (40, 160, 6)), CAMERA, name="w", wavelength_nm=np.linspace(400, 1000, 6)
+    )
     sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=-0.5, lines=1)
     block = block_of(scene, sweep, range(1), samples=range(280, 360))
     light = expected_light(scene, block, {SLIT: "3x1", Widening(): "only"})[0] / scene.electrons

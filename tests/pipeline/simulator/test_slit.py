@@ -94,8 +94,9 @@ def test_bound_is_what_the_probe_measured_with_a_margin() -> None:
 def test_slit_of_no_width_sees_what_a_pixel_sees() -> None:
     """A zero-width slit is a line of light, its probe finite and its variants alike."""
     narrow = replace(RIG, camera=replace(RIG.camera, slit_um=0.0))
-    scene = raster_from_values(np.random.default_rng(3).uniform(0, 1, (50, 80, 1)), RIG.camera, name="t",
-                               wavelength_nm=np.array([550.0]))  # fmt: skip
+    scene = raster_from_values(
+        np.random.default_rng(3).uniform(0, 1, (50, 80, 1)), RIG.camera, name="t", wavelength_nm=np.array([550.0])
+    )
     probe = probe_scene(scene, narrow, [SWEEP])
     assert np.isfinite(list(probe.slit_errors.values())).all()
     assert np.isfinite(probe.slope).all()

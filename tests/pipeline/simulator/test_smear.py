@@ -33,8 +33,9 @@ def test_positions_are_held_by_the_mirror_or_the_footprint(step: int) -> None:
 def test_no_smear_where_every_line_has_one_position() -> None:
     """Fine lines stand still: the bound is 0 and the position that of mid exposure."""
     sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=0.0, lines=4)
-    scene = raster_from_values(np.random.default_rng(0).uniform(0, 1, (30, 60, 1)), RIG.camera, name="t",
-                               wavelength_nm=np.array([550.0]))  # fmt: skip
+    scene = raster_from_values(
+        np.random.default_rng(0).uniform(0, 1, (30, 60, 1)), RIG.camera, name="t", wavelength_nm=np.array([550.0])
+    )
     assert SMEAR.bound(probe_scene(scene, RIG, [sweep]), RIG).value == 0
     block = SweepBlock(RIG, sweep, range(4), scene.wavelength_nm, scene.shape)
     np.testing.assert_array_equal(smeared_positions(block, "positions"), block.middle[:, None])

@@ -34,9 +34,23 @@ def probe(slope: float, curvature: float, span: float = 1e9, sweep: Sweep = SWEE
     one, none = np.ones(1), np.zeros(1)
     both = np.stack([none, one])
     return Probe(
-        "sigma", (sweep,), 500 * one, None, one, one, span * one, slope * both, curvature * both, none, none, 1e4, 0.0,
-        1.0, sweep.lines, 60.0,
-    )  # fmt: skip
+        "sigma",
+        (sweep,),
+        500 * one,
+        None,
+        one,
+        one,
+        span * one,
+        slope * both,
+        curvature * both,
+        none,
+        none,
+        1e4,
+        0.0,
+        1.0,
+        sweep.lines,
+        60.0,
+    )
 
 
 @pytest.mark.parametrize(("samples", "lines", "px"), [(1450, 640, 0.011), (1500, 600, 0.020), (1500, 1000, 0.056)])

@@ -249,8 +249,16 @@ def test_probe_of_a_noiseless_rig_is_finite() -> None:
     values[30:] = 1.0
     noiseless = replace(RIG, detector=Detector(noiseless=True))
     probe = probe_scene(scene_of(values), noiseless, [SWEEP])
-    found = [probe.level, probe.spread, probe.span, probe.slope, probe.curvature, probe.spectral_slope,
-             probe.spectral_curvature, list(probe.slit_errors.values())]  # fmt: skip
+    found = [
+        probe.level,
+        probe.spread,
+        probe.span,
+        probe.slope,
+        probe.curvature,
+        probe.spectral_slope,
+        probe.spectral_curvature,
+        list(probe.slit_errors.values()),
+    ]
     assert all(np.isfinite(one).all() for one in found)
     assert probe.unit_least_dn == pytest.approx(1 / np.sqrt(12))
     assert all(np.isfinite(menu.off.error) for menu in list_options(probe, noiseless, EFFECTS))

@@ -113,8 +113,9 @@ def test_flat_scene_stays_flat() -> None:
 def test_keystone_needs_no_slit(variant: str) -> None:
     """Every band is seen from its own place, through the slit and without it."""
     x = np.mgrid[:120, :160][1]
-    ramp = raster_from_values(np.repeat((x + 0.0)[..., None], 3, axis=2), CAMERA, name="ramp",
-                              wavelength_nm=np.array([400.0, 700.0, 1000.0]))  # fmt: skip
+    ramp = raster_from_values(
+        np.repeat((x + 0.0)[..., None], 3, axis=2), CAMERA, name="ramp", wavelength_nm=np.array([400.0, 700.0, 1000.0])
+    )
     sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=-20.0, lines=3)
     block = SweepBlock(RIG, sweep, range(3), ramp.wavelength_nm, ramp.shape, samples=range(290, 350))
     light = expected_light(ramp, block, {SLIT: variant, KEYSTONE: "linear"}) / ramp.electrons
@@ -127,8 +128,9 @@ def test_folded_positions_are_those_held_near_the_middle(step: int) -> None:
     scene = grain()
     sweep = Sweep("s", "coarse", "x", strip_px=0.0, start_px=-20.0, lines=4, step=step, binning=step)
     block = SweepBlock(RIG, sweep, range(4), scene.wavelength_nm, scene.shape, samples=range(300, 340))
-    one, other = (expected_light(scene, block, {ROTATION: "rays", SMEAR: smear, SLIT: "3x1", **BLURS})
-                  for smear in SMEAR.variants)  # fmt: skip
+    one, other = (
+        expected_light(scene, block, {ROTATION: "rays", SMEAR: smear, SLIT: "3x1", **BLURS}) for smear in SMEAR.variants
+    )
     assert np.abs(one - other).max() / one.std() < 0.02
 
 

@@ -45,8 +45,10 @@ def test_measured_changes_are_those_of_each_effect_and_of_all():
     effects = Brightening("drift", 0.01, share=0.01), Brightening("cloud", 0.02, share=0.02)
     on, read = Brightening("vignetting", 3.0, share=0.5), MadeUp("read", 0.1)
     measured = verify(decided(*effects, on, read), render, CHIPS, units)
-    assert measured == pytest.approx({"drift": 1.2 * 1.02 * 1.5 * 0.01, "cloud": 1.2 * 1.01 * 1.5 * 0.02,
-                                      TOTAL: 1.2 * 1.5 * (1.01 * 1.02 - 1)}, rel=1e-4)  # fmt: skip
+    assert measured == pytest.approx(
+        {"drift": 1.2 * 1.02 * 1.5 * 0.01, "cloud": 1.2 * 1.01 * 1.5 * 0.02, TOTAL: 1.2 * 1.5 * (1.01 * 1.02 - 1)},
+        rel=1e-4,
+    )
 
 
 def test_nothing_left_out_measures_nothing():

@@ -30,10 +30,14 @@ def even_scene(fwhm_nm: float = 2.0) -> RasterScene:
     nm = np.linspace(740, 784, BANDS)
     panel_electrons = (30_000 * (1 - 0.6 * np.exp(-(((nm - 762) / 5) ** 2)))).astype(np.float32)
     return RasterScene(
-        "even", "even", SceneRaster.of(np.full((20, 20, 1), 0.4, np.float32)),
-        Once.of(SceneLight(panel_electrons[None], panel_electrons)), np.ones(BANDS, np.float32), nm,
+        "even",
+        "even",
+        SceneRaster.of(np.full((20, 20, 1), 0.4, np.float32)),
+        Once.of(SceneLight(panel_electrons[None], panel_electrons)),
+        np.ones(BANDS, np.float32),
+        nm,
         np.full(BANDS, fwhm_nm),
-    )  # fmt: skip
+    )
 
 
 def source_of(*names: str, rig: Rig = RIG) -> SimulatedSource:
@@ -59,10 +63,19 @@ def test_plain_frames_are_the_panel_over_the_dark_level() -> None:
     assert (found.dark.dtype, found.white.dtype, found.panel.dtype) == (np.float32,) * 3
 
 
-@pytest.mark.parametrize("names", [
-    ("dark-current",), ("prnu",), ("striping",), ("response",), ("smile",), ("vignetting",), ("response", "smile"),
-    ("dark-current", "prnu", "striping", "response", "smile", "vignetting", "smear", "slit"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("dark-current",),
+        ("prnu",),
+        ("striping",),
+        ("response",),
+        ("smile",),
+        ("vignetting",),
+        ("response", "smile"),
+        ("dark-current", "prnu", "striping", "response", "smile", "vignetting", "smear", "slit"),
+    ],
+)
 def test_calibration_takes_out_what_it_sees(names: tuple[str, ...]) -> None:
     """An even scene comes back as its reflectance to a rounding, far from rest, whatever spectrograph and detector do.
 
@@ -122,8 +135,9 @@ def test_panel_is_stated_in_the_rigs_bands() -> None:
     """Where the panel's values have detail in the spectrum, the response rounds it as it does the light."""
     scene = even_scene()
     scene = replace(scene, panel=(1 - 0.5 * np.exp(-(((scene.wavelength_nm - 762) / 4) ** 2))).astype(np.float32))
-    plain, wide = (SimulatedSource(scene, RIG, chosen=effects_on(*names)).references(SWEEP).panel
-                   for names in ((), ("response",)))  # fmt: skip
+    plain, wide = (
+        SimulatedSource(scene, RIG, chosen=effects_on(*names)).references(SWEEP).panel for names in ((), ("response",))
+    )
     np.testing.assert_array_equal(plain, scene.panel)
     assert wide.min() > plain.min() + 0.05
     np.testing.assert_allclose(wide.mean(), plain.mean(), atol=0.02)
@@ -145,8 +159,13 @@ def test_calibration_does_not_know_the_rest() -> None:
 def test_usual_effects_are_those_of_any_camera_behind_a_mirror() -> None:
     """By default rays, footprint, vignetting and noise are on; names and mapping say the same."""
     assert [effect.name for effect, _ in USUAL.effects] == [
-        "rotation", "slit", "smear", "vignetting", "shot", "read-noise",
-    ]  # fmt: skip
+        "rotation",
+        "slit",
+        "smear",
+        "vignetting",
+        "shot",
+        "read-noise",
+    ]
     assert effects_on("shot", "slit").effects == effects_on("slit", "shot").effects
     assert effects_on().effects == ()
     assert {effect for effect, _ in USUAL.effects} <= set(BY_NAME.values())

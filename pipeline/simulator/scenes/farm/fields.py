@@ -11,15 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.simulator.scenes.farm.canvas import Ground, Mixture, Painting, blend, grass, moist_soil
 from pipeline.simulator.scenes.farm.farm_plan import TWINS, UNEVEN_DAYS, FieldPlan
-from pipeline.simulator.scenes.farm.land import (
-    Field,
-    Points,
-    edge,
-    parcel_pixels,
-    smooth_noise,
-    stream,
-    stripes,
-)
+from pipeline.simulator.scenes.farm.land import Field, Points, edge, parcel_pixels, smooth_noise, stream, stripes
 from pipeline.simulator.scenes.farm.seasons import (
     YEAR_DAYS,
     Crop,
@@ -80,11 +72,7 @@ def _content(
 
 
 def _standing_crop(
-    work: Painting,
-    field: FieldPlan,
-    crop: Crop,
-    place: tuple[Rows, Ground, Mixture],
-    harm: tuple[Field, Field],
+    work: Painting, field: FieldPlan, crop: Crop, place: tuple[Rows, Ground, Mixture], harm: tuple[Field, Field]
 ) -> Content:
     """Plants in rows over soil that they shade; gaps, lodged patches and wheel marks."""
     (rows, here, soil), (gaps, down) = place, harm
