@@ -68,7 +68,7 @@ def made_up(measured: float = 0.02, tolerance: float | None = 0.1) -> Comparison
         bound=tolerance,
         measured=measured,
         rms=measured / 2,
-        place=effect_comparison.Place("full-0", 120, 180, 7),
+        place=effect_comparison.ViewPlace("full-0", 120, 180, 7),
         raw_unequal=0.05,
         raw_most_dn=1,
         left_out=("polarisation",),
