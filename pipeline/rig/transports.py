@@ -67,6 +67,7 @@ class SerialTransport:
         self._serial = _open(port, baud)
 
     def write(self, data: bytes, deadline: float) -> None:
+        """Send all of the bytes until then; see `Transport`."""
         if self._clock.now() >= deadline:
             raise DeadlinePassed(f"no time was left to send {len(data)} bytes to {self.port}; give a longer deadline")
         try:
@@ -79,6 +80,7 @@ class SerialTransport:
             raise self._gone(error) from error
 
     def read(self, at_most: int, deadline: float) -> bytes:
+        """Give what has come, at least a byte, until then; see `Transport`."""
         try:
             while self._clock.now() < deadline:
                 first: bytes = self._serial.read(1)
@@ -90,6 +92,7 @@ class SerialTransport:
             raise self._gone(error) from error
 
     def drain(self) -> bytes:
+        """Give what lies in the buffers, waiting for nothing."""
         drained = b""
         try:
             while len(drained) < _MOST_DRAINED and (there := self._serial.in_waiting):
@@ -164,6 +167,7 @@ class SocketTransport:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def write(self, data: bytes, deadline: float) -> None:
+        """Send all of the bytes until then; see `Transport`."""
         left = deadline - self._clock.now()
         if left <= 0:
             raise DeadlinePassed(f"no time was left to send {len(data)} bytes to {self.port}; give a longer deadline")
@@ -176,6 +180,7 @@ class SocketTransport:
             raise self._gone(str(error)) from error
 
     def read(self, at_most: int, deadline: float) -> bytes:
+        """Give what has come, at least a byte, until then; see `Transport`."""
         left = deadline - self._clock.now()
         if left <= 0:
             return b""
@@ -192,6 +197,7 @@ class SocketTransport:
         return data
 
     def drain(self) -> bytes:
+        """Give what lies in the buffers, waiting for nothing."""
         drained = b""
         self._socket.setblocking(False)
         try:

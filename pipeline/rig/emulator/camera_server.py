@@ -58,6 +58,7 @@ class InProcessCameraLine:
         self._say(chunks)
 
     def read(self, at_most: int, deadline: float) -> bytes:
+        """Give what the camera has answered by then."""
         if not self._coming:
             self._check_open()
         if not self._coming or self._coming[0][0] > deadline:

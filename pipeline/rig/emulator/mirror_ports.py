@@ -44,6 +44,7 @@ class InProcessTransport:
         self._schedule(self.device.opened())
 
     def write(self, data: bytes, deadline: float) -> None:
+        """Hand the bytes to the device at once."""
         self._check_open()
         self.sent.append(data)
         if self.device.hung:
@@ -56,6 +57,7 @@ class InProcessTransport:
             raise self._gone() from error
 
     def read(self, at_most: int, deadline: float) -> bytes:
+        """Give what the device has answered by then."""
         self._check_open()
         if not self._due and self.device.gone:
             raise self._gone()
