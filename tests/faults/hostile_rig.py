@@ -30,9 +30,18 @@ from pipeline.rig.mirror.mirror_controller import open_mirror
 from pipeline.rig.mirror.mirror_settings import MirrorSettings
 from pipeline.rig.rig_check import CheckRow, check_camera, check_mirror
 from tests.faults.fault_table import Clock, Row
+from tests.rig.camera.hostile_camera import (
+    REPLIES,
+    Answers,
+    Hostile,
+    HostileControl,
+    HostileFiles,
+    Pieces,
+    flood,
+    trickled,
+)
 from tests.rig.chaos_line import Mangler
 from tests.rig.chaotic_surveys import is_message, survey_in_chaos
-from tests.rig.hostile_camera import REPLIES, Answers, Hostile, HostileControl, HostileFiles, Pieces, flood, trickled
 
 FULL_S, QUICK_S = 600.0, 6.0  # both devices together
 SURVEYS, FEW_SURVEYS = 100, 4

@@ -27,7 +27,7 @@ from storage.archive.archive import Archive
 from tests.faults.disk_full import can_mount, small_disk
 from tests.faults.fault_table import Clock, Row
 from tests.faults.nursery import ROOT
-from tests.flows.schedule_days import NOON, HandClock
+from tests.flows.schedule.schedule_days import NOON, HandClock
 from tests.soak.accounts import Account, Leftovers, Look, clear, problems_of
 from tests.soak.pulled_rig import LINK, RigProcess
 from tests.soak.resident_memory import Growth, resident_bytes

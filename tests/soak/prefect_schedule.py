@@ -27,7 +27,7 @@ from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger, ledgers
 from tests.faults.fault_table import Clock, Row
 from tests.faults.nursery import ROOT
-from tests.flows.schedule_days import HandClock
+from tests.flows.schedule.schedule_days import HandClock
 from tests.soak.accounts import Account, problems_of
 from tests.soak.processes import children_of, is_alive, listener_at, words_of
 from tests.soak.resident_memory import MB, Growth, resident_bytes

@@ -21,7 +21,7 @@ from flows.schedule.field_schedule import FieldSchedule
 from flows.schedule.fields import ServedField, load_fields, survey_field
 from flows.schedule.times import parse_timetable
 from storage.archive.ledger import ledgers
-from tests.flows.schedule_days import HandClock
+from tests.flows.schedule.schedule_days import HandClock
 from tests.soak.pulled_rig import RigControl
 
 FIELDS = {"north": 1, "south": 2, "west": 3}  # with the seeds of their scenes

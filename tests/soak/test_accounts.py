@@ -16,7 +16,7 @@ import pytest
 
 from flows.schedule.ledger_state import moment_words
 from storage.archive.archive import Archive
-from tests.flows.schedule_days import NOON
+from tests.flows.schedule.schedule_days import NOON
 from tests.soak.accounts import Account, Leftovers, clear
 from tests.soak.day_of_surveys import Day
 from tests.soak.day_of_surveys import judged as judge_day

@@ -1,0 +1,338 @@
+"""The export of surveys: images, cubes and catalogue agree with the archive's stores, with a pose and without."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import odc.geo.xr  # noqa: F401 - gives xarray its .odc
+import pytest
+import xarray as xr
+from rich.console import Console
+
+from flows.archive.export_command import run_export
+from flows.publish.run_folder import Published
+from flows.publish.survey_command import run_survey
+from flows.settings.load import load_settings
+from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
+from pipeline.ground.view import RigPose
+from storage.archive.archive import Archive
+from storage.export.cog_files import cog_problems
+from storage.export.stac_items import stac_problems
+from storage.readers.envi_cubes import open_envi_cube
+from tests.storage.export.stac_rules import extension_problems
+
+rasterio = pytest.importorskip("rasterio", reason="exports are written with rasterio, of the extra [geo]")
+pystac = pytest.importorskip("pystac", reason="exports are described with pystac, of the extra [geo]")
+pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
+POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
+QUIET = Console(quiet=True)
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A survey, its archive, and what its export gave."""
+
+    published: Published
+    archive: Path
+    out: Path
+    answer: dict[str, Any]
+
+    @property
+    def id(self) -> str:
+        """The run's name."""
+        return self.published.folder.name
+
+    def file(self, key: str) -> Path:
+        """One exported file."""
+        return self.out / str(self.answer["files"][key])
+
+    def store(self, product: str) -> xr.Dataset:
+        """A store of the archive, as a stranger opens it."""
+        return xr.open_zarr(self.archive / self.published.receipt["products"][product], consolidated=False)
+
+    def item(self) -> dict[str, Any]:
+        """The STAC item."""
+        found: dict[str, Any] = json.loads(Path(self.answer["item"]).read_text())
+        return found
+
+
+@pytest.fixture(scope="module")
+def surveys(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Published]]:
+    """One archive with the same farm twice: without a pose and with one."""
+    archive = tmp_path_factory.mktemp("surveys") / "field-a"
+    flags = {
+        "size": "192x128",
+        "bands": "20,60,100,150,200",
+        "budget": "0.9",
+        "engine": "plain",
+        "out": str(archive),
+        "controls": False,
+        "seed": "1",
+    }
+    settings = load_settings(None, flags)
+    return archive, [run_survey(settings, QUIET), run_survey(replace(settings, pose=POSE), QUIET)]
+
+
+@pytest.fixture(scope="module")
+def exports(surveys: tuple[Path, list[Published]], tmp_path_factory: pytest.TempPathFactory) -> list[Exported]:
+    """Both runs exported into one folder, with ENVI files."""
+    archive, published = surveys
+    out = tmp_path_factory.mktemp("exports").resolve()
+    return [
+        Exported(one, archive, out, run_export(archive, one.folder.name, out, envi=True, console=QUIET))
+        for one in published
+    ]
+
+
+@pytest.fixture
+def plain(exports: list[Exported]) -> Exported:
+    """The survey without a pose."""
+    return exports[0]
+
+
+@pytest.fixture
+def posed(exports: list[Exported]) -> Exported:
+    """The survey with a pose."""
+    return exports[1]
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_every_image_is_a_cloud_optimised_geotiff(exports: list[Exported], number: int) -> None:
+    """The four images of a run pass all checks of the layout."""
+    images = {key: cog_problems(exports[number].file(key)) for key in ("class_map", "confidence", "attention", "rgb")}
+    assert [problems for problems in images.values() if problems] == []
+
+
+def test_with_a_pose_images_lie_where_the_zarr_store_lies(posed: Exported) -> None:
+    """Rasterio's CRS, transform and values are those that plain xarray and odc.geo read from the map's store."""
+    store = posed.store("ground_map")
+    box = store.odc.geobox
+    for key, array in (("class_map", "classes"), ("confidence", "confidence"), ("rgb", "picture")):
+        with rasterio.open(posed.file(key)) as file:
+            assert file.crs.to_epsg() == box.crs.epsg == 32632
+            assert file.transform == box.affine
+            wanted = xr.open_zarr(store.encoding["source"], consolidated=False, mask_and_scale=False)[array].values
+            np.testing.assert_array_equal(np.moveaxis(file.read(), 0, -1).reshape(wanted.shape), wanted)
+
+
+def test_without_a_pose_images_lie_on_angles(plain: Exported) -> None:
+    """No CRS, the Zarr store's own transform in radians, its values, and a tag that says so."""
+    store = xr.open_zarr(
+        plain.archive / plain.published.receipt["products"]["class_map"], consolidated=False, mask_and_scale=False
+    )
+    for key, array in (("class_map", "classes"), ("confidence", "confidence")):
+        with rasterio.open(plain.file(key)) as file:
+            assert file.crs is None
+            assert list(file.transform[:6]) == store.attrs["spatial:transform"]
+            np.testing.assert_array_equal(file.read(1), store[array].values)
+            assert "no CRS" in file.tags()["place"]
+    with rasterio.open(plain.file("rgb")) as file:
+        mosaic = plain.store("mosaic")
+        assert list(file.transform[:6]) == mosaic.attrs["spatial:transform"]
+        assert file.shape == mosaic["coverage"].shape
+        np.testing.assert_array_equal(file.read().max(axis=0) > 0, mosaic["coverage"].values > 0)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_attention_keeps_its_seats(exports: list[Exported], number: int) -> None:
+    """One pixel a seat, from the scene's corner on, with the scores of the store."""
+    done = exports[number]
+    score, scene = done.store("attention")["score"].values, done.store("class_map").attrs["spatial:transform"]
+    with rasterio.open(done.file("attention")) as file:
+        np.testing.assert_array_equal(file.read(1), score)
+        patch = int(file.tags()["seat_px"])
+        a, b, c, d, e, f = scene
+        assert file.transform[:6] == pytest.approx((patch * a, b, c, d, patch * e, f))
+        assert file.crs is None
+        assert file.tags()["policy"] == "gain"
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_classes_bring_their_names_and_colours(exports: list[Exported], number: int) -> None:
+    """The legend of the archive stands in the file and in the catalogue."""
+    done = exports[number]
+    about = done.store("class_map").attrs
+    with rasterio.open(done.file("class_map")) as file:
+        table, tags = file.colormap(1), file.tags(1)
+        assert file.nodata == 255
+    assert [tags[f"CLASS_{number}"] for number in range(len(about["class_names"]))] == about["class_names"]
+    assert [list(table[number][:3]) for number in range(len(about["class_names"]))] == about["class_colours"]
+    named = done.item()["assets"]["class_map"]["classification:classes"]
+    assert [one["title"] for one in named] == about["class_names"]
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_files_say_which_run_and_store_they_are_of(exports: list[Exported], number: int) -> None:
+    """Run, product, time and program stand in the tags."""
+    done = exports[number]
+    with rasterio.open(done.file("class_map")) as file:
+        tags = file.tags()
+    product = ("class_map", "ground_map")[number]
+    assert tags["run"] == done.id
+    assert tags["product"] == done.published.receipt["products"][product]
+    assert tags["surveyed"] == done.published.receipt["started"]
+    assert tags["TIFFTAG_SOFTWARE"].startswith("spectralzoom ")
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")  # cubes lie on the camera's grid
+@pytest.mark.parametrize("number", [0, 1])
+def test_cubes_are_the_archives_bit_for_bit(exports: list[Exported], number: int) -> None:
+    """Mosaic and sweeps through this project's ENVI reader and through rasterio are the Zarr stores' numbers."""
+    done = exports[number]
+    mosaic, products = done.store("mosaic"), done.published.receipt["products"]
+    stores = {"mosaic_envi": mosaic["values"].values}
+    for product in ("raw_coarse", "raw_fine"):
+        for path in (done.archive / products[product]).glob("*.zarr"):
+            stores[f"{path.stem}_envi"] = xr.open_zarr(path, consolidated=False)["dn"].values
+    assert set(stores) == {key for key in done.answer["files"] if key.endswith("_envi")}
+    for key, wanted in stores.items():
+        cube = open_envi_cube(done.file(key))
+        assert cube.values.dtype == wanted.dtype
+        assert np.ascontiguousarray(cube.values).tobytes() == wanted.tobytes()
+        np.testing.assert_array_equal(cube.header.wavelength_nm, mosaic["wavelength"].values)
+        np.testing.assert_array_equal(cube.header.fwhm_nm, mosaic["fwhm"].values)
+        assert cube.notes == ()
+    with rasterio.open(done.file("mosaic_envi")) as file:
+        np.testing.assert_array_equal(np.moveaxis(file.read(), 0, -1), mosaic["values"].values)
+        assert np.isnan(file.nodata)
+
+
+def test_the_catalogue_is_valid_and_leads_to_every_file(exports: list[Exported]) -> None:
+    """STAC's schemas accept it, pystac walks it, and every address leads to a file or store that is there."""
+    path = Path(exports[0].answer["collection"])
+    assert stac_problems(json.loads(path.read_text())) == []
+    collection = pystac.Collection.from_file(str(path))
+    items = list(collection.get_items(recursive=True))
+    assert [item.id for item in items] == [done.id for done in exports]
+    for done, item in zip(exports, items, strict=True):
+        assert stac_problems(done.item()) == []
+        assert extension_problems(done.item()) == []
+        for asset in item.assets.values():
+            target = Path(str(asset.get_absolute_href()))
+            assert (target / "zarr.json").is_file() if "zarr" in asset.media_type else target.is_file()
+            assert asset.roles
+    assert {"class_map", "mosaic_zarr", "patches_zarr", "receipt", "mosaic_envi_header"} <= set(items[0].assets)
+
+
+def test_items_say_when_where_and_how(plain: Exported, posed: Exported) -> None:
+    """Times and lineage of the receipt, wavelengths in micrometres; geometry and CRS only with a pose."""
+    receipt, item = posed.published.receipt, posed.item()
+    about = item["properties"]
+    assert (about["datetime"], about["end_datetime"]) == (receipt["started"], receipt["finished"])
+    wave = posed.store("mosaic")["wavelength"].values / 1000
+    assert (about["hsi:wavelength_min"], about["hsi:wavelength_max"]) == (wave.min(), wave.max())
+    assert about["processing:software"] == receipt["versions"]
+    assert all(stage["key"] in about["processing:lineage"] for stage in receipt["stages"])
+    assert about["proj:code"] == item["assets"]["class_map"]["proj:code"] == "EPSG:32632"
+    box = posed.store("ground_map").odc.geobox
+    assert item["assets"]["class_map"]["proj:transform"] == list(box.affine[:6])
+    assert item["assets"]["attention"]["proj:code"] is None
+    west, south, east, north = item["bbox"]
+    assert west < 9.5001 < east + 1e-3
+    assert 52.1 < south < north < 52.101
+    assert plain.item()["geometry"] is None
+    assert "proj:code" not in plain.item()["properties"]
+    assert "no rig pose" in plain.item()["properties"]["description"]
+
+
+def test_exported_again_nothing_changes(posed: Exported) -> None:
+    """The latest run without a name, into another folder beside the archive: the same bytes, and nothing else."""
+    copy = posed.out.parent / "again"
+    answer = run_export(posed.archive, None, copy, envi=True, console=QUIET)
+    assert answer["run"] == posed.id
+    before = {path.relative_to(posed.out): path for path in posed.out.rglob("*") if posed.id in path.parts}
+    again = {path.relative_to(copy): path for path in copy.rglob("*") if path != copy / "collection.json"}
+    again.pop(Path(posed.id))
+    assert set(again) == {name for name in before if name != Path(posed.id)}
+    changed = [
+        name for name, path in again.items() if path.is_file() and path.read_bytes() != before[name].read_bytes()
+    ]
+    shutil.rmtree(copy)
+    assert changed == []
+
+
+def test_leftovers_of_a_killed_export_go(posed: Exported, tmp_path: Path) -> None:
+    """What an export left half written goes with the next one."""
+    for folder in (tmp_path, tmp_path / posed.id):
+        (folder / ".export-x.part").mkdir(parents=True)
+    run_export(posed.archive, posed.id, tmp_path, envi=False, console=QUIET)
+    assert not list(tmp_path.rglob("*.part"))
+    assert not list(tmp_path.rglob("*.lock"))
+
+
+def test_a_run_that_is_not_there_is_refused(posed: Exported, tmp_path: Path) -> None:
+    """The message names the runs that there are; an empty archive says that it has none."""
+    with pytest.raises(SettingsError, match=f"no run 'x'; its latest are .*{posed.id}"):
+        run_export(posed.archive, "x", tmp_path / "out", envi=False, console=QUIET)
+    Archive.open(tmp_path / "empty")
+    with pytest.raises(SettingsError, match="has no published run; survey into it first"):
+        run_export(tmp_path / "empty", None, tmp_path / "out", envi=False, console=QUIET)
+    assert not (tmp_path / "out").exists()
+
+
+def test_places_that_cannot_be_written_are_refused(posed: Exported, tmp_path: Path) -> None:
+    """A folder of the archive, a file, and a folder below a file: one message each, and the archive verifies."""
+    with pytest.raises(SettingsError, match="lies in the archive"):
+        run_export(posed.archive, None, posed.archive / "export", envi=False, console=QUIET)
+    (tmp_path / "file").write_text("mine")
+    for out in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(ArchiveError, match=r"cannot export to .*; choose another --out"):
+            run_export(posed.archive, None, out, envi=False, console=QUIET)
+    assert (tmp_path / "file").read_text() == "mine"
+    assert all(finding.problem is None for finding in Archive.open(posed.archive).verify_all())
+
+
+def test_a_run_goes_by_the_names_that_other_verbs_give_it(posed: Exported, tmp_path: Path) -> None:
+    """Its address, with a slash or without, and latest."""
+    for run in (f"runs/{posed.id}", f"{posed.id}/", "latest"):
+        assert run_export(posed.archive, run, tmp_path / "out", envi=False, console=QUIET)["run"] == posed.id
+
+
+def test_a_changed_receipt_is_not_believed(posed: Exported, tmp_path: Path) -> None:
+    """Readable as it is: what it says is not what was published."""
+    archive = tmp_path / "field-a"
+    shutil.copytree(posed.archive, archive)
+    receipt = archive / "runs" / posed.id / "receipt.json"
+    receipt.write_text(receipt.read_text().replace('"seed": 1', '"seed": 2', 1))
+    with pytest.raises(IncompleteStoreError, match=r"is damaged: receipt.json has changed .*run verify"):
+        run_export(archive, posed.id, tmp_path / "out", envi=False, console=QUIET)
+
+
+@pytest.mark.parametrize("package", ["rasterio", "pystac"])
+def test_without_the_extra_one_message_says_what_to_install(
+    posed: Exported, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str
+) -> None:
+    """Nothing is begun without all of it."""
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ArchiveError, match=rf"{package}.*pip install 'spectralzoom\[geo\]'"):
+        run_export(posed.archive, None, tmp_path / "out", envi=False, console=QUIET)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_damaged_store_is_named_and_gives_no_image(posed: Exported, tmp_path: Path) -> None:
+    """A flipped bit in the class map of the archive: an error with the store's address, no file of that name."""
+    archive = tmp_path / "field-a"
+    shutil.copytree(posed.archive, archive)
+    store = archive / posed.published.receipt["products"]["ground_map"]
+    shard = next(path for path in sorted((store / "classes").rglob("*")) if path.is_file() and path.name != "zarr.json")
+    content = bytearray(shard.read_bytes())
+    content[40] ^= 4
+    shard.write_bytes(content)
+    with pytest.raises(IncompleteStoreError, match=r"ground_map.*classes"):
+        run_export(archive, None, tmp_path / "out", envi=False, console=QUIET)
+    assert not list((tmp_path / "out").rglob("*.tif"))
+
+
+def test_a_store_that_is_gone_is_named(posed: Exported, tmp_path: Path) -> None:
+    """The message says which product is missing and what to do."""
+    archive = tmp_path / "field-a"
+    shutil.copytree(posed.archive, archive)
+    shutil.rmtree((archive / posed.published.receipt["products"]["mosaic"]).parent)
+    with pytest.raises(IncompleteStoreError, match=r"the mosaic of run .* does not; run its survey again"):
+        run_export(archive, None, tmp_path / "out", envi=False, console=QUIET)

@@ -1,0 +1,281 @@
+"""Ingest: what a file holds becomes one immutable store, once; killed or refused it leaves nothing."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from numpy.typing import NDArray
+from PIL import Image
+from rich.console import Console
+
+import flows.archive.ingest_command
+from flows.archive.ingest_command import IngestRequest, run_ingest
+from pipeline.errors import ArchiveError, SceneError, WavelengthError
+from storage.archive.archive import Archive
+from storage.readers.cube_sources import CubeSource
+from storage.readers.scan_files import open_cube_source
+from storage.readers.scene_files import load_scene_file
+
+NM = "wavelength units = um\nwavelength = {0.45, 0.55, 0.65}\nfwhm = {0.01, 0.01, 0.02}\n"
+KINDS = {"u1": 1, "i2": 2, "i4": 3, "f4": 4, "f8": 5, "u2": 12}
+
+
+def write_envi(path: Path, values: NDArray[Any], *, lines: int | None = None, more: str = NM) -> Path:
+    """Write (line, sample, band) values as BIL with their header; give the header."""
+    promised = len(values) if lines is None else lines
+    path.with_suffix(".hdr").write_text(
+        f"ENVI\nsamples = {values.shape[1]}\nlines = {promised}\nbands = {values.shape[2]}\n"
+        f"data type = {KINDS[values.dtype.str[1:]]}\ninterleave = bil\nbyte order = 0\n{more}"
+    )
+    path.write_bytes(values.transpose(0, 2, 1).tobytes())
+    return path.with_suffix(".hdr")
+
+
+def ingest(source: Path | str, archive: Path, **flags: Any) -> dict[str, Any]:
+    """Ingest without showing anything."""
+    return run_ingest(IngestRequest(str(source), archive, **flags), Console(quiet=True))
+
+
+def opened(record: dict[str, Any]) -> xr.Dataset:
+    """The stored cube as plain xarray reads it."""
+    with xr.open_zarr(Path(record["path"]) / "cube.zarr", consolidated=False) as found:
+        return found.load()
+
+
+@pytest.fixture
+def raw() -> NDArray[np.uint16]:
+    """Numbers of 150 lines, more than two blocks, (150, 40, 3) uint16."""
+    return np.random.default_rng(0).integers(0, 4096, (150, 40, 3), dtype=np.uint16)
+
+
+def test_all_that_is_known_is_stored(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
+    """Numbers, wavelengths, line facts, references and where they came from open with plain xarray."""
+    folder = tmp_path / "flight 7"
+    folder.mkdir()
+    write_envi(folder / "raw_0", raw[:100])
+    write_envi(folder / "raw_100", raw[100:])
+    write_envi(folder / "darkReference", raw[:1] // 8)
+    (folder / "frameIndex_0.txt").write_text("f\tt\n" + "".join(f"{i}\t{5000 + 40 * i}\n" for i in range(100)))
+    record = ingest(folder, tmp_path / "archive", name="field-7")
+    data = opened(record)
+    assert data["values"].dims == ("line", "sample", "band")
+    assert data["values"].dtype == np.uint16
+    np.testing.assert_array_equal(data["values"], raw)
+    np.testing.assert_allclose(data["wavelength"], [450, 550, 650])
+    np.testing.assert_allclose(data["fwhm"], [10, 10, 20])
+    np.testing.assert_allclose(data["time"][:100], np.arange(100) * 40e-6)
+    assert np.isnan(data["time"][100:]).all()
+    assert data["valid_line"].all()
+    np.testing.assert_array_equal(data["dark"], raw[0] // 8)
+    about = data.attrs
+    assert (about["name"], about["wavelength_units_in_file"], about["first_stamp_us"]) == ("field-7", "um", 5000)
+    digest = hashlib.sha256((folder / "raw_0").read_bytes()).hexdigest()
+    assert {"name": "raw_0", "size": raw[:100].nbytes, "sha256": digest} in about["files"]
+    assert about["headers"]["raw_0.hdr"] == (folder / "raw_0.hdr").read_text()
+    assert str(tmp_path) not in json.dumps(about)
+    with Image.open(Path(record["path"]) / "quicklook.png") as picture:
+        assert picture.size == (40, 150)
+    assert Archive.open(tmp_path / "archive").verify_all()[0].problem is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "high", "stored"),
+    [
+        ("u1", 255, "u1"),
+        ("u2", 65535, "u2"),
+        ("i2", 30000, "u2"),
+        ("i4", 65535, "u2"),
+        ("i4", 65536, "f4"),
+        ("f4", 100, "f4"),
+        ("f8", 100, "f4"),
+    ],
+)
+def test_types(tmp_path: Path, kind: str, high: int, stored: str) -> None:
+    """Whole numbers that fit stay whole; the rest are float32. No number changes."""
+    values = np.random.default_rng(1).integers(0, high + 1, (70, 5, 3)).astype(kind)
+    values[69, 0, 0] = high
+    data = opened(ingest(write_envi(tmp_path / "a.img", values), tmp_path / "archive"))
+    assert data["values"].dtype == np.dtype(stored)
+    np.testing.assert_array_equal(data["values"], values)
+
+
+def test_negative_numbers_become_float(tmp_path: Path) -> None:
+    """Signed numbers below 0 do not fit uint16."""
+    values = np.array([[[-1, 2, 3]]], np.int16)
+    data = opened(ingest(write_envi(tmp_path / "a.img", values), tmp_path / "archive"))
+    np.testing.assert_array_equal(data["values"], values.astype(np.float32))
+
+
+def test_truncated_file(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
+    """Whole lines are kept, lost ones are flagged and 0, and the record says how many."""
+    header = write_envi(tmp_path / "a.img", raw[:90], lines=100)
+    record = ingest(header, tmp_path / "archive")
+    data = opened(record)
+    assert (record["lost_lines"], record["shape"]) == (10, [100, 40, 3])
+    assert np.flatnonzero(~data["valid_line"].values).tolist() == list(range(90, 100))
+    np.testing.assert_array_equal(data["values"][:90], raw[:90])
+    assert not data["values"][90:].any()
+
+
+def test_the_same_content_is_stored_once(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
+    """Neither name nor place of the files counts; a name that is stated, other bytes or other wavelengths do."""
+    archive = tmp_path / "archive"
+    first = ingest(write_envi(tmp_path / "a.img", raw), archive)
+    (tmp_path / "elsewhere").mkdir()
+    again = ingest(write_envi(tmp_path / "elsewhere" / "b.raw", raw), archive)
+    assert (first["cached"], again["cached"], again["key"]) == (False, True, first["key"])
+    others = [
+        ingest(tmp_path / "a.hdr", archive, name="n"),
+        ingest(tmp_path / "a.hdr", archive, wavelengths=[400, 500, 600]),
+        ingest(write_envi(tmp_path / "c.img", raw + 1), archive),
+        ingest(tmp_path / "a.hdr", archive, dark=str(tmp_path / "c.hdr")),
+    ]
+    assert len({record["key"] for record in [first, *others]}) == 5
+
+
+def test_images_and_arrays(tmp_path: Path, scene_files: Path, raw: NDArray[np.uint16]) -> None:
+    """What a survey takes for a scene can be ingested; without wavelengths it is stored without."""
+    picture = opened(ingest(scene_files / "scene.png", tmp_path / "archive"))
+    with Image.open(scene_files / "scene.png") as image:
+        np.testing.assert_array_equal(picture["values"], np.asarray(image))
+    assert picture["wavelength"].values.tolist() == [640, 550, 460]
+    np.save(tmp_path / "a.npy", raw)
+    record = ingest(tmp_path / "a.npy", tmp_path / "archive")
+    assert record["wavelength_nm"] is None
+    assert "wavelength" not in opened(record)
+    with pytest.raises(WavelengthError, match="expected 3 wavelengths, one a band, got 2"):
+        ingest(tmp_path / "a.npy", tmp_path / "archive", wavelengths=[500, 600])
+
+
+def test_what_was_ingested_is_a_scene(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
+    """A store of an ingest is a scene by its folder, and can be ingested again with all that is known of it."""
+    record = ingest(write_envi(tmp_path / "a.img", raw[:20], lines=22), tmp_path / "archive")
+    scene = load_scene_file(record["path"])
+    np.testing.assert_array_equal(scene.values[:20], raw[:20])
+    assert np.isnan(scene.values[20:]).all()
+    np.testing.assert_allclose(scene.wavelength_nm, [450, 550, 650])
+    again = ingest(record["path"], tmp_path / "second")
+    xr.testing.assert_equal(opened(again), opened(record))
+    assert again["lost_lines"] == 2
+
+
+def test_geotiff_by_rows(tmp_path: Path, real_data: Path) -> None:
+    """A GeoTIFF is read some rows at a time, and gives the numbers that a scene of it has."""
+    pytest.importorskip("rasterio")
+    path = real_data / "rgbn" / "rgbn.tif"
+    data = opened(ingest(path, tmp_path / "archive"))
+    np.testing.assert_array_equal(data["values"], load_scene_file(path).values)
+
+
+def test_real_raw_frames(tmp_path: Path, real_data: Path) -> None:
+    """Raw frames of a space-borne imager come back bit by bit; the header says nothing of wavelengths."""
+    header = next((real_data / "emit_raw").glob("*.hdr"))
+    record = ingest(header, tmp_path / "archive")
+    data = opened(record)
+    source = np.fromfile(header.with_suffix(""), "<i2").reshape(3, 328, 1280).transpose(0, 2, 1)
+    np.testing.assert_array_equal(data["values"].astype(np.int64), source)
+    assert record["wavelength_nm"] is None
+
+
+@pytest.mark.parametrize("name", ["../out", "a/b", "/tmp/x", "..", "", "a.part", "a\n"])
+def test_names_that_lead_elsewhere(tmp_path: Path, raw: NDArray[np.uint16], name: str) -> None:
+    """A name that is a path is refused before anything is made."""
+    header = write_envi(tmp_path / "a.img", raw)
+    with pytest.raises(ArchiveError, match="cannot be a name in an archive"):
+        ingest(header, tmp_path / "archive", name=name)
+    assert not (tmp_path / "archive").exists()
+
+
+def test_a_source_that_fails_half_way(tmp_path: Path, raw: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error in the middle leaves no store, and the next ingest makes it."""
+    header = write_envi(tmp_path / "a.img", raw)
+
+    def torn(request: IngestRequest) -> CubeSource:
+        source = open_cube_source(request.source)
+        object.__setattr__(source, "read", lambda start, stop: _raise() if start else raw[start:stop])
+        return source
+
+    with monkeypatch.context() as patch:
+        patch.setattr(flows.archive.ingest_command, "_opened", torn)
+        with pytest.raises(SceneError, match="torn"):
+            ingest(header, tmp_path / "archive")
+    archive = Archive.open(tmp_path / "archive")
+    assert archive.refs() == []
+    assert not list((tmp_path / "archive").rglob("*.part"))
+    assert not ingest(header, tmp_path / "archive")["cached"]
+
+
+def _raise() -> None:
+    raise SceneError("torn")
+
+
+def test_a_source_that_changes_meanwhile(
+    tmp_path: Path, raw: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files that change while they are read are not kept."""
+    header = write_envi(tmp_path / "a.img", raw)
+    real = flows.archive.ingest_command.write_ingested_cube
+
+    def grows(*arguments: Any, **named: Any) -> None:
+        real(*arguments, **named)
+        with (tmp_path / "a.img").open("ab") as file:
+            file.write(b"more")
+
+    monkeypatch.setattr(flows.archive.ingest_command, "write_ingested_cube", grows)
+    with pytest.raises(SceneError, match="changed while it was read; ingest it again once it is whole"):
+        ingest(header, tmp_path / "archive")
+    assert Archive.open(tmp_path / "archive").refs() == []
+
+
+def test_progress_and_notes_are_shown(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
+    """The size, what is doubtful and where the store lies stand on the console."""
+    shown = io.StringIO()
+    request = IngestRequest(str(write_envi(tmp_path / "a.img", raw[:5], lines=9)), tmp_path / "archive")
+    run_ingest(request, Console(file=shown, width=200))
+    text = shown.getvalue()
+    for words in ("storing the cube: 100%", "9 x 40 px, 3 bands, 450-650 nm", "4 of 9 lines are in no file", "stored:"):
+        assert words in text
+    run_ingest(request, Console(file=shown, width=200))
+    assert "already there:" in shown.getvalue()
+
+
+CODE = """
+import sys
+from pathlib import Path
+from rich.console import Console
+from flows.archive.ingest_command import IngestRequest, run_ingest
+print("go", flush=True)
+run_ingest(IngestRequest(sys.argv[1], Path(sys.argv[2])), Console(quiet=True))
+"""
+
+
+@pytest.mark.parametrize("wait_s", [0.0, 0.05, 0.15])
+def test_killed_it_leaves_nothing_half_made(tmp_path: Path, wait_s: float) -> None:
+    """After kill -9 the archive verifies, and the next ingest gives the store of an undisturbed one."""
+    rng = np.random.default_rng(3)
+    header = write_envi(tmp_path / "a.img", rng.integers(0, 4096, (640, 320, 3), dtype=np.uint16))
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", CODE, str(header), str(tmp_path / "archive")]
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(wait_s)
+        process.send_signal(signal.SIGKILL)
+    archive = Archive.open(tmp_path / "archive")
+    assert all(finding.problem is None for finding in archive.verify_all())
+    record, undisturbed = ingest(header, tmp_path / "archive"), ingest(header, tmp_path / "other")
+    assert record["key"] == undisturbed["key"]
+    xr.testing.assert_identical(opened(record), opened(undisturbed))
+    assert not list((tmp_path / "archive").rglob("*.part"))

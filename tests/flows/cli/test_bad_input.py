@@ -1,0 +1,345 @@
+"""Bad input at the command line: one clear message (or it works), the right exit code, the archive as it was."""
+
+from __future__ import annotations
+
+import builtins
+import errno
+import os
+import re
+import shutil
+import subprocess
+import sys
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from flows.survey.survey import STAGES
+from storage.archive.archive import Archive
+from storage.arrays.class_maps import load_class_map
+from tests.flows.stage_doubles import act_instead
+
+ROOT = Path(__file__).parents[3]
+NM = "460,500,550,600,620,640"
+RAN = "looked twice at"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, scene_files: Path, weights: Path, make_weights: Any) -> Path:
+    """Every kind of bad file beside good ones, and a surveyed archive."""
+    here = tmp_path_factory.mktemp("bad")
+    for path in scene_files.iterdir():
+        shutil.copy(path, here)
+    shutil.copy(weights, here / "w.safetensors")
+    shutil.copy(make_weights((1500.0, 1700.0, 2000.0)), here / "infrared.safetensors")
+    (here / "corrupt.safetensors").write_bytes(weights.read_bytes()[:5000])
+    (here / "corrupt.png").write_bytes((here / "scene.png").read_bytes()[:300])
+    (here / "a_file").write_text("no folder")
+    picture, labels = (np.asarray(Image.open(here / name)) for name in ("scene.png", "labels.png"))
+    for name, values in {
+        "small": labels[:50],
+        "tiny": picture[:5, :6],
+        "odd": picture[:37, :53],
+        "black": np.zeros_like(picture[:64]),
+    }.items():
+        Image.fromarray(values).save(here / f"{name}.png")
+    cube = np.load(here / "cube.npy")
+    np.save(here / "one.npy", cube[..., :1])
+    cube[3:9, 5:20] = cube[20, 20, 2] = np.nan
+    np.save(here / "gaps.npy", cube)
+    return here
+
+
+@pytest.fixture(scope="module")
+def surveyed(folder: Path, survey_png: Any) -> Path:
+    """An archive with one survey in it."""
+    survey_png(folder / "archive")
+    return folder / "archive"
+
+
+def contents(root: Path) -> dict[str, bytes | None] | None:
+    """Every file and folder below, or None where there is nothing."""
+    if not root.exists():
+        return None
+    return {str(path.relative_to(root)): path.read_bytes() if path.is_file() else None for path in root.rglob("*")}
+
+
+REFUSED = {
+    "missing file": (1, "--scene none.png", "there is no file none.png"),
+    "corrupt file": (1, "--scene corrupt.png", "corrupt.png cannot be read as .png.*truncated"),
+    "folder": (1, "--scene .", "is a folder, expected a file"),
+    "labels of another size": (1, "--labels small.png", "small.png are 50 x 128 px, the scene is 96 x 128"),
+    "labels missing": (1, "--labels none.png", "there is no file none.png"),
+    "micrometres": (2, "--scene cube.npy --wavelengths 0.46,0.5,0.55,0.6,0.62,0.64", "micrometres.* then write 460"),
+    "too few wavelengths": (1, "--scene cube.npy --wavelengths 460,550", "expected 6 wavelengths.* got 2"),
+    "no wavelengths": (1, "--scene cube.npy", "nothing says their wavelengths; give --wavelengths in nm"),
+    "words as wavelengths": (2, "--scene cube.npy --wavelengths red,green", "from 150 to 30000 nm, got 'red'"),
+    "band that is not there": (1, "--scene cube.npy --bands 0,9 --wavelengths 460,500", "band 9, but .*bands 0..5"),
+    "budget 0": (2, "--budget 0", "above 0 and at most 1, got '0'"),
+    "budget 1.5": (2, "--budget 1.5", "above 0 and at most 1, got '1.5'"),
+    "budget -1": (2, "--budget -1", "above 0 and at most 1, got '-1'"),
+    "budget abc": (2, "--budget abc", "above 0 and at most 1, got 'abc'"),
+    "budget below the coarse pass": (2, "--budget 0.1", "the coarse pass alone takes.* least possible is 0.39"),
+    "scene smaller than a patch": (2, "--scene tiny.png", "the coarse pass alone takes.* least possible is 0.92"),
+    "weights corrupt": (1, "--weights corrupt.safetensors", "corrupt.safetensors is not a readable safetensors file"),
+    "weights missing": (1, "--weights none.safetensors", "no weights at none.safetensors; train some"),
+    "weights of other wavelengths": (1, "--weights infrared.safetensors", "for 1500-2000 nm; .* at 460-640 nm"),
+    "unknown policy": (2, "--policy guess", "one of gain, entropy, margin, sobel, .*mask.*; got 'guess'"),
+    "mask of another size": (1, "--policy mask --mask small.png", r"\(50, 128\) px \(y, x\), the scene is \(96, 128\)"),
+    "policy mask without one": (2, "--policy mask", "needs a mask file"),
+    "unknown flag": (2, "--budgets 1", "Unknown option"),
+    "unknown source": (2, "--source rigg", "--source must be one of sim, rig; got 'rigg'"),
+    "exposure in seconds": (2, "--exposure-ms 0.1", "--exposure-ms must be a number from 0.5.*then write 100"),
+    "farm beyond memory": (2, "--scene farm --size 60000x60000", "takes about .* GB of memory, this machine has"),
+    "memory for no tile": (
+        2,
+        "--memory 300MiB --budget 1",
+        "exceeds --memory 300 MiB: .* give at least --memory 5.. MiB",
+    ),
+    "memory for no process": (
+        2,
+        "--memory 900MiB --budget 1 --scheduler processes",
+        "exceeds --memory 900 MiB: .* each of two processes 512 MiB; give at least --memory 10.. MiB",
+    ),
+    "mirror off by a line": (
+        2,
+        "--pointing-px 200 --budget 1",
+        "^--pointing-px 200: .* overlap by 656 px .* give less than 192$",
+    ),
+    "unknown effect": (2, "--effects slit,fog", "--effects: unknown effect 'fog'"),
+}
+
+
+def survey_words(more: str, out: str = "archive") -> list[str]:
+    """A survey that works, with flags added or put in the place of its own."""
+    words = ["--scene", "scene.png", "--weights", "w.safetensors", "--engine", "plain", "--out", out, "--no-controls"]
+    given = more.split()
+    for flag in given[::2]:
+        if flag in words:
+            place = words.index(flag)
+            del words[place : place + 2]
+    return ["survey", *words, *given]
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused_with_one_message(
+    case: str, folder: Path, surveyed: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The right exit code, one line that says what to do, no traceback, and no trace in the archive, old or new."""
+    code, words, message = REFUSED[case]
+    monkeypatch.chdir(folder)
+    before = contents(surveyed)
+    for out in ("archive", "never_made"):
+        ended = command_line(*survey_words(words, out))
+        assert ended.code == code
+        assert len(ended.errors) == 1
+        assert re.search(message, ended.errors[0]), ended.errors[0]
+        assert "Traceback" not in ended.err
+        assert ended.out == ""
+    assert contents(surveyed) == before
+    assert not (folder / "never_made").exists()
+
+
+WORKS = {
+    "one band": ("--scene one.npy --wavelengths 550 --budget 1", "wavelengths stated: 550 nm"),
+    "wavelengths out of order": ("--scene cube.npy --wavelengths 640,460,500,550,620,600 --budget 1", "640, 460"),
+    "budget 1": ("--budget 1", RAN),
+    "scene smaller than a patch": ("--scene tiny.png --budget 1", RAN),
+    "odd sizes": ("--scene odd.png --budget 1", RAN),
+    "NaN pixels": (f"--scene gaps.npy --wavelengths {NM} --budget 1", "91 pixels without a value were given"),
+    "all black": ("--scene black.png --budget 1", RAN),
+}
+
+
+@pytest.mark.parametrize("case", WORKS)
+def test_unusual_input_works(
+    case: str, folder: Path, tmp_path: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The survey ends with 0, says what it assumed, every pixel with a value has a class, the archive verifies."""
+    words, says = WORKS[case]
+    monkeypatch.chdir(folder)
+    ended = command_line(*survey_words(words, str(tmp_path / "archive")))
+    assert (ended.code, ended.errors) == (0, [])
+    assert says in " ".join(ended.err.split())
+    archive = Archive.open(tmp_path / "archive", create=False)
+    assert [finding.problem for finding in archive.verify_all() if finding.problem] == []
+    drawn = class_map(archive)
+    assert np.count_nonzero(drawn == 255) == (90 if case == "NaN pixels" else 0)
+    assert set(np.unique(drawn)) <= {0, 1, 2, 255}
+
+
+def class_map(archive: Archive) -> np.ndarray:
+    """The one class map of an archive."""
+    (ref,) = archive.refs("segment")
+    return load_class_map(ref.path / "class_map.zarr").classes
+
+
+@pytest.mark.parametrize("out", ["a_file", "a_file/below"])
+def test_out_that_is_a_file(out: str, folder: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refused before anything runs; the file stays."""
+    monkeypatch.chdir(folder)
+    ended = command_line(*survey_words("", out))
+    assert (ended.code, len(ended.errors)) == (1, 1)
+    assert re.search("file, expected a folder.*choose another --out", ended.errors[0])
+    assert (folder / "a_file").read_text() == "no folder"
+
+
+def test_interrupted_survey_says_how_to_go_on(
+    folder: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Ctrl-C in a stage ends with 130 and one line; the same command goes on with what was captured."""
+    real = STAGES["attend"]
+
+    def interrupted(*given: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(folder)
+    act_instead(monkeypatch, "attend", interrupted)
+    words = survey_words("--budget 0.7", str(tmp_path / "archive"))
+    ended = command_line(*words)
+    assert (ended.code, ended.out) == (130, "")
+    assert "interrupted; the same command goes on from here" in ended.err
+    monkeypatch.setitem(STAGES, "attend", real)
+    ended = command_line(*words)
+    assert ended.code == 0
+    assert "coarse sweep: 100% cached" in ended.err
+
+
+TRAINING = {
+    "labels missing": (1, "scene.png -o new.safetensors", "scene has no labels; training needs them: give --labels"),
+    "unknown hold-out": (1, "scene.png -o new.safetensors --hold-out 99", "no scene 99 to hold out; it has scene"),
+    "folder missing": (2, "scene.png -o none/w.safetensors --labels labels.png", "folder none does not exist"),
+    "scenes of files": (2, "scene.png -o new.safetensors --scenes 3", "--scenes is for the built-in farm"),
+    "-o is a folder": (2, "scene.png -o archive --labels labels.png", "archive is a folder, expected a file"),
+    "nothing there": (1, "none -o new.safetensors", "no file or folder none"),
+    "no steps": (2, "scene.png -o new.safetensors --steps 0", "--steps must be above 0, got 0"),
+    "no patch": (2, "scene.png -o new.safetensors --patch 0", "--patch must be above 0, got 0"),
+    "sizes do not fit": (2, "scene.png -o new.safetensors --labels labels.png --factor 3", "divide by the factor 3"),
+    "too many for validation": (1, "scene.png -o new.safetensors --validation 3", "leave none of 1 to train on"),
+    "band that is no number": (2, "scene.png -o new.safetensors --bands a", "whole numbers with commas, got 'a'"),
+    "negative seed": (2, "scene.png -o new.safetensors --seed -1", "--seed must be 0 or more, got -1"),
+    "no -o": (2, "scene.png", "--out requires an argument"),
+    "hold-out of the farm": (2, "farm -o new.safetensors --hold-out 100000", "--hold-out is for scene files"),
+    "bands of the farm": (2, "farm -o new.safetensors --bands 0,1", "--bands is for scene files"),
+}
+
+
+@pytest.mark.parametrize("case", TRAINING)
+def test_training_refused_with_one_message(
+    case: str, folder: Path, surveyed: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before the first step: the right exit code, one line that says what to do, and no file of weights."""
+    code, words, message = TRAINING[case]
+    monkeypatch.chdir(folder)
+    ended = command_line("train", *words.split())
+    assert (ended.code, len(ended.errors)) == (code, 1)
+    assert re.search(message, ended.errors[0]), ended.errors[0]
+    assert "Traceback" not in ended.err
+    assert not list(folder.glob("new.safetensors*"))
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        (survey_words("--scene none.png", "never_made"), 1, "error: there is no file none.png"),
+        (survey_words("--budget 1.5", "never_made"), 2, "error: --budget must be a share of the full scan's seconds"),
+    ],
+)
+def test_real_process_ends_with_the_code(words: list[str], code: int, says: str, folder: Path) -> None:
+    """What the shell sees: exit code, one message on stderr, nothing on stdout."""
+    command = [sys.executable, "-m", "flows.cli.main", *words]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "80"}
+    ended = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout) == (code, "")
+    assert ended.stderr.startswith(says)
+    assert ended.stderr.count("\n") == 1
+
+
+# --- a disk that refuses ----------------------------------------------------------------------------------------------
+
+
+@dataclass
+class FullDisk:
+    """Files below ``root`` take ``left`` writes (opened, written to by descriptor, renamed); then the disk is full."""
+
+    root: Path
+    left: float
+    writes: int = 0
+
+    def _spend(self, path: object) -> None:
+        if isinstance(path, str | Path) and Path(path).absolute().is_relative_to(self.root):
+            self.writes += 1
+            if self.writes > self.left:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    def __enter__(self) -> FullDisk:
+        """Stand between Python and the disk."""
+        real_open, real_write, real_rename = builtins.open, os.write, os.rename
+
+        def open_(file: Any, mode: str = "r", *rest: Any, **named: Any) -> Any:
+            if set(mode) & set("wax+"):
+                self._spend(file)
+            return real_open(file, mode, *rest, **named)
+
+        def write(descriptor: int, content: Any) -> int:
+            self._spend(str(Path(f"/proc/self/fd/{descriptor}").resolve()))
+            return real_write(descriptor, content)
+
+        def rename(old: Any, new: Any, **named: Any) -> None:
+            self._spend(new)
+            real_rename(old, new, **named)
+
+        self._patches = ExitStack()
+        for name, value in {"io.open": open_, "builtins.open": open_, "os.write": write, "os.rename": rename}.items():
+            self._patches.enter_context(mock.patch(name, value))
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._patches.close()
+
+
+FULL_WORDS = "--labels labels.png --budget 0.7"
+
+
+@pytest.fixture(scope="module")
+def undisturbed(folder: Path, tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> tuple[int, np.ndarray]:
+    """Writes of a whole survey, and its class map."""
+    out = tmp_path_factory.mktemp("undisturbed")
+    with FullDisk(out, np.inf) as disk:
+        survey_png(out, budget="0.7", scene=str(folder / "scene.png"), weights=str(folder / "w.safetensors"))
+    return disk.writes, class_map(Archive.open(out))
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="tells a descriptor's file by /proc")
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 0.8, 0.985, 0.9999])
+def test_full_disk_anywhere_in_a_survey(
+    share: float,
+    undisturbed: tuple[int, np.ndarray],
+    folder: Path,
+    tmp_path: Path,
+    command_line: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One message, exit 1, published stores whole and nothing half-made; with space again the rerun ends well."""
+    monkeypatch.chdir(folder)
+    writes, expected = undisturbed
+    out = tmp_path / "archive"
+    with FullDisk(out, int(share * writes)) as disk:
+        ended = command_line(*survey_words(FULL_WORDS, str(out)))
+    assert disk.writes > int(share * writes)
+    assert (ended.code, len(ended.errors)) == (1, 1)
+    assert re.search("the disk is full: free some space|No space left on device; free space", ended.errors[0])
+    assert "Traceback" not in ended.err
+    archive = Archive.open(out)
+    published = {ref.uri: contents(ref.path) for ref in archive.refs()}
+    assert [finding.problem for finding in archive.verify_all() if finding.problem] == []
+    assert not [path for path in out.rglob("*.part") if "spool" not in path.parts]
+    assert command_line(*survey_words(FULL_WORDS, str(out))).code == 0
+    assert {uri: contents(out / uri) for uri in published} == published
+    np.testing.assert_array_equal(class_map(archive), expected)
+    assert archive.runs()

@@ -1,0 +1,126 @@
+"""The command line's own process: what it settles before anything is computed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import flows.cli.survey_verbs  # noqa: F401 - main registers them when it runs
+from flows.cli import main as cli
+from flows.cli.app import GOES_ON, app
+from flows.cli.survey_verbs import IN_TABLES
+from flows.settings.declared import SURVEY, TABLES
+from flows.terminal.shown_text import print_json
+
+ONE_THREAD = """
+import os, sys
+from flows.cli.main import main
+assert "numpy" not in sys.modules, "numpy has read its number of threads already"
+try:
+    main(["--version"])
+except SystemExit:
+    print(os.environ["OPENBLAS_NUM_THREADS"])
+"""
+
+
+def test_numpy_computes_on_one_thread_whatever_the_shell_says() -> None:
+    """Sums split among threads round otherwise: one seed would give other light on a machine with more cores."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), "OPENBLAS_NUM_THREADS": "2"}
+    command = [sys.executable, "-c", ONE_THREAD]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout.split()[-1]) == (0, "1"), ended.stderr
+
+
+GROUPS = ("rig",)  # verbs that have verbs below them
+VERBS = [verb for verb in app if not verb.startswith("-") and verb not in GROUPS]
+VERBS += [f"{group} {verb}" for group in GROUPS for verb in app[group] if not verb.startswith("-")]
+
+
+def _flags(verb: str) -> dict[str, str | None]:
+    """What a verb takes, and what its help says of each."""
+    named = reduce(lambda found, word: found[word], verb.split(), app)
+    found = named.assemble_argument_collection(parse_docstring=True)
+    return {argument.name: argument.parameter.help for argument in found if argument.name != "*"}
+
+
+@pytest.mark.parametrize("verb", ["survey", "plan"])
+def test_a_survey_can_be_planned_by_its_own_words(verb: str) -> None:
+    """Every setting that is in no table has its flag, in both verbs."""
+    assert {f"--{name.replace('_', '-')}" for name in {*SURVEY, *IN_TABLES} - set(TABLES)} <= set(_flags(verb))
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_flag_says_what_it_is(verb: str) -> None:
+    """Nobody has to guess."""
+    assert [name for name, words in _flags(verb).items() if not words] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["survy"], 'Unknown command "survy". Did you mean "survey"?; see spectralzoom --help'),
+        (["survey", "--budgt", "1"], "Unknown option: --budgt. Did you mean --budget?; see spectralzoom survey --help"),
+        (
+            ["plan", "--rounds=2"],
+            "Unknown option: --rounds; there is one round of detail: a second never paid (README, Limits) and was "
+            "removed; leave it out; see spectralzoom plan --help",
+        ),
+    ],
+)
+def test_a_wrong_word_is_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """With the nearest right one, or why it went, and where all of them stand; no list that is cut off."""
+    with pytest.raises(SystemExit) as ended:
+        cli.main(words)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == f"error: {message}\n"
+
+
+def test_printed_json_is_json(capsys: pytest.CaptureFixture[str]) -> None:
+    """What is not finite has no place in it."""
+    content: dict[str, Any] = {"a": float("nan"), "b": [1.5, float("inf")], "name": "ü"}
+    print_json(content)
+    assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail) == {"a": None, "b": [1.5, None], "name": "ü"}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_sigterm_ends_every_verb(
+    verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """143 and one sentence, which says whether the same command goes on; afterwards SIGTERM is what it was before."""
+    named = reduce(lambda found, word: found[word], verb.split(), app)
+
+    def terminated() -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        pytest.fail("SIGTERM was not heard")
+
+    monkeypatch.setattr(named, "default_command", terminated)
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as left:
+        cli.main(verb.split())
+    goes_on = "; the same command goes on from here" if verb in GOES_ON else ""
+    assert (left.value.code, capsys.readouterr().err.strip()) == (143, f"terminated{goes_on}")
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+ENDING = """
+import atexit, os, signal, sys
+from flows.cli.main import main
+atexit.register(lambda: os.kill(os.getpid(), signal.SIGTERM))
+sys.argv[1:] = ["--version"]
+main()
+"""
+
+
+def test_sigterm_has_no_effect_once_the_exit_code_stands() -> None:
+    """A command that has done its work and is ending, children and all, ends as it would have."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    ended = subprocess.run([sys.executable, "-c", ENDING], env=environment, capture_output=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, b"")

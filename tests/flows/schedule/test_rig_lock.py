@@ -1,0 +1,166 @@
+"""One rig, one holder: whoever asks, from whichever account, folder for temporary files or archive."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from flows.schedule import rig_lock as schedule_lock
+from flows.schedule.rig_lock import RigLock, rig_lock
+from flows.settings.survey_settings import Settings
+from pipeline.errors import ArchiveError, RigError
+from storage.archive.ledger import Ledger
+from storage.archive.staging import take_lock
+
+ROOT = Path(__file__).parents[3]
+PORT = f"/dev/ttyTEST{os.getpid()}"  # two runs of these tests on one machine are two rigs
+TAKES = """
+import os, sys
+from dataclasses import replace
+from pathlib import Path
+os.access = lambda *given, **named: False  # /run/lock is for others
+from flows.schedule.rig_lock import rig_lock
+from flows.settings.survey_settings import Settings
+settings = Settings()
+lock = rig_lock(replace(settings, source="rig", rig=replace(settings.rig, port=sys.argv[1])), Path())
+print(lock.take("a survey"), flush=True)
+sys.stdin.read()
+"""
+
+
+def lock_of(port: str = PORT) -> RigLock:
+    """The lock of the rig at a port."""
+    settings = Settings()
+    return rig_lock(replace(settings, source="rig", rig=replace(settings.rig, port=port)), Path())
+
+
+@contextmanager
+def takers(folder: Path, count: int) -> Iterator[list[tuple[subprocess.Popen[str], bool]]]:
+    """Processes that take the rig one after the other, each with another TMPDIR; of other users, where that may be."""
+    tried: list[tuple[subprocess.Popen[str], bool]] = []
+    try:
+        for number in range(count):
+            temporary = folder / f"tmp-{number}"
+            temporary.mkdir(mode=0o777)
+            environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(temporary), "HOME": str(temporary)}
+            process = subprocess.Popen(
+                [sys.executable, "-c", TAKES, PORT],
+                env=environment,
+                text=True,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+            )
+            assert process.stdout is not None
+            tried.append((process, process.stdout.readline() == "True\n"))
+        yield tried
+    finally:
+        for process, _ in tried:
+            process.kill()
+            process.communicate()
+
+
+def test_three_users_with_folders_of_their_own(tmp_path: Path) -> None:
+    """With /run/lock shut and another TMPDIR each, one of three has the rig, and it is free once that one is killed."""
+    with takers(tmp_path, 3) as tried:
+        assert [took for _, took in tried] == [True, False, False]
+        lock, holder = lock_of(), tried[0][0]
+        assert not lock.take()
+        assert lock.holder() == f"a survey (process {holder.pid})"
+        holder.kill()
+        holder.wait()
+        assert lock.take("by hand")
+        assert lock_of().holder() == f"by hand (process {os.getpid()})"
+        lock.release()
+    assert lock_of().holder() == "another process"
+
+
+def test_two_names_of_one_port_are_one_rig(tmp_path: Path) -> None:
+    """A link to the device, as udev makes them, is the device; ports whose names are long are told apart."""
+    (tmp_path / "tty").touch()
+    (tmp_path / "by-id").symlink_to(tmp_path / "tty")
+    assert lock_of(str(tmp_path / "by-id")).place == lock_of(str(tmp_path / "tty")).place
+    one, other = (lock_of(f"socket://{'a' * 200}:{port}") for port in (5000, 5001))
+    assert one.take()
+    assert other.take()
+    one.release()
+    other.release()
+
+
+def test_a_rig_that_cannot_be_locked_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the kernel refuses for another reason than that it is held, there is one message and no rig."""
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(schedule_lock.socket, "socket", refuse)
+    with pytest.raises(RigError, match=r"cannot lock the rig .*: Operation not permitted; .* goes on without"):
+        lock_of().take()
+
+
+def test_a_system_without_such_names_uses_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Elsewhere than on Linux a file at a fixed place is the lock, whatever TMPDIR says, and links are refused."""
+    monkeypatch.setattr(schedule_lock.sys, "platform", "darwin")
+    place = lock_of("/dev/cu.usb").place
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    assert lock_of("/dev/cu.usb").place == place == Path("/tmp/spectralzoom-rig-dev-cu.usb.lock")
+    monkeypatch.setattr(schedule_lock, "FIXED_FOLDER", tmp_path)
+    lock, other = lock_of("/dev/cu.usb"), lock_of("/dev/cu.usb")
+    assert lock.take("a survey")
+    assert not other.take()
+    assert other.holder() == f"a survey (process {os.getpid()})"
+    lock.release()
+
+
+@pytest.mark.parametrize("kind", ["to a file", "to nothing", "hard"])
+def test_what_a_lock_points_at_is_left_alone(tmp_path: Path, kind: str) -> None:
+    """A link in the lock's place is refused by name; a file that has another name too is locked and not written."""
+    target, path = tmp_path / "precious", tmp_path / "rig.lock"
+    if kind != "to nothing":
+        target.write_text("bytes")
+    lock = RigLock(path)
+    if kind == "hard":
+        path.hardlink_to(target)
+        assert lock.take("a survey")
+        lock.release()
+    else:
+        path.symlink_to(target)
+        with pytest.raises(ArchiveError, match=r"rig\.lock is a link, expected a lock file of its own; see where it"):
+            lock.take("a survey")
+    assert target.exists() == (kind != "to nothing")
+    assert not target.exists() or target.read_text() == "bytes"
+
+
+def test_words_of_a_lock_are_its_holders(tmp_path: Path) -> None:
+    """A file left by a killed process with longer words keeps none of them."""
+    path = tmp_path / "rig.lock"
+    path.write_text("a survey of a field with a very long name indeed (process 1)\n")
+    lock = RigLock(path)
+    assert lock.take("x")
+    assert path.read_text() == f"x (process {os.getpid()})\n"
+    lock.release()
+
+
+def test_locks_and_ledgers_of_an_archive_follow_no_link(tmp_path: Path) -> None:
+    """Neither a lock, nor the folder of locks, nor a field's ledger is used through a link; a FIFO is no lock file."""
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    for name in ("linked", "piped", "schedule"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "linked" / ".locks").symlink_to(elsewhere)
+    (tmp_path / "piped" / ".locks").mkdir()
+    os.mkfifo(tmp_path / "piped" / ".locks" / "use.lock")
+    (tmp_path / "schedule" / "north.jsonl").symlink_to(elsewhere / "north")
+    with pytest.raises(ArchiveError, match=r"\.locks is a link, expected a folder of its own"):
+        take_lock(tmp_path / "linked" / ".locks" / "use.lock")
+    with pytest.raises(ArchiveError, match=r"use\.lock is no file, expected a lock file"):
+        take_lock(tmp_path / "piped" / ".locks" / "use.lock")
+    with pytest.raises(ArchiveError, match="it is a link, expected a file; take it out"):
+        Ledger(tmp_path, "north").append({})
+    assert list(elsewhere.iterdir()) == []

@@ -1,0 +1,249 @@
+"""Serving: what is refused before anything runs, plain serving and artifacts."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import os
+import re
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from flows.publish.prefect_artifacts import MOST_BYTES, artifact_key, savings_rows, small_jpeg, survey_markdown
+from flows.schedule import prefect_schedule as serve_prefect
+from flows.schedule import serve_command
+from flows.schedule.fields import ServedField, alone_on, load_fields
+from flows.schedule.plain_schedule import serve_plain
+from flows.schedule.served import ServeRequest
+from flows.schedule.times import parse_timetable
+from flows.settings.survey_settings import Settings
+from pipeline.errors import ArchiveError
+from storage.archive.archive import Archive
+from storage.archive.ledger import Ledger
+from tests.flows.schedule.schedule_days import NOON, HandClock
+
+EVERY = parse_timetable(None, "20m", "UTC")
+
+
+BAD = {
+    "no fields": ((), "--every 30m", 2, "no fields: give the settings file of one or more"),
+    "every nothing": (("north",), "--every 0s", 2, "--every '0s': expected 10s to 366d"),
+    "cron of no minute": (("north",), "--cron '61_*_*_*_*'", 2, "--cron '61 .*': Bad minute; expected such as"),
+    "cron nonsense": (("north",), "--cron hourly", 2, "--cron 'hourly': expected five fields"),
+    "neither": (("north",), "", 2, "needs --cron or --every, got neither"),
+    "both": (("north",), "--every 30m --cron *", 2, "got both"),
+    "no such file": (("nowhere",), "--every 30m", 2, "no settings file .*nowhere.toml"),
+    "unknown key": (("typo",), "--every 30m", 2, "unknown setting 'sceene' in .*typo.toml; did you mean 'scene'"),
+    "neither scene nor rig": (("blind",), "--every 30m", 2, "blind.toml says neither scene nor source = 'rig'"),
+    "scene missing": (("gone",), "--every 30m", 1, "gone.toml: there is no file .*gone.png"),
+    "twice": (("north", "north"), "--every 30m", 2, "are both called north"),
+    "late": (("north",), "--every 30m --late 1.5", 2, "--late 1.5: expected a share of the interval"),
+    "limit": (("north",), "--every 30m --limit 0", 2, "--limit 0: expected 1 or more"),
+    "zone": (("north",), "--cron '0_6_*_*_*' --timezone Mars/Olympus", 2, "'Mars/Olympus' is no time zone"),
+    "address": (("north",), "--every 30m --notify ftp://x", 2, "expected https://HOST/PATH"),
+    "address of no port": (("north",), "--every 30m --notify http://host:port/x", 2, "'http://host:port/x' is no addr"),
+    "name": (("named",), "--every 30m", 2, "'name' in .*named.toml must be a name of letters, digits"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_refused_before_anything_is_served(
+    case: str, field_file: Callable[..., Path], tmp_path: Path, command_line: Any
+) -> None:
+    """One clear message and the right exit code; no archive and no server is left."""
+    names, words, code, message = BAD[case]
+    field_file("north")
+    field_file("typo", lines='sceene = "x"')
+    field_file("blind", scene=None)
+    field_file("gone", scene="gone.png")
+    field_file("named", name="../north")
+    given = [word.strip("'").replace("_", " ") for word in words.split()]
+    ended = command_line("serve", *(tmp_path / f"{name}.toml" for name in names), *given)
+    assert (ended.code, len(ended.errors)) == (code, 1), ended.err
+    assert re.search(message, ended.errors[0]), ended.errors[0]
+    assert not (tmp_path / "archive" / "schedule").exists()
+
+
+def test_two_serves_on_one_archive(field_file: Callable[..., Path], command_line: Any) -> None:
+    """The second is refused, and nothing of the first is changed."""
+    file = field_file()
+    with alone_on(load_fields([file])):
+        ended = command_line("serve", file, "--every", "30m", "--engine", "plain")
+    assert (ended.code, len(ended.errors)) == (1, 1)
+    assert "another serve works on the archive" in ended.errors[0]
+
+
+def test_two_serves_of_one_rig(field_file: Callable[..., Path], tmp_path: Path, command_line: Any) -> None:
+    """Also with archives of their own the second is refused: a rig is served once."""
+    port = f"/dev/ttyNONE{os.getpid()}"  # these tests may run twice on one machine
+    rig = f'[rig]\nport = "{port}"\nhost = "192.0.2.1"\n'
+    files = [field_file(name, out=str(tmp_path / name), source="rig") for name in ("north", "south")]
+    for file in files:
+        file.write_text(file.read_text() + rig)
+    with alone_on(load_fields(files[:1])):
+        ended = command_line("serve", files[1], "--every", "30m", "--engine", "plain")
+    assert (ended.code, len(ended.errors)) == (1, 1), ended.err
+    assert f"another serve uses the rig at {port}: give all its fields to that one" in ended.errors[0]
+
+
+@pytest.mark.parametrize(
+    ("url", "words", "message"),
+    [
+        ("http://127.0.0.1:9/api", (), "no Prefect server answers at http://127.0.0.1:9/api, which PREFECT_"),
+        ("", ("--port", 70000), "--port 70000 cannot be used"),
+    ],
+)
+def test_a_server_that_cannot_be_had(
+    url: str,
+    words: Sequence[object],
+    message: str,
+    field_file: Callable[..., Path],
+    command_line: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One message, before anything is said to be served; the field's ledger has no line."""
+    monkeypatch.setenv("PREFECT_API_URL", url)
+    file = field_file()
+    ended = command_line("serve", file, "--every", "30m", *words)
+    assert (ended.code, len(ended.errors)) == (2, 1), ended.err
+    assert message in " ".join(ended.errors[0].split())
+    assert "serving" not in ended.err
+    assert load_fields([file])[0].schedule(EVERY, 0.5).ledger.lines() == []
+
+
+def test_a_ledger_that_cannot_be_written_at_the_start(
+    field_file: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is served on Prefect, and no field is left as if it were."""
+    request = ServeRequest(fields=load_fields([field_file("north"), field_file("south")]), timetable=EVERY, late=0.5)
+    append = Ledger.append
+
+    def refuse(self: Ledger, line: Mapping[str, Any]) -> None:
+        if self.field == "south":
+            raise ArchiveError("the disk is full")
+        append(self, line)
+
+    monkeypatch.setattr(Ledger, "append", refuse)
+    monkeypatch.setattr(serve_prefect, "server_for", lambda home, port: nullcontext())
+    with pytest.raises(ArchiveError, match="the disk is full"):
+        serve_prefect.serve_prefect(request, lambda words: None)
+    assert [line["event"] for line in request.schedules()["north"].ledger.lines()] == ["opened", "closed"]
+
+
+def test_sigterm_stops_a_schedule(
+    field_file: Callable[..., Path], command_line: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That is the way to stop it, and no error: it says how to go on, and ends with 0."""
+
+    def terminated(*given: Any) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        pytest.fail("SIGTERM was not heard")
+
+    monkeypatch.setattr(serve_command, "_serve_plain", terminated)
+    ended = command_line("serve", field_file(), "--every", "30m", "--engine", "plain")
+    assert (ended.code, ended.errors) == (0, [])
+    assert ended.err.splitlines()[-1].startswith("stopped: nothing is due any more; the same command serves again")
+
+
+def test_the_flag_for_the_archive_wins(field_file: Callable[..., Path], tmp_path: Path) -> None:
+    """Fields keep their own archives, unless one is given for all."""
+    files = [field_file("north"), field_file("south", out=str(tmp_path / "other"))]
+    assert [Path(one.settings.out).name for one in load_fields(files)] == ["archive", "other"]
+    assert {one.settings.out for one in load_fields(files, "all")} == {"all"}
+
+
+def test_a_farm_that_grows_is_seen_on_its_day() -> None:
+    """Each due time is a visit of its own; the built-in farm is as on that day, unless the settings say another."""
+    due = datetime(2026, 2, 1, 23, 30, tzinfo=UTC)
+    one = ServedField("farm", Path("farm.toml"), Settings(scene="farm@2"))
+    berlin = parse_timetable("30 0 * * *", None, "Europe/Berlin")
+    asked = one.settings_of(due, berlin)
+    assert (asked.name, asked.visit, asked.day) == ("farm", "2026-02-01T23:30:00Z", 33)
+    fixed = ServedField("farm", Path("farm.toml"), Settings(scene="farm@2", day=172))
+    assert fixed.settings_of(due, berlin).day == 172
+    rig = ServedField("farm", Path("farm.toml"), Settings(scene="farm@2", source="rig"))
+    assert rig.settings_of(due, berlin).day is None  # what stands before a rig is as it is
+
+
+def test_plain_serving_needs_no_server(
+    field_file: Callable[..., Path], command_line: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Its surveys run without one too, whatever the fields' files say or leave out."""
+    engines: list[str] = []
+
+    def served(schedules: Any, locks: Any, survey: Callable[..., Path], *_: Any, **named: Any) -> None:
+        survey("north", NOON)
+
+    def surveyed(one: ServedField, *_: Any) -> Path:
+        engines.append(one.settings.engine)
+        return tmp_path
+
+    monkeypatch.setattr(serve_command, "serve_plain", served)
+    monkeypatch.setattr(serve_command, "survey_field", surveyed)
+    ended = command_line("serve", field_file("north", engine="prefect"), "--every", "30m", "--engine", "plain")
+    assert (ended.code, engines) == (0, ["plain"])
+
+
+def test_plain_serving_surveys_fields_in_turn_and_each_visit_anew(
+    field_file: Callable[..., Path], tmp_path: Path, survey_png: Any
+) -> None:
+    """Two fields, two due times: four published runs, each with light of its own, and ledgers that name them."""
+    fields = {one.name: one for one in load_fields([field_file("north"), field_file("south")])}
+    clock = HandClock()
+    schedules = {name: one.schedule(EVERY, 0.5, clock) for name, one in fields.items()}
+
+    def survey(name: str, due: datetime) -> Path:
+        asked = fields[name].settings_of(due, EVERY)
+        return Path(survey_png(tmp_path / "archive", name=name, visit=asked.visit).folder)
+
+    serve_plain(
+        schedules,
+        {name: one.lock() for name, one in fields.items()},
+        survey,
+        lambda words: None,
+        clock=clock,
+        until=NOON + timedelta(minutes=41),
+    )
+    archive = Archive.open(tmp_path / "archive")
+    assert [path.name.split("-")[1] for path in archive.runs()] == ["north", "south", "north", "south"]
+    for name, schedule in schedules.items():
+        lines = schedule.ledger.lines()
+        assert [line["event"] for line in lines] == ["opened", "begun", "done", "begun", "done", "closed"], name
+        assert all((archive.root / line["run"]).is_dir() for line in lines if line["event"] == "done")
+    receipts = [json.loads((path / "receipt.json").read_text()) for path in archive.runs()]
+    assert (
+        len({receipt["products"]["raw_coarse"] for receipt in receipts}) == 2
+    )  # one for each visit: here both fields are one scene
+    assert [finding for finding in archive.verify_all() if finding.problem] == []
+
+
+def test_the_picture_of_an_artifact_is_small(survey_png: Any, tmp_path: Path) -> None:
+    """At most 100 KiB in the text, whatever the picture; the text has the receipt's figures and where the report is."""
+    noise = np.random.default_rng(0).integers(0, 256, (1500, 2000, 3), dtype=np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(noise).save(file, "PNG")
+    assert len(base64.b64encode(small_jpeg(file.getvalue()))) <= MOST_BYTES
+    published = survey_png(tmp_path)
+    text = survey_markdown(published, "archive/runs/x")
+    assert "data:image/jpeg;base64," in text
+    assert "archive/runs/x/report.html" in text
+    assert all(row["cost"] in text for row in savings_rows(published.receipt))
+    assert artifact_key("North_field 7") == "north-field-7"
+
+
+def test_alone_means_alone(field_file: Callable[..., Path]) -> None:
+    """The lock of a serve is free again after it."""
+    fields = load_fields([field_file()])
+    with alone_on(fields), pytest.raises(ArchiveError, match="another serve"), alone_on(fields):
+        pass
+    with alone_on(fields):
+        pass

@@ -1,0 +1,385 @@
+"""Settings: defaults, precedence, and every mistake refused with its place and its cure."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import MISSING, asdict, fields, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flows.settings.declared import SURVEY, TABLES
+from flows.settings.documents import example_toml, settings_table
+from flows.settings.load import load_settings, of_this_version, parse_settings
+from flows.settings.survey_settings import MapChoice, Settings
+from flows.settings.values import Tolerance
+from pipeline.errors import BudgetError, SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import CostModel
+from pipeline.ground.view import RigPose
+from pipeline.simulator.effects.registry import EFFECTS
+from pipeline.simulator.rig_model import Air, Detector, Optics, Rig, Sky
+from storage.archive.whole_files import to_json
+
+EXAMPLE = Path(__file__).parents[3] / "survey.example.toml"
+POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 30, "tilt_deg": 40, "height_m": 12}
+
+
+@pytest.fixture
+def toml(tmp_path: Path):
+    """Write text as a survey's file and give its path."""
+
+    def write(text: str) -> Path:
+        path = tmp_path / "survey.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def test_nothing_given_is_the_default():
+    """No file and no flag gives the defaults of the design."""
+    found = load_settings()
+    assert found == Settings()
+    assert (found.scene, found.budget, found.policy, found.memory) == ("farm", 0.5, "gain", 4 * 2**30)
+
+
+def test_every_field_of_the_dataclasses_can_be_set():
+    """Every part of the survey and of the rig is read back from its plain values."""
+    for name in ("camera", "cost", "optics", "mirror", "detector", "air", "sky"):
+        assert parse_settings({name: asdict(getattr(Settings(), name))}) == Settings()
+
+
+def test_words_are_those_of_the_parts_that_use_them():
+    """Effects that the settings accept are exactly those that exist."""
+    every = ",".join(effect.name for effect in EFFECTS)
+    assert parse_settings({"effects": every}).effects == every
+
+
+def test_flags_win_over_the_file(toml):
+    """A flag replaces the file's value and leaves the others."""
+    path = toml('budget = 0.4\npolicy = "sobel"\n[camera]\nexposure_ms = 50\nbits = 10\n')
+    found = load_settings(path, {"budget": "0.3", "camera.exposure_ms": 20, "seed": None})
+    assert (found.budget, found.policy, found.seed) == (0.3, "sobel", 0)
+    assert (found.camera.exposure_ms, found.camera.bits) == (20.0, 10)
+
+
+def test_paths_of_a_file_start_at_its_folder(toml):
+    """Relative paths move with the settings file; built-in names and flags stay as they are."""
+    path = toml('scene = "field.npy"\nlabels = "/data/labels.png"\nsource = "sim"\n')
+    found = load_settings(path, {"out": "here"})
+    assert found.scene == str(path.parent / "field.npy")
+    assert (found.labels, found.source, found.out) == ("/data/labels.png", "sim", "here")
+    assert load_settings(toml('scene = "farm"')).scene == "farm"
+
+
+def test_example_in_the_project_is_valid():
+    """The example that the README points to is accepted and says the defaults."""
+    found = load_settings(EXAMPLE)
+    assert replace(found, out=Settings.out) == Settings()
+
+
+def test_example_is_what_the_declarations_say():
+    """The file is made of them; after a change: python -m flows.settings.documents > survey.example.toml."""
+    assert EXAMPLE.read_text(encoding="utf-8") == example_toml()
+
+
+def test_the_table_of_documents_has_every_setting():
+    """With its default, what it may be, and a line of help, in as many cells everywhere."""
+    rows = [line.split(" | ") for line in settings_table().splitlines() if line.startswith("| `")]
+    assert [row[0].strip("| `") for row in rows] == [
+        *(name for name in SURVEY if name not in TABLES),
+        *(key for keys in TABLES.values() for key in keys),
+    ]
+    assert {len(row) for row in rows} == {4}
+    assert ["| `samples`", "`640`", "a whole number from 16 to 65536", "Pixels of a line [px] |"] in rows
+
+
+def test_every_setting_says_what_it_is_and_takes_its_default():
+    """A line of help each, and a default (or an example) that its own range does not refuse."""
+    for keys in ({name: one for name, one in SURVEY.items() if name not in TABLES}, *TABLES.values()):
+        for name, one in keys.items():
+            assert one.item.metadata["description"], name
+            value = one.told["example"] if one.item.default in (None, MISSING) else one.item.default
+            assert one.read(str(value) if isinstance(value, Tolerance) else value, name) is not None
+
+
+def test_example_lists_every_setting():
+    """Those without a default, and whole tables, stand in comments."""
+    lines = [line.removeprefix("# ") for line in EXAMPLE.read_text(encoding="utf-8").splitlines()]
+    named = {line.partition("=")[0].strip() for line in lines if "=" in line}
+    assert {item.name for item in fields(Settings)} - set(TABLES) <= named
+    for name, keys in TABLES.items():
+        assert f"[{name}]" in lines
+        assert set(keys) <= named, name
+
+
+@pytest.mark.parametrize(
+    ("line", "near"),
+    [
+        ("budgt = 0.5", "'budget'"),
+        ("waveleghts = [660]", "'wavelengths'"),
+        ("[camera]\nexposure = 100", "'camera.exposure_ms'"),
+        ("[camra]\nbits = 12", "'camera'"),
+        ("exposure_ms = 100", "'camera.exposure_ms'"),
+        ("[pose]\nlat = 52.1", "'pose.lat_deg'"),
+        ("height_m = 12", "'pose.height_m'"),
+        ("[map]\nresolution = 0.1", "'map.resolution_m'"),
+        ("pointing = 50", "'pointing_px'"),
+        ("[mirror]\nnatural = 20", "'mirror.natural_hz'"),
+        ("smile_nm = 0.2", "'optics.smile_nm'"),
+    ],
+)
+def test_unknown_key_is_refused_with_the_nearest(toml, line, near):
+    """A misspelt key is named together with the file and the key that was probably meant."""
+    with pytest.raises(SettingsError, match=rf"unknown setting.*survey\.toml; did you mean {near}"):
+        load_settings(toml(line))
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"camera": {"exposure_ms": 0.1}}, "from 0.5 to 10000 ms, got 0.1; was it given in seconds.* 100"),
+        ({"camera": {"exposure_ms": 10_001}}, "10000 ms, got 10001; was it given in microseconds"),
+        ({"camera": {"pitch_um": 7.4e-6}}, "um, got 7.4e-06; was it given in metres.* 7.4"),
+        ({"camera": {"focal_length_mm": 0.07}}, "mm, got 0.07; was it given in metres.* 70"),
+        ({"cost": {"slew_s": 50}}, "s, got 50; was it given in milliseconds.* 0.05"),
+        ({"wavelengths": [0.66, 0.8]}, "nm, got 0.66; was it given in micrometres.* 660"),
+        ({"camera": {"exposure_ms": float("nan")}}, "got nan$"),
+        ({"pose": POSE | {"lat_deg": 521000000}}, "90 deg, got 521000000; was it given in 1e-7 degrees.* 52.1"),
+        ({"pose": POSE | {"height_m": 120_000}}, "20000 m, got 120000; was it given in millimetres.* 120"),
+        ({"map": {"resolution_m": 1e-5}}, "m, got 1e-05; was it given in kilometres.* 0.01"),
+    ],
+)
+def test_unit_mistakes_are_refused_with_a_guess(table, words):
+    """A value out of range says the range, and the unit in which it would make sense."""
+    with pytest.raises(SettingsError, match=words):
+        parse_settings(table)
+
+
+@pytest.mark.parametrize("budget", ["abc", 0, "0", -1, 1.5, float("nan"), True, float("inf"), [0.5]])
+def test_budget_out_of_range_is_refused(budget):
+    """A budget is a share above 0 and at most 1; anything else says so and exits with 2."""
+    with pytest.raises(BudgetError, match="above 0 and at most 1, got") as caught:
+        load_settings(flags={"budget": budget})
+    assert caught.value.exit_code == 2
+    assert str(caught.value).startswith("--budget")
+
+
+def test_budget_in_percent_is_guessed():
+    """35 was meant as 0.35, and 1 is the whole scan."""
+    with pytest.raises(BudgetError, match=r"for 35 % write 0\.35"):
+        parse_settings({"budget": 35})
+    assert parse_settings({"budget": 1}).budget == 1.0
+
+
+@pytest.mark.parametrize(
+    ("text", "count"), [("4GiB", 2**32), ("500 MB", 500_000_000), ("1.5gib", 3 * 2**29), (2**30, 2**30)]
+)
+def test_memory_reads_units(text, count):
+    """Binary and decimal units are told apart."""
+    assert parse_settings({"memory": text}).memory == count
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"memory": "four"}, "such as 4GiB"),
+        ({"memory": "4"}, "at least 256MiB"),
+        ({"scheduler": "dask"}, "'scheduler': .* threads, processes, or the address of a dask scheduler such as tcp:"),
+        ({"workers": 0}, "a whole number from 1 to 1024, got 0; one process or thread each"),
+        ({"rounds": 1}, r"unknown setting 'rounds'; there is one round of detail: .* was removed; leave it out$"),
+        ({"rounds": 2}, r"unknown setting 'rounds'; there is one round of detail: .* was removed; leave it out$"),
+        ({"threshold": -1}, "threshold' must be a number from 0 to 1e\\+09 nat per second, got -1"),
+        ({"threshold": 1, "policy": "sobel"}, "policy 'sobel' scores in a unit of its own: leave --threshold out"),
+        ({"seed": -1}, "whole number from 0"),
+        ({"seed": 1.0}, "whole number from 0"),
+        ({"policy": "entropi"}, "one of gain, entropy, margin, sobel, .*mask"),
+        ({"policy": "mask"}, "needs a mask file"),
+        ({"mask": "m.png"}, "policy 'mask' only"),
+        ({"effects": "smear,glare"}, r"'effects': unknown effect 'glare'"),
+        ({"effects": "smear,turbulance"}, "did you mean 'turbulence'"),
+        ({"effects": "slit,throughput"}, "the effect 'throughput' is now called 'vignetting'"),
+        ({"effects": ["read"]}, "the effect 'read' is now called 'read-noise'"),
+        ({"effects": "auto,slit"}, "'auto' stands alone, got 'auto,slit'"),
+        ({"effects": []}, "no effect is named"),
+        ({"tol": -0.1}, "'tol' must be 0 or more, in sigmas of the noise such as 0.1, or in DN .* got -0.1"),
+        ({"tol": "10%"}, "'tol' must be 0 or more"),
+        ({"tol": True}, "'tol' must be 0 or more"),
+        ({"tol": float("nan")}, "'tol' must be 0 or more"),
+        ({"optics": {"aperture_mm": 0.015}}, "from 0.1 to 1000 mm, got 0.015; was it given in metres.* 15"),
+        ({"optics": {"focus_m": 0}}, "of at least 0.01 m or inf, got 0"),
+        ({"optics": {"fwhm_nm": float("inf")}}, "from 0 to 1000 nm, got inf"),
+        ({"mirror": {"repeatability_urad": -40e-6}}, "from 0 to 100000 urad"),
+        (
+            {"mirror": {"coating": "brass"}},
+            "'mirror.coating' must be one of aluminium, gold, silver, ideal; got 'brass'",
+        ),
+        (
+            {"optics": {"polarisation": 0.02}},
+            r"unknown .*'optics\.polarisation'; the mirror's coating .* \[mirror\] coat",
+        ),
+        ({"detector": {"noiseless": "maybe"}}, "true or false"),
+        ({"detector": {"temperature_deg_c": 60}}, "from -80 to 50 deg C, got 60"),
+        ({"detector": {"unit": 1.5}}, "whole number from 0"),
+        ({"air": {"distance_m": 0}}, "of at least 0.001 m, got 0"),
+        ({"air": {"relief": "hills"}}, "one of flat, step, plane; got 'hills'"),
+        ({"air": {"nearest_m": 3}}, "needs air.distance_m"),
+        ({"air": {"distance_m": 5, "nearest_m": 6, "farthest_m": 4}}, "nearest_m = 6 lies beyond air.farthest_m = 4"),
+        ({"sky": {"started": "noon"}}, "must be a date and time with its zone, such as .* got noon"),
+        ({"sky": {"started": datetime(2026, 6, 1, 12)}}, "needs a time zone: write 2026-06-01T12:00:00Z for UTC"),
+        ({"sky": {"latitude_deg": 520000000}}, "90 deg, got 520000000; was it given in 1e-7 degrees.* 52"),
+        ({"bands": [0, 0]}, "names a band twice"),
+        ({"bands": "0;1"}, "counted from 0"),
+        ({"bands": [0, 1], "wavelengths": [660]}, "each of the 2 bands, got 1"),
+        ({"size": "1280"}, "WIDTHxHEIGHT"),
+        ({"size": "64x64", "scene": "a.png"}, "has its own"),
+        ({"controls": "no"}, "true or false"),
+        ({"camera": 3}, "must be a table"),
+        ({"camera": {"dark_dn": 5000}}, "leaves no room"),
+        ({"out": " "}, "text that is not empty"),
+        ({"kernel": "cubic"}, "one of catmull-rom, bilinear, nearest; got 'cubic'"),
+        ({"pointing_px": -1}, "from 0 to 300 px, got -1"),
+        ({"pose": {"lat_deg": 52.1, "tilt_deg": 40}}, r"\[pose\] lacks lon_deg, heading_deg; give every one"),
+        ({"pose": POSE | {"range_m": 20}}, r"\[pose\]: .* height_m or range_m, one of the two; got height_m = 12"),
+        ({"pose": POSE | {"height_m": None}}, "needs height_m or range_m, one of the two"),
+        ({"pose": POSE | {"tilt_deg": 91}}, "tilt_deg' must be a number from -90 to 90 deg, got 91"),
+        ({"pose": POSE | {"slope_deg": float("inf")}}, "slope_deg' must be a number from 0 to 80 deg"),
+        ({"map": {"epsg": 32632}}, r"\[map\] .* where the rig stands: give \[pose\]"),
+        ({"pose": POSE, "map": {"epsg": "UTM 32"}}, "from 1024 to 32767, got 'UTM 32'; the number after EPSG:"),
+    ],
+)
+def test_wrong_values_are_refused(table, words):
+    """Each wrong value is refused by a message that says what is wanted."""
+    with pytest.raises(SettingsError, match=words):
+        parse_settings(table)
+
+
+def test_a_pose_and_its_map_are_read(toml):
+    """The tables become the pose and the choice of the map; without them there is no pose."""
+    found = load_settings(toml("[pose]\nlon_deg = -3.25\nlat_deg = 57\nheading_deg = 350\ntilt_deg = 20\nrange_m = 40"))
+    assert found.pose == RigPose(lon_deg=-3.25, lat_deg=57.0, heading_deg=350.0, tilt_deg=20.0, range_m=40.0)
+    assert (found.map, Settings().pose) == (MapChoice(), None)
+    found = parse_settings({"pose": POSE, "map": {"epsg": 25832, "resolution_m": 0.05}})
+    assert found.map == MapChoice(25832, 0.05)
+
+
+def test_the_commented_pose_of_the_example_is_valid():
+    """Taking off the comment signs of [pose] and [map] gives a posed survey (with one of height and range)."""
+    text = EXAMPLE.read_text(encoding="utf-8")
+    lines = [line.removeprefix("# ") for line in text[text.index("# [pose]") :].splitlines()]
+    table = tomllib.loads(
+        "\n".join(line for line in lines if line.startswith("[") or (" = " in line and not line.startswith("range_m")))
+    )
+    found = parse_settings(table)
+    assert found.pose is not None
+    assert (found.pose.height_m, found.map.epsg) == (12.0, 32632)
+    assert set(table["pose"]) | {"range_m"} == {item.name for item in fields(RigPose)}
+
+
+def test_a_rig_is_read_from_its_tables(toml):
+    """Every table becomes its part of the rig; without them it is the rig at rest in calm, clear air."""
+    assert Settings().simulated_rig == Rig()
+    found = load_settings(
+        toml(
+            "tol = 0.5\n[optics]\nfocus_m = inf\nsmile_nm = -0.2\n[mirror]\ndamping = 1\n[detector]\nnoiseless = true\n"
+            '[air]\ndistance_m = 30\nrelief = "step"\nnearest_m = 20\n[sky]\nstarted = 2026-06-01T12:00:00+02:00\n'
+        )
+    )
+    rig = found.simulated_rig
+    assert (rig.optics, rig.mirror.damping, rig.detector) == (Optics(smile_nm=-0.2), 1.0, Detector(noiseless=True))
+    assert rig.air == Air(distance_m=30.0, relief="step", nearest_m=20.0)
+    assert rig.sky.started == datetime(2026, 6, 1, 10, tzinfo=UTC)
+    assert rig.camera == found.camera
+
+
+def test_receipts_of_before_are_read():
+    """Keys that there are no longer are left out of a receipt's settings, in its tables too; the others stay."""
+    now = Settings(seed=3, optics=Optics(smile_nm=1.0)).to_dict()
+    before = now | {"patch": 16, "rounds": 1, "rig": {**now["rig"], "old": 1}}
+    before["optics"] = {**now["optics"], "polarisation": 0.02}
+    assert of_this_version(before) == now
+    assert parse_settings(of_this_version(before)) == Settings(seed=3, optics=Optics(smile_nm=1.0))
+    with pytest.raises(SettingsError, match=r"its survey had 2 rounds of detail, .* survey the field by hand"):
+        of_this_version(before | {"rounds": 2})
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [
+        (0.1, Tolerance()),
+        ("0.1", Tolerance()),
+        (0, Tolerance(0.0)),
+        ("0.5dn", Tolerance(0.5, "dn")),
+        ("0.5 DN", Tolerance(0.5, "dn")),
+        ("2 sigma", Tolerance(2.0)),
+        ("inf", Tolerance(float("inf"))),
+        (float("inf"), Tolerance(float("inf"))),
+        ("1e-3dn", Tolerance(1e-3, "dn")),
+    ],
+)
+def test_a_tolerance_has_a_unit(given, wanted):
+    """Sigmas of the noise, or DN; what is written of it reads back the same."""
+    found = parse_settings({"tol": given}).tol
+    assert found == wanted
+    assert parse_settings({"tol": str(found)}).tol == wanted
+
+
+def test_file_that_cannot_be_read_is_one_message(toml, tmp_path):
+    """A missing file, a folder and broken TOML are settings errors with the path."""
+    with pytest.raises(SettingsError, match=r"no settings file .*nowhere\.toml"):
+        load_settings(tmp_path / "nowhere.toml")
+    with pytest.raises(SettingsError, match="cannot read the settings file"):
+        load_settings(tmp_path)
+    with pytest.raises(SettingsError, match=r"cannot read the settings file .*line 1.*expected TOML"):
+        load_settings(toml("budget 0.5"))
+
+
+def test_text_and_lists_say_the_same():
+    """What a flag says with commas is what a file says with a list."""
+    one = load_settings(flags={"bands": "0, 2", "wavelengths": "660,800.5", "size": "300x20", "effects": "shot,slit"})
+    two = parse_settings({"bands": [0, 2], "wavelengths": [660, 800.5], "size": [300, 20], "effects": ["slit", "shot"]})
+    assert one == two
+    assert (one.shape, one.effects) == ((20, 300), "slit,shot")
+
+
+@given(
+    budget=st.floats(0, 1, exclude_min=True),
+    seed=st.integers(0, 2**63 - 1),
+    bands=st.none() | st.sets(st.integers(0, 900), min_size=1),
+    memory=st.integers(2**28, 2**40),
+    exposure=st.floats(0.5, 10_000),
+    slew=st.floats(0, 10),
+    posed=st.booleans(),
+    tolerance=st.builds(Tolerance, st.floats(0), st.sampled_from(["sigma", "dn"])),
+)
+def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposure, slew, posed, tolerance):
+    """`parse_settings` undoes `to_dict`, so that a receipt's settings can be run again."""
+    settings = Settings(
+        budget=budget,
+        seed=seed,
+        bands=None if bands is None else tuple(bands),
+        memory=memory,
+        camera=LineCamera(exposure_ms=exposure),
+        cost=CostModel(slew_s=slew),
+        pose=RigPose(**POSE) if posed else None,
+        map=MapChoice(resolution_m=0.1 if posed else None),
+        pointing_px=slew,
+        tol=tolerance,
+        sky=Sky(started=datetime(2026, 6, 1, 10, tzinfo=UTC) if posed else None, cloud_share=budget),
+        air=Air(distance_m=exposure if posed else None),
+        detector=Detector(well_e=exposure + 1),
+    )
+    assert parse_settings(settings.to_dict()) == settings
+    assert parse_settings(json.loads(to_json(settings.to_dict()))) == settings
+
+
+@pytest.mark.parametrize("value", ["", 3])
+def test_a_scheduler_that_is_no_text_is_named_once(value):
+    """A setting stands once in its message."""
+    with pytest.raises(SettingsError, match=r"^'scheduler' must be text that is not empty"):
+        parse_settings({"scheduler": value})

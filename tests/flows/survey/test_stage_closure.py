@@ -1,0 +1,190 @@
+"""What a stage's code is: which definitions are reached, and what leaves their digest alone."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.flows.survey.stage_closure import Sources
+
+STAGE = """
+import numpy as np
+from models.light import Lamp, brighter as more
+from pipeline import sums
+
+LEAST = 3
+
+def stage(lamp: Lamp, by: int = LEAST) -> int:
+    from storage.store import write
+    write(more(lamp, by))
+    return sums.total(np.ones(by))
+
+def unasked():
+    return LEAST
+"""
+TEXTS = {
+    "flows.survey.stages": STAGE,
+    "models.light": """
+from pipeline.shapes import Shape
+
+STEP = 2
+
+class Lamp(Shape):
+    size: int = STEP
+    def lit(self): return self.size
+
+def brighter(lamp, by):
+    return lamp.lit() + by
+""",
+    "pipeline.shapes": "class Shape:\n    sides = 4\n",
+    "pipeline.sums": "import math\n\ndef total(values):\n    return math.fsum(values)\n",
+    "storage.store": "def write(value):\n    print(value)\n",
+}
+REACHED = {
+    ("flows.survey.stages", "stage"),
+    ("flows.survey.stages", "LEAST"),
+    ("models.light", "Lamp"),
+    ("models.light", "brighter"),
+    ("models.light", "STEP"),
+    ("pipeline.shapes", "Shape"),
+    ("pipeline.sums", "total"),
+    ("storage.store", "write"),
+}
+
+
+def digest(edits: dict[str, str], root: str = "stage") -> str:
+    """Digest of the stage above with some modules in other words."""
+    code = Sources(TEXTS | edits)
+    return code.digest(code.closure([root]))
+
+
+def edited(module: str, old: str, new: str) -> dict[str, str]:
+    """One module with one thing changed."""
+    assert old in TEXTS[module]
+    return {module: TEXTS[module].replace(old, new)}
+
+
+def test_names_are_followed_through_imports() -> None:
+    """Default values, annotations, base classes, modules' attributes and imports in functions lead on."""
+    assert Sources(TEXTS).closure(["stage"]) == REACHED
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        edited("flows.survey.stages", "LEAST = 3", "LEAST = 4"),
+        edited("flows.survey.stages", "import numpy as np", "import cupy as np"),
+        edited("models.light", "STEP = 2", "STEP = 1 + 2"),
+        edited("models.light", "lamp.lit() + by", "lamp.lit() - by"),
+        edited("pipeline.shapes", "sides = 4", "sides = 5"),
+        edited("pipeline.sums", "fsum", "prod"),
+        edited("storage.store", "print(value)", "print(value, value)"),
+    ],
+)
+def test_an_edited_expression_changes_the_digest(edit: dict[str, str]) -> None:
+    """Wherever in the closure it stands."""
+    assert digest(edit) != digest({})
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        edited("models.light", "def brighter(lamp, by):", 'def brighter(lamp, by):\n    """Words."""'),
+        edited("models.light", "    size: int = STEP", '    """Words."""\n\n    size: int = STEP  # px'),
+        edited("pipeline.shapes", "class Shape:", '"""A module."""\nclass Shape:'),
+        edited("storage.store", "print(value)", "print(\n        value,\n    )"),
+        edited("flows.survey.stages", "def unasked():\n    return LEAST", "def unasked():\n    return 0"),
+        edited("flows.survey.stages", "numpy as np", "numpy")
+        | {"flows.survey.stages": STAGE.replace("numpy as np", "numpy").replace("np.", "numpy.")},
+        {"flows.survey.stages": STAGE.replace("brighter as more", "brighter").replace("more(", "brighter(")},
+        {
+            "flows.survey.stages": STAGE.replace(
+                "from pipeline import sums", "from pipeline.sums import total"
+            ).replace("sums.t", "t")
+        },
+    ],
+)
+def test_other_words_for_the_same_leave_the_digest(edit: dict[str, str]) -> None:
+    """Docstrings, comments, layout, how a name is imported, and code that the stage does not reach."""
+    assert digest(edit) == digest({})
+
+
+def test_a_moved_definition_leaves_the_digest() -> None:
+    """A function, a class and a constant go to other files, and the imports with them."""
+    lines = TEXTS["models.light"].splitlines(keepends=True)
+    moved = {
+        "flows.survey.stages": STAGE.replace("models.light import", "models.beams import").replace(
+            "pipeline import", "storage import"
+        ),
+        "models.light": "STEP = 2\n",
+        "models.beams": "from models.light import STEP\n" + "".join(line for line in lines if "STEP = 2" not in line),
+        "pipeline.sums": "",
+        "storage.sums": TEXTS["pipeline.sums"],
+    }
+    assert digest(moved) == digest({})
+
+
+def test_local_names_are_no_imports() -> None:
+    """A parameter, a loop's variable and a comprehension's that are called as a definition do not reach it."""
+    text = """
+from models.light import Lamp, brighter, STEP
+
+def stage(Lamp):
+    for brighter in Lamp:
+        print(brighter)
+    return [STEP for STEP in Lamp] + [(lambda stage: stage)(1)]
+"""
+    assert Sources(TEXTS | {"flows.survey.stages": text}).closure(["stage"]) == {("flows.survey.stages", "stage")}
+
+
+def test_a_global_beside_a_comprehension_is_reached() -> None:
+    """A comprehension's variable hides a definition in the comprehension alone."""
+    text = "from models.light import STEP\n\ndef stage(x):\n    return [STEP for STEP in x], STEP\n"
+    assert ("models.light", "STEP") in Sources(TEXTS | {"flows.survey.stages": text}).closure(["stage"])
+
+
+def test_registrations_come_with_their_module() -> None:
+    """What registers itself, by a bare statement or a decorator of our own, counts once its module is reached."""
+    text = """
+from pipeline.table import KNOWN, register
+
+def stage():
+    return KNOWN
+
+@register
+def one(): return 1
+
+KNOWN.append(2)
+"""
+    table = "KNOWN = []\n\ndef register(one):\n    KNOWN.append(one)\n    return one\n"
+    found = Sources({"flows.survey.stages": text, "pipeline.table": table}).closure(["stage"])
+    assert {("flows.survey.stages", ""), ("flows.survey.stages", "one"), ("pipeline.table", "register")} <= found
+
+
+def test_names_in_casts_are_followed() -> None:
+    """A type imported for the checker alone leads to its class."""
+    text = """
+from typing import TYPE_CHECKING, cast
+
+if TYPE_CHECKING:
+    from models.light import Lamp
+
+def stage(lamp):
+    return cast("Lamp", lamp).lit()
+"""
+    assert ("pipeline.shapes", "Shape") in Sources(TEXTS | {"flows.survey.stages": text}).closure(["stage"])
+
+
+def test_a_barrier_ends_the_way() -> None:
+    """What is behind a barrier alone is not reached, nor the barrier."""
+    behind = {("models.light", "Lamp"), ("models.light", "STEP"), ("pipeline.shapes", "Shape")}
+    assert Sources(TEXTS).closure(["stage"], ["Lamp"]) == REACHED - behind
+
+
+def test_a_name_must_say_which() -> None:
+    """A root that no module has, or two have, is refused; the module's name tells two apart."""
+    code = Sources({"flows.one": "def stage(): pass", "flows.two": "def stage(): pass"})
+    assert code.named("two.stage") == ("flows.two", "stage")
+    with pytest.raises(LookupError, match=r"one definition called stage, found it in \['flows.one', 'flows.two'\]"):
+        code.named("stage")
+    with pytest.raises(LookupError, match="called gone, found it in no module"):
+        code.named("gone")

@@ -1,0 +1,152 @@
+"""Caches of libraries for a user without a home: a private folder, only where it is needed, and nobody else's."""
+
+from __future__ import annotations
+
+import os
+import pwd
+import stat
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from flows.schedule.runner import own_temporary_folder
+from flows.terminal.cache_places import place_caches, place_pages
+from pipeline.errors import SettingsError
+
+ROOT = Path(__file__).parents[3]
+NOWHERE = "/proc/nonexistent"  # where not even root can write
+FARM = ["--scene", "farm", "--size", "64x64", "--effects", "shot"]
+VERBS = """
+from flows.cli.main import main
+for words in ({survey}, {plan}, {report}):
+    try:
+        main(words)
+    except SystemExit as ended:
+        assert ended.code == 0, words
+"""
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder for temporary files."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    return folder
+
+
+def test_a_home_is_used_as_ever(tmp_path: Path, temporary: Path) -> None:
+    """Where ~/.cache or XDG_CACHE_HOME can be written nothing is named and nothing made elsewhere."""
+    for environment in ({"HOME": str(tmp_path)}, {"HOME": NOWHERE, "XDG_CACHE_HOME": str(tmp_path / "a" / "b")}):
+        before = dict(environment)
+        assert place_caches(environment) is None
+        assert environment == before
+    assert list(temporary.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "environment", [{"HOME": NOWHERE}, {"HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE}, {"HOME": "here"}]
+)
+def test_without_one_they_are_in_a_private_folder(environment: dict[str, str], temporary: Path) -> None:
+    """Of this user's, and the same for the next process; those who were told a place keep it."""
+    environment = environment | {"MPLCONFIGDIR": "/elsewhere"}
+    folder = place_caches(environment)
+    assert folder == temporary / f"spectralzoom-{os.geteuid()}"
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert environment["XDG_CACHE_HOME"] == str(folder)
+    assert environment["NUMBA_CACHE_DIR"] == str(folder / "numba")
+    assert environment["MPLCONFIGDIR"] == "/elsewhere"
+    assert place_caches({"HOME": NOWHERE}) == folder
+
+
+@pytest.mark.parametrize("trap", ["link", "open to others", "of another user", "file"])
+def test_a_folder_that_is_not_ours_alone_is_not_used(trap: str, temporary: Path, tmp_path: Path) -> None:
+    """Its name can be guessed: what somebody else has put there is left alone, for caches are run as code."""
+    guessed = temporary / f"spectralzoom-{os.geteuid()}"
+    if trap == "link":
+        (tmp_path / "theirs").mkdir(mode=0o700)
+        guessed.symlink_to(tmp_path / "theirs")
+    elif trap == "file":
+        guessed.touch(mode=0o700)
+    else:
+        guessed.mkdir(mode=0o700)
+        guessed.chmod(0o755 if trap == "open to others" else 0o700)
+        if trap == "of another user":
+            if os.geteuid() != 0:
+                pytest.skip("only root can give a folder away")
+            os.chown(guessed, 65534, 65534)
+    folder = place_caches({"HOME": NOWHERE})
+    assert folder is not None
+    assert folder != guessed
+    assert folder.parent == temporary
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert not any((tmp_path / "theirs").iterdir()) if trap == "link" else True
+
+
+def test_a_user_unknown_to_the_system_has_a_home_that_is_not_there(
+    temporary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As Debian's users without one: libraries that ask where it is are told, and cannot write there."""
+    monkeypatch.setattr(pwd, "getpwuid", lambda number: {}[number])
+    environment: dict[str, str] = {}
+    assert place_caches(environment) is not None
+    assert environment["HOME"] == "/nonexistent"
+
+
+def test_nothing_to_write_to_is_one_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It names what to set."""
+    monkeypatch.setattr(tempfile, "tempdir", NOWHERE)
+    with pytest.raises(SettingsError, match=r"neither a home nor a temporary folder .* set XDG_CACHE_HOME to a folder"):
+        place_caches({"HOME": NOWHERE})
+
+
+def test_prefects_pages_are_unpacked_where_that_is_possible(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside Prefect's code where that can be written, else in the cache folder."""
+    environment = {"XDG_CACHE_HOME": str(tmp_path)}
+    monkeypatch.setattr(os, "access", lambda *_: True)
+    assert place_pages(environment) == {}
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert place_pages(environment) == {
+        "PREFECT_SERVER_UI_STATIC_DIRECTORY": str(tmp_path / "spectralzoom" / "prefect-pages")
+    }
+
+
+def test_prefects_runner_has_a_temporary_folder_of_its_own(temporary: Path) -> None:
+    """Its /tmp/runner_storage belongs to the first user who runs one; ours goes with the process."""
+    from prefect.runner import Runner
+
+    with own_temporary_folder():
+        place = Path(Runner()._tmp_dir)
+        assert stat.S_IMODE(place.parents[1].stat().st_mode) == 0o700
+    assert place.is_relative_to(temporary)
+    assert place.parents[1].name.startswith("spectralzoom-runner-")
+    assert tempfile.tempdir == str(temporary)
+    assert list(temporary.iterdir()) == []
+
+
+def test_a_farm_is_surveyed_by_a_user_without_a_home(tmp_path: Path) -> None:
+    """Survey, plan and report end well and say nothing of homes; numba keeps its work in the private folder."""
+    temporary, out = tmp_path / "temporary", str(tmp_path / "archive")
+    temporary.mkdir()
+    code = VERBS.format(
+        survey=["survey", *FARM, "--engine", "plain", "--no-controls", "--out", out],
+        plan=["plan", *FARM, "--out", out],
+        report=["report", out, "-o", str(tmp_path / "index.html")],
+    )
+    environment = {
+        "PATH": os.environ["PATH"],
+        "PYTHONPATH": str(ROOT),
+        "HOME": NOWHERE,
+        "TMPDIR": str(temporary),
+        "OMP_NUM_THREADS": "1",
+    }
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "nonexistent" not in done.stderr
+    assert "atplotlib" not in done.stderr
+    private = temporary / f"spectralzoom-{os.geteuid()}"
+    assert list((private / "numba").rglob("*.nbi"))

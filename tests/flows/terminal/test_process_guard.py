@@ -1,0 +1,141 @@
+"""Processes bound to this one: they end with it, are let go of when they have ended, and are started again."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from flows.terminal import process_guard
+from flows.terminal.process_guard import KeptProcess, end_with_us
+from tests.soak.processes import children_of, is_alive
+
+SLEEPS = [sys.executable, "-c", "import time; print('up', flush=True); time.sleep(60)"]
+DEAF = [
+    sys.executable,
+    "-c",
+    "import signal, time; signal.signal(15, signal.SIG_IGN); print('up', flush=True); time.sleep(5); print('over')",
+]
+ENDS = """
+import os, signal, subprocess, sys
+from flows.terminal.process_guard import end_with_us
+child = subprocess.Popen(["sleep", "60"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+let_go = end_with_us(child.pid)
+if "let go" in sys.argv:
+    let_go()
+print(child.pid, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def killed_beside_a_child(*words: str) -> int:
+    """Have a process killed that bound another to itself; gives the other."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    ended = subprocess.run(
+        [sys.executable, "-c", ENDS, *words], env=environment, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == -signal.SIGKILL
+    return int(ended.stdout)
+
+
+def wait_until_gone(pid: int, patience_s: float = 5.0) -> bool:
+    """Whether a process ends soon."""
+    end = time.monotonic() + patience_s
+    while is_alive(pid) and time.monotonic() < end:
+        time.sleep(0.02)
+    return not is_alive(pid)
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Iterator[KeptProcess]:
+    """A process that sleeps."""
+    process = KeptProcess(SLEEPS, tmp_path / "logs" / "kept.log", 5.0)
+    yield process
+    process.stop()
+
+
+def held() -> tuple[int, list[int]]:
+    """How many files this process has open, and its children."""
+    return len(list(Path("/proc/self/fd").iterdir())), children_of(os.getpid())
+
+
+def test_a_killed_process_leaves_none_behind() -> None:
+    """What was bound to end with a process does so when it is killed."""
+    assert wait_until_gone(killed_beside_a_child())
+
+
+def test_what_was_let_go_of_is_left_alone() -> None:
+    """A number that was let go of may be a stranger's: nothing is sent to it when the process that held it ends."""
+    stranger = killed_beside_a_child("let go")
+    try:
+        assert not wait_until_gone(stranger, 0.5)
+    finally:
+        os.kill(stranger, signal.SIGKILL)
+
+
+def test_nothing_is_held_of_what_was_let_go_of() -> None:
+    """No process and no open file stays, also where the guard itself was killed."""
+    before = held()
+    for kill in (False, True):
+        with subprocess.Popen(["sleep", "60"]) as child:
+            others = set(children_of(os.getpid()))
+            let_go = end_with_us(child.pid)
+            child.kill()
+            child.wait()
+            if kill:
+                (guard,) = set(children_of(os.getpid())) - others
+                os.kill(guard, signal.SIGKILL)
+            let_go()
+    assert held() == before
+
+
+def test_a_kept_process_is_started_again_and_nothing_piles_up(kept: KeptProcess) -> None:
+    """Started where it does not run, after a death and on request; after the end nothing of it is there."""
+    before = held()
+    assert kept.keep_up()
+    assert not kept.keep_up()
+    once = held()
+    assert len(once[1]) == len(before[1]) + 2  # it and its guard
+    for pid in set(once[1]) - set(before[1]):
+        os.kill(pid, signal.SIGKILL)
+        wait_until_gone(pid)
+    assert not kept.runs()
+    assert held() == before
+    assert kept.keep_up()
+    kept.restart()
+    kept.restart()
+    assert (held()[0], len(held()[1])) == (once[0], len(once[1]))
+    kept.stop()
+    kept.stop()
+    assert held() == before
+
+
+def test_a_kept_process_that_does_not_listen_is_killed(tmp_path: Path) -> None:
+    """After its patience it is ended all the same."""
+    deaf = KeptProcess(DEAF, tmp_path / "log", 0.1)
+    before = held()
+    deaf.keep_up()
+    while "up" not in deaf.log.read_text():
+        time.sleep(0.02)
+    deaf.stop()
+    assert held() == before
+    assert "over" not in deaf.log.read_text()
+
+
+def test_a_log_that_has_grown_is_begun_anew(kept: KeptProcess, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was said is kept from start to start until it is too much."""
+    kept.log.parent.mkdir()
+    kept.log.write_text("before\n")
+    kept.keep_up()
+    kept.stop()
+    assert kept.log.read_text().startswith("before\n")
+    monkeypatch.setattr(process_guard, "LARGEST_LOG", 3)
+    kept.keep_up()
+    kept.stop()
+    assert "before" not in kept.log.read_text()

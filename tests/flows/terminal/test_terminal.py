@@ -1,0 +1,140 @@
+"""What reaches terminal and pages: names and devices' words as escapes, whatever prints them."""
+
+from __future__ import annotations
+
+import ast
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.markup import escape
+from rich.panel import Panel
+from rich.progress import Progress
+from rich.table import Table
+from rich.tree import Tree
+
+from flows.publish.pages import render_markdown
+from flows.schedule.field_history import FieldHistory
+from flows.schedule.history_page import render_history, render_index
+from flows.terminal.shown_text import Terminal
+from pipeline.visible_text import is_visible
+from storage.archive.whole_files import to_json
+
+HOSTILE = "field\x1b]0;owned\x07\x1b[2J\u202egnp.map\x9b31m\u2028\udcff"
+SHOWN = "field\\x1b]0;owned\\x07\\x1b[2J\\u202egnp.map\\x9b31m\\u2028\\udcff"
+
+
+def _table(words: str) -> Table:
+    table = Table("name")
+    table.add_row(escape(words))
+    return table
+
+
+def _tree(words: str) -> Tree:
+    tree = Tree(escape(words))
+    tree.add(escape(words))
+    return tree
+
+
+@pytest.mark.parametrize(
+    "thing",
+    [escape, _table, _tree, lambda words: Panel(escape(words)), lambda words: [words]],
+    ids=["words", "table", "tree", "panel", "list"],
+)
+def test_nothing_that_is_printed_steers_the_terminal(thing: Callable[[str], Any]) -> None:
+    """Styles and borders are the console's own; in the words no control character is left."""
+    file = io.StringIO()
+    Terminal(file=file, width=200, color_system=None).print(thing(HOSTILE))
+    assert all(is_visible(letter) for letter in file.getvalue())
+    assert "\\u202e" in file.getvalue()
+
+
+def test_bars_show_names_as_escapes() -> None:
+    """A bar moves the cursor itself, and nothing else does."""
+    file = io.StringIO()
+    with Progress(console=Terminal(file=file, width=200, force_terminal=True, color_system=None)) as bars:
+        bars.add_task(escape(HOSTILE), total=1)
+    assert "\x1b]0" not in file.getvalue()
+    assert "\u202e" not in file.getvalue()
+
+
+def test_json_says_the_same_in_escapes() -> None:
+    """Printed JSON steers no terminal, and reads back as it was."""
+    content = {HOSTILE: [HOSTILE, "Süd 🌾"]}
+    text = to_json(content)
+    assert all(is_visible(letter) for letter in text)
+    assert "Süd 🌾" in text
+    assert json.loads(text) == content
+
+
+def _history(words: str) -> FieldHistory:
+    row = {
+        "run": words,
+        "created": "2026-06-01T10:00:00Z",
+        "due": words,
+        "attempts": 1,
+        "miou": 0.5,
+        "unit": "share",
+        "overall_accuracy": None,
+        "savings": {"capture_s": 0.5},
+        "areas": {words: 1.0},
+        "colours": {},
+    }
+    return FieldHistory(words, words, [row], [{"event": "failed", "due": words, "reason": words}])
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        lambda words: render_history(_history(words), "runs"),
+        lambda words: render_index([_history(words)], words, {words: words}),
+    ],
+    ids=["history", "index"],
+)
+def test_pages_show_names_as_escapes(page: Callable[[str], str]) -> None:
+    """Words beside a name are not turned round by it, and nothing in them is markup."""
+    text = page(HOSTILE)
+    assert all(is_visible(letter) for letter in text)
+    assert text.count(SHOWN) >= 3
+    assert '<b title="' not in page('<b title="x">')
+
+
+def test_prefects_pages_show_names_as_escapes() -> None:
+    """The text of a survey has them, with its markup off."""
+    words = HOSTILE + "<b>[x](y)`|"
+    text = render_markdown(
+        "survey.md",
+        survey=words,
+        headline=words,
+        picture="",
+        rows=[{words: words}],
+        findings=[words],
+        where="archive/runs/x_1",
+    )
+    assert all(is_visible(letter) for letter in text)
+    assert text.count(r"\<b\>\[x\](y)\`\|") == 5
+    assert "`archive/runs/x_1/report.html`" in text
+
+
+def test_a_command_names_a_hostile_file_in_escapes(command_line: Any, tmp_path: Path) -> None:
+    """The message of a verb quotes what it was given."""
+    ended = command_line("survey", tmp_path / "north\x1b[31m\u202e.toml")
+    assert (ended.code, len(ended.errors)) == (2, 1)
+    assert "north\\x1b[31m\\u202e.toml" in ended.err
+    assert "\u202e" not in ended.err
+
+
+def test_every_console_is_a_terminal() -> None:
+    """No verb prints past it: consoles are made in one module, and pages escape by one function."""
+    root = Path(__file__).parents[3] / "flows"
+    made: list[str] = []
+    for path in root.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Console":
+                made.append(path.name)
+            if isinstance(node, ast.ImportFrom) and node.module in ("html", "jinja2") and path.name != "pages.py":
+                made.append(path.name)
+    assert made == []

@@ -1,0 +1,231 @@
+"""The emulated camera speaks the documented bytes, and its faults meet a client that says what happened."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from pipeline.errors import RigError
+from pipeline.rig.camera.line_camera import CaptureUnknown
+from pipeline.rig.clock import ManualClock
+from pipeline.rig.device_errors import DeviceRefused
+from pipeline.rig.emulator.camera_device import CameraConnection, CameraDevice, CameraFault, CameraFaults, CameraUnit
+from tests.rig.camera.camera_line import control_of, scene_lines
+
+CAPTURE = b'capture({"prefix": "", "maxCubes": 1, "maxFramesPerCube": 5})'
+PROMPT = b"\r\nhpi> "
+
+
+def device_with(fault: CameraFault | None = None, times: int = 1, seed: int = 0, **unit: object) -> CameraDevice:
+    """A camera with one fault."""
+    faults = CameraFaults({} if fault is None else {fault: times}, seed)
+    return CameraDevice(scene_lines(), ManualClock(), unit=CameraUnit(**unit), faults=faults)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("sent", "received"),
+    [
+        (
+            b'configure({"exposure": 4.5, "framePeriod": 5})\r',
+            b'configure({"exposure": 4.5, "framePeriod": 5})\r\n{"success": true, '
+            b'"response": {"exposure": 4.5, "framePeriod": 5.0}, "errorMessage": ""}' + PROMPT,
+        ),
+        (
+            b'configure({"exposure": 6, "framePeriod": 5})\r',
+            b'configure({"exposure": 6, "framePeriod": 5})\r\n{"success": false, "response": null, '
+            b'"errorMessage": "exposure longer than frame period"}' + PROMPT,
+        ),
+        (
+            CAPTURE + b"\r\n",
+            CAPTURE + b'\r\n{"success": true, "response": {"folder": "/captured/000000"}, "errorMessage": ""}' + PROMPT,
+        ),
+        (b"isCapturing\r", b'isCapturing\r\n{"success": true, "response": false, "errorMessage": ""}' + PROMPT),
+        (b"stopCapture\r", b'stopCapture\r\n{"success": true, "response": false, "errorMessage": ""}' + PROMPT),
+        (
+            b'listFiles("/")\r',
+            b'listFiles("/")\r\n{"success": true, "response": [{"name": "/captured", "size": 0, "mtime": 0, '
+            b'"isDirectory": true}], "errorMessage": ""}' + PROMPT,
+        ),
+        (
+            b'listFiles("/x")\r',
+            b'listFiles("/x")\r\n{"success": false, "response": null, "errorMessage": "no such folder /x"}' + PROMPT,
+        ),
+        (
+            b"hello\r",
+            b'hello\r\n{"success": false, "response": null, "errorMessage": "unknown command hello"}' + PROMPT,
+        ),
+        (
+            b"configure({]\r",
+            b'configure({]\r\n{"success": false, "response": null, "errorMessage": '
+            b'"argument of configure is not JSON"}' + PROMPT,
+        ),
+        (b"\r", PROMPT),
+    ],
+)
+def test_bytes_of_every_command(sent: bytes, received: bytes) -> None:
+    """Each command gives its bytes, in one piece or byte by byte."""
+    for size in (1, len(sent)):
+        talk = CameraConnection(device_with())
+        came = b""
+        for at in range(0, len(sent), size):
+            chunks, goes_on = talk.feed(sent[at : at + size])
+            assert goes_on
+            came += b"".join(chunk.data for chunk in chunks)
+        assert came == received
+
+
+def test_exit_ends_the_connection() -> None:
+    """Nothing is said to exit."""
+    assert CameraConnection(device_with()).feed(b"exit\r") == ([], False)
+
+
+def test_frames_pass_with_time() -> None:
+    """A capture runs for its frames' time; what is over by then is in the files."""
+    device = device_with()
+    clock = device.clock
+    control = control_of(device, clock)  # type: ignore[arg-type]
+    folder = control.capture(30, cubes=2).folder
+    clock.sleep(0.3)
+    assert control.is_capturing()
+    assert len(device.files()[f"{folder}/raw_0"]) == 29 * 48
+    clock.sleep(0.4)
+    assert not control.is_capturing()
+    names = [file.name.rsplit("/", 1)[1] for file in control.list_files(folder)]
+    assert names == [
+        "frameIndex_0.txt",
+        "frameIndex_30.txt",
+        "imu_gps.txt",
+        "raw_0",
+        "raw_0.hdr",
+        "raw_30",
+        "raw_30.hdr",
+    ]
+
+
+def test_what_it_sees_is_asked_once() -> None:
+    """Each frame is looked at once, at its own mid exposure, by the mirror's position then."""
+    seen: list[tuple[float, float]] = []
+
+    def lines(positions: np.ndarray, times: np.ndarray) -> np.ndarray:
+        seen.extend(zip(positions[:, 0].tolist(), times.tolist(), strict=True))
+        return np.zeros((len(times), 2, 2), np.uint16)
+
+    clock = ManualClock()
+    device = CameraDevice(lines, clock, positions=lambda times: np.stack([times / 10, times], axis=-1))
+    control_of(device, clock).capture(100)
+    for _ in range(20):
+        clock.sleep(0.07)
+        device.files()
+    assert [time for _, time in seen] == pytest.approx([0.015 + 0.01 * number for number in range(100)])
+    assert [x for x, _ in seen] == pytest.approx([time / 10 for _, time in seen])
+
+
+def test_exposures_as_pulses() -> None:
+    """Spans of time side by side give each exposure once, for whoever is triggered by them."""
+    device = device_with()
+    control = control_of(device, device.clock)  # type: ignore[arg-type]
+    control.configure(8, 10)
+    control.capture(50)
+    edges = np.linspace(0, 1, 38)
+    pulses = np.concatenate([device.exposures(*span) for span in pairwise(edges)])
+    np.testing.assert_allclose(pulses, 0.01 + np.arange(50)[:, None] * 0.01 + [0, 0.008], atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(
+    "fault", [CameraFault.SLOW, CameraFault.SPLIT, CameraFault.MERGED, CameraFault.STALE], ids=lambda fault: fault.name
+)
+def test_harmless_faults(fault: CameraFault, seed: int) -> None:
+    """Slow, cut, merged and stale replies change nothing, for a capture neither, and it is sent once."""
+    device = device_with(fault, 10, seed)
+    control = control_of(device, device.clock)  # type: ignore[arg-type]
+    control.configure(5, 6)
+    assert control.capture(50_000).folder == "/captured/000000"
+    assert control.is_capturing()
+    assert control.stop_capture()
+    assert len(device.captures) == 1
+    assert sum(line.startswith("capture(") for line in device.commands) == 1
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [CameraFault.LATE, CameraFault.SILENT, CameraFault.HANGS_UP, CameraFault.NOT_JSON],
+    ids=lambda fault: fault.name,
+)
+def test_lost_replies(fault: CameraFault) -> None:
+    """Reads get over a lost reply; a capture is sent once, found by asking, and told, within its deadlines."""
+    device = device_with(fault, 1)
+    clock = device.clock
+    control = control_of(device, clock)  # type: ignore[arg-type]
+    assert not control.is_capturing()
+    before = clock.now()
+    control._folders = lambda: set() if not device.captures else {"/captured/000000"}  # type: ignore[method-assign]
+    device.faults.left[fault] = 1
+    with pytest.raises(CaptureUnknown, match="asked again it captures, and new are the folders /captured/000000"):
+        control.capture(5000)
+    assert clock.now() - before < 12
+    assert len(device.captures) == 1
+
+
+@pytest.mark.parametrize(("fault", "words"), [(CameraFault.FULL, "disk full"), (CameraFault.BUSY, "busy capturing")])
+def test_captures_that_are_refused(fault: CameraFault, words: str) -> None:
+    """A camera that is full or busy says so; the next capture begins."""
+    device = device_with(fault)
+    control = control_of(device, device.clock)  # type: ignore[arg-type]
+    with pytest.raises(DeviceRefused, match=words):
+        control.capture(5)
+    assert device.captures == []
+    assert control.capture(5).folder == "/captured/000000"
+
+
+def test_disk_that_fills_up() -> None:
+    """A disk without room refuses the next capture."""
+    device = device_with(disk_bytes=1000)
+    clock = device.clock
+    control = control_of(device, clock)  # type: ignore[arg-type]
+    control.capture(30)
+    clock.sleep(1)
+    with pytest.raises(DeviceRefused, match=r"disk full; copy the folders on the camera's disk"):
+        control.capture(30)
+
+
+def test_camera_that_never_answers() -> None:
+    """Every transaction ends by its deadline, however long the camera stays silent."""
+    device = device_with(CameraFault.SILENT, 1000)
+    clock = device.clock
+    with pytest.raises(RigError, match="within 5 s"):
+        control_of(device, clock).is_capturing()  # type: ignore[arg-type]
+    assert clock.now() == pytest.approx(3 * 5 + 2 * 0.5)
+
+
+CONTROL_FAULTS = [fault for fault in CameraFault if fault not in (CameraFault.BREAKS_OFF, CameraFault.REFUSES_FILES)]
+
+
+@pytest.mark.parametrize("fault", CONTROL_FAULTS, ids=lambda fault: fault.name)
+def test_fault_suite(fault: CameraFault) -> None:
+    """Twenty places each: no wait beyond its deadlines, one capture at most, what was acknowledged is all there."""
+    for seed in range(20):
+        device = device_with(fault, 1 + seed % 2, seed)
+        device.faults.passes = seed // 3
+        clock = device.clock
+        control = control_of(device, clock)  # type: ignore[arg-type]
+        folder = told = ""
+        try:
+            control.configure(5, 6)
+            folder = control.capture(40).folder
+        except CaptureUnknown as error:
+            folder, told = "/captured/000000", str(error)
+        except DeviceRefused as error:
+            told = str(error)
+        words = "refused capture" if fault in (CameraFault.FULL, CameraFault.BUSY) else "It is not sent again; asked"
+        assert told == "" or words in told
+        while control.is_capturing():
+            clock.sleep(0.1)
+        assert clock.now() < 60
+        assert len(device.captures) == sum(line.startswith("capture(") for line in device.commands) - (folder == "")
+        if folder:
+            raw = next(file for file in control.list_files(folder) if file.name.endswith("raw_0"))
+            struck = device.faults.left[fault] < 1 + seed % 2
+            assert raw.size == 40 * 48 - (72 if fault is CameraFault.CUT_CUBE and struck else 0)

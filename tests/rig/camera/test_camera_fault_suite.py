@@ -1,0 +1,211 @@
+"""Every fault of the emulated camera, and some of the mirror's, with many seeds, against whole sweeps through a rig.
+
+Each session takes a small sweep through drivers of both devices on a clock that waiting moves. What was given is right,
+no acknowledged line is captured twice, and a later process with the same files ends the sweep.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.errors import RigError
+from pipeline.geometry.scan import Sweep
+from pipeline.rig.camera.camera_files import KeptInMemory
+from pipeline.rig.camera.camera_settings import ControlPatience
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.capture.capture_runner import RigDevices
+from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults
+from pipeline.rig.emulator.fault_names import make_fault
+from pipeline.rig.emulator.mirror_faults import Fault
+from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.mirror.registers import Status
+from pipeline.source import Line
+from tests.rig.mirror.test_fault_suite import moves
+from tests.rig.small_rig import SmallRig, small_rig, small_source
+
+SEEDS = range(20)
+SWEEP = Sweep("fine-5", "fine", "x", 1.5, -4.5, 7)
+PAIRS = 5  # of the vector memory, with its lead-in: four lines a capture
+CAPTURES = [(0, 4), (4, 7)]
+COMMANDS, TRANSFERS = 12, 8  # occasions of an undisturbed sweep, a few less
+PATIENCE = ControlPatience()
+# a request that is asked again: each time a connection, its prompt, the reply
+MOST_ASKED_S = (PATIENCE.retries + 1) * 2 * PATIENCE.deadline_s + PATIENCE.retries * PATIENCE.pause_s
+MOST_CAPTURED_S = 4 * MOST_ASKED_S  # what is there before, the capture, and what it did where its reply is lost
+MOST_TAKEN_S = 300.0  # a sweep, whatever is asked again
+HARMLESS = (CameraFault.SLOW, CameraFault.SPLIT, CameraFault.MERGED, CameraFault.STALE)
+OF_FILES = (CameraFault.BREAKS_OFF, CameraFault.REFUSES_FILES)
+OF_MIRROR = (
+    "no-reply",
+    "reply-bit-flipped",
+    "request-byte-lost",
+    "silent-reset",
+    "reset-in-upload",
+    "gone-after",
+    "cell-lost",
+    "split-replies",
+)
+PLACES = re.compile(r"emulat|127\.0\.0\.1|/captured/|camera")
+
+
+@pytest.fixture(scope="module")
+def undisturbed() -> list[Line]:
+    """The sweep's lines as an undisturbed rig gives them, which are the simulated source's."""
+    with small_rig(vector_pairs=PAIRS) as rig:
+        lines = list(rig.source().lines(SWEEP))
+    expected = small_source().lines(SWEEP)
+    np.testing.assert_array_equal([line.data for line in lines], [line.data for line in expected])
+    return lines
+
+
+@dataclass
+class Looks:
+    """Sweeps through one emulated rig, each with its fault; what was sent and waited for is noted."""
+
+    rig: SmallRig
+    asked_s: list[float] = field(default_factory=list)
+    captured_s: list[float] = field(default_factory=list)
+    errors: list[RigError] = field(default_factory=list)
+    sent: list[bytes] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        connect = self.rig.devices
+
+        def devices() -> RigDevices:
+            opened = connect()
+            assert isinstance(opened.camera, HeadwallCamera)
+            assert isinstance(opened.steering, MirrorController)
+            control = opened.camera.control
+            for name, noted in {"_ask": self.asked_s, "capture": self.captured_s}.items():
+                setattr(control, name, self.timed(getattr(control, name), noted))
+            self.sent = self.rig.line.transport.sent
+            return opened
+
+        self.rig.devices = devices  # type: ignore[method-assign]
+
+    def timed(self, call: Callable[..., Any], noted: list[float]) -> Callable[..., Any]:
+        """The same call, with the time that it took noted."""
+
+        def timing(*given: Any, **named: Any) -> Any:
+            began = self.rig.line.clock.now()
+            try:
+                return call(*given, **named)
+            finally:
+                noted.append(self.rig.line.clock.now() - began)
+
+        return timing
+
+    def strike(self, camera: CameraFaults, mirror: tuple[Fault, ...] = ()) -> None:
+        """Have faults from now on."""
+        self.rig.emulated.camera.faults, self.rig.emulated.mirror.faults = camera, mirror
+
+    def mend(self) -> None:
+        """Take all faults away, and the mirror off and on again."""
+        self.strike(CameraFaults())
+        self.rig.emulated.camera.files()  # looks at what is over: a mirror that restarts forgets where it was
+        mirror = self.rig.emulated.mirror
+        mirror.gone = mirror.hung = False
+        mirror.state.flags = Status(0)
+        mirror.restart(boot_s=0.0)
+
+    def go_on(self, kept: KeptInMemory, lines: list[Line]) -> None:
+        """Take what is still missing as another process would; the error that ends it is noted."""
+        try:
+            for line in self.rig.source(kept).lines(SWEEP, first=len(lines)):
+                lines.append(line)
+        except RigError as error:
+            self.errors.append(error)
+
+
+@pytest.fixture(scope="module")
+def looks() -> Iterator[Looks]:
+    """One rig for all sessions of this file."""
+    with small_rig(vector_pairs=PAIRS) as rig:
+        yield Looks(rig)
+
+
+def assert_right(lines: list[Line], undisturbed: list[Line]) -> None:
+    """Lines from the first on, each as an undisturbed rig gives it."""
+    for number, (line, expected) in enumerate(zip(lines, undisturbed, strict=False)):
+        assert line.number == number
+        np.testing.assert_array_equal(line.data, expected.data)
+        assert (line.mirror_x, line.mirror_y, line.valid) == (expected.mirror_x, expected.mirror_y, True)
+
+
+def assert_clear(error: RigError) -> None:
+    """One line of words with the place."""
+    words = str(error)
+    assert PLACES.search(words), words
+    assert "\n" not in words
+    assert "Traceback" not in words
+    assert 20 < len(words) < 900, words
+
+
+def session(looks: Looks, undisturbed: list[Line], camera: CameraFaults, mirror: tuple[Fault, ...] = ()) -> None:
+    """A sweep with a fault, then the rest of it without: every line once, and right."""
+    kept, lines = KeptInMemory(), list[Line]()
+    for noted in (looks.asked_s, looks.captured_s, looks.errors):
+        noted.clear()
+    began_s, captures = looks.rig.line.clock.now(), looks.rig.emulated.camera.captures
+    captures.clear()  # of the session before
+    looks.strike(camera, mirror)
+    looks.go_on(kept, lines)
+    assert looks.rig.line.clock.now() - began_s <= MOST_TAKEN_S
+    assert max(looks.asked_s, default=0.0) <= MOST_ASKED_S, max(looks.asked_s)
+    assert max(looks.captured_s, default=0.0) <= MOST_CAPTURED_S, max(looks.captured_s)
+    assert_right(lines, undisturbed)
+    assert looks.errors or len(lines) == SWEEP.lines
+    for error in looks.errors:
+        assert_clear(error)
+    motions = [data for data in looks.sent if moves(data)]  # there and along the path, in turn
+    assert all(one != other for one, other in pairwise(motions)), "a motion was sent twice"
+    broke = len(looks.errors)
+    looks.mend()
+    looks.go_on(kept, lines)
+    assert len(looks.errors) == broke, looks.errors[-1]
+    assert len(lines) == SWEEP.lines
+    assert_right(lines, undisturbed)
+    told = looks.rig.source(kept).record["captures"]
+    ranges = [(one["first"], one["stop"]) for one in told if "spent" not in one]
+    assert sorted(ranges) == ranges
+    assert all(one[1] <= other[0] for one, other in pairwise(ranges)), ranges
+    assert len(captures) >= len(told)
+
+
+@pytest.mark.parametrize("fault", CameraFault, ids=lambda fault: str(fault.value))
+def test_no_fault_of_the_camera_loses_lines_or_hangs(fault: CameraFault, looks: Looks, undisturbed: list[Line]) -> None:
+    """Twenty sweeps with each: struck once at some occasion, or so often that asking again does not help."""
+    ended, struck = 0, 0
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        often = 1 if seed % 2 == 0 else int(rng.integers(3, 7))
+        occasions = {CameraFault.FULL: 2, CameraFault.BUSY: 2, CameraFault.CUT_CUBE: 2}.get(
+            fault, TRANSFERS if fault in OF_FILES else COMMANDS
+        )
+        faults = CameraFaults({fault: often}, seed, int(rng.integers(occasions)))
+        session(looks, undisturbed, faults)
+        struck += faults.left[fault] < often
+        ended += bool(looks.errors)
+        if fault in HARMLESS:
+            assert not looks.errors, (seed, looks.errors)
+        if fault in OF_FILES and often == 1:
+            assert not looks.errors, (seed, looks.errors)
+    assert struck == len(SEEDS)
+    assert ended > 0 or fault in (*HARMLESS, CameraFault.CUT_CUBE, CameraFault.BREAKS_OFF)
+
+
+@pytest.mark.parametrize("name", OF_MIRROR)
+def test_no_fault_of_the_mirror_spoils_a_sweep(name: str, looks: Looks, undisturbed: list[Line]) -> None:
+    """Twenty sweeps with each: lines are right or not given, and the sweep is ended once the mirror is mended."""
+    ended = 0
+    for seed in SEEDS:
+        session(looks, undisturbed, CameraFaults(), (make_fault(name, seed),))
+        ended += bool(looks.errors)
+    assert ended > 0 or name in ("split-replies", "reply-bit-flipped")

@@ -1,0 +1,258 @@
+"""The emulated camera on the network and its driver: what was seen comes back bit for bit, and faults are told."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from pipeline.errors import RigError
+from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
+from pipeline.rig.camera.camera_settings import CameraAddress, ControlPatience, FileServer
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.clock import SYSTEM_CLOCK, ManualClock
+from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, DeviceRefused
+from pipeline.rig.emulator.camera_capture import FrameClock, IndexLayout
+from pipeline.rig.emulator.camera_device import CameraDevice, CameraFault, CameraFaults, CameraUnit
+from pipeline.rig.emulator.camera_server import CameraServer
+from pipeline.rig.transports import SocketTransport
+from tests.rig.camera.camera_line import LinesOf, scene_lines, wait_for
+
+
+def remote_files(device: CameraDevice, folder: str) -> list[RemoteFile]:
+    """A device's files in a folder, as a listing has them."""
+    files = sorted(device.files().items())
+    return [RemoteFile(name, len(data), False) for name, data in files if name.startswith(folder + "/")]
+
+
+@contextmanager
+def camera(
+    faults: dict[CameraFault, int] | None = None, unit: CameraUnit | None = None, **server: object
+) -> Iterator[tuple[HeadwallCamera, CameraDevice, LinesOf]]:
+    """A served camera, its driver by the same clock, and what it sees."""
+    clock, lines = ManualClock(100.0), scene_lines()
+    device = CameraDevice(lines, clock, unit=unit, faults=CameraFaults(dict(faults or {})))
+    with CameraServer(device) as served:
+        files = FileServer(served.host, served.file_port, stall_s=2.0, pause_s=0.01, **server)  # type: ignore[arg-type]
+        driver = HeadwallCamera.at(CameraAddress(served.host, served.port), files, clock=clock)
+        yield driver, device, lines
+        driver.close()
+
+
+@pytest.mark.parametrize("layout", [IndexLayout("\t", "\n"), IndexLayout(" ", "\r\n", restarts=True)])
+def test_whole_loop(layout: IndexLayout) -> None:
+    """Configure, capture, poll, fetch, lines: exactly what the camera saw, with its own frames' times."""
+    unit = CameraUnit(layout=layout, clock=FrameClock(drift_ppm=100.0), wavelength_nm=(400.5, 500.25, 600.0, 700.0))
+    with camera(unit=unit) as (driver, device, lines):
+        driver.configure(8.0, 10.0)
+        capture = driver.capture(60, cubes=3, prefix="field")
+        assert capture.folder == "/captured/field_000000"
+        wait_for(driver, 5.0)
+        seen: list[tuple[str, int, int]] = []
+        found = driver.fetch(capture.folder, KeptInMemory(), lambda *step: seen.append(step))
+        np.testing.assert_array_equal(found.values, np.concatenate(lines.given))
+        assert found.values.shape == (180, 6, 4)
+        assert found.valid.all()
+        assert found.notes == ()
+        assert found.wavelength_nm is not None
+        assert found.wavelength_nm.tolist() == [400.5, 500.25, 600.0, 700.0]
+        assert np.diff(found.times.stamp_us).tolist() == [10001] * 179
+        assert seen[-1] == (f"{capture.folder}/raw_60", 60 * 48, 60 * 48)
+        assert device.commands.count("isCapturing") > 2
+
+
+def test_references_from_the_folder() -> None:
+    """A dark reference that lies in the capture's folder is fetched and averaged."""
+    dark = np.random.default_rng(1).integers(60, 70, (20, 6, 4)).astype(np.uint16)
+    with camera(unit=CameraUnit(references={"darkReference": dark})) as (driver, _, _):
+        folder = driver.capture(3).folder
+        wait_for(driver, 5.0)
+        found = driver.references(folder, KeptInMemory())
+        assert list(found) == ["dark"]
+        np.testing.assert_array_equal(found["dark"].mean, dark.mean(axis=0).astype(np.float32))
+
+
+def test_transfer_that_breaks_off_goes_on() -> None:
+    """Broken off again and again it is taken up where it ended: no byte lost, none twice."""
+    faults = {CameraFault.BREAKS_OFF: 4, CameraFault.REFUSES_FILES: 2}
+    with camera(faults, tries=3, overlap=16) as (driver, device, lines):
+        folder = driver.capture(100).folder
+        wait_for(driver, 5.0)
+        kept = KeptInMemory()
+        np.testing.assert_array_equal(driver.fetch(folder, kept).values, np.concatenate(lines.given))
+        assert kept.files == {file.name: device.files()[file.name] for file in remote_files(device, folder)}
+        assert not any(device.faults.left.values())
+
+
+def test_what_has_come_is_kept() -> None:
+    """Where the server stays away the part that came is there, and the next call fetches the rest only."""
+    with camera({CameraFault.BREAKS_OFF: 1}, tries=1) as (driver, device, _):
+        driver.capture(100)
+        wait_for(driver, 5.0)
+        (raw,) = [file for file in remote_files(device, "/captured/000000") if file.name.endswith("raw_0")]
+        kept = KeptInMemory()
+        with pytest.raises(DeviceGone, match=rf"{raw.size // 2} bytes of {raw.name} are kept, and fetching again"):
+            fetch_files(driver.server, [raw], kept)
+        assert kept.size(raw.name) == raw.size // 2
+        fetch_files(driver.server, [raw], kept)
+        assert bytes(kept.files[raw.name]) == device.files()[raw.name]
+
+
+def test_another_file_of_the_same_name() -> None:
+    """What is held of another file is never mixed with this one's bytes."""
+    with camera() as (driver, device, _):
+        driver.capture(10)
+        wait_for(driver, 5.0)
+        (raw,) = [file for file in remote_files(device, "/captured/000000") if file.name.endswith("raw_0")]
+        for held, words in ((b"\xff" * 20, "it is another file"), (b"x" * 10_000, "it is another one")):
+            kept = KeptInMemory({raw.name: bytearray(held)})
+            with pytest.raises(RigError, match=words):
+                fetch_files(driver.server, [raw], kept)
+            assert bytes(kept.files[raw.name]) == held
+        with pytest.raises(RigError, match=r"481 when it was listed; is the capture still running"):
+            fetch_files(driver.server, [RemoteFile(raw.name, 481, False)], KeptInMemory())
+
+
+@pytest.mark.parametrize("read_twice", [True, False])
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (-100, r"goes on after its 380 bytes; is the capture still running"),
+        (100, r"ended at byte 480 of 580; look at the file there"),
+    ],
+)
+def test_transfer_of_another_length(more: int, words: str, read_twice: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file that is longer, or shorter, than the server said is not taken for whole, and nothing of it is kept."""
+    with camera(tries=2, read_twice=read_twice) as (driver, device, _):
+        driver.capture(10)
+        wait_for(driver, 5.0)
+        name = "/captured/000000/raw_0"
+        whole, kept = device.files()[name], KeptInMemory()
+        monkeypatch.setattr("pipeline.rig.emulator.camera_server._FilesInMemory.getsize", lambda *_: len(whole) + more)
+        with pytest.raises(RigError, match=words) as caught:
+            fetch_files(driver.server, [RemoteFile(name, None, False)], kept)
+        assert type(caught.value) is RigError
+        assert kept.size(name) == 0
+
+
+def test_files_that_are_refused() -> None:
+    """A wrong password, a missing file and nobody there are told apart, each once."""
+    with camera() as (driver, device, _):
+        driver.capture(2)
+        wait_for(driver, 5.0)
+        (index,) = [file for file in remote_files(device, "/captured/000000") if "frameIndex" in file.name]
+        wrong = FileServer(driver.server.host, driver.server.port, password="x")
+        with pytest.raises(DeviceRefused, match="user and password"):
+            fetch_files(wrong, [index], KeptInMemory())
+        with pytest.raises(DeviceRefused, match="whether the file is there"):
+            fetch_files(driver.server, [RemoteFile("/captured/none", 3, False)], KeptInMemory())
+        port = driver.server.port
+    away = FileServer("127.0.0.1", port, tries=2, pause_s=0.0)
+    with pytest.raises(DeviceGone, match="is not there or went away"):
+        fetch_files(away, [index], KeptInMemory())
+
+
+def test_fetch_while_it_captures() -> None:
+    """Files that may still grow are not fetched."""
+    with camera() as (driver, _, _):
+        folder = driver.capture(1000).folder
+        with pytest.raises(RigError, match="a capture still runs"):
+            driver.fetch(folder, KeptInMemory())
+        assert driver.stop()
+
+
+def test_cut_off_in_a_cube() -> None:
+    """A cube that ends within a line gives its whole lines."""
+    with camera({CameraFault.CUT_CUBE: 1}) as (driver, _, lines):
+        folder = driver.capture(20).folder
+        wait_for(driver, 5.0)
+        found = driver.fetch(folder, KeptInMemory())
+        assert found.valid.tolist() == [True] * 18 + [False] * 2
+        np.testing.assert_array_equal(found.values[:18], np.concatenate(lines.given[1:])[:18])
+
+
+def test_nobody_listens() -> None:
+    """A port that nobody listens on, and one that cannot be, are told before anything else."""
+    with pytest.raises(DeviceGone, match=r"no connection to 127.0.0.1:1: connection refused; is the camera on"):
+        SocketTransport("127.0.0.1", 1)
+    with pytest.raises(ValueError, match="from 1 to 65535"):
+        SocketTransport("127.0.0.1", 0)
+
+
+def test_server_closes_cleanly() -> None:
+    """Threads end and ports are free again; a taken port is refused."""
+    before = threading.active_count()
+    device = CameraDevice(scene_lines(), ManualClock())
+    with CameraServer(device) as served:
+        line = SocketTransport(served.host, served.port)
+        with pytest.raises(RigError, match="cannot be listened on"):
+            CameraServer(device, port=served.port)
+        with pytest.raises(RigError, match="cannot be listened on"):
+            CameraServer(device, file_port=served.file_port)
+    line.close()
+    assert threading.active_count() == before
+    with CameraServer(device, port=served.port, file_port=served.file_port):
+        pass
+
+
+@contextmanager
+def somebody(says: bytes) -> Iterator[int]:
+    """A port where somebody says this and then nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        talks: list[socket.socket] = []
+
+        def answer() -> None:
+            with contextlib.suppress(OSError):
+                talks.append(listener.accept()[0])
+                talks[0].sendall(says)
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        try:
+            yield int(listener.getsockname()[1])
+        finally:
+            thread.join()
+            for talk in talks:
+                talk.close()
+
+
+@pytest.mark.parametrize(
+    ("says", "kind", "words"),
+    [
+        (b"", DeadlinePassed, r"was silent for 0\.1 s"),
+        (b"HTTP/1.1 400\r\n", RigError, "is no FTP; check host and port"),
+    ],
+)
+def test_other_servers(says: bytes, kind: type[RigError], words: str) -> None:
+    """One that stays silent and one that speaks something else are told by the deadline."""
+    file = RemoteFile("/captured/raw_0", 3, False)
+    with somebody(says) as port, pytest.raises(kind, match=words):
+        fetch_files(FileServer("127.0.0.1", port, stall_s=0.1, tries=1), [file], KeptInMemory())
+
+
+def test_silence_on_a_real_socket() -> None:
+    """By the system's clock a lost reply costs its deadline, and the next connection answers."""
+    device = CameraDevice(scene_lines(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.SILENT: 1}))
+    with CameraServer(device) as served:
+        driver = HeadwallCamera.at(
+            CameraAddress(served.host, served.port), FileServer(), patience=ControlPatience(0.3, 1, 0.01)
+        )
+        assert not driver.is_capturing()
+        driver.close()
+    assert device.commands[:2] == ["isCapturing", "isCapturing"]
+
+
+def test_closing_does_not_wait_for_what_is_late() -> None:
+    """A reply that a fault holds back for a minute holds back nobody who closes the camera."""
+    device = CameraDevice(scene_lines(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.LATE: 1}))
+    with CameraServer(device) as served, socket.create_connection((served.host, served.port), timeout=5) as client:
+        client.sendall(b"isCapturing\r")
+        while not device.commands:
+            SYSTEM_CLOCK.sleep(0.01)
+        served.close()
+        assert not any(thread.is_alive() for thread in served._threads)

@@ -1,0 +1,273 @@
+"""A whole emulated rig: planned sweeps give the simulated source's lines, and everything else what the mirror does."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.geometry.scan import Sweep, sweep_positions
+from pipeline.rig.camera.camera_files import KeptInMemory
+from pipeline.rig.camera.camera_settings import CameraAddress, FileServer
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.capture.capture_paths import REFERENCES, capture_prefix
+from pipeline.rig.clock import SYSTEM_CLOCK, Clock
+from pipeline.rig.device_errors import DeviceGone
+from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults
+from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
+from pipeline.rig.mirror.mirror_controller import MirrorController, open_mirror
+from pipeline.rig.mirror.mirror_settings import MirrorSettings
+from pipeline.rig.mirror.registers import Trigger
+from pipeline.rig.transports import SocketTransport
+from pipeline.simulator.instrument import QUIET
+from pipeline.simulator.simulated import SimulatedSource
+from tests.rig.camera.camera_line import wait_for
+from tests.rig.small_rig import CAMERA, COARSE, FINE, small_source
+
+ODD = Sweep("fine-7", "fine", "x", 10 / 3, -11.1, 23)
+MOST_S = 60.0
+
+
+class Pair:
+    """Drivers of both devices."""
+
+    def __init__(self, mirror: MirrorController, camera: HeadwallCamera, clock: Clock) -> None:
+        self.mirror, self.camera, self.clock = mirror, camera, clock
+        camera.configure(CAMERA.exposure_ms, CAMERA.frame_ms)
+
+    def play(self, sweep: Sweep, first: int = 0, *, edges: bool = True, told: Sweep | None = None) -> str:
+        """Play a sweep from a line on during a capture, announced as ``told``; give the folder of what was seen."""
+        held = sweep_positions(sweep, CAMERA)[first:].reshape(-1, 2)
+        cells = np.concatenate([held[:1], held]) if edges else held
+        self.mirror.goto(*held[0])
+        self.mirror.settle(2.0)
+        self.mirror.load_path(cells, "none")
+        rate_hz = 1000 * sweep.step / CAMERA.frame_ms
+        self.mirror.run(0, len(cells), rate_hz, trigger=Trigger.RISING_EDGE if edges else Trigger.OFF)
+        prefix = capture_prefix(sweep if told is None else told, first)
+        folder = self.camera.capture(sweep.lines - first, prefix=prefix).folder
+        wait_for(self.camera, MOST_S)
+        return folder
+
+    def lines(self, folder: str) -> np.ndarray[Any, Any]:
+        """Lines of a capture, (line, sample, band)."""
+        return self.camera.fetch(folder, KeptInMemory()).values
+
+
+@contextmanager
+def connected(source: SimulatedSource | None = None, **rig: Any) -> Iterator[tuple[Pair, EmulatedRig]]:
+    """Drivers of an emulated rig in this process."""
+    whole = EmulatedRig(small_source() if source is None else source, **rig)
+    with whole.in_process() as line:
+        mirror = MirrorController(line.transport, MirrorSettings(), line.clock)
+        mirror.connect()
+        yield Pair(mirror, line.camera(), line.clock), whole
+
+
+def planned(sweep: Sweep, lines: range, source: SimulatedSource | None = None) -> np.ndarray[Any, Any]:
+    """What the simulated source gives of some lines, not binned."""
+    return (small_source() if source is None else source).render(replace(sweep, binning=1), lines)
+
+
+@pytest.mark.parametrize("sweep", [FINE, COARSE, ODD], ids=lambda sweep: str(sweep.name))
+@pytest.mark.parametrize("first", [0, 3])
+def test_planned_sweep_gives_the_lines_of_the_simulated_source(sweep: Sweep, first: int) -> None:
+    """Bit for bit, from whichever line on, by pulses for every held position."""
+    with connected() as (pair, _):
+        folder = pair.play(sweep, first)
+        np.testing.assert_array_equal(pair.lines(folder), planned(sweep, range(first, sweep.lines)))
+
+
+@pytest.mark.parametrize("sweep", [FINE, COARSE], ids=lambda sweep: str(sweep.name))
+def test_path_on_its_own_clock_gives_them_too(sweep: Sweep) -> None:
+    """Where it begins within half a held position of the first exposure."""
+    with connected(wired="none") as (pair, _):
+        folder = pair.play(sweep, edges=False)
+        np.testing.assert_array_equal(pair.lines(folder), planned(sweep, range(sweep.lines)))
+
+
+@pytest.mark.parametrize(("wired", "cells"), [("position", 40), ("frame", 10), ("none", 0)])
+def test_pulses_are_as_the_cable_has_them(wired: Any, cells: int) -> None:
+    """One for each held position of 10 lines of 4, one for each frame, or none."""
+    with connected(wired=wired) as (pair, _):
+        pair.play(COARSE)
+        assert pair.mirror.index() == cells
+
+
+def test_lines_are_those_where_the_mirror_is() -> None:
+    """A path that begins two lines on gives the lines from there on; the announcement does not make it so."""
+    with connected() as (pair, _):
+        folder = pair.play(replace(FINE, start_px=FINE.start_px + 2, lines=FINE.lines - 2), told=FINE)
+        np.testing.assert_array_equal(pair.lines(folder), planned(FINE, range(2, FINE.lines)))
+
+
+def test_path_beside_the_plan_is_looked_at_from_there() -> None:
+    """Half a pixel beside the announced sweep: what the sweep there would give, but for the rounding of DN."""
+    source = small_source(chosen=QUIET)
+    beside = replace(FINE, strip_px=FINE.strip_px + 0.5)
+    with connected(source) as (pair, _):
+        folder = pair.play(beside, told=FINE)
+        found = pair.lines(folder).astype(int)
+    assert np.abs(found - planned(beside, range(FINE.lines), source)).max() <= 1
+    assert np.abs(found - planned(FINE, range(FINE.lines), source)).max() > 1
+
+
+def test_measured_look_follows_the_motion() -> None:
+    """The mirror lags behind what it is sent: lines lie a little beside the planned ones, and near them."""
+    source = small_source(chosen=QUIET)
+    with connected(source, look="measured") as (pair, _):
+        folder = pair.play(FINE)
+        off = np.abs(pair.lines(folder).astype(int) - planned(FINE, range(FINE.lines), source))
+    contrast = np.abs(np.diff(planned(FINE, range(FINE.lines), source).astype(int), axis=0)).mean()
+    assert 0 < off.mean() < contrast / 2
+
+
+def test_captures_that_announce_nothing_have_streams_of_their_own() -> None:
+    """Two looks at one place differ by their noise alone."""
+    with connected() as (pair, _):
+        pair.mirror.goto(0.0, 0.0)
+        looks = []
+        for _ in range(2):
+            folder = pair.camera.capture(3).folder
+            wait_for(pair.camera, MOST_S)
+            looks.append(pair.lines(folder).astype(int))
+    rest = planned(Sweep("rest", "fine", "x", 0.0, 0.0, 1), range(1), small_source(chosen=QUIET))
+    every = np.concatenate(looks)
+    assert len(np.unique(every.reshape(6, -1), axis=0)) == 6
+    assert np.abs(every - rest).mean() < 20  # of 1700 DN
+
+
+def test_other_times_are_those_of_the_camera() -> None:
+    """A camera that is told half of the exposure gives the lines of a rig with that camera."""
+    half = replace(CAMERA, exposure_ms=CAMERA.exposure_ms / 2)
+    source = small_source()
+    with connected() as (pair, _):
+        pair.camera.configure(half.exposure_ms, half.frame_ms)
+        folder = pair.play(FINE)
+        told = replace(source, rig=replace(source.rig, camera=half))
+        np.testing.assert_array_equal(pair.lines(folder), planned(FINE, range(FINE.lines), told))
+
+
+def test_reference_capture_has_dark_and_white() -> None:
+    """Their means are those of the simulated source, to the steps of so many frames of whole numbers."""
+    with connected() as (pair, _):
+        folder = pair.camera.capture(1, prefix=REFERENCES).folder
+        wait_for(pair.camera, MOST_S)
+        found = pair.camera.references(folder, KeptInMemory())
+    wanted = small_source().references(FINE)
+    for name, mean in (("dark", wanted.dark), ("white", wanted.white)):
+        assert np.abs(found[name].mean - mean).max() <= 1 / 64
+
+
+def test_old_captures_make_room() -> None:
+    """Only the newest finished captures keep their files; folders stay."""
+    with connected(kept=2) as (pair, rig):
+        for _ in range(4):
+            pair.camera.capture(1)
+            wait_for(pair.camera, MOST_S)
+        names = {name.rsplit("/", 1)[0] for name in rig.camera.files()}
+        assert names == {"/captured/000001", "/captured/000002", "/captured/000003"}
+        assert "/captured/000000" in rig.camera.folders()
+
+
+def test_references_outlast_the_captures_after_them() -> None:
+    """They are asked for again with every sweep of a survey, however many captures that takes."""
+    with connected(kept=2) as (pair, _):
+        folder = pair.camera.capture(1, prefix=REFERENCES).folder
+        wait_for(pair.camera, MOST_S)
+        for _ in range(4):
+            pair.camera.capture(1)
+            wait_for(pair.camera, MOST_S)
+        assert set(pair.camera.references(folder, KeptInMemory())) == {"dark", "white"}
+
+
+def test_frames_that_wait_to_be_looked_at_keep_the_camera_busy() -> None:
+    """Behind ports a thread looks; until it has, the capture is not over and its files are not whole."""
+    with connected() as (pair, rig):
+        rig.camera.aside = True
+        folder = pair.camera.capture(20, prefix=capture_prefix(FINE)).folder
+        pair.clock.sleep(30.0)
+        assert pair.camera.is_capturing()
+        assert not [name for name in rig.camera.files() if "raw_" in name]
+        assert [rig.camera.look_on() for _ in range(4)] == [True, True, True, False]
+        assert not pair.camera.is_capturing()
+        assert len(pair.lines(folder)) == 20
+
+
+def test_cube_that_is_cut_off_lacks_lines() -> None:
+    """A fault of the camera strikes what it sees of the scene, too."""
+    with connected(camera_faults=CameraFaults({CameraFault.CUT_CUBE: 1})) as (pair, _):
+        found = pair.camera.fetch(pair.play(FINE), KeptInMemory())
+    assert found.valid.tolist() == [True] * (FINE.lines - 2) + [False] * 2
+    np.testing.assert_array_equal(found.values[:-2], planned(FINE, range(FINE.lines - 2)))
+
+
+def test_clock_of_the_source_says_when_a_sweep_began() -> None:
+    """What drifts is as in the survey where the source knows the sweep's start, whenever it is played."""
+    source = small_source(clock={FINE.name: 12.0})
+    with connected(source) as (pair, rig):
+        pair.clock.sleep(100.0)
+        folder = pair.play(FINE)
+        np.testing.assert_array_equal(pair.lines(folder), planned(FINE, range(FINE.lines), source))
+        assert rig.camera.view.source.started_s(FINE) == 12.0
+
+
+def test_state_in_words() -> None:
+    """What both devices do now."""
+    with connected() as (pair, rig):
+        pair.mirror.goto(0.25, 0.0)
+        pair.mirror.settle(2.0)
+        pair.camera.capture(2)
+        seen = rig.seen()
+        assert seen.position == pytest.approx((0.25, 0.0), abs=1e-3)
+        assert (seen.mode, seen.last, seen.capturing, seen.captures) == ("pro, requests checked", "status", True, 1)
+
+
+def test_camera_line_ends_when_the_camera_hangs_up() -> None:
+    """After exit nothing can be written or read."""
+    with EmulatedRig(small_source()).in_process() as line:
+        wire = line.camera_line()
+        assert wire.drain().endswith(b"hpi> ")
+        wire.write(b"exit\r", 1.0)
+        for use in (lambda: wire.write(b"isCapturing\r", 1.0), lambda: wire.read(1, 1.0)):
+            with pytest.raises(DeviceGone, match="closed by the other end"):
+                use()
+
+
+@contextmanager
+def served(speed: float) -> Iterator[tuple[Pair, EmulatedRig]]:
+    """Drivers of an emulated rig behind a pty and sockets, by the clock on the wall."""
+    rig = EmulatedRig(small_source(), FastClock(speed))
+    with contextlib.ExitStack() as stack:
+        ports = stack.enter_context(rig.serve())
+        mirror = stack.enter_context(open_mirror(MirrorSettings(port=ports.port, deadline_s=5.0)))
+        files = FileServer(ports.host, ports.file_port)
+        camera = HeadwallCamera.at(CameraAddress(ports.host, ports.camera_port), files)
+        stack.callback(camera.close)
+        yield Pair(mirror, camera, SYSTEM_CLOCK), rig
+
+
+def test_same_lines_come_through_ports() -> None:
+    """Through a real pty and real sockets, forty times as fast, by pulses."""
+    with served(40.0) as (pair, _):
+        for sweep in (FINE, COARSE):
+            folder = pair.play(sweep)
+            np.testing.assert_array_equal(pair.lines(folder), planned(sweep, range(sweep.lines)))
+
+
+def test_closing_leaves_nothing() -> None:
+    """Both ports are gone, and a device that is used afterwards says so."""
+    with served(40.0) as (pair, rig):
+        port = pair.mirror.settings.port
+    with pytest.raises(DeviceGone, match="no port"):
+        open_mirror(MirrorSettings(port=port))
+    assert not rig.camera.is_capturing()
+    with rig.serve() as again:
+        address = again.host, again.camera_port
+    with pytest.raises(DeviceGone, match="no connection"):
+        SocketTransport(*address, connect_s=0.5)

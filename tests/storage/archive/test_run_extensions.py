@@ -1,0 +1,331 @@
+"""Adding to a published run: whatever happens, the run lies there whole, with what is added or without it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.errors import ArchiveError
+from storage.archive import manifests, run_folders
+from storage.archive.archive import Archive
+from storage.archive.lineage import Catalogue
+from storage.archive.manifests import read_manifest, write_manifest
+from storage.archive.records import read_run
+from storage.archive.staging import PART_SUFFIX
+from storage.maintenance.garbage import clear_up
+from tests.storage.small_archive import Small, small_survey
+from tests.storage.small_bucket import FIRST, SECOND, Machine, problems
+
+ROOT = Path(__file__).parents[3]
+KILL_EVERYWHERE = """
+import os, shutil, sys
+from pathlib import Path
+from storage.archive import manifests
+from storage.archive import run_folders
+from storage.archive.archive import Archive
+from tests.faults.injection import end_at, logged_calls
+from tests.storage.archive.test_run_extensions import extend, run_id
+
+base, folder, way = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]
+if way == "by two renames":
+    run_folders.try_exchange = lambda one, other: False
+
+def end(at):
+    shutil.copytree(base, folder / f"{at}")
+    child = os.fork()
+    if child == 0:
+        end_at(str(folder / f"{at}"), at, 9, log=str(folder / f"{at}.calls"))
+        archive = Archive.open(folder / f"{at}")
+        extend(archive, run_id(archive))
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+assert end(0) == 0
+calls = len(logged_calls(folder / "0.calls"))
+assert [end(at) for at in range(1, calls + 1)] == [-9] * calls
+print(calls)
+"""
+
+
+def run_id(archive: Archive) -> str:
+    """The name of the one run of an archive."""
+    (folder,) = archive.runs()
+    return folder.name
+
+
+def extend(archive: Archive, name: str, figure: float = 0.75) -> Path:
+    """Judge the small survey's map, and publish the run again with what came of it."""
+
+    def build(path: Path) -> None:
+        (path / "accuracy.json").write_text(json.dumps({"miou": figure}))
+
+    (map_,) = archive.refs("segment")
+    ref, _ = archive.produce("evaluate", build, version=1, params={"figure": figure}, inputs=[map_.key])
+    draft = archive.extend_run(name)
+    assert draft is not None
+    with draft:
+        before = json.loads((draft.published / "receipt.json").read_text())
+        products = {**before["products"], "accuracy": f"{ref.uri}/accuracy.json"}
+        draft.write_file("receipt.json", json.dumps({**before, "products": products, "accuracy": {"miou": figure}}))
+        return draft.publish(survey="farm", rests_on=archive.manifest_hashes([map_, ref]))
+
+
+def figure_of(archive: Archive) -> float | None:
+    """The accuracy in the receipt of the one run, None where there is none yet."""
+    found = read_run(archive.root / "runs" / run_id(archive), {})
+    assert found.problem is None
+    return found.receipt.get("accuracy", {}).get("miou")
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Archive:
+    """An archive with one run."""
+    opened = Archive.open(tmp_path / "archive")
+    small_survey(opened)
+    return opened
+
+
+def test_a_run_keeps_its_name_and_date(archive: Archive) -> None:
+    """One folder, one run, of the time at which it was published, that rests on what was added too; it verifies."""
+    name = run_id(archive)
+    created = read_manifest(archive.root / "runs" / name)["created"]
+    folder = extend(archive, name)
+    assert [path.name for path in (archive.root / "runs").iterdir()] == [name] == [folder.name]
+    (run,) = Catalogue.read(archive.root).runs
+    assert (run.created, figure_of(archive)) == (created, 0.75)
+    assert run.sealed > created
+    assert any(uri.startswith("stages/evaluate/") for uri in run.recorded)
+    assert problems(archive) == []
+    assert not [*(archive.root / ".locks").glob("runs-*")]
+
+
+def test_an_old_run_does_not_become_the_newest(archive: Archive) -> None:
+    """It is extended after another was published, and stays the older one of the two."""
+    first = run_id(archive)
+    small_survey(archive, seed=1)
+    names = [run.folder.name for run in Catalogue.read(archive.root).runs]
+    draft = archive.extend_run(first)
+    assert draft is not None
+    with draft:
+        draft.write_file("receipt.json", "{}")
+        draft.publish()
+    assert [run.folder.name for run in Catalogue.read(archive.root).runs] == names
+
+
+def test_what_is_not_published_changes_nothing(archive: Archive) -> None:
+    """A block that fails, and one that ends without a word, leave the run as it was, and nothing beside it."""
+    name, before = run_id(archive), (archive.runs()[0] / "manifest.json").read_bytes()
+    for error in (None, KeyboardInterrupt(), ArchiveError("the disk is full")):
+        draft = archive.extend_run(name)
+        assert draft is not None
+        with suppress(KeyboardInterrupt, ArchiveError), draft:
+            draft.write_file("receipt.json", "{}")
+            if error is not None:
+                raise error
+        assert (archive.runs()[0] / "manifest.json").read_bytes() == before
+        assert [path.name for path in (archive.root / "runs").iterdir()] == [name]
+        assert problems(archive) == []
+
+
+def test_one_at_a_time(archive: Archive) -> None:
+    """A second process is told that it is being done, and a run that is not there is named."""
+    name = run_id(archive)
+    draft = archive.extend_run(name)
+    assert draft is not None
+    with draft:
+        assert archive.extend_run(name, wait=False) is None
+        assert archive.reclaim() == []
+        assert clear_up(archive, keep_days=0).removals == ()
+        assert problems(archive) == []
+    with pytest.raises(ArchiveError, match=r"there is no run 20261120T101701-gone in .*; see ls"):
+        archive.extend_run("20261120T101701-gone")
+
+
+@pytest.mark.parametrize("way", ["exchange", "by two renames"])
+def test_killed_at_every_call_of_the_system(archive: Archive, tmp_path: Path, way: str) -> None:
+    """The run is there, whole, without what is added or with it; the next time it is added."""
+    command = [sys.executable, "-c", KILL_EVERYWHERE, str(archive.root), str(tmp_path), way]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    calls = int(subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True).stdout)
+    assert calls > 30
+    seen = set()
+    for at in range(1, calls + 1):
+        out = tmp_path / f"{at}"
+        if way == "exchange":
+            assert problems(Archive(out)) == []
+        opened = Archive.open(out)  # a verb that writes; it does what two renames may have left to do
+        assert problems(opened) == []
+        seen.add(figure_of(opened))
+        extend(opened, run_id(opened))
+        assert (figure_of(opened), problems(opened)) == (0.75, [])
+        opened.reclaim()
+        assert not [*out.rglob(f"*{PART_SUFFIX}")]
+    assert seen == {None, 0.75}
+
+
+def test_broken_off_between_two_renames_it_is_put_back(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where folders cannot be exchanged and the second rename fails, the run has its name again, as it was."""
+    monkeypatch.setattr(run_folders, "try_exchange", lambda one, other: False)
+    name, rename = run_id(archive), Path.rename
+
+    def refuse(self: Path, to: Path) -> Path:
+        if to.name == name and self.name == name + PART_SUFFIX:
+            raise KeyboardInterrupt
+        return rename(self, to)
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    with pytest.raises(KeyboardInterrupt):
+        extend(archive, name)
+    assert (figure_of(archive), problems(archive)) == (None, [])
+
+
+def test_killed_between_two_renames_verify_and_gc_know(archive: Archive) -> None:
+    """verify tells of it by name, gc keeps its stores, and the next verb that writes gives the run its name."""
+    name = run_id(archive)
+    extend(archive, name)
+    (archive.root / "runs" / name).rename(archive.root / "runs" / (name + PART_SUFFIX))
+    assert any(one.startswith(f"runs/{name} what was added to it lacks its last step") for one in problems(archive))
+    assert "unfinished" not in {removal.what for removal in clear_up(archive, keep_days=9, dry_run=True).removals}
+    opened = Archive.open(archive.root, create=False)
+    assert (figure_of(opened), problems(opened)) == (0.75, [])
+
+
+def test_a_store_that_was_added_is_known_by_its_hash(archive: Archive) -> None:
+    """It is younger than its run; a manifest that somebody has sealed anew is found out all the same."""
+    extend(archive, run_id(archive))
+    (ref,) = archive.refs("evaluate")
+    (ref.path / "accuracy.json").write_text(json.dumps({"miou": 0.99}))
+    known = {name: value for name, value in read_manifest(ref.path).items() if name not in ("files", "seal", "format")}
+    write_manifest(ref.path, known)
+    (found,) = problems(archive)
+    assert f"its manifest.json has changed since runs/{run_id(archive)} was published" in found
+
+
+def test_stores_made_after_a_run_was_extended_are_dated_after_it(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the clock was ahead then: by dates `verify` tells a store made anew from one that was changed."""
+
+    class Tomorrow(datetime):
+        @classmethod
+        def now(cls, tz: Any = None) -> Any:
+            return datetime.now(tz) + timedelta(days=1)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(manifests, "datetime", Tomorrow)
+        extend(archive, run_id(archive))
+    (ref,), (run,) = archive.refs("evaluate"), Catalogue.read(archive.root).runs
+    ahead = datetime.fromisoformat(run.sealed).timestamp()
+    os.utime(run.folder / "manifest.json", (ahead, ahead))
+    assert run_folders.date_of_store(archive.root, ref.uri) > run.sealed > datetime.now(UTC).isoformat()
+
+
+def test_verify_under_way_takes_an_extension_for_no_damage(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The manifest was read before, the files after."""
+    from storage.maintenance import verification
+
+    name, broken = run_id(archive), verification.broken_files
+
+    def extended_meanwhile(folder: Path, manifest: Any, *, hashes: bool) -> Any:
+        if folder.name == name and "extended" not in manifest:
+            extend(archive, name)
+        return broken(folder, manifest, hashes=hashes)
+
+    monkeypatch.setattr(verification, "broken_files", extended_meanwhile)
+    assert [one for one in problems(archive) if one.startswith("runs/")] == []
+    assert figure_of(archive) == 0.75
+
+
+# --- in a bucket ------------------------------------------------------------------------------------------------------
+
+
+def _survey(archive: Archive) -> Small:
+    made = small_survey(archive)
+    assert made.run is not None
+    return made
+
+
+def test_an_extension_reaches_other_machines(machine: Machine) -> None:
+    """One that has the run already brings what was added; nothing of before is left, and all verifies."""
+    archive = machine(FIRST)
+    _survey(archive)
+    other = machine(SECOND, create=False)
+    assert figure_of(other) is None
+    extend(archive, run_id(archive))
+    assert problems(archive) == []
+    other = machine(SECOND, create=False)
+    assert (figure_of(other), problems(other)) == (0.75, [])
+    assert clear_up(other, keep_days=0).removals == ()
+
+
+def test_killed_before_the_files_of_before_go(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other machines have what was added, and gc clears those files away."""
+    archive = machine(FIRST)
+    _survey(archive)
+    machine(SECOND, create=False)
+
+    def kill(*given: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(archive.objects, "remove", kill)
+        with pytest.raises(KeyboardInterrupt):
+            extend(archive, run_id(archive))
+    other = machine(SECOND, create=False)
+    assert (figure_of(other), problems(other)) == (0.75, [])
+    (gone,) = clear_up(other, keep_days=0).removals
+    assert gone.what == "upload"
+    assert (figure_of(machine(SECOND, create=False)), problems(machine(FIRST))) == (0.75, [])
+
+
+def test_an_extension_that_could_not_be_uploaded_is_later(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed before its manifest is put the bucket has the run as it was; the next time this machine sends the rest."""
+    archive = machine(FIRST)
+    _survey(archive)
+
+    def kill(*given: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(archive.copy), "send_run", kill)
+        with pytest.raises(KeyboardInterrupt):
+            extend(archive, run_id(archive))
+    other = machine(SECOND, create=False)
+    assert (figure_of(other), problems(other)) == (None, [])
+    machine(FIRST)
+    other = machine(SECOND, create=False)
+    assert (figure_of(other), problems(other)) == (0.75, [])
+
+
+def test_of_two_machines_that_extend_one_run_the_first_stands(machine: Machine) -> None:
+    """The other takes it, and both end with the same run."""
+    archive = machine(FIRST)
+    _survey(archive)
+    other = machine(SECOND, create=False)
+    extend(archive, run_id(archive), 0.75)
+    folder = extend(other, run_id(other), 0.5)
+    assert (figure_of(archive), figure_of(other)) == (0.75, 0.75)
+    assert (folder / "receipt.json").is_file()
+    assert problems(machine(FIRST)) == []
+
+
+def test_a_damaged_manifest_in_the_bucket_does_not_reach_the_copy(machine: Machine) -> None:
+    """Where a run was extended its manifest is asked for again: what has rotted is not taken."""
+    archive = machine(FIRST)
+    _survey(archive)
+    extend(archive, run_id(archive))
+    name = f"runs/{run_id(archive)}/manifest.json"
+    archive.objects.write(f"runs/{run_id(archive)}/{'0' * 16}/receipt.json", b"of before, and not cleared away yet")
+    text = archive.objects.read(name) or b""
+    archive.objects.write(name, text.replace(b'"survey": "farm"', b'"survey": "fern"'))
+    again = machine(FIRST, create=False)
+    assert figure_of(again) == 0.75
+    assert any("its seal does not fit" in one for one in problems(again))

@@ -1,0 +1,424 @@
+"""Blocks on threads and processes: order, results, bounds, what cannot be sent, workers that die."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dask.distributed import LocalCluster
+
+from pipeline.errors import SettingsError, ShapeError, WorkerError
+from pipeline.geometry.camera import LineCamera
+from pipeline.rectify.placed import PixelGrid
+from pipeline.rectify.tiles import plan_tiles
+from storage.arrays.mosaics import MosaicWriter
+from storage.parallel import cluster_work, worker_facts
+from storage.parallel.block_work import block_graph, run_blocks
+from storage.parallel.crew import Crew, count_cores
+
+PROCESSES = Crew("processes", 2)
+
+
+def square(number: int) -> int:
+    """What is sent to other processes stands in a module."""
+    return number * number
+
+
+def square_unless(refused: int, number: int) -> int:
+    """Fail for one number."""
+    if number == refused:
+        raise ShapeError(f"no {number}")
+    return number * number
+
+
+def die_once(folder: Path, number: int) -> int:
+    """Be killed in the middle of block 3, the first time."""
+    if number == 3 and not (folder / "died").exists():
+        (folder / "died").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def die(number: int) -> int:
+    """Be killed in every block 1."""
+    if number == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def threads_here(number: int) -> tuple[int, str | None]:
+    """Whose process this is, and how many threads arithmetic may take."""
+    return os.getpid(), os.environ.get("OMP_NUM_THREADS")
+
+
+@pytest.fixture(scope="module")
+def processes() -> Iterator[Crew]:
+    """Two worker processes for all tests here."""
+    with PROCESSES.open() as crew:
+        yield crew
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("count", [0, 1, 7])
+def test_threads_give_results_in_order(workers: int, count: int) -> None:
+    """However many threads, each item is made once, results stand in the items' order, and progress ends at 1."""
+    shares: list[float] = []
+    found = run_blocks(lambda item: item * 10, range(count), Crew(workers=workers), report=shares.append)
+    assert found == [10 * item for item in range(count)]
+    assert shares == [(number + 1) / count for number in range(count)]
+
+
+def test_processes_give_results_in_order(processes: Crew) -> None:
+    """Other processes give what threads give; each result is shown once, whether it is kept or not."""
+    shown: dict[int, int] = {}
+    assert run_blocks(square, range(20), processes, each=shown.__setitem__) == [square(item) for item in range(20)]
+    assert shown == {item: square(item) for item in range(20)}
+    assert run_blocks(square, range(20), processes, keep=False) == []
+
+
+def test_workers_are_kept_and_have_one_thread(processes: Crew) -> None:
+    """While a crew is open the same processes work for every call, none of them this one, one thread each."""
+    first, second = ({*run_blocks(threads_here, range(8), processes)} for _ in range(2))
+    assert first | second == first
+    assert {threads for _, threads in first} == {"1"}
+    assert os.getpid() not in {process for process, _ in first}
+
+
+@pytest.mark.parametrize("workers", [2, 5])
+def test_few_blocks_are_begun_ahead_of_the_oldest(workers: int) -> None:
+    """A slow block holds up those far behind it: what is in memory at a time does not grow with the blocks."""
+    begun: list[int] = []
+    go_on = threading.Event()
+
+    def make(number: int) -> None:
+        begun.append(number)
+        if number == 0:
+            go_on.wait(0.3)
+            assert max(begun) < workers
+
+    run_blocks(make, range(24), Crew(workers=workers))
+    assert sorted(begun) == list(range(24))
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_on_threads_is_raised_here(workers: int) -> None:
+    """What a block raises ends the work."""
+    with pytest.raises(ShapeError, match="no 3"):
+        run_blocks(partial(square_unless, 3), range(9), Crew(workers=workers))
+
+
+def test_an_error_of_a_process_is_raised_here(processes: Crew) -> None:
+    """What a block raises comes over with its type and message, and the workers serve the next call."""
+    with pytest.raises(ShapeError, match="no 3"):
+        run_blocks(partial(square_unless, 3), range(9), processes)
+    assert run_blocks(square, range(3), processes) == [0, 1, 4]
+
+
+def test_what_cannot_travel_is_refused(processes: Crew) -> None:
+    """Closures, and arrays in the work or in items, are refused before anything is sent."""
+    with pytest.raises(TypeError, match=r"the work of blocks cannot be sent .* expected a function of a module"):
+        run_blocks(lambda item: item, range(3), processes)
+    with pytest.raises(TypeError, match=r"the work of blocks takes \d+ bytes .* give partial paths to open"):
+        run_blocks(partial(square_unless, np.zeros(10**5)), range(3), processes)
+    with pytest.raises(TypeError, match="the item of blocks takes"):
+        run_blocks(np.sum, [np.zeros(10**5)], processes)
+
+
+def test_a_killed_worker_costs_only_time(tmp_path: Path, processes: Crew) -> None:
+    """kill -9 of a worker in the middle of a block: the block is made again, by another."""
+    assert run_blocks(partial(die_once, tmp_path), range(8), processes) == list(range(8))
+    assert (tmp_path / "died").exists()
+
+
+def test_a_block_that_kills_its_workers_is_one_error() -> None:
+    """Where every try kills the worker, the error says so and what to do; a crew kept open gets other workers."""
+    with Crew("processes", 1).open() as crew:
+        (before, _), *_ = run_blocks(threads_here, [0], crew)
+        with pytest.raises(
+            WorkerError, match=r"1 worker processes: workers died .* in the same block.*--scheduler threads"
+        ):
+            run_blocks(die, range(3), crew)
+        (after, _), *_ = run_blocks(threads_here, [0], crew)
+        assert before != after
+
+
+@pytest.mark.parametrize("scheduler", ["thread", "tcp://", "tcp://host", "http://host:80", "tcp://host:port"])
+def test_an_unknown_scheduler_is_refused(scheduler: str) -> None:
+    """A word that is none, or an address without a port, is refused with what is expected."""
+    with pytest.raises(SettingsError, match="threads, processes, or the address of a dask scheduler such as tcp://"):
+        Crew(scheduler)
+
+
+def test_workers_are_counted() -> None:
+    """None is a worker for each core; fewer than one is refused."""
+    assert Crew().count == count_cores() >= 1
+    with pytest.raises(SettingsError, match="at least 1, got 0"):
+        Crew(workers=0)
+
+
+def test_nobody_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No scheduler at the address: one error that says where, what was expected and what to do."""
+    monkeypatch.setattr(cluster_work, "ANSWER_S", 0.3)
+    with pytest.raises(SettingsError, match=r"tcp://127.0.0.1:9: expected a dask scheduler .*start `dask scheduler`"):
+        run_blocks(square, [1], Crew("tcp://127.0.0.1:9"))
+
+
+@pytest.fixture(scope="module")
+def elsewhere() -> Iterator[Crew]:
+    """A scheduler with one worker, found by its address."""
+    with LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address="127.0.0.1:0") as cluster:
+        crew = Crew(cluster.scheduler_address)
+        with crew.open():
+            yield crew
+
+
+def test_workers_of_a_scheduler_elsewhere_give_the_same(elsewhere: Crew, tmp_path: Path) -> None:
+    """By the address of a scheduler its workers make the blocks, once they have shown that they see the folder."""
+    assert run_blocks(square, range(6), elsewhere, paths=[tmp_path]) == [square(item) for item in range(6)]
+
+
+def test_workers_that_see_other_files_are_refused(
+    elsewhere: Crew, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder that differs there is named, with what both see and what to do; nothing is made."""
+    monkeypatch.setattr(worker_facts, "_seen", lambda folder: "with 7 names")
+    with pytest.raises(
+        SettingsError, match=rf"worker tcp:.* has {tmp_path} with 0 names .*, expected with 7 names .*mount"
+    ):
+        run_blocks(square, [1], elsewhere, paths=[tmp_path])
+
+
+@pytest.fixture
+def other_versions(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
+    """Somebody who may change what this process takes for its own versions."""
+    worker_facts.versions_here.cache_clear()
+    yield monkeypatch
+    worker_facts.versions_here.cache_clear()
+
+
+def test_workers_of_another_version_are_refused(elsewhere: Crew, other_versions: pytest.MonkeyPatch) -> None:
+    """Other code or another numpy there would give other bytes: the first that differs is named."""
+    other_versions.setattr(worker_facts, "version", lambda name: "0.1")
+    with pytest.raises(SettingsError, match=r"has numpy \d.*, expected 0.1 as here; install the same there"):
+        run_blocks(square, [1], elsewhere)
+    worker_facts.versions_here.cache_clear()
+    other_versions.setattr(worker_facts, "_code_digest", lambda: "of code abc")
+    with pytest.raises(SettingsError, match=r"has spectralzoom of code \w+, expected of code abc as here"):
+        run_blocks(square, [1], elsewhere)
+
+
+def test_workers_still_run_what_they_began_with(other_versions: pytest.MonkeyPatch) -> None:
+    """Files that changed on the disk since are not what a process runs."""
+    before = worker_facts.versions_here()
+    other_versions.setattr(worker_facts, "_code_digest", lambda: "of code abc")
+    assert worker_facts.versions_here() == before
+
+
+def test_workers_with_several_threads_of_arithmetic_are_refused() -> None:
+    """Sums of several threads are rounded otherwise: other bytes under the same key."""
+    expected = {**worker_facts.about_here([]), **worker_facts.ONE_THREAD}
+    with pytest.raises(SettingsError, match=r"worker 1 has OMP_NUM_THREADS 4, expected 1 in its environment"):
+        worker_facts.check_facts("worker 1", expected | {"OMP_NUM_THREADS": "4"}, expected)
+
+
+def test_a_scheduler_that_lacks_the_program_is_refused(elsewhere: Crew, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scheduler opens what it passes on to workers."""
+    monkeypatch.setattr(cluster_work, "versions_here", _not_there)
+    with pytest.raises(SettingsError, match=r"the scheduler or a worker cannot import SpectralZoom \(.*no storage"):
+        run_blocks(square, [1], elsewhere)
+
+
+def _not_there() -> None:
+    raise ModuleNotFoundError("no storage")
+
+
+STALE_S = 0.6
+
+
+def fail_or_write(folder: Path, number: int) -> None:
+    """Fail in block 0 while block 1 is still to write."""
+    if number == 0:
+        while not (folder / "begun").exists():
+            time.sleep(0.01)
+        raise ShapeError("no 0")
+    (folder / "begun").touch()
+    time.sleep(STALE_S)
+    (folder / f"late {number}").touch()
+
+
+@pytest.mark.parametrize("scheduler", ["threads", "processes"])
+def test_nobody_writes_after_an_error(tmp_path: Path, processes: Crew, scheduler: str) -> None:
+    """Once an error is raised whoever asked may take the folder away: no block comes back to it, none is begun."""
+    crew = processes if scheduler == "processes" else Crew(workers=2)
+    with pytest.raises(ShapeError, match="no 0"):
+        run_blocks(partial(fail_or_write, tmp_path), range(6), crew)
+    left = sorted(path.name for path in tmp_path.iterdir())
+    time.sleep(2 * STALE_S)
+    assert sorted(path.name for path in tmp_path.iterdir()) == left
+
+
+GONE = """
+import subprocess, sys, time
+from contextlib import suppress
+from pipeline.errors import PipelineError, WorkerError
+from storage.parallel import cluster_work
+from storage.parallel.block_work import run_blocks
+from storage.parallel.crew import Crew
+from tests.storage.parallel.test_block_work import nap
+
+def dask(*words):
+    command = [sys.executable, "-m", f"distributed.cli.dask_{words[0]}", *words[1:], "--no-dashboard"]
+    return subprocess.Popen(command, stderr=subprocess.DEVNULL)
+
+def begin(crew):
+    started = dask("scheduler", "--host", crew.scheduler), dask("worker", crew.scheduler, "--nthreads", "1")
+    while True:
+        with suppress(PipelineError):
+            run_blocks(nap, range(1), crew)
+            return started
+        time.sleep(0.1)
+
+def end(started):
+    for one in started:
+        one.terminate()
+        one.wait()
+
+if __name__ == "__main__":
+    cluster_work.ANSWER_S = 1.0
+    with Crew(sys.argv[1]).open() as crew:
+        started = begin(crew)
+        try:
+            run_blocks(nap, range(9), crew, each=lambda number, result: started[0].kill())
+        except WorkerError as error:
+            print(error)
+        end(started)
+        started = begin(crew)
+        print(run_blocks(nap, range(3), crew))
+        end(started)
+"""
+
+
+def nap(number: int) -> int:
+    """A short block."""
+    time.sleep(0.05)
+    return number
+
+
+def test_a_scheduler_that_goes_away_is_one_error(tmp_path: Path) -> None:
+    """In the middle of the work: one message, no traceback of dask's; one that comes back serves the same crew."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    (script := tmp_path / "gone.py").write_text(GONE)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    done = subprocess.run(
+        [sys.executable, str(script), address], env=environment, capture_output=True, text=True, timeout=60, check=True
+    )
+    gone = f"--scheduler {address}: the scheduler is gone; the same command goes on once it is there again"
+    assert done.stdout.splitlines() == [gone, "[0, 1, 2]"]
+    assert done.stderr == ""
+
+
+INTERRUPTED = """
+import signal, sys, time
+from functools import partial
+from pathlib import Path
+from storage.parallel.block_work import run_blocks
+from storage.parallel.crew import Crew
+from tests.storage.parallel.test_block_work import touch_slowly
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs have it ignored
+    try:
+        run_blocks(partial(touch_slowly, Path(sys.argv[1])), range(1000), Crew("processes", 2))
+    except KeyboardInterrupt:
+        sys.exit(130)
+"""
+
+
+TERMINATED = """
+import os, signal, sys, threading
+from contextlib import suppress
+from pathlib import Path
+from storage.parallel.block_work import run_blocks
+from storage.parallel.crew import Crew
+def children():
+    return [child for task in Path("/proc/self/task").glob("*/children") for child in task.read_text().split()]
+def terminate():
+    while True:
+        with suppress(OSError):  # a thread that has ended
+            if len(children()) > 1:  # a tracker, and a worker
+                break
+    os.kill(os.getpid(), signal.SIGTERM)
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    threading.Thread(target=terminate, daemon=True).start()
+    try:
+        run_blocks(abs, range(4), Crew("processes", 1))
+    except KeyboardInterrupt:
+        sys.exit(143)
+"""
+
+
+def test_sigterm_while_workers_begin(tmp_path: Path) -> None:
+    """It is heard once they are there, and they end without a word."""
+    (script := tmp_path / "terminated.py").write_text(TERMINATED)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (143, b"")
+
+
+def touch_slowly(folder: Path, number: int) -> None:
+    """Show that a block has begun, and take a while."""
+    (folder / f"{number}-{os.getpid()}").touch()
+    time.sleep(0.3)
+
+
+def is_running(process: int) -> bool:
+    """Whether a process is there and no zombie that nobody has asked for."""
+    try:
+        return ") Z " not in Path(f"/proc/{process}/stat").read_text()
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL])
+def test_no_worker_outlives_its_crew(tmp_path: Path, sent: signal.Signals) -> None:
+    """Ctrl-C ends the workers without a word of theirs; after kill -9 of the process that started them they end too."""
+    begun = tmp_path / "begun"
+    begun.mkdir()
+    (script := tmp_path / "interrupted.py").write_text(INTERRUPTED)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    command = [sys.executable, str(script), str(begun)]
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, start_new_session=True) as started:
+        while len(list(begun.iterdir())) < 3:
+            assert started.poll() is None
+            time.sleep(0.02)
+        (os.killpg if sent == signal.SIGINT else os.kill)(started.pid, sent)
+        assert started.stderr is not None
+        said = started.stderr.read()
+        assert started.wait(30) == (130 if sent == signal.SIGINT else -sent)
+    workers = {int(path.name.split("-")[1]) for path in begun.iterdir()}
+    assert len(workers) == 2
+    end = time.monotonic() + 20
+    while any(map(is_running, workers)):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    if sent == signal.SIGINT:
+        assert said == b""
+
+
+@pytest.mark.parametrize(("side", "tiles"), [(10240, 2560), (2560, 160)])
+def test_graphs_of_the_largest_field_stay_small(tmp_path: Path, side: int, tiles: int) -> None:
+    """10240 x 10240 px and 270 bands, coarse and fine: a task a shard."""
+    writer = MosaicWriter(tmp_path / "m.zarr", (side, side), np.linspace(400, 1000, 270))
+    planned = plan_tiles([], LineCamera(), PixelGrid((0.0, 0.0), 1, (side, side)), writer.tile_shape)
+    assert len(block_graph(lambda number, *before: number, len(planned), 16)) == len(planned) == tiles

@@ -1,0 +1,403 @@
+"""An archive on S3: whoever publishes first wins, a half upload is nothing, and every byte that is used was checked."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from storage.remote.opening import is_archive, open_archive
+
+pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
+
+from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
+from storage.archive.addresses import StageRef
+from storage.archive.lineage import Catalogue
+from storage.arrays.layout import create_group, write_image
+from storage.maintenance.garbage import IN_USE, clear_up
+from storage.remote import object_places
+from storage.remote.object_places import UnreachableError, is_remote, parse_place
+from storage.remote.object_stores import AT_ONCE, Objects, some_at_a_time
+from tests.storage.small_archive import small_survey
+from tests.storage.small_bucket import FIRST, SECOND, Machine, make, object_of, problems, rot
+
+
+def test_a_store_is_found_and_fetched_elsewhere(machine: Machine) -> None:
+    """A second machine makes nothing, has no file of the store before it asks for its path, and then the same bytes."""
+    ref, built = make(machine(FIRST))
+    other = machine(SECOND)
+    found, rebuilt = make(other, b"never written")
+    assert (built, rebuilt) == (True, False)
+    assert found == ref
+    folder = other.root / found.uri
+    assert [path.name for path in folder.iterdir()] == ["manifest.json"]
+    assert (found.path / "deep" / "a.bin").read_bytes() == b"light"
+    assert (folder / "manifest.json").read_bytes() == (ref.path / "manifest.json").read_bytes()
+    other.verify(found)
+
+
+def test_a_second_writer_takes_what_stands(bucket: str, machine: Machine) -> None:
+    """Of two machines that make one key at a time one publishes; both end with its store, whatever they had made."""
+    archives = [machine(FIRST), machine(SECOND)]
+    made, together = {}, threading.Barrier(2)
+
+    def publish(number: int) -> None:
+        def build(path: Path) -> None:
+            together.wait(20)
+            (path / "a.bin").write_bytes(b"made by %d" % number)
+
+        made[number] = archives[number].produce("rectify", build, version=1, params={})[0]
+
+    threads = [threading.Thread(target=publish, args=(number,)) for number in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert made[0] == made[1]
+    assert archives[0].manifest_hash(made[0]) == archives[1].manifest_hash(made[1])
+    assert (made[0].path / "a.bin").read_bytes() == (made[1].path / "a.bin").read_bytes()
+    names = archives[0].objects.listing(made[0].uri)
+    assert sum(name.endswith("manifest.json") for name in names) == 1
+    assert problems(archives[0]) == []
+
+
+def test_many_claims_of_a_name_have_one_winner(bucket: str, machine: Machine) -> None:
+    """A conditional put is one: of eight at a time one is written, and all are told the same content."""
+    objects = machine(FIRST).objects
+    for name in ("a", "b", "c", "d", "e"):
+        told = some_at_a_time(partial(objects.claim, name), [b"%d" % number for number in range(AT_ONCE)])
+        assert set(told) == {objects.read(name)}
+
+
+def test_a_store_without_conditional_puts_is_refused(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a put that must not overwrite does, two surveys would destroy each other's: no archive is begun."""
+    monkeypatch.setattr(Objects, "create", lambda self, name, content: True)
+    with pytest.raises(ArchiveError, match="ignores conditional puts"):
+        open_archive(bucket)
+
+
+def test_a_publisher_killed_before_the_manifest_leaves_nothing_visible(
+    bucket: str, machine: Machine, tmp_path: Path
+) -> None:
+    """Killed between files and manifest: others find nothing; the rerun uploads the manifest, and no file again."""
+    script = (
+        "import os, signal, sys\n"
+        "from pathlib import Path\n"
+        "from storage.remote.opening import open_archive\n"
+        "from storage.remote.object_stores import Objects\n"
+        "archive = open_archive(sys.argv[1])\n"
+        "Objects.claim = lambda *given: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "def build(path):\n"
+        "    (path / 'deep').mkdir()\n"
+        "    (path / 'deep' / 'a.bin').write_bytes(b'light')\n"
+        "    (path / 'b.json').write_text('{}')\n"
+        "archive.produce('rectify', build, version=1, params={})\n"
+    )
+    other = machine(SECOND)
+    mine = machine(FIRST)  # and so for the process: its environment is this one's
+    ended = subprocess.run([sys.executable, "-c", script, bucket], cwd=Path(__file__).parents[3], check=False)
+    assert ended.returncode == -9
+    assert len(other.objects.listing("stages")) == 2
+    key = next((mine.root / "stages" / "rectify").iterdir()).name
+    assert other.find("rectify", key) is None
+    before = other.objects.listing("stages")
+    ref, built = make(machine(FIRST))
+    assert not built
+    after = other.objects.listing("stages")
+    assert {name: after[name] for name in before} == before
+    assert other.find("rectify", key) == ref
+
+
+def test_a_flipped_bit_is_found_and_never_used(machine: Machine) -> None:
+    """verify names the file; whoever fetches it is refused, and has nothing of it."""
+    archive = machine(FIRST)
+    ref, _ = make(archive)
+    rot(archive, object_of(archive, ref, "a.bin"))
+    assert problems(archive) == [f"{ref.uri} deep/a.bin has changed since it was published (its SHA-256 differs)"]
+    other = machine(SECOND)
+    found = other.find("rectify", ref.key)
+    assert found is not None
+    with pytest.raises(IncompleteStoreError, match=r"a\.bin has changed since it was published"):
+        _ = found.path
+    assert not (other.root / found.uri / "deep" / "a.bin").exists()
+
+
+@pytest.mark.parametrize("at", [5, 200, -30])
+def test_a_flipped_bit_in_a_manifest_is_found(machine: Machine, at: int) -> None:
+    """The manifest vouches for itself, in the bucket too."""
+    archive = machine(FIRST)
+    ref, _ = make(archive)
+    rot(archive, f"{ref.uri}/manifest.json", at)
+    assert [finding.uri for finding in archive.verify_all() if finding.problem] == [ref.uri]
+    with pytest.raises(IncompleteStoreError, match=r"no valid manifest\.json"):
+        machine(SECOND).find("rectify", ref.key)
+
+
+def test_missing_and_foreign_objects_are_found(machine: Machine) -> None:
+    """A file that is gone, one that nobody listed, and a store that a run names and that is gone."""
+    archive = machine(FIRST)
+    small = small_survey(archive)
+    ref, _ = make(archive)
+    archive.objects.remove([object_of(archive, ref, "b.json")])
+    archive.objects.write(object_of(archive, ref, "a.bin") + ".more", b"x")
+    archive.objects.remove(archive.objects.listing(small.mosaic.uri))
+    assert set(problems(archive)) == {
+        f"{small.mosaic.uri} is not there, but {small.run and 'runs/' + small.run.name} names it",
+        f"{ref.uri} b.json cannot be read: it is missing",
+        f"{ref.uri} deep/a.bin.more is not in the manifest: take it out of the archive",
+    }
+
+
+def test_a_broken_chunk_is_named(machine: Machine) -> None:
+    """Of a broken shard verify tells the rows, as in a folder."""
+    archive = machine(FIRST)
+
+    def build(path: Path) -> None:
+        group = create_group(path / "m.zarr", "m", {})
+        write_image(group, "values", ("y", "x"), np.arange(128 * 64, dtype=np.uint16).reshape(128, 64), {})
+
+    ref, _ = archive.produce("rectify", build, version=1, params={})
+    rot(archive, object_of(archive, ref, "m.zarr/values/c/1/0"), at=50)
+    (found,) = problems(archive)
+    assert "values: rows 64 to 127" in found
+    assert "unreadable: rows 64 to 95, columns 0 to 31" in found
+
+
+def test_a_run_is_seen_elsewhere_with_all_it_rests_on(machine: Machine) -> None:
+    """ls of another machine has runs, receipts and stores; a rerun here sends no store again."""
+    small = small_survey(machine(FIRST))
+    assert small.run is not None
+    other = machine(SECOND, create=False, write=False)
+    catalogue = Catalogue.read(other.root)
+    (run,) = catalogue.runs
+    assert run.problem is None
+    assert run.names == {small.map.uri, small.mosaic.uri, small.raw.uri}
+    assert set(catalogue.stores) == run.names
+    again = machine(FIRST)
+    small_survey(again)
+    assert again.objects.traffic.received < 20_000  # manifests, which say that all is there
+    assert again.objects.traffic.sent < 5_000  # the new run
+    assert problems(again) == []
+
+
+def test_runs_of_one_second_have_names_of_their_own(machine: Machine) -> None:
+    """Two machines that begin a run in the same second do not get the same name."""
+    one, other = machine(FIRST), machine(SECOND)
+    first = one._begin_run("20261120T101010-farm")
+    assert first is not None
+    assert other._begin_run("20261120T101010-farm") is None
+    first.abandon()
+
+
+def test_what_could_not_be_sent_is_sent_by_the_next_run(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bucket goes away in the middle: all is made and kept, one error at the end says so, and the rerun uploads."""
+    archive = machine(FIRST)
+    silence = UnreachableError("it cannot be reached")
+    made: list[StageRef] = []
+
+    def survey() -> None:
+        with archive.in_use(), monkeypatch.context() as patch:
+            made.append(make(archive)[0])
+            patch.setattr(Objects, "write", lambda *given: (_ for _ in ()).throw(silence))
+            made.append(make(archive, b"dark", seed=1)[0])
+            small_survey(archive)
+
+    with pytest.raises(UnreachableError, match="is kept in"):
+        survey()
+    ref, lost = made
+    assert (lost.path / "deep" / "a.bin").read_bytes() == b"dark"
+    other = machine(SECOND)
+    assert other.find("rectify", ref.key) is not None
+    assert other.find("rectify", lost.key) is None
+    machine(FIRST)
+    assert other.find("rectify", lost.key) == lost
+    assert problems(other) == []
+    assert len(Catalogue.read(machine(SECOND, create=False).root).runs) == 1
+
+
+def test_a_capture_goes_on_without_a_network(
+    bucket: str, machine: Machine, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Where a working copy is, no answer is no reason not to begin; where there is none, it is refused at once."""
+    make(machine(FIRST))
+    monkeypatch.setattr(object_places, "RETRIES", 0)
+    place = parse_place(bucket)
+    silent = object_places.ObjectPlace(place.bucket, place.prefix, "http://127.0.0.1:9")
+    monkeypatch.setattr("storage.remote.object_archive.parse_place", lambda text: silent)
+    with pytest.raises(UnreachableError, match=r"127\.0\.0\.1:9: it cannot be reached: check the network"):
+        open_archive(bucket)
+    (silent.working_copy() / ".known").mkdir(parents=True)
+    archive = open_archive(bucket)
+    assert "going on in" in caplog.text
+    with pytest.raises(UnreachableError, match="the same command uploads it"), archive.in_use():
+        assert make(archive, seed=3)[1]
+    with pytest.raises(UnreachableError, match="cannot be reached"):
+        open_archive(bucket, create=False)
+
+
+def test_gc_takes_what_no_run_names_and_broken_off_uploads(machine: Machine) -> None:
+    """Manifest first; what a receipt names stays, on every machine; a broken-off upload goes with its files."""
+    archive = machine(FIRST)
+    kept, gone = small_survey(archive), small_survey(archive, seed=1, named=False)
+    archive.objects.write("stages/rectify/half/0123456789abcdef/a.bin", b"half")
+    opened = machine(SECOND, create=False)
+    assert [removal.what for removal in clear_up(opened, keep_days=1).removals] == []
+    planned = clear_up(opened, keep_days=0, dry_run=True)
+    done = clear_up(opened, keep_days=0)
+    assert done == planned
+    assert [removal.uri for removal in done.removals] == [
+        gone.map.uri,
+        gone.mosaic.uri,
+        gone.raw.uri,
+        "stages/rectify/half/0123456789abcdef",
+    ]
+    left = {name.rpartition("/")[0] for name in archive.objects.listing("stages")}
+    assert {name.split("/")[2] for name in left} == {kept.map.key, kept.mosaic.key, kept.raw.key}
+    assert problems(opened) == []
+    machine(FIRST, create=False)
+    assert {ref.uri for ref in machine(FIRST).refs()} == {kept.raw.uri, kept.mosaic.uri, kept.map.uri}
+
+
+def test_gc_leaves_an_archive_alone_that_another_machine_uses(machine: Machine) -> None:
+    """A lease of a survey elsewhere keeps stores; a dead one of this machine does not."""
+    one, other = machine(FIRST), machine(SECOND, create=False)
+    small_survey(one, named=False)
+    other.copy.mirror()
+    with one.in_use():
+        done = clear_up(other, keep_days=0)
+        assert (done.obstacle, done.removals) == (IN_USE, ())
+    other.objects.write(".in-use/shared-of-the-dead", b"")
+    (other.root / ".in-use").mkdir(exist_ok=True)
+    (other.root / ".in-use" / "shared-of-the-dead.lock").touch()
+    assert len(clear_up(other, keep_days=0).removals) == 3
+    assert other.objects.listing(".in-use") == {}
+
+
+def test_a_cached_store_that_was_cleared_away_is_sent_again(machine: Machine) -> None:
+    """What another machine removed is uploaded again before a run names it."""
+    archive, other = machine(FIRST), machine(SECOND, create=False)
+    small = small_survey(archive, named=False)
+    other.discard(small.raw)
+    small_survey(archive)
+    assert problems(archive) == []
+
+
+def test_a_lost_working_copy_costs_nothing_but_time(machine: Machine) -> None:
+    """All of it may be deleted; files that lack are fetched again."""
+    archive = machine(FIRST)
+    ref, _ = make(archive)
+    (ref.path / "deep" / "a.bin").unlink()
+    again = machine(FIRST).find("rectify", ref.key)
+    assert again is not None
+    assert (again.path / "deep" / "a.bin").read_bytes() == b"light"
+    shutil.rmtree(archive.root)
+    found, built = make(machine(FIRST))
+    assert not built
+    assert (found.path / "deep" / "a.bin").read_bytes() == b"light"
+
+
+def test_a_published_store_opens_with_plain_zarr(bucket: str, machine: Machine) -> None:
+    """Without SpectralZoom: the manifest's hash tells the folder, zarr and obstore do the rest."""
+    import hashlib
+
+    import zarr
+    from obstore.store import S3Store
+
+    def build(path: Path) -> None:
+        write_image(create_group(path / "m.zarr", "m", {}), "values", ("y", "x"), np.eye(40, dtype=np.uint8), {})
+
+    ref, _ = machine(FIRST).produce("rectify", build, version=1, params={})
+    name, _, prefix = bucket.removeprefix("s3://").partition("/")
+    store = S3Store(name, prefix=f"{prefix}/{ref.uri}", client_options={"allow_http": True})
+    text = bytes(store.get("manifest.json").bytes())
+    assert "m.zarr/zarr.json" in json.loads(text)["files"]
+    folder = f"{prefix}/{ref.uri}/{hashlib.sha256(text).hexdigest()[:16]}/m.zarr"
+    inner = S3Store(name, prefix=folder, client_options={"allow_http": True})
+    group = zarr.open_group(zarr.storage.ObjectStore(inner, read_only=True), mode="r", use_consolidated=False)
+    np.testing.assert_array_equal(group["values"][:], np.eye(40))
+
+
+@pytest.mark.parametrize("text", ["s3://", "s3://Upper/x", "s3://ok/../x", "s3://bucket/a//b", "s3://bucket/a b"])
+def test_addresses_that_are_none_are_refused(text: str) -> None:
+    """A bucket's name is S3's, a prefix is of plain letters and cannot climb."""
+    assert is_remote(text)
+    with pytest.raises(SettingsError, match=r"expected s3://bucket/prefix"):
+        parse_place(text)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "words"),
+    [
+        ("nonsense", "is no address"),
+        ("http://10.0.0.1:9000", "plain http"),
+        ("ftp://x", "no address"),
+        ("http://", "no"),
+    ],
+)
+def test_endpoints_that_cannot_be_used_are_refused(endpoint: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plain http goes to this machine alone, unless it is allowed."""
+    monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
+    with pytest.raises(SettingsError, match=words):
+        parse_place("s3://bucket/x")
+
+
+def test_a_missing_bucket_or_archive_is_one_clear_error(bucket: str) -> None:
+    """The message says what is missing and what to do."""
+    with pytest.raises(ArchiveError, match=r"s3://no-such-bucket/x at http://.*: there is no such bucket: create it"):
+        open_archive("s3://no-such-bucket/x")
+    with pytest.raises(ArchiveError, match="is not there; check the name"):
+        open_archive(f"{bucket}-none", create=False)
+    assert not is_archive(f"{bucket}-none")
+
+
+@pytest.mark.parametrize("text", ["gs://bucket/x", "http://host/x", "S3://bucket/x"])
+def test_addresses_of_other_kinds_are_no_folders(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are refused, and no folder is made that is called so."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SettingsError, match=r"expected a folder, or s3://bucket/prefix"):
+        open_archive(text)
+    with pytest.raises(SettingsError, match=r"expected a folder, or s3://bucket/prefix"):
+        is_archive(text)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("answer", "words", "passing"),
+    [
+        ("Server returned non-2xx status code: 503 Service Unavailable: SlowDown", "run again later", True),
+        ("HTTP error: request or response body error", "broken off", True),
+        ("Server returned non-2xx status code: 501 Not Implemented: ", "lacks what an archive needs", False),
+        ("Received redirect without LOCATION", "set AWS_REGION", False),
+        ('Encountered object with invalid path: Path "x//y"', 'Path "x//y"; take it out of the bucket', False),
+        ("The AWS Access Key Id does not exist: InvalidAccessKeyId", "check AWS_ACCESS_KEY_ID", False),
+    ],
+)
+def test_what_a_store_answers_is_told_in_words(bucket: str, answer: str, words: str, passing: bool) -> None:
+    """What may pass by itself is told from what somebody has to change."""
+    from obstore.exceptions import GenericError
+
+    with pytest.raises(UnreachableError, match=re.escape(words)) as told, object_places.answers_of(parse_place(bucket)):
+        raise GenericError(answer)
+    assert told.value.passing is passing
+
+
+@pytest.mark.parametrize("create", [True, False])
+def test_what_has_another_mark_is_no_archive(bucket: str, machine: Machine, create: bool) -> None:
+    """Such as a network's page for guests, which answers everything, or an archive of a later version."""
+    machine(FIRST).objects.write("archive.json", b"<html>welcome</html>")
+    with pytest.raises(ArchiveError, match=r"archive\.json is not as expected"):
+        open_archive(bucket, create=create)
+
+
+def test_no_archive_is_made_among_the_stores_of_another(bucket: str) -> None:
+    """What lies there would be taken for the other's, and cleared away."""
+    with pytest.raises(SettingsError, match="lies in an archive's folder stages"):
+        open_archive(f"{bucket}/stages")
