@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flows.terminal.figures import DASH, format_seconds
-from pipeline.simulator.selection.manifest import UNIT_WORDS
+from pipeline.simulator.selection.choice import UNIT_WORDS
 
 WIDE = 100  # characters, from which words fit into the table
 COLOURS = {"on": "green", "off": "dim"}

@@ -28,7 +28,7 @@ from models.network.process import keep_freed_memory, use_one_thread
 from pipeline.errors import ArchiveError, SceneError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.selection.manifest import UNIT_WORDS
+from pipeline.simulator.selection.choice import UNIT_WORDS
 from storage.archive.archive import StageRef
 from storage.readers.scene_files import load_scene_file
 from storage.remote.opening import open_archive

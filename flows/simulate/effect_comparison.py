@@ -21,17 +21,13 @@ from flows.survey.stages.effects import chosen_effects, load_manifest, source_wi
 from pipeline.errors import BoundError
 from pipeline.geometry.camera import bin_samples
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import Effect
-from pipeline.simulator.effects.light_units import stored_mean, unit_at
-from pipeline.simulator.effects.probe import Unit
+from pipeline.simulator.effects.effect import Effect, SweepBlock
+from pipeline.simulator.effects.probe import Unit, stored_mean, unit_at
 from pipeline.simulator.effects.registry import BY_NAME
-from pipeline.simulator.instrument import BLOCK_LINES
-from pipeline.simulator.readout import dark_frame, read_out
-from pipeline.simulator.render import expected_light
-from pipeline.simulator.selection.arithmetic import contrast_about, misplaced_electrons, misplaced_share
-from pipeline.simulator.selection.manifest import UNIT_WORDS
-from pipeline.simulator.simulated import SimulatedSource, sweep_starts
+from pipeline.simulator.render import dark_frame, expected_light, read_out
+from pipeline.simulator.selection.choice import UNIT_WORDS
+from pipeline.simulator.selection.verification import contrast_about, misplaced_electrons, misplaced_share
+from pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource, sweep_starts
 from storage.archive.archive import StageRef
 from storage.arrays.quicklooks import choose_bands
 

@@ -8,8 +8,7 @@ from functools import partial
 from threading import Semaphore
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.instrument import BLOCK_LINES
-from pipeline.simulator.simulated import SimulatedSource
+from pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource
 from pipeline.source import Line, Source
 from storage.parallel.block_work import run_blocks
 from storage.parallel.crew import Crew

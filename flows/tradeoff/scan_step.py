@@ -13,7 +13,7 @@ from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.rectify.calibration.calibrate import reflectance
 from pipeline.rectify.lookup import grid_lookup
 from pipeline.rectify.resample import resample
-from pipeline.simulator.instrument import QUIET
+from pipeline.simulator.effects.registry import QUIET
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep

@@ -23,8 +23,7 @@ from flows.tradeoff.simulated_lines import (
 from pipeline.simulator.effects.effect import OFF, Effect
 from pipeline.simulator.effects.line import SLIT
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.readout import dark_frame, read_out
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.render import dark_frame, expected_light, read_out
 from pipeline.simulator.selection.choice import CHEAP_SHARE, Decision, decide
 
 EXACT = "exact"

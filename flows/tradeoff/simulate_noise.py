@@ -12,11 +12,10 @@ from flows.tradeoff.entries import Level, Setting, Tradeoff, register
 from flows.tradeoff.simulated_lines import look_at_lines
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.counting import QUANTISATION, READ_NOISE, SATURATION, SHOT
-from pipeline.simulator.effects.effect import OFF
+from pipeline.simulator.effects.effect import OFF, SweepBlock
 from pipeline.simulator.effects.probe import Probe
-from pipeline.simulator.readout import read_out
+from pipeline.simulator.render import read_out
 from pipeline.simulator.rig_model import Rig
 
 LEVELS = 6

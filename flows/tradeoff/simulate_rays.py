@@ -13,7 +13,7 @@ from flows.tradeoff.simulate import FOOTPRINT
 from flows.tradeoff.simulated_lines import Against, FarmLines, Light, look_at_lines
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.lazy import Once
-from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import SLIT
 from pipeline.simulator.effects.registry import RAYS
 from pipeline.simulator.render import expected_light

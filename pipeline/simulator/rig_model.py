@@ -12,9 +12,9 @@ from typing import Literal
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.optics.coatings import Coating
 from pipeline.stated import assumed, check_stated, stated
 
+Coating = Literal["aluminium", "gold", "silver", "ideal"]  # ideal: reflects everything, at any angle
 Relief = Literal["flat", "step", "plane"]
 LEAST_DISTANCE_M = 1e-3
 

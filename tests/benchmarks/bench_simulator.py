@@ -13,14 +13,12 @@ from measure import Clock, Row, ratio, time_in_turn
 from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
-from pipeline.simulator.effects.effect import Effect
-from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.effect import Effect, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
+from pipeline.simulator.effects.probe import noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.readout import read_out
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.render import expected_light, read_out
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.effects.sensor import dark_electrons
+from pipeline.simulator.effects.counting import dark_electrons
 from pipeline.simulator.rig_model import Rig
 
 VOLT_PER_E = 1e-5

@@ -10,17 +10,16 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import Effect
-from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.effect import Effect, SweepBlock
+from pipeline.simulator.effects.probe import noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.instrument import sweep_block
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.options import acts_on_light
 from pipeline.simulator.selection.survey_probe import probe_scene
+from pipeline.simulator.simulated import sweep_block
 
 ROUNDING = 4e-6  # of the light over its noise: sums of float32 in another order
 CAMERA = LineCamera(samples=64)

@@ -16,19 +16,17 @@ from hypothesis import strategies as st
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import Effect, Light
-from pipeline.simulator.effects.light_units import noise_electrons, stored_mean, unit_at
 from pipeline.simulator.effects.line import ROTATION, SLIT
-from pipeline.simulator.effects.probe import Unit
+from pipeline.simulator.effects.probe import Unit, noise_electrons, stored_mean, unit_at
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.instrument import sweep_block
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.selection.choice import decide
-from pipeline.simulator.selection.manifest import TOTAL
+from pipeline.simulator.selection.choice import TOTAL, decide
 from pipeline.simulator.selection.survey_probe import probe_survey
 from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
+from pipeline.simulator.simulated import sweep_block
 from tests.hard_cases.simulated_scene import scene_of
 
 LOOK: dict[Effect, str] = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[-1]}

@@ -15,20 +15,16 @@ from flows.settings.survey_settings import plain_value
 from flows.survey.run import CaptureRun
 from flows.survey.stage import Product, Wanted, stage
 from pipeline.errors import IncompleteStoreError
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import Effect, Light
-from pipeline.simulator.effects.light_units import unit_at
+from pipeline.simulator.effects.effect import Effect, Light, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
-from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.effects.probe import Probe, unit_at
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
-from pipeline.simulator.instrument import sweep_block
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.selection.choice import Decision, decide
-from pipeline.simulator.selection.manifest import list_effects, sum_up
+from pipeline.simulator.selection.choice import Decision, decide, list_effects, sum_up
 from pipeline.simulator.selection.survey_probe import probe_survey
 from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
-from pipeline.simulator.simulated import SimulatedSource, sweep_starts
+from pipeline.simulator.simulated import SimulatedSource, sweep_block, sweep_starts
 from storage.archive.archive import StageRef
 from storage.archive.stored_tables import read_table
 from storage.archive.whole_files import to_json

@@ -34,13 +34,11 @@ from pipeline.rig.emulator.camera_device import CameraDevice, CameraFaults, Came
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.mirror.steering import wire_positions
 from pipeline.rig.survey_rig import Pulses
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import Aim, Bound
+from pipeline.simulator.effects.effect import Aim, Bound, SweepBlock
 from pipeline.simulator.effects.probe import Probe
-from pipeline.simulator.instrument import render_lines
 from pipeline.simulator.render import Choice
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.simulated import SimulatedSource
+from pipeline.simulator.simulated import SimulatedSource, render_lines
 from pipeline.source import AT_REST
 
 Look = Literal["sent", "measured"]

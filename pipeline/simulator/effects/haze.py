@@ -20,13 +20,10 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Bound, Gain, Light, LightChange
-from pipeline.simulator.effects.gain_range import GainRange
-from pipeline.simulator.effects.light_units import lights_within, unit_electrons
+from pipeline.simulator.effects.air import has_relief, reach_m, sample_distances, spoken_reach
+from pipeline.simulator.effects.effect import OFF, Bound, Gain, Light, LightChange, SweepBlock
 from pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT
-from pipeline.simulator.effects.probe import Probe
-from pipeline.simulator.effects.relief import has_relief, reach_m, sample_distances, spoken_reach
+from pipeline.simulator.effects.probe import GainRange, Probe, lights_within, unit_electrons
 from pipeline.simulator.rig_model import Air, Rig
 from pipeline.simulator.scenes.daylight import relative_daylight
 

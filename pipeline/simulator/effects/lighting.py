@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, points_of_scan
-from pipeline.simulator.block import SweepBlock, sweep_stream
-from pipeline.simulator.effects.effect import OFF, Bound, Gain, Light
-from pipeline.simulator.effects.gain_range import GainRange
-from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.effects.effect import OFF, Bound, Gain, Light, SweepBlock, sweep_stream
+from pipeline.simulator.effects.probe import GainRange, Probe
 from pipeline.simulator.rig_model import Rig, Sky
 from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
 

@@ -12,16 +12,13 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, points_of_scan
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Bound, Effect
+from pipeline.simulator.effects.air import PARALLAX, greatest_share, sway_gradient, turbulence_px
+from pipeline.simulator.effects.effect import OFF, Bound, Effect, SweepBlock
 from pipeline.simulator.effects.mirror_path import beside_plan, greatest_lag_px, transient
-from pipeline.simulator.effects.mirror_pointing import at_line_ends, end_gains
-from pipeline.simulator.effects.moving_air import sway_gradient, turbulence_px
+from pipeline.simulator.effects.pointing import at_line_ends, end_gains
 from pipeline.simulator.effects.probe import Probe
-from pipeline.simulator.effects.relief import PARALLAX, greatest_share
 from pipeline.simulator.optics.rays import RayViews
-from pipeline.simulator.optics.tap_sums import Parts, fewest_parts
-from pipeline.simulator.optics.tap_tables import BETWEEN_ROWS, SCALE_STEP, TABULATED
+from pipeline.simulator.optics.tap_sums import BETWEEN_ROWS, SCALE_STEP, TABULATED, Parts, fewest_parts
 from pipeline.simulator.rig_model import Rig
 
 MARGIN = 1.5  # over what the probe measured at the roughest places found

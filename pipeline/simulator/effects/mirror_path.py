@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Aim, Bound
-from pipeline.simulator.effects.mirror_pointing import at_line_ends
+from pipeline.simulator.effects.effect import OFF, Aim, Bound, SweepBlock
+from pipeline.simulator.effects.pointing import at_line_ends
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 

@@ -1,13 +1,15 @@
-"""Pointing errors of the simulated mirror: where it really looks while it reports the planned positions.
+"""Where the mirror looks beside its plan: jitter, hysteresis, drift, and pointing errors of whole sweeps.
 
-Beside the mirror's own faults (jitter, hysteresis and thermal drift, which follow from a rig's numbers) these put whole
-sweeps, each by itself, beside their places: what registration is there to find.
+The mirror's own faults (jitter, hysteresis, thermal drift) follow from a rig's numbers. Pointing errors put whole
+sweeps, each by itself, beside the places that the mirror reports: what registration is there to find.
 """
 
 from __future__ import annotations
 
+import math
 import zlib
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -15,16 +17,211 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import Aim, Bound
-from pipeline.simulator.effects.mirror_pointing import at_line_ends
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import position_to_normal
+from pipeline.geometry.scan import Sweep, line_positions, points_of_scan
+from pipeline.simulator.effects.effect import Aim, Bound, SweepBlock, unit_stream
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
+
+Floats = NDArray[np.float64]
+EXCEEDED = 1e-3  # probability that any line of a survey lies beyond the bound
+_MODES = 6
+
+
+def end_gains(sweep: Sweep, camera: LineCamera) -> Floats:
+    """Give the derivatives of a line's points (along, scan) by those of its centre, (line, point, 2, 2).
+
+    The points are the line's two ends and its centre, where the derivatives are 1 and 0. At the end of 320 px a
+    centre that moves by 1 px along the line moves the point by .034 px along the scan.
+    """
+    slopes = np.array([-0.5, 0.0, 0.5]) * camera.samples * camera.ifov_rad
+    centre = sweep.line_px()[:, None]
+
+    def points(strip: float, scan: float) -> Floats:
+        return np.stack(points_of_scan(sweep.strip_px + strip, camera, centre + scan, slopes), axis=-1)
+
+    by_strip, by_scan = (points(1, 0) - points(-1, 0)) / 2, (points(0, 1) - points(0, -1)) / 2
+    return np.stack([by_strip, by_scan], axis=-1)
+
+
+def at_line_ends(sweeps: Iterable[Sweep], camera: LineCamera, along: float, scan: float) -> tuple[float, float]:
+    """Bound how far any point of any line moves, for centres that move by up to so much. [px]"""
+    most = np.eye(2)
+    for sweep in sweeps:
+        if sweep.lines:
+            most = np.maximum(most, np.abs(end_gains(sweep, camera)).max(axis=(0, 1)))
+    moved = most @ [along, scan]
+    return float(moved[0]), float(moved[1])
+
+
+@dataclass(frozen=True)
+class Jitter(Aim):
+    """A normal deviate of the tilt about either axis, anew for every line.
+
+    At rest the view moves by 2 sigma in the plane of incidence, which is the scan's axis, and by sqrt(2) sigma across
+    it, along the line; elsewhere by the derivatives of the exact reflection.
+    """
+
+    name = "jitter"
+    cost_ns = MappingProxyType({"exact": 0.15})
+
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
+        """Give the shift, (line, 1, 2) along the line and the scan. [px]"""
+        drawn = np.array([block.stream(self.name, number).standard_normal(2) for number in block.numbers.tolist()])
+        shift: Floats = (tilt_to_scene(block.normals) * drawn.reshape(-1, 1, 2)).sum(axis=-1) * _sigma_px(block.rig)
+        return shift[:, None]
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound what the worst of all lines' deviates changes; with a probability of 1e-3 a survey goes beyond.
+
+        A line changes by at most its slope's share in the two tilts times the length of the two deviates. That length
+        exceeds m with probability exp(-m^2 / 2), so any of n lines' does with at most n exp(-m^2 / 2): m is
+        sqrt(2 ln(n / 1e-3)), 5.4 for 2560 lines.
+        """
+        sigma, lines = _sigma_px(rig), probe.lines
+        if sigma == 0 or lines == 0:
+            return Bound(0.0, "the mirror comes back to the same tilt")
+        along, scan, common = _spreads(probe, rig)
+        most = math.sqrt(2 * math.log(lines / EXCEEDED))
+        g, h = probe.slope[0] * along, probe.slope[1] * scan
+        value = np.minimum(most * sigma * np.sqrt(g * g + h * h + 2 * common * g * h), probe.span).max(initial=0.0)
+        why = f"lines jump by {sigma * scan:.2f} px rms along the scan and {sigma * along:.2f} along the line"
+        return Bound(float(value), f"{why}, one of {lines} by {most:.1f} times that")
+
+
+JITTER = Jitter()
+
+
+def tilt_to_scene(normals: Floats) -> Floats:
+    """Give the derivatives of scene tangents with respect to tilts of the mirror, (..., 2, 2).
+
+    Parameters
+    ----------
+    normals
+        (..., 3) unit normals.
+
+    Returns
+    -------
+    Rows are along the line and along the scan; columns a tilt about the axis most nearly in the plane of incidence,
+    which moves the view across that plane, and one about y, which moves it within. At rest diag(sqrt(2), 2).
+    """
+    within = np.stack([normals[..., 2], np.zeros_like(normals[..., 0]), -normals[..., 0]], axis=-1)  # y x n
+    within /= np.hypot(normals[..., 2], normals[..., 0])[..., None]
+    across = np.cross(normals, within)
+    tilts = np.stack([across, within], axis=-2)  # (..., tilt, 3)
+    # o = k - 2 (n . k) n with k = (0, 0, 1)
+    view = -2 * normals[..., 2:] * normals
+    view[..., 2] += 1
+    turned = -2 * (tilts[..., 2:] * normals[..., None, :] + normals[..., None, 2:] * tilts)
+    ahead = view[..., None, :1]
+    tangents = (turned[..., 1:] - turned[..., :1] * view[..., None, 1:] / ahead) / ahead
+    gains: Floats = np.swapaxes(tangents, -1, -2)
+    return gains
+
+
+def _sigma_px(rig: Rig) -> float:
+    return rig.mirror.repeatability_urad * 1e-6 / rig.camera.ifov_rad
+
+
+def _spreads(probe: Probe, rig: Rig) -> tuple[float, float, float]:
+    """Greatest px along the line and along the scan for 1 px of tilt, and the greatest correlation of the two."""
+    worst = np.zeros(3)
+    for sweep in probe.sweeps:
+        if sweep.lines:
+            tilt = tilt_to_scene(position_to_normal(line_positions(sweep, rig.camera)))
+            gain = end_gains(sweep, rig.camera) @ tilt[:, None]
+            size = np.sqrt((gain**2).sum(axis=-1))
+            common = np.abs((gain[..., 0, :] * gain[..., 1, :]).sum(axis=-1)) / size.prod(axis=-1)
+            worst = np.maximum(worst, [size[..., 0].max(), size[..., 1].max(), common.max()])
+    return float(worst[0]), float(worst[1]), float(worst[2])
+
+
+@dataclass(frozen=True)
+class Hysteresis(Aim):
+    """A systematic error of pointing: smooth over the mirror's disk, one field for each copy of the rig.
+
+    The field is at most ``hysteresis_px`` in either axis; a scan the other way meets it with the other sign.
+    """
+
+    name = "hysteresis"
+    cost_ns = MappingProxyType({"exact": 0.07})
+
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
+        """Give the shift, (line, 1, 2) along the line and the scan. [px]"""
+        return _course(block.rig, block.sweep, block.middle)[:, None]
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound by slope times the greatest shift that any line of the sweeps has: the field is known."""
+        if rig.mirror.hysteresis_px == 0 or not probe.sweeps:
+            return Bound(0.0, "the mirror comes to the same place from either side")
+        ways = [_course(rig, sweep, line_positions(sweep, rig.camera)) for sweep in probe.sweeps]
+        along, scan = np.abs(np.concatenate(ways)).max(axis=0, initial=0.0)
+        why = f"lines lie up to {along:.2g} px off along the line and {scan:.2g} px along the scan"
+        return Bound(probe.moved(*at_line_ends(probe.sweeps, rig.camera, along, scan)), why)
+
+
+@dataclass(frozen=True)
+class ThermalDrift(Aim):
+    """The view walks in one direction as the unit warms up; each copy of the rig has a direction of its own."""
+
+    name = "thermal-drift"
+    cost_ns = MappingProxyType({"exact": 0.06})
+
+    def aim(self, block: SweepBlock, variant: str) -> Floats:
+        """Give the shift since the survey's start, (line, 1, 2) along the line and the scan. [px]"""
+        walked = block.rig.mirror.drift_px_per_min / 60 * block.time_s
+        return np.stack([walked * one for one in _along_and_scan(block.rig)], axis=-1)[:, None]
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound by slope times the way walked until the last line."""
+        rate = rig.mirror.drift_px_per_min
+        if rate == 0 or not probe.sweeps:
+            return Bound(0.0, "the view does not drift")
+        walked = rate / 60 * (probe.seconds + rig.camera.frame_ms * 1e-3)
+        along, scan = (walked * abs(one) for one in _along_and_scan(rig))
+        why = f"the view drifts by {walked:.2g} px, {rate:g} px/min for {probe.seconds:.3g} s"
+        return Bound(probe.moved(*at_line_ends(probe.sweeps, rig.camera, along, scan)), why)
+
+
+HYSTERESIS = Hysteresis()
+
+THERMAL_DRIFT = ThermalDrift()
+
+
+def pointing_field(unit: int, position: Floats) -> Floats:
+    """Give a smooth field over the disk, (..., 2) for positions (..., 2); between -1 and 1 on it. [-]
+
+    A sum of the six Zernike polynomials up to degree 2 in the disk's own coordinates, each at most 1 in size, with
+    normal deviates for weights whose sizes sum to 1.
+    """
+    x, y = position[..., 0], position[..., 1]
+    modes = np.stack([np.ones_like(x), x, y, 2 * (x * x + y * y) - 1, x * x - y * y, 2 * x * y], axis=-1)
+    weights = unit_stream(unit, Hysteresis.name).standard_normal((_MODES, 2))
+    field: Floats = (modes[..., None] * (weights / np.abs(weights).sum(axis=0))).sum(axis=-2)
+    return field
+
+
+def _course(rig: Rig, sweep: Sweep, position: Floats) -> Floats:
+    """Shift (line, 2) of lines at some positions of a sweep. [px]"""
+    return rig.mirror.hysteresis_px * scan_sign(sweep) * pointing_field(rig.detector.unit, position)
+
+
+def scan_sign(sweep: Sweep) -> float:
+    """Give 1 for a scan towards greater coordinates (or one that stands still), -1 for one that comes back."""
+    held = sweep.held_px().ravel()
+    return -1.0 if len(held) > 1 and held[-1] < held[0] else 1.0
+
+
+def _along_and_scan(rig: Rig) -> tuple[float, float]:
+    """Part of the drift along the line and along the scan; the mirror's own axes are the line's and the scan's."""
+    turn = unit_stream(rig.detector.unit, ThermalDrift.name).uniform(0, 2 * math.pi)
+    return math.cos(turn), math.sin(turn)
+
 
 ACCURACY_PX = 50.0  # 0.15 deg mechanical, as quoted by the vendor: systematic, unknown before registration
 REPEATABILITY_PX = 0.8  # 40 urad mechanical: anew for every line
 _MOST_DEVIATES = 6.0  # beyond, one line in 5e8 lies
-Floats = NDArray[np.float64]
 
 
 class Pointing(Aim, ABC):

@@ -1,15 +1,22 @@
-"""The summary of a scene and a rig from which effects are decided: how bright, steep and curved the image is."""
+"""What effects are decided from: a summary of scene and rig, units of stored numbers, ranges of gains over wavelength.
+
+A number of a raw line sums neighbouring samples, and has the noise of that sum. All is counted per sample: light as the
+mean over the samples of a sum, noise as that of the mean. A change of the one over the other is the change of the
+stored number in its own sigmas, whatever the binning.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from itertools import pairwise
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Sweep
+from pipeline.simulator.rig_model import Rig
 
 Floats = NDArray[np.float64]
 Unit = Literal["sigma", "dn"]
@@ -79,3 +86,154 @@ class Probe:
 def _times(steep: Floats, way: Floats | float) -> Floats:
     """Their product; 0 where there is no way, however steep it is."""
     return np.multiply(steep, way, out=np.zeros(np.shape(steep)), where=np.not_equal(way, 0))
+
+
+Light = NDArray[np.float32]
+
+
+def stored_mean(light: NDArray[np.floating], binning: int) -> NDArray[np.floating]:
+    """Give the mean of each ``binning`` neighbours, (..., sample, band) -> (..., sample // binning, band).
+
+    A remainder is dropped, as in the raw lines.
+    """
+    if binning == 1:
+        return light
+    count = light.shape[-2] // binning
+    whole = light[..., : count * binning, :].reshape(*light.shape[:-2], count, binning, light.shape[-1])
+    mean: NDArray[np.floating] = whole.mean(axis=-2)
+    return mean
+
+
+def noise_electrons(signal: NDArray[np.floating], rig: Rig, binning: int = 1) -> Light:
+    """Give one standard deviation of shot noise, read noise and quantisation at each signal; never 0. [e-]
+
+    ``signal`` is the mean of ``binning`` samples, each with noise of its own, and the noise is that of the mean.
+    """
+    camera, quantised = rig.camera, rig.camera.electrons_per_dn**2 / 12
+    if rig.detector.noiseless:
+        return np.full_like(signal, np.sqrt(quantised / binning))
+    noise: Light = np.sqrt(np.maximum(signal, 0) + np.float32(camera.read_noise_e**2 + quantised))
+    return noise if binning == 1 else noise / np.float32(np.sqrt(binning))
+
+
+def unit_at(signal: NDArray[np.floating], rig: Rig, unit: Unit, binning: int = 1) -> Light:
+    """Give what a unit of the tolerance, of a number that sums ``binning`` samples, is of their mean signal. [e-]"""
+    if unit == "sigma":
+        return noise_electrons(signal, rig, binning)
+    return np.full_like(signal, rig.camera.electrons_per_dn / binning)
+
+
+def fixed_variance(rig: Rig) -> float:
+    """Give the variance of read noise and quantisation, which light does not change. [e-^2]"""
+    camera = rig.camera
+    return camera.read_noise_e**2 + camera.electrons_per_dn**2 / 12
+
+
+def unit_electrons(light_e: Floats, probe: Probe, rig: Rig) -> Floats:
+    """Give the unit of the probe at some light [e-]; what does not follow the light is the smallest unit met."""
+    if probe.unit == "sigma" and not rig.detector.noiseless:
+        return np.sqrt((np.maximum(light_e, 0.0) + fixed_variance(rig)) / probe.binning)
+    return np.full_like(light_e, probe.unit_least_dn * rig.camera.electrons_per_dn)
+
+
+def lights_within(probe: Probe, rig: Rig) -> tuple[Floats, Floats]:
+    """Give least and greatest light of every band, (band,) each [e-]: where level and span have their units from.
+
+    With U(S)^2 = (S + n) / m for means of m samples, the greatest S has level S / U(S), and the least a difference of
+    span U to it, or a smaller.
+    """
+    if probe.unit != "sigma" or rig.detector.noiseless:
+        unit = unit_electrons(probe.level, probe, rig)
+        high, way = probe.level * unit, probe.span * unit
+    else:
+        fixed, level, span = fixed_variance(rig), probe.level**2 / probe.binning, probe.span**2 / probe.binning
+        high = (level + np.sqrt(level * (level + 4 * fixed))) / 2
+        way = (np.sqrt(span * (span + 4 * (high + fixed))) - span) / 2
+    return np.maximum(high - way, probe.darkest_e), high
+
+
+Real = TypeVar("Real", np.float32, np.float64)
+
+
+@dataclass(frozen=True)
+class GainRange:
+    """Factors of light that a gain has anywhere in a survey, (band,) each.
+
+    ``uneven`` is the greatest difference of two factors within one line. ``steepest`` and ``bend`` are the greatest
+    first and second differences of the factor over wavelength; ``added_e`` is light that is added, with differences
+    of its own.
+    """
+
+    least: Floats
+    greatest: Floats
+    uneven: float
+    steepest: Floats  # [1/nm]
+    bend: Floats  # [1/nm^2]
+    added_e: Floats
+    added_steepest: Floats  # [e-/nm]
+    added_bend: Floats  # [e-/nm^2]
+
+    @staticmethod
+    def between(least: float, greatest: float, bands: int, *, uneven: float = 0.0) -> GainRange:
+        """The same in all bands."""
+        no = np.zeros(bands)
+        return GainRange(np.full(bands, least), np.full(bands, greatest), uneven, no, no, no, no, no)
+
+    @staticmethod
+    def of(factors: Floats, wavelength_nm: Floats, *, uneven: float, added_e: Floats | None = None) -> GainRange:
+        """Those of (state, band) factors that stand for all that there are, with (state, band) light added."""
+        added = np.zeros((1, factors.shape[1])) if added_e is None else added_e
+        own, of_added = _differences(factors, wavelength_nm), _differences(added, wavelength_nm)
+        return GainRange(factors.min(axis=0), factors.max(axis=0), uneven, *own, added.max(axis=0), *of_added)
+
+
+def _differences(factors: Floats, wavelength_nm: Floats) -> tuple[Floats, Floats]:
+    nm = np.asarray(wavelength_nm, np.float64)
+    if len(nm) < 2:
+        return np.zeros(len(nm)), np.zeros(len(nm))
+    return steepest_difference(factors, nm).max(axis=0), np.abs(second_difference(factors, nm)).max(axis=0)
+
+
+def rising_runs(wavelength_nm: Floats) -> list[slice]:
+    """Give the runs of bands whose wavelengths rise: where they fall back or stay, another detector begins."""
+    breaks = np.flatnonzero(~(np.diff(wavelength_nm) > 0)) + 1
+    ends = [0, *breaks.tolist(), len(wavelength_nm)]
+    return [slice(start, stop) for start, stop in pairwise(ends)]
+
+
+def rising_gaps(wavelength_nm: Floats) -> Floats:
+    """Give the distances of neighbouring bands within runs. [nm]"""
+    gaps = np.diff(wavelength_nm)
+    return gaps[gaps > 0]
+
+
+def difference_rates(wavelength_nm: Floats) -> Floats:
+    """Weights of the second difference D, (2, band): of the steps down and up to the neighbours. [1/nm^2]
+
+    D I = up (I_next - I) + down (I_last - I) is the second derivative of any parabola. 0 at both ends of a run.
+    """
+    rates = np.zeros((2, len(wavelength_nm)))
+    gaps = np.diff(wavelength_nm)
+    inner = 1 + np.flatnonzero((gaps[:-1] > 0) & (gaps[1:] > 0))
+    before, after = gaps[inner - 1], gaps[inner]
+    rates[:, inner] = 2 / (before + after) / np.stack([before, after])
+    return rates
+
+
+def second_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArray[Real]:
+    """Give D I of spectra (..., band), as :func:`difference_rates` defines it. [1/nm^2]"""
+    down, up = difference_rates(wavelength_nm).astype(spectra.dtype)
+    steps, out = np.diff(spectra, axis=-1), np.zeros_like(spectra)
+    out[..., :-1] = up[:-1] * steps
+    out[..., 1:] -= down[1:] * steps
+    return out
+
+
+def steepest_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArray[Real]:
+    """Give |I'| of spectra (..., band) towards the steeper neighbour of each band; 0 for a run of one band. [1/nm]"""
+    gaps = np.diff(wavelength_nm)
+    rate = np.divide(1, gaps, out=np.zeros_like(gaps), where=gaps > 0).astype(spectra.dtype)
+    steep, out = np.abs(np.diff(spectra, axis=-1)) * rate, np.zeros_like(spectra)
+    out[..., :-1] = steep
+    np.maximum(out[..., 1:], steep, out=out[..., 1:])
+    return out

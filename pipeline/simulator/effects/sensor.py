@@ -1,4 +1,4 @@
-"""Elements of one sensor: dark current, defects, and gains of their own (fixed pattern)."""
+"""Light on the detector: gains of its elements and columns (fixed pattern), and stray light over all of a line."""
 
 from __future__ import annotations
 
@@ -10,132 +10,15 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.block import SweepBlock, unit_stream
-from pipeline.simulator.effects.effect import Bound, Effect, Gain
-from pipeline.simulator.effects.gain_range import GainRange
-from pipeline.simulator.effects.noise import normal_deviates, told_apart
-from pipeline.simulator.effects.probe import Probe
-from pipeline.simulator.rig_model import Rig
+from pipeline.errors import ShapeError
+from pipeline.simulator.effects.effect import Bound, Gain, LightChange, SweepBlock, unit_stream
+from pipeline.simulator.effects.noise import normal_deviates
+from pipeline.simulator.effects.probe import GainRange, Probe
+from pipeline.simulator.rig_model import Optics, Rig
 
-REFERENCE_DEG_C = 25.0
-ZERO_DEG_C_K = 273.15
-BOLTZMANN_EV_PER_K = 8.617333e-5
 Light = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class DarkCurrent(Effect):
-    """Electrons that warmth sets free, as many in every element; they take part in the shot noise.
-
-    References
-    ----------
-    .. [1] Janesick, "Scientific Charge-Coupled Devices", SPIE Press, 2001: dark current of a depleted sensor goes with
-       T^1.5 exp(-Eg / 2kT), and Eg by Varshni's formula.
-    .. [2] Widenhorn, Blouke, Weber, Rest and Bodegom, "Temperature dependence of dark current in a CCD", Proceedings of
-       SPIE 4669, 2002. doi:10.1117/12.463446
-    """
-
-    name = "dark-current"
-    cost_ns = MappingProxyType({"exact": 0.1})
-
-    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound it where least noise hides it: its mean, and what its spread adds to the noise."""
-        electrons = dark_electrons(rig)
-        if electrons == 0:
-            return Bound(0.0, "the sensor has none")
-        sd = float(np.hypot(rig.camera.read_noise_e, np.sqrt(max(probe.darkest_e, 0.0))))
-        spread = told_apart(float(np.hypot(sd, np.sqrt(electrons))), sd)
-        if probe.unit == "dn":
-            summed = float(np.sqrt(probe.binning))  # the spread of a sum over that of a sample
-            spread *= summed * float(np.hypot(sd, np.sqrt(electrons))) / rig.camera.electrons_per_dn
-        warm = rig.detector.temperature_deg_c
-        why = f"{electrons:.3g} e- in {rig.camera.exposure_ms:g} ms at {warm:g} deg C, beside {sd:.3g} e- of noise"
-        return Bound(probe.added(electrons, rig.camera.electrons_per_dn) + spread, why)
-
-
-DARK_CURRENT = DarkCurrent()
-
-
-def warmth(temperature_deg_c: float) -> float:
-    """By how much more dark current flows than at 25 deg C, where the rig's numbers are stated.
-
-    Electrons set free in silicon's depleted layer [1]: twice as many 8.4 deg C above 25, and 3.6 deg C above -80. Valid
-    from -80 to 50 deg C, which settings are held to: in warmer sensors current that diffuses from the bulk takes over,
-    which goes with the whole gap instead of half of it [2], and sensors differ in how much of it they collect.
-    """
-    return math.exp(_log_generation(temperature_deg_c) - _log_generation(REFERENCE_DEG_C))
-
-
-def band_gap_ev(kelvin: float) -> float:
-    """Silicon's band gap by Varshni's formula with the constants of [1]. [eV]"""
-    return 1.1557 - 7.021e-4 * kelvin**2 / (1108 + kelvin)
-
-
-def _log_generation(temperature_deg_c: float) -> float:
-    kelvin = temperature_deg_c + ZERO_DEG_C_K
-    return 1.5 * math.log(kelvin) - band_gap_ev(kelvin) / (2 * BOLTZMANN_EV_PER_K * kelvin)
-
-
-def dark_electrons(rig: Rig) -> float:
-    """Give the expected dark electrons of one exposure in a sound element; 0 in an ideal sensor. [e-]"""
-    if rig.detector.noiseless:
-        return 0.0
-    seconds = rig.camera.exposure_ms * 1e-3
-    return rig.detector.dark_e_per_s * seconds * warmth(rig.detector.temperature_deg_c)
-
-
-@dataclass(frozen=True)
-class Defects(Effect):
-    """Dead elements gather no light; hot ones add electrons, with their shot noise. An element may be both."""
-
-    name = "defects"
-    cost_ns = MappingProxyType({"exact": 0.3})
-
-    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound it by the greatest signal of bands with dead elements, and the electrons of hot ones."""
-        bands = len(probe.wavelength_nm)
-        dead, hot = dead_elements(rig, bands), hot_electrons(rig, bands)
-        if not (dead.any() or hot.any()):
-            return Bound(0.0, "no element is dead or hot")
-        lost = probe.scaled(dead.any(axis=0).astype(np.float64))
-        electrons = float(hot.max())
-        gained = min(electrons, rig.camera.full_well_e)  # the converter's end
-        why = f"{dead.sum()} dead and {(hot > 0).sum()} hot elements of {dead.size}, these with {electrons:.3g} e- more"
-        added = probe.added(gained, rig.camera.electrons_per_dn) if gained else 0.0
-        return Bound(max(lost, added), why)
-
-
-DEFECTS = Defects()
-
-
-def dead_elements(rig: Rig, bands: int) -> Mask:
-    """Give the elements without response, (sample, band) of the whole camera."""
-    return _mask(rig.detector.unit, "dead", rig.camera.samples, bands, share=rig.detector.dead_share)
-
-
-def hot_electrons(rig: Rig, bands: int) -> Light:
-    """Give what hot elements add in one exposure, (sample, band) of the whole camera. [e-]"""
-    detector = rig.detector
-    mask = _mask(detector.unit, "hot", rig.camera.samples, bands, share=detector.hot_share)
-    return mask * np.float32(most_hot_electrons(rig))
-
-
-def most_hot_electrons(rig: Rig) -> float:
-    """Give what a hot element adds in one exposure; 0 where the sensor has none, or is ideal. [e-]"""
-    detector = rig.detector
-    if detector.noiseless or not detector.hot_share:
-        return 0.0
-    return detector.hot_e_per_s * rig.camera.exposure_ms * 1e-3 * warmth(detector.temperature_deg_c)
-
-
-@lru_cache(maxsize=8)
-def _mask(unit: int, kind: str, samples: int, bands: int, *, share: float) -> Mask:
-    """Elements below a share of uniform draws, band by band: more bands or a larger share keep those there were."""
-    below = unit_stream(unit, kind).random((bands, samples)) < share
-    mask: Mask = np.ascontiguousarray(below.T)
-    mask.setflags(write=False)
-    return mask
+HALO, EVEN = "halo", "even"
+LEAST_MODE = 1e-8  # of a wide Gaussian's cosines; fainter ones are below float32
 
 
 @dataclass(frozen=True)
@@ -187,7 +70,6 @@ class Striping(Gain):
 
 
 PRNU = Prnu()
-
 STRIPING = Striping()
 
 
@@ -214,3 +96,102 @@ def _gains(unit: int, kind: str, samples: int, bands: int, *, share: float) -> L
     gains: Light = np.maximum(1 + np.float32(share) * drawn, 0)
     gains.setflags(write=False)
     return gains
+
+
+@dataclass(frozen=True)
+class StrayLight(LightChange):
+    """A share of all the light in a line is scattered over its detector: (1 - f) S + f K S. A band is a row.
+
+    Of it ``stray_even`` falls evenly, the rest as a Gaussian ``stray_halo_px`` wide (sd), reflected at the detector's
+    edges. K has no weight below 0 and keeps all light.
+
+    ``halo`` is exact: the Gaussian passes only the slowest cosines of a frame, so it is a product with few of them.
+    ``even`` lets all of the scattered light fall evenly.
+    """
+
+    name = "stray-light"
+    cost_ns = MappingProxyType({HALO: 1.2, EVEN: 0.65})
+    whole_line = True  # light comes from all samples: a line is made whole, then cut
+
+    def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound it by f (S - mean), were all to fall evenly, and what the halo differs from that."""
+        optics = rig.optics
+        if optics.stray_share == 0:
+            return Bound(0.0, "no light is scattered")
+        spread = float(np.max(probe.spread, initial=0))
+        halo = optics.stray_share * (1 - optics.stray_even) * _most_halo(probe, rig, spread)
+        why = f"{optics.stray_share:.2g} of a line's light, signals up to {spread:.3g} {probe.unit} from its mean"
+        if variant == EVEN:
+            return Bound(halo, f"{why}; {1 - optics.stray_even:.2g} of it in a halo")
+        return Bound(optics.stray_share * spread + halo, why)
+
+    def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
+        """Give the light after scattering; works in place.
+
+        Raises
+        ------
+        ShapeError : samples of the line are missing.
+        """
+        optics, samples = block.rig.optics, block.rig.camera.samples
+        if optics.stray_share == 0:
+            return light
+        if light.shape[1] != samples:
+            raise ShapeError(
+                f"stray light comes from all {samples} samples of a line, got {light.shape[1]}; "
+                "make whole lines and cut them afterwards, or leave stray-light out"
+            )
+        for line in light:  # line by line: rounding, too, does not depend on the block
+            even = np.float32(optics.stray_share * line.mean(dtype=np.float64))
+            scattered = _scattered(line, optics) if variant == HALO else even
+            line *= np.float32(1 - optics.stray_share)
+            line += scattered
+        return light
+
+
+STRAY_LIGHT = StrayLight()
+
+
+def _most_halo(probe: Probe, rig: Rig, spread: float) -> float:
+    """Bound |H - mean| over the unit at any sample, H the halo's own light.
+
+    It is at most the light that the kernel takes elsewhere than an even one would, times the range of signals: the
+    brightest less the darkest, and never more than twice the greatest way from the mean. That is ``spread`` units,
+    each no more than the unit at the brightest sample.
+    """
+    elsewhere = _uneven_share((rig.camera.samples, len(probe.wavelength_nm)), rig.optics.stray_halo_px)
+    per_dn = rig.camera.electrons_per_dn
+    range_e, least_e = max(probe.brightest_e - probe.darkest_e, 0.0), probe.unit_least_dn * per_dn
+    most = math.sqrt(1 + range_e / (probe.binning * least_e**2)) if probe.unit == "sigma" else 1.0
+    return min(elsewhere * probe.added(range_e, per_dn), min(2 * elsewhere, 1) * spread * most)
+
+
+@lru_cache(maxsize=16)
+def _uneven_share(counts: tuple[int, ...], sd_px: float) -> float:
+    """Greatest share of a sample's halo that comes from elsewhere than if it were even: 1 narrow, 0 endless."""
+    even = 1.0
+    for count in counts:
+        waves, passed = _cosines(count, sd_px)
+        kernel = (waves.T * passed) @ waves
+        even *= 1 - float(np.abs(kernel - 1 / count).sum(axis=1).max()) / 2
+    return 1 - even
+
+
+def _scattered(line: Light, optics: Optics) -> Light:
+    """Take a frame to its slowest cosines, weaken them as the kernel f K does, and back: f K S, (sample, band)."""
+    along, along_kept = _cosines(line.shape[0], optics.stray_halo_px)
+    across, across_kept = _cosines(line.shape[1], optics.stray_halo_px)
+    kept = np.outer(along_kept, across_kept) * (1 - optics.stray_even)
+    kept[0, 0] = 1
+    modes = along @ (line @ across.T) * (optics.stray_share * kept).astype(np.float32)
+    back: Light = (along.T @ modes) @ across
+    return back
+
+
+@lru_cache(maxsize=16)
+def _cosines(count: int, sd_px: float) -> tuple[Light, NDArray[np.float64]]:
+    """Orthonormal cosines (mode, count) that a Gaussian reflected at both ends passes, and the share it passes."""
+    passed = np.exp(-((np.pi * sd_px / count * np.arange(count)) ** 2) / 2)
+    modes = np.arange(count)[passed > LEAST_MODE]
+    waves = np.cos(np.pi / count * np.outer(modes, np.arange(count) + 0.5))
+    waves *= np.sqrt(np.where(modes == 0, 1, 2) / count)[:, None]
+    return waves.astype(np.float32), passed[modes]

@@ -11,10 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import Bound, LightChange
-from pipeline.simulator.effects.gain_range import difference_rates, rising_gaps, rising_runs
-from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.effects.effect import Bound, LightChange, SweepBlock
+from pipeline.simulator.effects.probe import Probe, difference_rates, rising_gaps, rising_runs
 from pipeline.simulator.rig_model import Rig
 
 Floats = NDArray[np.float64]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.rectify.kernels import tensor_rows
-from pipeline.simulator.optics.footprint import Footprint
+from pipeline.simulator.optics.kernel_fit import Footprint
 from pipeline.simulator.optics.rays import RayViews
 from pipeline.simulator.optics.tap_sums import Gatherer, ScenePixels
 from pipeline.simulator.scenes.scene import RasterScene, Scene

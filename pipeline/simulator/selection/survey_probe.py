@@ -12,24 +12,21 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.effects.gain_range import second_difference, steepest_difference
-from pipeline.simulator.effects.light_units import stored_mean, unit_at
 from pipeline.simulator.effects.line import SLIT, UPRIGHT, box_of, box_parts
-from pipeline.simulator.effects.probe import Probe, Unit
-from pipeline.simulator.optics.footprint import Footprint, fold
-from pipeline.simulator.optics.kernel_fit import Moments
+from pipeline.simulator.effects.probe import Probe, Unit, second_difference, steepest_difference, stored_mean, unit_at
+from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
 from pipeline.simulator.optics.rays import middle_normal
 from pipeline.simulator.optics.tap_sums import LADDER
 from pipeline.simulator.render import views_all_over
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, Scene
-from pipeline.simulator.selection.scouting import telling_places
 from pipeline.simulator.selection.survey_looks import (
     SampleViews,
     joined,
     light_seen,
     line_sums,
     patch_views,
+    telling_places,
     views_of_lines,
     views_of_places,
 )

@@ -22,7 +22,7 @@ from flows.archive.reprocess_command import ReprocessRequest, _survey, run_repro
 from flows.settings.survey_settings import Settings
 from models.weights.files import content_key
 from pipeline.errors import ArchiveError, SettingsError, WeightsError
-from pipeline.simulator.scenes.farm.canvas import CLASSES
+from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from tests.conftest import Survey, WeightsMaker

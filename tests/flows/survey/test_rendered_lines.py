@@ -15,8 +15,7 @@ from pipeline.errors import RigError, SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator import instrument, render
-from pipeline.simulator.effects.registry import BY_NAME
-from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.effects.registry import BY_NAME, effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource

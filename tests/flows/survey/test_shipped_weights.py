@@ -19,7 +19,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import coarse_sweeps, full_sweeps
 from pipeline.rectify.region import mosaic_rows
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.farm.canvas import CLASSES
+from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 

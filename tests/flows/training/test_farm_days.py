@@ -24,7 +24,7 @@ from models.weights.files import Description
 from pipeline.errors import ArchiveError, SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.simulator.scenes.farm.canvas import CLASSES
+from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, REMOVED_LAW, farm_scene
 from pipeline.simulator.scenes.farm.seasons import sun_over_farm
 from pipeline.simulator.scenes.scene import RasterScene

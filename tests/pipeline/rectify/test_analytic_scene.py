@@ -15,7 +15,7 @@ from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.rectify.lookup import grid_lookup
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.resample import Kernel, resample
-from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource
 

@@ -16,7 +16,7 @@ from pipeline.planning.coverage import full_sweeps
 from pipeline.rectify.region import PixelGrid, mosaic_tile, place
 from pipeline.rectify.registration.illumination import LightRatio, light_ratio, overlap_light, solve_lights
 from pipeline.rectify.registration.overlaps import Window
-from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep

@@ -19,7 +19,7 @@ from pipeline.rectify.registration.alignment import no_shifts
 from pipeline.rectify.registration.overlaps import BroadSweep, PlacedImage, broad_bands, overlap_windows, places_seen
 from pipeline.rectify.registration.seams import Registration, measure_windows, place_images, register_sweeps
 from pipeline.simulator.effects.pointing import PointingErrors
-from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.scenes.scene import SceneLight

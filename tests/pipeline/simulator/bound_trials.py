@@ -8,13 +8,12 @@ from functools import partial
 
 import numpy as np
 
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Effect, Light
-from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.effect import OFF, Effect, Light, SweepBlock
+from pipeline.simulator.effects.probe import noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS, READOUT
 from pipeline.simulator.render import expected_light
-from pipeline.simulator.selection.arithmetic import ROUNDING, contrast_about, misplaced_electrons, misplaced_share
 from pipeline.simulator.selection.options import SAFETY, Menu, list_options
+from pipeline.simulator.selection.verification import ROUNDING, contrast_about, misplaced_electrons, misplaced_share
 from tests.pipeline.simulator.random_cases import Case
 
 DRAWN = frozenset({"jitter", "turbulence"})  # one survey of 1000 may go beyond their bounds

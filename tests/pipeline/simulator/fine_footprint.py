@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from pipeline.geometry.mirror import position_to_normal
-from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.optics.rays import exact_views, middle_normal
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 

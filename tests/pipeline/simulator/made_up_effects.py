@@ -9,8 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Bound, Light
+from pipeline.simulator.effects.effect import OFF, Bound, Light, SweepBlock
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
 

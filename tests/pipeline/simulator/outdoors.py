@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import OFF
+from pipeline.simulator.effects.effect import OFF, SweepBlock
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Air, Rig, Sky
 

@@ -17,10 +17,9 @@ from scipy.ndimage import gaussian_filter
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.probe import Probe
-from pipeline.simulator.optics.coatings import Coating
-from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Relief, Rig, Sky
+from pipeline.simulator.rig_model import Air, Coating, Detector, MirrorMotion, Optics, Relief, Rig, Sky
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneLight, SceneRaster
 from pipeline.simulator.selection.survey_probe import probe_scene
 

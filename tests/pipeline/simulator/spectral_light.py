@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.gain_range import second_difference, steepest_difference
-from pipeline.simulator.effects.probe import Probe, Unit
+from pipeline.simulator.effects.effect import SweepBlock
+from pipeline.simulator.effects.probe import Probe, Unit, second_difference, steepest_difference
 from pipeline.simulator.rig_model import Optics, Rig
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 

@@ -15,7 +15,7 @@ from pipeline.geometry.scan import Axis, Sweep
 from pipeline.rectify.registration.anchoring import Anchor, anchor_sweep
 from pipeline.rectify.registration.overlaps import BroadSweep
 from pipeline.simulator.effects.pointing import CommonOffset
-from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.scenes.scene import RasterScene

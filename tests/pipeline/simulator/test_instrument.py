@@ -15,12 +15,12 @@ from pipeline.geometry.mirror import direction_to_scene, mirror_throughput, posi
 from pipeline.geometry.scan import Sweep, line_positions, sweep_positions
 from pipeline.lazy import Once
 from pipeline.simulator.effects.pointing import CommonOffset
-from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.instrument import USUAL, effects_on, render_lines, sweep_block
+from pipeline.simulator.effects.registry import EFFECTS, USUAL, effects_on
 from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
 from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.simulated import render_lines, sweep_block
 
 CAMERA = LineCamera()
 OPTICS = effects_on("rotation", "slit", "smear")

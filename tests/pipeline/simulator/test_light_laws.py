@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
-from pipeline.simulator.effects.effect import OFF, Effect
+from pipeline.simulator.effects.effect import OFF, Effect, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig

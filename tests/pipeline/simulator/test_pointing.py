@@ -11,7 +11,7 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.simulator.effects.pointing import PointingErrors
-from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep

@@ -11,9 +11,9 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
-from pipeline.simulator.effects.stray_light import STRAY_LIGHT
+from pipeline.simulator.effects.sensor import STRAY_LIGHT
 from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Rig

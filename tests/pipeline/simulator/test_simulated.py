@@ -13,7 +13,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.simulator.effects.counting import SHOT
-from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera, bin_samples
-from pipeline.simulator.effects.light_units import noise_electrons, stored_mean, unit_at
+from pipeline.simulator.effects.probe import noise_electrons, stored_mean, unit_at
 from pipeline.simulator.rig_model import Detector, Rig
 
 RIG = Rig()

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep
-from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig, Sky
 from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, sweep_starts

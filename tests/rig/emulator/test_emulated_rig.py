@@ -24,7 +24,7 @@ from pipeline.rig.mirror.mirror_controller import MirrorController, open_mirror
 from pipeline.rig.mirror.mirror_settings import MirrorSettings
 from pipeline.rig.mirror.registers import Trigger
 from pipeline.rig.transports import SocketTransport
-from pipeline.simulator.instrument import QUIET
+from pipeline.simulator.effects.registry import QUIET
 from pipeline.simulator.simulated import SimulatedSource
 from tests.rig.camera.camera_line import wait_for
 from tests.rig.small_rig import CAMERA, COARSE, FINE, small_source

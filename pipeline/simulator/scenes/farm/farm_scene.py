@@ -28,13 +28,32 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.lazy import Once
-from pipeline.simulator.scenes.farm.borders import dig_ponds, paint_borders, plant_trees
-from pipeline.simulator.scenes.farm.canvas import CLASS_COLOURS, CLASSES, Canvas, Ground, Painting
-from pipeline.simulator.scenes.farm.farm_plan import FarmPlan, farm_plan
-from pipeline.simulator.scenes.farm.fields import paint_fields
-from pipeline.simulator.scenes.farm.land import stream
+from pipeline.simulator.scenes.farm.farm_plan import (
+    CLASS_COLOURS,
+    CLASSES,
+    Canvas,
+    FarmPlan,
+    Ground,
+    Mixture,
+    Painting,
+    farm_plan,
+    grass,
+    hard_track,
+)
+from pipeline.simulator.scenes.farm.fields import paint_fields, plant_weeds
+from pipeline.simulator.scenes.farm.land import (
+    Band,
+    Border,
+    Points,
+    band_pixels,
+    disc_pixels,
+    edge,
+    scene_points,
+    smooth_noise,
+    stream,
+)
+from pipeline.simulator.scenes.farm.seasons import Sun, foliage
 from pipeline.simulator.scenes.farm.spectra import PANEL_REFLECTANCE, band_centres, spectral_library
-from pipeline.simulator.scenes.farm.weeds import plant_weeds
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 
 # A law is what a seed is drawn by; it stands first in a scene's key, and one that is out there never changes.
@@ -129,3 +148,143 @@ def _draw(plan: FarmPlan) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     plant_trees(work)
     work.canvas.dim(ground.light)
     return work.canvas.drawn()
+
+
+WIDTHS = {"margin": (2.0, 4.5), "hedge": (4.5, 6.5), "ditch": (1.3, 2.2), "road": (3.0, 5.0)}  # half, px
+BANKS = {"margin": (0.0, 0.0), "hedge": (0.0, 0.0), "ditch": (2.5, 4.5), "road": (1.0, 2.5)}
+BARE_CROWN = 0.62  # cover of a crown without leaves
+SHADOW = 0.78  # of the ground under a crown's shadow that no direct sun reaches
+
+
+def paint_borders(work: Painting) -> None:
+    """Draw the lines between parcels, roads last."""
+    for kind in ("margin", "hedge", "ditch", "road"):
+        for number, (border, its_kind) in enumerate(work.plan.borders):
+            if its_kind == kind:
+                _paint_line(work, stream(work.plan.seed, f"border {number}"), border, kind)
+
+
+def _paint_line(work: Painting, rng: np.random.Generator, border: Border, kind: str) -> None:
+    """Grass on both sides, and what the kind has in the middle; a ditch is fuller after rain."""
+    canvas, plan = work.canvas, work.plan
+    band = _wobbled(rng, band_pixels(border, 12.0, canvas.shape), 0.8 if kind == "road" else 1.6)
+    here = work.ground.at(band.index)
+    half, bank = rng.uniform(*WIDTHS[kind]), rng.uniform(*BANKS[kind])
+    dryness, strip, inner = rng.uniform(0.25, 0.55), rng.uniform() < 0.5, rng.uniform(0.8, 1.2)
+    _cover(canvas, band, half + bank, grass(here, dryness), "grass")
+    if kind == "ditch":
+        full = half * (0.75 + 1.4 * plan.moisture)
+        _cover(canvas, band, full, {"water": np.ones_like(band.across)}, "water")
+    if kind == "road":
+        _cover(canvas, band, half, hard_track(here, 0.75), "track")
+        if strip:
+            _cover(canvas, band, inner, grass(here, 0.5), "grass")
+
+
+def _wobbled(rng: np.random.Generator, band: Band, size: float) -> Band:
+    """Bend a line a little: two sines of random phase, 37 and 61 px per radian."""
+    phases = rng.uniform(0, 2 * np.pi, 2)
+    bend = np.sin(band.along / 37 + phases[0]) + np.sin(band.along / 61 + phases[1])
+    return Band(band.index, band.across + np.float32(size / 2) * bend.astype(np.float32), band.along)
+
+
+def _cover(canvas: Canvas, band: Band, half: float, mixture: Mixture, label: str) -> None:
+    """Lay a surface over the pixels within ``half`` of the line."""
+    cover = edge(half - np.abs(band.across))
+    hit = np.flatnonzero(cover)
+    canvas.over(band.index[hit], cover[hit], {name: part[hit] for name, part in mixture.items()}, label)
+
+
+def dig_ponds(work: Painting) -> None:
+    """Ponds with grass round them, in meadows where there are any: one, and one more for every 650 000 px."""
+    canvas, plan = work.canvas, work.plan
+    rng, shape = stream(plan.seed, "ponds"), plan.shape
+    shore = smooth_noise(rng, shape, 14).ravel()
+    meadows = [one.parcel for one in plan.fields if one.use == "grass"] or [one.parcel for one in plan.fields]
+    ponds = []
+    for _ in range(1 + shape[0] * shape[1] // 650_000):
+        corners = meadows[rng.integers(len(meadows))].corners
+        centre = corners.mean(axis=0) + 0.5 * (corners[rng.integers(len(corners))] - corners.mean(axis=0))
+        index = disc_pixels(centre[None], np.array([34.0]), shape)[0]
+        distance = np.hypot(*(scene_points(index, shape) - centre).T)
+        inside = rng.uniform(14, 24) + 1.8 * shore[index] - distance
+        canvas.over(index, edge(inside + 4), grass(work.ground.at(index), 0.15), "grass")
+        ponds.append((index, edge(inside)))
+    for index, cover in ponds:  # after every bank: two ponds may meet
+        canvas.over(index, cover, {"water": np.ones_like(cover)}, "water")
+
+
+def crowns_of(work: Painting) -> Points:
+    """Crowns of hedges and of trees beside the lines: y, x and radius, (n, 3)."""
+    plan = work.plan
+    crowns = [_standing_trees(stream(plan.seed, "trees"), [border for border, _ in plan.borders])]
+    for number, (border, kind) in enumerate(plan.borders):
+        if kind == "hedge":
+            crowns.append(_hedge_crowns(stream(plan.seed, f"hedge {number}"), border))
+    return np.concatenate(crowns)
+
+
+def _hedge_crowns(rng: np.random.Generator, border: Border) -> Points:
+    """Crowns along a line: y, x and radius, (n, 3); every twentieth is missing."""
+    along = np.arange(0.0, border.length, 5.0)
+    along = along[rng.uniform(size=along.size) > 0.05]
+    step = (border.end - border.start) / max(border.length, 1e-9)
+    centres = border.start + along[:, None] * step + rng.normal(0, 1.0, (along.size, 2))
+    return np.column_stack([centres, rng.uniform(4, 7, along.size)])
+
+
+def _standing_trees(rng: np.random.Generator, borders: list[Border]) -> Points:
+    """Single trees beside the lines, one in 320 px: y, x and radius, (n, 3)."""
+    trees = [np.zeros((0, 3))]
+    for border in borders:
+        count = rng.poisson(border.length / 320)
+        step = (border.end - border.start) / max(border.length, 1e-9)
+        aside = rng.choice([-1.0, 1.0], (count, 1)) * rng.uniform(7, 14, (count, 1)) * np.array([-step[1], step[0]])
+        places = border.start + rng.uniform(0, border.length, (count, 1)) * step + aside
+        trees.append(np.column_stack([places, rng.uniform(5, 12, count)]))
+    return np.concatenate(trees)
+
+
+def plant_trees(work: Painting) -> None:
+    """Shadows on the ground, away from the sun, then crowns that are darker on that side, in the leaves of the day."""
+    canvas, plan = work.canvas, work.plan
+    crowns = crowns_of(work)
+    centres, radius = crowns[:, :2], crowns[:, 2]
+    leaves = {name: share for name, share in foliage(plan.day).items() if share > 0}
+    opaque = 1 - (1 - BARE_CROWN) * leaves.get("twigs", 0.0)
+    shadow = crown_shadows(centres, radius, plan.sun, plan.shape).ravel()
+    dark = np.flatnonzero(shadow)
+    depth = np.asarray(SHADOW * opaque * shadow[dark], np.float32)
+    canvas.over(dark, depth, {"shade": np.ones_like(depth)}, None)
+    index, cover, disc = disc_pixels(centres, radius, plan.shape)
+    away = ((scene_points(index, plan.shape) - centres[disc]) / radius[disc, None]) @ plan.sun.cast
+    away /= np.hypot(*plan.sun.cast)
+    here = work.ground.at(index)
+    shade = np.asarray(np.clip(0.18 + 0.18 * away + 0.08 * here.tuft + 0.05 * here.grain, 0, 0.6), np.float32)
+    mixture = {name: share * (1 - shade) for name, share in leaves.items()}
+    canvas.over(index, np.asarray(opaque * cover, np.float32), mixture | {"shade": shade}, "tree")
+
+
+def crown_shadows(
+    centres: Points, radius: NDArray[np.float64], sun: Sun, shape: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Cover of the ground by shadows of ellipsoid crowns, (y, x) from 0 to 1.
+
+    A crown is ``radius`` wide and 0.9 ``radius`` high each way about a point 1.2 ``radius`` above the ground; its
+    shadow is an ellipse, and where shadows meet the darker counts.
+    """
+    covered = np.zeros(shape, np.float32)
+    length = float(np.hypot(*sun.cast))
+    along = sun.cast / length
+    middles = centres + 1.2 * radius[:, None] * sun.cast + (np.array(shape) - 1) / 2
+    for (y0, x0), width in zip(middles, radius, strict=True):
+        reach = float(np.hypot(width, 0.9 * width * length))
+        top, bottom = (int(np.clip(y0 + side * (reach + 1), 0, shape[0])) for side in (-1, 1))
+        left, right = (int(np.clip(x0 + side * (reach + 1), 0, shape[1])) for side in (-1, 1))
+        dy = (np.arange(top, bottom + 1) - y0)[: shape[0] - top, None]
+        dx = (np.arange(left, right + 1) - x0)[None, : shape[1] - left]
+        far = np.hypot((dy * along[0] + dx * along[1]) / reach, (dx * along[0] - dy * along[1]) / width)
+        cover = np.clip((1 - far) * width + 0.5, 0, 1)
+        window = covered[top : top + dy.size, left : left + dx.size]
+        np.maximum(window, cover.astype(np.float32), out=window)
+    return covered

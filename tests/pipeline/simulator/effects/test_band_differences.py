@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.simulator.effects.gain_range import (
+from pipeline.simulator.effects.probe import (
     difference_rates,
     rising_gaps,
     rising_runs,

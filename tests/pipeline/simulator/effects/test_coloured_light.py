@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.simulator.effects.blurs import DIFFRACTION, KEYSTONE
-from pipeline.simulator.effects.gain_range import second_difference, steepest_difference
+from pipeline.simulator.effects.probe import second_difference, steepest_difference
 from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.selection.passed_light import light_through
+from pipeline.simulator.selection.options import light_through
 from tests.pipeline.simulator.made_up_effects import even_probe
 
 NM = np.linspace(400.0, 1000.0, 61)

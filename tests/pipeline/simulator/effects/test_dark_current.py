@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError
-from pipeline.simulator.effects.sensor import BOLTZMANN_EV_PER_K, band_gap_ev, dark_electrons, warmth
+from pipeline.simulator.effects.counting import BOLTZMANN_EV_PER_K, band_gap_ev, dark_electrons, warmth
 from pipeline.simulator.rig_model import Detector, Rig
 
 DEGREES = st.floats(-80.0, 49.0)

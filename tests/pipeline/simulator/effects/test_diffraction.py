@@ -13,11 +13,10 @@ from scipy.special import j0, j1
 
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE, THIRD_RING, airy_energy, airy_variance
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import SLIT
-from pipeline.simulator.optics.footprint import fold
-from pipeline.simulator.optics.kernel_fit import Moments
+from pipeline.simulator.optics.kernel_fit import Moments, fold
 from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig

@@ -7,10 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.simulator.effects.gain_range import GainRange, second_difference, steepest_difference
-from pipeline.simulator.effects.light_units import fixed_variance, lights_within, unit_electrons
+from pipeline.simulator.effects.probe import (
+    GainRange,
+    fixed_variance,
+    lights_within,
+    second_difference,
+    steepest_difference,
+    unit_electrons,
+)
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.selection.passed_light import Growth, light_after
+from pipeline.simulator.selection.options import Growth, light_after
 from tests.pipeline.simulator.made_up_effects import RIG, even_probe
 
 NM = np.linspace(400.0, 1000.0, 25)

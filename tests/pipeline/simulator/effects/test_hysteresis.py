@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.mirror_pointing import HYSTERESIS, THERMAL_DRIFT, pointing_field, scan_sign
+from pipeline.simulator.effects.effect import SweepBlock
+from pipeline.simulator.effects.pointing import HYSTERESIS, THERMAL_DRIFT, pointing_field, scan_sign
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Detector, MirrorMotion, Rig
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.lazy import Once
-from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.blurs import KEYSTONE, keystone_shift
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import SLIT
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.mirror_path import LAG, responses, transient
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig

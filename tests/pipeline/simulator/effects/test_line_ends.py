@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, points_of_scan
-from pipeline.simulator.effects.mirror_pointing import at_line_ends, end_gains
+from pipeline.simulator.effects.pointing import at_line_ends, end_gains
 
 CAMERA = LineCamera()
 

@@ -11,13 +11,12 @@ import pytest
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, sweep_to_scene
 from pipeline.lazy import Once
-from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.air import PARALLAX, WIND
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.mirror_path import LAG, STAIRCASE
-from pipeline.simulator.effects.mirror_pointing import HYSTERESIS, JITTER, THERMAL_DRIFT
-from pipeline.simulator.effects.moving_air import WIND
+from pipeline.simulator.effects.pointing import HYSTERESIS, JITTER, THERMAL_DRIFT
 from pipeline.simulator.effects.probe import Probe
-from pipeline.simulator.effects.relief import PARALLAX
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, MirrorMotion, Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneLight, SceneRaster

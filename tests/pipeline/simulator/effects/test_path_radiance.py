@@ -16,7 +16,7 @@ from pipeline.lazy import Once
 from pipeline.planning.coverage import full_sweeps
 from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.haze import PATH_RADIANCE, extinction_per_m, rayleigh_per_m
-from pipeline.simulator.effects.light_units import fixed_variance
+from pipeline.simulator.effects.probe import fixed_variance
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Rig, Sky
 from pipeline.simulator.scenes.image_scene import raster_from_values

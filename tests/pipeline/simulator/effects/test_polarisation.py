@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.mirror_throughput import POLARISATION
-from pipeline.simulator.optics.coatings import reflectance
+from pipeline.simulator.effects.effect import SweepBlock
+from pipeline.simulator.effects.mirror_throughput import POLARISATION, reflectance
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 from tests.pipeline.simulator.spectral_light import probe_of, rig_with
 

@@ -13,11 +13,19 @@ from scipy import stats
 from pipeline.errors import SceneError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.counting import QUANTISATION, READ_NOISE, SATURATION, SHOT
-from pipeline.simulator.effects.sensor import DARK_CURRENT, DEFECTS, PRNU, STRIPING, dead_elements, hot_electrons
-from pipeline.simulator.readout import dark_frame, read_out
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.effects.counting import (
+    DARK_CURRENT,
+    DEFECTS,
+    QUANTISATION,
+    READ_NOISE,
+    SATURATION,
+    SHOT,
+    dead_elements,
+    hot_electrons,
+)
+from pipeline.simulator.effects.effect import SweepBlock
+from pipeline.simulator.effects.sensor import PRNU, STRIPING
+from pipeline.simulator.render import dark_frame, expected_light, read_out
 from pipeline.simulator.rig_model import Detector, Rig
 from tests.pipeline.simulator.spectral_light import small_scene
 

@@ -11,11 +11,19 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.effects.counting import QUANTISATION, READ_NOISE, SATURATION, SHOT
+from pipeline.simulator.effects.counting import (
+    DARK_CURRENT,
+    DEFECTS,
+    QUANTISATION,
+    READ_NOISE,
+    SATURATION,
+    SHOT,
+    dead_elements,
+    hot_electrons,
+)
 from pipeline.simulator.effects.noise import CHIP_SAMPLES, MOST_VARIATION, divergence
 from pipeline.simulator.effects.probe import Probe, Unit
-from pipeline.simulator.effects.sensor import DARK_CURRENT, DEFECTS, dead_elements, hot_electrons
-from pipeline.simulator.readout import read_out
+from pipeline.simulator.render import read_out
 from pipeline.simulator.rig_model import Detector, Rig
 from tests.pipeline.simulator.spectral_light import block_of, probe_of
 

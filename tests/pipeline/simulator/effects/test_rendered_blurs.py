@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.air import TURBULENCE
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import SLIT
-from pipeline.simulator.effects.moving_air import TURBULENCE
 from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig

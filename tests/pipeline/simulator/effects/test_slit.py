@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.geometry.camera import LineCamera, footprint_kernel
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import MARGIN, SLIT, box_of, box_parts
 from pipeline.simulator.optics.tap_sums import fewest_parts, misplaced
 from pipeline.simulator.render import expected_light, views_all_over

@@ -7,9 +7,9 @@ import pytest
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR, folded_positions, smeared_positions
+from pipeline.simulator.effects.probe import noise_electrons
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values

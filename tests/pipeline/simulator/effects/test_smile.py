@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import SweepBlock
+from pipeline.simulator.effects.sensor import STRAY_LIGHT
 from pipeline.simulator.effects.spectrometer import RESPONSE, SMILE, wavelength_shift
-from pipeline.simulator.effects.stray_light import STRAY_LIGHT
 from pipeline.simulator.render import expected_light
 from tests.pipeline.simulator.spectral_light import (
     SAMPLES,

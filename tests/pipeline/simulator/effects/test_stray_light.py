@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
 from pipeline.errors import SettingsError, ShapeError
-from pipeline.simulator.effects.stray_light import STRAY_LIGHT
+from pipeline.simulator.effects.sensor import STRAY_LIGHT
 from tests.pipeline.simulator.spectral_light import SAMPLES, block_of, probe_of, random_light, rig_with, worst
 
 

@@ -11,8 +11,8 @@ import pytest
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import j0
 
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.moving_air import TURBULENCE, rytov_variance, turbulence_px
+from pipeline.simulator.effects.air import TURBULENCE, rytov_variance, turbulence_px
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.rig_model import Air, Optics, Rig
 from tests.pipeline.simulator.fine_image import IMAGES, SWEEP, change, probe_of, shifted
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.mirror import mirror_throughput
 from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.mirror_throughput import MOST_BEND, VIGNETTING
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig

@@ -11,9 +11,9 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.lazy import Once
 from pipeline.rectify.calibration.calibrate import calibrate
-from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
-from pipeline.simulator.effects.sensor import dark_electrons, dead_elements, hot_electrons, response_gain, stripe_gain
-from pipeline.simulator.instrument import USUAL, effects_on
+from pipeline.simulator.effects.counting import dark_electrons, dead_elements, hot_electrons
+from pipeline.simulator.effects.registry import BY_NAME, EFFECTS, USUAL, effects_on
+from pipeline.simulator.effects.sensor import response_gain, stripe_gain
 from pipeline.simulator.rig_model import Detector, Rig
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from pipeline.simulator.simulated import SimulatedSource

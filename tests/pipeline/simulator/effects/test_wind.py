@@ -10,8 +10,8 @@ import pytest
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, sweep_to_scene
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.moving_air import WIND, line_to_line_px, sway_px, within_exposure_px
+from pipeline.simulator.effects.air import WIND, line_to_line_px, sway_px, within_exposure_px
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Air, Rig
 

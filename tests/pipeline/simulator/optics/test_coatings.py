@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.simulator.optics.coatings import METALS, fresnel, reflectance, refractive_index
+from pipeline.simulator.effects.mirror_throughput import METALS, fresnel, reflectance, refractive_index
 
 PARTS = st.floats(0.02, 20.0)
 ANGLES = np.radians(np.linspace(0.0, 89.9, 400))

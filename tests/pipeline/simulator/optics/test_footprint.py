@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.simulator.optics.footprint import Footprint, fold
-from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE, Moments
-from pipeline.simulator.optics.tap_tables import box_weight
+from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE, Footprint, Moments, fold
+from pipeline.simulator.optics.tap_sums import box_weight
 
 PLAIN = ((2.7, 1.0), (1, 1), 1)
 

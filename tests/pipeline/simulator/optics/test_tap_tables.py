@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.geometry.camera import footprint_kernel
-from pipeline.simulator.optics.tap_tables import SCALE_STEP, TapTable, blurred_weight, box_weight
+from pipeline.simulator.optics.tap_sums import SCALE_STEP, TapTable, blurred_weight, box_weight
 
 DISTANCE = np.linspace(-5, 5, 401)
 

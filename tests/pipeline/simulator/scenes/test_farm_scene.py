@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError, SettingsError, WavelengthError
 from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.scenes.farm.canvas import CLASS_COLOURS, CLASSES
-from pipeline.simulator.scenes.farm.farm_plan import FarmPlan, farm_plan
+from pipeline.simulator.scenes.farm.farm_plan import CLASS_COLOURS, CLASSES, FarmPlan, farm_plan
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene, law_of_key, refuse_removed
 from pipeline.simulator.scenes.farm.land import parcel_pixels
 from pipeline.simulator.scenes.farm.spectra import MATERIALS

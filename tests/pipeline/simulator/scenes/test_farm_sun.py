@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import SceneError
-from pipeline.simulator.scenes.farm.borders import crown_shadows
+from pipeline.simulator.scenes.farm.farm_scene import crown_shadows
 from pipeline.simulator.scenes.farm.seasons import LATITUDE_DEG, Sun, sun_over_farm
 
 SHAPE = (161, 161)

@@ -10,16 +10,15 @@ import pytest
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
-from pipeline.simulator.effects.effect import Light
+from pipeline.simulator.effects.effect import Light, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
-from pipeline.simulator.instrument import sweep_block
 from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.selection.arithmetic import ROUNDING, contrast_about, misplaced_electrons, misplaced_share
+from pipeline.simulator.selection.verification import ROUNDING, contrast_about, misplaced_electrons, misplaced_share
+from pipeline.simulator.simulated import sweep_block
 
 RIG = Rig(camera=LineCamera(samples=64, exposure_ms=10_000.0))
 SWEEP = Sweep("s", "coarse", "x", 0.0, -24.0, 12, 4, 4)

@@ -9,8 +9,7 @@ import pytest
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.scan import Sweep, sweep_to_scene
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import Light
+from pipeline.simulator.effects.effect import Light, SweepBlock
 from pipeline.simulator.selection.verification import MOST_CANDIDATES, candidate_blocks, worst_blocks
 from tests.pipeline.simulator.made_up_effects import RIG
 

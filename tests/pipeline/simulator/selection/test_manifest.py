@@ -7,8 +7,7 @@ import math
 
 import pytest
 
-from pipeline.simulator.selection.choice import decide
-from pipeline.simulator.selection.manifest import list_effects, sum_up
+from pipeline.simulator.selection.choice import decide, list_effects, sum_up
 from tests.pipeline.simulator.made_up_effects import RIG, MadeUp, Shift, even_probe
 
 FIELDS = {"name", "state", "variant", "bound", "measured", "cost_s", "why", "reason", "left_out", "magnitude", "unit"}

@@ -12,11 +12,10 @@ from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
-from pipeline.simulator.effects.light_units import noise_electrons, stored_mean
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
-from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.effects.probe import Probe, noise_electrons, stored_mean
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Detector, Rig

@@ -12,17 +12,15 @@ import pytest
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
-from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import Light as Light32
-from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
-from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.effects.probe import Probe, noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneLight, SceneRaster
-from pipeline.simulator.selection.choice import Decision, decide
-from pipeline.simulator.selection.manifest import TOTAL
+from pipeline.simulator.selection.choice import TOTAL, Decision, decide
 from pipeline.simulator.selection.options import SAFETY
 from pipeline.simulator.selection.survey_probe import probe_scene
 from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks

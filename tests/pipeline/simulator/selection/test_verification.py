@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 from pipeline.errors import BoundError
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.effect import Effect, Light
-from pipeline.simulator.selection.choice import Decision, decide
-from pipeline.simulator.selection.manifest import TOTAL
+from pipeline.simulator.effects.effect import Effect, Light, SweepBlock
+from pipeline.simulator.selection.choice import TOTAL, Decision, decide
 from pipeline.simulator.selection.verification import Floats, verify
 from tests.pipeline.simulator.made_up_effects import RIG, SWEEP, Brightening, MadeUp, even_probe
 
