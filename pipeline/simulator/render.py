@@ -59,9 +59,7 @@ class Choice:
     def of(chosen: Mapping[Any, str] | Choice) -> Choice:
         """Take a mapping {effect: variant}, in the order of the chain; effects that are off may be among them.
 
-        Raises
-        ------
-        SettingsError : an effect has no such variant.
+        Raises SettingsError: an effect has no such variant.
         """
         if isinstance(chosen, Choice):
             return chosen
@@ -82,25 +80,22 @@ class Choice:
 def expected_light(scene: Scene, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Light:
     """Give the electrons that the samples of some lines gather on average, before the readout.
 
-    Parameters
-    ----------
-    chosen
-        The effects that are on, in the order of the chain, each with its variant; none is a camera of rays that
-        stands still and whose lines lie straight.
-
-    Returns
-    -------
-    (line, sample, band) float32, the block's samples. [e-]
-
-    Raises
-    ------
-    PoseError : a position, with what aims add, is out of the mirror's reach.
-    SettingsError : an effect has no such variant.
+    ``chosen``: The effects that are on, in the order of the chain, each with its variant; none is a camera of rays that
+    stands still and whose lines lie straight.
+    Returns (line, sample, band) float32, the block's samples. [e-]
+    Raises PoseError: a position, with what aims add, is out of the mirror's reach. SettingsError: an effect has no such
+    variant.
     """
     choice = Choice.of(chosen)
     if block.samples is not None and any(getattr(effect, "whole_line", False) for effect, _ in choice.effects):
         return expected_light(scene, replace(block, samples=None), choice)[:, block.columns]
-    return _changed(_seen(scene, block, choice), block, choice)
+    steps = [views.flat() for views in _views(block, choice, scene.shape)]
+    exposures = block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
+    moments, names = tuple(choice.doing("moments")), tuple(map(choice.variant, ("slit", "smear", "rotation")))
+    light = _looker(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names).look(
+        scene, steps, along_y=block.sweep.along == "y", exposures=exposures
+    )
+    return _changed(light.reshape(len(block.lines), len(block.columns), light.shape[1]), block, choice)
 
 
 def held_positions(block: SweepBlock, choice: Choice) -> Floats:
@@ -114,16 +109,7 @@ def held_positions(block: SweepBlock, choice: Choice) -> Floats:
     return position
 
 
-def _seen(scene: Scene, block: SweepBlock, choice: Choice) -> Light:
-    """Light of the block through the folded footprint, (line, sample, band)."""
-    steps = [views.flat() for views in _views(block, choice, scene.shape)]
-    exposures = block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
-    light = _looker_of(block, choice).look(scene, steps, along_y=block.sweep.along == "y", exposures=exposures)
-    return light.reshape(len(block.lines), len(block.columns), light.shape[1])
-
-
 def _changed(light: Light, block: SweepBlock, choice: Choice) -> Light:
-    """Multiply and change light as the effects do. Factors without bands are gathered: they pass through spectra."""
     pending: Light | None = None
     for effect, variant in choice.effects:
         if hasattr(effect, "gain"):
@@ -162,11 +148,6 @@ def _tangents(position: Floats, slopes: Floats, *, exact: bool) -> RayViews:
     return straight_views(direction_to_scene(position_to_direction(position)), 0.0, slopes)
 
 
-def _looker_of(block: SweepBlock, choice: Choice) -> Looker:
-    moments, names = tuple(choice.doing("moments")), tuple(map(choice.variant, ("slit", "smear", "rotation")))
-    return _looker(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names)
-
-
 @lru_cache(maxsize=8)
 def _looker(
     rig: Rig, sweep: Sweep, wavelengths: bytes, blurs: tuple[tuple[Any, str], ...], names: tuple[str, ...]
@@ -192,19 +173,9 @@ def read_out(light: Light, block: SweepBlock, chosen: Mapping[Any, str] | Choice
 
     The converter always rounds (half to even) and never gives less than 0 or more than its full scale.
 
-    Parameters
-    ----------
-    light
-        (line, sample, band) of the block; negative values count as 0. [e-]
-
-    Returns
-    -------
-    (line, sample, band) uint16, all samples of the block before binning.
-
-    Raises
-    ------
-    SceneError : a number is not finite; names the first.
-    ShapeError : the light is not the block's.
+    ``light``: (line, sample, band) of the block; negative values count as 0. [e-]
+    Returns (line, sample, band) uint16, all samples of the block before binning.
+    Raises SceneError: a number is not finite; names the first. ShapeError: the light is not the block's.
     """
     expected_shape = (len(block.lines), len(block.columns), len(block.wavelength_nm))
     if light.shape != expected_shape:
@@ -240,14 +211,30 @@ class Readout:
             expected[self.dead] = 0
         expected += self.added
         if not np.isfinite(expected.max(initial=0.0)):
-            raise _not_finite(expected, self.block, number)
+            sample, band = np.argwhere(~np.isfinite(expected))[0]
+            raise SceneError(
+                f"sweep {self.block.sweep.name}: line {number}, sample {self.block.columns[sample]}, band {band} expects"
+                f" {expected[sample, band]} electrons; give a scene and a rig of finite numbers"
+            )
         shot = self._variant(SHOT.name)
         if shot == OFF:
             return self._with_read_noise(self._within_well(expected), number)
         deviate = self._deviates(SHOT.name, number)
         if shot == EXACT:
             return self._with_read_noise(self._within_well(photon_counts(expected, deviate)), number)
-        return self._cheap(expected, deviate, number)
+        merged = self.read_noise_e >= LEAST_MERGED_READ_E and self.well_e is None
+        least = least_expected(self.read_noise_e if merged else 0.0)
+        dim = np.flatnonzero(expected < np.float32(least)) if least else np.zeros(0, np.intp)
+        exact = photon_counts(expected.take(dim), deviate.take(dim))
+        if merged:
+            electrons = merged_noise(expected, self.read_noise_e, deviate)
+            if dim.size:
+                read = self._deviates(READ_NOISE.name, number).take(dim)
+                electrons.reshape(-1)[dim] = exact + read * np.float32(self.read_noise_e)
+            return electrons
+        counts = rounded_counts(expected, deviate)
+        counts.reshape(-1)[dim] = exact
+        return self._with_read_noise(self._within_well(counts), number)
 
     def converted(self, electrons: Light) -> NDArray[np.uint16]:
         """Give the converter's numbers, rounded half to even, within 0 and its full scale."""
@@ -285,22 +272,6 @@ class Readout:
         on = self._variant(SATURATION.name) != OFF and well_reached(self.block.rig, self.read_noise_e)
         return self.block.rig.detector.well_e if on else None
 
-    def _cheap(self, expected: Light, deviate: Light, number: int) -> Light:
-        """Cheap draws where they may stand for exact ones, exact ones below."""
-        merged = self.read_noise_e >= LEAST_MERGED_READ_E and self.well_e is None
-        least = least_expected(self.read_noise_e if merged else 0.0)
-        dim = np.flatnonzero(expected < np.float32(least)) if least else np.zeros(0, np.intp)
-        exact = photon_counts(expected.take(dim), deviate.take(dim))
-        if merged:
-            electrons = merged_noise(expected, self.read_noise_e, deviate)
-            if dim.size:
-                read = self._deviates(READ_NOISE.name, number).take(dim)
-                electrons.reshape(-1)[dim] = exact + read * np.float32(self.read_noise_e)
-            return electrons
-        counts = rounded_counts(expected, deviate)
-        counts.reshape(-1)[dim] = exact
-        return self._with_read_noise(self._within_well(counts), number)
-
     def _within_well(self, electrons: Light) -> Light:
         return electrons if self.well_e is None else np.minimum(electrons, np.float32(self.well_e), out=electrons)
 
@@ -319,11 +290,3 @@ class Readout:
     def _variant(self, name: str) -> str:
         ideal = self.block.rig.detector.noiseless and name in (SHOT.name, READ_NOISE.name)
         return OFF if ideal else self.choice.variant(name)
-
-
-def _not_finite(expected: Light, block: SweepBlock, number: int) -> SceneError:
-    sample, band = np.argwhere(~np.isfinite(expected))[0]
-    return SceneError(
-        f"sweep {block.sweep.name}: line {number}, sample {block.columns[sample]}, band {band} expects"
-        f" {expected[sample, band]} electrons; give a scene and a rig of finite numbers"
-    )

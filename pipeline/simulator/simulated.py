@@ -62,39 +62,31 @@ class SimulatedSource:
 
     @property
     def camera(self) -> LineCamera:
-        """The rig's camera."""
         return self.rig.camera
 
     @property
     def wavelength_nm(self) -> NDArray[np.float64]:
-        """(band,) centre wavelengths [nm]."""
         return self.scene.wavelength_nm
 
     @property
     def field_shape(self) -> tuple[int, int]:
-        """(y, x) size of the field [px]."""
         return self.scene.shape
 
     def started_s(self, sweep: Sweep) -> float:
-        """When a sweep starts, after the survey did [s]."""
         return 0.0 if self.clock is None else float(self.clock.get(sweep.name, 0.0))
 
     def block(self, sweep: Sweep, lines: range) -> SweepBlock:
-        """Some lines of a sweep, as effects ask about them."""
         return sweep_block(self.scene, self.rig, sweep, lines, seed=self.seed, started_s=self.started_s(sweep))
 
     def render(self, sweep: Sweep, lines: range) -> NDArray[np.uint16]:
-        """Give raw numbers (line, sample, band) of some lines; see `render_lines`."""
         started_s = self.started_s(sweep)
         return render_lines(self.scene, self.rig, self.choice, sweep, lines, seed=self.seed, started_s=started_s)
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
         """Give the sweep's lines one by one, from line ``first`` on.
 
-        Raises
-        ------
-        ShapeError : sums of ``sweep.binning`` samples at full scale do not fit uint16.
-        PoseError : a position of the sweep is out of the mirror's reach.
+        Raises ShapeError: sums of ``sweep.binning`` samples at full scale do not fit uint16. PoseError: a position of
+        the sweep is out of the mirror's reach.
         """
         check_binning(sweep, self.camera)
         for start in range(first, sweep.lines, BLOCK_LINES):
@@ -103,10 +95,8 @@ class SimulatedSource:
     def lines_of(self, sweep: Sweep, numbers: range) -> list[Line]:
         """Give some lines of the sweep, as `lines` does. Threads may ask at the same time.
 
-        Raises
-        ------
-        ShapeError : sums of ``sweep.binning`` samples at full scale do not fit uint16.
-        PoseError : a position of the sweep is out of the mirror's reach.
+        Raises ShapeError: sums of ``sweep.binning`` samples at full scale do not fit uint16. PoseError: a position of
+        the sweep is out of the mirror's reach.
         """
         camera, middle = self.camera, line_positions(sweep, self.camera)
         return [
@@ -132,7 +122,6 @@ class SimulatedSource:
         return None
 
     def references(self, sweep: Sweep) -> References:
-        """Mean dark and white frames with the sweep's binning, as the effects that are on have them."""
         return take_references(self.scene, self.rig, self.choice, sweep)
 
 
@@ -145,12 +134,10 @@ class SimulatedSweep:
 
     @property
     def references(self) -> References:
-        """Dark and white frames."""
         return self.source.references(self.sweep)
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """(line, 2) mirror X and Y at mid exposure."""
         return line_positions(self.sweep, self.source.camera)
 
     @property
@@ -161,7 +148,6 @@ class SimulatedSweep:
 
     @property
     def valid_line(self) -> NDArray[np.bool_]:
-        """Every line can be used."""
         return np.ones(self.sweep.lines, bool)
 
     def read(self, start: int, stop: int) -> NDArray[np.uint16]:
@@ -177,12 +163,8 @@ def sweep_starts(
     Before it come the sweeps before, a set-up for each and its own, and the loads of the vector memory until then.
     Lines of a sweep follow each other without a break: a load in the midst of one delays the next sweep only.
 
-    Parameters
-    ----------
-    sweeps
-        In the order in which they are taken.
-    after_s
-        What the survey has spent before: the fine sweeps come after the coarse ones' seconds.
+    ``sweeps``: In the order in which they are taken.
+    ``after_s``: What the survey has spent before: the fine sweeps come after the coarse ones' seconds.
     """
     loads_before: dict[int, int] = {}
     for number, load in enumerate(memory_loads(sweeps, cost.vector_pairs), 1):
@@ -239,19 +221,11 @@ def render_lines(
 
     Neither the other lines and samples asked for nor the order of calls changes a number.
 
-    Parameters
-    ----------
-    samples
-        Neighbouring ones of the binned line; None is all. Effects for which all of a line counts see all of it.
-
-    Returns
-    -------
-    (line, sample, band) uint16, binned. [DN]
-
-    Raises
-    ------
-    ShapeError : sums of ``sweep.binning`` samples at full scale do not fit uint16, or the line has no such samples.
-    PoseError : a position of the sweep is out of the mirror's reach.
+    ``samples``: Neighbouring ones of the binned line; None is all. Effects for which all of a line counts see all of
+    it.
+    Returns (line, sample, band) uint16, binned. [DN]
+    Raises ShapeError: sums of ``sweep.binning`` samples at full scale do not fit uint16, or the line has no such
+    samples. PoseError: a position of the sweep is out of the mirror's reach.
     """
     check_binning(sweep, rig.camera)
     choice, count = Choice.of(chosen), rig.camera.samples // sweep.binning
@@ -271,9 +245,7 @@ def render_lines(
 def check_binning(sweep: Sweep, camera: LineCamera) -> None:
     """Refuse sums that do not fit raw numbers.
 
-    Raises
-    ------
-    ShapeError : ``sweep.binning`` samples at full scale sum to more than uint16 holds.
+    Raises ShapeError: ``sweep.binning`` samples at full scale sum to more than uint16 holds.
     """
     if sweep.binning > camera.most_binning:
         raise ShapeError(
@@ -288,27 +260,10 @@ def take_references(scene: Scene, rig: Rig, choice: Choice, sweep: Sweep) -> Ref
     The white frame is scaled to the exposure from a shorter one, so that it does not saturate. It is taken with the
     mirror at rest, by the light of the survey's start. Dead and hot elements are told as bad.
 
-    Returns
-    -------
-    Frames (sample, band) [DN]; the panel's values are those of the rig's bands.
+    Returns frames (sample, band) [DN]; the panel's values are those of the rig's bands.
     """
     block = sweep_block(scene, rig, AT_REST, range(1))
     dark = dark_frame(block, choice)
-    white = dark + _panel_light(block, choice) / np.float32(rig.camera.electrons_per_dn)
-    panel = scene.panel.astype(np.float32)
-    if (response := choice.variant(RESPONSE.name)) != OFF:
-        panel = RESPONSE.change(panel[None, None], block, response)[0, 0]
-    return References(
-        dark=_binned(dark, sweep.binning),
-        white=_binned(white, sweep.binning),
-        panel=panel,
-        bad=_bad_elements(block, choice, sweep.binning),
-        by_mirror=choice.variant(VIGNETTING.name) != OFF,
-    )
-
-
-def _panel_light(block: SweepBlock, choice: Choice) -> Frame:
-    """Electrons that the panel gives in one exposure, (sample, band)."""
     assert block.white_e is not None
     light = np.repeat(block.white_e.astype(np.float32)[None, None], len(block.columns), axis=1)
     for effect, variant in choice.effects:
@@ -321,7 +276,17 @@ def _panel_light(block: SweepBlock, choice: Choice) -> Frame:
     seen: Frame = light[0]
     if choice.variant(DEFECTS.name) != OFF:
         seen[dead_elements(block.rig, seen.shape[1])] = 0
-    return seen
+    white = dark + seen / np.float32(rig.camera.electrons_per_dn)
+    panel = scene.panel.astype(np.float32)
+    if (response := choice.variant(RESPONSE.name)) != OFF:
+        panel = RESPONSE.change(panel[None, None], block, response)[0, 0]
+    return References(
+        dark=_binned(dark, sweep.binning),
+        white=_binned(white, sweep.binning),
+        panel=panel,
+        bad=_bad_elements(block, choice, sweep.binning),
+        by_mirror=choice.variant(VIGNETTING.name) != OFF,
+    )
 
 
 def _bad_elements(block: SweepBlock, choice: Choice, binning: int) -> NDArray[np.bool_] | None:

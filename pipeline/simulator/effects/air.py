@@ -38,7 +38,6 @@ class Turbulence(Aim):
     cost_ns = MappingProxyType({"jitter": 0.13})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        """Give how far each line looks beside its plan, (line, 1, 2) along the line and the scan. [px]"""
         sigma = turbulence_px(block.rig)
         draws = [block.stream(self.name, int(number)).standard_normal(2) for number in block.numbers]
         return sigma * np.array(draws, np.float64).reshape(-1, 1, 2)
@@ -110,7 +109,6 @@ class Wind(Displacement):
     cost_ns = MappingProxyType({"exact": 0.9})
 
     def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
-        """Give what to add to points (line, sample), along the line and along the scan. [px]"""
         sway, air = sway_px(block.rig), block.rig.air
         if sway == 0 or air.distance_m is None:
             return np.zeros_like(along_px), np.zeros_like(scan_px)
@@ -128,7 +126,12 @@ class Wind(Displacement):
         if sway == 0:
             return Bound(0.0, "the air is calm")
         steep = sway * np.hypot(probe.slope[0], probe.slope[1])
-        return Bound(float(np.minimum(steep, probe.span).max(initial=0.0)), _reason(rig, sway))
+        aliased = ", too fast for the lines to follow" if sways_per_line(rig) > 0.5 else ""
+        smeared = f"up to {within_exposure_px(rig):.2g} px of smear within an exposure are not modelled"
+        return Bound(
+            float(np.minimum(steep, probe.span).max(initial=0.0)),
+            f"the crop sways by {sway:.2g} px, {line_to_line_px(rig):.2g} px from line to line{aliased}; {smeared}",
+        )
 
 
 WIND = Wind()
@@ -157,14 +160,7 @@ def within_exposure_px(rig: Rig) -> float:
 
 
 def sways_per_line(rig: Rig) -> float:
-    """Give f t_frame; above one half the sway is aliased."""
     return rig.air.wind_hz * rig.camera.frame_ms * 1e-3
-
-
-def _reason(rig: Rig, sway: float) -> str:
-    aliased = ", too fast for the lines to follow" if sways_per_line(rig) > 0.5 else ""
-    smeared = f"up to {within_exposure_px(rig):.2g} px of smear within an exposure are not modelled"
-    return f"the crop sways by {sway:.2g} px, {line_to_line_px(rig):.2g} px from line to line{aliased}; {smeared}"
 
 
 FARTHEST_M = 1e7  # infinity: nothing passes so much air
@@ -184,7 +180,6 @@ class Parallax(Displacement):
     cost_ns = MappingProxyType({"exact": 0.2})
 
     def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
-        """Give what to add to points (line, sample), along the line and along the scan. [px]"""
         air, sweep = block.rig.air, block.sweep
         if air.distance_m is None:
             return np.zeros_like(along_px), np.zeros_like(scan_px)
@@ -193,7 +188,6 @@ class Parallax(Displacement):
         return share * (along_px - sweep.strip_px), share * (scan_px - block.scan_px[:, None])
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by slope times the displacement at the lines' ends of the part farthest from the scene's distance."""
         share = greatest_share(rig.air)
         if share == 0 or not probe.sweeps:
             return Bound(0.0, "all of the scene is at one distance")
@@ -255,7 +249,6 @@ def reach_m(rig: Rig) -> tuple[float, float] | None:
 
 
 def has_relief(rig: Rig) -> bool:
-    """Whether samples see the scene at more than one distance."""
     reach = reach_m(rig)
     return reach is not None and reach[0] != reach[1]
 
@@ -274,5 +267,4 @@ def sample_distances(block: SweepBlock) -> Floats:
 
 
 def spoken_reach(ends: tuple[float, float]) -> str:
-    """Say it in words."""
     return f"{ends[1]:g} m" if ends[0] == ends[1] else f"{ends[0]:g} to {ends[1]:g} m"

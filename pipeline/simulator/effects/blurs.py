@@ -63,7 +63,6 @@ class Diffraction(Blur):
     cost_ns = MappingProxyType({AIRY: 6.7, GAUSSIAN: 3.4, ONE_WIDTH: 0.3})
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
-        """Give the blur of each band; ``normal`` (3,) is the mirror's in the camera frame, None at rest."""
         waves, none = _waves(rig, wavelength_nm, normal), np.zeros((2, len(wavelength_nm)))
         if variant == AIRY:
             return Moments(none, none, waves)
@@ -156,11 +155,9 @@ class Aberration(Blur):
     cost_ns = MappingProxyType({"gaussian": 0.3})
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
-        """Give the blur, equal in all bands."""
         return even(np.full(2, rig.optics.aberration_px**2), len(wavelength_nm))
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound the error of no blur."""
         return blurred_bound(probe, "blur of the lens", self.moments(rig, probe.wavelength_nm, variant).variance[None])
 
 
@@ -182,11 +179,9 @@ class Defocus(Blur):
         return Merged(DIFFRACTION.name, AIRY, 0.1)
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
-        """Give the blur, equal in all bands; ``normal`` (3,) is the mirror's in the camera frame, None at rest."""
         return even(defocus_px(rig, rig.air.distance_m, normal) ** 2 / 16, len(wavelength_nm))
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound the error of no blur over all positions of the sweeps."""
         if rig.distances_m is None:
             return Bound(0.0, "the scene has no distance")
         normals = normals_met(probe.sweeps, rig.camera)
@@ -226,13 +221,11 @@ class Keystone(Blur):
         return Merged(DIFFRACTION.name, AIRY, 5.6)
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
-        """Give the shift of each band."""
         shift = np.zeros((2, len(wavelength_nm)))
         shift[0] = keystone_shift(rig, wavelength_nm)
         return Moments(shift, np.zeros_like(shift))
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound the error of no shift: slope along the line times shift, never more than the span, band by band."""
         shift = np.abs(keystone_shift(rig, probe.wavelength_nm))
         change = np.minimum(probe.slope[0] * shift, probe.span)
         if not shift.any():

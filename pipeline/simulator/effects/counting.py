@@ -141,7 +141,6 @@ def most_hot_electrons(rig: Rig) -> float:
 
 @lru_cache(maxsize=8)
 def _mask(unit: int, kind: str, samples: int, bands: int, *, share: float) -> Mask:
-    """Elements below a share of uniform draws, band by band: more bands or a larger share keep those there were."""
     below = unit_stream(unit, kind).random((bands, samples)) < share
     mask: Mask = np.ascontiguousarray(below.T)
     mask.setflags(write=False)
@@ -287,7 +286,6 @@ class Quantisation(Effect):
     cost_ns = MappingProxyType({"exact": 0.4})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound it by half a DN."""
         value = probe.added(0.5 * rig.camera.electrons_per_dn, rig.camera.electrons_per_dn)
         return Bound(value, f"0.5 DN of {rig.camera.electrons_per_dn:g} e-")
 

@@ -62,7 +62,6 @@ class Absorption(Gain):
     cost_ns = MappingProxyType({RANGE: 2.7, UNIFORM: 0.2})  # of a scene with relief
 
     def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
-        """Give the cost for the scene's relief: without any, samples share one distance."""
         return self.cost_ns if has_relief(rig) else dict.fromkeys(self.variants, self.cost_ns[UNIFORM])
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
@@ -80,7 +79,6 @@ class Absorption(Gain):
         return Bound(probe.scaled(share), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        """Give the transmission between the nearest and the farthest distance."""
         reach, nm = reach_m(rig), np.asarray(probe.wavelength_nm, np.float64)
         if reach is None:
             return GainRange.between(1.0, 1.0, len(nm))
@@ -88,7 +86,6 @@ class Absorption(Gain):
         return GainRange.of(passed, nm, uneven=float(passed.max(initial=0.0) - passed.min(initial=1.0)))
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
-        """Give (line, sample, band), or (1, 1, band) where all is at one distance."""
         rig, reach = block.rig, reach_m(block.rig)
         if reach is None:
             return np.ones((1, 1, 1), np.float32)
@@ -137,7 +134,6 @@ class PathRadiance(LightChange):
     cost_ns = MappingProxyType({RANGE: 3.1, UNIFORM: 0.5})  # of a scene with relief
 
     def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
-        """Give the cost for the scene's relief: without any, samples share one distance."""
         return self.cost_ns if has_relief(rig) else dict.fromkeys(self.variants, self.cost_ns[UNIFORM])
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
@@ -161,7 +157,6 @@ class PathRadiance(LightChange):
         return Bound(worst, f"air {verb} {most} and adds its own, over {spoken_reach(reach)}")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        """Give the transmission between the nearest and the farthest distance, and the air's own light."""
         reach, nm = reach_m(rig), np.asarray(probe.wavelength_nm, np.float64)
         if reach is None:
             return GainRange.between(1.0, 1.0, len(nm))
@@ -181,7 +176,6 @@ class PathRadiance(LightChange):
         )
 
     def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
-        """Change the light in place."""
         reach = reach_m(block.rig)
         if reach is None:
             return light
@@ -190,15 +184,11 @@ class PathRadiance(LightChange):
         lost = -np.expm1(-depth)
         light *= 1 - lost
         if block.white_e is not None:
-            light += (self._horizon(block) * lost).astype(np.float32, copy=False)
+            sky, still = block.rig.sky, block.rig.air.airlight_share * np.asarray(block.white_e, np.float64)
+            if sky.started is not None:
+                still = still * relative_daylight(sky, block.wavelength_nm, block.time_s)
+            light += (np.atleast_2d(still)[:, None].astype(np.float32) * lost).astype(np.float32, copy=False)
         return light
-
-    def _horizon(self, block: SweepBlock) -> Light:
-        """Light of endless air at a line's time, (line or 1, 1, band) [e-]."""
-        sky, still = block.rig.sky, block.rig.air.airlight_share * np.asarray(block.white_e, np.float64)
-        if sky.started is not None:
-            still = still * relative_daylight(sky, block.wavelength_nm, block.time_s)
-        return np.atleast_2d(still)[:, None].astype(np.float32)
 
 
 PATH_RADIANCE = PathRadiance()

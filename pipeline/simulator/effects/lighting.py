@@ -47,7 +47,10 @@ class Drift(Gain):
             return Bound(0.0, "the survey has no time of day")
         seconds = probe.seconds + rig.camera.frame_ms * 1e-3  # to the end of the last line
         worst = np.zeros(len(probe.wavelength_nm))
-        times = _corners(rig.sky, probe.wavelength_nm, seconds, variant)
+        times = knots_within(rig.sky, seconds)
+        rate = _first_rate(rig.sky, probe.wavelength_nm) if variant == LINEAR else 0.0
+        dark = -1 / rate if rate < 0 else np.inf  # from here on the straight line is 0
+        times = np.append(times, dark) if dark < seconds else times
         for some in np.array_split(times, len(times) // _KNOTS_AT_ONCE + 1):
             exact = _daylight(rig.sky, probe.wavelength_nm, some, SPECTRAL)
             missed = exact - (1 if variant == OFF else _daylight(rig.sky, probe.wavelength_nm, some, variant))
@@ -58,7 +61,6 @@ class Drift(Gain):
         return Bound(probe.scaled(worst), f"light {verb} by at most {100 * worst.max(initial=0.0):.3g} % {course}")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        """Give the daylight of the survey over that at its start; 1 without a time of day."""
         nm = np.asarray(probe.wavelength_nm, np.float64)
         if rig.sky.started is None:
             return GainRange.between(1.0, 1.0, len(nm))
@@ -67,7 +69,6 @@ class Drift(Gain):
         return GainRange.of(light, nm, uneven=float(np.ptp(light, axis=1).max(initial=0.0)))
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
-        """Give (line, 1, band), or (line, 1, 1) of the variants that take all bands as one."""
         sky = block.rig.sky
         if sky.started is None:
             return np.ones((1, 1, 1), np.float32)
@@ -98,14 +99,6 @@ def _first_rate(sky: Sky, wavelength_nm: Floats) -> float:
     return float(later - first) / _RATE_OVER_S
 
 
-def _corners(sky: Sky, wavelength_nm: Floats, seconds: float, variant: str) -> Floats:
-    """Times between which both the light and the variant are straight, (time,) [s]."""
-    times = knots_within(sky, seconds)
-    rate = _first_rate(sky, wavelength_nm) if variant == LINEAR else 0.0
-    dark = -1 / rate if rate < 0 else np.inf  # from here on the straight line is 0
-    return np.append(times, dark) if dark < seconds else times
-
-
 def _spoken(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds:.0f} s"
 
@@ -130,26 +123,20 @@ class Cloud(Gain):
         return Bound(probe.scaled(sky.cloud_share), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        """Give 1 less a cloud's share, to 1."""
         share = rig.sky.cloud_share
         return GainRange.between(1 - share, 1.0, len(probe.wavelength_nm), uneven=share)
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
-        """Give (line, sample, 1)."""
         sky = block.rig.sky
         if sky.cloud_share == 0:
             return np.ones((1, 1, 1), np.float32)
         sweep = block.sweep
         along, scan = points_of_scan(sweep.strip_px, block.rig.camera, block.scan_px[:, None], block.slopes)
         x, y = (along, scan) if sweep.along == "x" else (scan, along)
-        heading, place = self._course(block.seed, sky.cloud_size_px)
+        turn, place = sweep_stream(block.seed, "", self.name).random(2)  # no sweep's name: the whole survey's
+        heading, place = 2 * math.pi * float(turn), 2 * sky.cloud_size_px * float(place)
         way = x * math.cos(heading) + y * math.sin(heading) - sky.cloud_px_per_s * block.time_s[:, None] + place
         return (1 - sky.cloud_share * shadow(way, sky.cloud_size_px))[..., None].astype(np.float32)
-
-    def _course(self, seed: int, size_px: float) -> tuple[float, float]:
-        """Direction [rad] in which the shadows move, and where they are when the survey starts [px]."""
-        turn, place = sweep_stream(seed, "", self.name).random(2)  # no sweep's name: the whole survey's
-        return 2 * math.pi * float(turn), 2 * size_px * float(place)
 
 
 CLOUD = Cloud()
@@ -180,7 +167,6 @@ class Brdf(Gain):
     cost_ns = MappingProxyType({"angles": 0.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by level times the greatest slope part plus the greatest hot spot within the sweeps."""
         slope, hot = rig.sky.brdf_per_rad, rig.sky.hot_spot
         if slope == 0 and hot == 0:
             return Bound(0.0, "the scene reflects alike in all directions")
@@ -191,7 +177,6 @@ class Brdf(Gain):
         return Bound(probe.scaled(share), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        """Give the slope's ends, the hot spot on the upper one."""
         slope, bands = rig.sky.brdf_per_rad, len(probe.wavelength_nm)
         if not slope and not rig.sky.hot_spot:
             return GainRange.between(1.0, 1.0, bands)
@@ -201,7 +186,6 @@ class Brdf(Gain):
         return GainRange.between(least, greatest, bands, uneven=greatest - least)
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
-        """Give (line, sample, 1)."""
         sky = block.rig.sky
         if sky.brdf_per_rad == 0 and sky.hot_spot == 0:
             return np.ones((1, 1, 1), np.float32)
@@ -216,7 +200,6 @@ BRDF = Brdf()
 
 
 def _angles(sweep: Sweep, camera: LineCamera, scan_px: Floats, slopes: Floats) -> tuple[Floats, Floats]:
-    """Angle of view along the scene's x axis and phase, (line, sample) each [rad]."""
     along, scan = points_of_scan(sweep.strip_px, camera, scan_px[:, None], slopes)
     x = along if sweep.along == "x" else scan
     return np.arctan(x * camera.ifov_rad), np.arctan(np.hypot(along, scan) * camera.ifov_rad)
@@ -226,14 +209,15 @@ def _extremes(sweeps: tuple[Sweep, ...], camera: LineCamera) -> tuple[float, flo
     """Greatest angle from the undeflected direction and least phase within the sweeps [rad]."""
     greatest, least = 0.0, np.inf
     for sweep in (sweep for sweep in sweeps if sweep.lines):
-        angle, phase = _angles(sweep, camera, *(_looks(part) for part in (sweep.line_px(), camera.pixel_slopes())))
+        angle, phase = _angles(
+            sweep,
+            camera,
+            *(
+                part[np.unique(np.linspace(0, len(part) - 1, _LOOKS).round().astype(int))]
+                for part in (sweep.line_px(), camera.pixel_slopes())
+            ),
+        )
         steps = [np.abs(np.diff(phase, axis=axis)).max(initial=0.0) for axis in (0, 1)]
         greatest = max(greatest, float(np.abs(angle).max()))
         least = min(least, float(phase.min() - sum(steps) / 2))  # no point is further from one looked at
     return greatest, max(least, 0.0)
-
-
-def _looks(values: Floats) -> Floats:
-    """Take some of them, with both ends."""
-    some: Floats = values[np.unique(np.linspace(0, len(values) - 1, _LOOKS).round().astype(int))]
-    return some

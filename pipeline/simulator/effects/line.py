@@ -53,7 +53,15 @@ class Rotation(Effect):
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by slope times the greatest way between where rays meet the scene and where straight lines would."""
-        along, scan = _farthest(probe.sweeps, rig.camera, beside_plan_px(probe, rig))
+        beside = beside_plan_px(probe, rig)
+        ways = [
+            _course(sweep, rig.camera, (along, scan))
+            for sweep in probe.sweeps
+            if sweep.lines
+            for along in {-beside[0], 0.0, beside[0]}
+            for scan in {-beside[1], 0.0, beside[1]}
+        ]
+        along, scan = (max(way[0] for way in ways), max(way[1] for way in ways)) if ways else (0.0, 0.0)
         most = f"{round(along, 9):.3g} px along and {round(scan, 9):.3g} px along the scan"
         why = f"lines are turned and stretched by at most {most}"
         # The footprint does not lie turned either: the same as one box that does not.
@@ -62,18 +70,6 @@ class Rotation(Effect):
 
 
 ROTATION = Rotation()
-
-
-def _farthest(sweeps: tuple[Sweep, ...], camera: LineCamera, beside: tuple[float, float]) -> tuple[float, float]:
-    """Greatest difference along the line and the scan over all sweeps, wherever the mirror may look. [px]"""
-    ways = [
-        _course(sweep, camera, (along, scan))
-        for sweep in sweeps
-        if sweep.lines
-        for along in {-beside[0], 0.0, beside[0]}
-        for scan in {-beside[1], 0.0, beside[1]}
-    ]
-    return (max(way[0] for way in ways), max(way[1] for way in ways)) if ways else (0.0, 0.0)
 
 
 def _course(sweep: Sweep, camera: LineCamera, beside: tuple[float, float]) -> tuple[float, float]:
@@ -167,30 +163,22 @@ class Smear(Effect):
             along, scan = along + sway_gradient(rig), scan + sway_gradient(rig) + greatest_share(rig.air)
             way, area = np.abs(np.arange(most) - (most - 1) / 2).mean(), 2 * variance
             by_scan = np.minimum(probe.slope[1] * way, probe.curvature[1] * area) * scan
-            course = at_line_ends(probe.sweeps, rig.camera, 0.0, _uneven_course(probe.sweeps, rig))
+            uneven = (
+                np.abs(ways - ways.mean(axis=1, keepdims=True)).mean(axis=1) for ways in _courses(probe.sweeps, rig)
+            )
+            course = at_line_ends(probe.sweeps, rig.camera, 0.0, max((float(one.max()) for one in uneven), default=0.0))
             by_course = probe.slope[0] * course[0] + probe.slope[1] * course[1]
             change = np.minimum(probe.slope[0] * way * along + by_scan + by_course, probe.span)
             # at a step of the relief up to half of the positions see the other depth, at most twice as far off
             step = PARALLAX.bound(probe, rig).value if rig.air.relief == "step" else 0.0
             return Bound(float(change.max(initial=0.0)) + step, f"lines of an exposure lie as one, {most} px")
         both = np.zeros(probe.slope.shape)
-        both[1] = max(variance, _greatest_variance(probe.sweeps, rig))
+        held = ((ways + np.arange(ways.shape[1])).var(axis=1) for ways in _courses(probe.sweeps, rig))
+        both[1] = max(variance, max((float(one.max()) for one in held), default=0.0))
         return Bound(probe.blurred(both), f"the mirror moves {most} px in an exposure")
 
 
 SMEAR = Smear()
-
-
-def _uneven_course(sweeps: tuple[Sweep, ...], rig: Rig) -> float:
-    """Greatest mean way of held positions from where the mirror's mean in the exposure would have them. [px]"""
-    uneven = (np.abs(ways - ways.mean(axis=1, keepdims=True)).mean(axis=1) for ways in _courses(sweeps, rig))
-    return max((float(one.max()) for one in uneven), default=0.0)
-
-
-def _greatest_variance(sweeps: tuple[Sweep, ...], rig: Rig) -> float:
-    """Greatest variance of the positions of an exposure as the mirror runs, not as planned. [px^2]"""
-    held = ((ways + np.arange(ways.shape[1])).var(axis=1) for ways in _courses(sweeps, rig))
-    return max((float(one.max()) for one in held), default=0.0)
 
 
 def _courses(sweeps: tuple[Sweep, ...], rig: Rig) -> Iterator[Floats]:
@@ -213,7 +201,6 @@ def folded_positions(sweep: Sweep, variant: str) -> int:
 
 
 def _beside(sweeps: tuple[Sweep, ...], rig: Rig) -> tuple[float, float]:
-    """Greatest way beside its place, along the line and the scan, of any point per px that the line's centre moves."""
     found = np.zeros(2)
     for sweep in sweeps:
         if sweep.lines and sweep.step > 1:

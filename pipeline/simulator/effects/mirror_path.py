@@ -39,7 +39,6 @@ class Staircase(Aim):
     cost_ns = MappingProxyType({EXACT: 18.0, CENTRES: 0.01})  # exact: five positions a line instead of one
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        """Give how far beside the plan the mirror stands, (line, part, 2) along the line and the scan. [px]"""
         positions = block.rig.mirror.positions_per_line
         scan = beside_plan(positions, block.sweep.step, block.numbers, _parts(positions, block.sweep.step, variant))
         return np.stack([np.zeros_like(scan), scan], axis=-1)
@@ -87,7 +86,6 @@ def _parts(positions: float, step: int, variant: str) -> int:
 
 
 def _moments(positions: float, sweeps: tuple[Sweep, ...], variant: str) -> tuple[float, float, float]:
-    """Greatest mean way, mean size of the way and mean square of it over all lines, beside the plan or a variant."""
     worst = np.zeros(3)
     for step in {sweep.step for sweep in sweeps}:
         numbers = np.arange(max(sweep.lines for sweep in sweeps if sweep.step == step))
@@ -120,12 +118,10 @@ class Lag(Aim):
     cost_ns = MappingProxyType({EXACT: 0.15, EULER: 0.12})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        """Give the shift, (line, step, 2) along the line and the scan. [px]"""
         scan = transient(block.rig, block.sweep, block.numbers, variant)
         return np.stack([np.zeros_like(scan), scan], axis=-1)
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by slope times the greatest shift of any line, or times the greatest difference of the variants."""
         worst = greatest_lag_px(rig, probe.sweeps, variant)
         moved = at_line_ends(probe.sweeps, rig.camera, 0.0, worst)
         pace = f"{rig.camera.frame_ms:g} ms a line, {rig.mirror.natural_hz:g} Hz"
@@ -169,10 +165,7 @@ def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
     The matrix exponential of the free system over ``time`` is [[1 - h, g], [-g, 1 - h - 2 zeta g]] with g the first
     and h the second. By expm1 and sinc they are right below, at and above damping 1, and at any time from 0 on.
 
-    Parameters
-    ----------
-    time
-        (...) times the natural frequency. [rad]
+    ``time``: (...) times the natural frequency. [rad]
     """
     impulse = _impulse(time, damping)
     with np.errstate(under="ignore"):
@@ -247,7 +240,6 @@ def _steps(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> tu
 
 
 def _mean_over(held: float, damping: float, place: Floats, rate: Floats) -> Floats:
-    """Mean of the free oscillation over a time, from its state at the beginning."""
     if held == 0:
         return place
     impulse, rise = responses(np.array([held]), damping)
@@ -256,10 +248,17 @@ def _mean_over(held: float, damping: float, place: Floats, rate: Floats) -> Floa
 
 
 def _euler(damping: float, start: Floats, numbers: NDArray[np.int64], pace: tuple[float, float, int]) -> Floats:
-    """The same by implicit Euler steps, one for each held position and one for the readout."""
     period, held, step = pace
     one, rest = _euler_step(damping, held), _euler_step(damping, max(period - held * step, 0.0))
-    state = _advance(rest @ np.linalg.matrix_power(one, step), start, numbers)
+    matrix = rest @ np.linalg.matrix_power(one, step)
+    state = np.full(len(numbers), start[0]), np.full(len(numbers), start[1])
+    left = numbers.copy()
+    while left.any():
+        moved = _times(matrix, *state)
+        odd = left % 2 == 1
+        state = np.where(odd, moved[0], state[0]), np.where(odd, moved[1], state[1])
+        matrix, left = matrix @ matrix, left // 2
+
     means = []
     for _ in range(step):
         following = _times(one, *state)
@@ -270,18 +269,6 @@ def _euler(damping: float, start: Floats, numbers: NDArray[np.int64], pace: tupl
 
 def _euler_step(damping: float, time: float) -> Floats:
     return np.linalg.inv(np.array([[1.0, -time], [time, 1 + 2 * damping * time]]))
-
-
-def _advance(matrix: Floats, start: Floats, numbers: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """State after so many steps each, by repeated squaring: the same whichever other numbers are asked for."""
-    state = np.full(len(numbers), start[0]), np.full(len(numbers), start[1])
-    left = numbers.copy()
-    while left.any():
-        moved = _times(matrix, *state)
-        odd = left % 2 == 1
-        state = np.where(odd, moved[0], state[0]), np.where(odd, moved[1], state[1])
-        matrix, left = matrix @ matrix, left // 2
-    return state
 
 
 def _times(matrix: Floats, place: Floats, rate: Floats) -> tuple[Floats, Floats]:

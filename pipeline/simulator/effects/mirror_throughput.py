@@ -38,7 +38,6 @@ class Vignetting(Gain):
     cost_ns = MappingProxyType({HELD: 0.2, MIDDLE: 0.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound it by the greatest signal times the factor's greatest difference from 1 over all sweeps."""
         if variant == MIDDLE:
             most = max((sweep.step for sweep in probe.sweeps), default=1)
             bend = MOST_BEND / 2 * rig.camera.ifov_rad**2 * (most**2 - 1) / 12
@@ -51,13 +50,11 @@ class Vignetting(Gain):
         return Bound(probe.scaled(float(np.abs(shares - 1).max())), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        """Give the factors of all sweeps, each the same along a line."""
         shares = np.sqrt(1 - sweep_ends(probe, rig.camera))
         least, greatest = float(shares.min(initial=1.0)), float(shares.max(initial=1.0))
         return GainRange.between(least, greatest, len(probe.wavelength_nm))
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
-        """Give the factor of each line, (line, 1, 1)."""
         sweep, camera = block.sweep, block.rig.camera
         scan_px = sweep.held_px() if variant == HELD else sweep.line_px()[:, None]
         share = np.sqrt(1 - ahead(sweep.strip_px, scan_px[block.numbers], camera)).mean(axis=1)
@@ -96,7 +93,6 @@ class Polarisation(Gain):
     cost_ns = MappingProxyType({EXACT: 0.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound it by the greatest signal times the factor's greatest difference from 1 over all sweeps."""
         incidence = _incidence(sweep_ends(probe, rig.camera))
         if rig.mirror.coating == "ideal" or not incidence.size:
             return Bound(0.0, "the mirror reflects everything" if incidence.size else "no line is taken")
@@ -112,14 +108,12 @@ class Polarisation(Gain):
         return Bound(probe.scaled(most), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        """Give the factors of all sweeps, each the same along a line."""
         incidence, nm = _incidence(sweep_ends(probe, rig.camera)), np.asarray(probe.wavelength_nm, np.float64)
         if not incidence.size:
             return GainRange.between(1.0, 1.0, len(nm))
         return GainRange.of(_factors_between(incidence, rig, nm), nm, uneven=0.0)
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
-        """Give the factor of each line, (line, 1, band)."""
         looks = ahead(block.sweep.strip_px, block.scan_px, block.rig.camera)
         factor: Light = _factors(_incidence(looks), block.rig, block.wavelength_nm).astype(np.float32)
         return factor[:, None, :]
@@ -135,13 +129,11 @@ def _incidence(looks_ahead: Floats) -> Floats:
 
 
 def _factors(incidence_rad: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
-    """Reflectance over that at rest, (incidence, band)."""
     at_rest = reflectance(rig.mirror.coating, wavelength_nm, np.array([REST_RAD]))
     return reflectance(rig.mirror.coating, wavelength_nm, incidence_rad) / at_rest
 
 
 def _factors_between(incidence_rad: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
-    """Factors evenly from the least to the greatest of some incidences: metals may have extremes in between."""
     return _factors(np.linspace(incidence_rad.min(), incidence_rad.max(), _LOOKS), rig, wavelength_nm)
 
 
@@ -183,16 +175,12 @@ def reflectance(coating: Coating, wavelength_nm: Floats, incidence_rad: Floats) 
     """
     if coating == "ideal":
         return np.ones((len(incidence_rad), len(wavelength_nm)))
-    across, within = fresnel(refractive_index(coating, wavelength_nm), incidence_rad[:, None])
+    nm, n, k = METALS[coating].T
+    across, within = fresnel(
+        np.interp(wavelength_nm, nm, n) + 1j * np.interp(wavelength_nm, nm, k), incidence_rad[:, None]
+    )
     mean: Floats = (across + within) / 2
     return mean
-
-
-def refractive_index(coating: Coating, wavelength_nm: Floats) -> Indices:
-    """Give n + ik of a metal, (band,)."""
-    nm, n, k = METALS[coating].T
-    index: Indices = np.interp(wavelength_nm, nm, n) + 1j * np.interp(wavelength_nm, nm, k)
-    return index
 
 
 def fresnel(index: Indices, incidence_rad: Floats) -> tuple[Floats, Floats]:

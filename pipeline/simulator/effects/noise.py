@@ -40,16 +40,9 @@ def normal_deviates(rng: np.random.Generator, count: int) -> Light:
 def photon_counts(expected: Light, deviate: Light) -> Light:
     """Give exact Poisson counts: the quantile of each deviate's probability; 0 where 0 or less is expected.
 
-    Parameters
-    ----------
-    expected
-        Electrons, any shape, finite. [e-]
-    deviate
-        Standard normal, the same shape.
-
-    Returns
-    -------
-    The same shape, whole numbers (above 2^24 as near as float32 comes). [e-]
+    ``expected``: Electrons, any shape, finite. [e-]
+    ``deviate``: Standard normal, the same shape.
+    Returns the same shape, whole numbers (above 2^24 as near as float32 comes). [e-]
     """
     counts = np.zeros(expected.size, np.float32)
     mean, normal = expected.reshape(-1), deviate.reshape(-1)

@@ -67,7 +67,6 @@ class Jitter(Aim):
     cost_ns = MappingProxyType({"exact": 0.15})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        """Give the shift, (line, 1, 2) along the line and the scan. [px]"""
         drawn = np.array([block.stream(self.name, number).standard_normal(2) for number in block.numbers.tolist()])
         shift: Floats = (tilt_to_scene(block.normals) * drawn.reshape(-1, 1, 2)).sum(axis=-1) * _sigma_px(block.rig)
         return shift[:, None]
@@ -82,7 +81,15 @@ class Jitter(Aim):
         sigma, lines = _sigma_px(rig), probe.lines
         if sigma == 0 or lines == 0:
             return Bound(0.0, "the mirror comes back to the same tilt")
-        along, scan, common = _spreads(probe, rig)
+        worst = np.zeros(3)
+        for sweep in probe.sweeps:
+            if sweep.lines:
+                tilt = tilt_to_scene(position_to_normal(line_positions(sweep, rig.camera)))
+                gain = end_gains(sweep, rig.camera) @ tilt[:, None]
+                size = np.sqrt((gain**2).sum(axis=-1))
+                common = np.abs((gain[..., 0, :] * gain[..., 1, :]).sum(axis=-1)) / size.prod(axis=-1)
+                worst = np.maximum(worst, [size[..., 0].max(), size[..., 1].max(), common.max()])
+        along, scan, common = float(worst[0]), float(worst[1]), float(worst[2])
         most = math.sqrt(2 * math.log(lines / EXCEEDED))
         g, h = probe.slope[0] * along, probe.slope[1] * scan
         value = np.minimum(most * sigma * np.sqrt(g * g + h * h + 2 * common * g * h), probe.span).max(initial=0.0)
@@ -96,15 +103,9 @@ JITTER = Jitter()
 def tilt_to_scene(normals: Floats) -> Floats:
     """Give the derivatives of scene tangents with respect to tilts of the mirror, (..., 2, 2).
 
-    Parameters
-    ----------
-    normals
-        (..., 3) unit normals.
-
-    Returns
-    -------
-    Rows are along the line and along the scan; columns a tilt about the axis most nearly in the plane of incidence,
-    which moves the view across that plane, and one about y, which moves it within. At rest diag(sqrt(2), 2).
+    ``normals``: (..., 3) unit normals.
+    Returns rows are along the line and along the scan; columns a tilt about the axis most nearly in the plane of
+    incidence, which moves the view across that plane, and one about y, which moves it within. At rest diag(sqrt(2), 2).
     """
     within = np.stack([normals[..., 2], np.zeros_like(normals[..., 0]), -normals[..., 0]], axis=-1)  # y x n
     within /= np.hypot(normals[..., 2], normals[..., 0])[..., None]
@@ -124,19 +125,6 @@ def _sigma_px(rig: Rig) -> float:
     return rig.mirror.repeatability_urad * 1e-6 / rig.camera.ifov_rad
 
 
-def _spreads(probe: Probe, rig: Rig) -> tuple[float, float, float]:
-    """Greatest px along the line and along the scan for 1 px of tilt, and the greatest correlation of the two."""
-    worst = np.zeros(3)
-    for sweep in probe.sweeps:
-        if sweep.lines:
-            tilt = tilt_to_scene(position_to_normal(line_positions(sweep, rig.camera)))
-            gain = end_gains(sweep, rig.camera) @ tilt[:, None]
-            size = np.sqrt((gain**2).sum(axis=-1))
-            common = np.abs((gain[..., 0, :] * gain[..., 1, :]).sum(axis=-1)) / size.prod(axis=-1)
-            worst = np.maximum(worst, [size[..., 0].max(), size[..., 1].max(), common.max()])
-    return float(worst[0]), float(worst[1]), float(worst[2])
-
-
 @dataclass(frozen=True)
 class Hysteresis(Aim):
     """A systematic error of pointing: smooth over the mirror's disk, one field for each copy of the rig.
@@ -148,11 +136,9 @@ class Hysteresis(Aim):
     cost_ns = MappingProxyType({"exact": 0.07})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        """Give the shift, (line, 1, 2) along the line and the scan. [px]"""
         return _course(block.rig, block.sweep, block.middle)[:, None]
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by slope times the greatest shift that any line of the sweeps has: the field is known."""
         if rig.mirror.hysteresis_px == 0 or not probe.sweeps:
             return Bound(0.0, "the mirror comes to the same place from either side")
         ways = [_course(rig, sweep, line_positions(sweep, rig.camera)) for sweep in probe.sweeps]
@@ -169,7 +155,6 @@ class ThermalDrift(Aim):
     cost_ns = MappingProxyType({"exact": 0.06})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        """Give the shift since the survey's start, (line, 1, 2) along the line and the scan. [px]"""
         walked = block.rig.mirror.drift_px_per_min / 60 * block.time_s
         return np.stack([walked * one for one in _along_and_scan(block.rig)], axis=-1)[:, None]
 
@@ -214,7 +199,6 @@ def scan_sign(sweep: Sweep) -> float:
 
 
 def _along_and_scan(rig: Rig) -> tuple[float, float]:
-    """Part of the drift along the line and along the scan; the mirror's own axes are the line's and the scan's."""
     turn = unit_stream(rig.detector.unit, ThermalDrift.name).uniform(0, 2 * math.pi)
     return math.cos(turn), math.sin(turn)
 
@@ -240,7 +224,6 @@ class Pointing(Aim, ABC):
         """Give the error of some lines of a sweep, (line, 2) along the line and the scan [px]."""
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        """Give the error of a block's lines, (line, 1, 2) along the line and the scan. [px]"""
         return self.of_lines(block.sweep.name, block.lines)[:, None]
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:

@@ -44,9 +44,7 @@ def effects_on(*names: str) -> Choice:
 
     Cheap shot noise may stand for the exact one: see `counting.Shot`.
 
-    Raises
-    ------
-    SettingsError : there is no such effect.
+    Raises SettingsError: there is no such effect.
     """
     unknown = sorted(set(names) - set(BY_NAME))
     if unknown:

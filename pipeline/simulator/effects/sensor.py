@@ -37,11 +37,9 @@ class Prnu(Gain):
         return Bound(probe.scaled(off), f"gains differ by {share:.2%} (sd), {off.max():.2%} at most")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        """Give the sensor's least and greatest gain."""
         return _range_of(response_gain(rig, len(probe.wavelength_nm)), probe)
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
-        """Give the gain of each element, (1, sample, band)."""
         return response_gain(block.rig, len(block.wavelength_nm))[None, block.columns]
 
 
@@ -61,11 +59,9 @@ class Striping(Gain):
         return Bound(probe.scaled(off), f"gains of columns differ by {share:.2%} (sd), {off:.2%} at most")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        """Give the sensor's least and greatest gain."""
         return _range_of(stripe_gain(rig), probe)
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
-        """Give the gain of each column, (1, sample, 1)."""
         return stripe_gain(block.rig)[None, block.columns]
 
 
@@ -90,7 +86,6 @@ def _range_of(gains: Light, probe: Probe) -> GainRange:
 
 @lru_cache(maxsize=8)
 def _gains(unit: int, kind: str, samples: int, bands: int, *, share: float) -> Light:
-    """Gains band by band, each out of draws of its own: more bands keep those there were."""
     stream = unit_stream(unit, kind)
     drawn = np.stack([normal_deviates(stream, samples) for _ in range(bands)], axis=1)
     gains: Light = np.maximum(1 + np.float32(share) * drawn, 0)
@@ -128,9 +123,7 @@ class StrayLight(LightChange):
     def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
         """Give the light after scattering; works in place.
 
-        Raises
-        ------
-        ShapeError : samples of the line are missing.
+        Raises ShapeError: samples of the line are missing.
         """
         optics, samples = block.rig.optics, block.rig.camera.samples
         if optics.stray_share == 0:

@@ -65,7 +65,6 @@ class Response(LightChange):
         return Bound(float(np.minimum(curved, steep).max()), f"{why}: {sd:.2g} nm sd more")
 
     def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
-        """Give the light of a block in the rig's bands."""
         return widen_bands(light, block.wavelength_nm, block.fwhm_nm, block.rig.optics.fwhm_nm)
 
 
@@ -77,14 +76,9 @@ def widen_bands(spectra: Light, wavelength_nm: Floats, fwhm_nm: Floats | None, w
 
     Factors of light serve as well as light: (component, band) electrons.
 
-    Parameters
-    ----------
-    wavelength_nm, fwhm_nm
-        (band,) centres, and widths of the spectra's own bands; None or NaN where not known, and then nothing is done.
-
-    Returns
-    -------
-    Array of the same shape and type; ``spectra`` itself where its bands are all as wide already.
+    ``wavelength_nm``, ``fwhm_nm``: (band,) centres, and widths of the spectra's own bands; None or NaN where not known,
+    and then nothing is done.
+    Returns array of the same shape and type; ``spectra`` itself where its bands are all as wide already.
     """
     variance = missing_variance(wanted_nm, fwhm_nm, spectra.shape[-1])
     if not variance.any():
@@ -180,7 +174,6 @@ class Smile(LightChange):
         return Bound(steep * shift + min(bent, steep * shift * 2 * part * (1 - part)), why)
 
     def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
-        """Give the light at the wavelengths that each sample sees."""
         camera, smile = block.rig.camera, block.rig.optics.smile_nm
         if smile == 0 or light.shape[-1] < 2:
             return light
@@ -207,7 +200,6 @@ def wavelength_shift(samples: int, smile_nm: float) -> Floats:
 
 
 def _mix_bands(light: Light, made: Light, first: int, weights: Light) -> None:
-    """Sum shifted bands times weights into ``made``: tap k takes band b + first + k for band b."""
     import torch
 
     bands, (from_light, into, shares) = light.shape[-1], map(torch.from_numpy, (light, made, weights))

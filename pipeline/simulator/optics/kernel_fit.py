@@ -49,27 +49,18 @@ class Kernels:
     level: NDArray[np.intp]
 
     def some(self, which: list[int]) -> Kernels:
-        """Some of them."""
         return Kernels(self.shift[:, which], self.variance[:, which], self.level[which])
 
 
 def fit_kernels(blurs: Moments, box: tuple[float, float], held: int) -> tuple[Kernels, Floats, Floats]:
     """Choose kernels for the blurs of all bands, and how much each counts in every band.
 
-    Parameters
-    ----------
-    blurs
-        All of them together.
-    box
-        Widths of slit and pixel, across and along; 0 for none. [px]
-    held
-        Positions 1 px apart along the scan.
-
-    Returns
-    -------
-    The fewest that change no wave of any band by more than `NEGLIGIBLE` of its amplitude, or the best that were tried;
-    (kernel, node) shares of some bands, and (node, band) between which two nodes each band lies. None of the shares is
-    below 0, and they sum to 1.
+    ``blurs``: All of them together.
+    ``box``: Widths of slit and pixel, across and along; 0 for none. [px]
+    ``held``: Positions 1 px apart along the scan.
+    Returns the fewest that change no wave of any band by more than `NEGLIGIBLE` of its amplitude, or the best that were
+    tried; (kernel, node) shares of some bands, and (node, band) between which two nodes each band lies. None of the
+    shares is below 0, and they sum to 1.
     """
     waves = blurs.waves if blurs.waves is not None and blurs.waves.any() else np.zeros_like(blurs.shift)
     told, band = np.unique(np.concatenate([blurs.shift, blurs.variance, waves]), axis=1, return_inverse=True)
@@ -83,9 +74,12 @@ def _fit(told: bytes, bands: int, box: tuple[float, float], held: int) -> tuple[
     moments = np.frombuffer(told).reshape(6, bands)
     if bands <= _OWN and not moments[4:].any():
         return Kernels(moments[:2], moments[2:4], np.ones(bands, np.intp)), np.eye(bands), np.eye(bands)
-    place = _places(moments)
+    size = np.concatenate([moments[:2], np.sqrt(moments[2:4]), moments[4:]])
+    place = np.linalg.svd(size - size.mean(axis=1, keepdims=True), full_matrices=False)[2][0]
     order = np.argsort(place)
-    own, judged = _footprint(box, held), _some(order, _JUDGED)
+    steps = np.arange(held) - (held - 1) / 2
+    smeared = np.cos(2 * np.pi * np.outer(_SCAN, steps)).mean(axis=1)
+    own, judged = np.sinc(_ALONG * box[1]) * np.sinc(_SCAN * box[0]) * smeared, _some(order, _JUDGED)
     wanted, tried = _wanted(moments[:, judged], own), []
     for kernels in _candidates(moments, place):
         tried.append((kernels, _error(_passed(kernels, own), wanted)))
@@ -97,7 +91,11 @@ def _fit(told: bytes, bands: int, box: tuple[float, float], held: int) -> tuple[
     passed = _passed(chosen, own)
     for count in _FITTED:
         fitted = _some(order, count)
-        shares, between = _shares(passed, _wanted(moments[:, fitted], own)), _between(place, place[fitted])
+        nodes = place[fitted]
+        shares, between = (
+            _shares(passed, _wanted(moments[:, fitted], own)),
+            np.stack([np.interp(place, nodes, one) for one in np.eye(len(nodes))]),
+        )
         error = float(np.abs(passed @ (shares @ between[:, judged]) - wanted).max())
         if error <= enough or count >= bands:
             break
@@ -105,7 +103,6 @@ def _fit(told: bytes, bands: int, box: tuple[float, float], held: int) -> tuple[
 
 
 def _needed(passed: Transfer, wanted: Transfer, enough: float) -> list[int]:
-    """Numbers of kernels without which the others err too much, the least missed left out first."""
     kept = list(range(passed.shape[1]))
     while len(kept) > 1:
         without = [[one for one in kept if one != left] for left in kept]
@@ -118,31 +115,15 @@ def _needed(passed: Transfer, wanted: Transfer, enough: float) -> list[int]:
 
 
 def _error(passed: Transfer, wanted: Transfer) -> float:
-    """What the best shares err by of any wave in any band."""
     return float(np.abs(passed @ _shares(passed, wanted) - wanted).max())
 
 
-def _between(place: Floats, nodes: Floats) -> Floats:
-    """How much each of the nodes, which ascend, counts at every place, (node, band)."""
-    shares: Floats = np.stack([np.interp(place, nodes, one) for one in np.eye(len(nodes))])
-    return shares
-
-
 def _some(order: NDArray[np.intp], most: int) -> NDArray[np.intp]:
-    """Some bands, evenly along their curve, both ends among them."""
     some: NDArray[np.intp] = order[np.unique(np.linspace(0, len(order) - 1, min(len(order), most)).round().astype(int))]
     return some
 
 
-def _places(moments: Floats) -> Floats:
-    """Where bands lie along the curve of their moments, (band,)."""
-    size = np.concatenate([moments[:2], np.sqrt(moments[2:4]), moments[4:]])
-    place: Floats = np.linalg.svd(size - size.mean(axis=1, keepdims=True), full_matrices=False)[2][0]
-    return place
-
-
 def _candidates(moments: Floats, place: Floats) -> Iterator[Kernels]:
-    """Ever more kernels: at ever more nodes of the bands' curve, on a coarser and a finer ladder of sizes."""
     waves = moments[4:]
     widest = waves[:, waves[0].argmax()]
     ladders = [_ladder(widest, ratio) for ratio in _RATIOS] if waves.any() else [[(0.0, 1)]]
@@ -187,7 +168,6 @@ def _steps(shift: Floats) -> Floats:
 
 
 def _size_at(level: int) -> float:
-    """Size of the Gaussian that looks at a level, in its px."""
     return math.sqrt(THINNED * (1 - 1 / level**2) + _SMOOTH)
 
 
@@ -199,14 +179,6 @@ def _nodes(moments: Floats, place: Floats, count: int) -> Floats:
     low, high = place[order[[0, -1]]]
     at = np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2])
     return np.stack([np.interp(at, place[order], one[order]) for one in moments])
-
-
-def _footprint(box: tuple[float, float], held: int) -> Floats:
-    """What slit, pixel and held positions pass of the waves, (wave,)."""
-    steps = np.arange(held) - (held - 1) / 2
-    smeared = np.cos(2 * np.pi * np.outer(_SCAN, steps)).mean(axis=1)
-    passed: Floats = np.sinc(_ALONG * box[1]) * np.sinc(_SCAN * box[0]) * smeared
-    return passed
 
 
 def _seen_at(level: int) -> Floats:
@@ -299,7 +271,6 @@ class Footprint:
 
     @property
     def kernels(self) -> int:
-        """How many there are."""
         return int(self.shift.shape[1])
 
     @property
@@ -335,14 +306,8 @@ class Footprint:
 def fold(box: tuple[float, float], parts: tuple[int, int], held: int, blurs: Moments) -> Footprint:
     """Fold boxes and held positions with all blurs together.
 
-    Parameters
-    ----------
-    box
-        Widths of slit and pixel, 0 for none. [px]
-
-    Returns
-    -------
-    As few kernels as change no wave by more than `kernel_fit.NEGLIGIBLE` of its amplitude.
+    ``box``: Widths of slit and pixel, 0 for none. [px]
+    Returns as few kernels as change no wave by more than `kernel_fit.NEGLIGIBLE` of its amplitude.
     """
     kernels, shares, between = fit_kernels(blurs, box, held)
     return Footprint(box, parts, held, kernels.shift, kernels.variance, shares, between, kernels.level)

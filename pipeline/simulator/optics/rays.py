@@ -45,7 +45,6 @@ class RayViews:
         return self if level == 1 else replace(self, along=self.along / level, scan=self.scan / level)
 
     def flat(self) -> RayViews:
-        """All in one row."""
         return RayViews(*(np.ravel(getattr(self, one.name)) for one in fields(self)))
 
 
@@ -83,10 +82,7 @@ def spread_of_waves(normal: Floats | None = None) -> Floats:
     A pupil |n_z| wide along (n_x, n_y) and 1 across spreads waves by 1 / n_z^2 and 1; on the camera's own axes that is
     1 + n_y^2 / n_z^2 and 1 + n_x^2 / n_z^2. The covariance n_x n_y / n_z^2 is left out: it is 0 at rest.
 
-    Parameters
-    ----------
-    normal
-        (..., 3) mirror normals in the camera frame; None is the mirror at rest. Returns (..., 2).
+    ``normal``: (..., 3) mirror normals in the camera frame; None is the mirror at rest. Returns (..., 2).
     """
     n = REST_NORMAL if normal is None else np.asarray(normal, np.float64)
     spread: Floats = 1 + (n[..., 1::-1] / n[..., 2:]) ** 2

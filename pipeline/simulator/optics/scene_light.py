@@ -90,7 +90,8 @@ class Looker:
         spectra = scene.electrons * np.float32(exposures)
         levels = np.unique(self.footprint.level).tolist()
         pixels = {level: _pixels(scene, along_y, level) for level in levels} if isinstance(scene, RasterScene) else {}
-        shares = self._shares(len(steps), parted=bool(pixels))
+        sums = np.where(self.footprint.level == 1, math.prod(self.footprint.parts), 1) if bool(pixels) else 1
+        shares = (self.footprint.shares / np.reshape(len(steps) * sums, (-1, 1))).T.astype(np.float32)
         count, components = len(steps[0].along), spectra.shape[0]
         light = np.empty((count, spectra.shape[-1]), np.float32)
         kernels = self.footprint.kernels
@@ -111,14 +112,7 @@ class Looker:
             bands.write(parts, light[chunk])
         return light
 
-    def _shares(self, steps: int, *, parted: bool) -> Light:
-        """(node, kernel), over the sums of held positions, and of parts where there are pixels."""
-        sums = np.where(self.footprint.level == 1, math.prod(self.footprint.parts), 1) if parted else 1
-        share: Light = (self.footprint.shares / np.reshape(steps * sums, (-1, 1))).T.astype(np.float32)
-        return share
-
     def _sampled(self, scene: Scene, views: RayViews, along_y: bool, out: Light) -> None:
-        """Components of a scene without pixels, by rays."""
         out[:] = 0
         for kernel in range(self.footprint.kernels):
             for turn, run, weight in self._rays[kernel]:
@@ -133,7 +127,6 @@ class Looker:
 
 
 def _pixels(scene: RasterScene, along_y: bool, level: int) -> ScenePixels:
-    """A scene's pixels, or every ``level``-th of them."""
     planes = np.ascontiguousarray(scene.raster.thinned(level), np.float32)
     rows, columns, components = planes.shape
     return ScenePixels(tensor_rows(planes.reshape(-1, components)), (rows, columns), along_y)

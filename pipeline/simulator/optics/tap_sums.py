@@ -251,7 +251,7 @@ def box_weight(distance: Floats, width: float, held: int = 1) -> Floats:
         if width > 1e-6:
             total += (_integral(beside + width / 2) - _integral(beside - width / 2)) / width
         else:
-            total += _linear(beside)
+            total += np.maximum(1 - np.abs(beside), 0.0)
     weight: Floats = np.maximum(total / held, 0.0)  # differences of integrals round
     return weight
 
@@ -348,18 +348,12 @@ def _rows(place: Floats, taps: int, reach: float, kernels: tuple[Floats, Floats]
 
 
 def _reach(distance: Floats, weight: Floats, tail: float) -> float:
-    """Distance beyond which a kernel holds no more than ``tail``, in all and, at either side, in any one tap."""
     half = len(distance) // 2
     size = weight.max(axis=0)
     both = size[half:] + size[half::-1]
     beyond = both[::-1].cumsum()[::-1] * (distance[1] - distance[0])
     counts = (beyond > tail) | (both > 2 * tail)
     return float(distance[half:][counts][-1]) if counts.any() else 0.0
-
-
-def _linear(t: Floats) -> Floats:
-    kernel: Floats = np.maximum(1 - np.abs(t), 0.0)
-    return kernel
 
 
 def _integral(t: Floats) -> Floats:

@@ -31,9 +31,7 @@ _DAY_S = 86400.0
 def sun_elevation_deg(sky: Sky, seconds: Floats) -> Floats:
     """Give the sun's height over the horizon at some times, refraction included, (time,) [deg].
 
-    Raises
-    ------
-    SettingsError : the sky has no time of day.
+    Raises SettingsError: the sky has no time of day.
     """
     return _elevation_deg(sky.latitude_deg, sky.longitude_deg, _started(sky) + seconds)
 
@@ -44,9 +42,7 @@ def relative_daylight(sky: Sky, wavelength_nm: Floats, seconds: Floats) -> Float
     It is 0 with the sun at the horizon or below. A survey that starts in less light than the sun gives from 1 deg is
     relative to that light instead, since no exposure fits the night; so the ratio is finite and goes to 0 evenly.
 
-    Raises
-    ------
-    SettingsError : the sky has no time of day.
+    Raises SettingsError: the sky has no time of day.
     """
     start, place = _started(sky), (sky.latitude_deg, sky.longitude_deg)
     first = _irradiance(*place, np.array([start]), wavelength_nm)
@@ -115,16 +111,14 @@ def _light_of(elevation_deg: Floats, moments: Floats) -> Floats:
     from pvlib.atmosphere import get_relative_airmass
 
     zenith = 90.0 - np.maximum(elevation_deg, 0.0)
-    light = clear_sky(zenith, get_relative_airmass(zenith, "kastenyoung1989"), _day_of_year(moments))[1]
-    return np.where(elevation_deg[:, None] > 0, np.maximum(light.T, 0.0), 0.0)
-
-
-def _day_of_year(moments: Floats) -> Floats:
-    """Days since the year began in UTC, from 1 on and with parts of a day: nothing jumps at midnight."""
     moment = np.asarray(moments * 1e6, "datetime64[us]")
     start_of_year = moment.astype("datetime64[Y]").astype("datetime64[us]")
-    days: Floats = (moment - start_of_year).astype(np.float64) / (1e6 * _DAY_S) + 1
-    return days
+    light = clear_sky(
+        zenith,
+        get_relative_airmass(zenith, "kastenyoung1989"),
+        (moment - start_of_year).astype(np.float64) / (1e6 * _DAY_S) + 1,
+    )[1]
+    return np.where(elevation_deg[:, None] > 0, np.maximum(light.T, 0.0), 0.0)
 
 
 def _at_bands(light: Floats, wavelength_nm: Floats) -> Floats:

@@ -38,23 +38,20 @@ def raster_from_values(
     in ``filled_px``; where that is so in more than half of the bands, the pixel is ``missing`` and loses its label.
     Negative values give no electrons.
 
-    Parameters
-    ----------
-    values
-        (y, x, band) numbers, any real type.
-    key
-        Identity of the content; by default the hash of the values.
-
-    Raises
-    ------
-    SceneError : not three axes, nothing in it, no finite value, one that is no reading (see `pipeline.readings`), or
-        the labels do not fit.
+    ``values``: (y, x, band) numbers, any real type.
+    ``key``: Identity of the content; by default the hash of the values.
+    Raises SceneError: not three axes, nothing in it, no finite value, one that is no reading (see `pipeline.readings`),
+    or the labels do not fit.
     """
     if values.ndim != 3 or 0 in values.shape:
         raise SceneError(f"scene {name} must be (y, x, band) and not empty, got {values.shape}")
     if labels is not None and labels.shape != values.shape[:2]:
         raise SceneError(f"scene {name} is {values.shape[:2]} px, its labels {labels.shape}; crop or pad one")
-    _refuse_strange(values, name)
+    if (found := find_beyond(values)) is not None:
+        raise SceneError(
+            f"scene {name} has {found.words()}, beyond the {MOST_VALUE:g} that readings reach; put NaN where there is"
+            " no data, or give the values in a larger unit"
+        )
     planes = np.ascontiguousarray(values, dtype=np.float32)
     bright = _bright_value(planes, name)
     missing = _missing_pixels(planes)
@@ -80,15 +77,6 @@ def raster_from_values(
         filled_px=filled,
         missing=missing,
     )
-
-
-def _refuse_strange(values: NDArray[np.generic], name: str) -> None:
-    """Raise SceneError where a finite value is no reading: light for all others is measured by the brightest."""
-    if (found := find_beyond(values)) is not None:
-        raise SceneError(
-            f"scene {name} has {found.words()}, beyond the {MOST_VALUE:g} that readings reach; put NaN where there is"
-            " no data, or give the values in a larger unit"
-        )
 
 
 def _missing_pixels(planes: NDArray[np.float32]) -> NDArray[np.bool_] | None:

@@ -66,7 +66,6 @@ class SceneRaster:
 
 
 def _halved(planes: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
-    """Every second row or column of the blurred planes; one more than half, for positions up to the last."""
     size, count = planes.shape[axis], planes.shape[axis] // 2 + 1
     half = len(_BINOMIAL) // 2
     total = np.zeros((*planes.shape[:axis], count, *planes.shape[axis + 1 :]), np.float32)
@@ -171,17 +170,14 @@ class RasterScene:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(y, x) size [px]."""
         return self.raster.shape[:2]
 
     @property
     def electrons(self) -> NDArray[np.float32]:
-        """(component, band) electrons at the default exposure per unit of component; (band,) means a diagonal."""
         return self._checked_light().electrons
 
     @property
     def panel_electrons(self) -> NDArray[np.float32]:
-        """(band,) electrons that the white panel gives at the default exposure."""
         return self._checked_light().panel_electrons
 
     @property
@@ -200,7 +196,6 @@ class RasterScene:
         return self.raster.drawn()[1] if self.labelled else None
 
     def sample(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Give the components at points, (n,) rows and columns [px] -> (n, component) float32."""
         return gather(self.planes, y, x, "bilinear")
 
     def spectra(self) -> NDArray[np.float32]:

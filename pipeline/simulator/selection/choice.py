@@ -45,12 +45,10 @@ class Treatment:
 
     @property
     def name(self) -> str:
-        """Of the effect."""
         return self.menu.name
 
     @property
     def is_on(self) -> bool:
-        """Whether it is computed."""
         return self.option.variant != OFF
 
 
@@ -84,7 +82,6 @@ class Decision:
 
     @property
     def cost_ns(self) -> float:
-        """Per px and band, of the effects that are on [ns]."""
         return cost_of((one.menu for one in self.taken), {one.name: one.option for one in self.taken})
 
     def cost_of(self, one: Treatment) -> float:
@@ -118,21 +115,12 @@ def decide(
     Tolerance 0 is everything that the rig has, exact; an infinite one switches off all that may be off. Quantisation
     and saturation are never off. What the rig has none of is always off.
 
-    Parameters
-    ----------
-    probes
-        One for each binning of the survey; the worst counts.
-    effects
-        In the order of the chain; the order does not change what is chosen.
-    tolerance
-        Greatest change of any stored number, in the unit of the probes.
-    asked
-        ``auto``; ``all``: on and exact; ``none``; or names with commas: those on, in the variants that the tolerance
-        lets them have, and the others off, whatever that changes.
-
-    Raises
-    ------
-    SettingsError : the tolerance is negative or no number, or an asked name is not known.
+    ``probes``: One for each binning of the survey; the worst counts.
+    ``effects``: In the order of the chain; the order does not change what is chosen.
+    ``tolerance``: Greatest change of any stored number, in the unit of the probes.
+    ``asked``: ``auto``; ``all``: on and exact; ``none``; or names with commas: those on, in the variants that the
+    tolerance lets them have, and the others off, whatever that changes.
+    Raises SettingsError: the tolerance is negative or no number, or an asked name is not known.
     """
     if not tolerance >= 0:
         raise SettingsError(f"the tolerance must be 0 or more, got {tolerance}; 0 computes everything")
@@ -153,9 +141,7 @@ def decide(
 def named_effects(asked: str, known: Sequence[str]) -> frozenset[str] | None:
     """Give the effects that ``asked`` demands; None where the tolerance decides.
 
-    Raises
-    ------
-    SettingsError : a name is not known (names the nearest that is), or there is none.
+    Raises SettingsError: a name is not known (names the nearest that is), or there is none.
     """
     words = [word.strip() for word in asked.split(",") if word.strip()]
     if words in (["auto"], ["all"], ["none"]):
@@ -175,7 +161,6 @@ def named_effects(asked: str, known: Sequence[str]) -> frozenset[str] | None:
 def _settled(
     menus: Sequence[Menu], tolerance: float, named: frozenset[str] | None, *, exact: bool
 ) -> Iterator[Treatment]:
-    """Give what needs no weighing: absent, not asked for, exact, or all off."""
     for menu in menus:
         kept = menu.name in ALWAYS_ON
         if not menu.present:
@@ -189,7 +174,6 @@ def _settled(
 
 
 def _cheapened(menus: Sequence[Menu], tolerance: float, *, forced: bool) -> dict[str, Option]:
-    """Give the cheapest of what the greedy rule makes of everything exact, and of each one step from there."""
     exact = {menu.name: menu.exact for menu in menus}
     first = (step for menu in menus for step in _steps(menu, exact, menus, forced=forced))
     starts = [exact, *(exact | {step.name: step.option} for step in sorted(first) if step.option.error <= tolerance)]
@@ -198,7 +182,6 @@ def _cheapened(menus: Sequence[Menu], tolerance: float, *, forced: bool) -> dict
 
 
 def _greedy(menus: Sequence[Menu], tolerance: float, start: Mapping[str, Option], *, forced: bool) -> dict[str, Option]:
-    """Take cheaper options, the greatest saving per added error first, while the sum of errors fits."""
     current = dict(start)
     while True:
         steps = sorted(step for menu in menus for step in _steps(menu, current, menus, forced=forced))
@@ -219,7 +202,6 @@ class _Step(NamedTuple):
 
 
 def _steps(menu: Menu, taken: Mapping[str, Option], menus: Sequence[Menu], *, forced: bool) -> Iterator[_Step]:
-    """Give every option that makes all together cheaper than what is taken now."""
     now, stays = taken[menu.name], forced or menu.name in ALWAYS_ON
     sharing = [one for one in menus if one is menu or (one.merged is not None and one.merged.other == menu.name)]
     for option in menu.variants if stays else (*menu.variants, menu.off):
@@ -231,7 +213,6 @@ def _steps(menu: Menu, taken: Mapping[str, Option], menus: Sequence[Menu], *, fo
 
 
 def _error(options: Iterable[Option]) -> float:
-    """Sum exactly rounded, so that the order of effects cannot change it."""
     return math.fsum(option.error for option in options)
 
 
@@ -259,12 +240,24 @@ def list_effects(decision: Decision, measured: Mapping[str, float] | None = None
     `choice.Treatment`), ``left_out``, the bound on what leaving it out would change, and ``magnitude``, how large it is
     here, in the words of its own bound.
 
-    Parameters
-    ----------
-    measured
-        What `verify` found, by name.
+    ``measured``: What `verify` found, by name.
     """
-    return [_row(one, decision, None if measured is None else measured.get(one.name)) for one in decision.taken]
+    return [
+        {
+            "name": one.name,
+            "state": "on" if one.is_on else "off",
+            "variant": one.option.variant if one.is_on else None,
+            "bound": _finite(one.option.error),
+            "measured": None if measured is None else measured.get(one.name),
+            "cost_s": _seconds(decision.cost_of(one), decision),
+            "why": explain(one, decision),
+            "reason": one.reason,
+            "left_out": _finite(one.menu.off.error),
+            "magnitude": one.menu.off.why,
+            "unit": decision.unit,
+        }
+        for one in decision.taken
+    ]
 
 
 def sum_up(decision: Decision, measured: Mapping[str, float] | None = None) -> dict[str, Any]:
@@ -291,22 +284,6 @@ def sum_up(decision: Decision, measured: Mapping[str, float] | None = None) -> d
         "cheap_cost_s": cheap,
         "saved_s": exact - cost,
         "saved_cheap_s": cheap - cost,
-    }
-
-
-def _row(one: Treatment, decision: Decision, measured: float | None) -> dict[str, Any]:
-    return {
-        "name": one.name,
-        "state": "on" if one.is_on else "off",
-        "variant": one.option.variant if one.is_on else None,
-        "bound": _finite(one.option.error),
-        "measured": measured,
-        "cost_s": _seconds(decision.cost_of(one), decision),
-        "why": explain(one, decision),
-        "reason": one.reason,
-        "left_out": _finite(one.menu.off.error),
-        "magnitude": one.menu.off.why,
-        "unit": decision.unit,
     }
 
 

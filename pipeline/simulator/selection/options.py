@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
 from pipeline.simulator.effects.blurs import airy_gaussians
-from pipeline.simulator.effects.effect import OFF, Bound, Effect, Merged
+from pipeline.simulator.effects.effect import OFF, Effect, Merged
 from pipeline.simulator.effects.probe import (
     GainRange,
     Probe,
@@ -68,12 +68,10 @@ class Menu:
 
     @property
     def name(self) -> str:
-        """Of the effect."""
         return self.effect.name
 
     @property
     def exact(self) -> Option:
-        """The exact variant."""
         return self.variants[0]
 
     def cost_beside(self, option: Option, others: Mapping[str, Option]) -> float:
@@ -98,17 +96,18 @@ def list_options(probes: Probe | Sequence[Probe], rig: Rig, effects: Sequence[Ef
 
     Of several probes, one for each binning of a survey, every option has the error of the worst.
 
-    Raises
-    ------
-    SettingsError : two effects have one name, or a bound is negative or not a number; names it.
+    Raises SettingsError: two effects have one name, or a bound is negative or not a number; names it.
     """
-    _check_names(effects)
+    seen: set[str] = set()
+    for effect in effects:
+        if effect.name in seen:
+            raise SettingsError(f"two effects are named {effect.name!r}; register each once")
+        seen.add(effect.name)
     each = [_options_of(probe, rig, effects) for probe in ([probes] if isinstance(probes, Probe) else probes)]
     return tuple(_worst_of(menus) for menus in zip(*each, strict=True))
 
 
 def _worst_of(menus: Sequence[Menu]) -> Menu:
-    """Join one effect's menus of several probes; what it costs they have in common."""
 
     def worst(options: Iterable[Option]) -> Option:
         return max(options, key=lambda option: option.error)
@@ -142,7 +141,13 @@ def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) ->
     costs = effect.cost_at(probe, rig) if hasattr(effect, "cost_at") else effect.cost_ns
 
     def option(variant: str) -> Option:
-        bound = _checked_bound(effect, probe, rig, variant)
+        bound = effect.bound(probe, rig, variant)
+        if not bound.value >= 0:  # refuses NaN
+            raise SettingsError(
+                f"effect {effect.name}, {variant}: its bound is {bound.value}, expected 0 or more ({bound.why});"
+                " check the rig's numbers and the scene for values that are not finite"
+            )
+
         error = bound.value * gain * SAFETY if bound.value else 0.0
         why = bound.why if probe.binning == 1 or not error else f"{bound.why}, in sums of {probe.binning} samples"
         return Option(variant, error, _cost_ns(costs, variant), why)
@@ -156,26 +161,7 @@ def _cost_ns(costs: Mapping[str, float], variant: str) -> float:
     return 0.0 if variant == OFF else max(costs[variant], LEAST_COST_NS)
 
 
-def _checked_bound(effect: Effect, probe: Probe, rig: Rig, variant: str) -> Bound:
-    bound = effect.bound(probe, rig, variant)
-    if not bound.value >= 0:  # refuses NaN
-        raise SettingsError(
-            f"effect {effect.name}, {variant}: its bound is {bound.value}, expected 0 or more ({bound.why});"
-            " check the rig's numbers and the scene for values that are not finite"
-        )
-    return bound
-
-
-def _check_names(effects: Iterable[Effect]) -> None:
-    seen: set[str] = set()
-    for effect in effects:
-        if effect.name in seen:
-            raise SettingsError(f"two effects are named {effect.name!r}; register each once")
-        seen.add(effect.name)
-
-
 def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
-    """Whether the rig has the effect: leaving it out would change a scene that shows everything."""
     bright = max(probe.brightest_e, rig.camera.full_well_e)
     loud = replace(_even_probe(probe, 1.0), brightest_e=bright, slit_errors={})
     shown = max(effect.bound(loud, rig, OFF).value, effect.bound(probe, rig, OFF).value)
@@ -201,7 +187,6 @@ def _gain_range(effect: Effect, probe: Probe, rig: Rig) -> GainRange | None:
 
 
 def _gain_beside(effect: Effect, ranges: Sequence[GainRange | None], place: int, growth: Growth) -> float:
-    """By what all others multiply the error of an effect."""
     if not acts_on_light(effect):
         return 1.0
     beside = [one for other, one in enumerate(ranges) if one is not None and other != place]

@@ -47,7 +47,6 @@ class _Optics:
 
     @staticmethod
     def of(camera: LineCamera, binning: int) -> _Optics:
-        """Those of a camera whose stored numbers sum so many samples."""
         return _Optics(
             _short_kernel(camera.slit_px),
             _short_kernel(1.0),
@@ -68,20 +67,11 @@ class _Optics:
 def telling_places(scene: Scene, camera: LineCamera, sweeps: Sequence[Sweep], most: int = 200) -> NDArray[np.float64]:
     """Find the places where light changes most over its noise, and where there is most and least of it.
 
-    Parameters
-    ----------
-    sweeps
-        What will be looked at: other parts of the scene do not count. All sum as many samples to a stored number.
-    most
-        How many places, each in a tile of its own for one measure and band; the worst of every measure first.
-
-    Returns
-    -------
-    (place, 2) rows and columns, integers as floats. [px]
-
-    Raises
-    ------
-    SceneError : the scene holds a number that is not finite; the message says where.
+    ``sweeps``: What will be looked at: other parts of the scene do not count. All sum as many samples to a stored
+    number.
+    ``most``: How many places, each in a tile of its own for one measure and band; the worst of every measure first.
+    Returns (place, 2) rows and columns, integers as floats. [px]
+    Raises SceneError: the scene holds a number that is not finite; the message says where.
     """
     spectra = scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     bands, optics = telling_bands(spectra), _Optics.of(camera, sweeps[0].binning)
@@ -134,7 +124,6 @@ def telling_bands(spectra: Light) -> NDArray[np.intp]:
 
 
 def _strips(scene: Scene, tile: int, halo: int) -> Iterator[tuple[int, Light]]:
-    """Give the first row and the components of strips of ``tile`` rows, with a halo of repeated edges all around."""
     rows, columns = scene.shape
     across = np.arange(-halo, columns + halo).clip(0, columns - 1)
     for first in range(0, rows, tile):
@@ -184,14 +173,10 @@ def _worths(light: Light, rig: _Optics, turned: tuple[bool, ...]) -> Iterator[Li
             ahead, behind = np.roll(seen, -1, axis), np.roll(seen, 1, axis)
             yield rig.summed(np.abs(ahead - behind), line)[inner] / noise
             yield rig.summed(np.abs(ahead + behind - 2 * seen), line)[inner] / noise
-        yield np.divide(rig.summed(_mixed(seen), line)[inner], noise)  # what a box that does not lie turned misses
-
-
-def _mixed(seen: Light) -> Light:
-    """Mixed second difference along both axes, by size."""
-    rise: Light = np.roll(seen, -1, 0) - np.roll(seen, 1, 0)
-    mixed: Light = np.abs(np.roll(rise, -1, 1) - np.roll(rise, 1, 1))
-    return mixed
+        rise: Light = np.roll(seen, -1, 0) - np.roll(seen, 1, 0)
+        yield np.divide(
+            rig.summed(np.abs(np.roll(rise, -1, 1) - np.roll(rise, 1, 1)), line)[inner], noise
+        )  # what a box that does not lie turned misses
 
 
 def _short_kernel(width_px: float) -> NDArray[np.float32]:
@@ -210,7 +195,6 @@ def _blurred(light: Light, kernel: NDArray[np.float32], axis: int) -> Light:
 
 
 def _tile_maxima(worth: Light, first: int, tile: int) -> list[tuple[float, int, int]]:
-    """Greatest value of every tile and its place."""
     columns = worth.shape[1]
     best_row = worth.argmax(axis=0)
     ridge = worth[best_row, np.arange(columns)]
@@ -244,16 +228,13 @@ class SampleViews:
 
     @property
     def sums(self) -> int:
-        """How many stored numbers the samples make."""
         return len(self.slope) // self.binning
 
     def chosen(self, which: NDArray[np.intp]) -> SampleViews:
-        """Some of the views."""
         some: dict[str, Any] = {name: getattr(self, name)[which] for name in _OF_A_VIEW}
         return replace(self, **some)
 
     def chosen_sums(self, which: NDArray[np.intp]) -> SampleViews:
-        """All samples of some of the stored numbers."""
         return self.chosen((which[:, None] * self.binning + np.arange(self.binning)).ravel())
 
 
@@ -372,7 +353,6 @@ def _first_seeing(
 
 
 def _held(sweep: Sweep) -> Sweep:
-    """Every position that a sweep holds as a line of its own."""
     return replace(sweep, step=1, lines=sweep.lines * sweep.step, binning=1)
 
 
@@ -383,7 +363,6 @@ def _patch(binning: int) -> Floats:
 
 
 def _patches(sweep: Sweep, number: int, camera: LineCamera, line: Floats, sample: Floats) -> SampleViews:
-    """Views around continuous lines and samples of a sweep, moved to what it has."""
     patch, binning = _patch(sweep.binning), sweep.binning
     middle = sample if binning == 1 else (sample + 0.5) / binning - 0.5
     sums = np.rint(middle[:, None] + patch[:, 0]).clip(0, camera.samples // binning - 1).astype(np.intp).ravel()
@@ -401,5 +380,4 @@ def _patches(sweep: Sweep, number: int, camera: LineCamera, line: Floats, sample
 
 
 def _samples_of(sums: NDArray[np.intp], binning: int) -> NDArray[np.intp]:
-    """Give the camera's samples that stored numbers sum, one number's after the other's."""
     return (sums[:, None] * binning + np.arange(binning)).ravel()

@@ -52,9 +52,7 @@ def probe_survey(scene: Scene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "
 
     What a survey takes of time and lines, and how bright the light along its lines usually is, all have in common.
 
-    Raises
-    ------
-    SceneError, SettingsError, PoseError : as `probe_scene`.
+    Raises SceneError, SettingsError, PoseError: as `probe_scene`.
     """
     taken = _taken(sweeps)
     each = [tuple(one for one in taken if one.binning == binning) for binning in sorted({one.binning for one in taken})]
@@ -69,11 +67,8 @@ def probe_scene(scene: Scene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "s
     Where to look is found on the scene's own pixels (`scouting`), so that the maxima hold for the whole image and not
     for the looks alone. All sweeps sum as many samples to a stored number; see `probe_survey`.
 
-    Raises
-    ------
-    SceneError : the scene holds a number that is not finite; the message says where.
-    SettingsError : there is no line to take, or sweeps differ in their binning.
-    PoseError : a sweep is out of the mirror's reach.
+    Raises SceneError: the scene holds a number that is not finite; the message says where. SettingsError: there is no
+    line to take, or sweeps differ in their binning. PoseError: a sweep is out of the mirror's reach.
     """
     taken = _taken(sweeps)
     binnings = {sweep.binning for sweep in taken}
@@ -85,7 +80,12 @@ def probe_scene(scene: Scene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "s
     most = (room - room // 3) // (patch_views(binning) * len({sweep.along for sweep in taken}))
     places = telling_places(scene, camera, taken, max(most, 1 if binning == 1 else _LEAST_PLACES))
     views = joined([lines, views_of_places(places, scene, camera, taken)])
-    seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _LOOK, None, scene), _shifts())
+    none = (0.0, 0.0)
+    found = [(none, none)]
+    for axis in (0, 1):
+        both = [(way, 0.0) if axis == 0 else (0.0, way) for way in (-_FAR, -_NEAR, _NEAR, _FAR)]
+        found += [(way, none) for way in both] + [(none, way) for way in (both[0], both[3])]
+    seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _LOOK, None, scene), found)
     means = seen[0, : len(lines.slope)].reshape(-1, line_sums(camera, binning) * binning * bands).mean(axis=1)
     errors = _slit_errors(scene, rig, views, taken, unit)
     usual = np.quantile(seen[0, : len(lines.slope)], np.linspace(0, 1, USUAL_LIGHTS)).astype(np.float64)
@@ -126,7 +126,6 @@ def _slit_errors(scene: Scene, rig: Rig, views: SampleViews, sweeps: tuple[Sweep
 
 
 def _roughest(scene: Scene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray[np.intp]:
-    """Stored numbers where a middle ray, and a box that does not lie turned, differ most: of all, and of each sweep."""
     boxes = _footprint(SLIT.variants[0], rig, _CLOSE, None, scene)
     close = light_seen(scene, rig.camera, views, boxes, _PHASES)
     scale, found = unit_at(_stored(close, views), rig, unit, views.binning), []
@@ -177,16 +176,6 @@ def _moments(rig: Rig, wavelength_nm: Floats, normal: Floats) -> Moments:
 def _stored(values: Light, views: SampleViews) -> Light:
     """Means over the samples of each stored number, (..., number, band)."""
     return np.asarray(stored_mean(values, views.binning), np.float32)
-
-
-def _shifts() -> list[tuple[tuple[float, float], tuple[float, float]]]:
-    """None first; then along and across in turn: the camera's rays by -far, -near, near, far, points by -far, far."""
-    none = (0.0, 0.0)
-    found = [(none, none)]
-    for axis in (0, 1):
-        both = [(way, 0.0) if axis == 0 else (0.0, way) for way in (-_FAR, -_NEAR, _NEAR, _FAR)]
-        found += [(way, none) for way in both] + [(none, way) for way in (both[0], both[3])]
-    return found
 
 
 def _summed_up(scene: Scene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit, seen: Light, means: Light) -> Probe:

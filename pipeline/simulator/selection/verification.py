@@ -17,7 +17,7 @@ from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.effects.probe import stored_mean
 from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE
 from pipeline.simulator.optics.tap_sums import TABULATED
-from pipeline.simulator.selection.choice import TOTAL, UNIT_WORDS, Decision, Treatment
+from pipeline.simulator.selection.choice import TOTAL, UNIT_WORDS, Decision
 from pipeline.simulator.selection.options import acts_on_light
 
 Floats = NDArray[np.float64]
@@ -30,16 +30,9 @@ Render = Callable[[SweepBlock, Mapping[Effect, str]], Light]
 def candidate_blocks(whole: Sequence[SweepBlock], places: Floats, *, lines: int = VERIFIED_LINES) -> list[SweepBlock]:
     """Give blocks of few lines about places of the scene and about the first, middle and last line of every sweep.
 
-    Parameters
-    ----------
-    whole
-        Every sweep as one block of all its lines.
-    places
-        (place, 2) rows and columns that are steep, bright or dark. [px]
-
-    Returns
-    -------
-    At most `MOST_CANDIDATES`, evenly out of all, none twice.
+    ``whole``: Every sweep as one block of all its lines.
+    ``places``: (place, 2) rows and columns that are steep, bright or dark. [px]
+    Returns at most `MOST_CANDIDATES`, evenly out of all, none twice.
     """
     found = [(block, first) for block in whole for first in _first_lines(block, places, lines)]
     kept = np.unique(np.linspace(0, len(found) - 1, min(len(found), MOST_CANDIDATES)).round().astype(int))
@@ -54,20 +47,10 @@ def worst_blocks(
 
     Of numbers as they are stored, and of each binning that the sweeps have its own.
 
-    Parameters
-    ----------
-    render
-        Expected electrons (line, sample, band); the footprint alone is enough.
-    units
-        From expected electrons and their binning to one unit of the tolerance at each. [e-]
-
-    Returns
-    -------
-    By name; one block may have several.
-
-    Raises
-    ------
-    ShapeError : there is nothing to choose from.
+    ``render``: Expected electrons (line, sample, band); the footprint alone is enough.
+    ``units``: From expected electrons and their binning to one unit of the tolerance at each. [e-]
+    Returns by name; one block may have several.
+    Raises ShapeError: there is nothing to choose from.
     """
     best: dict[str, tuple[float, SweepBlock]] = {}
     least = min((block.sweep.binning for block in candidates), default=1)
@@ -88,7 +71,6 @@ def worst_blocks(
 
 
 def _first_lines(block: SweepBlock, places: Floats, lines: int) -> list[int]:
-    """First lines of the blocks of one sweep, ascending."""
     sweep, camera = block.sweep, block.rig.camera
     middles = [0, sweep.lines // 2, sweep.lines - 1] if sweep.lines else []
     centred = np.reshape(places, (-1, 2)) - (np.array(block.shape) - 1) / 2
@@ -101,7 +83,6 @@ def _first_lines(block: SweepBlock, places: Floats, lines: int) -> list[int]:
 
 
 def _scores(block: SweepBlock, relative: Floats) -> dict[str, float]:
-    """How much a block is what it may be named for, of light in units."""
     steps = [np.abs(np.diff(relative, axis=axis)).max(initial=0.0) for axis in (0, 1)]
     return {
         "steepest": float(max(steps)),
@@ -150,40 +131,41 @@ def verify(decision: Decision, render: Render, blocks: Mapping[str, SweepBlock],
     Draws are paired: streams are keyed by seed, sweep, line and effect, so that the difference is the effect's alone.
     Effects of the readout change distributions, not expected light, and are not measured here.
 
-    Parameters
-    ----------
-    render
-        Expected electrons (line, sample, band) of a block with some effects on.
-    blocks
-        By name, as `worst_blocks` chooses them.
-    units
-        From expected electrons with everything on, and their binning, to one unit of the tolerance at each. [e-]
-
-    Returns
-    -------
-    Greatest change in the unit of the tolerance: by the name of each effect that is not exact, and of `TOTAL`.
-
-    Raises
-    ------
-    BoundError : a change exceeds the bound that the decision counted on; names effect, bound, change and place.
+    ``render``: Expected electrons (line, sample, band) of a block with some effects on.
+    ``blocks``: By name, as `worst_blocks` chooses them.
+    ``units``: From expected electrons with everything on, and their binning, to one unit of the tolerance at each. [e-]
+    Returns greatest change in the unit of the tolerance: by the name of each effect that is not exact, and of `TOTAL`.
+    Raises BoundError: a change exceeds the bound that the decision counted on; names effect, bound, change and place.
     """
     full = [_rendered(name, block, render, decision, units) for name, block in _once_each(blocks).items()]
-    changed = [one for one in decision.taken if _changes_light(one)]
+    changed = [
+        one
+        for one in decision.taken
+        if acts_on_light(one.menu.effect) and one.menu.present and one.option is not one.menu.exact
+    ]
     trials = [(one.name, [one]) for one in changed] + [(TOTAL, changed)]
     measured: dict[str, float] = {}
     for name, inexact in trials:
-        bound, chosen = math.fsum(one.option.error for one in inexact), _with(decision, inexact)
+        instead = {one.name: one.option.variant for one in inexact}
+        variants = {effect: instead.get(effect.name, variant) for effect, variant in decision.exact.items()}
+        bound, chosen = (
+            math.fsum(one.option.error for one in inexact),
+            {effect: variant for effect, variant in variants.items() if variant != OFF},
+        )
         share = misplaced_share(decision.exact, chosen)
         found = [_greatest_change(one, render(one.block, chosen), bound, share) for one in full] if inexact else []
         worst = max(found, key=lambda one: one.unexplained, default=_Change(0.0))
         if not worst.unexplained <= bound:
-            raise BoundError(_complaint(name, worst, bound, decision))
+            raise BoundError(
+                f"{name}: what was left out changes light by {worst.change:.3g} {UNIT_WORDS[decision.unit]} at {worst.place},"
+                f" above its bound of {bound:.3g}; the probe missed how bright or steep the scene is there: simulate with"
+                " --tol 0 or --effects all, and please report it with the rig's settings"
+            )
         measured[name] = max((one.greatest for one in found), default=0.0)
     return measured
 
 
 def _once_each(blocks: Mapping[str, SweepBlock]) -> dict[str, SweepBlock]:
-    """Join the names of blocks that are the same lines: the brightest is often the steepest as well."""
     names: dict[tuple[str, range], list[str]] = {}
     for name, block in blocks.items():
         names.setdefault((block.sweep.name, block.lines), []).append(name)
@@ -194,17 +176,6 @@ def _rendered(name: str, block: SweepBlock, render: Render, decision: Decision, 
     light = stored_mean(render(block, decision.exact), block.sweep.binning)
     unit = np.broadcast_to(units(np.asarray(light, np.float32), block.sweep.binning), light.shape)
     return _Rendered(name, block, light, unit, render)
-
-
-def _changes_light(one: Treatment) -> bool:
-    return acts_on_light(one.menu.effect) and one.menu.present and one.option is not one.menu.exact
-
-
-def _with(decision: Decision, inexact: Sequence[Treatment]) -> dict[Effect, str]:
-    """Everything exact but these, in the order of the chain."""
-    instead = {one.name: one.option.variant for one in inexact}
-    variants = {effect: instead.get(effect.name, variant) for effect, variant in decision.exact.items()}
-    return {effect: variant for effect, variant in variants.items() if variant != OFF}
 
 
 def _greatest_change(one: _Rendered, light: Light, bound: float, share: float) -> _Change:
@@ -222,14 +193,6 @@ def _greatest_change(one: _Rendered, light: Light, bound: float, share: float) -
     place = f"sweep {block.sweep.name}, line {block.numbers[line]}, sample {count}{summed}, band {band}"
     return _Change(
         float(change.max()), float(change[worst]), float(rounding[worst]), f"{place} of the {one.name} lines"
-    )
-
-
-def _complaint(name: str, worst: _Change, bound: float, decision: Decision) -> str:
-    return (
-        f"{name}: what was left out changes light by {worst.change:.3g} {UNIT_WORDS[decision.unit]} at {worst.place},"
-        f" above its bound of {bound:.3g}; the probe missed how bright or steep the scene is there: simulate with"
-        " --tol 0 or --effects all, and please report it with the rig's settings"
     )
 
 
@@ -260,7 +223,6 @@ def misplaced_share(exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -
 
 
 def _folded(ways: Mapping[Effect, str]) -> dict[str, str]:
-    """What kernels are made of; a slit's parts all have the same."""
     blurs = {one.name: way for one, way in ways.items() if hasattr(one, "moments") or one.name == SMEAR.name}
     return blurs | {one.name: "box" for one in ways if one.name == SLIT.name}
 

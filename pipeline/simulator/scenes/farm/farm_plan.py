@@ -245,9 +245,7 @@ class FarmPlan:
 def farm_plan(seed: int, shape: tuple[int, int] = (1024, 1280), *, day: int = 172, hour: float = 11.0) -> FarmPlan:
     """Plan the farm: no pixel is drawn.
 
-    Raises
-    ------
-    SceneError : a negative seed, an empty shape, a day that is not 1 to 366, or the sun below 5 degrees.
+    Raises SceneError: a negative seed, an empty shape, a day that is not 1 to 366, or the sun below 5 degrees.
     """
     if seed < 0 or min(shape) < 1:
         raise SceneError(f"the farm needs a seed >= 0 and a shape of at least 1 x 1 px, got seed {seed}, shape {shape}")

@@ -89,29 +89,16 @@ def farm_scene(
 ) -> RasterScene:
     """Give a farm on a day: equal arguments give the same scene, bit for bit. It is drawn when first looked at.
 
-    Parameters
-    ----------
-    seed
-        Not negative. Another day of the same seed and shape is the same land.
-    shape
-        (y, x), any size from 1 x 1. The land is drawn for the size: a larger scene is another farm. [px]
-    bands
-        Equally spaced from 400 to 1000 nm, at least 2.
-    camera
-        Its full well sets the electrons; ``LineCamera()`` unless given.
-    day
-        Of the year, 1 to 366; by default 172.
-    hour
-        True solar time, the sun in the south at 12; by default 11. [h]
-
-    Returns
-    -------
-    Planes are abundances of ``farm_plan(...).materials``; scene values are reflectance; every pixel is labelled.
-
-    Raises
-    ------
-    SceneError : a negative seed, an empty shape, a day that is not 1 to 366, the sun below 5 degrees.
-    WavelengthError : fewer than 2 bands.
+    ``seed``: Not negative. Another day of the same seed and shape is the same land.
+    ``shape``: (y, x), any size from 1 x 1. The land is drawn for the size: a larger scene is another farm. [px]
+    ``bands``: Equally spaced from 400 to 1000 nm, at least 2.
+    ``camera``: Its full well sets the electrons; ``LineCamera()`` unless given.
+    ``day``: Of the year, 1 to 366; by default 172.
+    ``hour``: True solar time, the sun in the south at 12; by default 11. [h]
+    Returns planes are abundances of ``farm_plan(...).materials``; scene values are reflectance; every pixel is
+    labelled.
+    Raises SceneError: a negative seed, an empty shape, a day that is not 1 to 366, the sun below 5 degrees.
+    WavelengthError: fewer than 2 bands.
     """
     plan = farm_plan(seed, shape, day=USUAL_DAY if day is None else day, hour=USUAL_HOUR if hour is None else hour)
     seen_by, size = camera or LineCamera(), f"{shape[0]}x{shape[1]}"
@@ -161,24 +148,20 @@ def paint_borders(work: Painting) -> None:
     for kind in ("margin", "hedge", "ditch", "road"):
         for number, (border, its_kind) in enumerate(work.plan.borders):
             if its_kind == kind:
-                _paint_line(work, stream(work.plan.seed, f"border {number}"), border, kind)
-
-
-def _paint_line(work: Painting, rng: np.random.Generator, border: Border, kind: str) -> None:
-    """Grass on both sides, and what the kind has in the middle; a ditch is fuller after rain."""
-    canvas, plan = work.canvas, work.plan
-    band = _wobbled(rng, band_pixels(border, 12.0, canvas.shape), 0.8 if kind == "road" else 1.6)
-    here = work.ground.at(band.index)
-    half, bank = rng.uniform(*WIDTHS[kind]), rng.uniform(*BANKS[kind])
-    dryness, strip, inner = rng.uniform(0.25, 0.55), rng.uniform() < 0.5, rng.uniform(0.8, 1.2)
-    _cover(canvas, band, half + bank, grass(here, dryness), "grass")
-    if kind == "ditch":
-        full = half * (0.75 + 1.4 * plan.moisture)
-        _cover(canvas, band, full, {"water": np.ones_like(band.across)}, "water")
-    if kind == "road":
-        _cover(canvas, band, half, hard_track(here, 0.75), "track")
-        if strip:
-            _cover(canvas, band, inner, grass(here, 0.5), "grass")
+                rng = stream(work.plan.seed, f"border {number}")
+                canvas, plan = work.canvas, work.plan
+                band = _wobbled(rng, band_pixels(border, 12.0, canvas.shape), 0.8 if kind == "road" else 1.6)
+                here = work.ground.at(band.index)
+                half, bank = rng.uniform(*WIDTHS[kind]), rng.uniform(*BANKS[kind])
+                dryness, strip, inner = rng.uniform(0.25, 0.55), rng.uniform() < 0.5, rng.uniform(0.8, 1.2)
+                _cover(canvas, band, half + bank, grass(here, dryness), "grass")
+                if kind == "ditch":
+                    full = half * (0.75 + 1.4 * plan.moisture)
+                    _cover(canvas, band, full, {"water": np.ones_like(band.across)}, "water")
+                if kind == "road":
+                    _cover(canvas, band, half, hard_track(here, 0.75), "track")
+                    if strip:
+                        _cover(canvas, band, inner, grass(here, 0.5), "grass")
 
 
 def _wobbled(rng: np.random.Generator, band: Band, size: float) -> Band:
@@ -189,7 +172,6 @@ def _wobbled(rng: np.random.Generator, band: Band, size: float) -> Band:
 
 
 def _cover(canvas: Canvas, band: Band, half: float, mixture: Mixture, label: str) -> None:
-    """Lay a surface over the pixels within ``half`` of the line."""
     cover = edge(half - np.abs(band.across))
     hit = np.flatnonzero(cover)
     canvas.over(band.index[hit], cover[hit], {name: part[hit] for name, part in mixture.items()}, label)
@@ -220,17 +202,13 @@ def crowns_of(work: Painting) -> Points:
     crowns = [_standing_trees(stream(plan.seed, "trees"), [border for border, _ in plan.borders])]
     for number, (border, kind) in enumerate(plan.borders):
         if kind == "hedge":
-            crowns.append(_hedge_crowns(stream(plan.seed, f"hedge {number}"), border))
+            rng = stream(plan.seed, f"hedge {number}")
+            along = np.arange(0.0, border.length, 5.0)
+            along = along[rng.uniform(size=along.size) > 0.05]
+            step = (border.end - border.start) / max(border.length, 1e-9)
+            centres = border.start + along[:, None] * step + rng.normal(0, 1.0, (along.size, 2))
+            crowns.append(np.column_stack([centres, rng.uniform(4, 7, along.size)]))
     return np.concatenate(crowns)
-
-
-def _hedge_crowns(rng: np.random.Generator, border: Border) -> Points:
-    """Crowns along a line: y, x and radius, (n, 3); every twentieth is missing."""
-    along = np.arange(0.0, border.length, 5.0)
-    along = along[rng.uniform(size=along.size) > 0.05]
-    step = (border.end - border.start) / max(border.length, 1e-9)
-    centres = border.start + along[:, None] * step + rng.normal(0, 1.0, (along.size, 2))
-    return np.column_stack([centres, rng.uniform(4, 7, along.size)])
 
 
 def _standing_trees(rng: np.random.Generator, borders: list[Border]) -> Points:

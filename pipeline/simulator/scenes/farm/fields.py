@@ -76,7 +76,6 @@ def paint_fields(work: Painting) -> None:
 def _content(
     work: Painting, rng: np.random.Generator, field: FieldPlan, centres: Points, ground: tuple[Ground, Field]
 ) -> Content:
-    """Materials and class shares of one field."""
     here, down = ground
     land, crop = field.land_on(work.plan.day), field.crop
     salt = int(rng.integers(2**31))
@@ -95,7 +94,6 @@ def _content(
 def _standing_crop(
     work: Painting, field: FieldPlan, crop: Crop, place: tuple[Rows, Ground, Mixture], harm: tuple[Field, Field]
 ) -> Content:
-    """Plants in rows over soil that they shade; gaps, lodged patches and wheel marks."""
     (rows, here, soil), (gaps, down) = place, harm
     age = field.land_on(work.plan.day).days
     local = age + np.clip(4 * here.vigour + 1.5 * here.tuft, -UNEVEN_DAYS, UNEVEN_DAYS)
@@ -135,7 +133,6 @@ def _stand(field: FieldPlan, crop: Crop, here: Ground, local: Points, down: Fiel
 
 
 def _with_wheel_marks(content: Content, field: FieldPlan, rows: Rows, soil: Mixture) -> Content:
-    """Lay tramlines over a field: its soil, trodden smooth, with a few stones."""
     if field.tramlines is None:
         return content
     marks = wheel_marks(field, rows)
@@ -145,7 +142,6 @@ def _with_wheel_marks(content: Content, field: FieldPlan, rows: Rows, soil: Mixt
 
 
 def _stubble_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture, days: float) -> Content:
-    """Straw in cut rows, swaths for nine days, soil between; straw greys over months and green comes back."""
     row = stripes(rows.place, field.row_period_px, CLOSED * field.row_period_px)
     swath = stripes(rows.across, 44.0, 12.0) * np.float32(days < 9)
     lying = 0.52 + 0.17 * row + 0.22 * swath + 0.05 * here.tuft + 0.03 * here.grain
@@ -160,7 +156,6 @@ def _stubble_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture, da
 
 
 def _meadow(rows: Rows, field: FieldPlan, here: Ground, days: float, day: int) -> Content:
-    """Grass mown in bands; pale for weeks after mowing, dull in winter."""
     winter = 0.5 + 0.5 * np.cos(2 * np.pi * (day - 25) / YEAR_DAYS)
     dryness = float(0.18 + 0.34 * np.exp(-days / 12) + 0.24 * winter)
     bands = stripes(rows.across, field.row_period_px, field.row_period_px / 2)
@@ -169,7 +164,6 @@ def _meadow(rows: Rows, field: FieldPlan, here: Ground, days: float, day: int) -
 
 
 def _bare_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture) -> Content:
-    """Soil as harrow or drill left it, in furrows; wheel marks on fallow."""
     period = field.row_period_px if field.crop is None else 10.5
     furrow = stripes(rows.place, period, 3.0)
     mixture = blend(soil, {"shade": np.ones_like(furrow)}, 0.15 * furrow)
@@ -187,7 +181,6 @@ def _lodging_field(work: Painting) -> Field | None:
 
 
 def _lodged(noise: Field, field: FieldPlan, day: int) -> Field:
-    """Share of each pixel of a field that lies: patches that grow with the season."""
     share = field.lodging * lodged_share(day)
     crop = field.crop
     if share <= 0 or crop is None or field.land_on(day).phase != "crop" or field.land_on(day).days < 150:
@@ -324,18 +317,17 @@ def field_weeds(rng: np.random.Generator, field: FieldPlan, day: int) -> dict[st
     emergence = np.append(emergence, rng.uniform(110, 190, single))
     turned = np.full(count + single, days_since_turned(field.use, day, field.late_days))
     age = (day - emergence) % YEAR_DAYS
-    size = radius * weed_size(day, emergence, turned) * _cut(field, day, age)
+    land = field.land_on(day)
+    size = (
+        radius
+        * weed_size(day, emergence, turned)
+        * np.where((age > land.days) & (land.phase in ("grass", "stubble")), 0.5, 1.0)
+    )
     flowers = (kinds == "mustard") & (age >= FLOWERING[0]) & (age < FLOWERING[1])
     spectra = np.where(flowers, "blossom", np.where(kinds == "mustard", "weed_leafy", kinds))
     seen = size > SEEN_PX
     plants = np.column_stack([places, size])
     return {str(name): plants[seen & (spectra == name)] for name in np.unique(spectra[seen])}
-
-
-def _cut(field: FieldPlan, day: int, age: Floats) -> Floats:
-    """Plants that saw mowing or harvest are half as wide."""
-    land = field.land_on(day)
-    return np.where((age > land.days) & (land.phase in ("grass", "stubble")), 0.5, 1.0)
 
 
 def _clustered(rng: np.random.Generator, field: FieldPlan, count: int) -> Points:

@@ -35,7 +35,6 @@ class Border:
 
     @property
     def length(self) -> float:
-        """[px]."""
         return float(np.hypot(*(self.end - self.start)))
 
 
@@ -64,7 +63,10 @@ def divide_land(rng: np.random.Generator, size: tuple[float, float], area: float
         if polygon_area(parcel.corners) < area * rng.uniform(1.15, 1.9):
             parcels.append(parcel)
             continue
-        cut = _choose_cut(rng, parcel, turn)
+        spans = [_span(parcel.corners, turn + quarter) for quarter in (0.0, np.pi / 2)]
+        angle = turn + (np.pi / 2 if np.ptp(spans[1]) > np.ptp(spans[0]) else 0.0) + rng.uniform(-0.12, 0.12)
+        low, high = _span(parcel.corners, angle)
+        cut = float(np.cos(angle)), float(np.sin(angle)), float(low + (high - low) * rng.uniform(0.36, 0.64))
         opposite = (-cut[0], -cut[1], -cut[2])
         for side in (cut, opposite):
             waiting.append(Parcel(clip_polygon(parcel.corners, side), (*parcel.cuts, side)))
@@ -74,16 +76,7 @@ def divide_land(rng: np.random.Generator, size: tuple[float, float], area: float
     return parcels, borders
 
 
-def _choose_cut(rng: np.random.Generator, parcel: Parcel, turn: float) -> tuple[float, float, float]:
-    """A line across the longer of the farm's two directions, up to 7 degrees off, in the middle third."""
-    spans = [_span(parcel.corners, turn + quarter) for quarter in (0.0, np.pi / 2)]
-    angle = turn + (np.pi / 2 if np.ptp(spans[1]) > np.ptp(spans[0]) else 0.0) + rng.uniform(-0.12, 0.12)
-    low, high = _span(parcel.corners, angle)
-    return float(np.cos(angle)), float(np.sin(angle)), float(low + (high - low) * rng.uniform(0.36, 0.64))
-
-
 def _span(corners: Points, angle: float) -> tuple[float, float]:
-    """Least and greatest offset of the corners along a direction."""
     offset = corners @ np.array([np.cos(angle), np.sin(angle)])
     return float(offset.min()), float(offset.max())
 
@@ -107,7 +100,6 @@ def polygon_area(corners: Points) -> float:
 
 
 def visible_area(parcel: Parcel, shape: tuple[int, int]) -> float:
-    """Area of a parcel on the scene [px^2]."""
     corners = parcel.corners
     for axis in ((1.0, 0.0, shape[0]), (-1.0, 0.0, shape[0]), (0.0, 1.0, shape[1]), (0.0, -1.0, shape[1])):
         corners = clip_polygon(corners, (axis[0], axis[1], -axis[2] / 2))
@@ -202,7 +194,6 @@ def disc_pixels(
 
 
 def scene_points(index: NDArray[np.intp], shape: tuple[int, int]) -> Points:
-    """Scene coordinates of flat pixel numbers, (n, 2)."""
     return np.stack(np.divmod(index, shape[1]), axis=-1) - (np.array(shape) - 1) / 2
 
 

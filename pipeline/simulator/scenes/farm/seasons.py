@@ -101,9 +101,7 @@ def sun_over_farm(day: int, hour: float) -> Sun:
 
     Right to 0.7 degrees in the years about 2025; refraction is left out.
 
-    Raises
-    ------
-    SceneError : the day is not 1 to 366, or the sun is lower than 5 degrees at the hour.
+    Raises SceneError: the day is not 1 to 366, or the sun is lower than 5 degrees at the hour.
 
     References
     ----------
@@ -172,7 +170,6 @@ def stage_shares(crop: Crop, age: ArrayLike) -> dict[str, Field]:
 
 
 def crop_height(crop: Crop, age: float) -> float:
-    """Height of the plants [px]."""
     days, heights = np.array(crop.heights).T
     return float(np.interp(age, days, heights))
 

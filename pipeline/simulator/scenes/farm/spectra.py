@@ -122,9 +122,7 @@ class SpectralLibrary:
 def band_centres(bands: int) -> tuple[Spectrum, Spectrum]:
     """Centres and widths of ``bands`` equally spaced bands from 400 to 1000 nm, (band,) each [nm].
 
-    Raises
-    ------
-    WavelengthError : fewer than 2 bands.
+    Raises WavelengthError: fewer than 2 bands.
     """
     if bands < 2:
         raise WavelengthError(f"the farm's spectra need at least 2 bands from 400 to 1000 nm, got {bands}")
@@ -135,9 +133,7 @@ def band_centres(bands: int) -> tuple[Spectrum, Spectrum]:
 def spectral_library(bands: int, materials: tuple[str, ...] = MATERIALS) -> SpectralLibrary:
     """Compute some materials in ``bands`` equally spaced Gaussian bands from 400 to 1000 nm (arrays are read-only).
 
-    Raises
-    ------
-    WavelengthError : fewer than 2 bands.
+    Raises WavelengthError: fewer than 2 bands.
     """
     wavelength, fwhm = band_centres(bands)
     known = _known_spectra()
