@@ -251,8 +251,7 @@ class Readout:
         same = np.float32(dark_electrons(self.block.rig) if dark else 0.0)
         if self._variant(DEFECTS.name) == OFF or not self.block.rig.detector.hot_share:
             return same
-        hot: Light = hot_electrons(self.block.rig, len(self.block.wavelength_nm))[self.block.columns] + same
-        return hot
+        return hot_electrons(self.block.rig, len(self.block.wavelength_nm))[self.block.columns] + same
 
     @cached_property
     def dead(self) -> NDArray[np.bool_] | None:

@@ -300,5 +300,4 @@ def _bad_elements(block: SweepBlock, choice: Choice, binning: int) -> NDArray[np
 
 def _binned(frame: Frame, binning: int) -> Frame:
     count = len(frame) // binning
-    sums: Frame = frame[: count * binning].reshape(count, binning, -1).sum(axis=1)
-    return sums
+    return np.asarray(frame[: count * binning].reshape(count, binning, -1).sum(axis=1))

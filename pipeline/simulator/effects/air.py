@@ -26,11 +26,9 @@ GUST_M = 3.0  # length of the waves that run over a canopy; assumed
 class Turbulence(Aim):
     """Jitter of the lines, normal and equal in both directions: warm air bends the light, anew for every line.
 
-    References
-    ----------
-    .. [1] Andrews and Phillips, "Laser Beam Propagation through Random Media", 2nd edition, SPIE Press, 2005, chapters
+    [1] Andrews and Phillips, "Laser Beam Propagation through Random Media", 2nd edition, SPIE Press, 2005, chapters
        6 (angle of arrival) and 8 (scintillation).
-    .. [2] Fried, "Optical resolution through a randomly inhomogeneous medium for very long and very short exposures",
+    [2] Fried, "Optical resolution through a randomly inhomogeneous medium for very long and very short exposures",
        Journal of the Optical Society of America 56, 1966. doi:10.1364/JOSA.56.001372
     """
 
@@ -63,9 +61,6 @@ class Turbulence(Aim):
         )
 
 
-TURBULENCE = Turbulence()
-
-
 def turbulence_px(rig: Rig) -> float:
     """Give the standard deviation of the angle of arrival per axis, sqrt(1.09 Cn2 d D^(-1/3)), from the farthest part.
 
@@ -86,8 +81,7 @@ def turbulence_px(rig: Rig) -> float:
 def rytov_variance(rig: Rig, wavelength_nm: float) -> float:
     """Give how strong the turbulence is: of the light's logarithm in spherical waves, 0.5 Cn2 k^(7/6) d^(11/6) [1]."""
     waves_per_m = 2 * math.pi / (wavelength_nm * 1e-9)
-    variance: float = 0.5 * rig.air.turbulence_cn2 * waves_per_m ** (7 / 6) * _way_m(rig) ** (11 / 6)
-    return variance
+    return float(0.5 * rig.air.turbulence_cn2 * waves_per_m ** (7 / 6) * _way_m(rig) ** (11 / 6))
 
 
 def _way_m(rig: Rig) -> float:
@@ -132,9 +126,6 @@ class Wind(Displacement):
             float(np.minimum(steep, probe.span).max(initial=0.0)),
             f"the crop sways by {sway:.2g} px, {line_to_line_px(rig):.2g} px from line to line{aliased}; {smeared}",
         )
-
-
-WIND = Wind()
 
 
 def sway_px(rig: Rig) -> float:
@@ -197,9 +188,6 @@ class Parallax(Displacement):
         return Bound(probe.moved(along, scan), why)
 
 
-PARALLAX = Parallax()
-
-
 def closeness(air: Air, row: Floats) -> Floats:
     """Give 1 / distance at rows of the scene, -1 its first and 1 its last. [1/m]
 
@@ -214,8 +202,7 @@ def closeness(air: Air, row: Floats) -> Floats:
     if air.relief == "step":
         return np.where(row < 0, far, near)
     share = (np.clip(row, -1, 1) + 1) / 2
-    inverse: Floats = far * (1 - share) + near * share
-    return inverse
+    return far * (1 - share) + near * share
 
 
 def greatest_share(air: Air) -> float:
@@ -262,9 +249,11 @@ def sample_distances(block: SweepBlock) -> Floats:
     along, scan = points_of_scan(sweep.strip_px, block.rig.camera, block.scan_px[:, None], block.slopes)
     row = scan if sweep.along == "x" else along
     inverse = closeness(block.rig.air, row / max((block.shape[0] - 1) / 2, 0.5))
-    metres: Floats = 1 / np.clip(inverse, 1 / ends[1], 1 / ends[0])
-    return metres
+    return 1 / np.clip(inverse, 1 / ends[1], 1 / ends[0])
 
 
 def spoken_reach(ends: tuple[float, float]) -> str:
     return f"{ends[1]:g} m" if ends[0] == ends[1] else f"{ends[0]:g} to {ends[1]:g} m"
+
+
+TURBULENCE, WIND, PARALLAX = Turbulence(), Wind(), Parallax()

@@ -84,9 +84,6 @@ class Diffraction(Blur):
         return blurred_bound(probe, cause, np.max(missing, axis=0), share)
 
 
-DIFFRACTION = Diffraction()
-
-
 def airy_energy(v: float) -> float:
     """Give the share of the light of an Airy pattern within v = pi D theta / lambda (Rayleigh): 1 - J0^2 - J1^2."""
     from scipy.special import j0, j1
@@ -143,8 +140,7 @@ def _gaussian(waves: Floats, variant: str) -> Floats:
 def _waves(rig: Rig, wavelength_nm: Floats, normal: Floats | None) -> Floats:
     """lambda over the pupil's widths along line and scan, (2, band). [px]"""
     angle = np.asarray(wavelength_nm, np.float64) * 1e-9 / (rig.optics.aperture_mm * 1e-3)
-    waves: Floats = angle / rig.camera.ifov_rad * np.sqrt(spread_of_waves(normal))[:, None]
-    return waves
+    return angle / rig.camera.ifov_rad * np.sqrt(spread_of_waves(normal))[:, None]
 
 
 @dataclass(frozen=True)
@@ -159,9 +155,6 @@ class Aberration(Blur):
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         return blurred_bound(probe, "blur of the lens", self.moments(rig, probe.wavelength_nm, variant).variance[None])
-
-
-ABERRATION = Aberration()
 
 
 @dataclass(frozen=True)
@@ -188,9 +181,6 @@ class Defocus(Blur):
         worst = np.max([defocus_px(rig, rig.air.distance_m, normal) ** 2 / 16 for normal in normals], axis=0)
         cause = f"defocus at {rig.air.distance_m:g} m, focused at {rig.optics.focus_m:g} m"
         return blurred_bound(probe, cause, even(worst, len(probe.wavelength_nm)).variance[None])
-
-
-DEFOCUS = Defocus()
 
 
 def defocus_px(rig: Rig, distance_m: float | None, normal: Floats | None = None) -> Floats:
@@ -238,11 +228,10 @@ class Keystone(Blur):
         )
 
 
-KEYSTONE = Keystone()
-
-
 def keystone_shift(rig: Rig, wavelength_nm: Floats) -> Floats:
     """Give how far along the line each band sees beside the mirror model's place, (band,) from -k/2 to k/2. [px]"""
     share = (np.asarray(wavelength_nm, np.float64) - FIRST_NM) / (LAST_NM - FIRST_NM)
-    shift: Floats = rig.optics.keystone_px * (np.clip(share, 0.0, 1.0) - 0.5)
-    return shift
+    return rig.optics.keystone_px * (np.clip(share, 0.0, 1.0) - 0.5)
+
+
+DIFFRACTION, ABERRATION, DEFOCUS, KEYSTONE = Diffraction(), Aberration(), Defocus(), Keystone()

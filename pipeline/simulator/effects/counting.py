@@ -38,11 +38,9 @@ Mask = NDArray[np.bool_]
 class DarkCurrent(Effect):
     """Electrons that warmth sets free, as many in every element; they take part in the shot noise.
 
-    References
-    ----------
-    .. [1] Janesick, "Scientific Charge-Coupled Devices", SPIE Press, 2001: dark current of a depleted sensor goes with
+    [1] Janesick, "Scientific Charge-Coupled Devices", SPIE Press, 2001: dark current of a depleted sensor goes with
        T^1.5 exp(-Eg / 2kT), and Eg by Varshni's formula.
-    .. [2] Widenhorn, Blouke, Weber, Rest and Bodegom, "Temperature dependence of dark current in a CCD", Proceedings of
+    [2] Widenhorn, Blouke, Weber, Rest and Bodegom, "Temperature dependence of dark current in a CCD", Proceedings of
        SPIE 4669, 2002. doi:10.1117/12.463446
     """
 
@@ -62,9 +60,6 @@ class DarkCurrent(Effect):
         warm = rig.detector.temperature_deg_c
         why = f"{electrons:.3g} e- in {rig.camera.exposure_ms:g} ms at {warm:g} deg C, beside {sd:.3g} e- of noise"
         return Bound(probe.added(electrons, rig.camera.electrons_per_dn) + spread, why)
-
-
-DARK_CURRENT = DarkCurrent()
 
 
 def warmth(temperature_deg_c: float) -> float:
@@ -114,9 +109,6 @@ class Defects(Effect):
         why = f"{dead.sum()} dead and {(hot > 0).sum()} hot elements of {dead.size}, these with {electrons:.3g} e- more"
         added = probe.added(gained, rig.camera.electrons_per_dn) if gained else 0.0
         return Bound(max(lost, added), why)
-
-
-DEFECTS = Defects()
 
 
 def dead_elements(rig: Rig, bands: int) -> Mask:
@@ -172,9 +164,6 @@ class Saturation(Effect):
             of_sample = float(np.hypot(np.sqrt(brightest), camera.read_noise_e)) / camera.electrons_per_dn
             unit_dn = of_sample / np.sqrt(probe.binning)
         return Bound(over / camera.electrons_per_dn / unit_dn, why)
-
-
-SATURATION = Saturation()
 
 
 def well_reached(rig: Rig, read_noise_e: float) -> bool:
@@ -236,9 +225,6 @@ class Shot(Effect):
         return Bound(in_unit(apart, total, probe, rig), why)
 
 
-SHOT = Shot()
-
-
 def in_unit(deviations: float, sd_e: float, probe: Probe, rig: Rig) -> float:
     """Give deviations of a noise of ``sd_e`` in each sample [e-] in the unit of the probe."""
     if probe.unit == "sigma":
@@ -275,9 +261,6 @@ class ReadNoise(Effect):
         return Bound(in_unit(told_apart(total, shot), total, probe, rig), why)
 
 
-READ_NOISE = ReadNoise()
-
-
 @dataclass(frozen=True)
 class Quantisation(Effect):
     """Rounding half to even. Raw lines are whole numbers, so it is never left out."""
@@ -290,4 +273,11 @@ class Quantisation(Effect):
         return Bound(value, f"0.5 DN of {rig.camera.electrons_per_dn:g} e-")
 
 
-QUANTISATION = Quantisation()
+DARK_CURRENT, DEFECTS, SATURATION, SHOT, READ_NOISE, QUANTISATION = (
+    DarkCurrent(),
+    Defects(),
+    Saturation(),
+    Shot(),
+    ReadNoise(),
+    Quantisation(),
+)

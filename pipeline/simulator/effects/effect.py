@@ -171,8 +171,7 @@ class SweepBlock:
     @property
     def scan_px(self) -> Floats:
         """(line,) scan coordinate at mid exposure [px]."""
-        centres: Floats = self.sweep.line_px()[self.numbers]
-        return centres
+        return self.sweep.line_px()[self.numbers]
 
     def stream(self, effect: str, number: int) -> np.random.Generator:
         """Give an effect's random stream at one line: blocks, order and other effects never change it."""

@@ -1,13 +1,11 @@
 """Air between rig and scene: it takes light out of the way, adds its own, and its gases absorb.
 
-References
-----------
-.. [1] Koschmieder, "Theorie der horizontalen Sichtweite", Beitraege zur Physik der freien Atmosphaere 12, 1924: a
+[1] Koschmieder, "Theorie der horizontalen Sichtweite", Beitraege zur Physik der freien Atmosphaere 12, 1924: a
    contrast of 2 % is left at the visibility V, so that extinction is 3.912 / V: all of it, molecules included.
-.. [2] Bird and Riordan, "Simple solar spectral model for direct and diffuse irradiance on horizontal and tilted
+[2] Bird and Riordan, "Simple solar spectral model for direct and diffuse irradiance on horizontal and tilted
    planes at the earth's surface for cloudless atmospheres", TR-215-2436, 1984, with the constant 118.3 of its
    published program. doi:10.2172/5986936
-.. [3] Kruse, McGlauchlin and McQuistan, "Elements of Infrared Technology", Wiley, 1962: Angstrom's exponent is 0.585
+[3] Kruse, McGlauchlin and McQuistan, "Elements of Infrared Technology", Wiley, 1962: Angstrom's exponent is 0.585
    V^(1/3) below 6 km.
 """
 
@@ -100,9 +98,6 @@ class Absorption(Gain):
         return gain
 
 
-ABSORPTION = Absorption()
-
-
 def transmission(metres: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
     """Give the share of light that passes so much air near the ground, (distance, band).
 
@@ -117,8 +112,7 @@ def transmission(metres: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
     x, y = water * water_cm, oxygen * mass
     passed = np.exp(-0.2385 * x / (1 + 20.07 * x) ** 0.45)  # [2] Eq. 2-8
     passed *= np.exp(-1.41 * y / (1 + 118.3 * y) ** 0.45)  # [2] Eq. 2-11
-    mean: Floats = (passed * (weight / weight.sum())).sum(axis=-1)
-    return mean
+    return np.asarray((passed * (weight / weight.sum())).sum(axis=-1))
 
 
 @dataclass(frozen=True)
@@ -191,9 +185,6 @@ class PathRadiance(LightChange):
         return light
 
 
-PATH_RADIANCE = PathRadiance()
-
-
 def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
     """Give the extinction of aerosol and molecules near the ground, (band,) [1/m]: 0.17 /km in all at 23 km, 550 nm.
 
@@ -205,15 +196,13 @@ def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
     molecules = rayleigh_per_m(np.array([VISIBLE_NM]))[0]
     aerosol = max(KOSCHMIEDER / air.visibility_km * 1e-3 - molecules, 0.0)
     exponent = min(ANGSTROM, KRUSE * air.visibility_km ** (1 / 3))
-    per_m: Floats = aerosol * (wavelength_nm / VISIBLE_NM) ** -exponent + rayleigh_per_m(wavelength_nm)
-    return per_m
+    return np.asarray(aerosol * (wavelength_nm / VISIBLE_NM) ** -exponent + rayleigh_per_m(wavelength_nm))
 
 
 def rayleigh_per_m(wavelength_nm: Floats) -> Floats:
     """Give what molecules scatter at sea level, (band,) [1/m]: the optical depth of [2], Eq. 2-4, over 8434 m."""
     micron = wavelength_nm * 1e-3
-    per_m: Floats = 1 / (micron**4 * (115.6406 - 1.3366 / micron**2)) / AIR_MASS_M
-    return per_m
+    return 1 / (micron**4 * (115.6406 - 1.3366 / micron**2)) / AIR_MASS_M
 
 
 def _contrast(probe: Probe, rig: Rig) -> Floats:
@@ -232,11 +221,12 @@ def _contrast(probe: Probe, rig: Rig) -> Floats:
     above = probe.level * np.clip(1 - share, 0.0, 1.0)
     sun = DRIFT.gain_range(probe, rig)
     below = np.maximum(horizon - shaded * low, 0.0) * np.maximum(sun.greatest, 1.0)
-    worst: Floats = np.maximum(above, below / unit_electrons(shaded * np.minimum(sun.least, 1.0) * low, probe, rig))
-    return worst
+    return np.asarray(np.maximum(above, below / unit_electrons(shaded * np.minimum(sun.least, 1.0) * low, probe, rig)))
 
 
 def _between(near: Floats, far: Floats) -> Floats:
     """Share of the light lost between two optical depths, exp(-near) - exp(-far), however near they lie."""
-    share: Floats = -np.exp(-near) * np.expm1(near - far)
-    return share
+    return -np.exp(-near) * np.expm1(near - far)
+
+
+ABSORPTION, PATH_RADIANCE = Absorption(), PathRadiance()

@@ -75,9 +75,6 @@ class Drift(Gain):
         return _daylight(sky, block.wavelength_nm, block.time_s, variant)[:, None].astype(np.float32)
 
 
-DRIFT = Drift()
-
-
 def _daylight(sky: Sky, wavelength_nm: Floats, seconds: Floats, variant: str) -> Floats:
     """Give (time, band), or (time, 1), over the light at the start."""
     if variant == LINEAR:
@@ -89,8 +86,7 @@ def _daylight(sky: Sky, wavelength_nm: Floats, seconds: Floats, variant: str) ->
 
 def _of_all(sky: Sky, wavelength_nm: Floats, seconds: Floats) -> Floats:
     """Mean over the bands, (time, 1): every band counts by its light at the start, so as 1."""
-    mean: Floats = relative_daylight(sky, wavelength_nm, seconds).mean(axis=1, keepdims=True)
-    return mean
+    return np.asarray(relative_daylight(sky, wavelength_nm, seconds).mean(axis=1, keepdims=True))
 
 
 def _first_rate(sky: Sky, wavelength_nm: Floats) -> float:
@@ -139,9 +135,6 @@ class Cloud(Gain):
         return (1 - sky.cloud_share * shadow(way, sky.cloud_size_px))[..., None].astype(np.float32)
 
 
-CLOUD = Cloud()
-
-
 def shadow(way_px: Floats, size_px: float) -> Floats:
     """Give how much of a cloud lies between the sun and points so far along its way, 0 to 1; the period is 2 sizes.
 
@@ -149,8 +142,7 @@ def shadow(way_px: Floats, size_px: float) -> Floats:
     """
     from_middle = np.abs((way_px + size_px) % (2 * size_px) - size_px)
     t = np.clip((size_px / 2 - from_middle) / (EDGE_SHARE * size_px) + 0.5, 0.0, 1.0)
-    smooth: Floats = t * t * (3 - 2 * t)
-    return smooth
+    return t * t * (3 - 2 * t)
 
 
 @dataclass(frozen=True)
@@ -196,9 +188,6 @@ class Brdf(Gain):
         return np.maximum(factor, 0.0)[..., None].astype(np.float32)
 
 
-BRDF = Brdf()
-
-
 def _angles(sweep: Sweep, camera: LineCamera, scan_px: Floats, slopes: Floats) -> tuple[Floats, Floats]:
     along, scan = points_of_scan(sweep.strip_px, camera, scan_px[:, None], slopes)
     x = along if sweep.along == "x" else scan
@@ -221,3 +210,6 @@ def _extremes(sweeps: tuple[Sweep, ...], camera: LineCamera) -> tuple[float, flo
         greatest = max(greatest, float(np.abs(angle).max()))
         least = min(least, float(phase.min() - sum(steps) / 2))  # no point is further from one looked at
     return greatest, max(least, 0.0)
+
+
+DRIFT, CLOUD, BRDF = Drift(), Cloud(), Brdf()

@@ -69,9 +69,6 @@ class Rotation(Effect):
         return Bound(probe.moved(along, scan) + shape, why)
 
 
-ROTATION = Rotation()
-
-
 def _course(sweep: Sweep, camera: LineCamera, beside: tuple[float, float]) -> tuple[float, float]:
     slopes = camera.pixel_slopes()
     slopes = slopes[np.unique(np.linspace(0, len(slopes) - 1, _LOOKS).round().astype(int))]
@@ -114,9 +111,6 @@ class SlitBox(Effect):
             value += probe.blurred(np.repeat(SCALE_STEP * box + BETWEEN_ROWS, bands, axis=1))
             value += probe.blurred(np.full((2, bands), turned)) + TABULATED * float(probe.span.max(initial=0.0))
         return Bound(value, f"{why}, measured where the scene is roughest")
-
-
-SLIT = SlitBox()
 
 
 def box_parts(variant: str, rig: Rig, views: RayViews) -> Parts:
@@ -178,9 +172,6 @@ class Smear(Effect):
         return Bound(probe.blurred(both), f"the mirror moves {most} px in an exposure")
 
 
-SMEAR = Smear()
-
-
 def _courses(sweeps: tuple[Sweep, ...], rig: Rig) -> Iterator[Floats]:
     """Ways of held positions beside their plan, (line, step), of each kind of sweep that has several. [px]"""
     for sweep in {(one.lines, one.step): one for one in sweeps if one.lines and one.step > 1}.values():
@@ -207,3 +198,6 @@ def _beside(sweeps: tuple[Sweep, ...], rig: Rig) -> tuple[float, float]:
             moved = end_gains(sweep, rig.camera)[..., 1] - [0.0, 1.0]
             found = np.maximum(found, np.abs(moved).max(axis=(0, 1)))
     return float(found[0]), float(found[1])
+
+
+ROTATION, SLIT, SMEAR = Rotation(), SlitBox(), Smear()

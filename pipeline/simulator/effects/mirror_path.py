@@ -56,9 +56,6 @@ class Staircase(Aim):
         return Bound(value, f"lines lie up to {mean:.3f} px off, held positions {square**0.5:.2f} px rms")
 
 
-STAIRCASE = Staircase()
-
-
 def beside_plan(positions: float, step: int, numbers: NDArray[np.int64], parts: int = 1) -> Floats:
     """Give the mean position less the planned one in each part of each held px of path, (line, step * parts). [px]
 
@@ -73,8 +70,7 @@ def beside_plan(positions: float, step: int, numbers: NDArray[np.int64], parts: 
     area = np.diff(whole, axis=1) / 2 + np.diff(part**2, axis=1) / 2
     lag = area * parts / positions
     middle = np.tile((np.arange(parts) + 0.5) / parts - 0.5, step)
-    shift: Floats = middle + (0.5 - lag) / positions
-    return shift
+    return middle + (0.5 - lag) / positions
 
 
 def _parts(positions: float, step: int, variant: str) -> int:
@@ -129,9 +125,6 @@ class Lag(Aim):
         return Bound(probe.moved(*moved), f"lines lie up to {worst:.2g} px off {why}")
 
 
-LAG = Lag()
-
-
 def greatest_lag_px(rig: Rig, sweeps: Iterable[Sweep], variant: str = OFF) -> float:
     """Give the greatest shift along the scan of any line, or the greatest difference of a variant to the exact one."""
     worst = 0.0
@@ -183,12 +176,10 @@ def _impulse(time: Floats, damping: float) -> Floats:
     with np.errstate(under="ignore"):
         if damping <= 1:
             turn = math.sqrt((1 - damping) * (1 + damping)) * time
-            wave: Floats = np.exp(-damping * time) * time * np.sinc(turn / np.pi)
-            return wave
+            return np.exp(-damping * time) * time * np.sinc(turn / np.pi)
         apart = 2 * math.sqrt((damping - 1) * (damping + 1)) * time
         share = np.where(apart > 0, -np.expm1(-apart) / np.where(apart > 0, apart, 1.0), 1.0)
-        decay: Floats = np.exp(-_slow_rate(damping) * time) * time * share
-        return decay
+        return np.exp(-_slow_rate(damping) * time) * time * share
 
 
 def _slow_rate(damping: float) -> float:
@@ -222,8 +213,7 @@ def _at_start(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) ->
     flown = float(sweep.lines * sweep.step)
     settled = np.array([2 * math.pi * mirror.natural_hz * mirror.settled_s])
     g, h = (one.item() for one in responses(settled, damping))
-    start: Floats = steady + flown * np.array([1 - h, -g])
-    return start
+    return steady + flown * np.array([1 - h, -g])
 
 
 def _steps(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> tuple[Floats, float, float]:
@@ -243,8 +233,7 @@ def _mean_over(held: float, damping: float, place: Floats, rate: Floats) -> Floa
     if held == 0:
         return place
     impulse, rise = responses(np.array([held]), damping)
-    mean: Floats = (place * (impulse + 2 * damping * rise) + rate * rise) / held
-    return mean
+    return (place * (impulse + 2 * damping * rise) + rate * rise) / held
 
 
 def _euler(damping: float, start: Floats, numbers: NDArray[np.int64], pace: tuple[float, float, int]) -> Floats:
@@ -274,3 +263,6 @@ def _euler_step(damping: float, time: float) -> Floats:
 def _times(matrix: Floats, place: Floats, rate: Floats) -> tuple[Floats, Floats]:
     """A 2 x 2 matrix times states, written out: a library's product may round by the number of states."""
     return matrix[0, 0] * place + matrix[0, 1] * rate, matrix[1, 0] * place + matrix[1, 1] * rate
+
+
+STAIRCASE, LAG = Staircase(), Lag()

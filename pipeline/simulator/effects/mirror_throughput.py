@@ -58,11 +58,7 @@ class Vignetting(Gain):
         sweep, camera = block.sweep, block.rig.camera
         scan_px = sweep.held_px() if variant == HELD else sweep.line_px()[:, None]
         share = np.sqrt(1 - ahead(sweep.strip_px, scan_px[block.numbers], camera)).mean(axis=1)
-        factor: Light = share.astype(np.float32)[:, None, None]
-        return factor
-
-
-VIGNETTING = Vignetting()
+        return np.asarray(share.astype(np.float32)[:, None, None])
 
 
 def sweep_ends(probe: Probe, camera: LineCamera) -> Floats:
@@ -75,8 +71,7 @@ def sweep_ends(probe: Probe, camera: LineCamera) -> Floats:
 def ahead(along_px: float, scan_px: Floats, camera: LineCamera) -> Floats:
     """Give o_z, the part along the camera's axis, of the unit directions to points of the scene."""
     xi, eta = along_px * camera.ifov_rad, scan_px * camera.ifov_rad
-    part: Floats = eta / np.sqrt(1 + xi**2 + eta**2)
-    return part
+    return eta / np.sqrt(1 + xi**2 + eta**2)
 
 
 @dataclass(frozen=True)
@@ -119,13 +114,9 @@ class Polarisation(Gain):
         return factor[:, None, :]
 
 
-POLARISATION = Polarisation()
-
-
 def _incidence(looks_ahead: Floats) -> Floats:
     """Angle between chief ray and mirror normal where the mirror looks along unit directions of this o_z. [rad]"""
-    angle: Floats = np.arccos(np.sqrt((1 - looks_ahead) / 2))
-    return angle
+    return np.arccos(np.sqrt((1 - looks_ahead) / 2))
 
 
 def _factors(incidence_rad: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
@@ -179,8 +170,7 @@ def reflectance(coating: Coating, wavelength_nm: Floats, incidence_rad: Floats) 
     across, within = fresnel(
         np.interp(wavelength_nm, nm, n) + 1j * np.interp(wavelength_nm, nm, k), incidence_rad[:, None]
     )
-    mean: Floats = (across + within) / 2
-    return mean
+    return (across + within) / 2
 
 
 def fresnel(index: Indices, incidence_rad: Floats) -> tuple[Floats, Floats]:
@@ -190,3 +180,6 @@ def fresnel(index: Indices, incidence_rad: Floats) -> tuple[Floats, Floats]:
     across = np.abs((cosine - beyond) / (cosine + beyond)) ** 2
     within = np.abs((square * cosine - beyond) / (square * cosine + beyond)) ** 2
     return across, within
+
+
+VIGNETTING, POLARISATION = Vignetting(), Polarisation()

@@ -26,9 +26,7 @@ def normal_deviates(rng: np.random.Generator, count: int) -> Light:
 
     The words come from the bit generator as they are: every deviate takes as many, and the stream may be counted.
 
-    References
-    ----------
-    .. [1] Box, Muller, "A note on the generation of random normal deviates", Ann. Math. Stat. 29, 1958.
+    [1] Box, Muller, "A note on the generation of random normal deviates", Ann. Math. Stat. 29, 1958.
            doi:10.1214/aoms/1177706645
     """
     drawn = np.empty(count + count % 2, np.float32)
@@ -156,9 +154,7 @@ def _series_quantile(mean: Floats, z: Floats) -> Floats:
     quantile is floor(x). x is expanded in 1 / sqrt(mean) [1]; where it comes as near to a whole number as the expansion
     may err, the distribution itself is asked.
 
-    References
-    ----------
-    .. [1] Giles, "Algorithm 955: approximation of the inverse Poisson cumulative distribution function", ACM Trans.
+    [1] Giles, "Algorithm 955: approximation of the inverse Poisson cumulative distribution function", ACM Trans.
            Math. Softw. 42, 2016. doi:10.1145/2699466
     """
     from scipy.special import gammaincc, ndtr

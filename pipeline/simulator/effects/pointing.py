@@ -97,9 +97,6 @@ class Jitter(Aim):
         return Bound(float(value), f"{why}, one of {lines} by {most:.1f} times that")
 
 
-JITTER = Jitter()
-
-
 def tilt_to_scene(normals: Floats) -> Floats:
     """Give the derivatives of scene tangents with respect to tilts of the mirror, (..., 2, 2).
 
@@ -117,8 +114,7 @@ def tilt_to_scene(normals: Floats) -> Floats:
     turned = -2 * (tilts[..., 2:] * normals[..., None, :] + normals[..., None, 2:] * tilts)
     ahead = view[..., None, :1]
     tangents = (turned[..., 1:] - turned[..., :1] * view[..., None, 1:] / ahead) / ahead
-    gains: Floats = np.swapaxes(tangents, -1, -2)
-    return gains
+    return np.swapaxes(tangents, -1, -2)
 
 
 def _sigma_px(rig: Rig) -> float:
@@ -169,11 +165,6 @@ class ThermalDrift(Aim):
         return Bound(probe.moved(*at_line_ends(probe.sweeps, rig.camera, along, scan)), why)
 
 
-HYSTERESIS = Hysteresis()
-
-THERMAL_DRIFT = ThermalDrift()
-
-
 def pointing_field(unit: int, position: Floats) -> Floats:
     """Give a smooth field over the disk, (..., 2) for positions (..., 2); between -1 and 1 on it. [-]
 
@@ -183,8 +174,7 @@ def pointing_field(unit: int, position: Floats) -> Floats:
     x, y = position[..., 0], position[..., 1]
     modes = np.stack([np.ones_like(x), x, y, 2 * (x * x + y * y) - 1, x * x - y * y, 2 * x * y], axis=-1)
     weights = unit_stream(unit, Hysteresis.name).standard_normal((_MODES, 2))
-    field: Floats = (modes[..., None] * (weights / np.abs(weights).sum(axis=0))).sum(axis=-2)
-    return field
+    return np.asarray((modes[..., None] * (weights / np.abs(weights).sum(axis=0))).sum(axis=-2))
 
 
 def _course(rig: Rig, sweep: Sweep, position: Floats) -> Floats:
@@ -288,3 +278,6 @@ class CommonOffset(Pointing):
     def of_lines(self, sweep_name: str, lines: range) -> Floats:
         """Give the error of some lines, (line, 2) along the line and the scan [px]."""
         return np.tile(np.array(self.offset_px, np.float64), (len(lines), 1))
+
+
+JITTER, HYSTERESIS, THERMAL_DRIFT = Jitter(), Hysteresis(), ThermalDrift()

@@ -71,8 +71,7 @@ class Probe:
         """
         by_curvature = _times(self.curvature, variance_px2 / 2)
         by_slope = _times(self.slope, np.sqrt(variance_px2))
-        change: Floats = np.minimum(np.minimum(by_curvature, by_slope).sum(axis=0), self.span)
-        return change
+        return np.asarray(np.minimum(np.minimum(by_curvature, by_slope).sum(axis=0), self.span))
 
     def scaled(self, share: float | Floats) -> float:
         """Bound what multiplying by 1 + ``share`` (or (band,) shares) changes."""
@@ -100,8 +99,7 @@ def stored_mean(light: NDArray[np.floating], binning: int) -> NDArray[np.floatin
         return light
     count = light.shape[-2] // binning
     whole = light[..., : count * binning, :].reshape(*light.shape[:-2], count, binning, light.shape[-1])
-    mean: NDArray[np.floating] = whole.mean(axis=-2)
-    return mean
+    return np.asarray(whole.mean(axis=-2))
 
 
 def noise_electrons(signal: NDArray[np.floating], rig: Rig, binning: int = 1) -> Light:

@@ -65,10 +65,6 @@ class Striping(Gain):
         return stripe_gain(block.rig)[None, block.columns]
 
 
-PRNU = Prnu()
-STRIPING = Striping()
-
-
 def response_gain(rig: Rig, bands: int) -> Light:
     """Give the gains of the sensor's elements, (sample, band) of the whole camera."""
     return _gains(rig.detector.unit, "prnu", rig.camera.samples, bands, share=rig.detector.response_share)
@@ -141,9 +137,6 @@ class StrayLight(LightChange):
         return light
 
 
-STRAY_LIGHT = StrayLight()
-
-
 def _most_halo(probe: Probe, rig: Rig, spread: float) -> float:
     """Bound |H - mean| over the unit at any sample, H the halo's own light.
 
@@ -176,8 +169,7 @@ def _scattered(line: Light, optics: Optics) -> Light:
     kept = np.outer(along_kept, across_kept) * (1 - optics.stray_even)
     kept[0, 0] = 1
     modes = along @ (line @ across.T) * (optics.stray_share * kept).astype(np.float32)
-    back: Light = (along.T @ modes) @ across
-    return back
+    return np.asarray((along.T @ modes) @ across)
 
 
 @lru_cache(maxsize=16)
@@ -188,3 +180,6 @@ def _cosines(count: int, sd_px: float) -> tuple[Light, NDArray[np.float64]]:
     waves = np.cos(np.pi / count * np.outer(modes, np.arange(count) + 0.5))
     waves *= np.sqrt(np.where(modes == 0, 1, 2) / count)[:, None]
     return waves.astype(np.float32), passed[modes]
+
+
+PRNU, STRIPING, STRAY_LIGHT = Prnu(), Striping(), StrayLight()

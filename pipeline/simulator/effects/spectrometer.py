@@ -68,9 +68,6 @@ class Response(LightChange):
         return widen_bands(light, block.wavelength_nm, block.fwhm_nm, block.rig.optics.fwhm_nm)
 
 
-RESPONSE = Response()
-
-
 def widen_bands(spectra: Light, wavelength_nm: Floats, fwhm_nm: Floats | None, wanted_nm: float) -> Light:
     """Give spectra as bands of width ``wanted_nm`` see them; any linear measure of light, (..., band).
 
@@ -188,9 +185,6 @@ class Smile(LightChange):
         return out
 
 
-SMILE = Smile()
-
-
 def wavelength_shift(samples: int, smile_nm: float) -> Floats:
     """Give by how much longer the wavelength of each sample is than its band's, (sample,). [nm]"""
     half = (samples - 1) / 2
@@ -268,3 +262,6 @@ def _most_bent(shift: float, wavelength: Floats, bend: Floats) -> float:
     if shift > gaps[rising].min():  # bands see gaps that are not next to them
         beside = np.full_like(beside, bend.max())
     return float((part * (gaps - part) * beside)[rising].max()) / 2
+
+
+RESPONSE, SMILE = Response(), Smile()

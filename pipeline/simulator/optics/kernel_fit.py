@@ -52,22 +52,6 @@ class Kernels:
         return Kernels(self.shift[:, which], self.variance[:, which], self.level[which])
 
 
-def fit_kernels(blurs: Moments, box: tuple[float, float], held: int) -> tuple[Kernels, Floats, Floats]:
-    """Choose kernels for the blurs of all bands, and how much each counts in every band.
-
-    ``blurs``: All of them together.
-    ``box``: Widths of slit and pixel, across and along; 0 for none. [px]
-    ``held``: Positions 1 px apart along the scan.
-    Returns the fewest that change no wave of any band by more than `NEGLIGIBLE` of its amplitude, or the best that were
-    tried; (kernel, node) shares of some bands, and (node, band) between which two nodes each band lies. None of the
-    shares is below 0, and they sum to 1.
-    """
-    waves = blurs.waves if blurs.waves is not None and blurs.waves.any() else np.zeros_like(blurs.shift)
-    told, band = np.unique(np.concatenate([blurs.shift, blurs.variance, waves]), axis=1, return_inverse=True)
-    kernels, shares, between = _fit(told.tobytes(), told.shape[1], box, held)
-    return kernels, shares, between[:, band.ravel()]
-
-
 @lru_cache(maxsize=64)
 def _fit(told: bytes, bands: int, box: tuple[float, float], held: int) -> tuple[Kernels, Floats, Floats]:
     """Kernels and shares for bands (6, band), no two alike: shift, variance and waves."""
@@ -119,8 +103,7 @@ def _error(passed: Transfer, wanted: Transfer) -> float:
 
 
 def _some(order: NDArray[np.intp], most: int) -> NDArray[np.intp]:
-    some: NDArray[np.intp] = order[np.unique(np.linspace(0, len(order) - 1, min(len(order), most)).round().astype(int))]
-    return some
+    return np.asarray(order[np.unique(np.linspace(0, len(order) - 1, min(len(order), most)).round().astype(int))])
 
 
 def _candidates(moments: Floats, place: Floats) -> Iterator[Kernels]:
@@ -163,8 +146,7 @@ def _steps(shift: Floats) -> Floats:
     """How far neighbouring nodes lie apart, (2, 1): what is between two of them is wider than either."""
     if shift.shape[1] == 1:
         return np.zeros((2, 1))
-    steps: Floats = np.abs(np.diff(shift, axis=1)).max(axis=1, keepdims=True)
-    return steps
+    return np.asarray(np.abs(np.diff(shift, axis=1)).max(axis=1, keepdims=True))
 
 
 def _size_at(level: int) -> float:
@@ -194,8 +176,7 @@ def _gaussian(shift: Floats, variance: Floats) -> Transfer:
     """What Gaussians pass of the waves, (wave, kernel), with their phases."""
     turned = np.outer(_ALONG, shift[0]) + np.outer(_SCAN, shift[1])
     spread = np.outer(_ALONG**2, variance[0]) + np.outer(_SCAN**2, variance[1])
-    found: Transfer = np.exp(-2j * np.pi * turned - 2 * np.pi**2 * spread)
-    return found
+    return np.exp(-2j * np.pi * turned - 2 * np.pi**2 * spread)
 
 
 def _passed(kernels: Kernels, own: Floats) -> Transfer:
@@ -203,15 +184,13 @@ def _passed(kernels: Kernels, own: Floats) -> Transfer:
     left = kernels.variance - THINNED * (kernels.level**2 - 1)
     seen = {level: _seen_at(level) for level in set(kernels.level.tolist())}
     through = own[:, None] * np.stack([seen[level] for level in kernels.level.tolist()], axis=1)
-    passed: Transfer = through * _gaussian(kernels.shift, left)
-    return passed
+    return through * _gaussian(kernels.shift, left)
 
 
 def _wanted(moments: Floats, own: Floats) -> Transfer:
     """What bands pass of the waves, (wave, band), for moments (6, band)."""
     across = np.hypot(np.outer(_ALONG, moments[4]), np.outer(_SCAN, moments[5]))
-    through: Transfer = (own * _seen_at(1))[:, None] * _gaussian(moments[:2], moments[2:4]) * pupil_contrast(across)
-    return through
+    return (own * _seen_at(1))[:, None] * _gaussian(moments[:2], moments[2:4]) * pupil_contrast(across)
 
 
 def _shares(passed: Transfer, wanted: Transfer) -> Floats:
@@ -304,10 +283,14 @@ class Footprint:
 
 
 def fold(box: tuple[float, float], parts: tuple[int, int], held: int, blurs: Moments) -> Footprint:
-    """Fold boxes and held positions with all blurs together.
+    """Fold a box, held positions and the blurs of all bands into few kernels that the bands share.
 
-    ``box``: Widths of slit and pixel, 0 for none. [px]
-    Returns as few kernels as change no wave by more than `kernel_fit.NEGLIGIBLE` of its amplitude.
+    ``box``: widths of slit and pixel, across and along, 0 for none [px]. ``held``: positions 1 px apart along the scan.
+    Returns the fewest kernels that change no wave of any band by more than `NEGLIGIBLE` of its amplitude, or the best
+    that were tried; no share is below 0, and they sum to 1.
     """
-    kernels, shares, between = fit_kernels(blurs, box, held)
+    waves = blurs.waves if blurs.waves is not None and blurs.waves.any() else np.zeros_like(blurs.shift)
+    told, band = np.unique(np.concatenate([blurs.shift, blurs.variance, waves]), axis=1, return_inverse=True)
+    kernels, shares, between = _fit(told.tobytes(), told.shape[1], box, held)
+    between = between[:, band.ravel()]
     return Footprint(box, parts, held, kernels.shift, kernels.variance, shares, between, kernels.level)

@@ -85,8 +85,7 @@ def spread_of_waves(normal: Floats | None = None) -> Floats:
     ``normal``: (..., 3) mirror normals in the camera frame; None is the mirror at rest. Returns (..., 2).
     """
     n = REST_NORMAL if normal is None else np.asarray(normal, np.float64)
-    spread: Floats = 1 + (n[..., 1::-1] / n[..., 2:]) ** 2
-    return spread
+    return 1 + (n[..., 1::-1] / n[..., 2:]) ** 2
 
 
 def spread_of_rays(normal: Floats | None = None) -> Floats:
@@ -95,8 +94,7 @@ def spread_of_rays(normal: Floats | None = None) -> Floats:
     The covariance -n_x n_y is left out: it is 0 at rest.
     """
     n = REST_NORMAL if normal is None else np.asarray(normal, np.float64)
-    spread: Floats = 1 - n[..., 1::-1] ** 2
-    return spread
+    return 1 - n[..., 1::-1] ** 2
 
 
 def pupil_contrast(u: Floats) -> Floats:
@@ -107,8 +105,7 @@ def pupil_contrast(u: Floats) -> Floats:
     change u by 1 %, evenly to both sides, and no contrast by more than 1e-5.
     """
     inside = np.minimum(np.abs(u), 1.0)
-    contrast: Floats = 2 / np.pi * (np.arccos(inside) - inside * np.sqrt(1 - inside * inside))
-    return contrast
+    return np.asarray(2 / np.pi * (np.arccos(inside) - inside * np.sqrt(1 - inside * inside)))
 
 
 def normals_met(sweeps: Iterable[Sweep], camera: LineCamera) -> Floats:
@@ -127,5 +124,4 @@ def middle_normal(sweep: Sweep, camera: LineCamera) -> Floats:
     """Give the mirror's normal in the middle of a sweep, (3,): one kernel for all its lines, whatever the block."""
     middle = sweep.start_px + (sweep.lines * sweep.step - 1) / 2
     tangents = np.array([sweep.strip_px, middle]) * camera.ifov_rad
-    normal: Floats = direction_to_normal(scene_to_direction(tangents))
-    return normal
+    return direction_to_normal(scene_to_direction(tangents))

@@ -252,8 +252,7 @@ def box_weight(distance: Floats, width: float, held: int = 1) -> Floats:
             total += (_integral(beside + width / 2) - _integral(beside - width / 2)) / width
         else:
             total += np.maximum(1 - np.abs(beside), 0.0)
-    weight: Floats = np.maximum(total / held, 0.0)  # differences of integrals round
-    return weight
+    return np.maximum(total / held, 0.0)  # differences of integrals round
 
 
 def blurred_weight(width: float, variance: Floats, held: int = 1, per_px: int = PER_PX) -> tuple[Floats, Floats]:
@@ -317,8 +316,7 @@ class TapTable:
         number = np.clip(np.rint((scale - self.least_scale) * (1 / SCALE_STEP)), 0, self.scales - 1).astype(np.intp)
         number += np.arange(len(scale))[:, None] * self.scales
         number *= self.rows
-        rows: NDArray[np.intp] = number[:, None]
-        return rows
+        return np.asarray(number[:, None])
 
     def read(self, off: Weights, scale_row: NDArray[np.intp]) -> Weights:
         """Give the weights (tap, kernel, part, n) of positions (kernel, part, n) ``off`` px beside their pixel."""
@@ -359,5 +357,4 @@ def _reach(distance: Floats, weight: Floats, tail: float) -> float:
 def _integral(t: Floats) -> Floats:
     """Integral of the kernel of linear interpolation from 0 to t."""
     a = np.minimum(np.abs(t), 1.0)
-    integral: Floats = np.sign(t) * a * (1 - a / 2)
-    return integral
+    return np.sign(t) * a * (1 - a / 2)

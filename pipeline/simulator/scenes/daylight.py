@@ -1,13 +1,11 @@
 """Daylight through a survey: where the sun stands, and how much light falls on level ground in each band.
 
-The sun's place is from the algorithm of Reda and Andreas [1]_, the light from Bird and Riordan's SPECTRL2 [2]_, both by
+The sun's place is from the algorithm of Reda and Andreas [1], the light from Bird and Riordan's SPECTRL2 [2], both by
 package ``pvlib``, under a clear sky at sea level. Times are seconds since the survey's start.
 
-References
-----------
-.. [1] Reda and Andreas, "Solar position algorithm for solar radiation applications", Solar Energy 76, 2004.
+[1] Reda and Andreas, "Solar position algorithm for solar radiation applications", Solar Energy 76, 2004.
    doi:10.1016/j.solener.2003.12.003
-.. [2] Bird and Riordan, "Simple solar spectral model for direct and diffuse irradiance on horizontal and tilted
+[2] Bird and Riordan, "Simple solar spectral model for direct and diffuse irradiance on horizontal and tilted
    planes at the earth's surface for cloudless atmospheres", TR-215-2436, 1984. doi:10.2172/5986936
 """
 
@@ -47,8 +45,7 @@ def relative_daylight(sky: Sky, wavelength_nm: Floats, seconds: Floats) -> Float
     start, place = _started(sky), (sky.latitude_deg, sky.longitude_deg)
     first = _irradiance(*place, np.array([start]), wavelength_nm)
     faintest = _at_bands(_light_of(np.array([FAINTEST_DEG]), np.array([start])), wavelength_nm)
-    ratio: Floats = _irradiance(*place, start + np.asarray(seconds), wavelength_nm) / np.maximum(first, faintest)
-    return ratio
+    return _irradiance(*place, start + np.asarray(seconds), wavelength_nm) / np.maximum(first, faintest)
 
 
 def knots_within(sky: Sky, seconds: float) -> Floats:
@@ -92,8 +89,7 @@ def _elevation_deg(latitude: float, longitude: float, moments: Floats) -> Floats
 
     at_ground = {"elev": 0.0, "pressure": 1013.25, "temp": 12.0, "delta_t": 69.0, "atmos_refract": 0.5667}
     found = solar_position(np.asarray(moments, np.float64), latitude, longitude, **at_ground)
-    elevation: Floats = 90.0 - np.asarray(found[0], np.float64)  # of the zenith angle with refraction
-    return elevation
+    return 90.0 - np.asarray(found[0], np.float64)  # of the zenith angle with refraction
 
 
 def clear_sky(zenith_deg: Floats | float, airmass: Floats | float, day: Floats | float) -> tuple[Floats, Floats]:
@@ -127,8 +123,7 @@ def _at_bands(light: Floats, wavelength_nm: Floats) -> Floats:
     high = np.clip(np.searchsorted(model, wavelength_nm), 1, len(model) - 1)
     low = high - 1
     share = np.clip((wavelength_nm - model[low]) / (model[high] - model[low]), 0.0, 1.0)
-    at_bands: Floats = light[:, low] + share * (light[:, high] - light[:, low])
-    return at_bands
+    return light[:, low] + share * (light[:, high] - light[:, low])
 
 
 @lru_cache(maxsize=1)

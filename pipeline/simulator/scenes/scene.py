@@ -200,8 +200,7 @@ class RasterScene:
 
     def spectra(self) -> NDArray[np.float32]:
         """Scene value per unit of component, shaped as ``electrons``."""
-        spectra: NDArray[np.float32] = self.electrons * (self.panel / self.panel_electrons).astype(np.float32)
-        return spectra
+        return self.electrons * (self.panel / self.panel_electrons).astype(np.float32)
 
     def values(self) -> NDArray[np.float32]:
         """(y, x, band) float32 scene values: what a perfect survey returns. The whole cube, in memory."""
@@ -210,5 +209,4 @@ class RasterScene:
 
 def to_bands(components: NDArray[np.float32], spectra: NDArray[np.float32]) -> NDArray[np.float32]:
     """Multiply (..., component) by (component, band), or by the diagonal (band,); gives (..., band) float32."""
-    mixed: NDArray[np.float32] = components * spectra if spectra.ndim == 1 else components @ spectra
-    return mixed
+    return components * spectra if spectra.ndim == 1 else components @ spectra

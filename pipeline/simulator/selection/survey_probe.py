@@ -144,8 +144,7 @@ def _changes(scene: Scene, rig: Rig, views: SampleViews, footprint: Footprint, f
     """Greatest change of each stored number by another footprint, over the unit, (number,): measured, with its sign."""
     change = light_seen(scene, rig.camera, views, footprint, _PHASES) - finest
     change = np.abs(_stored(np.where(np.abs(change) > _ROUNDING * np.abs(finest), change, np.float32(0)), views))
-    greatest: Floats = (change / scale).max(axis=(0, 2)).astype(np.float64)
-    return greatest
+    return np.asarray((change / scale).max(axis=(0, 2)).astype(np.float64))
 
 
 def _footprint(variant: str, rig: Rig, parts: tuple[int, int], moments: Moments | None, scene: Scene) -> Footprint:
@@ -247,5 +246,4 @@ def _above(difference: Light, high: Light) -> Light:
 
 
 def _greatest(values: NDArray[np.floating]) -> Floats:
-    greatest: Floats = values.max(axis=0).astype(np.float64)
-    return greatest
+    return np.asarray(values.max(axis=0).astype(np.float64))

@@ -207,8 +207,7 @@ def misplaced_electrons(light: NDArray[np.floating], contrast: NDArray[np.floati
 
     ``contrast`` is that of `contrast_about`, stored as the light is, ``share`` that of `misplaced_share`.
     """
-    bound: Floats = share * contrast.astype(np.float64) + ROUNDING * float(np.abs(light).max(initial=0.0))
-    return bound
+    return share * contrast.astype(np.float64) + ROUNDING * float(np.abs(light).max(initial=0.0))
 
 
 def misplaced_share(exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> float:
@@ -244,8 +243,7 @@ def contrast_about(block: SweepBlock, render: Render) -> Floats:
     seen = np.concatenate(looks)
     ends_e = seen.max(axis=0), -seen.min(axis=0)
     most, least = (maximum_filter1d(one, 2 * REACH_PX + 1, axis=0, mode="nearest") for one in ends_e)
-    contrast: Floats = (most + least).astype(np.float64)[None]
-    return contrast
+    return np.asarray((most + least).astype(np.float64)[None])
 
 
 def _beside(sweep: Sweep, along_px: float, scan_px: float) -> Sweep:

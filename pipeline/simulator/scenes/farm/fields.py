@@ -298,11 +298,9 @@ def plant_weeds(work: Painting) -> None:
 
 
 def field_weeds(rng: np.random.Generator, field: FieldPlan, day: int) -> dict[str, Points]:
-    """Weeds of one field on a day: y, x and radius (n, 3) by spectrum. Poisson in number, clustered as by Thomas [1]_.
+    """Weeds of one field on a day: y, x and radius (n, 3) by spectrum. Poisson in number, clustered as by Thomas [1].
 
-    References
-    ----------
-    .. [1] Thomas, "A generalization of Poisson's binomial limit for use in ecology", Biometrika 36, 1949.
+    [1] Thomas, "A generalization of Poisson's binomial limit for use in ecology", Biometrika 36, 1949.
     """
     corners = field.parcel.corners
     area = polygon_area(corners)

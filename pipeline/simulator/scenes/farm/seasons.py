@@ -1,13 +1,11 @@
 """The farm's year: what stands on a field on a day, how crops, weeds and trees grow, water in the soil, and the sun.
 
-The year is a circle of 366 days. Ground cover follows the curve of AquaCrop [1]_: exponential growth to half of its
+The year is a circle of 366 days. Ground cover follows the curve of AquaCrop [1]: exponential growth to half of its
 end, then exponential approach. Its numbers, the calendars (a farm at 52 degrees north) and all other laws here are this
 project's. A stand's spectrum is a mixture of those of neighbouring stages, straight in days. North is up in the scene
 (towards smaller y), east to the right; hours are true solar time: the sun is in the south at 12.
 
-References
-----------
-.. [1] Steduto et al., "AquaCrop: The FAO crop model to simulate yield response to water: I. Concepts and underlying
+[1] Steduto et al., "AquaCrop: The FAO crop model to simulate yield response to water: I. Concepts and underlying
    principles", Agronomy Journal 101, 2009. doi:10.2134/agronj2008.0139s
 """
 
@@ -97,15 +95,13 @@ class Sun:
 
 
 def sun_over_farm(day: int, hour: float) -> Sun:
-    """Give the sun's place: declination by Spencer's series [1]_, hour angle 15 degrees an hour.
+    """Give the sun's place: declination by Spencer's series [1], hour angle 15 degrees an hour.
 
     Right to 0.7 degrees in the years about 2025; refraction is left out.
 
     Raises SceneError: the day is not 1 to 366, or the sun is lower than 5 degrees at the hour.
 
-    References
-    ----------
-    .. [1] Spencer, "Fourier series representation of the position of the sun", Search 2 (5), 1971.
+    [1] Spencer, "Fourier series representation of the position of the sun", Search 2 (5), 1971.
     """
     if not 1 <= day <= YEAR_DAYS:
         raise SceneError(f"the farm's day is 1 to {YEAR_DAYS}, counted from 1 January, got {day}")

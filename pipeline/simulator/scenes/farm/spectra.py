@@ -1,18 +1,16 @@
 """Spectra of the built-in farm: what its materials reflect, and how many electrons that gives in each band.
 
-Plant stands come from PROSPECT-D and 4SAIL [1]_ [2]_ (package ``prosail``), seen from above; soil from the dry and the
-wet spectrum of that package, mixed by moisture [3]_; sun and sky from Bird and Riordan's SPECTRL2 [4]_ (package
+Plant stands come from PROSPECT-D and 4SAIL [1] [2] (package ``prosail``), seen from above; soil from the dry and the
+wet spectrum of that package, mixed by moisture [3]; sun and sky from Bird and Riordan's SPECTRL2 [4] (package
 ``pvlib``). What those do not give follows laws of this project, written at each function; so do the stages' parameters
 and the camera's quantum efficiency (assumed). Everything is held at 1 nm and seen through Gaussian bands.
 
-References
-----------
-.. [1] Feret et al., "PROSPECT-D: Towards modeling leaf optical properties through a complete lifecycle", Remote
+[1] Feret et al., "PROSPECT-D: Towards modeling leaf optical properties through a complete lifecycle", Remote
    Sensing of Environment 193, 2017. doi:10.1016/j.rse.2017.03.004
-.. [2] Verhoef, "Light scattering by leaf layers with application to canopy reflectance modeling: the SAIL model",
+[2] Verhoef, "Light scattering by leaf layers with application to canopy reflectance modeling: the SAIL model",
    Remote Sensing of Environment 16, 1984. doi:10.1016/0034-4257(84)90057-9
-.. [3] Lobell and Asner, "Moisture effects on soil reflectance", Soil Science Society of America Journal 66, 2002.
-.. [4] Bird and Riordan, "Simple solar spectral model for direct and diffuse irradiance on horizontal and tilted
+[3] Lobell and Asner, "Moisture effects on soil reflectance", Soil Science Society of America Journal 66, 2002.
+[4] Bird and Riordan, "Simple solar spectral model for direct and diffuse irradiance on horizontal and tilted
    planes at the earth's surface for cloudless atmospheres", TR-215-2436, 1984. doi:10.2172/5986936
 """
 
@@ -137,7 +135,10 @@ def spectral_library(bands: int, materials: tuple[str, ...] = MATERIALS) -> Spec
     """
     wavelength, fwhm = band_centres(bands)
     known = _known_spectra()
-    response = band_response(wavelength, fwhm) * (_photons() * _quantum_efficiency())
+    # Photons under a clear sky on 21 June at sea level; a silicon sensor behind a grating (assumed).
+    nm, sky = clear_sky(_SUN_ZENITH_DEG, 1 / np.cos(np.deg2rad(_SUN_ZENITH_DEG)), 172)
+    efficiency = np.interp(GRID_NM, np.arange(400.0, 1101.0, 100.0), [0.34, 0.66, 0.72, 0.62, 0.47, 0.26, 0.09, 0.01])
+    response = band_response(wavelength, fwhm) * (np.interp(GRID_NM, nm, sky[:, 0]) * GRID_NM * efficiency)
     light = response.sum(axis=1)
     reflectance = np.stack([known[name] for name in materials]) @ response.T / light
     parts = (wavelength, fwhm, reflectance, light / light.max())
@@ -164,20 +165,9 @@ def band_response(wavelength_nm: Spectrum, fwhm_nm: Spectrum) -> NDArray[np.floa
     return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
-def _photons() -> Spectrum:
-    """Relative global photon flux on level ground: SPECTRL2 under a clear sky on 21 June at sea level."""
-    wavelength, light = clear_sky(_SUN_ZENITH_DEG, 1 / np.cos(np.deg2rad(_SUN_ZENITH_DEG)), 172)
-    return np.asarray(np.interp(GRID_NM, wavelength, light[:, 0]) * GRID_NM)
-
-
-def _quantum_efficiency() -> Spectrum:
-    """Silicon sensor behind a grating, assumed: straight lines between values every 100 nm."""
-    return np.interp(GRID_NM, np.arange(400.0, 1101.0, 100.0), [0.34, 0.66, 0.72, 0.62, 0.47, 0.26, 0.09, 0.01])
-
-
 @lru_cache(maxsize=1)
 def _known_spectra() -> dict[str, Spectrum]:
-    """Reflectance of each of ``MATERIALS`` on the 1 nm grid from 400 to 1030 nm."""
+    """Reflectance of each of ``MATERIALS`` on the 1 nm grid from 400 to 1030 nm; what no model gives is a law here."""
     from prosail import run_prosail, spectral_lib  # numba: a second to import
 
     def stand(one: Canopy) -> Spectrum:
@@ -188,64 +178,26 @@ def _known_spectra() -> dict[str, Spectrum]:
         )
         return np.asarray(seen[: len(GRID_NM)], dtype=np.float64)
 
-    size, iron = len(GRID_NM), _iron_oxide()
-    dry, wet = iron * spectral_lib.soil.rsoil1[:size], iron * spectral_lib.soil.rsoil2[:size]
     known = {name: stand(canopy) for name, canopy in (OTHERS | STAGES).items()}
-    for name, other in _TWINS.items():  # varieties differ by their leaves' green, of which ripe wheat has little left
-        known[name] = known[other] * (1 + (RIPE_CONTRAST if name.endswith("ripe") else 1.0) * (_twin_factor() - 1))
-    straw = _straw()
-    known |= {"soil_dry": dry, "soil_wet": 0.35 * dry + 0.65 * wet, "gravel": _gravel(), "water": _water()}
-    known |= {"straw": straw, "straw_grey": _weathered(straw), "twigs": _twigs()}
-    return known | {"blossom": _blossom(known["weed_leafy"]), "shade": _shade()}
-
-
-def _twin_factor() -> Spectrum:
-    """Second wheat over the first: 1 + 0.10 cos^2 within 25 nm of 715 nm, else 1 (law of this project).
-
-    As if the red edge lay about 3 nm further to the blue: a variety of the same stature with a little less
-    chlorophyll, and nothing else to tell it by.
-    """
+    # Second wheat over the first: 1 + 0.10 cos^2 within 25 nm of 715 nm, else 1, as if the red edge lay 3 nm further to
+    # the blue. Ripe wheat has little of the green left by which varieties differ.
     phase = np.clip((GRID_NM - TWIN_CENTRE_NM) / TWIN_HALF_WIDTH_NM, -1, 1) * (np.pi / 2)
-    return np.asarray(1 + TWIN_CONTRAST * np.cos(phase) ** 2)
-
-
-def _iron_oxide() -> Spectrum:
-    """Grey soil to brown loam: a factor of 0.5 in the violet, 1 beyond 700 nm (law of this project)."""
-    return np.asarray(1 - 0.5 / (1 + np.exp((GRID_NM - 545) / 40)))
-
-
-def _gravel() -> Spectrum:
-    """Limestone gravel: 0.20 at 400 nm, rising towards 0.42 with a scale of 220 nm (law of this project)."""
-    return np.asarray(0.42 - 0.22 * np.exp(-(GRID_NM - 400) / 220))
-
-
-def _water() -> Spectrum:
-    """Ditch: sky on the surface, 0.025 (500 / wavelength)^2; humps at 555 and 705 nm (law of this project)."""
+    factor = 1 + TWIN_CONTRAST * np.cos(phase) ** 2
+    for name, other in _TWINS.items():
+        known[name] = known[other] * (1 + (RIPE_CONTRAST if name.endswith("ripe") else 1.0) * (factor - 1))
+    iron = 1 - 0.5 / (1 + np.exp((GRID_NM - 545) / 40))  # grey soil to brown loam: 0.5 in the violet, 1 beyond 700 nm
+    dry, wet = (iron * soil[: len(GRID_NM)] for soil in (spectral_lib.soil.rsoil1, spectral_lib.soil.rsoil2))
     hump = 0.020 * np.exp(-(((GRID_NM - 555) / 70) ** 2)) + 0.008 * np.exp(-(((GRID_NM - 705) / 18) ** 2))
-    return np.asarray(0.025 * (500 / GRID_NM) ** 2 + hump)
-
-
-def _straw() -> Spectrum:
-    """Bleached cereal straw: 0.10 at 400 nm to 0.50 by a logistic about 620 nm, 90 nm wide (law of this project)."""
-    return np.asarray(0.08 + 0.42 / (1 + np.exp(-(GRID_NM - 620) / 90)))
-
-
-def _weathered(straw: Spectrum) -> Spectrum:
-    """Straw of last year: half as bright, and its slope nearly washed out (law of this project)."""
-    return np.asarray(0.06 + 0.30 * straw + 0.10 * (GRID_NM - 400) / 600)
-
-
-def _twigs() -> Spectrum:
-    """Bark: 0.05 at 400 nm, rising straight to 0.29 at 1000 nm (law of this project)."""
-    return np.asarray(0.05 + 0.24 * (GRID_NM - 400) / 600)
-
-
-def _blossom(leaves: Spectrum) -> Spectrum:
-    """Mustard in flower: half petals that absorb below 510 nm, half the leaves beneath (law of this project)."""
-    petals = 0.05 + 0.47 / (1 + np.exp(-(GRID_NM - 512) / 9))
-    return np.asarray(0.5 * petals + 0.5 * leaves)
-
-
-def _shade() -> Spectrum:
-    """Ground lit by a little blue sky alone: 0.004 + 0.010 (450 / wavelength)^4 (law of this project)."""
-    return np.asarray(0.004 + 0.010 * (450 / GRID_NM) ** 4)
+    straw = 0.08 + 0.42 / (1 + np.exp(-(GRID_NM - 620) / 90))  # bleached cereal straw: 0.10 at 400 nm to 0.50
+    petals = 0.05 + 0.47 / (1 + np.exp(-(GRID_NM - 512) / 9))  # of mustard: they absorb below 510 nm
+    return known | {
+        "soil_dry": dry,
+        "soil_wet": 0.35 * dry + 0.65 * wet,
+        "gravel": 0.42 - 0.22 * np.exp(-(GRID_NM - 400) / 220),  # of limestone: 0.20 at 400 nm, rising towards 0.42
+        "water": 0.025 * (500 / GRID_NM) ** 2 + hump,  # a ditch: sky on the surface, humps at 555 and 705 nm
+        "straw": straw,
+        "straw_grey": 0.06 + 0.30 * straw + 0.10 * (GRID_NM - 400) / 600,  # last year's: half as bright, nearly flat
+        "twigs": 0.05 + 0.24 * (GRID_NM - 400) / 600,  # bark: 0.05 at 400 nm, rising straight to 0.29 at 1000 nm
+        "blossom": 0.5 * petals + 0.5 * known["weed_leafy"],
+        "shade": 0.004 + 0.010 * (450 / GRID_NM) ** 4,  # ground that a little blue sky alone lights
+    }
