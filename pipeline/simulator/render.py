@@ -95,21 +95,7 @@ def expected_light(scene: Scene, block: SweepBlock, chosen: Mapping[Any, str] | 
     light = _looker(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names).look(
         scene, steps, along_y=block.sweep.along == "y", exposures=exposures
     )
-    return _changed(light.reshape(len(block.lines), len(block.columns), light.shape[1]), block, choice)
-
-
-def held_positions(block: SweepBlock, choice: Choice) -> Floats:
-    """Give what the mirror holds in each exposure, aims included, (line, step, 2); each for as long as the others."""
-    position = smeared_positions(block, choice.variant("smear"))
-    for aim, variant in choice.doing("aim"):
-        shift = aim.aim(block, variant)
-        if shift.shape[1] not in (1, position.shape[1]) and block.sweep.step > 1:  # the mirror's course is not followed
-            shift = shift.mean(axis=1, keepdims=True)
-        position = shifted_position(position, shift, block.rig.camera)
-    return position
-
-
-def _changed(light: Light, block: SweepBlock, choice: Choice) -> Light:
+    light = light.reshape(len(block.lines), len(block.columns), light.shape[1])
     pending: Light | None = None
     for effect, variant in choice.effects:
         if hasattr(effect, "gain"):
@@ -126,6 +112,17 @@ def _changed(light: Light, block: SweepBlock, choice: Choice) -> Light:
     if pending is not None:
         light *= pending
     return light
+
+
+def held_positions(block: SweepBlock, choice: Choice) -> Floats:
+    """Give what the mirror holds in each exposure, aims included, (line, step, 2); each for as long as the others."""
+    position = smeared_positions(block, choice.variant("smear"))
+    for aim, variant in choice.doing("aim"):
+        shift = aim.aim(block, variant)
+        if shift.shape[1] not in (1, position.shape[1]) and block.sweep.step > 1:  # the mirror's course is not followed
+            shift = shift.mean(axis=1, keepdims=True)
+        position = shifted_position(position, shift, block.rig.camera)
+    return position
 
 
 def _views(block: SweepBlock, choice: Choice, shape: tuple[int, int]) -> Iterator[RayViews]:
@@ -213,8 +210,8 @@ class Readout:
         if not np.isfinite(expected.max(initial=0.0)):
             sample, band = np.argwhere(~np.isfinite(expected))[0]
             raise SceneError(
-                f"sweep {self.block.sweep.name}: line {number}, sample {self.block.columns[sample]}, band {band} expects"
-                f" {expected[sample, band]} electrons; give a scene and a rig of finite numbers"
+                f"sweep {self.block.sweep.name}: line {number}, sample {self.block.columns[sample]}, band {band}"
+                f" expects {expected[sample, band]} electrons; give a scene and a rig of finite numbers"
             )
         shot = self._variant(SHOT.name)
         if shot == OFF:

@@ -208,21 +208,17 @@ class Shot(Effect):
         read = rig.camera.read_noise_e
         total = float(np.hypot(np.sqrt(brightest), read))
         if variant == GAUSSIAN:
-            return self._of_gaussian(probe, rig, total)
+            worst = max(chip_variation(0.0), chip_variation(read))
+            # Of one sample: 2 TV <= sqrt(divergence), which sums with samples.
+            apart = 2 * worst / np.sqrt(CHIP_SAMPLES) * np.sqrt(probe.binning)
+            why = (
+                f"{CHIP_SAMPLES:.0e} numbers have a total variation of at most {worst:.2g} from exact ones"
+                f" (limit {MOST_VARIATION:.2g}); exact below {least_expected(read):.3g} e-, without read noise"
+                f" {least_expected(0.0):.3g} e-"
+            )
+            return Bound(in_unit(apart, total, probe, rig), why)
         why = f"{total:.3g} e- of noise at {brightest:.3g} e-, {read:.3g} e- without"
         return Bound(in_unit(told_apart(total, read), total, probe, rig), why)
-
-    def _of_gaussian(self, probe: Probe, rig: Rig, total: float) -> Bound:
-        read = rig.camera.read_noise_e
-        worst = max(chip_variation(0.0), chip_variation(read))
-        apart = 2 * worst / np.sqrt(CHIP_SAMPLES)  # of one sample: 2 TV <= sqrt(divergence), which sums with samples
-        apart *= np.sqrt(probe.binning)
-        why = (
-            f"{CHIP_SAMPLES:.0e} numbers have a total variation of at most {worst:.2g} from exact ones"
-            f" (limit {MOST_VARIATION:.2g}); exact below {least_expected(read):.3g} e-, without read noise"
-            f" {least_expected(0.0):.3g} e-"
-        )
-        return Bound(in_unit(apart, total, probe, rig), why)
 
 
 def in_unit(deviations: float, sd_e: float, probe: Probe, rig: Rig) -> float:

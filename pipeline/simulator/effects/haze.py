@@ -181,7 +181,8 @@ class PathRadiance(LightChange):
             sky, still = block.rig.sky, block.rig.air.airlight_share * np.asarray(block.white_e, np.float64)
             if sky.started is not None:
                 still = still * relative_daylight(sky, block.wavelength_nm, block.time_s)
-            light += (np.atleast_2d(still)[:, None].astype(np.float32) * lost).astype(np.float32, copy=False)
+            horizon = np.atleast_2d(still)[:, None].astype(np.float32)  # of endless air, (line or 1, 1, band)
+            light += (horizon * lost).astype(np.float32, copy=False)
         return light
 
 

@@ -198,14 +198,9 @@ def _extremes(sweeps: tuple[Sweep, ...], camera: LineCamera) -> tuple[float, flo
     """Greatest angle from the undeflected direction and least phase within the sweeps [rad]."""
     greatest, least = 0.0, np.inf
     for sweep in (sweep for sweep in sweeps if sweep.lines):
-        angle, phase = _angles(
-            sweep,
-            camera,
-            *(
-                part[np.unique(np.linspace(0, len(part) - 1, _LOOKS).round().astype(int))]
-                for part in (sweep.line_px(), camera.pixel_slopes())
-            ),
-        )
+        ends = [np.linspace(0, count - 1, _LOOKS).round().astype(int) for count in (sweep.lines, camera.samples)]
+        lines, samples = map(np.unique, ends)
+        angle, phase = _angles(sweep, camera, sweep.line_px()[lines], camera.pixel_slopes()[samples])
         steps = [np.abs(np.diff(phase, axis=axis)).max(initial=0.0) for axis in (0, 1)]
         greatest = max(greatest, float(np.abs(angle).max()))
         least = min(least, float(phase.min() - sum(steps) / 2))  # no point is further from one looked at

@@ -149,7 +149,10 @@ def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64], variant: str =
     impulse, rise = responses(time, mirror.damping)
     place = start[0] * (1 - rise) + start[1] * impulse
     rate = -start[0] * impulse + start[1] * (1 - rise - 2 * mirror.damping * impulse)
-    return _mean_over(held, mirror.damping, place, rate)
+    if held == 0:
+        return place
+    impulse, rise = responses(np.array([held]), mirror.damping)
+    return (place * (impulse + 2 * mirror.damping * rise) + rate * rise) / held
 
 
 def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
@@ -227,13 +230,6 @@ def _steps(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> tu
     count = min(max(round(wanted), 1), _RAMP)
     exposed = held * sweep.step
     return period - np.arange(count) * exposed / count, sweep.step / count, period
-
-
-def _mean_over(held: float, damping: float, place: Floats, rate: Floats) -> Floats:
-    if held == 0:
-        return place
-    impulse, rise = responses(np.array([held]), damping)
-    return (place * (impulse + 2 * damping * rise) + rate * rise) / held
 
 
 def _euler(damping: float, start: Floats, numbers: NDArray[np.int64], pace: tuple[float, float, int]) -> Floats:

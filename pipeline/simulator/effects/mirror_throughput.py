@@ -167,9 +167,8 @@ def reflectance(coating: Coating, wavelength_nm: Floats, incidence_rad: Floats) 
     if coating == "ideal":
         return np.ones((len(incidence_rad), len(wavelength_nm)))
     nm, n, k = METALS[coating].T
-    across, within = fresnel(
-        np.interp(wavelength_nm, nm, n) + 1j * np.interp(wavelength_nm, nm, k), incidence_rad[:, None]
-    )
+    index = np.interp(wavelength_nm, nm, n) + 1j * np.interp(wavelength_nm, nm, k)
+    across, within = fresnel(index, incidence_rad[:, None])
     return (across + within) / 2
 
 

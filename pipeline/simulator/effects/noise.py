@@ -31,7 +31,17 @@ def normal_deviates(rng: np.random.Generator, count: int) -> Light:
     """
     drawn = np.empty(count + count % 2, np.float32)
     for start in range(0, len(drawn), PIECE):
-        _fill(drawn[start : start + PIECE], rng.bit_generator)
+        piece = drawn[start : start + PIECE]
+        half = len(piece) // 2
+        words = rng.bit_generator.random_raw(half).view(np.uint32)
+        radius: Light = np.multiply(words[:half], np.float32(2**-32), dtype=np.float32, casting="unsafe")
+        radius += np.float32(2**-33)  # never 0
+        np.log(radius, out=radius)
+        radius *= np.float32(-2)
+        np.sqrt(radius, out=radius)
+        turn = np.multiply(words[half:].view(np.int32), np.float32(np.pi * 2**-31), dtype=np.float32, casting="unsafe")
+        np.multiply(np.cos(turn, out=piece[:half]), radius, out=piece[:half])
+        np.multiply(np.sin(turn, out=piece[half:]), radius, out=piece[half:])
     return drawn[:count]
 
 
@@ -132,19 +142,6 @@ def told_apart(sd: float, other: float) -> float:
     ratio = wide / narrow
     cross = math.sqrt(2 * math.log1p(ratio - 1) / ((ratio - 1) * (ratio + 1)))  # over the wide one's sd
     return 2 * (math.erf(cross * ratio / math.sqrt(2)) - math.erf(cross / math.sqrt(2)))
-
-
-def _fill(drawn: Light, source: np.random.BitGenerator) -> None:
-    half = len(drawn) // 2
-    words = source.random_raw(half).view(np.uint32)
-    radius: Light = np.multiply(words[:half], np.float32(2**-32), dtype=np.float32, casting="unsafe")
-    radius += np.float32(2**-33)  # never 0
-    np.log(radius, out=radius)
-    radius *= np.float32(-2)
-    np.sqrt(radius, out=radius)
-    turn = np.multiply(words[half:].view(np.int32), np.float32(np.pi * 2**-31), dtype=np.float32, casting="unsafe")
-    np.multiply(np.cos(turn, out=drawn[:half]), radius, out=drawn[:half])
-    np.multiply(np.sin(turn, out=drawn[half:]), radius, out=drawn[half:])
 
 
 def _series_quantile(mean: Floats, z: Floats) -> Floats:

@@ -117,10 +117,7 @@ class StrayLight(LightChange):
         return Bound(optics.stray_share * spread + halo, why)
 
     def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
-        """Give the light after scattering; works in place.
-
-        Raises ShapeError: samples of the line are missing.
-        """
+        """Give the light after scattering; works in place. Raises ShapeError: samples of the line are missing."""
         optics, samples = block.rig.optics, block.rig.camera.samples
         if optics.stray_share == 0:
             return light

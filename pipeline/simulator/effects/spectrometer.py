@@ -161,7 +161,13 @@ class Smile(LightChange):
         gaps = rising_gaps(wavelength)
         if not gaps.size:
             return Bound(0.0, "no two bands of rising wavelength: a shift of wavelengths shows on no single band")
-        bent = _most_bent(shift, wavelength, probe.spectral_curvature)
+        between = np.diff(wavelength)
+        up = between > 0
+        way = np.minimum(shift, between / 2)
+        beside = np.maximum(probe.spectral_curvature[:-1], probe.spectral_curvature[1:])
+        if shift > between[up].min():  # bands see gaps that are not next to them
+            beside = np.full_like(beside, probe.spectral_curvature.max())
+        bent = float((way * (between - way) * beside)[up].max()) / 2
         if variant == LINEAR:
             return Bound(bent, f"{shift:.3g} nm at a line's ends, between bands {gaps.max():.3g} nm apart by lines")
         steep = float(np.max(probe.spectral_slope, initial=0))
@@ -251,17 +257,6 @@ def _run_taps(wavelength: Floats, shift: Floats, variant: str) -> list[tuple[NDA
     ]
     size = len(wavelength) - 1 - np.arange(len(wavelength))
     return [(np.clip(off, -np.arange(len(wavelength)), size), weight) for off, weight in taps]
-
-
-def _most_bent(shift: float, wavelength: Floats, bend: Floats) -> float:
-    """Greatest distance of a cubic from its chord on the way of a shift: that way times the rest of the gap, over 2."""
-    gaps = np.diff(wavelength)
-    rising = gaps > 0
-    part = np.minimum(shift, gaps / 2)
-    beside = np.maximum(bend[:-1], bend[1:])
-    if shift > gaps[rising].min():  # bands see gaps that are not next to them
-        beside = np.full_like(beside, bend.max())
-    return float((part * (gaps - part) * beside)[rising].max()) / 2
 
 
 RESPONSE, SMILE = Response(), Smile()

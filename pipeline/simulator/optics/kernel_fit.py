@@ -63,7 +63,8 @@ def _fit(told: bytes, bands: int, box: tuple[float, float], held: int) -> tuple[
     order = np.argsort(place)
     steps = np.arange(held) - (held - 1) / 2
     smeared = np.cos(2 * np.pi * np.outer(_SCAN, steps)).mean(axis=1)
-    own, judged = np.sinc(_ALONG * box[1]) * np.sinc(_SCAN * box[0]) * smeared, _some(order, _JUDGED)
+    own = np.sinc(_ALONG * box[1]) * np.sinc(_SCAN * box[0]) * smeared  # what slit, pixel and held positions pass
+    judged = _some(order, _JUDGED)
     wanted, tried = _wanted(moments[:, judged], own), []
     for kernels in _candidates(moments, place):
         tried.append((kernels, _error(_passed(kernels, own), wanted)))
@@ -75,11 +76,8 @@ def _fit(told: bytes, bands: int, box: tuple[float, float], held: int) -> tuple[
     passed = _passed(chosen, own)
     for count in _FITTED:
         fitted = _some(order, count)
-        nodes = place[fitted]
-        shares, between = (
-            _shares(passed, _wanted(moments[:, fitted], own)),
-            np.stack([np.interp(place, nodes, one) for one in np.eye(len(nodes))]),
-        )
+        shares = _shares(passed, _wanted(moments[:, fitted], own))
+        between = np.stack([np.interp(place, place[fitted], one) for one in np.eye(len(fitted))])
         error = float(np.abs(passed @ (shares @ between[:, judged]) - wanted).max())
         if error <= enough or count >= bands:
             break

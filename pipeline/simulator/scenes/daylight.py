@@ -109,11 +109,8 @@ def _light_of(elevation_deg: Floats, moments: Floats) -> Floats:
     zenith = 90.0 - np.maximum(elevation_deg, 0.0)
     moment = np.asarray(moments * 1e6, "datetime64[us]")
     start_of_year = moment.astype("datetime64[Y]").astype("datetime64[us]")
-    light = clear_sky(
-        zenith,
-        get_relative_airmass(zenith, "kastenyoung1989"),
-        (moment - start_of_year).astype(np.float64) / (1e6 * _DAY_S) + 1,
-    )[1]
+    day = (moment - start_of_year).astype(np.float64) / (1e6 * _DAY_S) + 1  # with parts: nothing jumps at midnight
+    light = clear_sky(zenith, get_relative_airmass(zenith, "kastenyoung1989"), day)[1]
     return np.where(elevation_deg[:, None] > 0, np.maximum(light.T, 0.0), 0.0)
 
 

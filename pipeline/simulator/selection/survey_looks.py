@@ -174,9 +174,8 @@ def _worths(light: Light, rig: _Optics, turned: tuple[bool, ...]) -> Iterator[Li
             yield rig.summed(np.abs(ahead - behind), line)[inner] / noise
             yield rig.summed(np.abs(ahead + behind - 2 * seen), line)[inner] / noise
         rise: Light = np.roll(seen, -1, 0) - np.roll(seen, 1, 0)
-        yield np.divide(
-            rig.summed(np.abs(np.roll(rise, -1, 1) - np.roll(rise, 1, 1)), line)[inner], noise
-        )  # what a box that does not lie turned misses
+        mixed = np.abs(np.roll(rise, -1, 1) - np.roll(rise, 1, 1))  # what a box that does not lie turned misses
+        yield np.divide(rig.summed(mixed, line)[inner], noise)
 
 
 def _short_kernel(width_px: float) -> NDArray[np.float32]:

@@ -148,18 +148,16 @@ def verify(decision: Decision, render: Render, blocks: Mapping[str, SweepBlock],
     for name, inexact in trials:
         instead = {one.name: one.option.variant for one in inexact}
         variants = {effect: instead.get(effect.name, variant) for effect, variant in decision.exact.items()}
-        bound, chosen = (
-            math.fsum(one.option.error for one in inexact),
-            {effect: variant for effect, variant in variants.items() if variant != OFF},
-        )
+        bound = math.fsum(one.option.error for one in inexact)
+        chosen = {effect: variant for effect, variant in variants.items() if variant != OFF}
         share = misplaced_share(decision.exact, chosen)
         found = [_greatest_change(one, render(one.block, chosen), bound, share) for one in full] if inexact else []
         worst = max(found, key=lambda one: one.unexplained, default=_Change(0.0))
         if not worst.unexplained <= bound:
             raise BoundError(
-                f"{name}: what was left out changes light by {worst.change:.3g} {UNIT_WORDS[decision.unit]} at {worst.place},"
-                f" above its bound of {bound:.3g}; the probe missed how bright or steep the scene is there: simulate with"
-                " --tol 0 or --effects all, and please report it with the rig's settings"
+                f"{name}: what was left out changes light by {worst.change:.3g} {UNIT_WORDS[decision.unit]} at"
+                f" {worst.place}, above its bound of {bound:.3g}; the probe missed how bright or steep the scene is"
+                " there: simulate with --tol 0 or --effects all, and please report it with the rig's settings"
             )
         measured[name] = max((one.greatest for one in found), default=0.0)
     return measured

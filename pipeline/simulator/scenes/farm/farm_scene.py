@@ -43,7 +43,6 @@ from pipeline.simulator.scenes.farm.farm_plan import (
 from pipeline.simulator.scenes.farm.fields import paint_fields, plant_weeds
 from pipeline.simulator.scenes.farm.land import (
     Band,
-    Border,
     Points,
     band_pixels,
     disc_pixels,
@@ -150,7 +149,14 @@ def paint_borders(work: Painting) -> None:
             if its_kind == kind:
                 rng = stream(work.plan.seed, f"border {number}")
                 canvas, plan = work.canvas, work.plan
-                band = _wobbled(rng, band_pixels(border, 12.0, canvas.shape), 0.8 if kind == "road" else 1.6)
+                band = band_pixels(border, 12.0, canvas.shape)
+                phases = rng.uniform(0, 2 * np.pi, 2)
+                bend = np.sin(band.along / 37 + phases[0]) + np.sin(band.along / 61 + phases[1])
+                band = Band(
+                    band.index,
+                    band.across + np.float32((0.8 if kind == "road" else 1.6) / 2) * bend.astype(np.float32),
+                    band.along,
+                )
                 here = work.ground.at(band.index)
                 half, bank = rng.uniform(*WIDTHS[kind]), rng.uniform(*BANKS[kind])
                 dryness, strip, inner = rng.uniform(0.25, 0.55), rng.uniform() < 0.5, rng.uniform(0.8, 1.2)
@@ -162,13 +168,6 @@ def paint_borders(work: Painting) -> None:
                     _cover(canvas, band, half, hard_track(here, 0.75), "track")
                     if strip:
                         _cover(canvas, band, inner, grass(here, 0.5), "grass")
-
-
-def _wobbled(rng: np.random.Generator, band: Band, size: float) -> Band:
-    """Bend a line a little: two sines of random phase, 37 and 61 px per radian."""
-    phases = rng.uniform(0, 2 * np.pi, 2)
-    bend = np.sin(band.along / 37 + phases[0]) + np.sin(band.along / 61 + phases[1])
-    return Band(band.index, band.across + np.float32(size / 2) * bend.astype(np.float32), band.along)
 
 
 def _cover(canvas: Canvas, band: Band, half: float, mixture: Mixture, label: str) -> None:
@@ -199,7 +198,15 @@ def dig_ponds(work: Painting) -> None:
 def crowns_of(work: Painting) -> Points:
     """Crowns of hedges and of trees beside the lines: y, x and radius, (n, 3)."""
     plan = work.plan
-    crowns = [_standing_trees(stream(plan.seed, "trees"), [border for border, _ in plan.borders])]
+    rng = stream(plan.seed, "trees")
+    trees = [np.zeros((0, 3))]
+    for border in [border for border, _ in plan.borders]:
+        count = rng.poisson(border.length / 320)
+        step = (border.end - border.start) / max(border.length, 1e-9)
+        aside = rng.choice([-1.0, 1.0], (count, 1)) * rng.uniform(7, 14, (count, 1)) * np.array([-step[1], step[0]])
+        places = border.start + rng.uniform(0, border.length, (count, 1)) * step + aside
+        trees.append(np.column_stack([places, rng.uniform(5, 12, count)]))
+    crowns = [np.concatenate(trees)]
     for number, (border, kind) in enumerate(plan.borders):
         if kind == "hedge":
             rng = stream(plan.seed, f"hedge {number}")
@@ -209,18 +216,6 @@ def crowns_of(work: Painting) -> Points:
             centres = border.start + along[:, None] * step + rng.normal(0, 1.0, (along.size, 2))
             crowns.append(np.column_stack([centres, rng.uniform(4, 7, along.size)]))
     return np.concatenate(crowns)
-
-
-def _standing_trees(rng: np.random.Generator, borders: list[Border]) -> Points:
-    """Single trees beside the lines, one in 320 px: y, x and radius, (n, 3)."""
-    trees = [np.zeros((0, 3))]
-    for border in borders:
-        count = rng.poisson(border.length / 320)
-        step = (border.end - border.start) / max(border.length, 1e-9)
-        aside = rng.choice([-1.0, 1.0], (count, 1)) * rng.uniform(7, 14, (count, 1)) * np.array([-step[1], step[0]])
-        places = border.start + rng.uniform(0, border.length, (count, 1)) * step + aside
-        trees.append(np.column_stack([places, rng.uniform(5, 12, count)]))
-    return np.concatenate(trees)
 
 
 def plant_trees(work: Painting) -> None:

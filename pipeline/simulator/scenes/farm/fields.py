@@ -316,11 +316,8 @@ def field_weeds(rng: np.random.Generator, field: FieldPlan, day: int) -> dict[st
     turned = np.full(count + single, days_since_turned(field.use, day, field.late_days))
     age = (day - emergence) % YEAR_DAYS
     land = field.land_on(day)
-    size = (
-        radius
-        * weed_size(day, emergence, turned)
-        * np.where((age > land.days) & (land.phase in ("grass", "stubble")), 0.5, 1.0)
-    )
+    cut = np.where((age > land.days) & (land.phase in ("grass", "stubble")), 0.5, 1.0)  # saw mowing or harvest
+    size = radius * weed_size(day, emergence, turned) * cut
     flowers = (kinds == "mustard") & (age >= FLOWERING[0]) & (age < FLOWERING[1])
     spectra = np.where(flowers, "blossom", np.where(kinds == "mustard", "weed_leafy", kinds))
     seen = size > SEEN_PX
