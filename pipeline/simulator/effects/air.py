@@ -26,10 +26,9 @@ GUST_M = 3.0  # length of the waves that run over a canopy; assumed
 class Turbulence(Aim):
     """Jitter of the lines, normal and equal in both directions: warm air bends the light, anew for every line.
 
-    [1] Andrews and Phillips, "Laser Beam Propagation through Random Media", 2nd edition, SPIE Press, 2005, chapters
-       6 (angle of arrival) and 8 (scintillation).
-    [2] Fried, "Optical resolution through a randomly inhomogeneous medium for very long and very short exposures",
-       Journal of the Optical Society of America 56, 1966. doi:10.1364/JOSA.56.001372
+    [1] Andrews and Phillips, "Laser Beam Propagation through Random Media", 2nd edition, SPIE Press, 2005, chapters 6,
+        8.
+    [2] Fried, Journal of the Optical Society of America 56, 1966. doi:10.1364/JOSA.56.001372
     """
 
     name = "turbulence"
@@ -41,10 +40,7 @@ class Turbulence(Aim):
         return sigma * np.array(draws, np.float64).reshape(-1, 1, 2)
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound the error of leaving the lines where they are, for all lines at once but in one survey of 1000.
-
-        The way of a line is Rayleigh's: it exceeds m sigma with the probability exp(-m^2 / 2), so that no line of N
-        exceeds sqrt(2 ln(N / risk)) sigma but with the risk; 5.3 for 1000 lines.
+        """Bound for all lines at once but in one survey of 1000: no line of N exceeds sqrt(2 ln(N / risk)) sigma else.
         """
         sigma = turbulence_px(rig)
         if not sigma:
@@ -62,15 +58,13 @@ class Turbulence(Aim):
 
 
 def turbulence_px(rig: Rig) -> float:
-    """Give the standard deviation of the angle of arrival per axis, sqrt(1.09 Cn2 d D^(-1/3)), from the farthest part.
+    """Give the deviation of the angle of arrival per axis, sqrt(1.09 Cn2 d D^(-1/3)), from the farthest part. [px]
 
-    A point of the scene sends spherical waves: air near the point tilts them less than air near the aperture, by
-    (z / d)^(5/3) a length of way, so that 3/8 of a plane wave's 2.91 are left [1]. D is the aperture as seen at rest,
-    10.6 mm of 15. Valid for Kolmogorov's spectrum with the same Cn2 all along the way (level, over even ground); for D
-    between its inner scale (some mm) and its outer one (some 0.1 m and more); where the first Fresnel zone,
-    sqrt(lambda d), is not much wider than D; and for weak turbulence, a `rytov_variance` up to 1: the bound says where
-    it is more. A scene without a distance has none. No way through the air is longer than `FARTHEST_M`, however far the
-    scene is. [px]
+    Spherical waves: air near the point tilts them less than air near the aperture, by (z / d)^(5/3) a length of way, so
+    that 3/8 of a plane wave's 2.91 are left [1]. D is the aperture as seen at rest, 10.6 mm of 15. Valid for
+    Kolmogorov's spectrum with one Cn2 all along the way, for D between inner and outer scale, sqrt(lambda d) not much
+    wider than D, and weak turbulence, `rytov_variance` up to 1. 0 without a distance; no way is longer than
+    `FARTHEST_M`.
     """
     metres = _way_m(rig)
     aperture_m = rig.optics.aperture_mm * 1e-3 * _REST
@@ -92,11 +86,9 @@ def _way_m(rig: Rig) -> float:
 class Wind(Displacement):
     """Crop motion: the scene sways by a travelling wave along the wind, its phase and direction drawn for a survey.
 
-    All of the scene sways, bare soil too, as one that stands at mid exposure. Lines sample the sway at the frame rate:
-    where f t_frame is above one half, a fast sway shows as a slow one.
-
-    The smear within an exposure is not modelled, nor counted in the bound: up to 2 pi f t_exp of the amplitude, which
-    is 2 % of it at 1 Hz in 3 ms and 62 % in 100 ms. ``why`` tells how many px that are.
+    All of the scene sways, as one that stands at mid exposure; where f t_frame is above one half, a fast sway shows as
+    a slow one. The smear within an exposure is neither modelled nor counted: up to 2 pi f t_exp of the amplitude, 2 %
+    of it at 1 Hz in 3 ms and 62 % in 100 ms. ``why`` tells how many px that are.
     """
 
     name = "wind"
@@ -161,10 +153,10 @@ FARTHEST_M = 1e7  # infinity: nothing passes so much air
 class Parallax(Displacement):
     """Displacement of what is not at the scene's distance, for which scale and geometry are right.
 
-    The virtual pinhole lies a lever L behind the pivot on the chief ray, which itself passes through the pivot at any
-    tilt. A ray meets a surface at distance d, taken along the chief ray, L (1/d - 1/d0) times its way from the line's
-    centre beside the point of distance d0. Depth is read where the ray of d0 falls. Occlusion is left out: within
-    one displacement of a step a sample may see the other depth, wrong by no more than the bound; nothing is hidden.
+    The virtual pinhole lies a lever L behind the pivot on the chief ray. A ray meets a surface at distance d, taken
+    along the chief ray, L (1/d - 1/d0) times its way from the line's centre beside the point of distance d0, where
+    depth is read. Occlusion is left out: within a displacement of a step a sample may see the other depth, within the
+    bound.
     """
 
     name = "parallax"
@@ -191,8 +183,8 @@ class Parallax(Displacement):
 def closeness(air: Air, row: Floats) -> Floats:
     """Give 1 / distance at rows of the scene, -1 its first and 1 its last. [1/m]
 
-    ``flat`` is all at ``distance_m``. A ``step`` has its farthest part up to the middle row and its nearest from there
-    on. Along a ``plane``, seen in perspective, 1 / distance runs evenly from the farthest to the nearest.
+    A ``step`` is farthest up to the middle row and nearest from there on; along a ``plane`` it runs evenly between
+    them.
     """
     if air.distance_m is None:
         return np.zeros_like(row)

@@ -51,11 +51,10 @@ def even(variance: Floats, bands: int) -> Moments:
 class Diffraction(Blur):
     """Diffraction at the mirror, the aperture stop: an Airy pattern, stretched along the scan by the elliptic pupil.
 
-    The pattern has no variance: its rings hold 2 / (pi v) of the light beyond v = pi D theta / lambda, and what it
-    passes of a slow wave falls in proportion to the wave's frequency. The exact variant is the pupil's own transfer
-    function in every band, far tails included: `kernel_fit` finds few kernels for it. The others put a Gaussian in its
-    place, of each band or of the middle one, of the variance of what lies inside the third dark ring (94 % of the
-    light); they pass up to 0.08 more of a wave.
+    The pattern has no variance: its rings hold 2 / (pi v) of the light beyond v = pi D theta / lambda. The exact
+    variant is the pupil's own transfer function in every band, by few kernels (`kernel_fit`). The others put a Gaussian
+    in its place, of each band or of the middle one, of the variance of what lies inside the third dark ring (94 % of
+    the light); they pass up to 0.08 more of a wave.
     """
 
     name = "diffraction"
@@ -69,10 +68,9 @@ class Diffraction(Blur):
         return Moments(none, _gaussian(waves, variant))
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound the error of no blur, or of a Gaussian, over all positions of the sweeps.
+        """Bound over all positions of the sweeps: the pattern is a sum of Gaussians of many widths.
 
-        The pattern is a sum of Gaussians of many widths: each changes the image, or a Gaussian in its place, by no more
-        than the difference of their variances does.
+        Each changes the image, or a Gaussian in its place, by no more than the difference of their variances does.
         """
         share, size = airy_gaussians()
         found = [_waves(rig, probe.wavelength_nm, normal) for normal in normals_met(probe.sweeps, rig.camera)]
@@ -108,8 +106,7 @@ def airy_variance(v: float) -> float:
 def airy_gaussians() -> tuple[Floats, Floats]:
     """Give shares, none below 0, of sum 1, and widths (sd) [lambda / D] of Gaussians whose sum is an Airy pattern.
 
-    By least squares on what the pupil passes of waves, those that a slit passes counting most: within 0.004 of it up to
-    0.6 of its cut-off. For bounds; what is rendered follows the pupil itself.
+    By least squares on what the pupil passes: within 0.004 of it up to 0.6 of its cut-off. For bounds, not for light.
     """
     from scipy.optimize import nnls
 
@@ -198,9 +195,8 @@ def defocus_px(rig: Rig, distance_m: float | None, normal: Floats | None = None)
 class Keystone(Blur):
     """Shift along the line, of its own in each band: a line is imaged longer at one wavelength than at another.
 
-    At the last wavelength a sample sees the scene ``keystone_px / 2`` further along the line (towards higher sample
-    numbers) than the mirror model says, at the first as much less far; so a red image lies at lower sample numbers than
-    a blue one. It is linear from 400 to 1000 nm, whatever bands the scene has of these, and stays at its ends beyond.
+    At the last wavelength a sample sees the scene ``keystone_px / 2`` further along the line (towards higher samples)
+    than the mirror model says, at the first as much less far; linear from 400 to 1000 nm, and held beyond.
     """
 
     name = "keystone"

@@ -38,10 +38,8 @@ Mask = NDArray[np.bool_]
 class DarkCurrent(Effect):
     """Electrons that warmth sets free, as many in every element; they take part in the shot noise.
 
-    [1] Janesick, "Scientific Charge-Coupled Devices", SPIE Press, 2001: dark current of a depleted sensor goes with
-       T^1.5 exp(-Eg / 2kT), and Eg by Varshni's formula.
-    [2] Widenhorn, Blouke, Weber, Rest and Bodegom, "Temperature dependence of dark current in a CCD", Proceedings of
-       SPIE 4669, 2002. doi:10.1117/12.463446
+    [1] Janesick, "Scientific Charge-Coupled Devices", SPIE Press, 2001: T^1.5 exp(-Eg / 2kT), Eg by Varshni's formula.
+    [2] Widenhorn et al., "Temperature dependence of dark current in a CCD", SPIE 4669, 2002. doi:10.1117/12.463446
     """
 
     name = "dark-current"
@@ -66,8 +64,7 @@ def warmth(temperature_deg_c: float) -> float:
     """By how much more dark current flows than at 25 deg C, where the rig's numbers are stated.
 
     Electrons set free in silicon's depleted layer [1]: twice as many 8.4 deg C above 25, and 3.6 deg C above -80. Valid
-    from -80 to 50 deg C, which settings are held to: in warmer sensors current that diffuses from the bulk takes over,
-    which goes with the whole gap instead of half of it [2], and sensors differ in how much of it they collect.
+    from -80 to 50 deg C: in warmer sensors current that diffuses from the bulk, with the whole gap, takes over [2].
     """
     return math.exp(_log_generation(temperature_deg_c) - _log_generation(REFERENCE_DEG_C))
 
@@ -177,8 +174,8 @@ def well_reached(rig: Rig, read_noise_e: float) -> bool:
 class Shot(Effect):
     """Poisson counts. ``gaussian`` has their first three cumulants, and takes the read noise into the same draw.
 
-    Where so few electrons are expected that a patch of its numbers could be told from exact ones, it is exact.
-    Noise counts twice the total variation between the distributions of a sample with and without: see `told_apart`.
+    It is exact where so few electrons are expected that a patch could be told from exact ones. Noise counts as
+    `told_apart`.
     """
 
     name = "shot"

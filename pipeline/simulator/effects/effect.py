@@ -1,9 +1,8 @@
 """What an effect is: a name, variants from exact to cheap, a bound on the error of each, a cost, and what it does.
 
-An effect does its work at one of six places of the chain, in this order: the mirror looks elsewhere (``Aim``), rays
-meet the scene elsewhere (``Displacement``), the footprint is blurred or shifted band by band (``Blur``), light is
-multiplied (``Gain``) or changed (``LightChange``), electrons are read out (``readout.py``). All before that are linear
-in the light.
+It works at one of six places of the chain, in this order: the mirror looks elsewhere (``Aim``), rays meet the scene
+elsewhere (``Displacement``), the footprint is blurred or shifted band by band (``Blur``), light is multiplied
+(``Gain``) or changed (``LightChange``), electrons are read out. All before the readout are linear in the light.
 """
 
 from __future__ import annotations
@@ -50,8 +49,8 @@ class Merged(NamedTuple):
 class Effect(Protocol):
     """What the decision needs to know, by name. Variants go from exact to cheap; off is none of them.
 
-    One that shares its work with another's says so by ``merged(rig)``; one whose cost depends on the light gives it by
-    ``cost_at(probe, rig)``, like ``cost_ns``.
+    ``merged(rig)`` says what it shares with another's work, ``cost_at(probe, rig)`` its cost where that follows the
+    light.
     """
 
     @property
@@ -114,8 +113,7 @@ class LightChange(Effect, Protocol):
 class SweepBlock:
     """Lines ``lines`` (numbers within the sweep) and samples ``samples`` (of the camera, before binning).
 
-    A line's result never depends on which others are in the block, nor a sample's. ``started_s`` is when the sweep
-    starts, counted from the survey's start.
+    A result never depends on which other lines or samples are in the block. ``started_s`` is since the survey's start.
     """
 
     rig: Rig

@@ -51,9 +51,8 @@ KRUSE = 0.585  # of the root of 1 km [3]
 class Absorption(Gain):
     """Share of the light that gases leave over a distance, averaged over the width of a band.
 
-    Water vapour about 720, 820 and 940 nm, oxygen at 690 and 760 nm: the band model of [2] for whole atmospheres,
-    taken to paths of metres (assumed: no source for these at 6 nm).
-    ``range`` takes each sample's own distance, ``uniform`` the middle of nearest and farthest.
+    Water vapour about 720, 820 and 940 nm, oxygen at 690 and 760 nm: the band model of [2] for whole atmospheres, taken
+    to paths of metres (assumed). ``range`` takes each sample's own distance, ``uniform`` the middle.
     """
 
     name = "absorption"
@@ -117,11 +116,10 @@ def transmission(metres: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class PathRadiance(LightChange):
-    """Light L at a distance d arrives as L exp(-beta d) + H (1 - exp(-beta d)).
+    """Light L at a distance d arrives as L exp(-beta d) + H (1 - exp(-beta d)), beta of ``extinction_per_m``.
 
-    beta is ``extinction_per_m``. H, the light of endless air, is ``air.airlight_share`` of the white panel's and
-    follows the daylight where the sky has a time of day; without the panel's light none is added. ``range`` takes each
-    sample's own distance, ``uniform`` the middle of nearest and farthest. A scene without a distance has no air.
+    H, the light of endless air, is ``air.airlight_share`` of the white panel's and follows the daylight; none is added
+    where the panel's light is not known. ``range`` takes each sample's own distance, ``uniform`` the middle.
     """
 
     name = "path-radiance"
@@ -189,10 +187,9 @@ class PathRadiance(LightChange):
 def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
     """Give the extinction of aerosol and molecules near the ground, (band,) [1/m]: 0.17 /km in all at 23 km, 550 nm.
 
-    At 550 nm it is Koschmieder's for the visibility [1] and no less than the molecules'; what these do not explain is
-    aerosol, which falls by Angstrom's exponent: 1.14 [2], below 7.4 km Kruse's 0.585 V^(1/3) [3], since fog is grey.
-    A visibility above 336 km, that of air without aerosol, is taken as that. Valid from 400 to 1000 nm beside the lines
-    of gases, which are absorption's, and down to some 0.5 km; in thicker fog Kruse's exponent is known to be too large.
+    At 550 nm it is Koschmieder's for the visibility [1], no less than the molecules'; what these do not explain is
+    aerosol, which falls by Angstrom's exponent: 1.14 [2], below 7.4 km Kruse's 0.585 V^(1/3) [3]. Above 336 km no
+    aerosol is left. Valid from 400 to 1000 nm beside the lines of gases, and down to some 0.5 km of visibility.
     """
     molecules = rayleigh_per_m(np.array([VISIBLE_NM]))[0]
     aerosol = max(KOSCHMIEDER / air.visibility_km * 1e-3 - molecules, 0.0)
@@ -209,8 +206,8 @@ def rayleigh_per_m(wavelength_nm: Floats) -> Floats:
 def _contrast(probe: Probe, rig: Rig) -> Floats:
     """Greatest difference of a signal and the light of endless air, over the signal's unit, (band,).
 
-    Daylight multiplies both, and is a gain like any other for the signals above H; clouds and the angle of view change
-    the signal alone, so that H counts over their greatest factor, and the darkest signal after their least.
+    Daylight multiplies both; clouds and the angle of view change the signal alone: H counts over their greatest factor,
+    and the darkest signal after their least.
     """
     if probe.white_e is None:
         return probe.level

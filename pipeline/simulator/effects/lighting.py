@@ -29,10 +29,9 @@ _LOOKS = 65  # lines of a sweep, and samples of a line, at which angles are take
 class Drift(Gain):
     """Light at a line's mid exposure over the light at the survey's start, to which the scene is stated.
 
-    ``spectral`` is SPECTRL2 under a clear sky, band by band, by the air that the sun shines through. ``scalar`` is the
-    mean of that over the bands, ``linear`` a straight line in time by the mean's rate in the survey's first minute,
-    never below 0. A survey that starts in the night is relative to the light of a sun 1 deg high.
-    Without a time of day there is no drift. With the sun at the horizon or below the light is 0.
+    ``spectral`` is SPECTRL2 under a clear sky, ``scalar`` its mean over the bands, ``linear`` a straight line in time
+    by the mean's rate in the survey's first minute, never below 0. A survey that starts in the night is relative to the
+    light of a sun 1 deg high; with the sun at the horizon or below the light is 0. Without a time of day there is none.
     """
 
     name = "drift"
@@ -103,8 +102,7 @@ def _spoken(seconds: float) -> str:
 class Cloud(Gain):
     """Straight bands of shadow, as wide as the gaps between them, that drift over the scene at a constant speed.
 
-    Direction and place follow from the seed alone, so that all sweeps of a survey lie under the same clouds. The edge
-    is a smooth step: the light is never broken off. All bands lose the same share.
+    Direction and place follow from the seed alone: all sweeps lie under the same clouds. All bands lose the same share.
     """
 
     name = "cloud"
@@ -149,10 +147,9 @@ def shadow(way_px: Floats, size_px: float) -> Floats:
 class Brdf(Gain):
     """Reflectance over that in the undeflected direction: 1 + b a + h exp(-phase / 2 deg), never below 0.
 
-    The angle a of view runs along the scene's x axis, which lies in the sun's plane (assumed); b is
-    ``sky.brdf_per_rad``. The phase is the angle to the undeflected direction, along which the sun's rays come from
-    behind the rig (assumed); h is ``sky.hot_spot``, and at its peak the slope breaks: a cusp. All materials and bands
-    share it, and directions are those of the plan, right to the mirror's own faults of 1e-3 rad.
+    The angle a of view runs along the scene's x axis, in the sun's plane (assumed); b is ``sky.brdf_per_rad``. The
+    phase is the angle to the undeflected direction, along which the sun's rays come (assumed); h is ``sky.hot_spot``.
+    All materials and bands share it; directions are those of the plan, right to the mirror's own faults of 1e-3 rad.
     """
 
     name = "brdf"

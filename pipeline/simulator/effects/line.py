@@ -81,11 +81,11 @@ def _course(sweep: Sweep, camera: LineCamera, beside: tuple[float, float]) -> tu
 
 @dataclass(frozen=True)
 class SlitBox(Effect):
-    """The footprint of slit and pixel. Off, a sample sees what its middle ray meets.
+    """The footprint of slit and pixel, a box in closed form. Off, a sample sees what its middle ray meets.
 
-    The box is in closed form over the scene's pixels, as long as it does not lie turned among them. Variants tell into
-    how many boxes that do not, across and along, it is parted; from two across on they have its covariance. Those of a
-    stated error take, for each sweep, as few as misplace no more of the light than that anywhere in the sweep.
+    Variants tell into how many boxes that do not lie turned, across and along, it is parted; from two across on they
+    have its covariance. Those of a stated error take, for each sweep, as few as misplace no more of the light than
+    that.
     """
 
     name = "slit"
@@ -95,9 +95,8 @@ class SlitBox(Effect):
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by half as much again as the probe measured; where it has not, by the box's variance and the span.
 
-        How a variant errs depends on what the scene holds within the footprint, which no derivative of the image
-        behind it tells. It was measured beside the rig's blurs: leaving one out is bounded by itself, for any slit.
-        What is rounded in tables, and what lines turn more where the mirror looks beside its plan, add a little.
+        How a variant errs depends on what lies within the footprint, which no derivative of the image tells. What is
+        rounded in tables, and what lines turn more where the mirror looks beside its plan, add a little.
         """
         width, bands = rig.camera.slit_px, len(probe.wavelength_nm)
         why = f"{_words(variant)} in place of a footprint {width:.2g} px wide and 1 px long"

@@ -29,10 +29,9 @@ _RAMP = 64  # steps of a line that are as good as a ramp
 class Staircase(Aim):
     """Sample and hold with any number of positions per px of path. Off, each px of the path has its one position.
 
-    The memory is played at a steady rate while lines are exposed and stands still while they are read out; it is
-    timed so that in the long run lines lie where they are planned. ``exact`` gives the mean position in equal parts of
-    the exposure, chosen so that no position changes within a part wherever :data:`MOST_PARTS` are enough; ``centres``
-    gives the mean of the whole exposure. A line that holds several px of path has one part for each in either variant.
+    The memory is played at a steady rate while lines are exposed, timed so that in the long run lines lie where they
+    are planned. ``exact`` gives the mean position in equal parts of the exposure, so many that no position changes
+    within a part where :data:`MOST_PARTS` are enough; ``centres`` that of the whole exposure, or of each px of path.
     """
 
     name = "staircase"
@@ -99,15 +98,11 @@ def _moments(positions: float, sweeps: tuple[Sweep, ...], variant: str) -> tuple
 class Lag(Aim):
     """Mirror lag and overshoot: what is left of the start of a sweep, as the mean shift over each held position.
 
-    The mirror follows its commands as a second-order system. One that has long been moving at a steady rate lies a
-    steady way behind, which calibration takes away. What is left is the difference of a mirror that starts from rest to
-    that steady one: a free oscillation that dies out, exactly known at any time; x'' + 2 zeta x' + x = 0 in units of
-    1 / natural frequency.
-
-    Before a sweep the mirror has flown back along the scan by the sweep's length, has had ``settled_s`` to come to
-    rest one held position ahead of the first, and takes the first step as line 0 begins. Moves along the line, between
-    strips, are taken for no longer. Smear within a held position is left to the smear's own effect. ``euler`` takes
-    one implicit Euler step for each held position: stable at any step, right only where lines are short.
+    The mirror follows its commands as a second-order system, x'' + 2 zeta x' + x = 0 in units of 1 / natural frequency.
+    Calibration takes away the way that one in steady motion lies behind; what is left is the free oscillation between
+    it and a mirror that starts from rest. Before a sweep it has flown back by the sweep's length, has had ``settled_s``
+    to come to rest one held position ahead, and takes the first step as line 0 begins. ``euler`` takes one implicit
+    Euler step for each held position: stable at any step, right only where lines are short.
     """
 
     name = "lag"
@@ -158,10 +153,8 @@ def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64], variant: str =
 def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
     """Give the responses to a unit impulse and to a unit step, of a system with natural frequency 1 rad/s.
 
-    The matrix exponential of the free system over ``time`` is [[1 - h, g], [-g, 1 - h - 2 zeta g]] with g the first
-    and h the second. By expm1 and sinc they are right below, at and above damping 1, and at any time from 0 on.
-
-    ``time``: (...) times the natural frequency. [rad]
+    ``time`` (...) is times that frequency, from 0 on [rad]. With g the first and h the second, the matrix exponential
+    of the free system is [[1 - h, g], [-g, 1 - h - 2 zeta g]]; by expm1 and sinc right below, at and above damping 1.
     """
     impulse = _impulse(time, damping)
     with np.errstate(under="ignore"):

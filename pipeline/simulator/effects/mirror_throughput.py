@@ -30,8 +30,7 @@ _LOOKS = 65  # incidences at which the sweeps' factors are taken for the bounds
 class Vignetting(Gain):
     """Light goes with the mirror's area as the camera sees it: |n_z| over |n_z| at rest, one factor for each line.
 
-    ``held`` averages over the positions of an exposure, ``middle`` takes the one at mid exposure. A single patch sees
-    next to one factor, yet not that of rest; so it is the difference from rest that counts.
+    ``held`` averages over the positions of an exposure, ``middle`` takes the one at mid exposure.
     """
 
     name = "vignetting"
@@ -78,10 +77,9 @@ def ahead(along_px: float, scan_px: Floats, camera: LineCamera) -> Floats:
 class Polarisation(Gain):
     """Light goes with the coating's reflectance at the chief ray's incidence over that at rest, 45 deg.
 
-    By Fresnel's formulae for bare metal, see `coatings`: from 20 to 70 deg aluminium goes from +0.5 to -3.7 % (mean of
-    400 to 1000 nm; -5.4 % at 820 nm), gold in the blue from -1.8 to +18 %. Valid where the light is unpolarised and the
-    spectrograph takes both polarisations alike; sky mirrored by wet leaves is not, and gratings do not quite. One
-    factor for each line and band, at mid exposure.
+    By Fresnel for bare metal: from 20 to 70 deg aluminium goes from +0.5 to -3.7 % (mean of 400 to 1000 nm; -5.4 % at
+    820 nm), gold in the blue from -1.8 to +18 %. Valid for unpolarised light and a spectrograph that takes both
+    polarisations alike. One factor for each line and band, at mid exposure.
     """
 
     name = "polarisation"

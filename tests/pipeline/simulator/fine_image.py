@@ -16,6 +16,7 @@ from scipy.special import j1
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.probe import Probe
+from tests.pipeline.simulator.made_up_effects import even_probe
 
 Floats = NDArray[np.float64]
 Transfer = Floats | complex
@@ -105,11 +106,10 @@ def probe_of(image: Floats, wavelength_nm: Floats | None = None, lines: int = 24
     slope = [np.abs(convolved(seen, wave)).max() for wave in waves]
     curvature = [np.abs(convolved(seen, wave**2)).max() for wave in waves]
     one, no = np.ones(len(nm)), np.zeros(len(nm))
-    return Probe(
+    return even_probe(
         unit="dn",
         sweeps=(SWEEP,),
         wavelength_nm=nm,
-        fwhm_nm=None,
         level=one * np.abs(seen).max(),
         spread=one * np.abs(seen - seen.mean(axis=0)).max(),
         span=one * np.ptp(seen),

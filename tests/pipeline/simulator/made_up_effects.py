@@ -79,3 +79,13 @@ def even_probe(**values: object) -> Probe:
         seconds=10.0,
     )
     return replace(probe, **values)  # type: ignore[arg-type]
+
+
+def steep_probe(
+    slope: tuple[float, float] = (0.0, 1.0), sweeps: tuple[Sweep, ...] = (SWEEP,), span: float = 1e9, **values: object
+) -> Probe:
+    """A scene of one band, known by its slope along the line and along the scan; ``curvature`` is one pair, too."""
+    both = np.array(values.pop("curvature", (0.0, 0.0)))[:, None]
+    lines = sum(sweep.lines for sweep in sweeps)
+    known = {"sweeps": sweeps, "slope": np.array(slope)[:, None], "curvature": both, "span": np.full(1, span)}
+    return even_probe(**{**known, "darkest_e": 0.0, "unit_least_dn": 1.0, "lines": lines, "seconds": 60.0, **values})

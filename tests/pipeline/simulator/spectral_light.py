@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.probe import Probe, Unit, second_difference, steepest_difference
 from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.scenes.scene import RasterScene
+from tests.pipeline.simulator.small_scenes import made_scene
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -56,10 +56,8 @@ def small_scene(fwhm_nm: float | None = None) -> tuple[Floats, RasterScene]:
     wavelength, light = random_light(7, bands=40)
     planes = np.random.default_rng(7).uniform(0.1, 1, (90, 110, 3)).astype(np.float32)
     spectra = np.ascontiguousarray(light[0, [0, 20, 40]])
-    panel = np.ones(40, np.float32)
     widths = None if fwhm_nm is None else np.full(40, fwhm_nm)
-    made = Once.of(SceneLight(spectra, spectra.max(axis=0)))
-    return wavelength, RasterScene("small", "small", SceneRaster.of(planes), made, panel, wavelength, widths)
+    return wavelength, made_scene(planes, spectra, wavelength, fwhm_nm=widths)
 
 
 def units(light: Light, unit: Unit) -> Floats:

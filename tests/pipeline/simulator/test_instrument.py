@@ -13,14 +13,14 @@ from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.camera import LineCamera, look
 from pipeline.geometry.mirror import direction_to_scene, mirror_throughput, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, line_positions, sweep_positions
-from pipeline.lazy import Once
 from pipeline.simulator.effects.pointing import CommonOffset
 from pipeline.simulator.effects.registry import EFFECTS, USUAL, effects_on
 from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
 from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import render_lines, sweep_block
+from tests.pipeline.simulator.small_scenes import made_scene
 
 CAMERA = LineCamera()
 OPTICS = effects_on("rotation", "slit", "smear")
@@ -107,14 +107,6 @@ def test_rays_are_those_of_the_mirror() -> None:
     np.testing.assert_allclose(line, expected, rtol=1e-4)
 
 
-def test_diagonal_and_full_electrons_agree() -> None:
-    """A diagonal given as a vector gives what the matrix gives."""
-    scene = scene_of(np.random.default_rng(2).random((20, 50, 4)))
-    full = replace(scene, light=Once.of(SceneLight(np.diag(scene.electrons), scene.panel_electrons)))
-    lines = [light_of(s, SWEEP, range(10, 14)) for s in (scene, full)]
-    np.testing.assert_allclose(lines[0], lines[1], rtol=1e-5)
-
-
 def test_turned_rig_sees_the_turned_scene() -> None:
     """A line along y over a scene is the line along x over the scene with its axes swapped."""
     values = np.random.default_rng(3).random((90, 60, 2))
@@ -153,15 +145,8 @@ def grainy(kind: str) -> RasterScene:
     if kind == "planes":
         return scene_of(rng.uniform(0, 1, (60, 90, 4)))
     electrons = rng.uniform(1e3, 6e3, (3, 7)).astype(np.float32)
-    return RasterScene(
-        "grain",
-        "grain",
-        SceneRaster.of(rng.uniform(0, 1, (60, 90, 3)).astype(np.float32)),
-        Once.of(SceneLight(electrons, electrons.sum(axis=0))),
-        np.ones(7, np.float32),
-        np.linspace(400, 1000, 7),
-        np.full(7, 3.0),
-    )
+    planes = rng.uniform(0, 1, (60, 90, 3))
+    return made_scene(planes, electrons, np.linspace(400, 1000, 7), fwhm_nm=np.full(7, 3.0))
 
 
 @cache

@@ -1,23 +1,31 @@
-"""The simulated source: noise that lines own, its statistics, saturation, references."""
+"""The simulated source: lines, noise, saturation, frames that calibrate, when sweeps start, and the rig's numbers."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import fields, replace
+from datetime import UTC, datetime
 from itertools import islice
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep, line_positions
+from pipeline.geometry.scan import CostModel, Sweep, line_positions
 from pipeline.rectify.calibration.calibrate import calibrate
-from pipeline.simulator.effects.counting import SHOT
-from pipeline.simulator.effects.registry import effects_on
-from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.effects.counting import SHOT, dark_electrons, dead_elements, hot_electrons
+from pipeline.simulator.effects.registry import BY_NAME, EFFECTS, USUAL, effects_on
+from pipeline.simulator.effects.sensor import response_gain, stripe_gain
+from pipeline.simulator.rig_model import Detector, Rig, Sky
 from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.simulated import SimulatedSource
-from pipeline.source import Source
+from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.simulated import SimulatedSource, sweep_starts
+from pipeline.source import References, Source
+from tests.pipeline.simulator.small_scenes import made_scene
 
 CAMERA = LineCamera()
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-19.5, lines=40)
@@ -108,20 +116,6 @@ def test_references_give_back_scene_values(binning: int, exposure_ms: float) -> 
     assert valid.all() == (values.max() * source.scene.electrons[0] * exposure_ms / 100 < CAMERA.full_well_e)
 
 
-def test_calibration_takes_the_mirror_out() -> None:
-    """Far from rest the light falls off and the references say so; calibrated lines are scene values again."""
-    values = np.random.default_rng(4).uniform(0.2, 0.6, (1, 1, 6)) * np.ones((40, 40, 1))
-    sweep = replace(SWEEP, strip_px=2500.0, start_px=-3000.0, lines=20)
-    for effects in (QUIET, (*QUIET, "vignetting")):
-        source = source_of(values, chosen=effects_on(*effects))
-        references, position = source.references(sweep), line_positions(sweep, CAMERA)
-        assert references.by_mirror == ("vignetting" in effects)
-        out, valid = calibrate(raw_of(source, sweep), references, saturated_dn=4095, position=position)
-        assert valid.all()
-        step = source.scene.panel[0] / source.scene.panel_electrons[0] * CAMERA.electrons_per_dn
-        np.testing.assert_allclose(out, np.broadcast_to(values[0, 0], out.shape), atol=0.6 * step)
-
-
 def test_black_scene_reads_dark() -> None:
     """An all-black scene gives the dark level, zeros after calibration, and read noise alone."""
     source = source_of(np.zeros((20, 20, 2)))
@@ -149,12 +143,6 @@ def test_lines_come_one_by_one() -> None:
     assert [line.number for line in islice(source_of(np.ones((8, 8, 1))).lines(endless, 3), 2)] == [3, 4]
 
 
-def test_source_tells_its_field_and_bands() -> None:
-    """The simulated source is a source like the rig."""
-    source: Source = source_of(np.ones((8, 9, 3)))
-    assert (source.name, source.field_shape, len(source.wavelength_nm)) == ("sim", (8, 9), 3)
-
-
 def test_impossible_settings_are_refused() -> None:
     """Unknown effects and variants, and sums that overflow uint16 are named."""
     with pytest.raises(SettingsError, match=r"'fog'.*choose from.*slit"):
@@ -163,3 +151,247 @@ def test_impossible_settings_are_refused() -> None:
         source_of(np.ones((8, 8, 1)), chosen={SHOT: "rough"})
     with pytest.raises(ShapeError, match="bin at most 16"):
         next(source_of(np.ones((8, 8, 1))).lines(replace(SWEEP, binning=20)))
+
+
+COST = CostModel()
+
+
+def sweeps_of(*sizes: int, step: int = 1) -> list[Sweep]:
+    """Sweeps of so many lines each."""
+    return [Sweep(f"sweep {k}", "fine", "x", 0.0, -10.0, lines, step) for k, lines in enumerate(sizes)]
+
+
+def test_sweeps_follow_one_another() -> None:
+    """Worked by hand: set-ups of .45 s, one load of 1.6 s for 1500 positions, 100 ms a line."""
+    assert sweep_starts(sweeps_of(10, 20, 5), CAMERA, COST) == pytest.approx(
+        {"sweep 0": 2.05, "sweep 1": 3.5, "sweep 2": 5.95}
+    )
+    starts = sweep_starts(sweeps_of(1000, 1000, 5), CAMERA, COST)  # the second begins in the first load
+    assert starts == pytest.approx({"sweep 0": 2.05, "sweep 1": 102.5, "sweep 2": 204.55})
+
+
+def test_fine_sweeps_come_after_the_coarse_ones() -> None:
+    """What was spent before is added to every start."""
+    first, later = (sweep_starts(sweeps_of(10, 20), CAMERA, COST, after_s=seconds) for seconds in (0.0, 60.0))
+    assert {name: start + 60 for name, start in first.items()} == later
+
+
+def test_no_sweeps_have_no_starts() -> None:
+    """A plan without sweeps is empty, and one without lines takes a set-up."""
+    assert sweep_starts([], CAMERA, COST) == {}
+    assert sweep_starts(sweeps_of(0), CAMERA, COST) == pytest.approx({"sweep 0": 0.45})
+
+
+@given(st.lists(st.integers(0, 2000), max_size=12), st.integers(1, 4))
+def test_sweeps_end_before_the_next_and_within_the_price(sizes: list[int], step: int) -> None:
+    """No sweep starts before the one before has ended, and the last ends within the plan's seconds."""
+    sweeps = sweeps_of(*sizes, step=step)
+    starts = [*sweep_starts(sweeps, CAMERA, COST).values(), COST.seconds(sweeps, CAMERA) + 1e-9]
+    for sweep, start, following in zip(sweeps, starts, starts[1:], strict=False):
+        assert start + CAMERA.scan_seconds(sweep.lines) <= following
+
+
+def test_light_goes_with_the_clock() -> None:
+    """A sweep that starts an hour after sunrise's light is brighter; references are of the survey's start."""
+    scene = raster_from_values(np.full((8, 8, 3), 0.1), CAMERA, name="t", wavelength_nm=np.array([500.0, 600.0, 700.0]))
+    rig = Rig(CAMERA, sky=Sky(started=datetime(2025, 6, 21, 5, tzinfo=UTC)))
+    chosen = effects_on("rotation", "drift")
+    sweep = Sweep("a", "fine", "x", 0.0, 0.0, 2)
+    now = SimulatedSource(scene, rig, chosen=chosen)
+    later = replace(now, clock={"a": 3600.0, "b": 0.0})
+    assert (later.started_s(sweep), later.started_s(replace(sweep, name="c")), now.started_s(sweep)) == (3600, 0, 0)
+    brighter = later.render(sweep, range(2)).astype(int) - 64
+    assert (brighter > 1.1 * (now.render(sweep, range(2)).astype(int) - 64)).all()
+    np.testing.assert_array_equal(later.references(sweep).white, now.references(sweep).white)
+    assert [line.time_s for line in later.lines(sweep)] == [line.time_s for line in now.lines(sweep)]
+
+
+WHITE_PANEL_CAMERA = LineCamera(
+    samples=64, bits=16, electrons_per_dn=1.0
+)  # fine steps: rounding is no part of the figures
+RIG = Rig(WHITE_PANEL_CAMERA, detector=Detector(response_share=0.05, stripe_share=0.02, temperature_deg_c=45.0))
+WHITE_PANEL_SWEEP = Sweep("s", "fine", "x", strip_px=900.0, start_px=-1500.0, lines=6)
+BANDS = 12
+
+
+def even_scene(fwhm_nm: float = 2.0) -> RasterScene:
+    """An even scene under light with a deep absorption, 40 % as bright as the panel; values are reflectances."""
+    nm = np.linspace(740, 784, BANDS)
+    panel_electrons = (30_000 * (1 - 0.6 * np.exp(-(((nm - 762) / 5) ** 2)))).astype(np.float32)
+    return made_scene(np.full((20, 20, 1), 0.4), panel_electrons[None], nm, fwhm_nm=np.full(BANDS, fwhm_nm))
+
+
+def white_panel_source_of(*names: str, rig: Rig = RIG) -> SimulatedSource:
+    """A source over the even scene with some effects."""
+    return SimulatedSource(even_scene(), rig, chosen=effects_on("rotation", *names))
+
+
+def values_of(source: SimulatedSource, sweep: Sweep = WHITE_PANEL_SWEEP) -> np.ndarray:
+    """Calibrated lines."""
+    raw = source.render(sweep, range(sweep.lines))
+    values, _ = calibrate(
+        raw,
+        source.references(sweep),
+        saturated_dn=65535 * sweep.binning,
+        position=line_positions(sweep, WHITE_PANEL_CAMERA),
+    )
+    return values
+
+
+def test_plain_frames_are_the_panel_over_the_dark_level() -> None:
+    """Without effects the dark frame is the camera's level, and the white one the panel's light above it."""
+    found = white_panel_source_of().references(WHITE_PANEL_SWEEP)
+    np.testing.assert_array_equal(found.dark, np.full((64, BANDS), 64, np.float32))
+    np.testing.assert_allclose(found.white - 64, np.tile(even_scene().panel_electrons, (64, 1)), rtol=1e-6)
+    assert (found.bad, found.flat, found.by_mirror) == (None, None, False)
+    assert (found.dark.dtype, found.white.dtype, found.panel.dtype) == (np.float32,) * 3
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("dark-current",),
+        ("prnu",),
+        ("striping",),
+        ("response",),
+        ("smile",),
+        ("vignetting",),
+        ("response", "smile"),
+        ("dark-current", "prnu", "striping", "response", "smile", "vignetting", "smear", "slit"),
+    ],
+)
+def test_calibration_takes_out_what_it_sees(names: tuple[str, ...]) -> None:
+    """An even scene comes back as its reflectance to a rounding, far from rest, whatever spectrograph and detector do.
+
+    The names, then the raw numbers with none of them, are not the same: there was something to take out.
+    """
+    source = white_panel_source_of(*names)
+    np.testing.assert_allclose(values_of(source), 0.4, atol=2e-4)
+    plain = white_panel_source_of().render(WHITE_PANEL_SWEEP, range(6)).astype(int)
+    assert np.abs(source.render(WHITE_PANEL_SWEEP, range(6)).astype(int) - plain).max() > 20
+
+
+def test_binned_frames_are_sums() -> None:
+    """Frames of n samples are the sums of theirs, and what is left over of the line is dropped."""
+    source = white_panel_source_of("prnu", "smile", "dark-current")
+    one, three = source.references(WHITE_PANEL_SWEEP), source.references(replace(WHITE_PANEL_SWEEP, binning=3))
+    for name in ("dark", "white"):
+        sums = getattr(one, name)[:63].reshape(21, 3, BANDS).sum(axis=1)
+        np.testing.assert_allclose(getattr(three, name), sums, rtol=1e-6)
+
+
+def test_frames_show_dark_current_and_gains() -> None:
+    """The dark frame has the mean dark current, the white frame both gains of every element."""
+    found = white_panel_source_of("dark-current", "prnu", "striping").references(WHITE_PANEL_SWEEP)
+    np.testing.assert_allclose(found.dark, 64 + dark_electrons(RIG), rtol=1e-6)
+    gains = response_gain(RIG, BANDS) * stripe_gain(RIG)
+    np.testing.assert_allclose(found.white - found.dark, gains * even_scene().panel_electrons, rtol=1e-4)
+
+
+def test_defects_are_told_as_bad() -> None:
+    """Dead elements show no panel, hot ones are bright in the dark; a sum with one of either is bad."""
+    rig = replace(RIG, detector=Detector(dead_share=0.02, hot_share=0.02, hot_e_per_s=2e4))
+    found = white_panel_source_of("defects", rig=rig).references(WHITE_PANEL_SWEEP)
+    dead, hot = dead_elements(rig, BANDS), hot_electrons(rig, BANDS) > 0
+    assert dead.any()
+    assert hot.any()
+    assert found.bad is not None
+    np.testing.assert_array_equal(found.bad, dead | hot)
+    np.testing.assert_array_equal(found.dark > 1000, hot)
+    np.testing.assert_array_equal(found.white == found.dark, dead)
+    binned = white_panel_source_of("defects", rig=rig).references(replace(WHITE_PANEL_SWEEP, binning=4)).bad
+    np.testing.assert_array_equal(binned, (dead | hot).reshape(16, 4, BANDS).any(axis=1))
+    assert white_panel_source_of(rig=rig).references(WHITE_PANEL_SWEEP).bad is None
+
+
+def test_a_sound_sensor_has_no_bad_elements() -> None:
+    """With defects on and none there, nothing is told as bad."""
+    assert white_panel_source_of("defects").references(WHITE_PANEL_SWEEP).bad is None
+
+
+def test_bad_elements_are_filled_by_calibration() -> None:
+    """An even scene seen with dead and hot elements comes back even."""
+    rig = replace(RIG, detector=Detector(dead_share=0.02, hot_share=0.02, hot_e_per_s=2e4))
+    np.testing.assert_allclose(values_of(white_panel_source_of("defects", rig=rig)), 0.4, atol=2e-4)
+
+
+def test_panel_is_stated_in_the_rigs_bands() -> None:
+    """Where the panel's values have detail in the spectrum, the response rounds it as it does the light."""
+    scene = even_scene()
+    scene = replace(scene, panel=(1 - 0.5 * np.exp(-(((scene.wavelength_nm - 762) / 4) ** 2))).astype(np.float32))
+    plain, wide = (
+        SimulatedSource(scene, RIG, chosen=effects_on(*names)).references(WHITE_PANEL_SWEEP).panel
+        for names in ((), ("response",))
+    )
+    np.testing.assert_array_equal(plain, scene.panel)
+    assert wide.min() > plain.min() + 0.05
+    np.testing.assert_allclose(wide.mean(), plain.mean(), atol=0.02)
+
+
+def test_calibration_does_not_know_the_rest() -> None:
+    """Effects that it cannot see change no frame."""
+    seen = {"dark-current", "defects", "prnu", "striping", "response", "smile", "vignetting"}
+    plain = white_panel_source_of().references(WHITE_PANEL_SWEEP)
+    for effect in EFFECTS:
+        if effect.name in seen:
+            continue
+        found = white_panel_source_of(effect.name).references(WHITE_PANEL_SWEEP)
+        assert isinstance(found, References)
+        np.testing.assert_array_equal(found.white, plain.white, err_msg=effect.name)
+        np.testing.assert_array_equal(found.dark, plain.dark, err_msg=effect.name)
+
+
+def test_usual_effects_are_those_of_any_camera_behind_a_mirror() -> None:
+    """By default rays, footprint, vignetting and noise are on; names and mapping say the same."""
+    assert [effect.name for effect, _ in USUAL.effects] == [
+        "rotation",
+        "slit",
+        "smear",
+        "vignetting",
+        "shot",
+        "read-noise",
+    ]
+    assert effects_on("shot", "slit").effects == effects_on("slit", "shot").effects
+    assert effects_on().effects == ()
+    assert {effect for effect, _ in USUAL.effects} <= set(BY_NAME.values())
+
+
+RIG_MODEL_RIG = Rig()
+PARTS = ("camera", "optics", "mirror", "detector", "air", "sky")
+NUMBERS = [
+    (part, item)
+    for part in PARTS
+    for item in fields(getattr(RIG_MODEL_RIG, part))
+    if "least" in item.metadata or (part == "camera" and isinstance(item.default, float))
+]
+
+
+def with_number(part: str, name: str, value: Any) -> Rig:
+    """A rig as its defaults are but for one number."""
+    return replace(RIG_MODEL_RIG, **{part: replace(getattr(RIG_MODEL_RIG, part), **{name: value})})
+
+
+@pytest.mark.parametrize(("part", "item"), NUMBERS, ids=lambda one: getattr(one, "name", one))
+def test_numbers_that_are_not_finite_are_refused_by_name(part: str, item: Any):
+    """Infinity only where it is the default; no number never."""
+    for value in (math.nan, -math.inf, math.inf):
+        if value == item.default:
+            assert with_number(part, item.name, value) == RIG_MODEL_RIG
+            continue
+        with pytest.raises(SettingsError, match=rf"{part}\.{item.name} must be a (finite )?number"):
+            with_number(part, item.name, value)
+
+
+def test_numbers_beyond_their_range_are_refused_with_it():
+    """Aperture and share of stray light."""
+    with pytest.raises(SettingsError, match=r"optics\.aperture_mm must be a number from 0\.1 to 1000 mm, got 0"):
+        with_number("optics", "aperture_mm", 0.0)
+    with pytest.raises(SettingsError, match=r"optics\.stray_share must be a number from 0 to 0\.5, got 0\.6"):
+        with_number("optics", "stray_share", 0.6)
+
+
+def test_a_distance_may_be_endless_but_not_nothing():
+    """None is light at the aperture, infinity the limit of no parallax."""
+    assert with_number("air", "distance_m", math.inf).distances_m == (math.inf, math.inf)
+    with pytest.raises(SettingsError, match=r"air\.distance_m must be a number of at least 0\.001 m or inf, got nan"):
+        with_number("air", "distance_m", math.nan)

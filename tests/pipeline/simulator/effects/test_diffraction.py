@@ -12,7 +12,6 @@ from scipy.integrate import quad
 from scipy.special import j0, j1
 
 from pipeline.geometry.scan import Sweep
-from pipeline.lazy import Once
 from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE, THIRD_RING, airy_energy, airy_variance
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import SLIT
@@ -20,8 +19,8 @@ from pipeline.simulator.optics.kernel_fit import Moments, fold
 from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
-from tests.pipeline.simulator.fine_image import FLAT, IMAGES, SWEEP, airy, airy_contrast, change, gaussian, probe_of
+from tests.pipeline.simulator.fine_image import IMAGES, SWEEP, airy, airy_contrast, change, gaussian, probe_of
+from tests.pipeline.simulator.small_scenes import made_scene
 
 RIG = Rig()
 NM = np.array([400.0, 700.0, 1000.0])
@@ -102,14 +101,6 @@ def test_contrast_of_an_elliptic_pupil_is_its_autocorrelation():
         assert axis[shifts] == pytest.approx(pupil_contrast(shifts / width), abs=2e-3)
 
 
-def test_waves_grow_with_the_wavelength():
-    """lambda over the pupil's width, 1.41 times as much along the scan as along the line at rest; nothing shifts."""
-    moments = DIFFRACTION.moments(RIG, NM, "airy")
-    assert not moments.shift.any()
-    assert not moments.variance.any()
-    assert moments.waves == pytest.approx(np.outer([1, np.sqrt(2)], RADIAN_PX))
-
-
 def test_gaussians_of_the_cheap_variants():
     """Each band's own has the variance inside the third ring; all of ``one-width`` are halfway between the ends."""
     own, one = (DIFFRACTION.moments(RIG, NM, variant).variance for variant in ("gaussian", "one-width"))
@@ -128,8 +119,7 @@ def test_rendered_waves_are_those_of_the_pupil(axis: int, cycles: float):
     where = np.arange(900) - 449.5
     wave = 1 + np.cos(2 * np.pi * cycles * where)
     planes = np.ones((900, 900, 1), np.float32) * (wave[:, None, None] if axis == 0 else wave[None, :, None])
-    light = SceneLight(np.full((1, 3), 1.0, np.float32), np.ones(3, np.float32))
-    scene = RasterScene("w", "w", SceneRaster.of(planes.astype(np.float32)), Once.of(light), np.ones(3, np.float32), NM)
+    scene = made_scene(planes, np.ones((1, 3)), NM)
     sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=-20.0, lines=40)
     block = SweepBlock(RIG, sweep, range(40), NM, scene.shape, samples=range(300, 340))
     found = expected_light(scene, block, {SLIT: "1x1", DIFFRACTION: "airy"})
@@ -213,18 +203,3 @@ def test_bound_covers_every_tilt_of_the_sweeps():
     steep, flat = (replace(SWEEP, start_px=start) for start in (4000.0, -5000.0))
     assert DIFFRACTION.bound(replace(probe, sweeps=(steep,)), RIG).value > rest
     assert DIFFRACTION.bound(replace(probe, sweeps=(flat,)), RIG).value == pytest.approx(rest, rel=2e-3)
-
-
-def test_nothing_to_blur():
-    """A flat scene and the exact variant have a bound of 0; a wide aperture has nearly none."""
-    flat = probe_of(FLAT, NM)
-    assert DIFFRACTION.bound(flat, RIG).value == pytest.approx(0, abs=1e-9)
-    probe = probe_of(IMAGES["edges"](), NM)
-    assert DIFFRACTION.bound(probe, RIG, "airy").value == 0
-    assert DIFFRACTION.bound(probe, Rig(optics=Optics(aperture_mm=1e3))).value < 1e-2
-
-
-def test_the_sentence_names_band_and_size():
-    """Why: blur in px at the band that it changes most, and the detail that it meets."""
-    why = DIFFRACTION.bound(probe_of(IMAGES["edges"](), NM), RIG).why
-    assert why.startswith("diffraction: 0.23 px (sd) along the line, 0.32 px along the scan at 1000 nm")

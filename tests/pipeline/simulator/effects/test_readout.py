@@ -24,10 +24,8 @@ from pipeline.simulator.effects.counting import (
     hot_electrons,
 )
 from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.sensor import PRNU, STRIPING
-from pipeline.simulator.render import dark_frame, expected_light, read_out
+from pipeline.simulator.render import dark_frame, read_out
 from pipeline.simulator.rig_model import Detector, Rig
-from tests.pipeline.simulator.spectral_light import small_scene
 
 SWEEP = Sweep("fine", "fine", "x", strip_px=0.0, start_px=-32.0, lines=64)
 BANDS = 20
@@ -161,24 +159,6 @@ def test_an_ideal_sensor_is_silent() -> None:
     )
 
 
-@pytest.mark.parametrize("chosen", [EVERYTHING, ALL_EXACT], ids=["cheap", "exact"])
-@pytest.mark.parametrize("read", [0.0, 3.0, 20.0])
-def test_blocks_of_any_size_give_the_same_lines(chosen: dict[Any, str], read: float) -> None:
-    """Blocks of 1, 7 and all lines, backwards, and a part of the samples are bit for bit the same."""
-    rig = Rig(camera=LineCamera(read_noise_e=read), detector=Detector(dead_share=0.01, hot_share=0.01, well_e=18_000))
-    lines = range(20)
-    whole = read_out(light_of(lines), block_of(rig, lines), chosen)
-    for size in (1, 7):
-        for start in reversed(lines[::size]):
-            part = range(start, min(start + size, 20))
-            np.testing.assert_array_equal(
-                read_out(light_of(part), block_of(rig, part), chosen), whole[start : part.stop]
-            )
-    for samples in (range(100, 140), range(0, 640, 3)):
-        some = read_out(light_of(lines)[:, list(samples)], block_of(rig, lines, samples), chosen)
-        np.testing.assert_array_equal(some, whole[:, list(samples)])
-
-
 def test_other_effects_do_not_change_the_draws() -> None:
     """With read noise or dark current off, the shot noise of every element is still that of the same photons."""
     rig, light = Rig(), even(10_000, 4)
@@ -234,19 +214,3 @@ def test_one_band_and_an_odd_number_of_elements() -> None:
     rig = Rig(camera=LineCamera(samples=3))
     block = SweepBlock(rig, SWEEP, range(2), np.array([700.0]), (8, 8))
     assert read_out(np.full((2, 3, 1), 5000, np.float32), block, EVERYTHING).shape == (2, 3, 1)
-
-
-def test_a_scene_through_the_whole_chain() -> None:
-    """Rays, patterns and readout of one block, and of its lines and samples apart, are bit for bit the same."""
-    nm, scene = small_scene()
-    rig = Rig(camera=LineCamera(samples=64))
-    chosen: dict[Any, str] = {PRNU: "exact", STRIPING: "exact"} | EVERYTHING
-
-    def taken(lines: range, samples: range | None = None) -> NDArray[np.uint16]:
-        block = SweepBlock(rig, SWEEP, lines, nm, scene.shape, samples=samples)
-        return read_out(expected_light(scene, block, chosen), block, chosen)
-
-    whole = taken(range(12))
-    assert np.ptp(whole) > 50
-    np.testing.assert_array_equal(np.concatenate([taken(range(7)), taken(range(7, 12))]), whole)
-    np.testing.assert_array_equal(taken(range(12), range(8, 24)), whole[:, 8:24])

@@ -1,8 +1,9 @@
-"""The decision which effects to compute: laws, cases worked by hand, and the words of what is asked."""
+"""The decision which effects to compute: laws, cases worked by hand, the words of what is asked, and the manifest."""
 
 from __future__ import annotations
 
 import itertools
+import json
 import math
 from dataclasses import replace
 
@@ -16,7 +17,7 @@ from pipeline.simulator.effects.blurs import DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.counting import READ_NOISE, SHOT
 from pipeline.simulator.effects.lighting import CLOUD
 from pipeline.simulator.rig_model import Detector, Rig, Sky
-from pipeline.simulator.selection.choice import Decision, decide, named_effects
+from pipeline.simulator.selection.choice import Decision, decide, list_effects, named_effects, sum_up
 from pipeline.simulator.selection.options import LEAST_COST_NS, SAFETY, cost_of, list_options
 from tests.pipeline.simulator.made_up_effects import RIG, Brightening, MadeUp, Shift, even_probe
 
@@ -103,25 +104,6 @@ def test_asking_by_name_switches_on_those_and_no_others(effects: list[MadeUp], t
     assert math.fsum(one.option.error for one in decision.taken if one.is_on) <= tolerance
 
 
-def test_infinite_tolerance_holds_for_bounds_without_limit():
-    """Two of them, both off."""
-    slits = [MadeUp(name, math.inf, (("exact", 0.0, 9.0), ("cheap", math.inf, 1.0))) for name in ("a", "b")]
-    assert variants(decide(PROBE, RIG, slits, math.inf)) == {"a": "off", "b": "off"}
-    assert variants(decide(PROBE, RIG, slits, math.inf, "a,b")) == {"a": "cheap", "b": "cheap"}
-    assert variants(decide(PROBE, RIG, slits, 1e9)) == {"a": "exact", "b": "exact"}
-
-
-def test_all_is_exact_and_none_keeps_what_is_stored():
-    """Both whatever the tolerance is."""
-    effects = [
-        MadeUp("a", 0.01, (("exact", 0.0, 9.0), ("cheap", 0.001, 1.0))),
-        MadeUp("saturation", 0.0),
-        MadeUp("b", 0),
-    ]
-    assert variants(decide(PROBE, RIG, effects, 1.0, "all")) == {"a": "exact", "saturation": "exact", "b": "off"}
-    assert variants(decide(PROBE, RIG, effects, 1.0, "none")) == {"a": "off", "saturation": "exact", "b": "off"}
-
-
 def enumerated_cost(effects: list[MadeUp], tolerance: float) -> float:
     """The least cost of all combinations of options within the tolerance."""
     menus = list_options(PROBE, RIG, effects)
@@ -142,40 +124,46 @@ def test_at_least_half_of_what_can_be_saved_is_saved(effects: list[MadeUp], tole
     assert saved >= best / 2 - 1e-9
 
 
-def test_dearest_per_bound_goes_first():
-    """Of three that fit two by two, the two that save most per bound are left out; worked by hand."""
-    effects = [
-        MadeUp("blur", 0.05, (("exact", 0.0, 0.9),)),
-        MadeUp("noise", 0.04, (("exact", 0.0, 7.7),)),
-        MadeUp("smile", 0.03, (("exact", 0.0, 0.3),)),
-    ]
-    decision = decide(PROBE, RIG, effects, 0.11)  # 1.2 * (0.05 + 0.04) = 0.108
-    assert variants(decision) == {"blur": "off", "noise": "off", "smile": "exact"}
-    assert decision.error == pytest.approx(0.108)
-    assert decision.cost_ns == pytest.approx(0.3)
+ENDLESS = [MadeUp(name, math.inf, (("exact", 0.0, 9.0), ("cheap", math.inf, 1.0))) for name in ("a", "b")]
+STORED = [MadeUp("a", 0.01, (("exact", 0.0, 9.0), ("cheap", 0.001, 1.0))), MadeUp("saturation", 0.0), MadeUp("b", 0)]
+THREE = [
+    MadeUp(n, e, (("exact", 0.0, c),)) for n, e, c in (("blur", 0.05, 0.9), ("noise", 0.04, 7.7), ("smile", 0.03, 0.3))
+]
+PAIR = [MadeUp("small", 0.01, (("exact", 0.0, 2.0),)), MadeUp("large", 1.0, (("exact", 0.0, 50.0),))]
+FREE = [MadeUp("free", 0.05, (("exact", 0.0, 0.0),)), MadeUp("dear", 0.05, (("exact", 0.0, 9.0),))]
+POISSON = [MadeUp("shot", 2.0, (("poisson", 0.0, 24.7), ("gauss", 0.01, 7.7), ("rough", 0.5, 3.8)))]
 
 
-def test_a_long_step_is_not_shut_out_by_a_short_one():
-    """Leaving out the small effect saves more per bound, leaving out the large one more in all."""
-    small, large = MadeUp("small", 0.01, (("exact", 0.0, 2.0),)), MadeUp("large", 1.0, (("exact", 0.0, 50.0),))
-    assert variants(decide(PROBE, RIG, [small, large], 1.2)) == {"small": "exact", "large": "off"}
+@pytest.mark.parametrize(
+    ("effects", "tolerance", "asked", "wanted"),
+    [
+        pytest.param(ENDLESS, math.inf, "auto", "off off", id="an infinite tolerance holds for bounds without limit"),
+        pytest.param(ENDLESS, math.inf, "a,b", "cheap cheap", id="those asked for are then as cheap as may be"),
+        pytest.param(ENDLESS, 1e9, "auto", "exact exact", id="no other tolerance does"),
+        pytest.param(STORED, 1.0, "all", "exact exact off", id="all is exact, but for what is absent"),
+        pytest.param(STORED, 1.0, "none", "off exact off", id="none keeps what is stored"),
+        pytest.param(THREE, 0.11, "auto", "off off exact", id="dearest per bound goes first, 1.2 (0.05 + 0.04) fit"),
+        pytest.param(PAIR, 1.2, "auto", "exact off", id="a long step is not shut out by a short one"),
+        pytest.param(PAIR, 0.1, "auto", "off exact", id="what is off may return in exchange for a dearer one"),
+        pytest.param(FREE, 0.12, "auto", "off off", id="what costs nothing is left out too"),
+        pytest.param(FREE, 0.11, "auto", "exact off", id="but goes last"),
+        pytest.param(POISSON, 0.1, "auto", "gauss", id="a variant where leaving out is too much, no cheaper one"),
+    ],
+)
+def test_worked_by_hand(effects: list[MadeUp], tolerance: float, asked: str, wanted: str):
+    """What each effect is treated as, in the order of the chain."""
+    decision = decide(PROBE, RIG, effects, tolerance, asked)
+    assert " ".join(variants(decision).values()) == wanted
+    assert decision.error <= tolerance or asked != "auto"
 
 
-def test_an_effect_may_return_in_exchange_for_a_dearer_one():
-    """What is off at one tolerance need not be off at every larger one; the cost falls all the same."""
-    small, large = MadeUp("small", 0.01, (("exact", 0.0, 2.0),)), MadeUp("large", 1.0, (("exact", 0.0, 50.0),))
-    strict, loose = (decide(PROBE, RIG, [small, large], tolerance) for tolerance in (0.1, 1.2))
-    assert (variants(strict)["small"], variants(loose)["small"]) == ("off", "exact")
-    assert loose.cost_ns < strict.cost_ns
-
-
-def test_a_variant_is_taken_where_leaving_out_is_too_much():
-    """From exact to cheap, no further."""
-    shot = MadeUp("shot", 2.0, (("poisson", 0.0, 24.7), ("gauss", 0.01, 7.7), ("rough", 0.5, 3.8)))
-    decision = decide(PROBE, RIG, [shot], 0.1)
-    assert variants(decision) == {"shot": "gauss"}
-    assert decision.taken[0].reason == "needed"
-    assert decision.cheap_cost_ns == 24.7  # 0.012 is more than a tenth of the tolerance
+def test_totals_of_a_decision():
+    """Errors sum with the factor of safety; the cheapest within a tenth of the tolerance is all exact here."""
+    assert (decide(PROBE, RIG, THREE, 0.11).error, decide(PROBE, RIG, THREE, 0.11).cost_ns) == pytest.approx(
+        (0.108, 0.3)
+    )
+    shot = decide(PROBE, RIG, POISSON, 0.1)
+    assert (shot.taken[0].reason, shot.cheap_cost_ns) == ("needed", 24.7)  # 0.012 is more than a tenth
 
 
 def test_gains_multiply_the_errors_of_others_but_not_their_own():
@@ -254,14 +242,6 @@ def test_a_draw_that_two_share_is_paid_once():
     assert decision.exact_cost_ns == pytest.approx(SHOT.cost_ns["exact"] + READ_NOISE.cost_ns["exact"])
 
 
-def test_free_effects_go_last():
-    """What costs nothing is left out too, where the others leave room: the scene does not call for it."""
-    free = MadeUp("free", 0.05, (("exact", 0.0, 0.0),))
-    dear = MadeUp("dear", 0.05, (("exact", 0.0, 9.0),))
-    assert variants(decide(PROBE, RIG, [free, dear], 0.12)) == {"free": "off", "dear": "off"}
-    assert variants(decide(PROBE, RIG, [free, dear], 0.11)) == {"free": "exact", "dear": "off"}
-
-
 def test_even_scene_shows_no_geometry_but_the_rig_has_it():
     """An effect without a trace in the scene is off from the smallest tolerance on, and on at 0."""
 
@@ -302,3 +282,102 @@ def test_names_are_unique():
     """A second effect of one name would be lost."""
     with pytest.raises(SettingsError, match="two effects are named 'shot'"):
         decide(PROBE, RIG, [MadeUp("shot", 1.0), MadeUp("shot", 2.0)], 0.1)
+
+
+FIELDS = {"name", "state", "variant", "bound", "measured", "cost_s", "why", "reason", "left_out", "magnitude", "unit"}
+EFFECTS = [
+    MadeUp("wind", 0.0),
+    Shift("rotation", 2.0),
+    MadeUp("blur", 0.05, (("kernel", 0.0, 2.0),)),
+    MadeUp("shot", 2.0, (("poisson", 0.0, 24.0), ("gauss", 0.01, 8.0))),
+    MadeUp("smile", 0.06, (("taps", 0.0, 0.5),)),
+    MadeUp("throughput", 0.02, (("factor", 0.0, 0.0),)),
+    MadeUp("saturation", 0.0, (("clip", 0.0, 0.1),)),
+]
+
+
+def whys(tolerance: float, asked: str = "auto") -> dict[str, str]:
+    """Reasons by name."""
+    return {row["name"]: row["why"] for row in list_effects(decide(PROBE, RIG, EFFECTS, tolerance, asked))}
+
+
+def test_rows_have_the_fields_of_a_receipt_and_plain_values():
+    """Receipts take them as they are."""
+    rows = list_effects(decide(PROBE, RIG, EFFECTS, math.inf), {"blur": 0.01})
+    assert all(set(row) == FIELDS for row in rows)
+    assert json.loads(json.dumps(rows, allow_nan=False)) == rows
+    assert [row["name"] for row in rows] == [effect.name for effect in EFFECTS]
+    assert [row["measured"] for row in rows if row["name"] in ("blur", "shot")] == [0.01, None]
+
+
+def test_rows_have_the_parts_of_their_reasons():
+    """What leaving an effect out would do also where it is on, and the words of its bound by themselves."""
+    rows = {row["name"]: row for row in list_effects(decide(PROBE, RIG, EFFECTS, 0.1))}
+    parts = [[rows[name][part] for part in ("reason", "left_out", "magnitude")] for name in ("wind", "shot")]
+    assert parts == [["absent", 0.0, "wind as off"], ["needed", pytest.approx(2.4), "shot as off"]]
+
+
+def test_totals_add_up():
+    """Bounds to the whole bound, seconds to what was saved against everything on."""
+    decision = decide(PROBE, RIG, EFFECTS, 0.1)
+    rows, totals = list_effects(decision), sum_up(decision, {"all effects": 0.03})
+    assert math.fsum(row["bound"] for row in rows) == pytest.approx(totals["bound"])
+    assert totals["bound"] <= totals["tolerance"] == 0.1
+    assert math.fsum(row["cost_s"] for row in rows) == pytest.approx(totals["cost_s"])
+    assert totals["saved_s"] == pytest.approx((24.0 - 8.0 + 2.0 + 1.0 + 0.001) * 1e-9 * 100 * 640)
+    assert (totals["on"], totals["off"], totals["within"], totals["measured"]) == (3, 4, True, 0.03)
+
+
+def test_seconds_against_cheap_variants_are_told_too():
+    """With variants whose own error is within a tenth of the tolerance: 0.12 for the noise's 0.012."""
+    totals = sum_up(decide(PROBE, RIG, EFFECTS, 0.12))
+    assert totals["cheap_cost_s"] == pytest.approx((8.0 + 2.0 + 0.5 + 1.0 + 0.1 + 0.001) * 1e-9 * 100 * 640)
+
+
+def test_asked_effects_may_leave_the_tolerance():
+    """The totals say so."""
+    totals = sum_up(decide(PROBE, RIG, EFFECTS, 0.1, "none"))
+    assert not totals["within"]
+    assert totals["bound"] == pytest.approx(1.2 * (0.05 + 2.0 + 0.06 + 0.02))
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("wind", "the rig has none of it: wind as off"),
+        ("rotation", "the scene shows nothing of it: 2 px aside"),
+        ("blur", "left out it changes a stored number by at most 0.06 sigma of the noise: blur as off"),
+        (
+            "shot",
+            "left out it could change a stored number by 2.4 sigma of the noise, more than the tolerance of 0.1: shot"
+            " as off; gauss differs from exact by at most 0.012 sigma of the noise: shot as gauss",
+        ),
+        (
+            "smile",
+            "left out it could change a stored number by 0.072 sigma of the noise, and the tolerance of 0.1 is spent"
+            " where it saves more: smile as off",
+        ),
+        ("throughput", "left out it changes a stored number by at most 0.024 sigma of the noise: throughput as off"),
+        ("saturation", "always there, for raw lines are whole numbers of limited size: saturation as off"),
+    ],
+)
+def test_reasons_say_why_in_words_and_numbers(name: str, why: str):
+    """Every case of the rule."""
+    assert whys(0.1)[name] == why
+
+
+def test_reasons_name_what_was_asked():
+    """Also where the rig lacks it, and where the tolerance is 0."""
+    asked = whys(0.1, "wind, blur")
+    assert asked["wind"].startswith("asked for, but the rig has none of it: ")
+    assert asked["blur"].startswith("asked for: ")
+    assert asked["smile"].startswith("not asked for; left out it could change a stored number by 0.072 sigma")
+    assert whys(0.0)["rotation"].startswith("the tolerance is 0, so everything is computed: ")
+
+
+def test_bounds_without_limit_become_null():
+    """JSON knows no infinity."""
+    decision = decide(PROBE, RIG, [MadeUp("slit", math.inf)], math.inf, "none")
+    assert list_effects(decision)[0]["bound"] is None
+    assert (sum_up(decision)["bound"], sum_up(decision)["tolerance"]) == (None, None)
+    assert "any number of sigma" in list_effects(decision)[0]["why"]

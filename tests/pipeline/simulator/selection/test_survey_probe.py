@@ -11,7 +11,6 @@ import pytest
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.lazy import Once
 from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
@@ -20,10 +19,11 @@ from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Detector, Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.options import SAFETY, list_options
 from pipeline.simulator.selection.survey_looks import views_of_places
 from pipeline.simulator.selection.survey_probe import probe_scene, probe_survey
+from tests.pipeline.simulator.small_scenes import made_scene
 
 RIG = Rig(camera=LineCamera(samples=96))
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-30.0, lines=61)
@@ -47,14 +47,7 @@ def mixed(seed: int, shape: tuple[int, int] = (80, 110), bands: int = 6) -> Rast
     planes = np.clip(0.4 + grain + 0.2 * wave + edge, 0, None).astype(np.float32)
     planes[rng.integers(20, 60), rng.integers(20, 90)] += rng.uniform(0, 2)
     electrons = rng.uniform(50, 6e3, (3, bands)).astype(np.float32)
-    return RasterScene(
-        "mixed",
-        f"{seed}",
-        SceneRaster.of(planes),
-        Once.of(SceneLight(electrons, electrons[0])),
-        np.ones(bands, np.float32),
-        np.linspace(400, 1000, bands),
-    )
+    return made_scene(planes, electrons, np.linspace(400, 1000, bands))
 
 
 def seen(scene: RasterScene, sweep: Sweep, variant: str = "3x1", blurs: dict[Any, str] | None = None) -> np.ndarray:
@@ -229,16 +222,8 @@ def test_number_that_is_not_finite_is_refused_with_its_place(bad: float) -> None
     """A scene with NaN or infinity is refused, and the message says where."""
     planes = np.ones((70, 40, 3), np.float32)
     planes[41, 17, 2] = bad
-    light = np.ones((3, 4), np.float32)
-    scene = RasterScene(
-        "holey",
-        "k",
-        SceneRaster.of(planes),
-        Once.of(SceneLight(light, light[0])),
-        np.ones(4, np.float32),
-        np.arange(4) + 400.0,
-    )
-    with pytest.raises(SceneError, match="holey is not finite at row 41, column 17, component 2"):
+    scene = made_scene(planes, np.ones((3, 4)), np.arange(4) + 400.0)
+    with pytest.raises(SceneError, match="made is not finite at row 41, column 17, component 2"):
         probe_scene(scene, RIG, [SWEEP])
 
 

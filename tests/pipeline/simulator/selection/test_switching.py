@@ -92,28 +92,28 @@ DEPTH_STEP = Case(  # focused where it looks: at infinity, all of it were a blur
 )
 
 
-@pytest.mark.parametrize(
-    ("case", "on", "off"),
-    [
-        pytest.param(
-            FLAT,
-            "vignetting,shot,read-noise,prnu,striping",
-            "slit,smear,diffraction,defocus,aberration,keystone,turbulence,rotation",
-            id="flat field",
-        ),
-        pytest.param(NOISELESS, "", "shot,read-noise,dark-current", id="noiseless"),
-        pytest.param(BRIGHT_FLAT, "shot", "read-noise", id="10,000 electrons"),
-        pytest.param(DIM_1_S, "dark-current", "", id="dim at 1 s"),
-        pytest.param(FAST, "lag", "", id="3 ms lines"),
-        pytest.param(SLOW, "", "lag", id="100 ms lines"),
-        pytest.param(CALM_30_M, "", "wind,turbulence,path-radiance", id="30 m calm"),
-        pytest.param(HAZY_300_M, "path-radiance,turbulence", "", id="300 m hazy"),
-        pytest.param(FOUR_HOURS, "drift", "", id="sun at 20 deg over 4 h"),
-        pytest.param(ONE_SWEEP_AT_NOON, "", "drift", id="6 s at noon"),
-        pytest.param(BRIGHT_ROOF, "stray-light,saturation", "", id="bright roof"),
-        pytest.param(DEPTH_STEP, "parallax", "", id="depth step at 3 m"),
-    ],
-)
+TABLE = [
+    pytest.param(
+        FLAT,
+        "vignetting,shot,read-noise,prnu,striping",
+        "slit,smear,diffraction,defocus,aberration,keystone,turbulence,rotation",
+        id="flat field",
+    ),
+    pytest.param(NOISELESS, "", "shot,read-noise,dark-current", id="noiseless"),
+    pytest.param(BRIGHT_FLAT, "shot", "read-noise", id="10,000 electrons"),
+    pytest.param(DIM_1_S, "dark-current", "", id="dim at 1 s"),
+    pytest.param(FAST, "lag", "", id="3 ms lines"),
+    pytest.param(SLOW, "", "lag", id="100 ms lines"),
+    pytest.param(CALM_30_M, "", "wind,turbulence,path-radiance", id="30 m calm"),
+    pytest.param(HAZY_300_M, "path-radiance,turbulence", "", id="300 m hazy"),
+    pytest.param(FOUR_HOURS, "drift", "", id="sun at 20 deg over 4 h"),
+    pytest.param(ONE_SWEEP_AT_NOON, "", "drift", id="6 s at noon"),
+    pytest.param(BRIGHT_ROOF, "stray-light,saturation", "", id="bright roof"),
+    pytest.param(DEPTH_STEP, "parallax", "", id="depth step at 3 m"),
+]
+
+
+@pytest.mark.parametrize(("case", "on", "off"), TABLE)
 def test_scene_and_rig_switch_effects(case: Case, on: str, off: str):
     """As the design's table says, of a rig that is as its defaults but for what the row names."""
     states = {one.name: one.is_on for one in decided(case).taken}
@@ -122,23 +122,7 @@ def test_scene_and_rig_switch_effects(case: Case, on: str, off: str):
     assert decided(case).error <= TOLERANCE
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        pytest.param(FLAT, id="flat field"),
-        pytest.param(NOISELESS, id="noiseless"),
-        pytest.param(BRIGHT_FLAT, id="10,000 electrons"),
-        pytest.param(DIM_1_S, id="dim at 1 s"),
-        pytest.param(FAST, id="3 ms lines"),
-        pytest.param(SLOW, id="100 ms lines"),
-        pytest.param(CALM_30_M, id="30 m calm"),
-        pytest.param(HAZY_300_M, id="300 m hazy"),
-        pytest.param(FOUR_HOURS, id="sun at 20 deg over 4 h"),
-        pytest.param(ONE_SWEEP_AT_NOON, id="6 s at noon"),
-        pytest.param(BRIGHT_ROOF, id="bright roof"),
-        pytest.param(DEPTH_STEP, id="depth step at 3 m"),
-    ],
-)
+@pytest.mark.parametrize("case", [pytest.param(row.values[0], id=row.id) for row in TABLE])
 def test_what_is_left_out_keeps_its_bounds_on_the_worst_chips(case: Case):
     """Rendered with everything on and with the choice, effect by effect and all together."""
     scene, rig, decision = scene_of(case), case.rig, decided(case)

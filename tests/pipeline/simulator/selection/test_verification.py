@@ -1,17 +1,37 @@
-"""What was left out, measured on chips: right bounds pass, wrong ones are named, chips are the worst places."""
+"""What was left out, measured on chips: right bounds pass, wrong ones are named; what arithmetic alone may change."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from pipeline.errors import BoundError
+from pipeline.errors import BoundError, ShapeError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, sweep_to_scene
+from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import Effect, Light, SweepBlock
+from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
+from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.selection.choice import TOTAL, Decision, decide
-from pipeline.simulator.selection.verification import Floats, verify
+from pipeline.simulator.selection.verification import (
+    MOST_CANDIDATES,
+    ROUNDING,
+    Floats,
+    candidate_blocks,
+    contrast_about,
+    misplaced_electrons,
+    misplaced_share,
+    verify,
+    worst_blocks,
+)
+from pipeline.simulator.simulated import sweep_block
 from tests.pipeline.simulator.made_up_effects import RIG, SWEEP, Brightening, MadeUp, even_probe
 
 BLOCK = SweepBlock(RIG, SWEEP, range(20, 28), np.array([500.0, 600.0]), (200, 700))
@@ -95,3 +115,137 @@ def test_sums_are_held_against_the_bound_as_they_are_stored():
     said = r"light by 0\.02 sigma .* sample 0 \(of 4 summed\), band 0 of the steepest lines"
     with pytest.raises(BoundError, match=said):
         verify(decided(shared), render, {"steepest": coarse}, noise)
+
+
+FAR = Sweep("far", "fine", "y", -400.0, -900.0, 50)
+WHOLE = SweepBlock(RIG, FAR, range(50), np.array([500.0]), (1000, 2000))
+
+
+def ones(light: Light, binning: int) -> Light:
+    """Electrons are the unit."""
+    return np.ones_like(light)
+
+
+def test_worst_chips_are_about_the_worst_places():
+    """A bright spot, a dark one, an edge, and the line that meets the mirror most obliquely, each its own chip."""
+
+    def light(chip: SweepBlock) -> Light:
+        seen = np.full((50, 640, 1), 50.0, np.float32)
+        seen[10, 100], seen[45, 630], seen[20, 200:400] = 60.0, 41.0, 58.0
+        seen[20, 300:] = 43.0
+        return seen[chip.lines.start : chip.lines.stop]
+
+    chips = [replace(WHOLE, lines=range(first, first + 5)) for first in range(0, 50, 5)]
+    found = worst_blocks(chips, light, ones)
+    assert {name: chip.lines.start for name, chip in found.items() if name != "most oblique"} == {
+        "steepest": 20,
+        "brightest": 10,
+        "darkest": 45,
+    }
+    assert found["most oblique"].normals[:, 2].max() == WHOLE.normals[:, 2].max()
+
+
+def test_each_binning_has_worst_chips_of_its_own():
+    """Sums by sums: what is brightest as a sample need not be so in a sum of 4."""
+
+    def light(chip: SweepBlock) -> Light:
+        seen = np.full((50, 640, 1), 50.0, np.float32)
+        seen[10, 100], seen[30, 100:108] = 60.0, 58.0
+        return seen[chip.lines.start : chip.lines.stop]
+
+    coarse = replace(WHOLE, sweep=replace(FAR, binning=4))
+    chips = [replace(whole, lines=range(at, at + 5)) for whole in (WHOLE, coarse) for at in range(0, 50, 5)]
+    found = worst_blocks(chips, light, ones)
+    assert found["brightest"].lines.start == 10
+    assert found["brightest in sums of 4"].lines.start == 30
+    assert found["brightest in sums of 4"].sweep.binning == 4
+
+
+def test_candidates_are_about_places_that_the_sweep_sees():
+    """And about its ends and middle; places beside it or out of the mirror's reach add none."""
+    along, scan = sweep_to_scene(FAR, RIG.camera)
+    here = np.array([along[30, 12], scan[30, 12]]) + (np.array(WHOLE.shape) - 1) / 2
+    places = np.array([here, here + np.array([0, 300]), [0, 1e6]])
+    assert [chip.lines for chip in candidate_blocks([WHOLE], places)] == [
+        range(3),
+        range(24, 27),
+        range(29, 32),
+        range(47, 50),
+    ]
+
+
+def test_candidates_stay_few_and_within_short_sweeps():
+    """Of many sweeps evenly; a sweep of one line has one chip, of none none."""
+    sweeps = [Sweep(f"s{number}", "fine", "x", 0.0, 0.0, number % 2 + 1) for number in range(99)]
+    chips = candidate_blocks([replace(WHOLE, sweep=sweep) for sweep in sweeps], np.zeros((0, 2)))
+    assert len(chips) == MOST_CANDIDATES
+    assert all(chip.lines == range(chip.sweep.lines) for chip in chips)
+    assert candidate_blocks([replace(WHOLE, sweep=replace(FAR, lines=0))], np.zeros((1, 2))) == []
+
+
+def test_nothing_to_choose_from_is_refused():
+    """Rather than verified on nothing."""
+    with pytest.raises(ShapeError, match="no lines to verify effects on: 0 candidates hold no sample"):
+        worst_blocks([], lambda chip: np.zeros((0, 640, 1), np.float32), ones)
+
+
+RIG = Rig(camera=LineCamera(samples=64, exposure_ms=10_000.0))
+SWEEP = Sweep("s", "coarse", "x", 0.0, -24.0, 12, 4, 4)
+EXACT: dict[Any, str] = {
+    ROTATION: "rays",
+    SLIT: "9x3",
+    SMEAR: "positions",
+    DIFFRACTION: "airy",
+    ABERRATION: "gaussian",
+    KEYSTONE: "linear",
+}
+
+
+def test_contrast_is_that_of_the_scene_about_a_sample() -> None:
+    """A bright pixel between two lines of a chip counts 8 px around it, and no farther; even light counts nothing."""
+    values = np.zeros((48, 64, 1))
+    values[23, 40] = 1.0
+    scene = raster_from_values(values, RIG.camera, name="t", wavelength_nm=np.array([550.0]))
+    block = sweep_block(scene, RIG, SWEEP, range(6, 8))  # looks at rows 24 to 31
+
+    def render(block: SweepBlock, chosen: Any) -> Light:
+        return expected_light(scene, block, chosen)
+
+    contrast = contrast_about(block, render)[0, :, 0]
+    full = float(scene.electrons.max()) * 100
+    assert contrast[33:48].min() > 0.5 * full
+    assert contrast[:30].max() == contrast[52:].max() == 0
+    assert contrast_about(replace(block, lines=range(9, 11)), render).max() == 0
+
+
+def test_kernels_that_differ_misplace_more() -> None:
+    """Another blur, or held positions folded; not the parts of a slit nor an effect without a kernel."""
+    same = misplaced_share(EXACT, {**EXACT, SLIT: "3x1"})
+    assert same == misplaced_share(EXACT, EXACT) < NEGLIGIBLE
+    without = {effect: way for effect, way in EXACT.items() if effect is not KEYSTONE}
+    boxless = {effect: way for effect, way in EXACT.items() if effect is not SLIT}
+    for other in (without, boxless, {**EXACT, SMEAR: "folded"}, {**EXACT, DIFFRACTION: "one-width"}):
+        assert misplaced_share(EXACT, other) == pytest.approx(same + NEGLIGIBLE)
+
+
+@pytest.mark.parametrize("pattern", ["rows", "columns"])
+def test_two_ways_to_fold_the_same_light_differ_by_no_more(pattern: str) -> None:
+    """Light of 60 full wells that no keystone can change, along rows, or that no held position can, along columns."""
+    y, x = np.mgrid[:48, :64]
+    plane = (y if pattern == "rows" else x) // 2 % 2
+    values = plane[..., None] * np.array([1.0, 0.7, 0.9])
+    nm = np.array([450.0, 640.0, 980.0])
+    scene = raster_from_values(values, RIG.camera, name="t", wavelength_nm=nm)
+    block = sweep_block(scene, RIG, SWEEP, range(12))
+    unshifted = {effect: way for effect, way in EXACT.items() if effect is not KEYSTONE}
+    other = unshifted if pattern == "rows" else {**EXACT, SMEAR: "folded"}
+    light, full = (expected_light(scene, block, one) for one in (other, EXACT))
+    contrast = contrast_about(block, lambda block, chosen: expected_light(scene, block, chosen))
+    bound = misplaced_electrons(full, contrast, misplaced_share(EXACT, other))
+    assert (np.abs(light.astype(np.float64) - full) <= bound).all()
+
+
+def test_even_light_differs_by_float32_alone() -> None:
+    """Without contrast nothing can be misplaced."""
+    light = np.full((3, 10, 2), 1e4, np.float32)
+    assert misplaced_electrons(light, np.zeros((1, 10, 2)), 1.0).max() == pytest.approx(1e4 * ROUNDING)

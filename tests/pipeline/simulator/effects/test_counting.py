@@ -1,25 +1,32 @@
-"""Which effects of the readout a scene calls for, and that their bounds hold."""
+"""Which effects of the readout a scene calls for, that their bounds hold, and silicon's dark current."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
+from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.effects.counting import (
+    BOLTZMANN_EV_PER_K,
     DARK_CURRENT,
     DEFECTS,
     QUANTISATION,
     READ_NOISE,
     SATURATION,
     SHOT,
+    band_gap_ev,
+    dark_electrons,
     dead_elements,
     hot_electrons,
+    warmth,
 )
 from pipeline.simulator.effects.noise import CHIP_SAMPLES, MOST_VARIATION, divergence
 from pipeline.simulator.effects.probe import Probe, Unit
@@ -59,14 +66,6 @@ def test_one_dark_sample_needs_read_noise() -> None:
     mixed = probe(100, 10_000)
     assert READ_NOISE.bound(mixed, RIG).value > TOLERANCE
     assert SHOT.bound(mixed, RIG).value == SHOT.bound(probe(10_000, 10_000), RIG).value
-
-
-@pytest.mark.parametrize("effect", NOISY, ids=[effect.name for effect in NOISY])
-def test_an_ideal_sensor_has_no_noise(effect: Any) -> None:
-    """All three are absent, whatever the scene; a camera without read noise has none either."""
-    assert effect.bound(probe(100, 10_000), Rig(detector=Detector(noiseless=True))).value == 0
-    silent = Rig(camera=LineCamera(read_noise_e=0.0))
-    assert (effect.bound(probe(100, 10_000), silent).value == 0) == (effect is READ_NOISE)
 
 
 def test_a_dim_scene_at_1_s_needs_dark_current() -> None:
@@ -180,11 +179,55 @@ def test_quantisation_is_half_a_dn() -> None:
     assert np.abs(read_out(light, block_of(RIG, NM), {}) - dn).max() <= 0.5
 
 
-@pytest.mark.parametrize("effect", [*NOISY, DEFECTS, SATURATION, QUANTISATION], ids=lambda effect: effect.name)
-def test_every_variant_has_a_cost_and_the_exact_one_no_error(effect: Any) -> None:
-    """Names in kebab-case, variants from exact to cheap, a cost for each."""
-    assert effect.name == effect.name.lower()
-    assert set(effect.cost_ns) == set(effect.variants)
-    assert effect.variants[0] == "exact"
-    rig = Rig(detector=Detector(dead_share=0.01, hot_share=0.01))
-    assert effect.bound(probe(100, 30_000), rig, "exact").value == 0
+DEGREES = st.floats(-80.0, 49.0)
+
+
+def doubling_deg(temperature_deg_c: float) -> float:
+    """How many degrees about a temperature make twice the dark current."""
+    return 0.2 * math.log(2) / math.log(warmth(temperature_deg_c + 0.1) / warmth(temperature_deg_c - 0.1))
+
+
+@pytest.mark.parametrize(("kelvin", "ev"), [(0.0, 1.1557), (300.0, 1.1108), (193.15, 1.1356)])
+def test_band_gap_by_hand(kelvin: float, ev: float) -> None:
+    """1.1557 - 7.021e-4 T^2 / (1108 + T): 1.11 eV in a warm room."""
+    assert band_gap_ev(kelvin) == pytest.approx(ev, abs=1e-4)
+
+
+def test_absolute_size_by_janesick() -> None:
+    """His 2.5e15 T^1.5 exp(-Eg / 2kT) e-/s from 1 cm^2 of 1 nA/cm^2 at 300 K gives that nA back, 6.24e9 e-/s."""
+    rate = 2.5e15 * 300**1.5 * math.exp(-band_gap_ev(300) / (2 * BOLTZMANN_EV_PER_K * 300))
+    assert rate == pytest.approx(6.24e9, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("deg_c", "factor"), [(25.0, 1.0), (0.0, 0.1056), (-40.0, 1.12e-3), (-80.0, 1.97e-6), (50.0, 6.80)]
+)
+def test_warmth_by_hand(deg_c: float, factor: float) -> None:
+    """Worked with a pocket calculator: at -80 deg C (193.15 / 298.15)^1.5 exp(21.629 - 34.114) = 1.97e-6."""
+    assert warmth(deg_c) == pytest.approx(factor, rel=3e-3)
+
+
+@pytest.mark.parametrize(("deg_c", "doubles"), [(25.0, 8.4), (-80.0, 3.6)])
+def test_it_doubles_in_fewer_degrees_in_the_cold(deg_c: float, doubles: float) -> None:
+    """Not every 7 deg C, as a rule of thumb has it: ln 2 over 1.5 / T + (Eg - T Eg') / 2kT^2."""
+    assert doubling_deg(deg_c) == pytest.approx(doubles, abs=0.05)
+
+
+@given(DEGREES, st.floats(0.1, 1.0))
+def test_warmer_is_more_and_ever_less_so(deg_c: float, way: float) -> None:
+    """It rises everywhere, by a factor that shrinks as it gets warmer."""
+    assert warmth(deg_c + way) > warmth(deg_c)
+    assert warmth(deg_c + way) / warmth(deg_c) <= warmth(deg_c - 1 + way) / warmth(deg_c - 1)
+
+
+def test_the_stated_rate_is_that_of_25_deg_c() -> None:
+    """200 e-/s there: 20 e- in 100 ms, exactly; at 33.4 deg C twice as many."""
+    assert dark_electrons(Rig()) == 20.0
+    assert dark_electrons(Rig(detector=Detector(temperature_deg_c=33.4))) == pytest.approx(40, rel=0.02)
+
+
+@pytest.mark.parametrize("deg_c", [-80.5, 51.0])
+def test_beyond_the_laws_range_is_refused(deg_c: float) -> None:
+    """Below, other leaks lead; above, what diffuses from the bulk."""
+    with pytest.raises(SettingsError, match=r"detector\.temperature_deg_c must be a number from -80 to 50 deg C"):
+        Rig(detector=Detector(temperature_deg_c=deg_c))

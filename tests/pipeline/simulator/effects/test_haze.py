@@ -1,4 +1,4 @@
-"""Path radiance and transmission: by hand, limits, when it counts, its variants and bounds, and blocks."""
+"""Air on the way: extinction and gases against published models, limits, variants and bounds."""
 
 from __future__ import annotations
 
@@ -12,22 +12,26 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.lazy import Once
 from pipeline.planning.coverage import full_sweeps
 from pipeline.simulator.effects.effect import OFF
-from pipeline.simulator.effects.haze import PATH_RADIANCE, extinction_per_m, rayleigh_per_m
+from pipeline.simulator.effects.haze import (
+    ABSORPTION,
+    AIR_MASS_M,
+    OXYGEN,
+    PATH_RADIANCE,
+    WATER,
+    extinction_per_m,
+    rayleigh_per_m,
+    transmission,
+)
 from pipeline.simulator.effects.probe import fixed_variance
-from pipeline.simulator.render import expected_light
-from pipeline.simulator.rig_model import Air, Rig, Sky
+from pipeline.simulator.rig_model import Air, Optics, Rig, Sky
 from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.outdoors import (
     BANDS,
     MORNING,
     NIGHT,
-    NOON,
-    SHAPE,
     WAVELENGTH,
     block_of,
     measured,
@@ -112,33 +116,12 @@ def test_what_looks_like_the_horizon_stays() -> None:
     np.testing.assert_allclose(seen, light, rtol=1e-6)
 
 
-def test_no_distance_no_air() -> None:
-    """A scene without a distance is light at the aperture."""
-    rig = rig_with()
-    assert PATH_RADIANCE.bound(probe_of(rig), rig).value == 0
-    light = np.full((1, 640, BANDS), 5e3, np.float32)
-    np.testing.assert_array_equal(PATH_RADIANCE.change(light.copy(), block_of(rig, range(1)), "range"), light)
-
-
 def test_without_the_panels_light_none_is_added() -> None:
     """Transmission alone."""
     rig = rig_with(HAZY_300_M)
     seen = PATH_RADIANCE.change(np.ones((1, 640, BANDS), np.float32), block_of(rig, range(1), white_e=None), "range")
     passed = np.exp(-300 * extinction_per_m(rig.air, WAVELENGTH))
     np.testing.assert_allclose(seen, np.broadcast_to(passed, seen.shape), rtol=1e-5)
-
-
-def test_short_exposures_need_it_in_haze_but_not_at_30_m() -> None:
-    """At 3 ms lines: off at 30 m in clear air at 0.1 sigma, on at 300 m in haze."""
-    near, far = rig_with(CLEAR_30_M, 3.0), rig_with(HAZY_300_M, 3.0)
-    assert 1.2 * PATH_RADIANCE.bound(probe_of(near), near).value < 0.1
-    assert PATH_RADIANCE.bound(probe_of(far), far).value > 1
-
-
-def test_long_exposures_need_it_even_at_30_m() -> None:
-    """At 100 ms the noise is so low that 30 m of clear air do change more than 0.1 sigma: it could not be left out."""
-    rig = rig_with(CLEAR_30_M)
-    assert measured(PATH_RADIANCE, rig, samples=range(1)) > 0.1
 
 
 @pytest.mark.parametrize("exposure", [3.0, 100.0])
@@ -191,35 +174,6 @@ def test_air_is_dark_at_night() -> None:
     assert not PATH_RADIANCE.change(np.zeros((2, 640, BANDS), np.float32), block, "range").any()
 
 
-@pytest.mark.parametrize("size", [1, 7])
-def test_blocks_do_not_matter(size: int) -> None:
-    """Lines and samples are the same in blocks of any size."""
-    rig, light = rig_with(SLOPING, started=NOON), np.full((20, 640, BANDS), 5e3, np.float32)
-    whole = PATH_RADIANCE.change(light.copy(), block_of(rig, range(20)), "range")
-    ranges = [range(start, min(start + size, 20)) for start in range(0, 20, size)]
-    parts = [PATH_RADIANCE.change(light[: len(some)].copy(), block_of(rig, some), "range") for some in ranges]
-    np.testing.assert_array_equal(np.concatenate(parts), whole)
-    some = PATH_RADIANCE.change(light[:, :7].copy(), block_of(rig, range(20), samples=range(100, 107)), "range")
-    np.testing.assert_array_equal(some, whole[:, 100:107])
-
-
-def test_rendered() -> None:
-    """Through the chain a black scene is the air's own light."""
-    spectra = white_e().astype(np.float32)
-    scene = RasterScene(
-        "black",
-        "black",
-        SceneRaster.of(np.zeros((*SHAPE, 1), np.float32)),
-        Once.of(SceneLight(spectra[None], spectra)),
-        np.ones(BANDS, np.float32),
-        WAVELENGTH,
-    )
-    block = block_of(rig_with(HAZY_300_M), range(2), samples=range(4))
-    light = expected_light(scene, block, {PATH_RADIANCE: "range"})
-    lost = -np.expm1(-300 * extinction_per_m(HAZY_300_M, WAVELENGTH))
-    np.testing.assert_allclose(light, np.broadcast_to(0.3 * white_e() * lost, light.shape), rtol=1e-5)
-
-
 @pytest.mark.parametrize("air", [CLEAR_30_M, HAZY_300_M, Air(math.inf), SLOPING])
 @pytest.mark.parametrize("black", [slice(1, 2), slice(None)], ids=["one band", "all bands"])
 def test_bands_without_light_have_a_finite_bound(air: Air, black: slice) -> None:
@@ -232,3 +186,91 @@ def test_bands_without_light_have_a_finite_bound(air: Air, black: slice) -> None
     found = [PATH_RADIANCE.bound(probe, rig, variant).value for variant in (OFF, *PATH_RADIANCE.variants)]
     assert np.isfinite(found).all()
     assert found[0] > 0
+
+
+SHARP = Rig(optics=Optics(fwhm_nm=0.0))
+
+
+def clear_sky(**what: float) -> tuple[np.ndarray, np.ndarray]:
+    """Wavelengths of SPECTRL2 and the sun's beam from the zenith through air with nothing but what is asked for."""
+    from pvlib.spectrum import spectrl2
+
+    nothing = {"precipitable_water": 0.0, "ozone": 0.0, "aerosol_turbidity_500nm": 0.0, "surface_pressure": 101325.0}
+    overhead = {"apparent_zenith": 0.0, "aoi": 0.0, "surface_tilt": 0.0, "ground_albedo": 0.2, "dayofyear": 172}
+    sky = spectrl2(**overhead, **(nothing | {"relative_airmass": 1.0} | what))
+    return sky["wavelength"], sky["dni"][:, 0] / sky["dni_extra"][:, 0]
+
+
+def test_water_is_spectrl2s() -> None:
+    """A way with 3 cm of water passes what SPECTRL2's atmosphere with 3 cm does, at its own wavelengths."""
+    nm, wet = clear_sky(precipitable_water=3.0)
+    dry = clear_sky()[1]
+    known = (nm >= 570) & (nm <= 1040)
+    rig = replace(SHARP, air=Air(vapour_g_per_m3=3e4 / AIR_MASS_M))
+    oxygen = transmission(np.array([AIR_MASS_M]), replace(SHARP, air=Air(vapour_g_per_m3=0.0)), nm[known])[0]
+    passed = transmission(np.array([AIR_MASS_M]), rig, nm[known])[0] / oxygen
+    np.testing.assert_allclose(passed, (wet / dry)[known], rtol=2e-3)
+
+
+def test_oxygen_is_spectrl2s() -> None:
+    """A whole atmosphere's worth of air passes what SPECTRL2's does once the molecules' scattering is divided out."""
+    nm, through = clear_sky()
+    known = (nm >= 600) & (nm <= 1000)
+    micron = nm[known] / 1000
+    scattered = np.exp(-1 / (micron**4 * (115.6406 - 1.3366 / micron**2)))  # Rayleigh, Eq. 2-4
+    passed = transmission(np.array([AIR_MASS_M]), replace(SHARP, air=Air(vapour_g_per_m3=0.0)), nm[known])[0]
+    np.testing.assert_allclose(passed, through[known] / scattered, rtol=2e-3)
+
+
+def test_by_hand() -> None:
+    """300 m at 10 g/m^3 hold 0.3 cm of water: x = 55 * 0.3, exp(-0.2385 x / (1 + 20.07 x)^0.45) = 0.749 at 937 nm."""
+    x = 55 * 0.3
+    by_hand = math.exp(-0.2385 * x / (1 + 20.07 * x) ** 0.45)
+    assert transmission(np.array([300.0]), SHARP, np.array([937.0]))[0, 0] == pytest.approx(by_hand, rel=1e-9)
+    assert by_hand == pytest.approx(0.749, abs=5e-4)
+
+
+def test_bands_smooth_the_line() -> None:
+    """The wider the band, the less of oxygen's depth it sees at 762.5 nm; the window at 870 nm passes all."""
+    depth = [
+        1 - transmission(np.array([300.0]), Rig(optics=Optics(fwhm_nm=fwhm)), np.array([762.5, 870.0]))[0]
+        for fwhm in (0.0, 6.0, 40.0)
+    ]
+    assert depth[0][0] > depth[1][0] > depth[2][0] > 0
+    assert max(one[1] for one in depth[:2]) < 1e-3
+
+
+def test_limits() -> None:
+    """No way passes all; an endless one nothing in the bands; more way never passes more."""
+    passed = transmission(np.array([0.0, 1.0, 30.0, 300.0, 1e7]), Rig(), WAVELENGTH)
+    assert (passed[0] == 1).all()
+    assert (np.diff(passed, axis=0) <= 1e-12).all()
+    assert passed[-1].min() < 1e-3
+
+
+def test_tables_are_in_order() -> None:
+    """Wavelengths rise and both ends are 0 or next to it."""
+    for table in (WATER, OXYGEN):
+        assert (np.diff(table[:, 0]) > 0).all()
+        assert table[[0, -1], 1].max() < 1e-4
+
+
+@pytest.mark.parametrize("variant", ["off", "uniform"])
+@pytest.mark.parametrize("air", [Air(30.0), Air(300.0), SLOPING, Air(30.0, "step", 5.0, 60.0), Air(math.inf)])
+def test_absorption_bound_holds_and_is_near(air: Air, variant: str) -> None:
+    """The change of any material is within the bound, and the bound within 6 times of it."""
+    rig = rig_with(air)
+    bound, seen = ABSORPTION.bound(probe_of(rig), rig, variant).value, measured(ABSORPTION, rig, variant)
+    assert seen <= 1.2 * bound
+    assert seen >= bound / 6
+
+
+def test_relief_between_knots() -> None:
+    """Each sample's own distance gives the transmission of that distance to 1e-4."""
+    rig = rig_with(SLOPING)
+    block = block_of(rig, range(0, 60, 59), samples=range(3))
+    gain = ABSORPTION.gain(block, "range")
+    row = block.scan_px / ((block.shape[0] - 1) / 2)
+    metres = 1 / (1 / 100 * (1 - row) / 2 + 1 / 10 * (1 + row) / 2)
+    assert gain.shape == (2, 3, BANDS)
+    np.testing.assert_allclose(gain[:, 1], transmission(metres, rig, WAVELENGTH), atol=1e-4)

@@ -1,0 +1,276 @@
+"""Air and depth: turbulence by three laws, rays of a pinhole behind the pivot, one wave of wind, and their bounds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.special import j0
+
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import scene_to_direction
+from pipeline.geometry.scan import Sweep, sweep_to_scene
+from pipeline.simulator.effects.air import (
+    PARALLAX,
+    TURBULENCE,
+    WIND,
+    closeness,
+    line_to_line_px,
+    rytov_variance,
+    sway_px,
+    turbulence_px,
+    within_exposure_px,
+)
+from pipeline.simulator.effects.effect import SweepBlock
+from pipeline.simulator.rig_model import Air, Optics, Rig
+from tests.pipeline.geometry.second_order import relief_error
+from tests.pipeline.simulator.fine_image import IMAGES, SWEEP, change, probe_of, shifted
+from tests.pipeline.simulator.made_up_effects import steep_probe
+
+LONG = replace(SWEEP, lines=3000, start_px=-1500.0)
+
+
+def rig_at(distance_m: float | None, **air: float) -> Rig:
+    """A rig that looks through so much air."""
+    return Rig(air=Air(distance_m, **air))
+
+
+def drawn(lines: range, seed: int = 0, rig: Rig | None = None) -> np.ndarray:
+    """Jitter of lines of the long sweep, (line, 2) [px]."""
+    block = SweepBlock(rig or rig_at(300.0), LONG, lines, np.array([700.0]), (10, 10), seed=seed)
+    jitter = TURBULENCE.aim(block, "jitter")
+    assert jitter.shape == (len(lines), 1, 2)
+    return jitter[:, 0]
+
+
+@pytest.mark.parametrize(("distance", "px"), [(30.0, 0.0365), (300.0, 0.1154)])
+def test_size_by_hand(distance: float, px: float):
+    """sqrt(1.09 1e-13 d 4.551) / 105.7 urad, where 10.6 mm to the power -1/3 are 4.551: 3.86 urad at 30 m."""
+    assert turbulence_px(rig_at(distance)) == pytest.approx(px, abs=1e-4)
+
+
+def test_size_by_the_structure_function():
+    """Its square is the phase's structure function at D over (k D)^2, summed along the way by the spectrum itself.
+
+    8 pi^2 k^2 dz Phi (1 - J0(kappa D z / d)) kappa dkappa, Phi = 0.033 Cn2 kappa^(-11/3): spherical waves from z = 0.
+    """
+    kappa = np.geomspace(1e-4, 1e7, 40_000)  # 1/m
+    place = (np.arange(64) + 0.5) / 64
+    d, cn2, aperture = 120.0, 1e-14, 0.015 * np.sqrt(0.5)
+    spectrum = 0.033 * cn2 * kappa ** (-8 / 3) * (1 - j0(kappa * aperture * place[:, None]))
+    variance = 8 * np.pi**2 * d * np.trapezoid(spectrum, kappa, axis=1).mean() / aperture**2
+    rig = rig_at(d, turbulence_cn2=cn2)
+    assert (turbulence_px(rig) * rig.camera.ifov_rad) ** 2 == pytest.approx(variance, rel=5e-3)
+
+
+def test_size_by_frieds_parameter():
+    """6.88 (D / r0)^(5/3) / (k D)^2, with r0 of spherical waves (8/3)^(3/5) times (0.423 k^2 Cn2 d)^(-3/5)."""
+    d, cn2, aperture, k = 250.0, 3e-14, 0.015 * np.sqrt(0.5), 2 * np.pi / 600e-9
+    r0 = (8 / 3) ** (3 / 5) * (0.423 * k**2 * cn2 * d) ** (-3 / 5)
+    rig = rig_at(d, turbulence_cn2=cn2)
+    radians = np.sqrt(6.88 * (aperture / r0) ** (5 / 3)) / (k * aperture)
+    assert turbulence_px(rig) * rig.camera.ifov_rad == pytest.approx(radians, rel=2e-3)
+
+
+@given(st.floats(1.0, 1e4), st.floats(1e-17, 1e-12), st.floats(1.1, 10.0))
+def test_how_it_grows(distance: float, cn2: float, times: float):
+    """As the root of the way and of Cn2, and it shrinks as the sixth root of the aperture."""
+    one = turbulence_px(rig_at(distance, turbulence_cn2=cn2))
+    assert turbulence_px(rig_at(distance * times, turbulence_cn2=cn2)) == pytest.approx(one * times**0.5)
+    assert turbulence_px(rig_at(distance, turbulence_cn2=cn2 * times)) == pytest.approx(one * times**0.5)
+    wide = replace(rig_at(distance, turbulence_cn2=cn2), optics=Optics(aperture_mm=15.0 * times))
+    assert turbulence_px(wide) == pytest.approx(one * times ** (-1 / 6))
+
+
+def test_strong_turbulence_is_said():
+    """The law is of weak turbulence: where it is strong the manifest calls it a guess. 0.5 1e-12 k^(7/6) 300^(11/6)."""
+    probe, strong = probe_of(IMAGES["edges"]()), rig_at(300.0, turbulence_cn2=1e-12)
+    k = 2 * np.pi / 550e-9
+    assert rytov_variance(strong, 550.0) == pytest.approx(0.5e-12 * k ** (7 / 6) * 300 ** (11 / 6))
+    assert "beyond weak turbulence (Rytov variance" in TURBULENCE.bound(probe, strong).why
+    assert "Rytov" not in TURBULENCE.bound(probe, rig_at(100.0)).why
+
+
+def test_statistics():
+    """Zero mean, the stated deviation in both directions, and no link between them or between lines."""
+    jitter = drawn(range(3000)) / turbulence_px(rig_at(300.0))
+    assert jitter.mean(axis=0) == pytest.approx([0, 0], abs=0.06)
+    assert jitter.std(axis=0) == pytest.approx([1, 1], abs=0.05)
+    both = np.column_stack([jitter[:-1], jitter[1:]])
+    assert np.abs(np.corrcoef(both.T) - np.eye(4)).max() < 0.06
+
+
+def test_bound_holds_and_is_near():
+    """The line that strays farthest in each of 20 surveys changes no number by more than the bound, nor far less."""
+    image, rig = IMAGES["both"](), rig_at(300.0)
+    bound = TURBULENCE.bound(probe_of(image, lines=100), rig).value
+    surveys = [drawn(range(100), seed) for seed in range(20)]
+    worst = [jitter[np.argmax(np.hypot(*jitter.T))] for jitter in surveys]
+    measured = [change(image, shifted(*way)) for way in worst]
+    assert max(measured) <= bound
+    assert bound / 6 < np.median(measured)
+
+
+def test_risk_of_the_bound():
+    """Of 20,000 surveys of 50 lines, about 20 have a line beyond the way that the bound allows."""
+    rng = np.random.default_rng(3)
+    ways = np.hypot(*rng.standard_normal((2, 20_000, 50))).max(axis=1)
+    ramp = replace(probe_of(IMAGES["edges"](), lines=50), slope=np.array([[0.0], [1.0]]), span=np.array([np.inf]))
+    allowed = TURBULENCE.bound(ramp, rig_at(300.0)).value / turbulence_px(rig_at(300.0))
+    assert 8 <= np.count_nonzero(ways > allowed) <= 34
+
+
+SWEEP = Sweep("strip", "fine", "x", 0.0, -100.0, 201)
+STEP = Air(distance_m=30.0, relief="step", nearest_m=3.0)
+
+
+def shown(air: Air, sweep: Sweep = SWEEP, lines: range = range(201)) -> tuple[np.ndarray, np.ndarray]:
+    """Displacement of the points of some lines."""
+    rig = Rig(air=air)
+    along, scan = sweep_to_scene(sweep, rig.camera)
+    taken = slice(lines.start, lines.stop)
+    return PARALLAX.displaced(SweepBlock(rig, sweep, lines, np.ones(1), (201, 640)), along[taken], scan[taken], "exact")
+
+
+def test_line_ends_move_by_half_a_line_times_the_lever():
+    """At a line's ends parts at 3 and 30 m lie 320 L (1/3 - 1/30) px apart, 9.6 px for 0.1 m; centres stay."""
+    along, scan = shown(STEP)
+    near = along[150]
+    middle = relief_error(Rig().camera, 3.0, 30.0)
+    assert middle == pytest.approx(9.6)
+    assert np.abs(near[[0, -1]]) == pytest.approx(middle * 319.5 / 320, rel=2e-3)
+    assert np.abs(near[319:321]).max() < 0.02
+    np.testing.assert_allclose(along[:100], 0, atol=1e-12)  # as far as the scene's distance
+    assert np.abs(scan).max() < 0.1
+
+
+@pytest.mark.parametrize("strip_px", [0.0, 1500.0, -3000.0])
+def test_rays_of_a_pinhole_behind_the_pivot(strip_px: float):
+    """Points seen from the lever behind the pivot, on a plane across the chief ray's distance, are met exactly."""
+    sweep = replace(SWEEP, strip_px=strip_px, start_px=900.0)
+    air = Air(distance_m=math.inf, relief="step", nearest_m=4.0, farthest_m=4.0, lever_m=0.1)
+    camera = Rig().camera
+    along, scan = sweep_to_scene(sweep, camera)
+    found = np.stack([along, scan], axis=-1) + np.stack(shown(air, sweep), axis=-1)
+    centre = np.stack([np.full(201, strip_px), sweep.line_px()], axis=-1) * camera.ifov_rad
+    chief = scene_to_direction(centre)[:, None]
+    ray = scene_to_direction(np.stack([along, scan], axis=-1) * camera.ifov_rad)
+    depth = 4.0 * chief[..., 0]  # of the plane that the chief ray meets 4 m from the pivot
+    point = -0.1 * chief + ray * ((depth + 0.1 * chief[..., 0]) / ray[..., 0])[..., None]
+    np.testing.assert_allclose(found * camera.ifov_rad, point[..., 1:] / point[..., :1], atol=1e-12)
+
+
+def test_reliefs():
+    """A step is far above the middle row and near from there on; along a plane 1/d runs evenly; flat is d0."""
+    row = np.array([-2.0, -1.0, -0.5, 0.0, 1.0, 3.0])
+    np.testing.assert_allclose(closeness(STEP, row), [1 / 30, 1 / 30, 1 / 30, 1 / 3, 1 / 3, 1 / 3])
+    plane = closeness(replace(STEP, relief="plane", farthest_m=math.inf), row)
+    np.testing.assert_allclose(plane, [0, 0, 1 / 12, 1 / 6, 1 / 3, 1 / 3])
+    np.testing.assert_allclose(closeness(replace(STEP, relief="flat"), row), 1 / 30)
+
+
+def test_a_line_across_the_step_has_both_depths():
+    """Where the line crosses the rows it meets both parts of the scene."""
+    along = shown(STEP, replace(SWEEP, along="y"))[0]
+    np.testing.assert_allclose(along[100, :320], 0, atol=1e-12)
+    assert along[100, -1] == pytest.approx(9.6, rel=0.01)
+
+
+@pytest.mark.parametrize("relief", ["step", "plane"])
+@pytest.mark.parametrize(("near", "far"), [(3.0, 30.0), (25.0, 30.0), (30.0, math.inf)])
+def test_bound_holds_and_is_tight(relief: str, near: float, far: float):
+    """The change of a wave along the line is below the bound and at least a sixth of it."""
+    air = Air(distance_m=30.0, relief=relief, nearest_m=near, farthest_m=far)  # type: ignore[arg-type]
+    along, scan = shown(air)
+    x, y = sweep_to_scene(SWEEP, Rig().camera)
+    change = np.abs(np.sin((x + along) / 5 + (y + scan) / 20) - np.sin(x / 5 + y / 20)).max()
+    bound = PARALLAX.bound(steep_probe((0.2, 0.05), (SWEEP,), 2.0), Rig(air=air)).value
+    assert change <= bound <= 6 * change
+
+
+@pytest.mark.parametrize(
+    "air", [Air(), Air(distance_m=3.0), Air(distance_m=math.inf, relief="step"), replace(STEP, lever_m=0)]
+)
+def test_nothing_at_one_distance(air: Air):
+    """No distance, one distance, all infinitely far, no lever: no displacement and no bound."""
+    assert PARALLAX.bound(steep_probe((5.0, 5.0), (SWEEP,)), Rig(air=air)).value == 0
+    assert not np.any(shown(air))
+
+
+BREEZE = Air(distance_m=30.0, wind_amplitude_m=0.02, wind_hz=1.0)
+CAMERA = LineCamera()
+
+
+def wind_shown(
+    air: Air, sweep: Sweep = SWEEP, lines: range = range(201), **options: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Displacement of the points of some lines."""
+    along, scan = sweep_to_scene(sweep, CAMERA)
+    taken = slice(lines.start, lines.stop)
+    block = SweepBlock(Rig(air=air), sweep, lines, np.ones(1), (201, 640), **options)  # type: ignore[arg-type]
+    return WIND.displaced(block, along[taken], scan[taken], "exact")
+
+
+def test_sizes():
+    """2 cm at 30 m are 6.3 px; at 1 Hz and 100 ms a line a tenth of a sway, 3.9 px from line to line."""
+    assert sway_px(Rig(air=BREEZE)) == pytest.approx(6.3, abs=0.01)
+    assert line_to_line_px(Rig(air=BREEZE)) == pytest.approx(2 * 6.306 * math.sin(0.1 * math.pi), abs=0.01)
+    size = np.hypot(*wind_shown(BREEZE))
+    assert size.max() == pytest.approx(6.306, rel=0.01)
+
+
+@pytest.mark.parametrize(("exposure_ms", "share"), [(3.0, 0.0188), (100.0, 0.618), (2000.0, 2.0)])
+def test_the_smear_that_is_not_modelled_is_told(exposure_ms: float, share: float):
+    """Little of the sway in 3 ms, most of it in 100 ms, all of its way in 2 s; the reason gives the px."""
+    rig = Rig(camera=LineCamera(exposure_ms=exposure_ms), air=BREEZE)
+    assert within_exposure_px(rig) == pytest.approx(share * sway_px(rig), rel=5e-3)
+    assert (
+        f"up to {within_exposure_px(rig):.2g} px of smear within an exposure"
+        in WIND.bound(steep_probe((1.0, 1.0)), rig).why
+    )
+
+
+def test_lines_follow_the_wave_and_no_faster():
+    """From line to line the crop moves by no more than stated, and by nearly that somewhere."""
+    along, scan = wind_shown(BREEZE)
+    moved = np.hypot(np.diff(along[:, 320]), np.diff(scan[:, 320])).max()
+    assert 0.9 * line_to_line_px(Rig(air=BREEZE)) < moved < 1.01 * line_to_line_px(Rig(air=BREEZE))
+
+
+def test_fast_sways_are_aliased():
+    """A sway of 11 Hz seen at 10 lines a second is one of 1 Hz; the reason says that lines cannot follow."""
+    slow, fast = wind_shown(BREEZE), wind_shown(replace(BREEZE, wind_hz=11.0))
+    phase = 2 * np.pi * 10 * CAMERA.exposure_ms / 2e3  # by the middle of the first exposure
+    assert phase == pytest.approx(np.pi)
+    np.testing.assert_allclose(fast, -np.asarray(slow), atol=1e-9)
+    assert "too fast" in WIND.bound(steep_probe((1.0, 1.0)), Rig(air=replace(BREEZE, wind_hz=11.0))).why
+    assert "too fast" not in WIND.bound(steep_probe((1.0, 1.0)), Rig(air=BREEZE)).why
+
+
+def test_one_wave_for_all_sweeps():
+    """Sweeps of other names and either axis see the same crop at the same place and time; another seed does not."""
+    point = np.array([[40.0]]), np.array([[-25.0]])
+    line = replace(SWEEP, lines=1)
+    seen = WIND.displaced(SweepBlock(Rig(air=BREEZE), line, range(1), np.ones(1), (201, 640)), *point, "exact")
+    across = replace(line, name="other", along="y")
+    turned = WIND.displaced(
+        SweepBlock(Rig(air=BREEZE), across, range(1), np.ones(1), (201, 640)), *point[::-1], "exact"
+    )
+    np.testing.assert_allclose(turned[::-1], seen)
+    assert not np.allclose(wind_shown(BREEZE, seed=3), wind_shown(BREEZE))
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("amplitude_m", [0.001, 0.1])
+def test_wind_bound_holds_and_is_tight(seed: int, amplitude_m: float):
+    """The change of crossed waves is below the bound and at least a sixth of it, whichever way the wind blows."""
+    air = replace(BREEZE, wind_amplitude_m=amplitude_m)
+    along, scan = wind_shown(air, seed=seed)
+    x, y = sweep_to_scene(SWEEP, CAMERA)
+    change = np.abs(np.sin((x + along) / 3) + np.sin((y + scan) / 4) - np.sin(x / 3) - np.sin(y / 4)).max()
+    bound = WIND.bound(steep_probe((1 / 3, 1 / 4), span=4.0), Rig(air=air)).value
+    assert change <= bound <= 6 * change

@@ -1,0 +1,232 @@
+"""Blurs: moments by hand, contrast through the renderer, bounds against real convolution, what folding leaves out."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pipeline.geometry.scan import Sweep
+from pipeline.simulator.effects.air import TURBULENCE
+from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE, defocus_px, keystone_shift
+from pipeline.simulator.effects.effect import SweepBlock
+from pipeline.simulator.effects.line import SLIT
+from pipeline.simulator.optics.rays import pupil_contrast
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Air, Optics, Rig
+from pipeline.simulator.scenes.scene import RasterScene
+from tests.pipeline.simulator.fine_image import (
+    BOX,
+    IMAGES,
+    SCAN,
+    SWEEP,
+    change,
+    convolved,
+    disc,
+    gaussian,
+    probe_of,
+    shifted,
+)
+from tests.pipeline.simulator.small_scenes import made_scene
+
+
+def rig_of(sigma_px: float) -> Rig:
+    """A rig whose lens blurs by so much."""
+    return Rig(optics=Optics(aberration_px=sigma_px))
+
+
+def test_moments():
+    """The square of the sd in all bands and both directions, no shift."""
+    moments = ABERRATION.moments(rig_of(0.3), np.array([400.0, 900.0]), "gaussian")
+    assert moments.variance == pytest.approx(np.full((2, 2), 0.09))
+    assert not moments.shift.any()
+
+
+@pytest.mark.parametrize("name", IMAGES)
+@pytest.mark.parametrize("sigma", [0.1, 0.35, 0.7])
+def test_bound_holds(name: str, sigma: float):
+    """Real convolution changes no image by more, and by no less than a sixth."""
+    image = IMAGES[name]()
+    bound = ABERRATION.bound(probe_of(image), rig_of(sigma)).value
+    assert bound / 6 <= change(image, gaussian(sigma, sigma)) <= bound + 1e-9
+
+
+NM = np.array([700.0])
+
+
+def rig_at(distance_m: float | None, focus_m: float = math.inf, **air: float) -> Rig:
+    """A rig that looks at a distance and is focused at another."""
+    return Rig(optics=Optics(focus_m=focus_m), air=Air(distance_m, **air))
+
+
+def test_disc_at_30_m():
+    """Focused at infinity, 10.6 mm of pupil make 3.3 px along the scan, and 15 mm make 4.7 px along the line."""
+    assert defocus_px(rig_at(30.0), 30.0) == pytest.approx([4.73, 3.34], abs=0.005)
+    variance = DEFOCUS.moments(rig_at(30.0), NM, "disc").variance[:, 0]
+    assert variance == pytest.approx(np.array([4.73, 3.344]) ** 2 / 16, rel=1e-3)
+
+
+def test_disc_at_grazing_incidence():
+    """At 70 deg of incidence the disc is 0.34 as wide along the scan as along the line."""
+    normal = np.array([np.sin(np.deg2rad(70)), 0, -np.cos(np.deg2rad(70))])
+    along, scan = np.sqrt(DEFOCUS.moments(rig_at(30.0), NM, "disc", normal).variance[:, 0] * 16)
+    assert [along, scan] == pytest.approx([4.73, 4.73 * np.cos(np.deg2rad(70))], abs=0.005)
+
+
+@given(st.floats(0.5, 1e6), st.floats(0.5, 1e6))
+def test_nearer_and_farther_blur_alike(distance: float, focus: float):
+    """The disc depends on |1/d - 1/d_f| alone: distance and focus may change places."""
+    there, back = defocus_px(rig_at(distance, focus), distance), defocus_px(rig_at(focus, distance), focus)
+    assert there == pytest.approx(back)
+
+
+@pytest.mark.parametrize(("distance", "focus"), [(None, 30.0), (30.0, 30.0), (math.inf, math.inf)])
+def test_in_focus_or_without_distance(distance: float | None, focus: float):
+    """No blur and a bound of 0, no NaN from infinity less infinity."""
+    rig = rig_at(distance, focus)
+    assert not DEFOCUS.moments(rig, NM, "disc").variance.any()
+    assert DEFOCUS.bound(probe_of(IMAGES["edges"]()), rig).value == 0
+
+
+def test_far_away_is_in_focus():
+    """1/d goes to 0 without a jump."""
+    sizes = [defocus_px(rig_at(d), d)[1] for d in (1e3, 1e6, 1e12, 1e300, math.inf)]
+    assert sizes[0] == pytest.approx(0.1, abs=0.001)
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] == 0
+
+
+@pytest.mark.parametrize("name", IMAGES)
+@pytest.mark.parametrize("distance", [60.0, 150.0])
+def test_bound_holds_for_disc_and_fold(name: str, distance: float):
+    """Neither the real disc nor the Gaussian of its variance changes an image by more; both come within 6x of it."""
+    image, rig = IMAGES[name](), rig_at(distance)
+    bound = DEFOCUS.bound(probe_of(image), rig).value
+    axes = defocus_px(rig, distance)
+    measured = [change(image, disc(*axes)), change(image, gaussian(*axes / 4))]
+    assert max(measured) <= bound + 1e-9
+    assert min(measured) >= bound / 6
+
+
+def test_bound_is_that_of_the_one_distance_that_is_computed():
+    """A nearest part at 100 m does not count: switched on, the blur would not be that of 100 m there."""
+    probe = probe_of(IMAGES["texture"]())
+    plain, deep = (DEFOCUS.bound(probe, rig).value for rig in (rig_at(200.0), rig_at(200.0, nearest_m=100.0)))
+    assert deep == plain
+
+
+KEYSTONE_NM = np.array([400.0, 700.0, 1000.0])
+
+
+def keystone_rig_of(keystone_px: float) -> Rig:
+    """A rig with so much keystone."""
+    return Rig(optics=Optics(keystone_px=keystone_px))
+
+
+@given(st.floats(0, 3), st.floats(400, 1000))
+def test_line_over_the_wavelengths(keystone: float, nm: float):
+    """From -k/2 at 400 nm through 0 at 700 to k/2 at 1000; a band's shift does not depend on other bands."""
+    shift = keystone_shift(keystone_rig_of(keystone), np.array([400.0, 700.0, 1000.0, nm]))
+    assert shift[:3] == pytest.approx([-keystone / 2, 0, keystone / 2])
+    assert shift[3] == pytest.approx(keystone * (nm - 700) / 600, abs=1e-12)
+    assert keystone_shift(keystone_rig_of(keystone), np.array([nm])) == pytest.approx(shift[3])
+
+
+def test_beyond_the_spectrograph_the_shift_stays():
+    """Bands that the spectrograph has not, of a scene from elsewhere, are shifted as its first or last."""
+    assert keystone_shift(keystone_rig_of(0.4), np.array([300.0, 2500.0])) == pytest.approx([-0.2, 0.2])
+
+
+def test_moments_shift_along_the_line_only():
+    """No shift along the scan and no blur."""
+    moments = KEYSTONE.moments(keystone_rig_of(0.4), KEYSTONE_NM, "linear")
+    assert moments.shift == pytest.approx(np.array([[-0.2, 0, 0.2], [0, 0, 0]]))
+    assert not moments.variance.any()
+
+
+def test_long_wavelengths_see_further_along_the_line():
+    """On a ramp of 100 e- per px along the line 0.5 px of keystone add 25 e- at 1000 nm and take 25 at 400."""
+    planes = np.repeat(np.arange(80, dtype=np.float32)[None, :, None], 30, axis=0)
+    electrons = np.full((1, 3), 100.0, np.float32)
+    scene = made_scene(planes, electrons, KEYSTONE_NM)
+    block = SweepBlock(keystone_rig_of(0.5), SWEEP, range(10, 13), KEYSTONE_NM, scene.shape, samples=range(300, 340))
+    plain = {SLIT: "3x1"}
+    beside = expected_light(scene, block, {KEYSTONE: "linear", **plain}) - expected_light(scene, block, plain)
+    assert beside[..., 0] == pytest.approx(-25, abs=0.05)
+    assert beside[..., 1] == pytest.approx(0, abs=0.05)
+    assert beside[..., 2] == pytest.approx(25, abs=0.05)
+
+
+@pytest.mark.parametrize("name", IMAGES)
+@pytest.mark.parametrize("keystone", [0.15, 1.0, 4.0])
+def test_keystone_bound_holds(name: str, keystone: float):
+    """A real shift changes no band by more, and the worst by no less than a sixth."""
+    image = IMAGES[name]()
+    bound = KEYSTONE.bound(probe_of(image, KEYSTONE_NM), keystone_rig_of(keystone)).value
+    measured = max(change(image, shifted(shift, 0)) for shift in keystone_shift(keystone_rig_of(keystone), KEYSTONE_NM))
+    assert bound / 6 <= measured <= bound * 1.001  # slopes are read on a grid of 1/16 px
+
+
+RENDERED_BLURS_NM = np.array([400.0, 600.0, 1000.0])
+RIG = Rig(optics=Optics(aberration_px=0.3, keystone_px=0.4), air=Air(distance_m=120.0))
+WAVES_SWEEP = Sweep("fine", "fine", "x", strip_px=0.0, start_px=-20.0, lines=40)
+ALL = {DIFFRACTION: "airy", DEFOCUS: "disc", ABERRATION: "gaussian", KEYSTONE: "linear", TURBULENCE: "jitter"}
+
+
+def scene_of(planes: NDArray[np.float32]) -> RasterScene:
+    """A raster of one component, of the same 1000 e- in all bands."""
+    electrons = np.full((1, 3), 1000.0, np.float32)
+    return made_scene(planes, electrons, RENDERED_BLURS_NM)
+
+
+def waves(period: float) -> RasterScene:
+    """Light of 1 + cos along the scan."""
+    wave = 1 + np.cos(2 * np.pi * (np.arange(120) - 59.5) / period)
+    return scene_of(np.repeat(wave[:, None, None], 60, axis=1).astype(np.float32))
+
+
+def light_of(scene: RasterScene, lines: range, chosen: dict[Any, str], samples: range | None = None) -> NDArray[Any]:
+    """Electrons of some lines through the footprint and what is chosen."""
+    block = SweepBlock(RIG, WAVES_SWEEP, lines, RENDERED_BLURS_NM, scene.shape, samples=samples)
+    return expected_light(scene, block, {SLIT: "3x1", **chosen})
+
+
+@pytest.mark.parametrize("blur", [DIFFRACTION, DEFOCUS, ABERRATION], ids=lambda blur: blur.name)
+def test_contrast_is_that_of_the_variance(blur: Any):
+    """A wave of 16 px along the scan keeps exp(-2 pi^2 s^2 / 16^2) of what the footprint left of it, or the pupil's."""
+    scene, samples = waves(16.0), range(310, 330)
+    before, after = (light_of(scene, range(40), chosen, samples) for chosen in ({}, {blur: blur.variants[0]}))
+    moments = blur.moments(RIG, RENDERED_BLURS_NM, blur.variants[0])
+    passed = np.exp(-2 * np.pi**2 * moments.variance[1] / 16**2)
+    if moments.waves is not None:
+        passed = passed * pupil_contrast(moments.waves[1] / 16)
+    left = np.ptp(after, axis=(0, 1)) / np.ptp(before, axis=(0, 1))
+    assert left == pytest.approx(passed, abs=1.5e-3)
+
+
+@pytest.mark.parametrize(
+    ("transfer", "bounded", "error", "bound"),
+    [
+        (np.sinc(0.375 * SCAN), ("blur", 0, 0.375**2 / 12), 0.013, 0.0135),
+        (np.sinc(1.125 * SCAN), ("blur", 0, 1.125**2 / 12), 0.046, 0.121),
+        (gaussian(0.1, 0.1), ("blur", 0.01, 0.01), 0.0283, 0.0280),
+        (gaussian(0.35, 0.35), ("blur", 0.35**2, 0.35**2), 0.114, 0.34),
+        (shifted(0, 0.1), ("shift", 0.1, 0.1), 0.038, 0.089),
+    ],
+    ids=["smear 0.375", "smear 1.125", "blur 0.1", "blur 0.35", "shift 0.1"],
+)
+def test_pairs_of_the_design(transfer: np.ndarray, bounded: tuple[str, float, float], error: float, bound: float):
+    """Edges of contrast 1 and 0.51 behind the slit: measured errors and bounds near those of the design's own image."""
+    image = IMAGES["edges"]()
+    probe = probe_of(image)
+    kind, along, scan = bounded
+    found = probe.moved(along, scan) if kind == "shift" else probe.blurred(np.array([[along], [scan]]))
+    measured = float(np.abs(convolved(image, BOX * (transfer - 1))).max())
+    assert measured <= found
+    assert found == pytest.approx(bound, rel=0.1)
+    assert measured == pytest.approx(error, rel=0.35)

@@ -1,0 +1,149 @@
+"""Light of sun and sky: reflectance by angle, clouds and the day's course, by hand, and their bounds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.geometry.scan import Sweep
+from pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT, EDGE_SHARE, HOT_SPOT_RAD, shadow
+from tests.pipeline.simulator.outdoors import MORNING, NIGHT, NOON, SWEEP, block_of, measured, probe_of, rig_with
+
+FAR = replace(SWEEP, strip_px=900.0, start_px=500.0)
+ACROSS = replace(SWEEP, along="y", strip_px=-700.0)
+
+
+def test_slope_along_a_line_by_hand() -> None:
+    """640 px are 3.9 deg, so that 0.1/rad is a slope of 0.68 % from end to end."""
+    gain = BRDF.gain(block_of(rig_with(brdf_per_rad=0.1), range(30, 31)), "angles")[0, :, 0]
+    assert gain[-1] - gain[0] == pytest.approx(0.1 * np.deg2rad(3.87), rel=2e-3)
+    assert gain[319:321].mean() == pytest.approx(1, abs=1e-6)
+
+
+def test_hot_spot_is_a_cusp() -> None:
+    """Its peak is its height; 2 deg away it is down to 1/e; its slope breaks at the peak."""
+    rig = rig_with(brdf_per_rad=0.0, hot_spot=0.05)
+    extra = BRDF.gain(block_of(rig, range(30, 31)), "angles")[0, :, 0].astype(np.float64) - 1
+    assert extra.max() == pytest.approx(0.05, rel=2e-3)
+    px = HOT_SPOT_RAD / rig.camera.ifov_rad
+    assert np.interp(319.5 - 300, np.arange(640), extra) == pytest.approx(0.05 * np.exp(-300 / px), rel=1e-3)
+    bend = np.abs(np.diff(extra, 2))
+    assert bend.argmax() in (317, 318, 319)
+    assert bend.max() > 20 * np.median(bend)
+
+
+def test_reflectance_is_never_negative() -> None:
+    """The steepest slope ends at 0."""
+    rig = rig_with(brdf_per_rad=5.0)
+    gain = BRDF.gain(block_of(rig, sweep=replace(SWEEP, strip_px=-3000.0)), "angles")
+    assert gain.min() == 0
+
+
+@pytest.mark.parametrize("sweep", [SWEEP, FAR, ACROSS])
+@pytest.mark.parametrize(("slope", "hot"), [(0.1, 0.0), (0.0, 0.05), (0.3, 0.02), (5.0, 2.0)])
+def test_bound_holds_and_is_near(sweep: Sweep, slope: float, hot: float) -> None:
+    """The change at any sample is within the bound, and the bound within 6 times of it."""
+    rig = rig_with(brdf_per_rad=slope, hot_spot=hot)
+    bound = BRDF.bound(probe_of(rig, sweep), rig).value
+    seen = measured(BRDF, rig, sweep=sweep)
+    assert seen <= 1.2 * bound
+    assert seen > bound / 6
+    assert BRDF.bound(probe_of(rig, sweep), rig, "angles").value == 0
+
+
+def test_crossing_sweeps_agree() -> None:
+    """Reflectance belongs to the scene: two sweeps that cross see the same at the same place."""
+    rig = rig_with(brdf_per_rad=0.4, hot_spot=0.1)
+    along_x = replace(SWEEP, strip_px=0.0, start_px=100.0)
+    along_y = replace(SWEEP, along="y", strip_px=100.0, start_px=0.0)
+    seen = [
+        BRDF.gain(block_of(rig, range(1), sweep=sweep), "angles")[0, 319:321].mean() for sweep in (along_x, along_y)
+    ]
+    assert seen[0] == pytest.approx(seen[1], abs=1e-5)
+
+
+SIZE = 300.0
+RIG = rig_with(cloud_share=0.6, cloud_size_px=SIZE)
+
+
+def test_a_shadow_by_hand() -> None:
+    """Full in the middle, none between two, a half in the middle of an edge."""
+    np.testing.assert_allclose(shadow(np.array([0, 150, 300, 450, 600.0]), SIZE), [1, 0.5, 0, 0.5, 1], atol=1e-12)
+
+
+@given(way=st.floats(-1e6, 1e6), size=st.floats(1, 1e5))
+def test_shadows_are_soft_and_come_again(way: float, size: float) -> None:
+    """Between 0 and 1, even about the middle, with a period of two sizes and a slope of at most 1.5 over the edge."""
+    step = 1e-3 * size
+    here, there = shadow(np.array([way, way + step]), size)
+    assert 0 <= here <= 1
+    assert abs(there - here) <= 1.5 / EDGE_SHARE * 1e-3 + 1e-6
+    assert shadow(np.array([-way]), size)[0] == pytest.approx(here, abs=1e-6)
+    assert shadow(np.array([way + 2 * size]), size)[0] == pytest.approx(here, abs=1e-6)
+
+
+def test_cloud_bound_holds_and_is_near() -> None:
+    """Wherever the shadow is, the change is within the bound; under its middle it is the bound."""
+    bound = CLOUD.bound(probe_of(RIG), RIG).value
+    looks = [measured(CLOUD, RIG, seed=seed) for seed in range(4)]
+    assert max(looks) == pytest.approx(bound, rel=1e-6)
+    assert CLOUD.bound(probe_of(RIG), RIG, "shadow").value == 0
+
+
+def test_shadow_moves_at_its_speed() -> None:
+    """Where a shadow is, it has come by its speed: a later line sees what another place saw before."""
+    still, quick = (rig_with(cloud_share=0.6, cloud_size_px=SIZE, cloud_px_per_s=speed) for speed in (0.0, 50.0))
+    now, later = (CLOUD.gain(block_of(quick, range(1), started_s=start), "shadow") for start in (0.0, 12.0))
+    np.testing.assert_allclose(now, later, atol=1e-5)  # 12 s at 50 px/s are one period
+    assert np.abs(now - CLOUD.gain(block_of(quick, range(1), started_s=3.0), "shadow")).max() > 0.1
+    first, last = (CLOUD.gain(block_of(still, range(1), started_s=start), "shadow") for start in (0.0, 12.3))
+    np.testing.assert_array_equal(first, last)
+
+
+def test_crossing_sweeps_see_the_same_shadow() -> None:
+    """Two sweeps of any name that cross see the same light where and when they do."""
+    along_x = replace(SWEEP, name="a", strip_px=0.0, start_px=0.0)
+    along_y = replace(SWEEP, name="b", along="y", strip_px=0.0, start_px=0.0)
+    seen = [
+        CLOUD.gain(block_of(RIG, range(1), sweep=sweep), "shadow")[0, 319:321].mean() for sweep in (along_x, along_y)
+    ]
+    assert seen[0] == pytest.approx(seen[1], abs=1e-6)
+
+
+FOUR_HOURS = 4 * 3600.0
+
+
+def test_four_hours_from_a_low_sun_need_it() -> None:
+    """From 20 deg over 4 h the light triples; no variant but the exact one will do."""
+    rig = rig_with(started=MORNING)
+    bound = DRIFT.bound(probe_of(rig, seconds=FOUR_HOURS), rig)
+    assert bound.value > 50
+    assert "the sun from 20" in bound.why
+    for variant in DRIFT.variants[1:]:
+        assert DRIFT.bound(probe_of(rig, seconds=FOUR_HOURS), rig, variant).value > 1
+
+
+@pytest.mark.parametrize("started", [NOON, MORNING, NIGHT])
+@pytest.mark.parametrize("variant", ["off", "scalar", "linear"])
+def test_drift_bound_holds_and_is_near(started: datetime, variant: str) -> None:
+    """What is left out is within the bound, and near it: the end of the survey is among what is measured."""
+    rig = rig_with(started=started)
+    seconds = FOUR_HOURS + 5.9
+    bound = DRIFT.bound(probe_of(rig, seconds=seconds), rig, variant).value
+    looks = [measured(DRIFT, rig, variant, started_s=start, samples=range(1)) for start in (0, 7200, 10800, 14400)]
+    assert max(looks) <= 1.0001 * bound
+    assert max(looks) > bound / 6
+
+
+@pytest.mark.parametrize("variant", DRIFT.variants)
+def test_night_is_dark(variant: str) -> None:
+    """With the sun down all the time no light is left but what a straight line from the start keeps."""
+    rig = rig_with(started=NIGHT)
+    gain = DRIFT.gain(block_of(rig), variant)
+    assert np.isfinite(gain).all()
+    assert gain.max() == (1 if variant == "linear" else 0)

@@ -1,0 +1,266 @@
+"""What the tilted mirror passes: Fresnel's laws and published metals, shares of its area, bounds over whole sweeps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.geometry.mirror import mirror_throughput
+from pipeline.geometry.scan import Sweep, line_positions
+from pipeline.simulator.effects.effect import SweepBlock
+from pipeline.simulator.effects.mirror_throughput import (
+    METALS,
+    MOST_BEND,
+    POLARISATION,
+    VIGNETTING,
+    fresnel,
+    reflectance,
+    refractive_index,
+)
+from pipeline.simulator.rig_model import MirrorMotion, Rig
+from tests.pipeline.simulator.spectral_light import probe_of, rig_with
+
+NM = np.linspace(400.0, 1000.0, 61)
+FLAT = np.full((2, 8, len(NM)), 10_000, np.float32)
+
+
+def sweep_at(strip_px, start_px, lines):
+    """A sweep along x."""
+    return Sweep("fine", "fine", "x", strip_px=strip_px, start_px=start_px, lines=lines)
+
+
+def coated(coating="aluminium"):
+    """A rig whose mirror is of some metal."""
+    return replace(rig_with(), mirror=MirrorMotion(coating=coating))
+
+
+RIG = coated()
+
+
+def factors(sweep, rig=RIG):
+    """Factor of every line, (line, band)."""
+    gain = POLARISATION.gain(SweepBlock(rig, sweep, range(sweep.lines), NM, (640, 640)), "exact")
+    assert gain.shape == (sweep.lines, 1, len(NM))
+    return gain[:, 0].astype(np.float64)
+
+
+def looking(view_deg, rig=RIG):
+    """Factors of one line that looks so far from rest: twice the mirror's turn, (band,)."""
+    return factors(sweep_at(0, np.tan(np.radians(view_deg)) / rig.camera.ifov_rad, 1), rig)[0]
+
+
+def test_bare_aluminium_by_fresnel():
+    """Over 400 to 1000 nm, +0.5 % at 20 deg and -3.7 % at 70; at most 0.7 and 5.4 %, at 820 nm."""
+    obtuse, oblique = 100 * (looking(-50) - 1), 100 * (looking(50) - 1)
+    assert (obtuse.mean(), oblique.mean()) == pytest.approx((0.49, -3.74), abs=0.02)
+    assert (obtuse.max(), oblique.min()) == pytest.approx((0.68, -5.38), abs=0.02)
+    assert abs(int(NM[oblique.argmin()]) - 820) <= 10
+
+
+def test_other_metals_by_fresnel():
+    """Gold turns round with wavelength, +17 % in the blue and under 1 % beyond 600 nm; silver changes least."""
+    gold, silver = 100 * (looking(50, coated("gold")) - 1), 100 * (looking(50, coated("silver")) - 1)
+    assert gold[NM < 480].min() > 16
+    assert np.abs(gold[NM > 600]).max() < 1
+    assert np.abs(silver).max() < 0.7
+
+
+@pytest.mark.parametrize("coating", METALS)
+def test_rest_is_1(coating):
+    """White frames are taken at rest: no band changes there."""
+    np.testing.assert_allclose(looking(0, coated(coating)), 1, atol=1e-6)
+
+
+def test_off_axis_incidence_follows_the_mirror():
+    """To the side of the plane of incidence cos i is |n_z| as well: 3000 px to the side at rest is 45 deg."""
+    np.testing.assert_allclose(factors(sweep_at(3000, 0, 1)), 1, atol=1e-6)
+
+
+@given(st.integers(-4500, 4500), st.integers(-11_000, 10_000), st.integers(1, 900), st.sampled_from(sorted(METALS)))
+@settings(max_examples=50, deadline=None)
+def test_bound_is_the_greatest_way_from_rest(strip_px, start_px, lines, coating):
+    """The bound holds for every line between the ends of a sweep, extremes of the metal included, and is reached."""
+    sweep, rig = sweep_at(strip_px, start_px, lines), coated(coating)
+    probe = probe_of(FLAT, NM, sweep=sweep)
+    way = (probe.level * np.abs(factors(sweep, rig) - 1)).max()
+    bound = POLARISATION.bound(probe, rig).value
+    assert way <= bound * (1 + 1e-4) + 1e-5
+    assert bound <= way * 1.05 + 1e-3
+    passed = POLARISATION.gain_range(probe, rig)
+    assert (factors(sweep, rig) <= passed.greatest + 1e-4).all()
+    assert (factors(sweep, rig) >= passed.least - 1e-4).all()
+
+
+def test_incidence_is_that_of_the_mirror():
+    """The factor follows the angle whose cosine is -n_z, at any place of the field."""
+    block = SweepBlock(RIG, sweep_at(-2300, 1700, 50), range(50), NM, (640, 640))
+    incidence = np.arccos(-block.normals[:, 2])
+    at_rest = reflectance("aluminium", NM, np.radians([45.0]))
+    np.testing.assert_allclose(factors(block.sweep), reflectance("aluminium", NM, incidence) / at_rest, rtol=1e-6)
+
+
+VIGNETTING_RIG, VIGNETTING_NM = Rig(), np.array([700.0])
+VIGNETTING_FLAT = np.full((2, 8, 1), 10_000, np.float32)
+
+
+def vignetting_sweep_at(strip_px, start_px, lines, step=1):
+    """A sweep along x."""
+    return Sweep("fine", "fine", "x", strip_px=strip_px, start_px=start_px, lines=lines, step=step)
+
+
+def vignetting_factors(sweep, variant="held"):
+    """Factor of every line, (line,)."""
+    gain = VIGNETTING.gain(SweepBlock(VIGNETTING_RIG, sweep, range(sweep.lines), VIGNETTING_NM, (640, 640)), variant)
+    assert gain.shape == (sweep.lines, 1, 1)
+    assert gain.dtype == np.float32
+    return gain[:, 0, 0].astype(np.float64)
+
+
+def test_shares_over_a_field_of_10240_px():
+    """Over 10240 x 10240 px the mirror passes 0.72 to 1.21 of its light at rest, and 1 at rest."""
+    held = vignetting_factors(vignetting_sweep_at(0, -5120, 10_241))
+    np.testing.assert_allclose(held[[0, 5120, -1]], [1.215, 1, 0.724], atol=5e-4)
+    assert np.all(np.diff(held) < 0)
+
+
+@pytest.mark.parametrize(("variant", "at"), [("held", "positions"), ("middle", "middle")])
+def test_shares_are_those_of_the_mirror(variant, at):
+    """What calibration divides by is what the lines are multiplied by, at any place of the field."""
+    sweep = vignetting_sweep_at(-2300, 1700, 50, 4)
+    shares = mirror_throughput(
+        getattr(SweepBlock(VIGNETTING_RIG, sweep, range(50), VIGNETTING_NM, (640, 640)), at)
+    ).reshape(50, -1)
+    np.testing.assert_allclose(vignetting_factors(sweep, variant), shares.mean(axis=1), rtol=1e-7)
+
+
+def test_one_sweep_of_640_lines_changes_138_dn():
+    """3.4 % from end to end, 138 of 4095 DN (139 if rounded first), of which the bound counts the way from rest."""
+    sweep = vignetting_sweep_at(0, -320, 640)
+    held = vignetting_factors(sweep)
+    assert 4095 * np.ptp(held) == pytest.approx(138.5, abs=0.5)
+    bound = VIGNETTING.bound(probe_of(VIGNETTING_FLAT, VIGNETTING_NM, "dn", sweep=sweep), VIGNETTING_RIG)
+    assert bound.value == pytest.approx(2000 * np.abs(held - 1).max(), rel=1e-5)
+    assert "0.983 to 1.017" in bound.why
+
+
+@given(st.integers(-4500, 4500), st.integers(-4500, 4000), st.integers(1, 60), st.integers(1, 8))
+@settings(max_examples=60, deadline=None)
+def test_bounds_hold_and_are_tight(strip_px, start_px, lines, step):
+    """The greatest way from 1 among all lines is the bound's, within 1 %; the middle of an exposure stands for all."""
+    sweep = vignetting_sweep_at(strip_px, start_px, lines, step)
+    probe, held = probe_of(VIGNETTING_FLAT, VIGNETTING_NM, sweep=sweep), vignetting_factors(sweep)
+    bound, signal = VIGNETTING.bound(probe, VIGNETTING_RIG).value, float(probe.level[0])
+    way = signal * np.abs(held - 1).max()
+    assert way <= bound + signal * 1e-7
+    assert bound <= 1.01 * way + signal * 2e-4 * step
+    middle = mirror_throughput(line_positions(sweep, VIGNETTING_RIG.camera))
+    exact = mirror_throughput(
+        SweepBlock(VIGNETTING_RIG, sweep, range(lines), VIGNETTING_NM, (640, 640)).positions
+    ).mean(axis=1)
+    assert (
+        signal * np.abs(middle - exact).max()
+        <= VIGNETTING.bound(probe, VIGNETTING_RIG, "middle").value + signal * 1e-14
+    )
+
+
+def test_bend_covers_the_disk():
+    """The second derivative of the share over the scan's tangent is nowhere above what the bound takes."""
+    eta = np.linspace(-1.19, 1.19, 2001)
+    for xi in (0.0, 0.3, 0.8):
+        share = np.sqrt(1 - eta / np.sqrt(1 + xi**2 + eta**2))
+        bend = np.abs(np.gradient(np.gradient(share, eta), eta))[2:-2].max()
+        assert bend < MOST_BEND
+        assert xi > 0 or bend > 0.98 * MOST_BEND
+
+
+PARTS = st.floats(0.02, 20.0)
+ANGLES = np.radians(np.linspace(0.0, 89.9, 400))
+
+
+def of(n: float, k: float, degrees: float) -> tuple[float, float]:
+    """Both reflectances of one index at one angle."""
+    across, within = fresnel(np.array([n + 1j * k]), np.radians([degrees]))
+    return float(across[0]), float(within[0])
+
+
+@given(PARTS, PARTS)
+def test_ends_of_the_range(n: float, k: float) -> None:
+    """Head on both are ((n - 1)^2 + k^2) / ((n + 1)^2 + k^2); grazing light is reflected whole."""
+    head_on = ((n - 1) ** 2 + k**2) / ((n + 1) ** 2 + k**2)
+    assert of(n, k, 0.0) == pytest.approx((head_on, head_on), rel=1e-9)
+    assert of(n, k, 90.0) == pytest.approx((1.0, 1.0), abs=1e-9)
+
+
+@given(PARTS, PARTS)
+def test_at_45_deg_one_is_the_square_of_the_other(n: float, k: float) -> None:
+    """For any index, Rp(45 deg) = Rs(45 deg)^2: how reflectances are measured by one angle."""
+    across, within = of(n, k, 45.0)
+    assert within == pytest.approx(across**2, rel=1e-9)
+
+
+@given(PARTS, PARTS)
+def test_across_rises_with_the_angle_and_is_the_greater(n: float, k: float) -> None:
+    """No share is negative or above 1."""
+    across, within = fresnel(np.array([n + 1j * k]), ANGLES)
+    assert (np.diff(across) > -1e-12).all()
+    assert (within <= across + 1e-12).all()
+    assert within.min() >= 0
+    assert across.max() <= 1 + 1e-12
+
+
+def test_glass_by_hand() -> None:
+    """n = 1.5: 4 % head on, nothing within the plane at Brewster's angle of 56.31 deg, 14.79 % across it there."""
+    assert of(1.5, 0.0, 0.0) == pytest.approx((0.04, 0.04))
+    assert of(1.5, 0.0, np.degrees(np.arctan(1.5))) == pytest.approx(((1.25 / 3.25) ** 2, 0.0), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("coating", "nm", "share"),
+    [
+        ("aluminium", 550, 0.916),
+        ("aluminium", 800, 0.867),
+        ("aluminium", 1000, 0.94),
+        ("gold", 600, 0.919),
+        ("gold", 700, 0.97),
+        ("silver", 550, 0.983),
+    ],
+)
+def test_published_reflectances_head_on(coating: str, nm: float, share: float) -> None:
+    """Of evaporated films (Hass in the American Institute of Physics Handbook, table 6g): within 2 points."""
+    found = reflectance(coating, np.array([nm]), np.zeros(1))  # type: ignore[arg-type]
+    assert found[0, 0] == pytest.approx(share, abs=0.02)
+
+
+def test_aluminium_by_hand() -> None:
+    """At 619.93 nm, a row of the table, and 70 deg: Rs and Rp from real arithmetic alone (a^2 + b^2 form)."""
+    n, k, sine = 1.3660, 7.4052, np.sin(np.radians(70.0))
+    cosine, tangent = np.sqrt(1 - sine**2), sine / np.sqrt(1 - sine**2)
+    real = n**2 - k**2 - sine**2
+    root = np.hypot(real, 2 * n * k)
+    a, both = np.sqrt((root + real) / 2), root
+    across = (both - 2 * a * cosine + cosine**2) / (both + 2 * a * cosine + cosine**2)
+    slope = sine * tangent
+    within = across * (both - 2 * a * slope + slope**2) / (both + 2 * a * slope + slope**2)
+    found = reflectance("aluminium", np.array([619.93]), np.radians([70.0]))[0, 0]
+    assert found == pytest.approx((across + within) / 2, rel=1e-9)
+    assert found == pytest.approx(0.8731, abs=1e-4)
+
+
+@pytest.mark.parametrize("coating", METALS)
+def test_tables_rise_and_their_ends_are_held(coating: str) -> None:
+    """Wavelengths in order; what lies beyond has the index of the nearest."""
+    nm, n, k = METALS[coating].T
+    assert (np.diff(nm) > 0).all()
+    assert nm[0] <= 311
+    assert nm[-1] >= 1937
+    found = refractive_index(coating, np.array([200.0, 5000.0]))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(found, [n[0] + 1j * k[0], n[-1] + 1j * k[-1]])
+
+
+def test_an_ideal_mirror_reflects_everything() -> None:
+    """At any angle, in every band."""
+    assert (reflectance("ideal", NM, ANGLES) == 1).all()

@@ -1,0 +1,339 @@
+"""Where the mirror looks: tilt's way into the scene, fields and draws, ends of lines, bounds, and all on a ramp."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
+from pipeline.geometry.scan import Sweep, line_positions, points_of_scan, sweep_to_scene
+from pipeline.simulator.effects.air import PARALLAX, WIND
+from pipeline.simulator.effects.effect import SweepBlock
+from pipeline.simulator.effects.line import ROTATION, SLIT
+from pipeline.simulator.effects.mirror_path import LAG, STAIRCASE
+from pipeline.simulator.effects.pointing import (
+    HYSTERESIS,
+    JITTER,
+    THERMAL_DRIFT,
+    PointingErrors,
+    at_line_ends,
+    end_gains,
+    pointing_field,
+    scan_sign,
+    tilt_to_scene,
+)
+from pipeline.simulator.effects.registry import effects_on
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from tests.pipeline.geometry.second_order import pointing_error
+from tests.pipeline.simulator.made_up_effects import steep_probe
+from tests.pipeline.simulator.small_scenes import made_scene
+
+SWEEP = Sweep("strip", "fine", "x", 0.0, -500.0, 1001)
+RIG = Rig(mirror=replace(MirrorMotion(), repeatability_urad=40.0))
+REST = np.array([1.0, 0.0, -1.0]) / np.sqrt(2)
+
+
+def shifts(lines: range = range(1001), *, seed: int = 0, rig: Rig = RIG, sweep: Sweep = SWEEP) -> np.ndarray:
+    """The shift of some lines."""
+    return JITTER.aim(SweepBlock(rig, sweep, lines, np.ones(1), (64, 64), seed), "exact")
+
+
+def test_at_rest_the_view_moves_as_the_pointing_error_says():
+    """40 urad move the view by .76 px in the plane of incidence, along the scan, and by .54 px along the line."""
+    gain = np.abs(tilt_to_scene(REST)) * 40e-6 / RIG.camera.ifov_rad
+    in_plane, across = pointing_error(RIG.camera, 40e-6)
+    np.testing.assert_allclose(gain, [[across, 0], [0, in_plane]], atol=1e-12)
+    assert (in_plane, across) == pytest.approx((0.757, 0.535), abs=1e-3)
+
+
+@pytest.mark.parametrize("position", [(0.0, 0.0), (0.3, 0.4), (-0.7, 0.5), (0.1, -0.9)])
+def test_gains_are_the_derivatives_of_the_reflection(position: tuple[float, float]):
+    """Small turns of the normal about two axes of its own move the view by the gains, anywhere on the disk."""
+    normal = position_to_normal(position)
+    within = np.cross([0.0, 1.0, 0.0], normal)
+    within /= np.linalg.norm(within)
+    for column, tilt in enumerate((np.cross(normal, within), within)):
+        turned = [normal + angle * tilt for angle in (1e-6, -1e-6)]
+        seen = [direction_to_scene(reflect((0.0, 0.0, 1.0), one / np.linalg.norm(one))) for one in turned]
+        np.testing.assert_allclose(tilt_to_scene(normal)[:, column], (seen[0] - seen[1]) / 2e-6, atol=1e-6)
+
+
+def test_spread_of_the_draws():
+    """Lines scatter by .76 px rms along the scan and .54 px along the line, without bias or correlation."""
+    shift = shifts()[:, 0]
+    assert np.std(shift, axis=0) == pytest.approx((0.535, 0.757), rel=0.1)
+    assert np.abs(shift.mean(axis=0)).max() < 0.1
+    assert abs(np.corrcoef(shift.T)[0, 1]) < 0.1
+
+
+def test_bound_holds_and_is_tight():
+    """Waves in random directions change by less than the bound in 8 surveys, at the median by a sixth at least."""
+    rng = np.random.default_rng(5)
+    ratios = []
+    for seed in range(8):
+        wave = rng.normal(0, 0.4, (3, 2))
+        place, phase = rng.uniform(-9, 9, (400, 2)), rng.uniform(0, 7, 3)
+        slope = np.abs(np.cos(place @ wave.T + phase) @ wave).max(axis=0) * 1.02
+        look = np.sin(place @ wave.T + phase)
+        shift = shifts(seed=seed)
+        measured = max(np.abs((np.sin((place + one) @ wave.T + phase) - look).sum(axis=1)).max() for one in shift[:, 0])
+        bound = JITTER.bound(steep_probe(tuple(slope), (SWEEP,), 6.0), RIG).value
+        assert measured <= bound
+        ratios.append(bound / measured)
+    assert np.median(ratios) < 6
+
+
+def test_more_lines_have_a_worse_worst():
+    """The bound grows with the root of the logarithm of the lines: 5.4 sigma for 2560."""
+    found = JITTER.bound(steep_probe(sweeps=(replace(SWEEP, start_px=0.0, lines=1),)), RIG).value
+    assert found == pytest.approx(np.sqrt(2 * np.log(1000)) * 0.757, rel=1e-3)
+    many = JITTER.bound(steep_probe(sweeps=(replace(SWEEP, start_px=-1280.0, lines=2560),)), RIG)
+    assert "5.4 times" in many.why
+    assert many.value > found
+
+
+HYSTERESIS_SWEEP = Sweep("strip", "fine", "x", 640.0, -700.0, 1401)
+HYSTERESIS_RIG = Rig(mirror=replace(MirrorMotion(), hysteresis_px=50.0, drift_px_per_min=2.0))
+
+
+class Returning(Sweep):
+    """A sweep that is scanned the other way."""
+
+    def held_px(self) -> np.ndarray:
+        """From the last position to the first."""
+        return super().held_px()[::-1, ::-1]
+
+
+def block(
+    lines: range = range(1401), *, sweep: Sweep = HYSTERESIS_SWEEP, rig: Rig = HYSTERESIS_RIG, started_s: float = 0.0
+) -> SweepBlock:
+    """Some lines of a sweep."""
+    return SweepBlock(rig, sweep, lines, np.ones(1), (64, 64), started_s=started_s)
+
+
+@pytest.mark.parametrize("unit", range(8))
+def test_field_stays_within_one_and_is_smooth(unit: int):
+    """Over the disk the field is at most 1 in either axis and changes by at most 4 per unit of position."""
+    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 101), np.linspace(-1, 1, 101)), axis=-1)
+    inside = np.hypot(*np.moveaxis(grid, -1, 0)) <= 1
+    field = np.where(inside[..., None], pointing_field(unit, grid), np.nan)
+    assert np.nanmax(np.abs(field)) <= 1 + 1e-12
+    assert np.nanmax(np.abs(np.diff(field, axis=0))) < 4.1 * 0.02
+    assert np.nanstd(field) > 0.05
+
+
+def test_units_differ_and_a_unit_keeps_its_field():
+    """The field follows from the copy of the rig alone: not from seed, sweep or block."""
+    whole = HYSTERESIS.aim(block(), "exact")
+    for size in (1, 7):
+        parts = [HYSTERESIS.aim(block(range(a, min(a + size, 40))), "exact") for a in range(0, 40, size)]
+        np.testing.assert_array_equal(np.concatenate(parts), whole[:40])
+    np.testing.assert_array_equal(
+        HYSTERESIS.aim(replace(block(), seed=9, sweep=replace(HYSTERESIS_SWEEP, name="b")), ""), whole
+    )
+    other = replace(HYSTERESIS_RIG, detector=replace(Detector(), unit=1))
+    assert not np.isclose(HYSTERESIS.aim(block(rig=other), "exact"), whole).all()
+
+
+def test_sign_is_that_of_the_scan():
+    """A scan that comes back meets the same field with the other sign; one position counts as forward."""
+    forth, back = (
+        HYSTERESIS.aim(block(), "exact"),
+        HYSTERESIS.aim(block(sweep=Returning(**vars(HYSTERESIS_SWEEP))), "exact"),
+    )
+    np.testing.assert_array_equal(back, -forth)
+    assert scan_sign(replace(HYSTERESIS_SWEEP, lines=1)) == 1
+    assert np.abs(forth).max() <= 50
+
+
+def test_drift_walks_evenly_in_one_direction():
+    """2 px a minute are 2 px after a minute, whatever the direction."""
+    drift = THERMAL_DRIFT.aim(block(range(601)), "exact")[:, 0]
+    assert np.hypot(*(drift[600] - drift[0])) == pytest.approx(2.0, rel=1e-9)
+    np.testing.assert_allclose(np.diff(drift, axis=0), np.broadcast_to(drift[1] - drift[0], (600, 2)), atol=1e-12)
+    late = THERMAL_DRIFT.aim(block(range(3), started_s=3600.0), "exact")[:, 0]
+    assert np.hypot(*late[0]) == pytest.approx(120.0, rel=1e-4)
+
+
+@pytest.mark.parametrize("effect", [HYSTERESIS, THERMAL_DRIFT])
+@pytest.mark.parametrize("reach_px", [10.0, 300.0])
+def test_hysteresis_bound_holds_and_is_tight(effect: object, reach_px: float):
+    """The change of a wave, long or short beside the shift, is below the bound and at least a sixth of it."""
+    shift = effect.aim(block(), "exact")[:, 0]  # type: ignore[attr-defined]
+    wave = np.array([0.6, 0.8]) / reach_px
+    phase = np.linspace(0, 2 * np.pi, 60)[:, None]
+    measured = np.abs(np.sin(phase + shift @ wave) - np.sin(phase)).max()
+    bound = effect.bound(steep_probe(tuple(wave), (HYSTERESIS_SWEEP,), 2.0, seconds=140.1), HYSTERESIS_RIG).value  # type: ignore[attr-defined]
+    assert measured <= bound <= 6 * measured
+
+
+CAMERA = LineCamera()
+
+
+def test_centres_move_as_they_are_told_and_ends_turn():
+    """The centre's derivatives are the identity; an end of 320 px has .034 px across for every px along."""
+    gains = end_gains(Sweep("a", "fine", "x", 0.0, 0.0, 1), CAMERA)[0]
+    np.testing.assert_allclose(gains[1], np.eye(2), atol=1e-9)
+    np.testing.assert_allclose(np.abs(gains[[0, 2], 1, 0]), 0.0338, atol=2e-4)
+
+
+@pytest.mark.parametrize("strip_px", [0.0, 2000.0, -4000.0])
+def test_no_point_of_a_line_moves_farther(strip_px: float):
+    """Shifts of 5 px in any direction move no point of any line by more than the bound, and some nearly so."""
+    sweep = Sweep("a", "fine", "x", strip_px, -1500.0, 301, step=10)
+    plan = np.stack(points_of_scan(strip_px, CAMERA, sweep.line_px()[:, None], CAMERA.pixel_slopes()))
+    bound = np.array(at_line_ends([sweep], CAMERA, 3.0, 4.0))
+    most = np.zeros(2)
+    for along, scan in ((3, 4), (3, -4), (-3, 4), (-3, -4)):
+        beside = points_of_scan(strip_px + along, CAMERA, sweep.line_px()[:, None] + scan, CAMERA.pixel_slopes())
+        most = np.maximum(most, np.abs(np.stack(beside) - plan).max(axis=(1, 2)))
+    assert np.all(most <= bound * (1 + 1e-4))
+    assert np.all(bound <= 1.1 * most)
+
+
+def test_no_lines_turn_nothing():
+    """Without lines the shift is the bound."""
+    assert at_line_ends([], CAMERA, 1.0, 2.0) == (1.0, 2.0)
+    assert at_line_ends([Sweep("a", "fine", "x", 0.0, 0.0, 0)], CAMERA, 1.0, 2.0) == (1.0, 2.0)
+
+
+POINTING_ERRORS_SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-19.5, lines=40)
+
+
+def source_of(pointing: PointingErrors | None) -> SimulatedSource:
+    """A source without noise over a smooth scene."""
+    y, x = np.mgrid[:120, :760]
+    values = (1 + 0.3 * np.cos(y / 7) * np.cos(x / 11))[..., None]
+    scene = raster_from_values(values, CAMERA, name="t", wavelength_nm=np.array([500.0]))
+    return SimulatedSource(scene, Rig(CAMERA), chosen=effects_on("rotation", "slit"), pointing=pointing)
+
+
+def test_errors_do_not_depend_on_what_else_is_asked():
+    """A line's error is its own: any range of lines gives the same, and sweeps and seeds give others."""
+    errors = PointingErrors(50, 0.8, seed=3)
+    whole = errors.of_lines("a", range(40))
+    np.testing.assert_array_equal(errors.of_lines("a", range(17, 23)), whole[17:23])
+    assert not np.allclose(errors.of_lines("b", range(40)), whole)
+    assert not np.allclose(replace(errors, seed=4).of_lines("a", range(40)), whole)
+
+
+def test_errors_have_the_stated_size():
+    """Offsets are even within their bound in both axes, jitter has its rms about them."""
+    errors = PointingErrors(50, 0.8)
+    offsets = np.array([errors.offset(f"sweep-{number}") for number in range(400)])
+    assert np.abs(offsets).max() <= 50
+    assert offsets.std(axis=0) == pytest.approx([50 / np.sqrt(3)] * 2, rel=0.1)
+    jitter = errors.of_lines("a", range(2000)) - errors.offset("a")
+    assert jitter.std(axis=0) == pytest.approx([0.8, 0.8], rel=0.05)
+    assert errors.of_lines("a", range(0)).shape == (0, 2)
+
+
+def test_mirror_looks_beside_and_reports_the_plan():
+    """An offset shows the scene moved by as much, while the lines and the sweep report planned positions."""
+    errors = PointingErrors(offset_px=20.0, jitter_px=0.0, seed=1)
+    along, scan = errors.offset("s")
+    moved = replace(
+        POINTING_ERRORS_SWEEP,
+        strip_px=float(along),
+        start_px=float(POINTING_ERRORS_SWEEP.start_px + scan),
+        name="moved",
+    )
+    seen = SimulatedSweep(source_of(errors), POINTING_ERRORS_SWEEP)
+    np.testing.assert_allclose(seen.read(0, 40), SimulatedSweep(source_of(None), moved).read(0, 40), atol=1)
+    np.testing.assert_array_equal(seen.position, line_positions(POINTING_ERRORS_SWEEP, CAMERA))
+    assert (
+        next(source_of(errors).lines(POINTING_ERRORS_SWEEP)).mirror_x
+        == line_positions(POINTING_ERRORS_SWEEP, CAMERA)[0, 0]
+    )
+
+
+def test_no_errors_change_nothing():
+    """Errors of size 0 give the very lines of a source without any, up to rounding."""
+    plain, aimed = (
+        SimulatedSweep(source_of(pointing), POINTING_ERRORS_SWEEP).read(0, 40)
+        for pointing in (None, PointingErrors(0.0, 0.0))
+    )
+    np.testing.assert_allclose(aimed.astype(int), plain.astype(int), atol=1)
+    assert (aimed == plain).mean() > 0.999
+
+
+def test_jitter_moves_lines_one_by_one():
+    """With jitter alone every line sees another place, and any one read by itself is the same."""
+    source = source_of(PointingErrors(0.0, 0.8, seed=5))
+    whole = SimulatedSweep(source, POINTING_ERRORS_SWEEP).read(0, 40)
+    assert not np.array_equal(whole, SimulatedSweep(source_of(None), POINTING_ERRORS_SWEEP).read(0, 40))
+    np.testing.assert_array_equal(SimulatedSweep(source, POINTING_ERRORS_SWEEP).read(23, 24)[0], whole[23])
+
+
+@pytest.mark.parametrize("sizes", [(-1.0, 0.8), (50.0, np.nan)])
+def test_impossible_errors_are_refused(sizes: tuple[float, float]):
+    """Negative and unknown sizes are named."""
+    with pytest.raises(SettingsError, match="must be finite and not negative"):
+        PointingErrors(*sizes)
+
+
+MIRROR_EFFECTS_CAMERA = LineCamera(samples=64, exposure_ms=4.0)
+MOTION = replace(
+    MirrorMotion(), positions_per_line=1.5, repeatability_urad=40.0, hysteresis_px=5.0, drift_px_per_min=500.0
+)
+AIR = Air(distance_m=30.0, relief="step", nearest_m=3.0, wind_amplitude_m=0.005, wind_hz=20.0)
+MIRROR_EFFECTS_RIG = Rig(camera=MIRROR_EFFECTS_CAMERA, mirror=MOTION, air=AIR)
+STRIP = Sweep("strip", "fine", "x", 3.0, -25.0, 40)
+ACROSS = replace(STRIP, along="y")
+PLAIN: dict[Any, str] = {ROTATION: "rays", SLIT: "3x1"}
+SLOPE = (8.0, 13.0)  # along x and along y [e-/px]
+MOVERS = [STAIRCASE, LAG, JITTER, HYSTERESIS, THERMAL_DRIFT, PARALLAX, WIND]
+
+
+def ramp() -> RasterScene:
+    """A scene that rises evenly along x and along y, in two bands of which the second is half as bright."""
+    y, x = np.mgrid[:161, :161]
+    plane = (2000 + SLOPE[0] * (x - 80) + SLOPE[1] * (y - 80)).astype(np.float32)[..., None]
+    electrons = np.array([[1.0, 0.5]], np.float32) * np.float32(DEFAULT_EXPOSURE_MS / MIRROR_EFFECTS_CAMERA.exposure_ms)
+    return made_scene(plane, electrons, [500.0, 600.0])
+
+
+def look(chosen: dict[Any, str], sweep: Sweep = STRIP, lines: range = range(40), **more: Any) -> np.ndarray:
+    """Light of some lines of the ramp."""
+    scene = ramp()
+    block = SweepBlock(MIRROR_EFFECTS_RIG, sweep, lines, scene.wavelength_nm, scene.shape, **more)
+    return expected_light(scene, block, {**chosen, **PLAIN})
+
+
+@pytest.mark.parametrize("sweep", [STRIP, ACROSS], ids=["x", "y"])
+@pytest.mark.parametrize("effect", MOVERS, ids=lambda effect: effect.name)
+def test_light_changes_by_slope_times_way(effect: Any, sweep: Sweep):
+    """On a ramp the light changes by the slope times the stated shift or displacement, in either orientation."""
+    found = look({effect: "exact"}, sweep) - look({}, sweep)
+    block = SweepBlock(MIRROR_EFFECTS_RIG, sweep, range(40), np.array([500.0, 600.0]), (161, 161))
+    if hasattr(effect, "aim"):
+        along, scan = np.moveaxis(effect.aim(block, "exact").mean(axis=1), -1, 0)[..., None]
+    else:
+        along, scan = effect.displaced(block, *sweep_to_scene(sweep, MIRROR_EFFECTS_CAMERA), "exact")
+    x, y = (along, scan) if sweep.along == "x" else (scan, along)
+    stated = np.broadcast_to(SLOPE[0] * x + SLOPE[1] * y, found.shape[:2])
+    away = (
+        np.abs(sweep_to_scene(sweep, MIRROR_EFFECTS_CAMERA)[sweep.along == "x"]) > 2
+    )  # a step of depth splits footprints on it
+    np.testing.assert_allclose(found[..., 0][away], stated[away], rtol=5e-3, atol=0.05)
+    np.testing.assert_allclose(found[..., 1], found[..., 0] / 2, atol=2e-3)
+    assert np.abs(found).max() > 0.1
+
+
+@pytest.mark.parametrize("effect", MOVERS, ids=lambda effect: effect.name)
+def test_the_change_stays_below_the_bound(effect: Any):
+    """The bound from the ramp's slopes holds for the rendered light and is at most six times as much."""
+    probe = steep_probe(SLOPE, (STRIP,), 4000.0, unit="dn", seconds=40 * 4e-3)
+    measured = np.abs(look({effect: "exact"}) - look({})).max()
+    bound = effect.bound(probe, MIRROR_EFFECTS_RIG).value
+    assert measured <= bound + 2e-3
+    assert bound <= 6 * measured
