@@ -35,12 +35,10 @@ from pipeline.source import AT_REST, Line, References
 class SimulatedSource:
     """A source that looks at ``scene`` with ``rig``. Quantisation and saturation are always on: raw lines are uint16.
 
-    Every effect draws from streams of its own, keyed (seed, sweep name, effect, line number): neither the first line
-    asked for nor the order of sweeps nor other effects change a line.
-
-    ``chosen`` are the effects that are on, {effect: variant}, in the order of the chain. ``clock`` says when sweeps
-    start, by name, after the survey did [s]; None, and a sweep it does not name, is at once. With ``pointing`` the
-    mirror looks beside the planned positions and still reports those.
+    Streams are keyed (seed, sweep name, effect, line number): neither the first line asked for nor the order of sweeps
+    nor other effects change a line. ``chosen`` are the effects that are on, {effect: variant}, in the order of the
+    chain. ``clock`` says when sweeps start, by name, after the survey did [s]; a sweep it does not name is at once.
+    With ``pointing`` the mirror looks beside the planned positions and still reports those.
     """
 
     scene: Scene
@@ -83,21 +81,13 @@ class SimulatedSource:
         return render_lines(self.scene, self.rig, self.choice, sweep, lines, seed=self.seed, started_s=started_s)
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
-        """Give the sweep's lines one by one, from line ``first`` on.
-
-        Raises ShapeError: sums of ``sweep.binning`` samples at full scale do not fit uint16. PoseError: a position of
-        the sweep is out of the mirror's reach.
-        """
+        """Give the sweep's lines one by one, from line ``first`` on. Raises ShapeError, PoseError as `render_lines`."""
         check_binning(sweep, self.camera)
         for start in range(first, sweep.lines, BLOCK_LINES):
             yield from self.lines_of(sweep, range(start, min(start + BLOCK_LINES, sweep.lines)))
 
     def lines_of(self, sweep: Sweep, numbers: range) -> list[Line]:
-        """Give some lines of the sweep, as `lines` does. Threads may ask at the same time.
-
-        Raises ShapeError: sums of ``sweep.binning`` samples at full scale do not fit uint16. PoseError: a position of
-        the sweep is out of the mirror's reach.
-        """
+        """Give some lines of the sweep, as `lines` does. Threads may ask at the same time."""
         camera, middle = self.camera, line_positions(sweep, self.camera)
         return [
             Line(
@@ -160,11 +150,9 @@ def sweep_starts(
 ) -> dict[str, float]:
     """Give when the first line of each sweep begins, by the sweep's name, since the survey's start. [s]
 
-    Before it come the sweeps before, a set-up for each and its own, and the loads of the vector memory until then.
-    Lines of a sweep follow each other without a break: a load in the midst of one delays the next sweep only.
-
-    ``sweeps``: In the order in which they are taken.
-    ``after_s``: What the survey has spent before: the fine sweeps come after the coarse ones' seconds.
+    ``sweeps`` are in the order in which they are taken, ``after_s`` is what the survey has spent before. Before a sweep
+    come those before, a set-up for each and its own, and the loads of the vector memory until then; a load in the midst
+    of one delays the next sweep only.
     """
     loads_before: dict[int, int] = {}
     for number, load in enumerate(memory_loads(sweeps, cost.vector_pairs), 1):
@@ -217,15 +205,11 @@ def render_lines(
     started_s: float = 0.0,
     samples: range | None = None,
 ) -> Raw:
-    """Give the raw numbers of some lines. Pure: threads and tasks may share all arguments.
+    """Give the raw numbers of some lines, (line, sample, band) uint16, binned [DN]. Pure: threads may share arguments.
 
-    Neither the other lines and samples asked for nor the order of calls changes a number.
-
-    ``samples``: Neighbouring ones of the binned line; None is all. Effects for which all of a line counts see all of
-    it.
-    Returns (line, sample, band) uint16, binned. [DN]
-    Raises ShapeError: sums of ``sweep.binning`` samples at full scale do not fit uint16, or the line has no such
-    samples. PoseError: a position of the sweep is out of the mirror's reach.
+    Neither the other lines and samples asked for nor the order of calls changes a number. ``samples``: neighbouring
+    ones of the binned line; None is all. Raises ShapeError: sums of ``sweep.binning`` samples at full scale do not fit
+    uint16, or the line has no such samples; PoseError: a position of the sweep is out of the mirror's reach.
     """
     check_binning(sweep, rig.camera)
     choice, count = Choice.of(chosen), rig.camera.samples // sweep.binning
@@ -255,12 +239,11 @@ def check_binning(sweep: Sweep, camera: LineCamera) -> None:
 
 
 def take_references(scene: Scene, rig: Rig, choice: Choice, sweep: Sweep) -> References:
-    """Give mean dark and white frames with the sweep's binning, free of noise.
+    """Give mean dark and white frames (sample, band) with the sweep's binning, free of noise. [DN]
 
-    The white frame is scaled to the exposure from a shorter one, so that it does not saturate. It is taken with the
-    mirror at rest, by the light of the survey's start. Dead and hot elements are told as bad.
-
-    Returns frames (sample, band) [DN]; the panel's values are those of the rig's bands.
+    The white frame is scaled from a shorter exposure, so that it does not saturate; it is taken with the mirror at
+    rest, by the light of the survey's start. Dead and hot elements are told as bad; the panel's values are in the rig's
+    bands.
     """
     block = sweep_block(scene, rig, AT_REST, range(1))
     dark = dark_frame(block, choice)
@@ -274,8 +257,12 @@ def take_references(scene: Scene, rig: Rig, choice: Choice, sweep: Sweep) -> Ref
         elif hasattr(effect, "change"):
             light = effect.change(light, block, variant)
     seen: Frame = light[0]
+    bad = None
     if choice.variant(DEFECTS.name) != OFF:
-        seen[dead_elements(block.rig, seen.shape[1])] = 0
+        dead = dead_elements(rig, seen.shape[1])
+        seen[dead] = 0
+        told = dead | (hot_electrons(rig, seen.shape[1]) > 0)  # of a sum one is enough
+        bad = _binned(told.astype(np.float32), sweep.binning) > 0 if told.any() else None
     white = dark + seen / np.float32(rig.camera.electrons_per_dn)
     panel = scene.panel.astype(np.float32)
     if (response := choice.variant(RESPONSE.name)) != OFF:
@@ -284,18 +271,9 @@ def take_references(scene: Scene, rig: Rig, choice: Choice, sweep: Sweep) -> Ref
         dark=_binned(dark, sweep.binning),
         white=_binned(white, sweep.binning),
         panel=panel,
-        bad=_bad_elements(block, choice, sweep.binning),
+        bad=bad,
         by_mirror=choice.variant(VIGNETTING.name) != OFF,
     )
-
-
-def _bad_elements(block: SweepBlock, choice: Choice, binning: int) -> NDArray[np.bool_] | None:
-    """Dead and hot elements, (sample, band): of a sum one is enough; None where there are none."""
-    if choice.variant(DEFECTS.name) == OFF:
-        return None
-    bands = len(block.wavelength_nm)
-    bad = dead_elements(block.rig, bands) | (hot_electrons(block.rig, bands) > 0)
-    return _binned(bad.astype(np.float32), binning) > 0 if bad.any() else None
 
 
 def _binned(frame: Frame, binning: int) -> Frame:

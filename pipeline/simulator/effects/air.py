@@ -40,8 +40,7 @@ class Turbulence(Aim):
         return sigma * np.array(draws, np.float64).reshape(-1, 1, 2)
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound for all lines at once but in one survey of 1000: no line of N exceeds sqrt(2 ln(N / risk)) sigma else.
-        """
+        """Bound for all lines at once, but in one survey of 1000: no line of N exceeds sqrt(2 ln(N / risk)) sigma."""
         sigma = turbulence_px(rig)
         if not sigma:
             return Bound(0.0, "no distance or no turbulence")
@@ -174,10 +173,17 @@ class Parallax(Displacement):
         share = greatest_share(rig.air)
         if share == 0 or not probe.sweeps:
             return Bound(0.0, "all of the scene is at one distance")
-        along, scan = (share * half for half in _half_lines(probe, rig))
+        half = np.zeros(2)  # greatest way from a line's centre to its ends, slit and pixel included
+        ends = np.array([-1.0, 1.0]) * rig.camera.samples / 2 * rig.camera.ifov_rad
+        for sweep in probe.sweeps:
+            centre = sweep.line_px()[:, None]
+            along, scan = points_of_scan(sweep.strip_px, rig.camera, centre, ends)
+            beside = np.abs(along - sweep.strip_px).max(initial=0.0), np.abs(scan - centre).max(initial=0.0)
+            half = np.maximum(half, beside)
+        most_along, most_scan = (share * half).tolist()
         near, far = rig.distances_m or (0.0, 0.0)
-        why = f"at the lines' ends {along:.2g} px between {near:g} and {far:g} m ({rig.air.relief})"
-        return Bound(probe.moved(along, scan), why)
+        why = f"at the lines' ends {most_along:.2g} px between {near:g} and {far:g} m ({rig.air.relief})"
+        return Bound(probe.moved(most_along, most_scan), why)
 
 
 def closeness(air: Air, row: Floats) -> Floats:
@@ -203,18 +209,6 @@ def greatest_share(air: Air) -> float:
         return 0.0
     ends = closeness(air, np.array([-1.0, 1.0])) - 1 / air.distance_m
     return air.lever_m * float(np.abs(ends).max())
-
-
-def _half_lines(probe: Probe, rig: Rig) -> tuple[float, float]:
-    """Greatest way from a line's centre to its ends, slit and pixel included: along the line and the scan. [px]"""
-    camera, worst = rig.camera, np.zeros(2)
-    ends = np.array([-1.0, 1.0]) * camera.samples / 2 * camera.ifov_rad
-    for sweep in probe.sweeps:
-        centre = sweep.line_px()[:, None]
-        along, scan = points_of_scan(sweep.strip_px, camera, centre, ends)
-        found = [np.abs(along - sweep.strip_px).max(initial=0.0), np.abs(scan - centre).max(initial=0.0)]
-        worst = np.maximum(worst, found)
-    return float(worst[0]), float(worst[1])
 
 
 def reach_m(rig: Rig) -> tuple[float, float] | None:

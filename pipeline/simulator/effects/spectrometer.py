@@ -56,7 +56,11 @@ class Response(LightChange):
         wavelength = np.asarray(probe.wavelength_nm, np.float64)
         variance = missing_variance(rig.optics.fwhm_nm, probe.fwhm_nm, len(wavelength))
         if not variance.any():
-            return Bound(0.0, _why_nothing(probe, rig))
+            known = probe.fwhm_nm is not None and np.isfinite(probe.fwhm_nm).any()
+            wide = f"the scene's bands are {rig.optics.fwhm_nm:g} nm wide already, or wider"
+            return Bound(
+                0.0, wide if known else "the width of the scene's bands is not known; they are taken as they are"
+            )
         near = np.abs(wavelength[:, None] - wavelength) <= REACH_SD * np.sqrt(variance)[:, None]
         curved = np.where(near, probe.spectral_curvature, 0).max(axis=1) * variance / 2
         steep = np.where(near, probe.spectral_slope, 0).max(axis=1) * np.sqrt(variance)
@@ -131,12 +135,6 @@ def _heat_kernel(wavelength_nm: Floats, variance: Floats) -> Floats:
     kernel[1:-1, 0] = 1 - place[1:-1] - inner @ (1 - place[1:-1])
     kernel[1:-1, -1] = place[1:-1] - inner @ place[1:-1]
     return kernel
-
-
-def _why_nothing(probe: Probe, rig: Rig) -> str:
-    if probe.fwhm_nm is None or not np.isfinite(probe.fwhm_nm).any():
-        return "the width of the scene's bands is not known; they are taken as they are"
-    return f"the scene's bands are {rig.optics.fwhm_nm:g} nm wide already, or wider"
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
-"""Few kernels for all bands: Gaussians, none of which counts below 0, whose sums pass waves as each band's blurs do.
+"""Footprints: slit, pixel and every blur folded to few kernels that all bands share, none of which counts below 0.
 
-Bands differ in shift and width, smoothly, and the pattern of the pupil has rings and far tails. Sums of Gaussians of a
-ladder of sizes, at a few of the bands' shifts, stand for all of them. What a sum passes of a wave is compared with the
-optical transfer function, behind the footprint of slit, pixel and scene; no kernel, and so no light, is negative.
+A kernel is a box (the slit across the line, the pixel along it) convolved with a Gaussian of a shift and a variance of
+its own. Gaussians of a ladder of sizes, at a few of the bands' shifts, stand for all bands; what a sum passes of a wave
+is compared with the optical transfer function behind the footprint of slit, pixel and scene. Wide ones look at every
+second, fourth, ... pixel of the scene, blurred before: see `SceneRaster.thinned`.
 """
 
 from __future__ import annotations
@@ -231,10 +232,9 @@ _ALIKE_PX = 0.3  # by which widths may differ of kernels that share a window
 class Footprint:
     """Kernels of a footprint and how much each counts in each band. All widths in px of the camera, or of the level.
 
-    ``shift`` and ``variance`` are (2, kernel) along the line and the scan. ``shares`` are (kernel, node) of some bands
-    and ``between`` (node, band): a band is one of those, or lies between two. ``parts`` are how many boxes across and
-    along stand for one box that lies turned in the scene. ``level`` is (kernel,) of which pixels each looks at: 1 is
-    all, 2 every second, and so on.
+    ``shift`` and ``variance`` are (2, kernel) along the line and the scan; ``shares`` (kernel, node) of some bands, and
+    ``between`` (node, band) between which two each band lies; ``parts`` how many boxes across and along stand for one
+    that lies turned; ``level`` (kernel,) of which pixels each looks at: 1 is all, 2 every second, and so on.
     """
 
     box: tuple[float, float]  # across and along; 0 is none

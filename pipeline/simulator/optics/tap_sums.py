@@ -31,21 +31,11 @@ _PHASES = (0.0, 0.5)  # of the pixels, along either axis
 
 @dataclass(frozen=True)
 class ScenePixels:
-    """A scene's planes as rows of a table, and what a step along the line and the scan is in it."""
+    """A scene's planes as rows of a table, and whether lines lie along y."""
 
     table: torch.Tensor  # (pixel, component)
     shape: tuple[int, int]
     along_y: bool
-
-    @property
-    def step(self) -> tuple[int, int]:
-        """Rows of the table from one pixel to the next along the line and the scan."""
-        return (self.shape[1], 1) if self.along_y else (1, self.shape[1])
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Pixels along the line and the scan."""
-        return self.shape if self.along_y else (self.shape[1], self.shape[0])
 
 
 @dataclass(frozen=True)
@@ -135,7 +125,8 @@ class Gatherer:
         import torch
 
         kind = np.int32 if pixels.shape[0] * pixels.shape[1] < 2**31 else np.int64
-        step, size = pixels.step, pixels.size
+        rows, columns = pixels.shape
+        step, size = ((columns, 1), (rows, columns)) if pixels.along_y else ((1, columns), (columns, rows))
         first = along - self.along.left, scan - self.scan.left
         within = [
             (one >= 0) & (one + table.taps <= many)

@@ -31,17 +31,15 @@ def raster_from_values(
     class_colours: NDArray[np.uint8] | None = None,
     key: str | None = None,
 ) -> RasterScene:
-    """Turn an image without a radiance law into a scene of relative, linear light.
+    """Turn an image (y, x, band) without a radiance law into a scene of relative, linear light.
 
     The 99.9th percentile of the finite values fills 60 % of the full well at the default exposure; a scene without
-    positive light takes 1 in its place. Pixels with a value that is not finite get the band's median and are counted
-    in ``filled_px``; where that is so in more than half of the bands, the pixel is ``missing`` and loses its label.
-    Negative values give no electrons.
+    positive light takes 1 in its place. Values that are not finite get the band's median, their pixels are counted in
+    ``filled_px``; where that is so in more than half of the bands, the pixel is ``missing`` and loses its label.
+    Negative values give no electrons. ``key``: identity of the content, by default the hash of the values.
 
-    ``values``: (y, x, band) numbers, any real type.
-    ``key``: Identity of the content; by default the hash of the values.
-    Raises SceneError: not three axes, nothing in it, no finite value, one that is no reading (see `pipeline.readings`),
-    or the labels do not fit.
+    Raises SceneError: not three axes, empty, no finite value, one that is no reading (`pipeline.readings`), or labels
+    that do not fit.
     """
     if values.ndim != 3 or 0 in values.shape:
         raise SceneError(f"scene {name} must be (y, x, band) and not empty, got {values.shape}")

@@ -1,16 +1,12 @@
-"""The decision: which effects to compute, and how, so that what is left out stays within one tolerance.
+"""The decision: which effects to compute, and how, so that what is left out stays within one tolerance; its manifest.
 
 The tolerance is of the numbers that are stored, sums of samples where a sweep bins them: an effect counts by what it
 does at the binning where it does most.
 
 Greedy: start with everything exact; of all cheaper options that still fit, take the one that saves most per error that
 it adds; until none fits. Because one long step may be shut out by a short one, the same is tried after each single
-step, and the cheapest end counts: it saves at least half of what can be saved.
-
-A larger tolerance never costs more: where the greedy rule under two tolerances first parts, the larger one takes a
-step that saves at least as much per error as all that the smaller can still take, and that is longer than the smaller's
-whole rest. It may switch a cheap effect on again in exchange for a dear one: what is off at one tolerance need not be
-off at every larger one.
+step, and the cheapest end counts: it saves at least half of what can be saved. A larger tolerance never costs more, but
+may switch a cheap effect on again in exchange for a dear one.
 """
 
 from __future__ import annotations
@@ -33,10 +29,10 @@ CHEAP_SHARE = 0.1  # of the tolerance: what a variant may err by itself in the r
 
 @dataclass(frozen=True)
 class Treatment:
-    """What was decided for one effect, beside what leaving it out would have done and exactness would have cost.
+    """What was decided for one effect, and why.
 
     ``small``: off, within the tolerance. ``needed``: leaving it out exceeds the tolerance alone; ``spent``: with the
-    others. ``exact``: on, for the tolerance is 0.
+    others.
     """
 
     menu: Menu
@@ -113,13 +109,11 @@ def decide(
     """Choose off or a variant for every effect, so that the sum of their errors stays within the tolerance.
 
     Tolerance 0 is everything that the rig has, exact; an infinite one switches off all that may be off. Quantisation
-    and saturation are never off. What the rig has none of is always off.
+    and saturation are never off; what the rig has none of always is. ``probes``: one for each binning of the survey;
+    the worst counts. ``effects``: in the order of the chain, which does not change what is chosen. ``tolerance``:
+    greatest change of any stored number, in the unit of the probes. ``asked``: ``auto``; ``all``: on and exact;
+    ``none``; or names with commas: those on, in the variants that the tolerance lets them have, and the others off.
 
-    ``probes``: One for each binning of the survey; the worst counts.
-    ``effects``: In the order of the chain; the order does not change what is chosen.
-    ``tolerance``: Greatest change of any stored number, in the unit of the probes.
-    ``asked``: ``auto``; ``all``: on and exact; ``none``; or names with commas: those on, in the variants that the
-    tolerance lets them have, and the others off, whatever that changes.
     Raises SettingsError: the tolerance is negative or no number, or an asked name is not known.
     """
     if not tolerance >= 0:
@@ -231,16 +225,12 @@ TOTAL = "all effects"
 
 
 def list_effects(decision: Decision, measured: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
-    """Give one plain row for every effect, in the order of the chain.
+    """Give one plain row for every effect, in the order of the chain; ``measured`` is what `verify` found, by name.
 
-    Each has ``name``; ``state`` (on or off); ``variant`` (None where off); ``bound`` on the change of any number that
-    is stored, at the worst binning, by treating the effect so, in ``unit``, with the factor of safety: 0 where it is
-    exact or absent, None where there is none; ``measured``, the same on lines of the scene (None where not verified);
-    ``cost_s``, estimated CPU seconds of all sweeps; ``why`` in a sentence, and its parts: ``reason`` (see
-    `choice.Treatment`), ``left_out``, the bound on what leaving it out would change, and ``magnitude``, how large it is
-    here, in the words of its own bound.
-
-    ``measured``: What `verify` found, by name.
+    ``bound`` is on the change of any stored number, at the worst binning, with the factor of safety, in ``unit`` (0
+    where exact or absent, None where there is none); ``cost_s`` are estimated CPU seconds of all sweeps; ``why`` is a
+    sentence, and its parts are ``reason`` (see `Treatment`), ``left_out``, the bound on leaving it out, and
+    ``magnitude``, the words of that bound.
     """
     return [
         {
@@ -263,9 +253,8 @@ def list_effects(decision: Decision, measured: Mapping[str, float] | None = None
 def sum_up(decision: Decision, measured: Mapping[str, float] | None = None) -> dict[str, Any]:
     """Give the totals: bound beside tolerance, and the CPU seconds that were saved against everything on.
 
-    ``saved_s`` is against everything that the rig has, exact; ``saved_cheap_s`` against everything on with each effect
-    in its cheapest variant whose own error is within a tenth of the tolerance. All are estimates from measured costs
-    per number, without the rays through the footprint that every simulation takes.
+    ``saved_s`` is against everything exact, ``saved_cheap_s`` against each effect in its cheapest variant that errs by
+    no more than a tenth of the tolerance; without the rays through the footprint that every simulation takes.
     """
     cost, exact, cheap = (
         _seconds(ns, decision) for ns in (decision.cost_ns, decision.exact_cost_ns, decision.cheap_cost_ns)

@@ -1,17 +1,16 @@
 """What the decision chooses from: for every effect, off and each variant with its error and cost.
 
-One currency. A bound is the change of a stored number in units of its noise (or in DN), at the worst binning of the
-survey. Effects that draw enter the same sum in two ways. Where a drawn displacement or gain moves the light (jitter,
-turbulence, wind), the bound is on the change with the same draws: it is as certain as any other. Where the draw is the
-noise itself (shot, read, dark), a paired change says nothing about later decisions; what matters is the total variation
-between the distributions of a number with and without. A change by ``d`` noise deviations has a total variation of at
-most ``d / 2``, so noise that changes it by ``t`` counts ``2 t`` deviations. Total variation is a metric and no later
-stage increases it: the sum of all bounds is then twice a bound on how much more often than not one number could tell
-the image from the exact one. Noise of samples that are summed grows as their sum's does: its deviations stay.
+A bound is the change of a stored number in units of its noise (or in DN), at the worst binning of the survey. Where a
+drawn displacement or gain moves the light (jitter, turbulence, wind), it is on the change with the same draws. Where
+the draw is the noise itself (shot, read, dark) what matters is the total variation between the distributions of a
+number with and without: noise that changes it by ``t`` counts ``2 t`` deviations, as much as a change that could be
+told apart as often. Total variation is a metric and no later stage increases it: so all bounds may be summed.
 
-Composition. Kernels that are not negative and sum to 1 have gain 1 at most, readout none. Gains of light (vignetting,
-drift, ...) multiply the errors of all other effects in the light, each by its own greatest factor, and change the unit:
-see `passed_light`. Gains and changes are asked for their bounds with the light that earlier gains leave and add.
+Kernels that are not negative and sum to 1 have gain 1 at most, readout none. Gains of light (vignetting, drift, ...)
+multiply the errors of all other effects in the light, each by its own greatest factor, and change the unit: with
+sigma(S)^2 = S + n, g sigma(S) / sigma(g S) grows with g; so the greatest gains count for errors made elsewhere, and the
+least of its own for a gain that is left out. Blurs and shifts of each band's own colour edges: light then changes over
+wavelength where the scene's does not.
 """
 
 from __future__ import annotations
@@ -83,7 +82,8 @@ class Menu:
 
     def cheapest_within(self, error: float) -> Option:
         """Give the cheapest variant, never off, whose own error is no more than this."""
-        return min((option for option in self.variants if option.error <= error), key=_by_cost, default=self.exact)
+        within = (option for option in self.variants if option.error <= error)
+        return min(within, key=lambda option: (option.cost_ns, option.error, option.variant), default=self.exact)
 
 
 def acts_on_light(effect: Effect) -> bool:
@@ -200,10 +200,6 @@ def cost_of(menus: Iterable[Menu], options: Mapping[str, Option]) -> float:
     return math.fsum(menu.cost_beside(options[menu.name], options) for menu in menus)
 
 
-def _by_cost(option: Option) -> tuple[float, float, str]:
-    return option.cost_ns, option.error, option.variant
-
-
 Floats = NDArray[np.float64]
 # Half of the integrals of |s dG/ds| and |s^2 d^2G/ds^2| for either axis, and, for both, of 2 |s^2 d^2G/ds dx|.
 _PER_LOG, _PER_LOG_TWICE, _PER_LOG_AND_PX = 0.5, 1.1, 2.3
@@ -285,11 +281,9 @@ def light_through(probe: Probe, rig: Rig, blurs: Iterable[Any]) -> Probe:
     """Give the probe of light that has passed blurs (their exact variants), with the spectral differences they make.
 
     A kernel of shift s and variance v makes I(x + s) blurred, whose derivative over wavelength is s' I_x + v' I_xx / 2
-    beside the scene's own (the heat equation in v), and its second one s'' I_x + v'' I_xx / 2 + (s' + v' d/dx / 2)^2
-    I_xx. At a step or a point, where I_xx has no end, v' I_xx / 2 is at most I_x times the change of the width.
-
-    Diffraction is a sum of Gaussians whose widths grow with the wavelength. What a wide one shows hardly depends on I_x
-    any more: its derivatives over the width's logarithm are at most certain parts of the span, whatever the image.
+    beside the scene's own, and its second one s'' I_x + v'' I_xx / 2 + (s' + v' d/dx / 2)^2 I_xx. At a step v' I_xx / 2
+    is at most I_x times the change of the width. Diffraction is a sum of Gaussians whose widths grow with the
+    wavelength: of a wide one the derivatives over the width's logarithm are at most certain parts of the span.
     """
     passed = list(blurs)
     if not passed or len(probe.wavelength_nm) < 2:

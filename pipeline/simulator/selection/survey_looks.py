@@ -45,15 +45,6 @@ class _Optics:
         """How far kernels, differences and sums reach. [px]"""
         return len(self.slit) // 2 + len(self.pixel) // 2 + 1 + self.binning // 2
 
-    @staticmethod
-    def of(camera: LineCamera, binning: int) -> _Optics:
-        return _Optics(
-            _short_kernel(camera.slit_px),
-            _short_kernel(1.0),
-            camera.read_noise_e**2 + camera.electrons_per_dn**2 / 12,
-            binning,
-        )
-
     def summed(self, values: Light, axis: int) -> Light:
         """Mean over the samples of a stored number about each pixel, along an axis."""
         if self.binning == 1:
@@ -67,14 +58,13 @@ class _Optics:
 def telling_places(scene: Scene, camera: LineCamera, sweeps: Sequence[Sweep], most: int = 200) -> NDArray[np.float64]:
     """Find the places where light changes most over its noise, and where there is most and least of it.
 
-    ``sweeps``: What will be looked at: other parts of the scene do not count. All sum as many samples to a stored
-    number.
-    ``most``: How many places, each in a tile of its own for one measure and band; the worst of every measure first.
-    Returns (place, 2) rows and columns, integers as floats. [px]
-    Raises SceneError: the scene holds a number that is not finite; the message says where.
+    Only where ``sweeps``, all of one binning, look; at most ``most``, each in a tile of its own for one measure and
+    band, the worst of every measure first. Returns (place, 2) rows and columns, integers as floats. [px] Raises
+    SceneError: the scene holds a number that is not finite.
     """
     spectra = scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-    bands, optics = telling_bands(spectra), _Optics.of(camera, sweeps[0].binning)
+    bands, fixed = telling_bands(spectra), camera.read_noise_e**2 + camera.electrons_per_dn**2 / 12
+    optics = _Optics(_short_kernel(camera.slit_px), _short_kernel(1.0), fixed, sweeps[0].binning)
     turned = tuple(sorted({sweep.along == "y" for sweep in sweeps}))
     reached, cell = _reached(scene.shape, camera, sweeps)
     tile = max(8, math.ceil(math.sqrt(scene.shape[0] * scene.shape[1] / _TILES)))
@@ -85,7 +75,9 @@ def telling_places(scene: Scene, camera: LineCamera, sweeps: Sequence[Sweep], mo
         taken = np.repeat(reached[rows], cell, axis=1)[:, : scene.shape[1]]
         if not taken.any():
             continue
-        light = _some_bands(planes, spectra, bands)
+        own_planes = spectra.ndim == 1
+        some = spectra[bands] if own_planes else np.ascontiguousarray(spectra[:, bands])
+        light = to_bands(planes[..., bands] if own_planes else planes, some)
         for sort, worth in enumerate(_worths(light, optics, turned)):
             for band in range(worth.shape[2]):
                 shown = np.where(taken, worth[..., band], -np.inf)
@@ -134,12 +126,6 @@ def _strips(scene: Scene, tile: int, halo: int) -> Iterator[tuple[int, Light]]:
         else:
             y, x = (axis.ravel().astype(np.float64) for axis in np.meshgrid(down, across, indexing="ij"))
             yield first, scene.sample(y, x).reshape(len(down), len(across), -1)
-
-
-def _some_bands(planes: Light, spectra: Light, bands: NDArray[np.intp]) -> Light:
-    if spectra.ndim == 1:
-        return to_bands(planes[..., bands], spectra[bands])
-    return to_bands(planes, np.ascontiguousarray(spectra[:, bands]))
 
 
 def _check_finite(scene: Scene, planes: Light, first: int) -> None:

@@ -50,9 +50,7 @@ _PHASES = tuple(((along, scan), (0.0, 0.0)) for along in (0.0, 0.5) for scan in 
 def probe_survey(scene: Scene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> tuple[Probe, ...]:
     """Probe the scene for sweeps of any binning: one probe for each binning that they have, the smallest first.
 
-    What a survey takes of time and lines, and how bright the light along its lines usually is, all have in common.
-
-    Raises SceneError, SettingsError, PoseError: as `probe_scene`.
+    Time, lines and the usual light they have in common. Raises SceneError, SettingsError, PoseError as `probe_scene`.
     """
     taken = _taken(sweeps)
     each = [tuple(one for one in taken if one.binning == binning) for binning in sorted({one.binning for one in taken})]
@@ -64,11 +62,9 @@ def probe_survey(scene: Scene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "
 def probe_scene(scene: Scene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> Probe:
     """Look at the scene through the footprint alone where it is steepest, brightest and darkest, and along some lines.
 
-    Where to look is found on the scene's own pixels (`scouting`), so that the maxima hold for the whole image and not
-    for the looks alone. All sweeps sum as many samples to a stored number; see `probe_survey`.
-
-    Raises SceneError: the scene holds a number that is not finite; the message says where. SettingsError: there is no
-    line to take, or sweeps differ in their binning. PoseError: a sweep is out of the mirror's reach.
+    Where to look is found on the scene's own pixels, so that the maxima hold for the whole image. Raises SceneError:
+    the scene holds a number that is not finite; SettingsError: no line to take, or sweeps of several binnings;
+    PoseError: a sweep is out of the mirror's reach.
     """
     taken = _taken(sweeps)
     binnings = {sweep.binning for sweep in taken}

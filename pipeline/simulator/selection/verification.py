@@ -30,9 +30,8 @@ Render = Callable[[SweepBlock, Mapping[Effect, str]], Light]
 def candidate_blocks(whole: Sequence[SweepBlock], places: Floats, *, lines: int = VERIFIED_LINES) -> list[SweepBlock]:
     """Give blocks of few lines about places of the scene and about the first, middle and last line of every sweep.
 
-    ``whole``: Every sweep as one block of all its lines.
-    ``places``: (place, 2) rows and columns that are steep, bright or dark. [px]
-    Returns at most `MOST_CANDIDATES`, evenly out of all, none twice.
+    ``whole``: every sweep as one block of all its lines; ``places``: (place, 2) rows and columns that are steep, bright
+    or dark [px]. Returns at most `MOST_CANDIDATES`, evenly out of all, none twice.
     """
     found = [(block, first) for block in whole for first in _first_lines(block, places, lines)]
     kept = np.unique(np.linspace(0, len(found) - 1, min(len(found), MOST_CANDIDATES)).round().astype(int))
@@ -45,12 +44,9 @@ def worst_blocks(
 ) -> dict[str, SweepBlock]:
     """Choose where bounds are hardest to keep: the steepest, brightest, darkest and most oblique of some blocks.
 
-    Of numbers as they are stored, and of each binning that the sweeps have its own.
-
-    ``render``: Expected electrons (line, sample, band); the footprint alone is enough.
-    ``units``: From expected electrons and their binning to one unit of the tolerance at each. [e-]
-    Returns by name; one block may have several.
-    Raises ShapeError: there is nothing to choose from.
+    Of numbers as they are stored, of each binning its own. ``render`` gives expected electrons (line, sample, band),
+    ``units`` one unit of the tolerance at each [e-], from electrons and their binning. Returns them by name; one block
+    may have several. Raises ShapeError: there is nothing to choose from.
     """
     best: dict[str, tuple[float, SweepBlock]] = {}
     least = min((block.sweep.binning for block in candidates), default=1)
@@ -126,15 +122,11 @@ class _Change:
 def verify(decision: Decision, render: Render, blocks: Mapping[str, SweepBlock], units: Units) -> dict[str, float]:
     """Measure on blocks what every effect that is off or cheapened changes, and all together, against everything on.
 
-    What changes are numbers as they are stored: sums of neighbouring samples where a sweep bins them.
+    Draws are paired: the difference is the effect's alone. Effects of the readout change distributions, not expected
+    light, and are not measured. ``render`` gives expected electrons (line, sample, band) of a block with some effects
+    on, ``units`` one unit of the tolerance at each [e-]. Returns the greatest change of a stored number in units: by
+    the name of each effect that is not exact, and of `TOTAL`.
 
-    Draws are paired: streams are keyed by seed, sweep, line and effect, so that the difference is the effect's alone.
-    Effects of the readout change distributions, not expected light, and are not measured here.
-
-    ``render``: Expected electrons (line, sample, band) of a block with some effects on.
-    ``blocks``: By name, as `worst_blocks` chooses them.
-    ``units``: From expected electrons with everything on, and their binning, to one unit of the tolerance at each. [e-]
-    Returns greatest change in the unit of the tolerance: by the name of each effect that is not exact, and of `TOTAL`.
     Raises BoundError: a change exceeds the bound that the decision counted on; names effect, bound, change and place.
     """
     full = [_rendered(name, block, render, decision, units) for name, block in _once_each(blocks).items()]
@@ -211,9 +203,8 @@ def misplaced_electrons(light: NDArray[np.floating], contrast: NDArray[np.floati
 def misplaced_share(exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> float:
     """Give the share of the contrast about a sample by which two ways to compute its light may differ at most.
 
-    Tables of weights, one along either axis, misplace up to `TABULATED` of the light by size, in either image; where
-    blurs or held positions differ, so do the few kernels that stand for those of all bands, each right to `NEGLIGIBLE`.
-    Weights sum to 1, so that what they misplace counts half of the contrast.
+    Tables of weights misplace up to `TABULATED` of the light along either axis, in either image; where blurs or held
+    positions differ, so do the kernels that stand for those of all bands, each right to `NEGLIGIBLE`. Half counts.
     """
 
     return 2 * TABULATED + (0.0 if _folded(exact) == _folded(chosen) else NEGLIGIBLE)

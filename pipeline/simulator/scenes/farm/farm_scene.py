@@ -88,16 +88,12 @@ def farm_scene(
 ) -> RasterScene:
     """Give a farm on a day: equal arguments give the same scene, bit for bit. It is drawn when first looked at.
 
-    ``seed``: Not negative. Another day of the same seed and shape is the same land.
-    ``shape``: (y, x), any size from 1 x 1. The land is drawn for the size: a larger scene is another farm. [px]
-    ``bands``: Equally spaced from 400 to 1000 nm, at least 2.
-    ``camera``: Its full well sets the electrons; ``LineCamera()`` unless given.
-    ``day``: Of the year, 1 to 366; by default 172.
-    ``hour``: True solar time, the sun in the south at 12; by default 11. [h]
-    Returns planes are abundances of ``farm_plan(...).materials``; scene values are reflectance; every pixel is
-    labelled.
-    Raises SceneError: a negative seed, an empty shape, a day that is not 1 to 366, the sun below 5 degrees.
-    WavelengthError: fewer than 2 bands.
+    ``seed`` is not negative; another day of the same seed and shape is the same land. ``shape`` (y, x) is any from 1 x
+    1 [px], ``bands`` equally spaced from 400 to 1000 nm, at least 2. The camera's full well sets the electrons. ``day``
+    is of the year, 1 to 366, ``hour`` true solar time, the sun in the south at 12 [h]. Planes are abundances of
+    ``farm_plan(...).materials``; scene values are reflectance; every pixel is labelled.
+
+    Raises SceneError: a negative seed, an empty shape, no such day, the sun below 5 degrees; WavelengthError: one band.
     """
     plan = farm_plan(seed, shape, day=USUAL_DAY if day is None else day, hour=USUAL_HOUR if hour is None else hour)
     seen_by, size = camera or LineCamera(), f"{shape[0]}x{shape[1]}"
