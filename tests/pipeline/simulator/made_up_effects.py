@@ -78,7 +78,7 @@ def even_probe(**values: object) -> Probe:
         lines=100,
         seconds=10.0,
     )
-    return replace(probe, **values)  # type: ignore[arg-type]
+    return replace(probe, **values)
 
 
 def steep_probe(

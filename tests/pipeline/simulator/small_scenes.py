@@ -24,11 +24,6 @@ def made_scene(planes: ArrayLike, electrons: ArrayLike, wavelength_nm: ArrayLike
     )
 
 
-def scene_of(values: ArrayLike, camera: LineCamera | None = None, nm: ArrayLike = (), **more: Any) -> RasterScene:
-    """A scene of values (y, x) or (y, x, band), in bands from 400 to 900 nm unless told."""
-    cube = np.asarray(values)
-    cube = cube[..., None] if cube.ndim == 2 else cube
-    bands = (
-        np.linspace(400, 900, cube.shape[2]) if len(np.shape(nm)) == 0 or not len(np.asarray(nm)) else np.asarray(nm)
-    )
-    return raster_from_values(cube, camera or LineCamera(), name="t", wavelength_nm=bands, **more)
+def image_scene(values: ArrayLike, camera: LineCamera, wavelength_nm: ArrayLike) -> RasterScene:
+    """A scene of an image's values (y, x, band)."""
+    return raster_from_values(np.asarray(values), camera, name="image", wavelength_nm=np.asarray(wavelength_nm, float))

@@ -17,9 +17,9 @@ from pipeline.rectify.registration.overlaps import BroadSweep
 from pipeline.simulator.effects.pointing import CommonOffset
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from tests.pipeline.simulator.small_scenes import image_scene
 
 CAMERA = LineCamera(samples=96)
 GRID = SceneGrid(240, 300, 16, 4)
@@ -29,7 +29,7 @@ def textured(seed: int = 0) -> RasterScene:
     """A scene of the grid's size with texture of 4 px and more."""
     values = gaussian_filter(np.random.default_rng(seed).normal(size=(GRID.height, GRID.width)), 4.0)
     cube = np.repeat((1 + 0.3 * values / values.std())[..., None], 2, axis=2)
-    return raster_from_values(cube, CAMERA, name="t", wavelength_nm=np.array([600.0, 700.0]))
+    return image_scene(cube, CAMERA, [600.0, 700.0])
 
 
 def coarse_mean(scene: RasterScene, factor: int) -> np.ndarray:
@@ -87,7 +87,7 @@ def test_sweep_is_compared_with_all_that_it_may_have_seen() -> None:
 
 def test_sweep_without_texture_stays_and_says_so() -> None:
     """On a field without texture nothing is found and nothing is moved."""
-    flat = raster_from_values(np.ones((240, 300, 2)), CAMERA, name="t", wavelength_nm=np.array([600.0, 700.0]))
+    flat = image_scene(np.ones((240, 300, 2)), CAMERA, [600.0, 700.0])
     found = anchored(sweep_of(), (5.0, 5.0), scene=flat)
     assert found.found.status == "flat"
     assert (found.shift.offset == 0).all()

@@ -11,16 +11,15 @@ import pytest
 
 from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.camera import LineCamera, look
-from pipeline.geometry.mirror import direction_to_scene, mirror_throughput, position_to_normal, reflect
-from pipeline.geometry.scan import Sweep, line_positions, sweep_positions
+from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
+from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.simulator.effects.pointing import CommonOffset
 from pipeline.simulator.effects.registry import EFFECTS, USUAL, effects_on
 from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
-from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import render_lines, sweep_block
-from tests.pipeline.simulator.small_scenes import made_scene
+from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 
 CAMERA = LineCamera()
 OPTICS = effects_on("rotation", "slit", "smear")
@@ -29,7 +28,7 @@ SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-19.5, lines=40)
 
 def scene_of(values: np.ndarray) -> RasterScene:
     """A scene of given values (y, x, band)."""
-    return raster_from_values(values, CAMERA, name="t", wavelength_nm=np.linspace(400, 900, values.shape[2]))
+    return image_scene(values, CAMERA, np.linspace(400, 900, values.shape[2]))
 
 
 def light_of(
@@ -58,17 +57,6 @@ def test_flat_scene_gives_flat_lines() -> None:
     np.testing.assert_allclose(light_of(scene, far, range(5)), expected, rtol=1e-5)
     longer = light_of(scene, far, range(5), camera=replace(CAMERA, exposure_ms=250.0))
     np.testing.assert_allclose(longer, 2.5 * expected, rtol=1e-5)
-
-
-@pytest.mark.parametrize("step", [1, 4])
-def test_mirror_passes_its_share_at_every_held_position(step: int) -> None:
-    """A flat scene shows the mirror's throughput, averaged over the positions held in each exposure."""
-    scene = scene_of(np.full((30, 30, 1), 4.0))
-    far = Sweep("far", "fine", "x", strip_px=-1500.0, start_px=2000.0, lines=6, step=step)
-    lines = light_of(scene, far, range(6), effects_on("rotation", "smear", "vignetting"))[..., 0]
-    share = mirror_throughput(sweep_positions(far, CAMERA)).mean(axis=1)
-    assert abs(share[0] - 1) > 0.05
-    np.testing.assert_allclose(lines / (4 * scene.electrons[0]), np.broadcast_to(share[:, None], (6, 640)), rtol=1e-5)
 
 
 def test_shifted_lines_see_the_shifted_place() -> None:

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
@@ -21,9 +20,8 @@ from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig
-from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
-from tests.pipeline.simulator.small_scenes import made_scene
+from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 
 SIZE = 96
 NM = np.array([400.0, 550.0, 700.0, 1000.0])
@@ -50,7 +48,7 @@ CHOICES = st.fixed_dictionaries(
 def scene_of(picture: str, dark: float = 0.0) -> RasterScene:
     """The picture in all bands: 1 on ``dark``."""
     values = np.where(PICTURES[picture], 1.0, dark)
-    return raster_from_values(np.repeat(values[..., None], len(NM), axis=2), RIG.camera, name=picture, wavelength_nm=NM)
+    return image_scene(np.repeat(values[..., None], len(NM), axis=2), RIG.camera, NM)
 
 
 def seen(scene: RasterScene, sweep: Sweep, chosen: dict[Any, str], rig: Rig = RIG) -> NDArray[np.float64]:
@@ -121,7 +119,7 @@ def test_tails_of_diffraction_reach_as_far_as_the_pupil_says() -> None:
     """
     rig = Rig(camera=LineCamera(samples=16))
     values = np.repeat((np.arange(801) > 400)[None, :, None] * np.ones((400, 1, 4)), 1, axis=2)
-    scene = raster_from_values(values, rig.camera, name="edge", wavelength_nm=NM)
+    scene = image_scene(values, rig.camera, NM)
     px = np.array([10, 20, 35, 50])
     sweeps = [Sweep("s", "fine", "x", strip_px=-float(x), start_px=0.0, lines=1) for x in px]
     light = np.concatenate([seen(scene, sweep, {SLIT: "1x1", DIFFRACTION: "airy"}, rig)[:, 8] for sweep in sweeps])
@@ -163,9 +161,7 @@ def test_nothing_chosen_is_a_straight_line_of_points() -> None:
 
 def test_diagonal_scene_is_that_of_its_matrix() -> None:
     """A scene with a plane of its own in each band gives what its diagonal matrix of electrons gives."""
-    diagonal = raster_from_values(
-        np.random.default_rng(1).uniform(0, 1, (60, 50, 4)), CAMERA, name="d", wavelength_nm=np.linspace(400, 1000, 4)
-    )
+    diagonal = image_scene(np.random.default_rng(1).uniform(0, 1, (60, 50, 4)), CAMERA, np.linspace(400, 1000, 4))
     light = SceneLight(np.diag(diagonal.electrons), diagonal.panel_electrons)
     full = replace(diagonal, light=Once.of(light))
     chosen = {**PLAIN, Widening(): "only"}
@@ -190,9 +186,7 @@ def test_blurs_widen_and_shift_each_band_by_its_moments() -> None:
     """On a wave every band keeps the contrast of its Gaussian, and is seen from the shifted place."""
     x = np.arange(160)
     wave = 1 + 0.5 * np.sin(2 * np.pi * x / 20)
-    scene = raster_from_values(
-        np.broadcast_to(wave[None, :, None], (40, 160, 6)), CAMERA, name="w", wavelength_nm=np.linspace(400, 1000, 6)
-    )
+    scene = image_scene(np.broadcast_to(wave[None, :, None], (40, 160, 6)), CAMERA, np.linspace(400, 1000, 6))
     sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=-0.5, lines=1)
     block = block_of(scene, sweep, range(1), samples=range(280, 360))
     light = expected_light(scene, block, {SLIT: "3x1", Widening(): "only"})[0] / scene.electrons
@@ -243,12 +237,6 @@ def test_gains_and_changes_run_in_the_order_given() -> None:
     last = expected_light(scene, block, {Nudge("change"): "only", Nudge("gain"): "only"})
     np.testing.assert_allclose(first, plain * gain + 7, rtol=1e-6)
     np.testing.assert_allclose(last, (plain + 7) * gain, rtol=1e-6)
-
-
-def test_unknown_variant_is_refused() -> None:
-    """A variant that an effect does not have is refused with those it has."""
-    with pytest.raises(SettingsError, match=r"effect slit has no variant 'airy'; choose from \('9x3'"):
-        Choice.of({SLIT: "airy"})
 
 
 def test_choice_leaves_out_what_is_off() -> None:

@@ -21,11 +21,10 @@ from pipeline.simulator.effects.counting import SHOT, dark_electrons, dead_eleme
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS, USUAL, effects_on
 from pipeline.simulator.effects.sensor import response_gain, stripe_gain
 from pipeline.simulator.rig_model import Detector, Rig, Sky
-from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, sweep_starts
 from pipeline.source import References, Source
-from tests.pipeline.simulator.small_scenes import made_scene
+from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 
 CAMERA = LineCamera()
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-19.5, lines=40)
@@ -34,8 +33,8 @@ QUIET = ("rotation", "slit", "smear")
 
 def source_of(values: np.ndarray, camera: LineCamera = CAMERA, **options: object) -> SimulatedSource:
     """A source that looks at given values (y, x, band)."""
-    scene = raster_from_values(values, CAMERA, name="t", wavelength_nm=np.linspace(400, 900, values.shape[2]))
-    return SimulatedSource(scene, Rig(camera), **options)  # type: ignore[arg-type]
+    scene = image_scene(values, CAMERA, np.linspace(400, 900, values.shape[2]))
+    return SimulatedSource(scene, Rig(camera), **options)
 
 
 def raw_of(source: Source, sweep: Sweep = SWEEP, first: int = 0) -> np.ndarray:
@@ -75,21 +74,6 @@ def test_noise_is_keyed_by_seed_sweep_and_line() -> None:
     assert np.abs(correlation).max() < 5 / np.sqrt(noise.shape[1])
 
 
-@pytest.mark.parametrize("effects", [("shot", "read-noise"), ("shot",), ("read-noise",), ()])
-@pytest.mark.parametrize("level", [0.02, 1.0])
-def test_noise_has_the_stated_variance(effects: tuple[str, ...], level: float) -> None:
-    """Mean and variance of a flat scene are those of shot, read and rounding noise, each only when on."""
-    values = np.full((40, 40, 8), level)
-    values[0, :4] = 1.0  # sets the scale and lies off the lines used
-    source = source_of(values, chosen=effects_on(*QUIET, *effects))
-    dn = raw_of(source)[5:].astype(float)
-    electrons = level * float(source.scene.electrons[0])
-    variance = electrons * ("shot" in effects) + CAMERA.read_noise_e**2 * ("read-noise" in effects)
-    expected = variance / CAMERA.electrons_per_dn**2 + (1 / 12 if effects else 0)
-    assert dn.mean() == pytest.approx(64 + electrons / 5, abs=5 * np.sqrt(expected / dn.size) if effects else 0.5)
-    assert dn.var() == pytest.approx(expected, rel=0.02, abs=1e-9)
-
-
 def test_binned_lines_are_sums_and_saturate_without_wrapping() -> None:
     """Twice the light that fills the well gives sums at full scale, and dark stays dark beside it."""
     values = np.zeros((40, 640, 2))
@@ -125,16 +109,6 @@ def test_black_scene_reads_dark() -> None:
     out, valid = calibrate(raw, source.references(SWEEP), saturated_dn=4095, position=position)
     assert valid.all()
     assert abs(out.mean()) < 1e-3 * source.scene.panel[0]
-
-
-def test_edges_never_wrap() -> None:
-    """At a black and white edge light reads the dark level at least, and where the well is full its end."""
-    values = np.zeros((40, 640, 1))
-    values[:, ::7] = values[::5] = 1.0
-    source = source_of(values, replace(CAMERA, exposure_ms=170.0), chosen=effects_on("rotation"))
-    raw = raw_of(source)
-    assert raw.min() == 64
-    assert raw.max() == 4095
 
 
 def test_lines_come_one_by_one() -> None:
@@ -191,9 +165,15 @@ def test_sweeps_end_before_the_next_and_within_the_price(sizes: list[int], step:
         assert start + CAMERA.scan_seconds(sweep.lines) <= following
 
 
+def test_blocks_tell_the_time_of_mid_exposure() -> None:
+    """Since the survey's start: line 3 of a sweep that starts after 60 s is exposed from 60.3 to 60.4 s."""
+    source = SimulatedSource(image_scene(np.ones((8, 8, 1)), CAMERA, [500.0]), Rig(CAMERA), clock={"a": 60.0})
+    assert source.block(Sweep("a", "fine", "x", 0.0, 0.0, 9), range(3, 5)).time_s == pytest.approx([60.35, 60.45])
+
+
 def test_light_goes_with_the_clock() -> None:
     """A sweep that starts an hour after sunrise's light is brighter; references are of the survey's start."""
-    scene = raster_from_values(np.full((8, 8, 3), 0.1), CAMERA, name="t", wavelength_nm=np.array([500.0, 600.0, 700.0]))
+    scene = image_scene(np.full((8, 8, 3), 0.1), CAMERA, [500.0, 600.0, 700.0])
     rig = Rig(CAMERA, sky=Sky(started=datetime(2025, 6, 21, 5, tzinfo=UTC)))
     chosen = effects_on("rotation", "drift")
     sweep = Sweep("a", "fine", "x", 0.0, 0.0, 2)

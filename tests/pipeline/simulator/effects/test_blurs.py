@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.air import TURBULENCE
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE, defocus_px, keystone_shift
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import SLIT
@@ -20,18 +19,7 @@ from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig
 from pipeline.simulator.scenes.scene import RasterScene
-from tests.pipeline.simulator.fine_image import (
-    BOX,
-    IMAGES,
-    SCAN,
-    SWEEP,
-    change,
-    convolved,
-    disc,
-    gaussian,
-    probe_of,
-    shifted,
-)
+from tests.pipeline.simulator.fine_image import BOX, IMAGES, SCAN, change, convolved, disc, gaussian, probe_of, shifted
 from tests.pipeline.simulator.small_scenes import made_scene
 
 
@@ -149,19 +137,6 @@ def test_moments_shift_along_the_line_only():
     assert not moments.variance.any()
 
 
-def test_long_wavelengths_see_further_along_the_line():
-    """On a ramp of 100 e- per px along the line 0.5 px of keystone add 25 e- at 1000 nm and take 25 at 400."""
-    planes = np.repeat(np.arange(80, dtype=np.float32)[None, :, None], 30, axis=0)
-    electrons = np.full((1, 3), 100.0, np.float32)
-    scene = made_scene(planes, electrons, KEYSTONE_NM)
-    block = SweepBlock(keystone_rig_of(0.5), SWEEP, range(10, 13), KEYSTONE_NM, scene.shape, samples=range(300, 340))
-    plain = {SLIT: "3x1"}
-    beside = expected_light(scene, block, {KEYSTONE: "linear", **plain}) - expected_light(scene, block, plain)
-    assert beside[..., 0] == pytest.approx(-25, abs=0.05)
-    assert beside[..., 1] == pytest.approx(0, abs=0.05)
-    assert beside[..., 2] == pytest.approx(25, abs=0.05)
-
-
 @pytest.mark.parametrize("name", IMAGES)
 @pytest.mark.parametrize("keystone", [0.15, 1.0, 4.0])
 def test_keystone_bound_holds(name: str, keystone: float):
@@ -175,7 +150,6 @@ def test_keystone_bound_holds(name: str, keystone: float):
 RENDERED_BLURS_NM = np.array([400.0, 600.0, 1000.0])
 RIG = Rig(optics=Optics(aberration_px=0.3, keystone_px=0.4), air=Air(distance_m=120.0))
 WAVES_SWEEP = Sweep("fine", "fine", "x", strip_px=0.0, start_px=-20.0, lines=40)
-ALL = {DIFFRACTION: "airy", DEFOCUS: "disc", ABERRATION: "gaussian", KEYSTONE: "linear", TURBULENCE: "jitter"}
 
 
 def scene_of(planes: NDArray[np.float32]) -> RasterScene:

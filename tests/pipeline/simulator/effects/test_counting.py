@@ -37,7 +37,6 @@ from tests.pipeline.simulator.spectral_light import block_of, probe_of
 TOLERANCE = 0.1 / 1.2  # of 0.1 sigma with the decision's factor of safety
 NM = np.array([500.0, 700.0, 900.0])
 RIG = Rig()
-NOISY = (SHOT, READ_NOISE, DARK_CURRENT)
 
 
 def probe(darkest_e: float, brightest_e: float, unit: Unit = "sigma") -> Probe:
@@ -125,7 +124,7 @@ def test_defects_bound_holds() -> None:
             block = block_of(rig, NM)
             on, off = (read_out(light, block, chosen).astype(np.float64) for chosen in ({DEFECTS: "exact"}, {}))
             measured = float(np.max(np.abs(on - off) / sigma))
-            bound = DEFECTS.bound(probe_of(light, NM, unit), rig).value  # type: ignore[arg-type]
+            bound = DEFECTS.bound(probe_of(light, NM, unit), rig).value
             assert measured <= bound * 1.02 + 0.5
             assert measured > bound / 6
 

@@ -26,7 +26,6 @@ from pipeline.simulator.effects.haze import (
 )
 from pipeline.simulator.effects.probe import fixed_variance
 from pipeline.simulator.rig_model import Air, Optics, Rig, Sky
-from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.outdoors import (
     BANDS,
@@ -39,6 +38,7 @@ from tests.pipeline.simulator.outdoors import (
     rig_with,
     white_e,
 )
+from tests.pipeline.simulator.small_scenes import image_scene
 
 CLEAR_30_M, HAZY_300_M = Air(30.0, visibility_km=23.0), Air(300.0, visibility_km=5.0)
 SLOPING = Air(30.0, relief="plane", nearest_m=10.0, farthest_m=100.0)
@@ -180,7 +180,7 @@ def test_bands_without_light_have_a_finite_bound(air: Air, black: slice) -> None
     """What air adds to them is all that there is; nothing overflows, with any effect of the view."""
     values = np.random.default_rng(0).uniform(0, 1, (24, 32, 3))
     values[..., black] = 0
-    scene = raster_from_values(values, LineCamera(samples=32), name="t", wavelength_nm=np.array([640.0, 550.0, 460.0]))
+    scene = image_scene(values, LineCamera(samples=32), [640.0, 550.0, 460.0])
     rig = Rig(LineCamera(samples=32), air=air, sky=Sky(brdf_per_rad=0.3, hot_spot=0.2))
     probe = probe_scene(scene, rig, full_sweeps(SceneGrid(24, 32, 8, 4), rig.camera, "x"))
     found = [PATH_RADIANCE.bound(probe, rig, variant).value for variant in (OFF, *PATH_RADIANCE.variants)]

@@ -25,11 +25,11 @@ from pipeline.simulator.effects.probe import noise_electrons
 from pipeline.simulator.optics.tap_sums import fewest_parts, misplaced
 from pipeline.simulator.render import expected_light, views_all_over
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.bound_trials import trials
 from tests.pipeline.simulator.random_cases import random_case
+from tests.pipeline.simulator.small_scenes import image_scene
 
 RIG = Rig(camera=LineCamera(samples=64))
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-14.5, lines=30)
@@ -83,7 +83,7 @@ def test_point_is_spread_by_the_closed_form_of_the_box(variant: str) -> None:
     """Of a bright pixel, lines at pixel centres show the box over linear interpolation, in closed form."""
     values = np.zeros((40, 64, 1))
     values[20, 30] = 1.0
-    scene = raster_from_values(values, RIG.camera, name="p", wavelength_nm=np.array([550.0]))
+    scene = image_scene(values, RIG.camera, [550.0])
     block = SweepBlock(RIG, replace(SWEEP, start_px=-15.5), range(30), scene.wavelength_nm, scene.shape)
     light = expected_light(scene, block, {SLIT: variant})[..., 0] / scene.electrons[0]
     slit, pixel = footprint_kernel(RIG.camera.slit_px), footprint_kernel(1.0)
@@ -96,7 +96,7 @@ def test_point_is_spread_by_the_closed_form_of_the_box(variant: str) -> None:
 def test_bound_is_what_the_probe_measured_with_a_margin() -> None:
     """Where lines are not turned one box is enough; bounds are the margin times what was measured."""
     values = np.random.default_rng(3).uniform(0, 1, (50, 80, 2))
-    scene = raster_from_values(values, RIG.camera, name="t", wavelength_nm=np.array([550.0, 700.0]))
+    scene = image_scene(values, RIG.camera, [550.0, 700.0])
     probe = probe_scene(scene, RIG, [SWEEP])
     bounds = [SLIT.bound(probe, RIG, variant).value for variant in (*SLIT.variants, "off")]
     assert bounds[0] == 0
@@ -108,9 +108,7 @@ def test_bound_is_what_the_probe_measured_with_a_margin() -> None:
 def test_slit_of_no_width_sees_what_a_pixel_sees() -> None:
     """A zero-width slit is a line of light, its probe finite and its variants alike."""
     narrow = replace(RIG, camera=replace(RIG.camera, slit_um=0.0))
-    scene = raster_from_values(
-        np.random.default_rng(3).uniform(0, 1, (50, 80, 1)), RIG.camera, name="t", wavelength_nm=np.array([550.0])
-    )
+    scene = image_scene(np.random.default_rng(3).uniform(0, 1, (50, 80, 1)), RIG.camera, [550.0])
     probe = probe_scene(scene, narrow, [SWEEP])
     assert np.isfinite(list(probe.slit_errors.values())).all()
     assert np.isfinite(probe.slope).all()
@@ -132,9 +130,7 @@ def test_positions_are_held_by_the_mirror_or_the_footprint(step: int) -> None:
 def test_no_smear_where_every_line_has_one_position() -> None:
     """Fine lines stand still: the bound is 0 and the position that of mid exposure."""
     sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=0.0, lines=4)
-    scene = raster_from_values(
-        np.random.default_rng(0).uniform(0, 1, (30, 60, 1)), RIG.camera, name="t", wavelength_nm=np.array([550.0])
-    )
+    scene = image_scene(np.random.default_rng(0).uniform(0, 1, (30, 60, 1)), RIG.camera, [550.0])
     assert SMEAR.bound(probe_scene(scene, RIG, [sweep]), RIG).value == 0
     block = SweepBlock(RIG, sweep, range(4), scene.wavelength_nm, scene.shape)
     np.testing.assert_array_equal(smeared_positions(block, "positions"), block.middle[:, None])
@@ -147,7 +143,7 @@ def test_change_is_within_the_bound(step: int, period: float, variant: str) -> N
     """On waves of any length, smear off or folded errs by at most 1.2 bounds."""
     y, x = np.mgrid[:90, :80]
     values = 1 + 0.4 * np.sin(2 * np.pi * y / period) + 0.1 * np.cos(2 * np.pi * x / 17)
-    scene = raster_from_values(values[..., None], RIG.camera, name="t", wavelength_nm=np.array([550.0]))
+    scene = image_scene(values[..., None], RIG.camera, [550.0])
     sweep = Sweep("s", "coarse", "x", strip_px=3.0, start_px=-36.0, lines=72 // step, step=step, binning=step)
     bound = SMEAR.bound(probe_scene(scene, RIG, [sweep]), RIG, variant).value
     block = SweepBlock(RIG, sweep, range(sweep.lines), scene.wavelength_nm, scene.shape)
@@ -169,7 +165,7 @@ ROTATION_RIG = Rig(camera=LineCamera(samples=80))
 
 def scene_of(values: np.ndarray) -> RasterScene:
     """A scene of one band."""
-    return raster_from_values(values[..., None], ROTATION_RIG.camera, name="t", wavelength_nm=np.array([550.0]))
+    return image_scene(values[..., None], ROTATION_RIG.camera, [550.0])
 
 
 def waves(seed: int) -> np.ndarray:
@@ -196,7 +192,7 @@ def test_ends_of_a_line_are_turned_by_the_line_rotation() -> None:
     """The ends of a line of 640 samples lie 320 px times the sine of its rotation off the plan, and stretched."""
     camera = LineCamera()
     sweep = Sweep("s", "fine", "x", strip_px=1500.0, start_px=800.0, lines=1)
-    scene = raster_from_values(np.ones((4, 4, 1)), camera, name="f", wavelength_nm=np.array([550.0]))
+    scene = image_scene(np.ones((4, 4, 1)), camera, [550.0])
     why = ROTATION.bound(probe_scene(scene, Rig(), [sweep]), Rig()).why
     scan = float(why.split(" px along the scan")[0].split()[-1])
     psi = line_rotation(position_to_direction(line_positions(sweep, camera)))[0]

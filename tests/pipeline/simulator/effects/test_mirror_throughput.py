@@ -231,7 +231,7 @@ def test_glass_by_hand() -> None:
 )
 def test_published_reflectances_head_on(coating: str, nm: float, share: float) -> None:
     """Of evaporated films (Hass in the American Institute of Physics Handbook, table 6g): within 2 points."""
-    found = reflectance(coating, np.array([nm]), np.zeros(1))  # type: ignore[arg-type]
+    found = reflectance(coating, np.array([nm]), np.zeros(1))
     assert found[0, 0] == pytest.approx(share, abs=0.02)
 
 
@@ -257,7 +257,7 @@ def test_tables_rise_and_their_ends_are_held(coating: str) -> None:
     assert (np.diff(nm) > 0).all()
     assert nm[0] <= 311
     assert nm[-1] >= 1937
-    found = refractive_index(coating, np.array([200.0, 5000.0]))  # type: ignore[arg-type]
+    found = refractive_index(coating, np.array([200.0, 5000.0]))
     np.testing.assert_array_equal(found, [n[0] + 1j * k[0], n[-1] + 1j * k[-1]])
 
 

@@ -14,13 +14,13 @@ from pipeline.geometry.camera import LineCamera, footprint_kernel
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
+from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.optics.tap_sums import SCALE_STEP, TapTable, blurred_weight, box_weight
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.scenes.scene import RasterScene
 from tests.pipeline.simulator.fine_footprint import fine_light
+from tests.pipeline.simulator.small_scenes import image_scene
 
 CAMERA = LineCamera()
 RIG = Rig(camera=CAMERA, optics=Optics(keystone_px=0.3))
@@ -33,7 +33,7 @@ def grain(bands: int = 3) -> RasterScene:
     """Pixels that know nothing of their neighbours: the roughest scene that there is, as large as it has to be."""
     rng = np.random.default_rng(0)
     values = rng.uniform(0.05, 1, (120, 160, bands))
-    return raster_from_values(values, CAMERA, name="grain", wavelength_nm=np.linspace(400, 1000, bands))
+    return image_scene(values, CAMERA, np.linspace(400, 1000, bands))
 
 
 def error(sweep: Sweep, line: int, variant: str, blurs: dict[Any, str], rig: Rig = RIG) -> float:
@@ -104,7 +104,7 @@ def test_rays_converge_to_the_closed_form() -> None:
 def test_flat_scene_stays_flat() -> None:
     """Weights sum to 1 at any place, turn and band."""
     nm = np.linspace(400, 1000, 3)
-    scene = raster_from_values(np.full((120, 160, 3), 0.7), CAMERA, name="flat", wavelength_nm=nm)
+    scene = image_scene(np.full((120, 160, 3), 0.7), CAMERA, nm)
     block = SweepBlock(RIG, CORNER, range(4), scene.wavelength_nm, scene.shape)
     for variant in ("off", *SLIT.variants):
         light = expected_light(scene, block, {ROTATION: "rays", SLIT: variant, **BLURS})
@@ -115,25 +115,11 @@ def test_flat_scene_stays_flat() -> None:
 def test_keystone_needs_no_slit(variant: str) -> None:
     """Every band is seen from its own place, through the slit and without it."""
     x = np.mgrid[:120, :160][1]
-    ramp = raster_from_values(
-        np.repeat((x + 0.0)[..., None], 3, axis=2), CAMERA, name="ramp", wavelength_nm=np.array([400.0, 700.0, 1000.0])
-    )
+    ramp = image_scene(np.repeat((x + 0.0)[..., None], 3, axis=2), CAMERA, [400.0, 700.0, 1000.0])
     sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=-20.0, lines=3)
     block = SweepBlock(RIG, sweep, range(3), ramp.wavelength_nm, ramp.shape, samples=range(290, 350))
     light = expected_light(ramp, block, {SLIT: variant, KEYSTONE: "linear"}) / ramp.electrons
     np.testing.assert_allclose(light - light[..., [1]], np.broadcast_to([-0.15, 0.0, 0.15], light.shape), atol=2e-4)
-
-
-@pytest.mark.parametrize("step", [2, 4, 8])
-def test_folded_positions_are_those_held_near_the_middle(step: int) -> None:
-    """Where lines do not turn, held positions in the footprint give what each of them gives by itself."""
-    scene = grain()
-    sweep = Sweep("s", "coarse", "x", strip_px=0.0, start_px=-20.0, lines=4, step=step, binning=step)
-    block = SweepBlock(RIG, sweep, range(4), scene.wavelength_nm, scene.shape, samples=range(300, 340))
-    one, other = (
-        expected_light(scene, block, {ROTATION: "rays", SMEAR: smear, SLIT: "3x1", **BLURS}) for smear in SMEAR.variants
-    )
-    assert np.abs(one - other).max() / one.std() < 0.02
 
 
 DISTANCE = np.linspace(-5, 5, 401)

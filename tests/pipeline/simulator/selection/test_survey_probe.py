@@ -18,12 +18,11 @@ from pipeline.simulator.effects.probe import Probe, noise_electrons, stored_mean
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Detector, Rig
-from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.options import SAFETY, list_options
 from pipeline.simulator.selection.survey_looks import views_of_places
 from pipeline.simulator.selection.survey_probe import probe_scene, probe_survey
-from tests.pipeline.simulator.small_scenes import made_scene
+from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 
 RIG = Rig(camera=LineCamera(samples=96))
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-30.0, lines=61)
@@ -32,7 +31,7 @@ BLURS: dict[Any, str] = {DIFFRACTION: "airy", ABERRATION: "gaussian", KEYSTONE: 
 
 def scene_of(values: np.ndarray) -> RasterScene:
     """A scene of given values (y, x, band)."""
-    return raster_from_values(values, RIG.camera, name="t", wavelength_nm=np.linspace(400, 900, values.shape[2]))
+    return image_scene(values, RIG.camera, np.linspace(400, 900, values.shape[2]))
 
 
 def mixed(seed: int, shape: tuple[int, int] = (80, 110), bands: int = 6) -> RasterScene:

@@ -72,7 +72,7 @@ def decided(case: Case) -> Decision:
 
 def rig_of(*, exposure_ms: float = 100.0, **parts: object) -> Rig:
     """A rig with some parts other than the defaults."""
-    return Rig(camera=replace(CAMERA, exposure_ms=exposure_ms), **parts)  # type: ignore[arg-type]
+    return Rig(camera=replace(CAMERA, exposure_ms=exposure_ms), **parts)
 
 
 FLAT = Case()

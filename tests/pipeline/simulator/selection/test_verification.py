@@ -18,7 +18,6 @@ from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.selection.choice import TOTAL, Decision, decide
 from pipeline.simulator.selection.verification import (
     MOST_CANDIDATES,
@@ -33,6 +32,7 @@ from pipeline.simulator.selection.verification import (
 )
 from pipeline.simulator.simulated import sweep_block
 from tests.pipeline.simulator.made_up_effects import RIG, SWEEP, Brightening, MadeUp, even_probe
+from tests.pipeline.simulator.small_scenes import image_scene
 
 BLOCK = SweepBlock(RIG, SWEEP, range(20, 28), np.array([500.0, 600.0]), (200, 700))
 CHIPS = {"steepest": BLOCK, "brightest": replace(BLOCK, lines=range(40, 44))}
@@ -205,7 +205,7 @@ def test_contrast_is_that_of_the_scene_about_a_sample() -> None:
     """A bright pixel between two lines of a chip counts 8 px around it, and no farther; even light counts nothing."""
     values = np.zeros((48, 64, 1))
     values[23, 40] = 1.0
-    scene = raster_from_values(values, RIG.camera, name="t", wavelength_nm=np.array([550.0]))
+    scene = image_scene(values, RIG.camera, [550.0])
     block = sweep_block(scene, RIG, SWEEP, range(6, 8))  # looks at rows 24 to 31
 
     def render(block: SweepBlock, chosen: Any) -> Light:
@@ -235,7 +235,7 @@ def test_two_ways_to_fold_the_same_light_differ_by_no_more(pattern: str) -> None
     plane = (y if pattern == "rows" else x) // 2 % 2
     values = plane[..., None] * np.array([1.0, 0.7, 0.9])
     nm = np.array([450.0, 640.0, 980.0])
-    scene = raster_from_values(values, RIG.camera, name="t", wavelength_nm=nm)
+    scene = image_scene(values, RIG.camera, nm)
     block = sweep_block(scene, RIG, SWEEP, range(12))
     unshifted = {effect: way for effect, way in EXACT.items() if effect is not KEYSTONE}
     other = unshifted if pattern == "rows" else {**EXACT, SMEAR: "folded"}
