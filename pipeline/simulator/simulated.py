@@ -30,6 +30,11 @@ from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, Scene
 from pipeline.source import AT_REST, Line, References
 
+Raw = NDArray[np.uint16]
+BLOCK_LINES = 16  # rendered at a time: 11 MB of light with 640 samples and 270 bands
+Frame = NDArray[np.float32]
+SEEN = frozenset({RESPONSE.name, SMILE.name, PRNU.name, STRIPING.name})  # by light of the panel
+
 
 @dataclass(frozen=True)
 class SimulatedSource:
@@ -166,12 +171,6 @@ def sweep_starts(
         starts[sweep.name] = after_s + spent
         lines += sweep.lines
     return starts
-
-
-Raw = NDArray[np.uint16]
-BLOCK_LINES = 16  # rendered at a time: 11 MB of light with 640 samples and 270 bands
-Frame = NDArray[np.float32]
-SEEN = frozenset({RESPONSE.name, SMILE.name, PRNU.name, STRIPING.name})  # by light of the panel
 
 
 def sweep_block(

@@ -20,6 +20,7 @@ NEAR_POINTS = 3 / 8  # of it from a path's end: the mean of (z / d)^(5/3); r0 [2
 RISK = 1e-3  # share of the surveys in which a line may stray further than the bound says
 _REST = math.sqrt(0.5)
 GUST_M = 3.0  # length of the waves that run over a canopy; assumed
+FARTHEST_M = 1e7  # infinity: nothing passes so much air
 
 
 @dataclass(frozen=True)
@@ -143,9 +144,6 @@ def within_exposure_px(rig: Rig) -> float:
 
 def sways_per_line(rig: Rig) -> float:
     return rig.air.wind_hz * rig.camera.frame_ms * 1e-3
-
-
-FARTHEST_M = 1e7  # infinity: nothing passes so much air
 
 
 @dataclass(frozen=True)

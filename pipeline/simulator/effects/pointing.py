@@ -27,6 +27,9 @@ from pipeline.simulator.rig_model import Rig
 Floats = NDArray[np.float64]
 EXCEEDED = 1e-3  # probability that any line of a survey lies beyond the bound
 _MODES = 6
+ACCURACY_PX = 50.0  # 0.15 deg mechanical, as quoted by the vendor: systematic, unknown before registration
+REPEATABILITY_PX = 0.8  # 40 urad mechanical: anew for every line
+_MOST_DEVIATES = 6.0  # beyond, one line in 5e8 lies
 
 
 def end_gains(sweep: Sweep, camera: LineCamera) -> Floats:
@@ -191,11 +194,6 @@ def scan_sign(sweep: Sweep) -> float:
 def _along_and_scan(rig: Rig) -> tuple[float, float]:
     turn = unit_stream(rig.detector.unit, ThermalDrift.name).uniform(0, 2 * math.pi)
     return math.cos(turn), math.sin(turn)
-
-
-ACCURACY_PX = 50.0  # 0.15 deg mechanical, as quoted by the vendor: systematic, unknown before registration
-REPEATABILITY_PX = 0.8  # 40 urad mechanical: anew for every line
-_MOST_DEVIATES = 6.0  # beyond, one line in 5e8 lies
 
 
 class Pointing(Aim, ABC):

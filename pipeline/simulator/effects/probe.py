@@ -21,6 +21,8 @@ from pipeline.simulator.rig_model import Rig
 Floats = NDArray[np.float64]
 Unit = Literal["sigma", "dn"]
 UNITS = {"sigma": "sigma", "dn": "DN"}
+Light = NDArray[np.float32]
+Real = TypeVar("Real", np.float32, np.float64)
 
 
 @dataclass(frozen=True)
@@ -87,9 +89,6 @@ def _times(steep: Floats, way: Floats | float) -> Floats:
     return np.multiply(steep, way, out=np.zeros(np.shape(steep)), where=np.not_equal(way, 0))
 
 
-Light = NDArray[np.float32]
-
-
 def stored_mean(light: NDArray[np.floating], binning: int) -> NDArray[np.floating]:
     """Give the mean of each ``binning`` neighbours, (..., sample, band) -> (..., sample // binning, band).
 
@@ -148,9 +147,6 @@ def lights_within(probe: Probe, rig: Rig) -> tuple[Floats, Floats]:
         high = (level + np.sqrt(level * (level + 4 * fixed))) / 2
         way = (np.sqrt(span * (span + 4 * (high + fixed))) - span) / 2
     return np.maximum(high - way, probe.darkest_e), high
-
-
-Real = TypeVar("Real", np.float32, np.float64)
 
 
 @dataclass(frozen=True)

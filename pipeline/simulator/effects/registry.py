@@ -37,6 +37,9 @@ LIGHT: tuple[Effect, ...] = (
 READOUT: tuple[Effect, ...] = (DARK_CURRENT, DEFECTS, SHOT, READ_NOISE, SATURATION, QUANTISATION)
 EFFECTS: tuple[Effect, ...] = (*AIMS, *RAYS, *FOOTPRINT, *LIGHT, *READOUT)
 BY_NAME = MappingProxyType({effect.name: effect for effect in EFFECTS})
+# Of any camera behind a mirror, without noise and with; cheap: beside exact ones a farm changes by .015 sigma at most.
+QUIET = Choice.of({ROTATION: "rays", SLIT: "3x1", SMEAR: FOLDED, VIGNETTING: HELD})
+USUAL = Choice((*QUIET.effects, (SHOT, GAUSSIAN), (READ_NOISE, "exact")))
 
 
 def effects_on(*names: str) -> Choice:
@@ -50,8 +53,3 @@ def effects_on(*names: str) -> Choice:
     if unknown:
         raise SettingsError(f"unknown effects {unknown}; choose from {', '.join(BY_NAME)}")
     return Choice(tuple((one, GAUSSIAN if one is SHOT else one.variants[0]) for one in EFFECTS if one.name in names))
-
-
-# Of any camera behind a mirror, without noise and with; cheap: beside exact ones a farm changes by .015 sigma at most.
-QUIET = Choice.of({ROTATION: "rays", SLIT: "3x1", SMEAR: FOLDED, VIGNETTING: HELD})
-USUAL = Choice((*QUIET.effects, (SHOT, GAUSSIAN), (READ_NOISE, "exact")))

@@ -39,6 +39,7 @@ _RADII = np.concatenate([np.geomspace(0.002, 0.1, 10), np.linspace(0.13, 1.3, 18
 _TURNS = (np.arange(8) + 0.5) * np.pi / 8
 _ALONG = np.concatenate([np.outer(_RADII, np.cos(_TURNS)).ravel(), _RADII, 0 * _RADII])
 _SCAN = np.concatenate([np.outer(_RADII, np.sin(_TURNS)).ravel(), 0 * _RADII, _RADII])
+_ALIKE_PX = 0.3  # by which widths may differ of kernels that share a window
 
 
 @dataclass(frozen=True)
@@ -223,9 +224,6 @@ class Moments:
         none = np.zeros((2, bands))
         shift, variance = sum((one.shift for one in blurs), none), sum((one.variance for one in blurs), none)
         return Moments(shift, variance, next((one.waves for one in blurs if one.waves is not None), None))
-
-
-_ALIKE_PX = 0.3  # by which widths may differ of kernels that share a window
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,15 @@ Parts = tuple[int, int]
 LADDER: tuple[Parts, ...] = ((1, 1), (2, 1), (3, 1), (5, 2), (9, 3))  # across and along; the last is taken as exact
 _FINER = (18, 6)  # than any; what they are held against
 _PHASES = (0.0, 0.5)  # of the pixels, along either axis
+Weights = NDArray[np.float32]
+PER_PX = 128  # rows of a table; between them weights are linear, right to 8e-6 of a kernel's curvature
+SCALE_STEP = 1 / 4096  # from one tabulated scale to the next; the nearest is taken
+_WORKED_OUT = 16  # every so many of them are worked out, those between are linear: right to 2e-6
+TAIL = 5e-6  # share of a kernel's weight that may lie beyond its taps; what is left is scaled to sum 1. No tap beyond
+# has more than that either: weights jump by so much where a tap comes in.
+TABULATED = 2e-5  # share of the light, by size, that a table of either axis misplaces at most, but for what follows
+BETWEEN_ROWS = 1 / (4 * PER_PX**2)  # variance that a kernel gains between two rows at most: half of either [px^2]
+_SDS = 6.5  # of a Gaussian: nothing beyond
 
 
 @dataclass(frozen=True)
@@ -220,17 +229,6 @@ def _weights(parts: Parts, box: tuple[float, float], shape: tuple[float, ...]) -
     runs = [box_weight(pixel + phase - along, widths[0]) for phase in _PHASES]
     turns = [box_weight(pixel + phase - scan, widths[1]) for phase in _PHASES]
     return np.stack([run @ turn.T for run in runs for turn in turns]) / len(along)
-
-
-Weights = NDArray[np.float32]
-PER_PX = 128  # rows of a table; between them weights are linear, right to 8e-6 of a kernel's curvature
-SCALE_STEP = 1 / 4096  # from one tabulated scale to the next; the nearest is taken
-_WORKED_OUT = 16  # every so many of them are worked out, those between are linear: right to 2e-6
-TAIL = 5e-6  # share of a kernel's weight that may lie beyond its taps; what is left is scaled to sum 1. No tap beyond
-# has more than that either: weights jump by so much where a tap comes in.
-TABULATED = 2e-5  # share of the light, by size, that a table of either axis misplaces at most, but for what follows
-BETWEEN_ROWS = 1 / (4 * PER_PX**2)  # variance that a kernel gains between two rows at most: half of either [px^2]
-_SDS = 6.5  # of a Gaussian: nothing beyond
 
 
 def box_weight(distance: Floats, width: float, held: int = 1) -> Floats:

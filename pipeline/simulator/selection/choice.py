@@ -25,6 +25,8 @@ from pipeline.simulator.selection.options import ALWAYS_ON, Menu, Option, cost_o
 
 Reason = Literal["absent", "unseen", "small", "needed", "spent", "exact", "asked", "unasked", "always"]
 CHEAP_SHARE = 0.1  # of the tolerance: what a variant may err by itself in the reference "everything on, cheap"
+UNIT_WORDS: dict[Unit, str] = {"sigma": "sigma of the noise", "dn": "DN"}
+TOTAL = "all effects"
 
 
 @dataclass(frozen=True)
@@ -218,10 +220,6 @@ def _reason(menu: Menu, option: Option, tolerance: float, named: frozenset[str] 
     if option.variant == OFF:
         return "small"
     return "needed" if menu.off.error > tolerance else "spent"
-
-
-UNIT_WORDS: dict[Unit, str] = {"sigma": "sigma of the noise", "dn": "DN"}
-TOTAL = "all effects"
 
 
 def list_effects(decision: Decision, measured: Mapping[str, float] | None = None) -> list[dict[str, Any]]:

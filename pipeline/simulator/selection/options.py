@@ -43,6 +43,10 @@ LEAST_COST_NS = 1e-3  # nothing that is computed is free: of two that bound alik
 ALWAYS_ON = frozenset({"quantisation", "saturation"})  # raw lines are whole numbers of few bits
 LINEAR_ACTIONS = ("aim", "displaced", "moments", "gain", "change")
 LIGHT_EFFECTS = frozenset({"slit", "smear", "rotation"})  # that the renderer itself does
+Floats = NDArray[np.float64]
+# Half of the integrals of |s dG/ds| and |s^2 d^2G/ds^2| for either axis, and, for both, of 2 |s^2 d^2G/ds dx|.
+_PER_LOG, _PER_LOG_TWICE, _PER_LOG_AND_PX = 0.5, 1.1, 2.3
+FINEST_PER_PX = 8.0  # derivatives along the image grow by no more per order: they are differences a quarter px apart
 
 
 @dataclass(frozen=True)
@@ -198,12 +202,6 @@ def _gain_beside(effect: Effect, ranges: Sequence[GainRange | None], place: int,
 def cost_of(menus: Iterable[Menu], options: Mapping[str, Option]) -> float:
     """Give what options, one for each menu by its name, cost together per px and band [ns]."""
     return math.fsum(menu.cost_beside(options[menu.name], options) for menu in menus)
-
-
-Floats = NDArray[np.float64]
-# Half of the integrals of |s dG/ds| and |s^2 d^2G/ds^2| for either axis, and, for both, of 2 |s^2 d^2G/ds dx|.
-_PER_LOG, _PER_LOG_TWICE, _PER_LOG_AND_PX = 0.5, 1.1, 2.3
-FINEST_PER_PX = 8.0  # derivatives along the image grow by no more per order: they are differences a quarter px apart
 
 
 @dataclass(frozen=True)

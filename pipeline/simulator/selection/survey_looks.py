@@ -29,6 +29,11 @@ TELLING_BANDS = 4
 _TILES = 8192  # at most about so many, each of which offers its best place
 _CELLS = 40_000  # at which it is asked whether a sweep looks there
 _LEAST_WEIGHT = 1e-3  # of a kernel's tap: enough to find places
+Floats = NDArray[np.float64]
+Way = tuple[float, float]
+LINE_SAMPLES = 64  # of a line, evenly from end to end, in sums where samples are summed
+_LEAST_SUMS = 16  # of a line
+_BESIDE = 2  # samples to either side of a place; of sums, one
 
 
 @dataclass(frozen=True)
@@ -188,13 +193,6 @@ def _tile_maxima(worth: Light, first: int, tile: int) -> list[tuple[float, int, 
         column = start + int(ridge[start : start + tile].argmax())
         found.append((float(ridge[column]), first + int(best_row[column]), column))
     return found
-
-
-Floats = NDArray[np.float64]
-Way = tuple[float, float]
-LINE_SAMPLES = 64  # of a line, evenly from end to end, in sums where samples are summed
-_LEAST_SUMS = 16  # of a line
-_BESIDE = 2  # samples to either side of a place; of sums, one
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,10 @@ Units = Callable[[Light, int], NDArray[np.floating]]  # of the mean light of so 
 VERIFIED_LINES = 3  # whole ones, for stray light comes from all of a line
 MOST_CANDIDATES = 40
 Render = Callable[[SweepBlock, Mapping[Effect, str]], Light]
+ROUNDING = 4e-6  # of the brightest light of some lines: float32 sums
+REACH_PX = 8  # of a footprint's weights, along the line and the scan
+_HALVES = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5))  # px along and scan
+MIDDLE_RAYS: Mapping[Effect, str] = {ROTATION: ROTATION.variants[0]}  # the scene itself, where lines really lie
 
 
 def candidate_blocks(whole: Sequence[SweepBlock], places: Floats, *, lines: int = VERIFIED_LINES) -> list[SweepBlock]:
@@ -184,12 +188,6 @@ def _greatest_change(one: _Rendered, light: Light, bound: float, share: float) -
     return _Change(
         float(change.max()), float(change[worst]), float(rounding[worst]), f"{place} of the {one.name} lines"
     )
-
-
-ROUNDING = 4e-6  # of the brightest light of some lines: float32 sums
-REACH_PX = 8  # of a footprint's weights, along the line and the scan
-_HALVES = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5))  # px along and scan
-MIDDLE_RAYS: Mapping[Effect, str] = {ROTATION: ROTATION.variants[0]}  # the scene itself, where lines really lie
 
 
 def misplaced_electrons(light: NDArray[np.floating], contrast: NDArray[np.floating], share: float) -> Floats:

@@ -49,6 +49,16 @@ _COLOURS = {
 CLASSES, CLASS_COLOURS = tuple(_COLOURS), np.array(list(_COLOURS.values()), np.uint8)
 
 Mixture = dict[str, Field]
+PARCEL_AREA_PX = 95_000.0
+USE_SHARES = {
+    **{"maize": 0.16, "sugar_beet": 0.15, "wheat_a": 0.15, "wheat_b": 0.15, "stubble": 0.09, "grass": 0.08},
+    **{"soil": 0.11, "late_maize": 0.045, "late_beet": 0.045},
+}
+BORDER_SHARES = {"road": 0.20, "ditch": 0.38, "hedge": 0.17, "margin": 0.25}  # of the lines between parcels
+TWINS = {"wheat_a": "wheat_b", "wheat_b": "wheat_a"}
+UNEVEN_DAYS = 9.0  # by which plants of one field are at most ahead of or behind the rest
+_ROWS_ELSEWHERE = {"stubble": (3.4, 4.4), "grass": (36.0, 52.0), "soil": (9.0, 13.0)}
+_WEEDS_ELSEWHERE = {"stubble": (1.0, 6.0), "grass": (0.2, 2.0), "soil": (0.5, 4.0)}
 
 
 @dataclass(frozen=True)
@@ -151,18 +161,6 @@ def blend(lower: Mixture, upper: Mixture, cover: Field) -> Mixture:
     for name, part in upper.items():
         mixed[name] = mixed.get(name, np.float32(0)) + part * cover
     return mixed
-
-
-PARCEL_AREA_PX = 95_000.0
-USE_SHARES = {
-    **{"maize": 0.16, "sugar_beet": 0.15, "wheat_a": 0.15, "wheat_b": 0.15, "stubble": 0.09, "grass": 0.08},
-    **{"soil": 0.11, "late_maize": 0.045, "late_beet": 0.045},
-}
-BORDER_SHARES = {"road": 0.20, "ditch": 0.38, "hedge": 0.17, "margin": 0.25}  # of the lines between parcels
-TWINS = {"wheat_a": "wheat_b", "wheat_b": "wheat_a"}
-UNEVEN_DAYS = 9.0  # by which plants of one field are at most ahead of or behind the rest
-_ROWS_ELSEWHERE = {"stubble": (3.4, 4.4), "grass": (36.0, 52.0), "soil": (9.0, 13.0)}
-_WEEDS_ELSEWHERE = {"stubble": (1.0, 6.0), "grass": (0.2, 2.0), "soil": (0.5, 4.0)}
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,10 @@ FARM_LAW, REMOVED_LAW = "farm@2", "farm@1"
 FARM_NAMES = ("farm", FARM_LAW)
 FARM_SHAPE = (1024, 1280)  # (y, x) unless another is asked for [px]
 USUAL_DAY, USUAL_HOUR = 172, 11.0  # the 21st of June, an hour before noon
+WIDTHS = {"margin": (2.0, 4.5), "hedge": (4.5, 6.5), "ditch": (1.3, 2.2), "road": (3.0, 5.0)}  # half, px
+BANKS = {"margin": (0.0, 0.0), "hedge": (0.0, 0.0), "ditch": (2.5, 4.5), "road": (1.0, 2.5)}
+BARE_CROWN = 0.62  # cover of a crown without leaves
+SHADOW = 0.78  # of the ground under a crown's shadow that no direct sun reaches
 
 
 def refuse_removed(name: str) -> None:
@@ -130,12 +134,6 @@ def _draw(plan: FarmPlan) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     plant_trees(work)
     work.canvas.dim(ground.light)
     return work.canvas.drawn()
-
-
-WIDTHS = {"margin": (2.0, 4.5), "hedge": (4.5, 6.5), "ditch": (1.3, 2.2), "road": (3.0, 5.0)}  # half, px
-BANKS = {"margin": (0.0, 0.0), "hedge": (0.0, 0.0), "ditch": (2.5, 4.5), "road": (1.0, 2.5)}
-BARE_CROWN = 0.62  # cover of a crown without leaves
-SHADOW = 0.78  # of the ground under a crown's shadow that no direct sun reaches
 
 
 def paint_borders(work: Painting) -> None:

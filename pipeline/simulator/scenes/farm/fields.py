@@ -50,6 +50,16 @@ LODGED_PATCH_PX = 30.0
 PASS_ROWS = 8  # sown at a time; each pass lies a little aside
 PASS_SD = 0.03  # of the period
 PIECE_PX = 14.0  # a gap is 0.15 of this to all of it, short ones oftener
+SPECIES: dict[str, tuple[float, float, float]] = {  # share, and first and last day of emergence
+    "weed_leafy": (0.55, 95.0, 172.0),
+    "weed_red": (0.30, 105.0, 185.0),
+    "mustard": (0.15, 92.0, 150.0),
+}
+FLOWERING = (36.0, 85.0)  # days since mustard came up
+CLUSTERED, CLUSTER = 0.65, 22  # share of plants in clusters, and plants in one
+ALONG_PX, ASIDE_PX = 16.0, 6.0  # spread of a cluster along the rows and across, sd
+VOLUNTEERS = 1 / 6000  # single plants of another crop per px
+SEEN_PX = 0.35  # least radius of a plant that is drawn
 
 
 class Content(NamedTuple):
@@ -271,18 +281,6 @@ def _scatter(first: NDArray[np.int64], second: NDArray[np.int64], salt: int) -> 
     for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
         mixed = (mixed ^ (mixed >> np.uint32(shift))) * np.uint32(factor)
     return np.asarray(mixed ^ (mixed >> np.uint32(16)), np.float64) / 2**32
-
-
-SPECIES: dict[str, tuple[float, float, float]] = {  # share, and first and last day of emergence
-    "weed_leafy": (0.55, 95.0, 172.0),
-    "weed_red": (0.30, 105.0, 185.0),
-    "mustard": (0.15, 92.0, 150.0),
-}
-FLOWERING = (36.0, 85.0)  # days since mustard came up
-CLUSTERED, CLUSTER = 0.65, 22  # share of plants in clusters, and plants in one
-ALONG_PX, ASIDE_PX = 16.0, 6.0  # spread of a cluster along the rows and across, sd
-VOLUNTEERS = 1 / 6000  # single plants of another crop per px
-SEEN_PX = 0.35  # least radius of a plant that is drawn
 
 
 def plant_weeds(work: Painting) -> None:
