@@ -14,7 +14,7 @@ from flows.survey.rendered_lines import rendering_crew, take_lines
 from pipeline.errors import RigError, SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator import instrument, render
+from pipeline.simulator import render, simulated
 from pipeline.simulator.effects.registry import BY_NAME, effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values
@@ -62,7 +62,7 @@ def test_neither_workers_nor_blocks_change_a_number(
     expected: list[Line], monkeypatch: pytest.MonkeyPatch, workers: int, size: int
 ) -> None:
     """With every effect on, rendered in blocks of 1, 7, 64 and all lines, with nothing remembered from before."""
-    monkeypatch.setattr(instrument, "BLOCK_LINES", size)
+    monkeypatch.setattr(simulated, "BLOCK_LINES", size)
     render._looker.cache_clear()
     assert_same(taken(source_of(), Crew("threads", workers), at_once=size), expected)
 

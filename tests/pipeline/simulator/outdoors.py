@@ -13,6 +13,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import OFF, SweepBlock
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Air, Rig, Sky
+from tests.pipeline.simulator.made_up_effects import even_probe
 
 Floats = NDArray[np.float64]
 WAVELENGTH = np.linspace(400.0, 1000.0, 61)
@@ -50,18 +51,13 @@ def probe_of(rig: Rig, *sweeps: Sweep, seconds: float = 6.0) -> Probe:
     light = materials(rig.camera.exposure_ms)
     span = np.ptp(light, axis=0) / _sigma(light.min(axis=0))
     flat, both = np.zeros(BANDS), np.zeros((2, BANDS))
-    return Probe(
-        unit="sigma",
+    return even_probe(
         sweeps=sweeps or (SWEEP,),
         wavelength_nm=WAVELENGTH,
-        fwhm_nm=None,
         level=(light / _sigma(light)).max(axis=0),
-        spread=flat,
         span=span,
-        slope=both,
-        curvature=both,
-        spectral_slope=flat,
-        spectral_curvature=flat,
+        **dict.fromkeys(("spread", "spectral_slope", "spectral_curvature"), flat),
+        **dict.fromkeys(("slope", "curvature"), both),
         brightest_e=float(light.max()),
         darkest_e=float(light.min()),
         unit_least_dn=float(_sigma(light).min()) / CAMERA.electrons_per_dn,
