@@ -11,8 +11,8 @@ from typing import Literal
 
 from pipeline.errors import PipelineError, RigError
 from pipeline.rig.camera.camera_files import log_in
-from pipeline.rig.camera.camera_settings import FileServer
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.device_settings import FileServer
 from pipeline.rig.mirror.mirror_controller import MirrorController, check_model
 from pipeline.rig.mirror.registers import Status
 

@@ -11,8 +11,7 @@ from serial import SerialException, SerialTimeoutException
 from serial.tools import list_ports
 
 from pipeline.errors import SettingsError
-from pipeline.rig.clock import SYSTEM_CLOCK, Clock
-from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
+from pipeline.rig.devices import SYSTEM_CLOCK, Clock, DeadlinePassed, DeviceGone
 
 USB_ID = (0x0483, 0xA31E)  # vendor and product of the mirror controller
 _SLICE_S = 0.02  # reads wait in slices: by so much a deadline may be overrun

@@ -10,11 +10,11 @@ import numpy as np
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.camera.camera_settings import CameraAddress, ControlPatience, FileServer
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.capture.rig_source import RigSource
-from pipeline.rig.clock import ManualClock
+from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer
+from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.source import Line, References
 from tests.rig.chaos_line import OFTEN, ChaosLine

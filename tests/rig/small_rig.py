@@ -8,20 +8,21 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mounting import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import Kept, KeptInMemory
 from pipeline.rig.capture.capture_runner import RigDevices
-from pipeline.rig.capture.rig_source import RigSource, RigView
-from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults
+from pipeline.rig.capture.rig_source import RigSource
+from pipeline.rig.device_settings import SurveyRig
+from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, InProcessRig
-from pipeline.rig.emulator.mirror_faults import Fault
+from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
+from pipeline.rig.emulator.mirror_device import Fault
 from pipeline.rig.mirror.mirror_controller import MirrorController
-from pipeline.rig.survey_rig import SurveyRig
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values
@@ -49,7 +50,7 @@ class SmallRig:
     line: InProcessRig
     settings: SurveyRig
     vector_pairs: int
-    view: RigView
+    wavelength_nm: NDArray[np.float64]
     opened: int = 0
 
     @property
@@ -73,7 +74,9 @@ class SmallRig:
     def source(self, kept: Kept | None = None) -> RigSource:
         """A source that looks through the rig; another call is another process."""
         return RigSource(
-            self.view,
+            self.emulated.camera.view.source.camera,
+            self.wavelength_nm,
+            self.emulated.camera.view.source.field_shape,
             self.devices,
             KeptInMemory() if kept is None else kept,
             rig=self.settings,
@@ -102,7 +105,6 @@ def small_rig(
         camera_faults=CameraFaults(dict(faults or {}), 0, passes),
         mounting=mounting,
     )
-    view = RigView(looked.camera, looked.wavelength_nm, looked.field_shape)
     with rig.in_process() as line:
         assert isinstance(line.server, CameraServer)
-        yield SmallRig(line, SurveyRig(**settings), vector_pairs, view)
+        yield SmallRig(line, SurveyRig(**settings), vector_pairs, looked.wavelength_nm)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from pipeline.errors import RigError
-from pipeline.rig.camera.camera_cubes import CapturedLines, Read, read_capture, read_references
+from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame, Read, mean_frame, read_capture, read_references
 from pipeline.rig.camera.camera_files import Kept, Progress, RemoteFile, fetch_files
-from pipeline.rig.camera.camera_references import MeanFrame, mean_frame
-from pipeline.rig.camera.camera_settings import CameraAddress, CameraLimits, ControlPatience, FileServer
-from pipeline.rig.camera.headwall_control import HeadwallControl
-from pipeline.rig.camera.line_camera import Capture, FrameClaim
-from pipeline.rig.clock import SYSTEM_CLOCK, Clock
+from pipeline.rig.camera.headwall_control import Capture, HeadwallControl
+from pipeline.rig.device_settings import CameraAddress, CameraLimits, ControlPatience, FileServer
+from pipeline.rig.devices import SYSTEM_CLOCK, Clock
 from pipeline.rig.transports import SocketTransport
 
 MOST_TEXT = 1 << 26  # bytes of a header, a frame index or another text: an index of two million frames
@@ -24,8 +22,22 @@ _RAW = re.compile(r"raw_\d+", re.IGNORECASE)
 _REFERENCE = re.compile(r"(dark|white)[a-z_]*", re.IGNORECASE)
 
 
+@dataclass(frozen=True)
+class FrameClaim:
+    """What a capture was asked for: frames, in all its cubes, of so many numbers of 16 bits."""
+
+    frames: int
+    samples: int
+    bands: int
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of a frame."""
+        return 2 * self.samples * self.bands
+
+
 class HeadwallCamera:
-    """A :class:`pipeline.rig.camera.line_camera.LineCameraDevice`. Nothing is connected before the first command."""
+    """A line camera for surveys. Nothing is connected before the first command."""
 
     def __init__(self, control: HeadwallControl, server: FileServer, clock: Clock = SYSTEM_CLOCK) -> None:
         self.control = control
@@ -69,29 +81,16 @@ class HeadwallCamera:
         self, folder: str, kept: Kept, progress: Progress | None = None, *, claim: FrameClaim | None = None
     ) -> CapturedLines:
         """Get a finished capture's files, small ones first, and give its lines; a later call continues.
-
-        Raises
-        ------
-        RigError : the capture still runs, its files do not belong together, or are larger than ``claim`` lets them be.
-        DeviceRefused, DeadlinePassed, DeviceGone
+        RigError where the capture still runs, its files do not belong together, or are larger than ``claim`` lets them
+        be; DeviceRefused, DeadlinePassed, DeviceGone.
         """
         files = self._finished(folder, claim)
-
-        def is_large(file: RemoteFile) -> bool:
-            base = file.base.lower()
-            return base.startswith("raw_") and not base.endswith(".hdr")
-
-        files.sort(key=lambda file: (is_large(file), file.name))
+        files.sort(key=lambda file: (bool(_RAW.fullmatch(file.base)), file.name))
         fetch_files(self.server, files, kept, progress, clock=self.clock)
         return read_capture([file.name for file in files], _reader(kept))
 
     def references(self, folder: str, kept: Kept, *, claim: FrameClaim | None = None) -> dict[str, MeanFrame]:
-        """Mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``; empty without any.
-
-        Raises
-        ------
-        RigError, DeviceRefused, DeadlinePassed, DeviceGone
-        """
+        """Mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``; empty without any."""
         files = [file for file in self._finished(folder, claim) if file.base.lower().startswith(("dark", "white"))]
         fetch_files(self.server, files, kept, clock=self.clock)
         cubes = read_references([file.name for file in files], _reader(kept))
@@ -121,9 +120,7 @@ def _reader(kept: Kept) -> Read:
 def bounded(files: Sequence[RemoteFile], claim: FrameClaim) -> list[RemoteFile]:
     """Give the files with the most that each can have: cubes what was asked for, references and texts a fixed number.
 
-    Raises
-    ------
-    RigError : one claims more, or all cubes together do, or there are too many files.
+    RigError where one claims more, or all cubes together do, or there are too many files.
     """
     if len(files) > MOST_FILES:
         raise RigError(f"the camera lists {len(files)} files in one capture, expected {MOST_FILES} at most; look there")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.camera.camera_files import RemoteFile
-from pipeline.rig.camera.camera_settings import CameraLimits, ControlPatience, check_capture, check_times
 from pipeline.rig.camera.headwall_replies import (
     MisfitError,
     ReplyReader,
@@ -19,28 +19,44 @@ from pipeline.rig.camera.headwall_replies import (
     as_truth,
     check_repeated,
     check_times_set,
-    other_command,
     response_of,
     to_request,
 )
-from pipeline.rig.camera.line_camera import Capture, CaptureUnknown
-from pipeline.rig.clock import SYSTEM_CLOCK, Clock
-from pipeline.rig.device_errors import DeadlinePassed, DeviceRefused, StateUnknown
+from pipeline.rig.device_settings import CameraLimits, ControlPatience, check_capture, check_times
+from pipeline.rig.devices import SYSTEM_CLOCK, Clock, DeadlinePassed, DeviceRefused, StateUnknown
 from pipeline.rig.transports import Transport
 
 LOG = logging.getLogger(__name__)
 LONGEST_GREETING = 1 << 16  # bytes
+CAPTURE_ROOT = "/captured"  # where new folders appear; assumed, the reply to a capture shows it
 MOST_PASSED_OVER = 32  # replies to other commands, while one is waited for
 Answer = TypeVar("Answer")
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A capture that the camera acknowledged."""
+
+    folder: str
+    sent_s: float  # when the command was sent, by the clock of the rig's drivers
+    acknowledged_s: float  # when its reply was whole: exposures began between the two, or soon after
+
+
+class CaptureUnknown(StateUnknown):
+    """A capture was sent and not acknowledged; what was found on asking stands in the message and here."""
+
+    def __init__(self, message: str, *, capturing: bool | None = None, folders: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.capturing = capturing  # None where the camera did not say
+        self.folders = folders  # that were not there before
 
 
 class HeadwallControl:
     """Commands to the camera.
 
     After a reply that was late or damaged the connection is given up and made anew, so that what comes late is never
-    taken for the next command's reply. ``connect`` makes a connection; ``capture_root`` is the folder that new folders
-    appear in (assumed; the reply to a capture shows it). Commands raise DeviceRefused, DeadlinePassed or DeviceGone
-    besides what they say themselves.
+    taken for the next command's reply. ``connect`` makes a connection. Commands raise DeviceRefused, DeadlinePassed or
+    DeviceGone besides what they say themselves.
     """
 
     def __init__(
@@ -50,13 +66,10 @@ class HeadwallControl:
         clock: Clock = SYSTEM_CLOCK,
         patience: ControlPatience | None = None,
         limits: CameraLimits | None = None,
-        capture_root: str = "/captured",
     ) -> None:
         self.patience = ControlPatience() if patience is None else patience
         self.limits = CameraLimits() if limits is None else limits
-        self.capture_root = capture_root
         self.clock = clock
-        self.greeting = ""
         self.unknown = ""  # why nobody knows whether a capture runs; empty where it is known
         self._connect = connect
         self._line: Transport | None = None
@@ -66,11 +79,8 @@ class HeadwallControl:
     def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
         """Set exposure and frame period. [ms]
 
-        Raises
-        ------
-        SettingsError : a time is none, too short (given in seconds?), or the exposure is longer than the period.
-        RigError : the camera says that it set others.
-        StateUnknown : a capture may be running, see ``capture``.
+        Raises SettingsError as :func:`check_times` does, RigError where the camera says that it set others, and
+        StateUnknown where a capture may be running, see ``capture``.
         """
         check_times(exposure_ms, frame_period_ms, self.limits)
         with self._lock:
@@ -83,10 +93,7 @@ class HeadwallControl:
 
         Sent once. Where no reply comes the camera is asked whether it captures and which folders are new, and that is
         said in the error; captures and settings are refused from then on: a person looks, and connects anew.
-
-        Raises
-        ------
-        CaptureUnknown : it was sent and not acknowledged. SettingsError : a number or the prefix cannot be used.
+        Raises CaptureUnknown then, and SettingsError where a number or the prefix cannot be used.
         """
         check_capture(frames, cubes, prefix)
         with self._lock:
@@ -107,7 +114,7 @@ class HeadwallControl:
                 self.unknown = "a capture was sent and the wait for its reply was interrupted"
                 self._hang_up()
                 raise
-            return Capture(folder, sent_s, self.clock.now(), frames, cubes)
+            return Capture(folder, sent_s, self.clock.now())
 
     def is_capturing(self) -> bool:
         """Ask whether a capture runs."""
@@ -174,15 +181,13 @@ class HeadwallControl:
             raise
 
     def _greet(self, line: Transport) -> None:
-        """Wait for the first prompt, whatever stands before it."""
+        """Wait for the first prompt, whatever stands before it, not even a line's end."""
         deadline = self.clock.now() + self.patience.deadline_s
         came = b""
         while self.clock.now() < deadline:
             data = line.read(65536, deadline)
             came += data
-            # a line's end before it: the greeting may lack one
             if b"hpi> " in came:
-                self.greeting = came.decode("utf-8", errors="replace").split("hpi> ")[0].strip()
                 return
             if len(came) > LONGEST_GREETING:
                 raise RigError(f"{line.port} greets without end ({_told(came)}); is this the camera's control port?")
@@ -201,7 +206,7 @@ class HeadwallControl:
         passed_over: list[str] = []
         while self.clock.now() < deadline:
             for said in self._reader.feed(line.read(65536, deadline)):
-                why = other_command(said, name)
+                why = f"a reply to {said.command}" if said.command not in ("", name) else ""
                 if not why:
                     check_repeated(said, request.decode().rstrip("\r"), line.port)
                     response = response_of(said, name, line.port)
@@ -237,7 +242,7 @@ class HeadwallControl:
     def _folders(self) -> set[str] | None:
         """Folders of the capture root; None where the camera does not list it."""
         try:
-            return {entry.name for entry in self.list_files(self.capture_root)}
+            return {entry.name for entry in self.list_files(CAPTURE_ROOT)}
         except DeviceRefused as error:
             LOG.warning("%s: a capture whose reply is lost will not be found by its folder", error)
             return None
@@ -251,7 +256,8 @@ class HeadwallControl:
             capturing = self.is_capturing()
             if before is not None and (now := self._folders()) is not None:
                 folders = tuple(sorted(now - before))
-            found = f"asked again it {'captures' if capturing else 'does not capture'}, and new are {_named(folders)}"
+            named = "the folders " + ", ".join(folders) if folders else "no folders"
+            found = f"asked again it {'captures' if capturing else 'does not capture'}, and new are {named}"
         except RigError as other:
             found = f"asked again it does not answer: {other}"
         return CaptureUnknown(
@@ -260,10 +266,6 @@ class HeadwallControl:
             capturing=capturing,
             folders=folders,
         )
-
-
-def _named(folders: Sequence[str]) -> str:
-    return "the folders " + ", ".join(folders) if folders else "no folders"
 
 
 def _told(came: bytes) -> str:

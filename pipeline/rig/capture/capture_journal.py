@@ -17,7 +17,7 @@ from typing import Any
 from pipeline.checked_lines import read_checked, with_check
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import Kept
-from pipeline.rig.capture.line_positions import CommandTimes, LinePositions
+from pipeline.rig.capture.line_positions import LinePositions
 
 JOURNAL = "captures.jsonl"
 LOG = logging.getLogger(__name__)
@@ -38,11 +38,6 @@ class CaptureRecord:
     index_at_end: int | None = None  # cell of the path that was played last
     log: LoggedPath | None = None
     spent: str = ""  # why no line is to be had from it any more
-
-    @property
-    def commands(self) -> CommandTimes:
-        """When path and capture were begun."""
-        return CommandTimes(self.run_s, self.capture_s)
 
 
 @dataclass(frozen=True)
@@ -130,8 +125,12 @@ class CaptureJournal:
         for line in read_checked(self._kept.read(JOURNAL, 0, self._kept.size(JOURNAL))):
             if line.state == "torn":
                 continue
-            if line.content is None or not self._could_follow(line.content):
-                why = "it has changed since it was written" if line.content is None else "what it adds to is not there"
+            why = "it has changed since it was written" if line.content is None else ""
+            try:
+                self._follow(line.content or {})
+            except (LookupError, TypeError, ValueError):
+                why = why or "what it adds to is not there"
+            if why:
                 self.damage.append(f"line {line.number} of {JOURNAL} counts for nothing: {why}")
         if self.damage:
             LOG.warning("%s", "; ".join(self.damage))
@@ -144,13 +143,6 @@ class CaptureJournal:
         torn = size > 0 and self._kept.read(JOURNAL, size - 1, size) != b"\n"
         self._kept.append(JOURNAL, (b"\n" if torn else b"") + with_check(text))
         self._follow(json.loads(text))
-
-    def _could_follow(self, record: dict[str, Any]) -> bool:
-        try:
-            self._follow(record)
-        except (LookupError, TypeError, ValueError):
-            return False
-        return True
 
     def _follow(self, record: dict[str, Any]) -> None:
         match record["what"]:

@@ -14,14 +14,15 @@ import numpy as np
 from pipeline.errors import RigError
 from pipeline.geometry.camera import LineCamera
 from pipeline.rig.camera.camera_files import Kept
-from pipeline.rig.camera.line_camera import LineCameraDevice
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_journal import CaptureJournal, CaptureRecord, LoggedPath
 from pipeline.rig.capture.capture_paths import LEAD, CapturePath, UntiedError, capture_prefix
 from pipeline.rig.capture.line_positions import MirrorTrack, line_edges
-from pipeline.rig.clock import Clock
+from pipeline.rig.device_settings import SurveyRig
+from pipeline.rig.devices import Clock
+from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.mirror.path_player import MotionLog
 from pipeline.rig.mirror.registers import Trigger
-from pipeline.rig.mirror.steering import MotionLog, Steering
-from pipeline.rig.survey_rig import SurveyRig
 from pipeline.source import AT_REST
 
 LOG = logging.getLogger(__name__)
@@ -41,8 +42,8 @@ def say_nothing(words: str) -> None:
 class RigDevices:
     """Both devices, connected, and the clock that their drivers go by."""
 
-    steering: Steering
-    camera: LineCameraDevice
+    steering: MirrorController
+    camera: HeadwallCamera
     clock: Clock
 
     def close(self) -> None:
@@ -77,10 +78,6 @@ class CaptureRunner:
 
         Motions and the capture are sent once. Where something fails after the mirror or the camera has begun, both are
         told to stop.
-
-        Raises
-        ------
-        StateUnknown, DeviceRefused, DeadlinePassed, DeviceGone, RigError
         """
         steering, prefix = self.devices.steering, capture_prefix(path.sweep, path.first)
         self._configure()
@@ -106,9 +103,7 @@ class CaptureRunner:
     def wait(self, taken: CaptureRecord) -> None:
         """Wait until a capture is over; one that goes on too long is stopped, and what it has counts.
 
-        Raises
-        ------
-        RigError : it does not end, though it was told to. DeviceRefused, DeadlinePassed, DeviceGone
+        RigError where it does not end, though it was told to.
         """
         camera, clock = self.devices.camera, self.devices.clock
         began, wanted = clock.now(), self._seconds(taken.stop - taken.first)
@@ -146,12 +141,7 @@ class CaptureRunner:
         return capture.folder
 
     def log_of(self, taken: CaptureRecord) -> MirrorTrack | None:
-        """Read the mirror's log of a capture; None where there is none.
-
-        Raises
-        ------
-        UntiedError : what is kept of it is not what the mirror gave.
-        """
+        """Read the mirror's log of a capture; None where there is none, UntiedError where it has changed."""
         if taken.log is None:
             return None
         names = (taken.log.name, taken.log.index_name)

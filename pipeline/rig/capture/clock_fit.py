@@ -111,8 +111,6 @@ class ClockFit:
     offset_s: float
     drift_ppm: float
     residual_us: float  # rms of the events that count
-    worst_us: float  # of the events that count
-    events: int
     rejected: int  # events too far off to count
 
     def mirror_s(self, stamp_us: Ints) -> Floats:
@@ -125,17 +123,9 @@ def fit_clocks(stamp_us: Ints, mirror_s: Floats) -> ClockFit:
 
     A line through medians, then least squares with Tukey's weights; one event gives an offset alone.
 
-    Parameters
-    ----------
-    stamp_us
-        (event,) camera stamps. [us]
-    mirror_s
-        (event,) times of the same events by the mirror's clock. [s]
-
-    Raises
-    ------
-    ShapeError : there is no event, or the two are not of one length.
-    RigError : the drift is above 1000 ppm, so these are not the same events.
+    ``stamp_us`` (event,) are camera stamps [us], ``mirror_s`` (event,) the same events by the mirror's clock [s].
+    ShapeError where there is no event, or the two are not of one length; RigError where the drift is above 1000 ppm, so
+    these are not the same events.
     """
     if stamp_us.ndim != 1 or stamp_us.shape != mirror_s.shape or not len(stamp_us):
         raise ShapeError(f"expected as many stamps as times, at least one, got {stamp_us.shape} and {mirror_s.shape}")
@@ -163,8 +153,6 @@ def fit_clocks(stamp_us: Ints, mirror_s: Floats) -> ClockFit:
         offset_s=offset,
         drift_ppm=slope * 1e6,
         residual_us=float(np.sqrt(np.sum(kept**2) / freedom)),
-        worst_us=float(np.abs(kept).max()),
-        events=len(camera),
         rejected=len(camera) - len(kept),
     )
 
@@ -198,11 +186,8 @@ def match_edges(
 
     Returns
     -------
-    (frame,) number of the edge; -1 where there is none within half a period.
-
-    Raises
-    ------
-    RigError : there is no edge, or nothing tells which frame one belongs to.
+    (frame,) number of the edge; -1 where there is none within half a period. RigError where there is no edge, or
+    nothing tells which frame one belongs to.
     """
     if not len(edge_s):
         raise RigError("the log holds no edge of a frame; is the trigger's cable in, and was the log on?")

@@ -22,18 +22,17 @@ from dataclasses import dataclass
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.mounting import STRAIGHT, Mounting
-from pipeline.rig.camera.camera_settings import FileServer
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.camera.headwall_control import HeadwallControl
-from pipeline.rig.clock import SYSTEM_CLOCK, Clock, ManualClock
-from pipeline.rig.emulator.camera_device import CameraFaults, CameraUnit
+from pipeline.rig.device_settings import FileServer, Pulses
+from pipeline.rig.devices import SYSTEM_CLOCK, Clock, ManualClock
+from pipeline.rig.emulator.camera_device import CameraUnit
 from pipeline.rig.emulator.camera_server import CameraServer, InProcessCameraLine
-from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.mirror_faults import Fault
+from pipeline.rig.emulator.fault_names import CameraFaults
+from pipeline.rig.emulator.mirror_device import Fault, MirrorDevice
 from pipeline.rig.emulator.mirror_ports import EmulatedPort, InProcessTransport
 from pipeline.rig.emulator.mirror_state import MirrorUnit
 from pipeline.rig.emulator.scene_camera import Look, SceneCamera, SceneView
-from pipeline.rig.survey_rig import Pulses
 from pipeline.simulator.simulated import SimulatedSource
 
 LOG = logging.getLogger(__name__)

@@ -12,10 +12,9 @@ from dataclasses import dataclass, field
 from itertools import count
 
 from pipeline.errors import RigError
-from pipeline.rig.clock import Clock
-from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
-from pipeline.rig.emulator.exchange import Chunk, VanishedError
-from pipeline.rig.emulator.mirror_device import MirrorDevice
+from pipeline.rig.devices import Clock, DeadlinePassed, DeviceGone
+from pipeline.rig.emulator import Chunk
+from pipeline.rig.emulator.mirror_device import MirrorDevice, VanishedError
 from pipeline.rig.mirror.transactions import BITS_PER_BYTE
 
 LOG = logging.getLogger(__name__)

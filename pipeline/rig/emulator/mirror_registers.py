@@ -13,10 +13,13 @@ import numpy as np
 
 from pipeline.errors import ShapeError
 from pipeline.rig.emulator.mirror_state import MirrorState, PositionLogger
-from pipeline.rig.mirror.pro_mode import ERROR_FLAG, MOST_PAYLOAD, Command, ErrorCode, Frame
-from pipeline.rig.mirror.pro_payloads import (
+from pipeline.rig.mirror.pro_mode import (
     CELL,
-    acknowledge,
+    ERROR_FLAG,
+    MOST_PAYLOAD,
+    Command,
+    ErrorCode,
+    Frame,
     cell_float,
     cell_int,
     float_cell,
@@ -138,7 +141,7 @@ class RegisterFile:
                 self.put_cells(register, offset, cells)
             case _:
                 raise RefusedError(ErrorCode.COMMAND_UNKNOWN)
-        return acknowledge(command)
+        return Frame(command)
 
     def get(self, number: int) -> bytes:
         """Give a register's cell; RefusedError where there is no such register."""
@@ -148,10 +151,8 @@ class RegisterFile:
     def put(self, cells: Mapping[int, bytes]) -> None:
         """Write registers at one moment; held positions go out together.
 
-        Raises
-        ------
-        RefusedError : a register is missing, read only or out of range, and then none is written; or one does not take
-            its value as things stand, and then those before it are.
+        RefusedError where a register is missing, read only or out of range, and then none is written; or one does not
+        take its value as things stand, and then those before it are.
         """
         values = {number: self._find(number).check(cell) for number, cell in cells.items()}
         self._state.advance()

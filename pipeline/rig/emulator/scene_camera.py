@@ -28,12 +28,12 @@ from pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from pipeline.geometry.mounting import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.capture.capture_paths import REFERENCES, Announced, announced
-from pipeline.rig.clock import Clock
-from pipeline.rig.emulator.camera_capture import EmulatedCapture, Floats, Ints, Raw
-from pipeline.rig.emulator.camera_device import CameraDevice, CameraFaults, CameraUnit
+from pipeline.rig.device_settings import Pulses
+from pipeline.rig.devices import Clock
+from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit, EmulatedCapture, Floats, Ints, Raw
+from pipeline.rig.emulator.fault_names import CameraFaults
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.mirror.steering import wire_positions
-from pipeline.rig.survey_rig import Pulses
+from pipeline.rig.mirror.path_player import wire_positions
 from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.effect import Aim, Bound
 from pipeline.simulator.effects.probe import Probe

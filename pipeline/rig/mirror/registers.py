@@ -11,16 +11,11 @@ from enum import IntEnum, IntFlag
 
 CHANNELS = 2  # 0 is X, 1 is Y
 
-_FEEDBACK, _LOGGER, _MEMORY, _CHAIN = 0x23, 0x24, 0x26, 0x40
-_STATIC, _VECTOR_UNIT, _XY_CONTROL = 0x50, 0x68, 0xC0  # plus the channel
-
-FEEDBACK_A = _FEEDBACK << 8 | 0x00  # of the first axis; the second's is the next one
-FEEDBACK_X, FEEDBACK_Y = _FEEDBACK << 8 | 0x02, _FEEDBACK << 8 | 0x03
-
-VECTOR_MEMORY = _MEMORY << 8  # one vector, shared by the channels
-
+FEEDBACK_A = 0x2300  # of the first axis; the second's is the next one
+FEEDBACK_X, FEEDBACK_Y = 0x2302, 0x2303
 LOG_SLOTS = 6
-LOG_RUN, LOG_RATE = _LOGGER << 8 | 0x10, _LOGGER << 8 | 0x11
+LOG_RUN, LOG_RATE = 0x2410, 0x2411
+VECTOR_MEMORY = 0x2600  # one vector, shared by the channels
 
 
 class Unit(IntEnum):
@@ -94,41 +89,19 @@ _WORDS = {
 _STOPS = Status.DISCONNECTED | Status.ELECTRONICS_WARM | Status.MIRROR_WARM | Status.EEPROM_INVALID
 
 
-@dataclass(frozen=True)
+@dataclass
 class ChannelRegisters:
     """The registers of one channel: the inputs it can follow, and which of them it does."""
 
     channel: int
 
-    @property
-    def static_xy(self) -> int:
-        """Held position, float."""
-        return self.static_system << 8 | Unit.XY
-
-    @property
-    def input(self) -> int:
-        """Which system the channel follows."""
-        return _CHAIN << 8 | 5 * self.channel
-
-    @property
-    def control(self) -> int:
-        """Which system controls the channel."""
-        return _CHAIN << 8 | 5 * self.channel + 2
-
-    @property
-    def static_system(self) -> int:
-        """System of held positions."""
-        return _STATIC + self.channel
-
-    @property
-    def vector_system(self) -> int:
-        """System that plays the vector memory."""
-        return _VECTOR_UNIT + self.channel
-
-    @property
-    def xy_system(self) -> int:
-        """System that controls position."""
-        return _XY_CONTROL + self.channel
+    def __post_init__(self) -> None:
+        self.static_system = 0x50 + self.channel  # of held positions
+        self.vector_system = 0x68 + self.channel  # plays the vector memory
+        self.xy_system = 0xC0 + self.channel  # controls position
+        self.static_xy = self.static_system << 8 | Unit.XY  # held position, float
+        self.input = 0x4000 + 5 * self.channel  # which system the channel follows
+        self.control = 0x4002 + 5 * self.channel  # which system controls the channel
 
     def vector(self, register: VectorRegister) -> int:
         """Id of a register of the vector unit."""
@@ -160,4 +133,4 @@ X, Y = ChannelRegisters(0), ChannelRegisters(1)
 
 def log_slot(slot: int) -> int:
     """Id of the register that says what a slot of the logger takes down, and of the vector that it takes down."""
-    return _LOGGER << 8 | slot
+    return 0x2400 | slot

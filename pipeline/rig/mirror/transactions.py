@@ -9,9 +9,8 @@ from collections.abc import Callable
 from typing import Literal, TypeVar
 
 from pipeline.errors import RigError
-from pipeline.rig.clock import Clock
-from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
-from pipeline.rig.mirror.mirror_settings import Patience
+from pipeline.rig.device_settings import Patience
+from pipeline.rig.devices import Clock, DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
 from pipeline.rig.transports import Transport
 
 LOG = logging.getLogger(__name__)
@@ -37,7 +36,6 @@ class Wire:
         self.clock = clock
         self.patience = patience
         self.lock = threading.RLock()
-        self.bytes_sent = self.bytes_received = 0
         self.unknown = ""  # why the state is unknown; empty where it is known
         self._owed = 0  # requests whose answer may still come
 
@@ -47,21 +45,11 @@ class Wire:
         return self.transport.port
 
     def exchange(self, data: bytes, name: str, kind: Kind, receiver: Callable[[], Receiver[Answer]]) -> Answer:
-        """Send a request and wait for its answer.
+        """Send a request, called ``name`` in messages, and wait for its answer.
 
-        Parameters
-        ----------
-        name
-            What the request is, for messages.
-        receiver
-            Makes a receiver, one for each time that the request is sent.
-
-        Raises
-        ------
-        StateUnknown : a motion was not acknowledged, or motions are frozen since an earlier one was not.
-        DeviceRefused : the device said no.
-        DeadlinePassed : a read or a write was not answered in time.
-        DeviceGone : the port went away.
+        ``receiver`` makes a receiver, one for each time that the request is sent. Raises StateUnknown where a motion
+        was not acknowledged, or motions are frozen since an earlier one was not; DeviceRefused; DeadlinePassed where a
+        read or a write was not answered in time; DeviceGone.
         """
         with self.lock:
             if kind == "motion":
@@ -74,11 +62,16 @@ class Wire:
                 try:
                     return self._once(data, name, receiver(), silence_s, deadline)
                 except RigError as error:
-                    refused = isinstance(error, DeviceRefused)
-                    if kind == "motion" and not refused:
-                        raise self._freeze(name, error) from error
+                    if kind == "motion" and not isinstance(error, DeviceRefused):
+                        self.unknown = f"{name} was sent and not acknowledged"
+                        raise StateUnknown(
+                            f"{name} was sent to {self.port} and may have happened or not: {error}. It is not sent "
+                            "again, and all motions are refused. Look at the mirror, then run again, which connects "
+                            "anew"
+                        ) from error
                     left -= 1
-                    if left == 0 or not _may_ask_again(error):
+                    again = error.garbled if isinstance(error, DeviceRefused) else not isinstance(error, DeviceGone)
+                    if left == 0 or not again:
                         raise
                     usual = kind == "greeting" and isinstance(error, DeadlinePassed) and error.silent
                     LOG.log(logging.INFO if usual else logging.WARNING, "%s; asking again", error)
@@ -89,42 +82,31 @@ class Wire:
                     self.unknown = f"{name} was interrupted" if kind == "motion" else self.unknown
                     raise
 
-    def _freeze(self, name: str, error: RigError) -> StateUnknown:
-        self.unknown = f"{name} was sent and not acknowledged"
-        return StateUnknown(
-            f"{name} was sent to {self.port} and may have happened or not: {error}. It is not sent again, and all "
-            f"motions are refused. Look at the mirror, then run again, which connects anew"
-        )
-
     def _once(self, data: bytes, name: str, receiver: Receiver[Answer], silence_s: float, deadline: float) -> Answer:
         """Send once, and wait until the device has said nothing for a while, or to the deadline where it goes on."""
         began = self.clock.now()
         self._owed += 1
         self.transport.write(data, deadline)
-        self.bytes_sent += len(data)
         came = b""
         until = min(began + silence_s, deadline)
         while self.clock.now() < until:
             part = self.transport.read(4096, until)
             until = min(self.clock.now() + silence_s, deadline) if part else until
-            self.bytes_received += len(part)
             came += part
-            answer = self._given(receiver, part) if part else None
+            try:
+                answer = receiver(part) if part else None
+            except DeviceRefused:  # an answer all the same; of what is none, the answer may still come
+                self._owed -= 1
+                raise
             if answer is not None:
                 self._owed -= 1
                 return answer
+        said = f"{len(came)} bytes that are none came: {came[:32].hex(' ')}" if came else "nothing came"
         raise DeadlinePassed(
-            f"no answer to {name} from {self.port} within {self.clock.now() - began:.3g} s ({_said(came)}); is the "
+            f"no answer to {name} from {self.port} within {self.clock.now() - began:.3g} s ({said}); is the "
             f"controller on, its cable in, and the port's speed right?",
             silent=not came,
         )
-
-    def _given(self, receiver: Receiver[Answer], part: bytes) -> Answer | None:
-        try:
-            return receiver(part)
-        except DeviceRefused:  # an answer all the same; of what is none, the answer may still come
-            self._owed -= 1
-            raise
 
     def _empty_line(self, when: str, latest: float = math.inf, *, level: int = logging.WARNING) -> None:
         """Drop what is on the line. Where an answer is still owed, wait for silence: it would pass for the next one."""
@@ -137,7 +119,6 @@ class Wire:
             until = min(self.clock.now() + self.patience.quiet_s, latest)
         self._owed = 0
         if stale:
-            self.bytes_received += len(stale)
             LOG.log(level, "%s: dropped %d stale bytes %s: %s", self.port, len(stale), when, stale[:64].hex(" "))
 
     def check_known(self, name: str) -> None:
@@ -147,11 +128,3 @@ class Wire:
                 f"{name} is refused on {self.port}: {self.unknown}, so where the mirror is is not known. Look at it, "
                 f"then run again, which connects anew"
             )
-
-
-def _may_ask_again(error: RigError) -> bool:
-    return error.garbled if isinstance(error, DeviceRefused) else not isinstance(error, DeviceGone)
-
-
-def _said(came: bytes) -> str:
-    return f"{len(came)} bytes that are none came: {came[:32].hex(' ')}" if came else "nothing came"

@@ -39,23 +39,12 @@ def header(lines: int) -> bytes:
 
 
 def test_header_by_hand() -> None:
-    """Sizes, byte order, offset and wavelengths are read; band after band stands within a line."""
+    """Sizes, byte order and offset are read; band after band stands within a line."""
     found = parse_cube_header(HEADER.format(lines=1).replace("\n", "\r\n"), "raw_0.hdr")
     assert (found.samples, found.lines, found.bands, found.offset, found.line_bytes) == (5, 1, 3, 0, 30)
-    assert found.wavelength_nm is not None
-    assert found.wavelength_nm.tolist() == [400.5, 500, 600]
     values = cube_lines(found, bytes(range(30))).values
     assert values[0, 1, 0] == 0x0302
     assert values[0, 0, 1] == 0x0B0A
-
-
-def test_wavelengths_come_out_in_nm() -> None:
-    """Whatever their unit; a list that does not fit the bands is left out."""
-    text = HEADER.format(lines=1).replace("400.5,\n500,\n600", "0.4, 0.5, 0.6\n} \nwavelength units = {um")
-    found = parse_cube_header(text, "h").wavelength_nm
-    assert found is not None
-    assert found.tolist() == [400, 500, 600]
-    assert parse_cube_header(text.replace("0.4, ", ""), "h").wavelength_nm is None
 
 
 def test_big_endian_with_an_offset() -> None:

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.camera.line_camera import CaptureUnknown
-from pipeline.rig.clock import ManualClock
-from pipeline.rig.device_errors import DeviceRefused
-from pipeline.rig.emulator.camera_device import CameraConnection, CameraDevice, CameraFault, CameraFaults, CameraUnit
+from pipeline.rig.camera.headwall_control import CaptureUnknown
+from pipeline.rig.devices import DeviceRefused, ManualClock
+from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
+from pipeline.rig.emulator.camera_server import CameraConnection
+from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 from tests.rig.camera.camera_line import control_of, scene_lines
 
 CAPTURE = b'capture({"prefix": "", "maxCubes": 1, "maxFramesPerCube": 5})'

@@ -18,12 +18,11 @@ import pytest
 from pipeline.errors import RigError
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.camera.camera_settings import ControlPatience
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_runner import RigDevices
-from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults
-from pipeline.rig.emulator.fault_names import make_fault
-from pipeline.rig.emulator.mirror_faults import Fault
+from pipeline.rig.device_settings import ControlPatience
+from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults, make_fault
+from pipeline.rig.emulator.mirror_device import Fault
 from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.mirror.registers import Status
 from pipeline.source import Line

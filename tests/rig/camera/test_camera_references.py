@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import RigError, ShapeError
-from pipeline.rig.camera.camera_references import as_references, mean_frame
+from pipeline.rig.camera.camera_cubes import as_references, mean_frame
 
 
 def frames(level: float, count: int = 40, shape: tuple[int, int] = (40, 10)) -> np.ndarray:

@@ -10,10 +10,11 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
-from pipeline.rig.camera.camera_settings import FileServer
-from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.camera_device import CameraDevice, CameraFault, CameraUnit
+from pipeline.rig.device_settings import FileServer
+from pipeline.rig.devices import ManualClock
+from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
 from pipeline.rig.emulator.camera_server import CameraServer
+from pipeline.rig.emulator.fault_names import CameraFault
 from tests.rig.camera.camera_line import control_of, scene_lines
 from tests.rig.chaos_line import ChaosLine
 from tests.rig.chaotic_surveys import survey_in_chaos

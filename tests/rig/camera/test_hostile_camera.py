@@ -9,9 +9,9 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files, log_in
-from pipeline.rig.camera.camera_settings import CameraAddress, ControlPatience, FileServer
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
+from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer
+from pipeline.rig.devices import DeadlinePassed, DeviceGone
 from pipeline.rig.rig_check import check_camera
 from tests.rig.camera.hostile_camera import Answers, HostileControl, HostileFiles, Pieces, flood, trickled
 

@@ -9,8 +9,8 @@ import pytest
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.scan import Sweep
-from pipeline.rig.camera.camera_settings import check_capture
 from pipeline.rig.capture.capture_paths import REFERENCES, Announced, announced, capture_prefix
+from pipeline.rig.device_settings import check_capture
 
 
 def test_prefix_of_a_sweep_is_readable() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.rig.camera.camera_cubes import CapturedLines
-from pipeline.rig.camera.frame_index import LineTimes
+from pipeline.rig.camera.camera_texts import LineTimes
 from pipeline.rig.capture.capture_journal import CaptureRecord, LoggedPath
 from pipeline.rig.capture.capture_paths import UntiedError, next_path, place_lines
 from pipeline.rig.capture.line_positions import MirrorTrack
@@ -25,7 +25,7 @@ def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
     valid = np.arange(count) < len(numbers)
     stamps = np.where(told >= 0, 10**15 + told * 100_000, -1)
     return CapturedLines(
-        np.zeros((count, 48, 3), np.uint16), valid, first, LineTimes(told, stamps, np.full(count, np.nan), ()), None, ()
+        np.zeros((count, 48, 3), np.uint16), valid, first, LineTimes(told, stamps, np.full(count, np.nan), ()), ()
     )
 
 

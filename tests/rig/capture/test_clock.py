@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pipeline.errors import SettingsError
-from pipeline.rig.clock import SYSTEM_CLOCK, ManualClock
+from pipeline.rig.devices import SYSTEM_CLOCK, ManualClock
 
 
 def test_sleeping_turns_a_manual_clock():

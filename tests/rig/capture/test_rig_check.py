@@ -11,19 +11,17 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import log_in
-from pipeline.rig.camera.camera_settings import FileServer
 from pipeline.rig.capture.capture_paths import capture_prefix
-from pipeline.rig.clock import ManualClock
-from pipeline.rig.device_errors import DeviceGone, DeviceRefused
-from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults, CameraUnit
+from pipeline.rig.device_settings import FileServer, MirrorSettings
+from pipeline.rig.devices import DeviceGone, DeviceRefused, ManualClock
+from pipeline.rig.emulator.camera_device import CameraUnit
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, InProcessRig
-from pipeline.rig.emulator.exchange import Mode
-from pipeline.rig.emulator.fault_names import make_fault
+from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults, make_fault
+from pipeline.rig.emulator.mirror_device import Mode
 from pipeline.rig.mirror.mirror_controller import MirrorController
-from pipeline.rig.mirror.mirror_settings import MirrorSettings
+from pipeline.rig.mirror.path_player import MotionLog
 from pipeline.rig.mirror.pro_mode import Command
 from pipeline.rig.mirror.registers import Status
-from pipeline.rig.mirror.steering import MotionLog
 from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, works
 from tests.rig.small_rig import FINE, small_source
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from ftplib import FTP
 from itertools import islice
 
@@ -15,8 +15,8 @@ from pipeline.geometry.mounting import Mounting
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.capture.capture_journal import CaptureJournal
+from pipeline.rig.mirror.path_player import wire_positions
 from pipeline.rig.mirror.pro_mode import Command
-from pipeline.rig.mirror.steering import wire_positions
 from pipeline.source import Line
 from tests.rig.small_rig import CAMERA, COARSE, FINE, small_rig, small_source
 
@@ -215,6 +215,6 @@ def test_devices_are_let_go_of_whatever_ends_a_look():
 def test_lines_of_another_size_are_refused():
     """A camera that gives other lines than the settings say ends the sweep, with what to set."""
     with small_rig() as rig:
-        rig.view = replace(rig.view, wavelength_nm=np.array([500.0, 600.0]))
+        rig.wavelength_nm = np.array([500.0, 600.0])
         with pytest.raises(RigError, match=r"holds lines of \(48, 3\) \(sample, band\), the settings say \(48, 2\)"):
             list(rig.source().lines(FINE))

@@ -11,8 +11,8 @@ import pytest
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.capture.capture_journal import JOURNAL
-from pipeline.rig.device_errors import DeviceGone, DeviceRefused, StateUnknown
-from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults
+from pipeline.rig.devices import DeviceGone, DeviceRefused, StateUnknown
+from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 from pipeline.source import Line
 from tests.rig.small_rig import COARSE, FINE, SmallRig, small_rig, small_source
 

@@ -14,8 +14,7 @@ import pytest
 import serial
 
 from pipeline.errors import SettingsError
-from pipeline.rig.clock import SYSTEM_CLOCK
-from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
+from pipeline.rig.devices import SYSTEM_CLOCK, DeadlinePassed, DeviceGone
 from pipeline.rig.transports import SerialTransport
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo terminals are of POSIX systems")

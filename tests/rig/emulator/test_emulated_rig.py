@@ -13,15 +13,13 @@ import pytest
 
 from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.camera.camera_settings import CameraAddress, FileServer
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_paths import REFERENCES, capture_prefix
-from pipeline.rig.clock import SYSTEM_CLOCK, Clock
-from pipeline.rig.device_errors import DeviceGone
-from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults
+from pipeline.rig.device_settings import CameraAddress, FileServer, MirrorSettings
+from pipeline.rig.devices import SYSTEM_CLOCK, Clock, DeviceGone
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
+from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 from pipeline.rig.mirror.mirror_controller import MirrorController, open_mirror
-from pipeline.rig.mirror.mirror_settings import MirrorSettings
 from pipeline.rig.mirror.registers import Trigger
 from pipeline.rig.transports import SocketTransport
 from pipeline.simulator.instrument import QUIET

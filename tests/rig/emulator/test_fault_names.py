@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pipeline.errors import SettingsError
-from pipeline.rig.emulator.camera_device import CameraFault
-from pipeline.rig.emulator.fault_names import KINDS, fault_table, read_faults
+from pipeline.rig.emulator.fault_names import KINDS, CameraFault, fault_table, read_faults
 
 
 def test_every_fault_of_the_table_can_be_asked_for() -> None:

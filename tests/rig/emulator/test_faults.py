@@ -5,22 +5,13 @@ from __future__ import annotations
 import pytest
 
 from pipeline.errors import SettingsError
-from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.exchange import Mode, VanishedError
+from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator.fault_names import KINDS, make_fault, read_fault
-from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.mirror_faults import LATE_S, SLOW_S, TICK_S, Chance, Fault
-from pipeline.rig.mirror.pro_mode import ErrorCode, Frame, encode
-from pipeline.rig.mirror.pro_payloads import (
-    ask_firmware,
-    ask_status,
-    float_cell,
-    get_value,
-    refuse,
-    set_value,
-    set_vector,
-)
+from pipeline.rig.emulator.mirror_device import Chance, Fault, MirrorDevice, Mode, VanishedError
+from pipeline.rig.emulator.mirror_faults import LATE_S, SLOW_S, TICK_S
+from pipeline.rig.mirror.pro_mode import ErrorCode, Frame, ask_status, encode, float_cell, get_value, refuse, set_vector
 from pipeline.rig.mirror.registers import VECTOR_MEMORY, Status, X
+from tests.rig.mirror.mirror_bytes import ASK_FIRMWARE, set_value
 
 CODES = {
     "error-frame": ErrorCode.FRAME_INVALID,
@@ -233,7 +224,7 @@ def test_other_devices() -> None:
     assert answer(modem, b"START\r\nAT\r\n") == b"START\r\nAT\r\n\r\nERROR\r\n\r\nOK\r\n"
     other = device_with("wrong-firmware")
     assert answer(other, b"GETID\r\n") == b"LENS-DRIVER-4\r\n"
-    assert answer(other, b"GOPRO\r\n" + encode(ask_firmware())).endswith(encode(Frame(1, bytes.fromhex("dead0001"))))
+    assert answer(other, b"GOPRO\r\n" + encode(ASK_FIRMWARE)).endswith(encode(Frame(1, bytes.fromhex("dead0001"))))
     assert {device_with("pro-at-connect", seed=seed).mode for seed in range(9)} == {Mode.PRO, Mode.PRO_CRC}
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.rig.clock import ManualClock
-from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
+from pipeline.rig.device_settings import MirrorSettings
+from pipeline.rig.devices import DeadlinePassed, DeviceGone, ManualClock
 from pipeline.rig.emulator.fault_names import make_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.emulator.mirror_ports import InProcessTransport
 from pipeline.rig.mirror.mirror_controller import MirrorController
-from pipeline.rig.mirror.mirror_settings import MirrorSettings
+from pipeline.rig.mirror.pro_mode import Frame, encode
 from pipeline.rig.mirror.transactions import BITS_PER_BYTE
 
 
@@ -102,10 +102,9 @@ def test_an_upload_takes_little_more_than_the_line_needs(baud: int) -> None:
     transport = line(baud=baud)
     driver = MirrorController(transport, MirrorSettings(baud=baud), transport.clock)
     driver.connect()
-    began, told, wire = transport.clock.now(), [], driver.wire
-    before = wire.bytes_sent + wire.bytes_received
+    began, told, before = transport.clock.now(), [], len(transport.sent)
     driver.load_path([(0.1, 0.2)] * 1500, "none", lambda done, total: told.append((done, total)))
-    wire_s = (wire.bytes_sent + wire.bytes_received - before) * BITS_PER_BYTE / baud
+    wire_s = (sum(map(len, transport.sent[before:])) + 300 * len(encode(Frame(0x14)))) * BITS_PER_BYTE / baud
     assert transport.clock.now() - began <= 1.2 * wire_s
     assert told[-1] == (3000, 3000)
     assert len(told) == 300

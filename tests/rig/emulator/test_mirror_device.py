@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.exchange import Mode
-from pipeline.rig.emulator.mirror_device import MirrorDevice
+from pipeline.rig.devices import ManualClock
+from pipeline.rig.emulator.mirror_device import MirrorDevice, Mode
 from pipeline.rig.emulator.mirror_state import MirrorUnit
 from pipeline.rig.mirror.registers import Status
 

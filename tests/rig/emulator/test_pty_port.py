@@ -12,14 +12,13 @@ import pytest
 import serial
 
 from pipeline.errors import RigError, SettingsError
-from pipeline.rig.clock import SYSTEM_CLOCK
-from pipeline.rig.device_errors import DeviceGone
+from pipeline.rig.device_settings import MirrorSettings
+from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone
 from pipeline.rig.emulator.emulated_rig import FastClock
 from pipeline.rig.emulator.fault_names import make_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.emulator.mirror_ports import EmulatedPort
 from pipeline.rig.mirror.mirror_controller import open_mirror
-from pipeline.rig.mirror.mirror_settings import MirrorSettings
 
 GET = bytes.fromhex("7e 00 11 02 50 01 59 3c 7e")
 GOT = bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e")

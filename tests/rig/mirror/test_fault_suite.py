@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.clock import ManualClock
-from pipeline.rig.device_errors import StateUnknown
+from pipeline.rig.device_settings import MirrorSettings
+from pipeline.rig.devices import ManualClock, StateUnknown
 from pipeline.rig.emulator.fault_names import KINDS, make_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.emulator.mirror_ports import InProcessTransport
 from pipeline.rig.mirror.mirror_controller import MirrorController
-from pipeline.rig.mirror.mirror_settings import MirrorSettings
-from pipeline.rig.mirror.pro_mode import Command, Frame, FrameReader
-from pipeline.rig.mirror.pro_payloads import cell_int, read_registers
+from pipeline.rig.mirror.pro_mode import Command, Frame, FrameReader, cell_int, read_registers
 from pipeline.rig.mirror.registers import VectorRegister, X, Y
 
 SEEDS = range(20)

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from pipeline.errors import SettingsError
-from pipeline.rig.mirror.mirror_settings import MirrorSettings
+from pipeline.rig.device_settings import MirrorSettings
 
 
 @pytest.mark.parametrize(

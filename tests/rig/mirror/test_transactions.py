@@ -8,9 +8,8 @@ import threading
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.rig.clock import ManualClock
-from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, StateUnknown
-from pipeline.rig.mirror.mirror_settings import Patience
+from pipeline.rig.device_settings import Patience
+from pipeline.rig.devices import DeadlinePassed, DeviceGone, ManualClock, StateUnknown
 from pipeline.rig.mirror.transactions import Kind, Wire
 from tests.rig.scripted import Late, Pair, ScriptedTransport, scripted
 
@@ -214,14 +213,6 @@ def test_a_port_that_is_gone_is_not_asked_again():
     with pytest.raises(DeviceGone):
         ask(wire, b"m\n", "motion")
     assert not wire.unknown
-
-
-def test_bytes_on_the_wire_are_counted():
-    """In both directions, stale bytes and retries included."""
-    with scripted([(b"q\n", b""), (b"q\n", b"abc\n")], stale=b"xy", drained=b"xy") as transport:
-        wire = make(transport)
-        ask(wire)
-        assert (wire.bytes_sent, wire.bytes_received) == (4, 6)
 
 
 def test_transactions_do_not_mix():
