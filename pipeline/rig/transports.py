@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import socket
-from typing import Any, Protocol
+from typing import Protocol
 
 import serial
 from serial import SerialException, SerialTimeoutException
@@ -16,9 +16,7 @@ from pipeline.rig.devices import SYSTEM_CLOCK, Clock, DeadlinePassed, DeviceGone
 USB_ID = (0x0483, 0xA31E)  # vendor and product of the mirror controller
 _SLICE_S = 0.02  # reads wait in slices: by so much a deadline may be overrun
 _WRITE_S = 0.25  # a frame takes 10 ms at 115200
-_MOST_DRAINED = 1 << 16  # bytes of a port that never ends
-_LEAST_WAIT_S = 0.001  # of a socket
-_MOST_DRAINED_TCP = 1 << 20
+_MOST_DRAINED = 1 << 16  # bytes of a port that never ends; over TCP 16 times as many
 
 
 class Transport(Protocol):
@@ -45,28 +43,28 @@ class Transport(Protocol):
 
 
 class SerialTransport:
-    """A :class:`Transport` over a serial port, held exclusively.
+    """A :class:`Transport` over a serial port, held exclusively, or an address that pyserial knows (``socket://host:port``).
 
-    Parameters
-    ----------
-    port
-        Name of the port, or an address that pyserial knows (``socket://host:port``).
-    baud
-        Speed; a USB port takes any.
-
-    Raises
-    ------
-    DeviceGone : no such port, in use, or not permitted; the message says what to do.
-    SettingsError : no such kind of address, or a speed that the port does not have.
+    DeviceGone where there is no such port, it is in use, or not permitted; SettingsError for a kind of address, or a
+    speed, that there is not.
     """
 
     def __init__(self, port: str, baud: int, clock: Clock = SYSTEM_CLOCK) -> None:
         self.port = port
         self._clock = clock
-        self._serial = _open(port, baud)
+        try:
+            self._serial = serial.serial_for_url(
+                port, baudrate=baud, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True
+            )
+        except SerialException as error:
+            raise DeviceGone(_why_not(port, error)) from error
+        except (ValueError, OverflowError) as error:
+            raise SettingsError(
+                f"expected a port's name or an address that pyserial knows, and a speed, got {port!r} at {baud!r}: "
+                f"{error}"
+            ) from error
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Send all of the bytes until then; see `Transport`."""
         if self._clock.now() >= deadline:
             raise DeadlinePassed(f"no time was left to send {len(data)} bytes to {self.port}; give a longer deadline")
         try:
@@ -79,7 +77,6 @@ class SerialTransport:
             raise self._gone(error) from error
 
     def read(self, at_most: int, deadline: float) -> bytes:
-        """Give what has come, at least a byte, until then; see `Transport`."""
         try:
             while self._clock.now() < deadline:
                 first: bytes = self._serial.read(1)
@@ -91,7 +88,6 @@ class SerialTransport:
             raise self._gone(error) from error
 
     def drain(self) -> bytes:
-        """Give what lies in the buffers, waiting for nothing."""
         drained = b""
         try:
             while len(drained) < _MOST_DRAINED and (there := self._serial.in_waiting):
@@ -105,17 +101,6 @@ class SerialTransport:
 
     def _gone(self, error: Exception) -> DeviceGone:
         return DeviceGone(f"{self.port} went away ({error}); look at the cable and the power, then connect again")
-
-
-def _open(port: str, baud: int) -> Any:
-    try:
-        return serial.serial_for_url(port, baudrate=baud, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True)
-    except SerialException as error:
-        raise DeviceGone(_why_not(port, error)) from error
-    except (ValueError, OverflowError) as error:
-        raise SettingsError(
-            f"expected a port's name or an address that pyserial knows, and a speed, got {port!r} at {baud!r}: {error}"
-        ) from error
 
 
 def _why_not(port: str, error: OSError) -> str:
@@ -140,13 +125,7 @@ def _ports_here() -> str:
 
 
 class SocketTransport:
-    """A :class:`Transport` to ``host:port``.
-
-    Raises
-    ------
-    SettingsError : the host or the port cannot be one.
-    DeviceGone : nobody answers there; the message says what to do.
-    """
+    """A :class:`Transport` to ``host:port``; SettingsError where that cannot be, DeviceGone where nobody is there."""
 
     def __init__(self, host: str, port: int, clock: Clock = SYSTEM_CLOCK, *, connect_s: float = 3.0) -> None:
         if not host or not 0 < port < 65536:
@@ -166,7 +145,6 @@ class SocketTransport:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Send all of the bytes until then; see `Transport`."""
         left = deadline - self._clock.now()
         if left <= 0:
             raise DeadlinePassed(f"no time was left to send {len(data)} bytes to {self.port}; give a longer deadline")
@@ -179,12 +157,11 @@ class SocketTransport:
             raise self._gone(str(error)) from error
 
     def read(self, at_most: int, deadline: float) -> bytes:
-        """Give what has come, at least a byte, until then; see `Transport`."""
         left = deadline - self._clock.now()
         if left <= 0:
             return b""
         try:
-            self._socket.settimeout(max(left, _LEAST_WAIT_S))
+            self._socket.settimeout(max(left, 1e-3))
             data = self._socket.recv(at_most)
         except TimeoutError:
             self._clock.sleep(deadline - self._clock.now())  # a clock turned by hand has not moved meanwhile
@@ -196,11 +173,10 @@ class SocketTransport:
         return data
 
     def drain(self) -> bytes:
-        """Give what lies in the buffers, waiting for nothing."""
         drained = b""
         self._socket.setblocking(False)
         try:
-            while len(drained) < _MOST_DRAINED_TCP:
+            while len(drained) < 16 * _MOST_DRAINED:
                 data = self._socket.recv(65536)
                 if not data:
                     raise self._gone("closed by the other end")

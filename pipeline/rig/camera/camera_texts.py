@@ -230,9 +230,9 @@ def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 
     if index.exposure_ms is not None:
         found.exposure_ms[place[inside]] = index.exposure_ms[inside]
     told, beyond = int(np.count_nonzero(inside)), int(np.count_nonzero(~inside))
-    notes: tuple[str, ...] = () if told == lines else (f"the frame index tells the time of {told} of {lines} lines",)
-    notes += (f"the frame index lists {beyond} frames beyond the lines",) if beyond else ()
-    return replace(found, notes=notes)
+    said: tuple[str, ...] = () if told == lines else (f"the frame index tells the time of {told} of {lines} lines",)
+    said += (f"the frame index lists {beyond} frames beyond the lines",) if beyond else ()
+    return replace(found, notes=said)
 
 
 def _rows(lines: Iterable[str]) -> _Rows:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Self
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame, Read, mean_frame, read_capture, read_references
 from pipeline.rig.camera.camera_files import Kept, Progress, RemoteFile, fetch_files
-from pipeline.rig.camera.headwall_control import Capture, HeadwallControl
+from pipeline.rig.camera.headwall_control import HeadwallControl
 from pipeline.rig.device_settings import CameraAddress, CameraLimits, ControlPatience, FileServer
 from pipeline.rig.devices import SYSTEM_CLOCK, Clock
-from pipeline.rig.transports import SocketTransport
+from pipeline.rig.transports import SocketTransport, Transport
 
 MOST_TEXT = 1 << 26  # bytes of a header, a frame index or another text: an index of two million frames
 MOST_OFFSET = 1 << 16  # bytes before the first frame of a cube; cameras write none
@@ -36,51 +37,35 @@ class FrameClaim:
         return 2 * self.samples * self.bands
 
 
-class HeadwallCamera:
-    """A line camera for surveys. Nothing is connected before the first command."""
+class HeadwallCamera(HeadwallControl):
+    """A line camera for surveys: its commands and its files. Nothing is connected before the first command."""
 
-    def __init__(self, control: HeadwallControl, server: FileServer, clock: Clock = SYSTEM_CLOCK) -> None:
-        self.control = control
-        self.server = server
-        self.clock = clock
-
-    @classmethod
-    def at(
-        cls,
-        address: CameraAddress,
+    def __init__(
+        self,
+        connect: Callable[[], Transport],
         server: FileServer,
         *,
+        clock: Clock = SYSTEM_CLOCK,
         patience: ControlPatience | None = None,
         limits: CameraLimits | None = None,
-        clock: Clock = SYSTEM_CLOCK,
-    ) -> HeadwallCamera:
+    ) -> None:
+        super().__init__(connect, clock=clock, patience=patience, limits=limits)
+        self.server = server
+
+    @classmethod
+    def at(cls, address: CameraAddress, server: FileServer, *, clock: Clock = SYSTEM_CLOCK, **given: Any) -> Self:
         """A camera on the network."""
 
         def connect() -> SocketTransport:
             return SocketTransport(address.host, address.port, clock, connect_s=address.connect_s)
 
-        return cls(HeadwallControl(connect, clock=clock, patience=patience, limits=limits), server, clock)
-
-    def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
-        """Set both times [ms]; see :meth:`HeadwallControl.configure`."""
-        self.control.configure(exposure_ms, frame_period_ms)
-
-    def capture(self, frames: int, *, cubes: int = 1, prefix: str = "") -> Capture:
-        """Begin to take lines, once; see :meth:`HeadwallControl.capture`."""
-        return self.control.capture(frames, cubes=cubes, prefix=prefix)
-
-    def is_capturing(self) -> bool:
-        """Whether lines are being taken."""
-        return self.control.is_capturing()
-
-    def stop(self) -> bool:
-        """End a capture; False where none ran."""
-        return self.control.stop_capture()
+        return cls(connect, server, clock=clock, **given)
 
     def fetch(
         self, folder: str, kept: Kept, progress: Progress | None = None, *, claim: FrameClaim | None = None
     ) -> CapturedLines:
         """Get a finished capture's files, small ones first, and give its lines; a later call continues.
+
         RigError where the capture still runs, its files do not belong together, or are larger than ``claim`` lets them
         be; DeviceRefused, DeadlinePassed, DeviceGone.
         """
@@ -96,17 +81,13 @@ class HeadwallCamera:
         cubes = read_references([file.name for file in files], _reader(kept))
         return {kind: mean_frame(cube.values) for kind, cube in cubes.items()}
 
-    def close(self) -> None:
-        """Hang up; a capture goes on."""
-        self.control.close()
-
     def _finished(self, folder: str, claim: FrameClaim | None) -> list[RemoteFile]:
         """Files of a folder, as two listings in a row have them: one that lost an entry on its way looks whole."""
         if self.is_capturing():
             raise RigError(f"a capture still runs, so files of {folder} may grow; wait for its end, or stop it")
-        listed = self.control.list_files(folder)
-        for _ in range(self.control.patience.retries + 1):
-            before, listed = listed, self.control.list_files(folder)
+        listed = self.list_files(folder)
+        for _ in range(self.patience.retries + 1):
+            before, listed = listed, self.list_files(folder)
             if listed == before:
                 files = [file for file in listed if not file.folder]
                 return files if claim is None else bounded(files, claim)

@@ -120,7 +120,7 @@ class HeadwallControl:
         """Ask whether a capture runs."""
         return self._ask("isCapturing", None, as_truth)
 
-    def stop_capture(self) -> bool:
+    def stop(self) -> bool:
         """End a capture; False where none ran. Stopping twice does no harm, so it is asked again without a reply."""
         try:
             return self._ask("stopCapture", None, as_stopped)

@@ -98,7 +98,12 @@ class CaptureRunner:
             taken = CaptureRecord(path.sweep, path.first, path.stop, capture.folder, path.triggered, run_s, at_s)
             self._journal.began(taken)
             self.wait(taken)
-        return self._end(taken)
+        if taken.triggered:
+            taken = replace(taken, index_at_end=steering.index())
+        if self._rig.log_pulses or not taken.triggered:
+            taken = replace(taken, log=self._keep_log(taken.folder, steering.read_log()))
+        steering.halt()
+        return self._journal.ended(taken)
 
     def wait(self, taken: CaptureRecord) -> None:
         """Wait until a capture is over; one that goes on too long is stopped, and what it has counts.
@@ -165,15 +170,6 @@ class CaptureRunner:
         sent = clock.now()
         self.devices.steering.run(0, len(path.cells), path.rate_hz, 1, trigger)
         return sent, clock.now()
-
-    def _end(self, taken: CaptureRecord) -> CaptureRecord:
-        steering = self.devices.steering
-        if taken.triggered:
-            taken = replace(taken, index_at_end=steering.index())
-        if self._rig.log_pulses or not taken.triggered:
-            taken = replace(taken, log=self._keep_log(taken.folder, steering.read_log()))
-        steering.halt()
-        return self._journal.ended(taken)
 
     def _keep_log(self, folder: str, log: MotionLog) -> LoggedPath:
         name, position = self._new_name(f"{folder}/mirror_log"), log.position.astype(_CELL).tobytes()

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pipeline.errors import RigError
-from pipeline.rig.devices import Clock, DeviceGone
+from pipeline.rig.devices import Clock, Closing, DeviceGone
 from pipeline.rig.emulator import Chunk
 from pipeline.rig.emulator.camera_device import MOST_LINE, PROMPT, CameraDevice
 from pipeline.rig.emulator.fault_names import CameraFault
@@ -115,7 +115,7 @@ class InProcessCameraLine:
             raise DeviceGone(f"the connection to {self.port} was lost (closed by the other end)")
 
 
-class CameraServer:
+class CameraServer(Closing):
     """Both ports of a device, of its control socket and of FTP (0 takes a free one), until ``close``. Also a context.
 
     RigError where a port is taken.
@@ -151,12 +151,6 @@ class CameraServer:
         self.file_port = int(self._files.socket.getsockname()[1])
         for serve in (self._serve_control, self._serve_files):
             self._start(serve)
-
-    def __enter__(self) -> CameraServer:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Hang up on everyone, and let go of the ports."""

@@ -70,11 +70,6 @@ class Register:
     whole: bool = False
     signed: bool = False
 
-    def to_cell(self) -> bytes:
-        """Give the cell of what is in it."""
-        value = self.read()
-        return int_cell(int(value)) if self.whole else float_cell(float(value))
-
     def check(self, cell: bytes) -> float | int:
         """Read a cell that is to be written; RefusedError where it may not be, or is out of range."""
         if self.write is None:
@@ -146,7 +141,9 @@ class RegisterFile:
     def get(self, number: int) -> bytes:
         """Give a register's cell; RefusedError where there is no such register."""
         self._state.advance()
-        return self._find(number).to_cell()
+        register = self._find(number)
+        value = register.read()
+        return int_cell(int(value)) if register.whole else float_cell(float(value))
 
     def put(self, cells: Mapping[int, bytes]) -> None:
         """Write registers at one moment; held positions go out together.

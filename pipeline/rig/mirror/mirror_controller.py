@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from pipeline.errors import RigError, SettingsError
 from pipeline.geometry.vector_memory import device_range
 from pipeline.rig.device_settings import MirrorSettings, ReadBack
-from pipeline.rig.devices import SYSTEM_CLOCK, Clock
+from pipeline.rig.devices import SYSTEM_CLOCK, Clock, Closing
 from pipeline.rig.mirror.mirror_requests import Identity, Modes, ProLink
 from pipeline.rig.mirror.path_player import (
     Logger,
@@ -37,7 +37,7 @@ _POLL_S = 0.01
 KNOWN_MODELS = ("MR-E", "MRE")  # begin the ids of the controllers that the documents are of
 
 
-class MirrorController:
+class MirrorController(Closing):
     """A mirror controller on a port. :meth:`connect` first; use it as a context, or close it.
 
     Motions (goto, run, park) are sent once. One that is not acknowledged raises StateUnknown, and so does every later
@@ -55,12 +55,6 @@ class MirrorController:
         self._log = Logger(self._link, self.settings.log_samples)
         self._identity: Identity | None = None
         self._pairs = 0  # that the vector memory holds
-
-    def __enter__(self) -> MirrorController:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def connect(self, *, known: bool = False) -> Identity:
         """Find the controller in whichever mode it is, and bring it to pro mode. Nothing moves.

@@ -43,54 +43,39 @@ class Command(IntEnum):
 
 
 class ErrorCode(IntEnum):
-    """Why the device says no."""
+    """Why the device says no, and that in words."""
 
-    FRAME_INVALID = 0x0001
-    COMMAND_UNKNOWN = 0x0002
-    LENGTH_MISMATCH = 0x0003
-    CRC_WRONG = 0x0004
-    NOT_IMPLEMENTED = 0x0005
-    NO_REGISTER = 0x0101
-    WRITE_FAILED = 0x0102
-    OUT_OF_RANGE = 0x0103
-    REGISTER_INVALID = 0x0104
-    READ_FAILED = 0x0105
-    READ_ONLY = 0x0106
-    VECTOR_INDEX = 0x0107
-    VECTOR_ALIGNMENT = 0x0108
-    LOCKED = 0x0109
-    NOT_READABLE = 0x010A
-    NO_SYSTEM = 0x0201
-    SYSTEM_NOT_SELECTABLE = 0x0202
-    CHAIN = 0x0203
+    words: str
 
+    FRAME_INVALID = 0x0001, "the frame is not valid"
+    COMMAND_UNKNOWN = 0x0002, "the command is unknown"
+    LENGTH_MISMATCH = 0x0003, "the length does not fit the command"
+    CRC_WRONG = 0x0004, "the CRC is wrong"
+    NOT_IMPLEMENTED = 0x0005, "the command is not implemented"
+    NO_REGISTER = 0x0101, "there is no such register"
+    WRITE_FAILED = 0x0102, "the register could not be written"
+    OUT_OF_RANGE = 0x0103, "the value is out of the register's range"
+    REGISTER_INVALID = 0x0104, "the register is not valid here"
+    READ_FAILED = 0x0105, "the register could not be read"
+    READ_ONLY = 0x0106, "the register can only be read"
+    VECTOR_INDEX = 0x0107, "the index lies outside the vector"
+    VECTOR_ALIGNMENT = 0x0108, "the index does not begin a cell of the vector"
+    LOCKED = 0x0109, "the register is locked"
+    NOT_READABLE = 0x010A, "the register cannot be read"
+    NO_SYSTEM = 0x0201, "there is no such system"
+    SYSTEM_NOT_SELECTABLE = 0x0202, "the system cannot be chosen here"
+    CHAIN = 0x0203, "the systems do not make a chain from input to output"
 
-_WORDS = {
-    ErrorCode.FRAME_INVALID: "the frame is not valid",
-    ErrorCode.COMMAND_UNKNOWN: "the command is unknown",
-    ErrorCode.LENGTH_MISMATCH: "the length does not fit the command",
-    ErrorCode.CRC_WRONG: "the CRC is wrong",
-    ErrorCode.NOT_IMPLEMENTED: "the command is not implemented",
-    ErrorCode.NO_REGISTER: "there is no such register",
-    ErrorCode.WRITE_FAILED: "the register could not be written",
-    ErrorCode.OUT_OF_RANGE: "the value is out of the register's range",
-    ErrorCode.REGISTER_INVALID: "the register is not valid here",
-    ErrorCode.READ_FAILED: "the register could not be read",
-    ErrorCode.READ_ONLY: "the register can only be read",
-    ErrorCode.VECTOR_INDEX: "the index lies outside the vector",
-    ErrorCode.VECTOR_ALIGNMENT: "the index does not begin a cell of the vector",
-    ErrorCode.LOCKED: "the register is locked",
-    ErrorCode.NOT_READABLE: "the register cannot be read",
-    ErrorCode.NO_SYSTEM: "there is no such system",
-    ErrorCode.SYSTEM_NOT_SELECTABLE: "the system cannot be chosen here",
-    ErrorCode.CHAIN: "the systems do not make a chain from input to output",
-}
+    def __new__(cls, code: int, words: str) -> ErrorCode:
+        error = int.__new__(cls, code)
+        error._value_, error.words = code, words
+        return error
 
 
 def error_words(code: int) -> str:
     """Say an error code of the device in words, with its number."""
-    known = code in ErrorCode.__members__.values()
-    return f"{_WORDS[ErrorCode(code)] if known else 'an error that this driver does not know'} (code {code:04X})"
+    known = {error.value: error.words for error in ErrorCode}
+    return f"{known.get(code, 'an error that this driver does not know')} (code {code:04X})"
 
 
 @dataclass(frozen=True)

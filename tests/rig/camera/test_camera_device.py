@@ -145,7 +145,7 @@ def test_harmless_faults(fault: CameraFault, seed: int) -> None:
     control.configure(5, 6)
     assert control.capture(50_000).folder == "/captured/000000"
     assert control.is_capturing()
-    assert control.stop_capture()
+    assert control.stop()
     assert len(device.captures) == 1
     assert sum(line.startswith("capture(") for line in device.commands) == 1
 

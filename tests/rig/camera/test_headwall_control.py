@@ -65,7 +65,7 @@ def test_every_command(echo: bool) -> None:
         control.configure(10.5, 11)
         assert control.capture(500, prefix="f1").folder == "/captured/f1_0"
         assert control.is_capturing()
-        assert control.stop_capture()
+        assert control.stop()
         files = [(file.name, file.size, file.folder) for file in control.list_files("/captured/a")]
         assert files == [("/captured/a/b", None, True), ("/captured/a/raw_0", 12, False)]
         control.close()
@@ -152,7 +152,7 @@ def test_capture_without_a_reply() -> None:
         for refused_now in (lambda: control.capture(500, prefix="f1"), lambda: control.configure(10, 10)):
             with pytest.raises(StateUnknown, match="stop what runs there, then run again, which connects anew"):
                 refused_now()
-        assert control.stop_capture()
+        assert control.stop()
 
 
 def test_folders_that_were_there_are_not_the_lost_captures() -> None:
@@ -227,7 +227,7 @@ def test_stop_where_none_runs() -> None:
     with talk(
         [(b"stopCapture\r", refused(b"stopCapture\r", b"not capturing")), (IS_CAPTURING, said(IS_CAPTURING, b"false"))]
     ) as control:
-        assert not control.stop_capture()
+        assert not control.stop()
 
 
 @pytest.mark.parametrize(

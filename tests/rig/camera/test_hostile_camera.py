@@ -192,5 +192,5 @@ def test_size_without_measure_in_a_listing() -> None:
     listing = REPLY % b'[{"name": "/a", "size": Infinity}, {"name": "/b", "size": NaN}, {"name": "/c", "size": "x"}]'
     with HostileControl(Answers(says={"listFiles": (listing,)})) as control:
         camera = HeadwallCamera.at(CameraAddress("127.0.0.1", control.port), FileServer())
-        assert [file.size for file in camera.control.list_files("/")] == [None] * 3
+        assert [file.size for file in camera.list_files("/")] == [None] * 3
         camera.close()

@@ -23,7 +23,7 @@ def killed_amid(rig: SmallRig, kept: KeptInMemory, patch: pytest.MonkeyPatch | N
         raise KilledError
 
     if patch is not None:
-        patch.setattr(HeadwallControl, "stop_capture", die)
+        patch.setattr(HeadwallControl, "stop", die)
     with pytest.raises(KilledError):
         list(rig.source(kept).saying(lambda words: die() if words.startswith("capturing") else None).lines(FINE))
 

@@ -115,16 +115,6 @@ def test_path_beside_the_plan_is_looked_at_from_there() -> None:
     assert np.abs(found - planned(FINE, range(FINE.lines), source)).max() > 1
 
 
-def test_measured_look_follows_the_motion() -> None:
-    """The mirror lags behind what it is sent: lines lie a little beside the planned ones, and near them."""
-    source = small_source(chosen=QUIET)
-    with connected(source, look="measured") as (pair, _):
-        folder = pair.play(FINE)
-        off = np.abs(pair.lines(folder).astype(int) - planned(FINE, range(FINE.lines), source))
-    contrast = np.abs(np.diff(planned(FINE, range(FINE.lines), source).astype(int), axis=0)).mean()
-    assert 0 < off.mean() < contrast / 2
-
-
 def test_captures_that_announce_nothing_have_streams_of_their_own() -> None:
     """Two looks at one place differ by their noise alone."""
     with connected() as (pair, _):

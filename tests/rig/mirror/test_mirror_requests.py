@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import nullcontext
 
 import pytest
 from hypothesis import given
@@ -160,15 +161,10 @@ def test_a_motion_answered_by_nonsense_freezes():
         SimpleLink(wire(transport)).do("XY=0.500000;0.000000", "motion")
 
 
-@pytest.mark.parametrize(("request_", "line"), [("START", b"START\r\n"), ("GETTEMP", b"GETTEMP\r\n")])
-def test_requests_are_lines(request_: str, line: bytes):
-    """A request ends in CR LF."""
-    assert to_line(request_) == line
-
-
 @pytest.mark.parametrize("request_", ["", "X=1\r\nX=2", "X=½", "X" * 63])
-def test_no_other_lines_are_sent(request_: str):
-    """Empty, double, foreign and long lines are refused; 64 bytes with the end still go."""
+def test_requests_are_lines(request_: str):
+    """A request ends in CR LF; empty, double, foreign and long lines are refused, 64 bytes with the end still go."""
+    assert to_line("START") == b"START\r\n"
     assert len(to_line("X" * 62)) == 64
     with pytest.raises(ShapeError, match=r"one line of ASCII|lines of 64 bytes, got 65"):
         to_line(request_)
@@ -183,39 +179,30 @@ def test_lines_come_whole_however_cut(lines: list[str], data: st.DataObject):
     assert reader.feed(stream[:cut]) + reader.feed(stream[cut:]) == [line.encode() for line in lines]
 
 
-@pytest.mark.parametrize("line", [b"OK", b"ok", b" Ok "])
-def test_ok_in_any_case_is_done(line: bytes):
-    """Replies are not case-sensitive."""
-    check_done(line, "START", "p")
-
-
 @pytest.mark.parametrize(
-    ("line", "words"),
+    ("line", "error", "words"),
     [
-        (b"NO", "NO to X=2: it does not know"),
-        (b"OL", "below the range"),
-        (b"OU", "above the range"),
-        (b"error", "ERROR"),
+        (b"OK", None, ""),
+        (b" ok ", None, ""),
+        (b"NO", DeviceRefused, "on /dev/m answered NO to X=2: it does not know"),
+        (b"OL", DeviceRefused, "below the range"),
+        (b"OU", DeviceRefused, "above the range"),
+        (b"error", DeviceRefused, "ERROR"),
+        *((line, RigError, "is this the mirror controller") for line in (b"", b"OKOK", b"$GPGGA,1", b"\xff\xfe")),
     ],
 )
-def test_refusals_are_said_in_words(line: bytes, words: str):
-    """NO, OL, OU and ERROR are the device's refusals, with the request and the port."""
-    with pytest.raises(DeviceRefused, match=words) as caught:
+def test_replies_that_say_whether_it_was_done(line: bytes, error: type[RigError] | None, words: str):
+    """OK in any case is done; refusals are said in words, and what the protocol does not have is another device."""
+    with nullcontext() if error is None else pytest.raises(error, match=words):
         check_done(line, "X=2", "/dev/m")
-    assert "/dev/m" in str(caught.value)
-
-
-@pytest.mark.parametrize("line", [b"", b"OKOK", b"$GPGGA,1", b"\xff\xfe"])
-def test_other_replies_are_another_device(line: bytes):
-    """What the protocol does not have is not taken for an answer."""
-    with pytest.raises(RigError, match="is this the mirror controller"):
-        check_done(line, "START", "p")
 
 
 @pytest.mark.parametrize(("line", "degrees"), [(b"31.5", 31.5), (b"-4", -4.0), (b"+31.25 C", 31.25)])
 def test_temperatures_are_numbers(line: bytes, degrees: float):
     """A temperature with or without decimals and unit."""
     assert read_temperature(line, "p") == degrees
+    with pytest.raises(RigError, match="a temperature to GETTEMP from p, got 'warm'"):
+        read_temperature(b"warm", "p")
 
 
 def test_texts_are_text():
@@ -225,8 +212,6 @@ def test_texts_are_text():
         read_text(b"NO", "GETID", "p")
     with pytest.raises(RigError, match="port's speed"):
         read_text(b"\x00\x81", "GETID", "p")
-    with pytest.raises(RigError, match="a temperature to GETTEMP from p, got 'warm'"):
-        read_temperature(b"warm", "p")
 
 
 SILENT = (b"START\r\n", b"")
@@ -235,11 +220,21 @@ SILENT = (b"START\r\n", b"")
 DAMAGED = bytes.fromhex("7E 00 D4 04 00 00 00 01 22 14 7E")  # what the greeting gets in pro mode
 
 
-@pytest.mark.parametrize("complaint", [b"", DAMAGED])
-def test_a_controller_in_pro_mode_is_brought_to_simple_mode_first(complaint: bytes):
-    """It does not answer the greeting; then it is told to change, and may complain about the greeting's bytes."""
-    leave = (LEAVE[0], [complaint, LEAVE[1]])
-    with scripted([SILENT, SILENT, SILENT, leave, GREET, *WHO, ENTER, WELL]) as transport:
+REST: list[Pair] = [*WHO, ENTER, WELL]
+FOUND: dict[str, list[Pair]] = {
+    "in pro mode": [SILENT, SILENT, SILENT, LEAVE, GREET, *REST],
+    "in pro mode, complaining of the greeting": [*[SILENT] * 3, (LEAVE[0], [DAMAGED, LEAVE[1]]), GREET, *REST],
+    "in a line that somebody began": [(b"START\r\n", b"NO\r\n"), *CONNECT],
+    "in a line that somebody began, and that is known": [(b"START\r\n", b"ERROR\r\n"), *CONNECT],
+    "after a greeting that was lost": [SILENT, *CONNECT],
+    "though the change's answer was lost": [GREET, *WHO, (ENTER[0], b""), WELL],
+}
+
+
+@pytest.mark.parametrize("name", FOUND)
+def test_a_controller_is_found(name: str):
+    """In whichever mode an earlier session left it; a greeting moves nothing and is repeated."""
+    with scripted(FOUND[name]) as transport:
         assert connected(transport).identity().device == "MR-E-2"
 
 
@@ -265,19 +260,6 @@ def test_damage_at_a_reconnect_is_warned_of(caplog: pytest.LogCaptureFixture):
     assert [record.levelname for record in caplog.records] == ["WARNING"]
 
 
-def test_a_line_that_somebody_began_is_ended_by_the_greeting():
-    """The first greeting ends it and is refused, the second is answered."""
-    for answer in (b"NO\r\n", b"ERROR\r\n"):
-        with scripted([(b"START\r\n", answer), *CONNECT]) as transport:
-            connected(transport)
-
-
-def test_a_lost_greeting_is_sent_again():
-    """A greeting moves nothing and is repeated."""
-    with scripted([SILENT, *CONNECT]) as transport:
-        connected(transport)
-
-
 def test_stale_bytes_at_connect_are_no_answer():
     """Whatever lies on the line from before is dropped."""
     stale = b"NO\r\n" + bytes.fromhex("7E 00 11 04 00 00")
@@ -299,12 +281,6 @@ def test_firmware_that_does_not_know_a_question_is_served_all_the_same():
     with scripted([GREET, *who, ENTER, WELL]) as transport:
         identity = connected(transport).identity()
     assert (identity.device, identity.version, identity.serial) == ("MR-E-2", "", "")
-
-
-def test_a_change_of_mode_whose_answer_was_lost_is_found_out():
-    """The status tells that it is in pro mode."""
-    with scripted([GREET, *WHO, (ENTER[0], b""), WELL]) as transport:
-        connected(transport)
 
 
 def test_firmware_without_crc_says_which_setting_to_turn():
