@@ -43,12 +43,7 @@ class Capture:
 
 
 class CaptureUnknown(StateUnknown):
-    """A capture was sent and not acknowledged; what was found on asking stands in the message and here."""
-
-    def __init__(self, message: str, *, capturing: bool | None = None, folders: tuple[str, ...] = ()) -> None:
-        super().__init__(message)
-        self.capturing = capturing  # None where the camera did not say
-        self.folders = folders  # that were not there before
+    """A capture was sent and not acknowledged; what was found on asking stands in the message."""
 
 
 class HeadwallControl:
@@ -250,21 +245,16 @@ class HeadwallControl:
     def _find_out(self, error: RigError, before: set[str] | None, prefix: str) -> CaptureUnknown:
         """Freeze, ask the camera what it does, and say it."""
         self.unknown = "a capture was sent and not acknowledged"
-        capturing: bool | None = None
-        folders: tuple[str, ...] = ()
         try:
-            capturing = self.is_capturing()
-            if before is not None and (now := self._folders()) is not None:
-                folders = tuple(sorted(now - before))
-            named = "the folders " + ", ".join(folders) if folders else "no folders"
-            found = f"asked again it {'captures' if capturing else 'does not capture'}, and new are {named}"
+            does = "captures" if self.is_capturing() else "does not capture"
+            now = None if before is None else self._folders()
+            new = sorted(now - before) if before is not None and now is not None else []
+            found = f"asked again it {does}, and new are {'the folders ' + ', '.join(new) if new else 'no folders'}"
         except RigError as other:
             found = f"asked again it does not answer: {other}"
         return CaptureUnknown(
             f"capture (prefix {prefix!r}) was sent and its reply is lost: {error}. It is not sent again; {found}. "
-            "Look at the camera, stop what runs there, then run again, which connects anew",
-            capturing=capturing,
-            folders=folders,
+            "Look at the camera, stop what runs there, then run again, which connects anew"
         )
 
 

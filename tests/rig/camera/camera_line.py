@@ -27,15 +27,10 @@ def wait_for(camera: HeadwallCamera, at_most_s: float) -> None:
         camera.clock.sleep(0.2)
 
 
-def scene_lines(samples: int = 6, bands: int = 4) -> LinesOf:
-    """What an emulated camera sees: numbers that tell time, position, sample and band."""
-    return LinesOf(samples, bands)
-
-
 class LinesOf:
     """Lines that only their own time and position have, kept as they were given."""
 
-    def __init__(self, samples: int, bands: int) -> None:
+    def __init__(self, samples: int = 6, bands: int = 4) -> None:
         self.size = (samples, bands)
         self.given: list[NDArray[np.uint16]] = []
 

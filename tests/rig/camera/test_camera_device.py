@@ -13,7 +13,7 @@ from pipeline.rig.devices import DeviceRefused, ManualClock
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
 from pipeline.rig.emulator.camera_server import CameraConnection
 from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
-from tests.rig.camera.camera_line import control_of, scene_lines
+from tests.rig.camera.camera_line import LinesOf, control_of
 
 CAPTURE = b'capture({"prefix": "", "maxCubes": 1, "maxFramesPerCube": 5})'
 PROMPT = b"\r\nhpi> "
@@ -22,7 +22,7 @@ PROMPT = b"\r\nhpi> "
 def device_with(fault: CameraFault | None = None, times: int = 1, seed: int = 0, **unit: object) -> CameraDevice:
     """A camera with one fault."""
     faults = CameraFaults({} if fault is None else {fault: times}, seed)
-    return CameraDevice(scene_lines(), ManualClock(), unit=CameraUnit(**unit), faults=faults)  # type: ignore[arg-type]
+    return CameraDevice(LinesOf(), ManualClock(), unit=CameraUnit(**unit), faults=faults)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

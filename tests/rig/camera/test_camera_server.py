@@ -20,7 +20,7 @@ from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit, FrameC
 from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 from pipeline.rig.transports import SocketTransport
-from tests.rig.camera.camera_line import LinesOf, scene_lines, wait_for
+from tests.rig.camera.camera_line import LinesOf, wait_for
 
 
 def remote_files(device: CameraDevice, folder: str) -> list[RemoteFile]:
@@ -34,7 +34,7 @@ def camera(
     faults: dict[CameraFault, int] | None = None, unit: CameraUnit | None = None, **server: object
 ) -> Iterator[tuple[HeadwallCamera, CameraDevice, LinesOf]]:
     """A served camera, its driver by the same clock, and what it sees."""
-    clock, lines = ManualClock(100.0), scene_lines()
+    clock, lines = ManualClock(100.0), LinesOf()
     device = CameraDevice(lines, clock, unit=unit, faults=CameraFaults(dict(faults or {})))
     with CameraServer(device) as served:
         files = FileServer(served.host, served.file_port, stall_s=2.0, pause_s=0.01, **server)  # type: ignore[arg-type]
@@ -184,7 +184,7 @@ def test_nobody_listens() -> None:
 def test_server_closes_cleanly() -> None:
     """Threads end and ports are free again; a taken port is refused."""
     before = threading.active_count()
-    device = CameraDevice(scene_lines(), ManualClock())
+    device = CameraDevice(LinesOf(), ManualClock())
     with CameraServer(device) as served:
         line = SocketTransport(served.host, served.port)
         with pytest.raises(RigError, match="cannot be listened on"):
@@ -234,7 +234,7 @@ def test_other_servers(says: bytes, kind: type[RigError], words: str) -> None:
 
 def test_silence_on_a_real_socket() -> None:
     """By the system's clock a lost reply costs its deadline, and the next connection answers."""
-    device = CameraDevice(scene_lines(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.SILENT: 1}))
+    device = CameraDevice(LinesOf(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.SILENT: 1}))
     with CameraServer(device) as served:
         driver = HeadwallCamera.at(
             CameraAddress(served.host, served.port), FileServer(), patience=ControlPatience(0.3, 1, 0.01)
@@ -246,7 +246,7 @@ def test_silence_on_a_real_socket() -> None:
 
 def test_closing_does_not_wait_for_what_is_late() -> None:
     """A reply that a fault holds back for a minute holds back nobody who closes the camera."""
-    device = CameraDevice(scene_lines(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.LATE: 1}))
+    device = CameraDevice(LinesOf(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.LATE: 1}))
     with CameraServer(device) as served, socket.create_connection((served.host, served.port), timeout=5) as client:
         client.sendall(b"isCapturing\r")
         while not device.commands:

@@ -1,4 +1,4 @@
-"""The emulated controller behind a pty, spoken to by pyserial and by the driver as a real port is."""
+"""Ways to the emulated controller: a line in this process, and a pty that is used as a real port is."""
 
 from __future__ import annotations
 
@@ -13,15 +13,94 @@ import serial
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.device_settings import MirrorSettings
-from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone
+from pipeline.rig.devices import SYSTEM_CLOCK, DeadlinePassed, DeviceGone, ManualClock
 from pipeline.rig.emulator.emulated_rig import FastClock
 from pipeline.rig.emulator.fault_names import make_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.mirror_ports import EmulatedPort
-from pipeline.rig.mirror.mirror_controller import open_mirror
+from pipeline.rig.emulator.mirror_ports import EmulatedPort, InProcessTransport
+from pipeline.rig.mirror.mirror_controller import MirrorController, open_mirror
+from pipeline.rig.mirror.pro_mode import Frame, encode
+from pipeline.rig.mirror.transactions import BITS_PER_BYTE
 
-GET = bytes.fromhex("7e 00 11 02 50 01 59 3c 7e")
-GOT = bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e")
+
+def line(*faults: str, baud: int = 0) -> InProcessTransport:
+    """A line to a controller with faults that strike at once."""
+    clock = ManualClock()
+    return InProcessTransport(MirrorDevice(clock, [make_fault(name, at=0) for name in faults]), clock, baud=baud)
+
+
+def test_bytes_come_in_order_and_no_more_than_asked_for() -> None:
+    """Reads give what is there, in parts if fewer are asked for."""
+    transport = line()
+    transport.write(b"START\r\nGETID\r\n", 1.0)
+    assert transport.drain() == b""
+    assert [transport.read(5, 1.0), transport.read(3, 1.0), transport.read(99, 1.0)] == [b"OK\r\nM", b"R-E", b"-2\r\n"]
+    assert transport.clock.now() < 0.01
+    assert transport.sent == [b"START\r\nGETID\r\n"]
+
+
+def test_bytes_take_their_time_on_the_line() -> None:
+    """At 9600 baud 7 bytes there and 4 back take 11 times 10 bits, besides the controller's own time."""
+    transport = line(baud=9600)
+    transport.write(b"START\r\n", 1.0)
+    assert transport.read(10, 1.0) == b"OK\r\n"
+    assert transport.clock.now() == pytest.approx(110 / 9600 + 2e-4)
+
+
+@pytest.mark.parametrize(("name", "acts"), [("gone-before", 0), ("gone-within", 0), ("gone-after", 1)])
+def test_a_device_that_goes_is_gone(name: str, acts: int) -> None:
+    """Whether it is gone at once or when it is read from, and for good; only after a request it was carried out."""
+    transport = line(name)
+
+    def ask() -> None:
+        transport.write(b"START\r\n", 1.0)
+        transport.read(10, 1.0)
+
+    for _ in range(2):
+        with pytest.raises(DeviceGone, match="went away; look at the cable"):
+            ask()
+    assert len(transport.device.acts) == acts
+
+
+def test_a_port_that_hangs_takes_nothing_until_the_deadline() -> None:
+    """The first bytes go nowhere, then writing blocks until its deadline."""
+    transport = line("hangs")
+    transport.write(b"START\r\n", 1.0)
+    assert transport.read(10, 1.0) == b""
+    with pytest.raises(DeadlinePassed, match="did not take 7 bytes"):
+        transport.write(b"START\r\n", 3.0)
+    assert transport.clock.now() == 3.0
+
+
+def test_a_line_waits_until_its_deadline_and_is_closed_for_good() -> None:
+    """Where nothing comes, the clock stands at the deadline; once it is closed nothing can be sent or read."""
+    transport = line()
+    assert transport.read(10, 2.5) == b""
+    assert transport.clock.now() == 2.5
+    transport.close()
+    for use in (lambda: transport.write(b"START\r\n", 1.0), lambda: transport.read(1, 1.0)):
+        with pytest.raises(DeviceGone, match="is closed"):
+            use()
+
+
+@pytest.mark.parametrize("baud", [115200, 256000])
+def test_an_upload_takes_little_more_than_the_line_needs(baud: int) -> None:
+    """1500 positions go up in at most 1.2 times the time of their bytes, progress told from first to last."""
+    transport = line(baud=baud)
+    driver = MirrorController(transport, MirrorSettings(baud=baud), transport.clock)
+    driver.connect()
+    began, told, before = transport.clock.now(), [], len(transport.sent)
+    driver.load_path([(0.1, 0.2)] * 1500, "none", lambda done, total: told.append((done, total)))
+    wire_s = (sum(map(len, transport.sent[before:])) + 300 * len(encode(Frame(0x14)))) * BITS_PER_BYTE / baud
+    assert transport.clock.now() - began <= 1.2 * wire_s
+    assert told[-1] == (3000, 3000)
+    assert len(told) == 300
+
+
+ASKED = bytes.fromhex("7e 00 11 02 50 01 59 3c 7e")
+
+
+REPLIED = bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e")
 
 
 @contextmanager
@@ -45,10 +124,10 @@ def test_both_modes_speak_through_the_pty() -> None:
     with opened() as (_, user):
         user.write(b"START\r\n")
         assert user.read_until(b"\n") == b"OK\r\n"
-        user.write(b"GOPROCRC\r\n" + GET)
-        assert user.read(4 + len(GOT)) == b"OK\r\n" + GOT
-        user.write(bytes.fromhex("7e 00 03 1a 11 13 0a 0d 7e") + GET)
-        assert user.read_until(GOT).endswith(GOT)
+        user.write(b"GOPROCRC\r\n" + ASKED)
+        assert user.read(4 + len(REPLIED)) == b"OK\r\n" + REPLIED
+        user.write(bytes.fromhex("7e 00 03 1a 11 13 0a 0d 7e") + ASKED)
+        assert user.read_until(REPLIED).endswith(REPLIED)
 
 
 def test_two_users_cannot_have_one_port() -> None:
@@ -61,7 +140,7 @@ def test_a_port_can_be_used_again_and_the_controller_goes_on() -> None:
     """A user who goes and one who comes find the controller as it was left: in pro mode."""
     device = MirrorDevice(SYSTEM_CLOCK)
     with EmulatedPort(device) as port:
-        for sent, back in ((b"GOPRO\r\n", b"OK\r\n"), (GET, GOT)):
+        for sent, back in ((b"GOPRO\r\n", b"OK\r\n"), (ASKED, REPLIED)):
             with serial.Serial(port.path, 115200, timeout=2.0, exclusive=True) as user:
                 user.write(sent)
                 assert user.read(len(back)) == back

@@ -1,4 +1,4 @@
-"""Serial ports: a pseudo terminal in place of the device, and every way in which a port is not there."""
+"""What devices are waited for with, their settings, and serial ports in every way in which one is not there."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ import sys
 import threading
 import tty
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import serial
 
 from pipeline.errors import SettingsError
-from pipeline.rig.devices import SYSTEM_CLOCK, DeadlinePassed, DeviceGone
+from pipeline.rig.device_settings import MirrorSettings
+from pipeline.rig.devices import SYSTEM_CLOCK, DeadlinePassed, DeviceGone, ManualClock
 from pipeline.rig.transports import SerialTransport
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo terminals are of POSIX systems")
@@ -166,3 +168,57 @@ def test_a_socket_is_a_port_too():
         assert got == b"START\r\n"
         line.close()
         thread.join(5)
+
+
+def test_sleeping_turns_a_manual_clock():
+    """Time passes by sleeping and by advancing, and never backwards."""
+    clock = ManualClock(5.0)
+    clock.sleep(1.5)
+    clock.sleep(-3.0)
+    clock.advance(0.5)
+    assert clock.now() == 7.0
+    with pytest.raises(SettingsError, match="only goes forward, got -1"):
+        clock.advance(-1)
+
+
+def test_the_system_clock_never_goes_back():
+    """The system's clock goes on, also where a wait of nothing or less is asked for."""
+    before = SYSTEM_CLOCK.now()
+    SYSTEM_CLOCK.sleep(-1)
+    SYSTEM_CLOCK.sleep(1e-4)
+    assert SYSTEM_CLOCK.now() > before
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("baud", 0),
+        ("deadline_s", 1000),
+        ("deadline_s", float("nan")),
+        ("retries", -1),
+        ("quiet_s", -1),
+        ("vector_pairs", 0),
+        ("vector_pairs", 8192),
+        ("log_rate_hz", 20000),
+        ("log_samples", True),
+    ],
+)
+def test_numbers_out_of_range_are_refused(name: str, value: Any):
+    """A number that nothing can mean (a deadline in ms) names the setting and the range."""
+    with pytest.raises(SettingsError, match=f"mirror.{name} must be a number from .* to .* got"):
+        MirrorSettings(**{name: value})
+
+
+@pytest.mark.parametrize(("name", "value"), [("ends", "open"), ("read_back", "some")])
+def test_unknown_choices_are_refused(name: str, value: Any):
+    """A choice that there is not names those that there are."""
+    with pytest.raises(SettingsError, match=f"mirror.{name} must be one of .*, got '{value}'"):
+        MirrorSettings(**{name: value})
+
+
+def test_defaults_are_assumed_and_say_so():
+    """Nothing was confirmed on hardware."""
+    settings = MirrorSettings()
+    assert settings.provenance == "assumed"
+    assert (settings.vector_pairs, settings.ends, settings.strict_crc) == (1500, "exclusive", False)
+    assert settings.patience.deadline_s == settings.deadline_s
