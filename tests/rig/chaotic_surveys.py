@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -104,19 +104,16 @@ def differences(survey: Survey, truth: Survey) -> list[str]:
     """Where numbers, positions or validity are others than without chaos."""
     wrong = []
     for name, found in survey.references.items():
-        one, other = found, truth.references[name]
-        if not (np.array_equal(one.dark, other.dark) and np.array_equal(one.white, other.white)) or one.bad is not None:
+        true = truth.references[name]
+        if (
+            not (np.array_equal(found.dark, true.dark) and np.array_equal(found.white, true.white))
+            or found.bad is not None
+        ):
             wrong.append(f"references of {name}")
     for name, lines in survey.lines.items():
         for number, line in enumerate(lines):
             other = truth.lines[name][number]
-            alike = (line.number, line.mirror_x, line.mirror_y, line.valid, line.exposure_ms) == (
-                other.number,
-                other.mirror_x,
-                other.mirror_y,
-                other.valid,
-                other.exposure_ms,
-            )
+            alike = replace(line, data=other.data, time_s=other.time_s) == other
             if not (alike and np.array_equal(line.data, other.data)):
                 wrong.append(f"line {number} of {name}")
     return wrong

@@ -1,4 +1,4 @@
-"""The control client sends the documented bytes once or again as it may, however replies are cut, and says what it found."""
+"""The control client sends the documented bytes once or again as it may, and says what it found."""
 
 from __future__ import annotations
 

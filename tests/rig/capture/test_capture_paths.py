@@ -1,4 +1,4 @@
-"""What captures are called, and their frames as lines: what was dropped is not valid, what contradicts itself is not used."""
+"""What captures are called, and their frames as lines: none that was dropped, or is contradicted, counts."""
 
 from __future__ import annotations
 

@@ -33,10 +33,14 @@ def assert_same(found: list[Line], sweep: Sweep, first: int = 0) -> None:
 
 
 @pytest.mark.parametrize("sweep", [COARSE, FINE], ids=lambda sweep: sweep.kind)
-def test_lines_are_those_of_the_simulated_source(sweep: Sweep):
-    """Coarse lines that hold four positions each and are summed by four, and fine ones."""
+@pytest.mark.parametrize("first", [0, 9])
+def test_lines_are_those_of_the_simulated_source(sweep: Sweep, first: int):
+    """Coarse lines that hold four positions each and are summed by four, and fine ones; from the middle too."""
     with small_rig() as rig:
-        assert_same(list(rig.source().lines(sweep)), sweep)
+        source = rig.source()
+        found = list(source.lines(sweep, first))
+        assert_same(found, sweep, first)
+        assert list(source.lines(sweep, sweep.lines)) == []
         assert len(rig.captures) == 1
 
 
@@ -85,29 +89,20 @@ def test_loads_of_the_vector_memory_change_no_line(sweep: Sweep, captures: int):
     assert np.count_nonzero(np.diff(late) > 0.01) == captures - 1
 
 
-def test_lines_from_the_middle_of_a_sweep():
-    """A sweep that is gone on with has the lines that it would have had."""
-    with small_rig() as rig:
-        source = rig.source()
-        found = list(source.lines(FINE, first=9))
-        assert list(source.lines(FINE, first=FINE.lines)) == []
-    expected = list(small_source().lines(FINE, 9))
-    np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
-    assert [line.number for line in found] == list(range(9, FINE.lines))
-
-
-def test_references_are_the_mean_of_the_cameras_frames():
-    """Dark and white are those of the simulated source to the frames' rounding, for every binning from one capture."""
-    with small_rig(panel=2.0) as rig:
+@pytest.mark.parametrize("white_at_rest", [True, False])
+def test_references_are_the_mean_of_the_cameras_frames(white_at_rest: bool):
+    """Those of the simulated source to the frames' rounding, of one capture; the mirror moves only if it shall rest."""
+    with small_rig(panel=2.0, white_at_rest=white_at_rest) as rig:
         source = rig.source()
         for sweep in (COARSE, FINE):
             found, expected = source.references(sweep), small_source().references(sweep)
             np.testing.assert_allclose(found.dark, expected.dark, atol=sweep.binning / 64)
             np.testing.assert_allclose(found.white, expected.white, atol=sweep.binning / 64)
             assert found.panel.tolist() == [2.0] * 3
-            assert found.by_mirror
+            assert found.by_mirror == white_at_rest
             assert found.bad is None
         assert sum("references" in said for said in rig.emulated.camera.commands if "capture(" in said) == 1
+        assert any(act.request.command == Command.SET_VALUES for act in rig.emulated.mirror.acts) == white_at_rest
 
 
 def test_references_are_fetched_once(monkeypatch: pytest.MonkeyPatch):
@@ -144,36 +139,23 @@ def counted(call: Callable[..., object], calls: list[object]) -> Callable[..., o
     return counting
 
 
-def test_mirror_is_left_alone_where_the_settings_say_so():
-    """Where white is not taken at rest, looking for references moves nothing; else it goes to 0; 0 and rests."""
-    for white_at_rest in (False, True):
-        with small_rig(white_at_rest=white_at_rest) as rig:
-            assert rig.source().references(FINE).by_mirror == white_at_rest
-            assert any(act.request.command == Command.SET_VALUES for act in rig.emulated.mirror.acts) == white_at_rest
-
-
-def test_without_pulses_lines_lie_where_the_log_measured():
-    """A path that runs by its own clock: lines are placed by the mirror's log, within what software timing leaves."""
-    with small_rig(pulses="none", log_samples=16000) as rig:
+@pytest.mark.parametrize("pulses", ["none", "frame"])
+def test_without_pulses_lines_lie_where_the_log_measured(pulses: str):
+    """A path that runs by its own clock: lines are placed by the log; a pulse a frame steps fine sweeps only."""
+    with small_rig(pulses=pulses, log_samples=16000) as rig:
         source = rig.source()
         found = list(source.lines(COARSE))
+        (told,) = source.record["captures"]
+        if pulses == "frame":
+            assert_same(list(source.lines(FINE)), FINE)
+            assert source.record["captures"][1]["method"] == "trigger"
     assert [line.number for line in found] == list(range(COARSE.lines))
     assert all(line.valid for line in found)
     off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - line_positions(COARSE, CAMERA)
     assert 1e-6 < np.hypot(*off.T).max() * 11275 < 3  # about as many px as a unit of the disk has
-    (told,) = source.record["captures"]
     assert (told["method"], told["sweep"], told["first"], told["stop"]) == ("log", "coarse-0", 0, 10)
     assert 0 < told["residual_px"] < 3
     assert any("software timing" in note for note in told["notes"])
-
-
-def test_one_pulse_a_frame_steps_fine_sweeps_only():
-    """Coarse lines hold several positions each, so there the path runs by its own clock."""
-    with small_rig(pulses="frame", log_samples=16000) as rig:
-        source = rig.source()
-        assert_same(list(source.lines(FINE)), FINE)
-        list(source.lines(COARSE))
-        assert [told["method"] for told in source.record["captures"]] == ["trigger", "log"]
 
 
 @pytest.mark.parametrize(("sweep", "pulses"), [(FINE, "frame"), (FINE, "position"), (COARSE, "position")])
