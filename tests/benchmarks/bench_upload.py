@@ -18,7 +18,7 @@ from pipeline.rig.devices import SYSTEM_CLOCK
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.emulator.mirror_ports import EmulatedPort
 from pipeline.rig.mirror.mirror_controller import open_mirror
-from pipeline.rig.mirror.transactions import BITS_PER_BYTE
+from pipeline.rig.transports import BITS_PER_BYTE
 
 PAIRS = 1500
 BAUDS = (115200, 256000)

@@ -285,7 +285,18 @@ def as_references(dark: MeanFrame, white: MeanFrame, *, panel: ArrayLike = 1.0) 
             f"panel has shape {values.shape}, expected one value or one for each of {dark.mean.shape[1]} bands"
         )
     for name, frame in (("dark", dark), ("white", white)):
-        _check_steady(name, frame)
+        share = np.count_nonzero(frame.jumping) / frame.jumping.size
+        if frame.odd_frames:
+            first = ", ".join(map(str, frame.odd_frames[:5]))
+            raise RigError(
+                f"{len(frame.odd_frames)} of {frame.frames} frames of the {name} reference show something else than "
+                f"the others ({first}); did the light change, or are bytes lost or added in it? Take both again"
+            )
+        if share > max(MOST_JUMPING, 1 / frame.jumping.shape[0]):
+            raise RigError(
+                f"{100 * share:.1f} % of the elements jump amid the frames of the {name} reference, at most "
+                f"{100 * MOST_JUMPING:g} % can; did the light change, or are bytes lost or added in it? Take both again"
+            )
     lit = np.count_nonzero(white.mean > dark.mean) / dark.mean.size
     if lit < LEAST_LIT:
         raise RigError(
@@ -320,18 +331,3 @@ def _strays(lines: NDArray[np.integer]) -> tuple[NDArray[np.bool_], tuple[int, .
         scatter += (np.minimum(off, JUMP_SIGMAS) ** 2).sum(axis=(1, 2))
     usual = max(float(np.median(scatter)), samples * bands)  # one sigma each
     return jumping, tuple(np.flatnonzero(scatter > ODD_FRAME**2 * usual).tolist())
-
-
-def _check_steady(name: str, frame: MeanFrame) -> None:
-    share = np.count_nonzero(frame.jumping) / frame.jumping.size
-    if frame.odd_frames:
-        first = ", ".join(map(str, frame.odd_frames[:5]))
-        raise RigError(
-            f"{len(frame.odd_frames)} of {frame.frames} frames of the {name} reference show something else than the "
-            f"others ({first}); did the light change, or are bytes lost or added in it? Take both again"
-        )
-    if share > max(MOST_JUMPING, 1 / frame.jumping.shape[0]):
-        raise RigError(
-            f"{100 * share:.1f} % of the elements jump amid the frames of the {name} reference, at most "
-            f"{100 * MOST_JUMPING:g} % can; did the light change, or are bytes lost or added in it? Take both again"
-        )

@@ -21,7 +21,6 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Axis, Sweep, line_positions, sweep_positions
 from pipeline.geometry.vector_memory import memory_loads
 from pipeline.rig.camera.camera_cubes import CapturedLines
-from pipeline.rig.capture.capture_journal import CaptureRecord
 from pipeline.rig.capture.clock_fit import FrameTimes
 from pipeline.rig.capture.line_positions import (
     CommandTimes,
@@ -145,6 +144,37 @@ def path_of(sweep: Sweep, lines: tuple[int, int], camera: LineCamera, *, trigger
 def can_trigger(pulses: Pulses, sweep: Sweep) -> bool:
     """Whether the pulses at the mirror's input step through this sweep: one a position is needed."""
     return pulses == "position" or (pulses == "frame" and sweep.step == 1)
+
+
+@dataclass(frozen=True)
+class CaptureRecord:
+    """Lines ``first`` to ``stop`` of a sweep, in a folder of the camera."""
+
+    sweep: Sweep
+    first: int
+    stop: int
+    folder: str
+    triggered: bool
+    run_s: tuple[float, float]  # sent and acknowledged, by the drivers' clock
+    capture_s: tuple[float, float]
+    index_at_end: int | None = None  # cell of the path that was played last
+    log: LoggedPath | None = None
+    spent: str = ""  # why no line is to be had from it any more
+
+
+@dataclass(frozen=True)
+class LoggedPath:
+    """A log of measured positions that is kept beside the files: (sample, 2) big-endian float32.
+
+    ``index_name`` is where the cells that were played are, (sample,) big-endian int32; empty where nobody asked.
+    """
+
+    name: str
+    rate_hz: float
+    started_s: float
+    start_error_s: float
+    index_name: str = ""
+    crc32: int | None = None  # of both files, one after the other; None by an earlier version
 
 
 class UntiedError(RigError):

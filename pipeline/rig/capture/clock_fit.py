@@ -136,7 +136,8 @@ def fit_clocks(stamp_us: Ints, mirror_s: Floats) -> ClockFit:
     for _ in range(_ROUNDS):
         off = mirror_s - camera - (offset + slope * camera)
         before = weight
-        weight = _tukey(off)
+        scale = max(_TO_SIGMA * float(np.median(np.abs(off))), LEAST_SCALE_S)
+        weight = np.clip(1 - (off / (_TUKEY * scale)) ** 2, 0, None) ** 2
         slope, offset = _weighted_line(camera, mirror_s - camera, weight)
         if np.allclose(weight, before, rtol=0, atol=1e-9):
             break
@@ -175,19 +176,13 @@ def match_edges(
     ----------
     stamp_us, number
         (frame,) stamps that never go back, and numbers from the start of the capture; numbers may have gaps.
-    edge_s
-        (edge,) in order, by the mirror's clock.
-    log_s
-        From when to when the log runs.
-    period_s
-        Frame period.
+    edge_s, log_s
+        (edge,) in order, by the mirror's clock; from when to when the log runs.
     first_near_s
         When frame 0 was, within less than half a period.
 
-    Returns
-    -------
-    (frame,) number of the edge; -1 where there is none within half a period. RigError where there is no edge, or
-    nothing tells which frame one belongs to.
+    Gives (frame,) the number of the edge; -1 where there is none within half a period. RigError where there is no edge,
+    or nothing tells which frame one belongs to.
     """
     if not len(edge_s):
         raise RigError("the log holds no edge of a frame; is the trigger's cable in, and was the log on?")
@@ -242,12 +237,6 @@ def _median_line(x: Floats, y: Floats) -> tuple[float, float]:
     apart = span != 0
     slope = float(np.median(rise[apart] / span[apart])) if apart.any() else 0.0
     return slope, float(np.median(y - slope * x))
-
-
-def _tukey(off: Floats) -> Floats:
-    scale = max(_TO_SIGMA * float(np.median(np.abs(off))), LEAST_SCALE_S)
-    weight: Floats = np.clip(1 - (off / (_TUKEY * scale)) ** 2, 0, None) ** 2
-    return weight
 
 
 def _weighted_line(x: Floats, y: Floats, weight: Floats) -> tuple[float, float]:

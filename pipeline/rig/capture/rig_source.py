@@ -32,10 +32,10 @@ from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_cubes import as_references
 from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
 from pipeline.rig.camera.headwall_camera import FrameClaim
-from pipeline.rig.capture.capture_journal import CaptureJournal, CaptureRecord
 from pipeline.rig.capture.capture_paths import (
     REFERENCES,
     CapturePath,
+    CaptureRecord,
     PlacedLines,
     UntiedError,
     can_trigger,
@@ -43,7 +43,7 @@ from pipeline.rig.capture.capture_paths import (
     path_of,
     place_lines,
 )
-from pipeline.rig.capture.capture_runner import CaptureRunner, RigDevices, Say, say_nothing
+from pipeline.rig.capture.capture_runner import CaptureJournal, CaptureRunner, RigDevices, Say, say_nothing
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.devices import DeviceRefused, StateUnknown
 from pipeline.simulator.instrument import check_binning

@@ -161,8 +161,6 @@ class CameraUnit:
     """What the emulated camera is like."""
 
     root: str = "/captured"
-    echoes: bool = True
-    greeting: str = "Hyperspec control"
     usual_frames: int = 2000  # of a cube, where the command says 0
     disk_bytes: int = 480 * 10**9
     clock: FrameClock = field(default_factory=FrameClock)
@@ -198,8 +196,7 @@ class CameraDevice:
 
     def greet(self) -> list[Chunk]:
         """What a new connection is sent."""
-        greeting = f"{self.unit.greeting}\r\n".encode() if self.unit.greeting else b""
-        return self._cut(greeting + PROMPT[2:])
+        return self._cut(b"Hyperspec control" + PROMPT)
 
     def command(self, line: str) -> list[Chunk] | None:
         """Do one command; give its reply, in pieces and in time, or None where the connection ends."""
@@ -246,12 +243,11 @@ class CameraDevice:
                 capture.put(self._lines(self._positions(middle_s), middle_s))
 
     def _spoken(self, line: str, reply: str) -> list[Chunk]:
-        echo = f"{line}\r\n" if self.unit.echoes else ""
         if self.faults.strikes(CameraFault.SILENT):
             return []
         if self.faults.strikes(CameraFault.NOT_JSON):
             reply = "Segmentation fault"
-        data = f"{echo}{reply}".encode() + PROMPT
+        data = f"{line}\r\n{reply}".encode() + PROMPT
         foreign = b'%b\r\n{"success": true, "response": [], "errorMessage": ""}' + PROMPT  # its echo tells it apart
         if self.faults.strikes(CameraFault.STALE):
             other = b"isCapturing" if line.startswith("listFiles") else b"listFiles"
@@ -290,7 +286,9 @@ class CameraDevice:
             case "isCapturing":
                 return self.is_capturing()
             case "stopCapture":
-                return self._stop()
+                if runs := self.is_capturing():
+                    self.captures[-1].stop(self.clock.now())
+                return runs
         raise RigError(f"unknown command {name}")
 
     def _configure(self, argument: Any) -> Any:
@@ -337,12 +335,6 @@ class CameraDevice:
             references=self.unit.references,
             cut_bytes=cut,
         )
-
-    def _stop(self) -> bool:
-        if not self.is_capturing():
-            return False
-        self.captures[-1].stop(self.clock.now())
-        return True
 
     def _list(self, argument: Any) -> list[dict[str, Any]]:
         folder = "/" + str(argument or "").strip("/")

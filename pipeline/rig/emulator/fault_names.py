@@ -19,6 +19,12 @@ from pipeline.rig.mirror.registers import Status
 
 _BYTES = 1024  # within so many bytes to the controller
 _FEW = 6  # opportunities of faults that only strike lines of simple mode
+# what faults of the mirror strike
+_REQUEST = "bytes to the controller"
+_REPLY = "bytes from the controller"
+_ANSWER = "what the controller answers"
+_STATE = "what the controller is in"
+_PORT = "the port"
 _VALUES = frozenset({Command.GET_VALUE, Command.SET_VALUE, Command.GET_VALUES, Command.SET_VALUES})
 _SETTING = frozenset({Command.SET_VALUE, Command.SET_VALUES})
 _VECTORS = frozenset({Command.SET_VECTOR, Command.GET_VECTOR})
@@ -74,16 +80,6 @@ class CameraFaults:
         return True
 
 
-class Where(Enum):
-    """What a fault of the mirror strikes."""
-
-    REQUEST = "bytes to the controller"
-    REPLY = "bytes from the controller"
-    ANSWER = "what the controller answers"
-    STATE = "what the controller is in"
-    PORT = "the port"
-
-
 @dataclass(frozen=True)
 class FaultKind:
     """A kind of fault of the mirror that users can ask for by its name.
@@ -94,67 +90,47 @@ class FaultKind:
 
     name: str
     words: str
-    where: Where
+    where: str
     build: Callable[[Chance], Fault]
     span: int = 64
     harmless: bool = False
 
 
 def _request(name: str, words: str, change: mirror.Change) -> FaultKind:
-    return FaultKind(name, words, Where.REQUEST, partial(mirror.RequestByte, change=change), _BYTES)
+    return FaultKind(name, words, _REQUEST, partial(mirror.RequestByte, change=change), _BYTES)
 
 
 def _reply(name: str, words: str, spoil: mirror.Spoil, *, lasting: bool = False, harmless: bool = False) -> FaultKind:
     build = partial(mirror.SpoiltReply, spoil=spoil, lasting=lasting)
-    return FaultKind(name, words, Where.REPLY, build, harmless=harmless)
+    return FaultKind(name, words, _REPLY, build, harmless=harmless)
 
 
 def _line(name: str, answer: Reply, words: str) -> FaultKind:
     words = f"one line of simple mode is answered by {answer}{words}"
-    return FaultKind(name, words, Where.ANSWER, partial(mirror.AnswersLine, answer=answer), _FEW)
+    return FaultKind(name, words, _ANSWER, partial(mirror.AnswersLine, answer=answer), _FEW)
 
 
 def _code(name: str, code: int, commands: Collection[int] | None = None, span: int = 64) -> FaultKind:
     words = f"one frame is refused: {error_words(code)}"
-    return FaultKind(name, words, Where.ANSWER, partial(mirror.AnswersError, code=code, commands=commands), span)
+    return FaultKind(name, words, _ANSWER, partial(mirror.AnswersError, code=code, commands=commands), span)
 
 
 def _bit(name: str, bit: Status, words: str) -> FaultKind:
-    return FaultKind(name, words, Where.STATE, partial(mirror.StatusBit, bit=bit), 32)
+    return FaultKind(name, words, _STATE, partial(mirror.StatusBit, bit=bit), 32)
 
 
 _KINDS = (
-    FaultKind(
-        "request-byte-lost",
-        "one byte to the controller is lost",
-        Where.REQUEST,
-        partial(mirror.RequestByte, change=mirror.lose),
-        _BYTES,
-    ),
-    FaultKind(
-        "request-bit-flipped",
-        "one bit of one byte to the controller is turned",
-        Where.REQUEST,
-        partial(mirror.RequestByte, change=mirror.flip),
-        _BYTES,
-    ),
-    FaultKind(
-        "request-byte-doubled",
-        "one byte to the controller comes twice",
-        Where.REQUEST,
-        partial(mirror.RequestByte, change=mirror.double),
-        _BYTES,
-    ),
+    _request("request-byte-lost", "one byte to the controller is lost", mirror.lose),
+    _request("request-bit-flipped", "one bit of one byte to the controller is turned", mirror.flip),
+    _request("request-byte-doubled", "one byte to the controller comes twice", mirror.double),
     _reply("reply-byte-lost", "one byte of one reply is lost", mirror.changed(mirror.lose)),
     _reply("reply-bit-flipped", "one bit of one reply is turned", mirror.changed(mirror.flip)),
     _reply("reply-byte-doubled", "one byte of one reply comes twice", mirror.changed(mirror.double)),
     _reply("split-replies", "replies come in pieces", mirror.split, lasting=True, harmless=True),
     _reply("merged-replies", "replies wait for each other", mirror.merge, lasting=True, harmless=True),
-    FaultKind(
-        "stale-bytes", "the port holds what another program asked for", Where.REPLY, mirror.StaleBytes, harmless=True
-    ),
+    FaultKind("stale-bytes", "the port holds what another program asked for", _REPLY, mirror.StaleBytes, harmless=True),
     _reply("noise", "bytes that mean nothing come before one reply", mirror.noise),
-    FaultKind("old-reply-again", "the reply before comes once more, before one", Where.REPLY, mirror.OldReplyAgain),
+    FaultKind("old-reply-again", "the reply before comes once more, before one", _REPLY, mirror.OldReplyAgain),
     _reply("late-reply", "one reply comes long after any deadline", mirror.late),
     _reply("just-late-reply", "one reply comes around its deadline", mirror.just_late),
     _reply("no-reply", "one request is carried out and never answered", mirror.lost),
@@ -173,19 +149,19 @@ _KINDS = (
     _code("error-vector-index", ErrorCode.VECTOR_INDEX, _VECTORS),
     _code("error-chain", ErrorCode.CHAIN, _SETTING, 4),
     _code("error-unknown", 0xBEEF),
-    FaultKind("wrong-firmware", "the controller says that it is another model", Where.ANSWER, mirror.OtherFirmware),
-    FaultKind("cell-lost", "one cell is acknowledged and not written", Where.STATE, mirror.CellLost, 16),
-    FaultKind("pro-at-connect", "the controller was left in pro mode", Where.STATE, mirror.ProAtConnect, harmless=True),
+    FaultKind("wrong-firmware", "the controller says that it is another model", _ANSWER, mirror.OtherFirmware),
+    FaultKind("cell-lost", "one cell is acknowledged and not written", _STATE, mirror.CellLost, 16),
+    FaultKind("pro-at-connect", "the controller was left in pro mode", _STATE, mirror.ProAtConnect, harmless=True),
     FaultKind(
         "silent-reset",
         "the controller restarts unasked and says nothing",
-        Where.STATE,
+        _STATE,
         partial(mirror.SilentReset, boot_s=0.0),
     ),
     FaultKind(
         "reset-in-upload",
         "the controller restarts while its vector memory is written",
-        Where.STATE,
+        _STATE,
         partial(mirror.SilentReset, boot_s=1.0, commands=_UPLOAD),
         16,
     ),
@@ -195,12 +171,12 @@ _KINDS = (
     _bit("electronics-warm", Status.ELECTRONICS_WARM, "the mirror head's electronics are too warm"),
     _bit("disconnected", Status.DISCONNECTED, "the mirror head is not connected"),
     _bit("eeprom-invalid", Status.EEPROM_INVALID, "the mirror's own calibration cannot be read"),
-    FaultKind("gone-before", "the device goes away before a request", Where.PORT, mirror.GoneBefore),
-    FaultKind("gone-within", "the device goes away in the middle of a request", Where.PORT, mirror.GoneWithin, _BYTES),
-    FaultKind("gone-after", "the device carries a request out and goes away", Where.PORT, mirror.GoneAfter),
-    FaultKind("hangs", "from some request on the port takes no bytes", Where.PORT, mirror.PortHangs),
-    FaultKind("echo", "a loop of wire is connected instead of the controller", Where.PORT, mirror.Echo),
-    FaultKind("modem", "a modem is connected instead of the controller", Where.PORT, mirror.Modem),
+    FaultKind("gone-before", "the device goes away before a request", _PORT, mirror.GoneBefore),
+    FaultKind("gone-within", "the device goes away in the middle of a request", _PORT, mirror.GoneWithin, _BYTES),
+    FaultKind("gone-after", "the device carries a request out and goes away", _PORT, mirror.GoneAfter),
+    FaultKind("hangs", "from some request on the port takes no bytes", _PORT, mirror.PortHangs),
+    FaultKind("echo", "a loop of wire is connected instead of the controller", _PORT, mirror.Echo),
+    FaultKind("modem", "a modem is connected instead of the controller", _PORT, mirror.Modem),
 )
 KINDS = {kind.name: kind for kind in _KINDS}
 _CAMERA = {"camera-" + fault.value.lower().replace(" ", "-"): fault for fault in CameraFault}
@@ -208,7 +184,7 @@ _CAMERA = {"camera-" + fault.value.lower().replace(" ", "-"): fault for fault in
 
 def fault_table() -> list[tuple[str, str, str]]:
     """Give every fault as its name, what it strikes, and what happens."""
-    rows = [(kind.name, f"mirror: {kind.where.value}", kind.words) for kind in KINDS.values()]
+    rows = [(kind.name, f"mirror: {kind.where}", kind.words) for kind in KINDS.values()]
     return rows + [(name, "camera", fault.words) for name, fault in _CAMERA.items()]
 
 

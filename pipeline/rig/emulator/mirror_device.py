@@ -39,7 +39,7 @@ from pipeline.rig.mirror.pro_mode import (
     encode,
     refuse,
 )
-from pipeline.rig.mirror.registers import CHANNELS, ChannelRegisters, Unit
+from pipeline.rig.mirror.registers import ChannelRegisters, Unit
 
 KEPT_ACTS = 5_000
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:E[-+]?\d+)?"
@@ -272,16 +272,13 @@ class MirrorDevice:
             command = request.damaged.data[1] if len(request.damaged.data) > 1 else 0
             return encode(refuse(command & ~ERROR_FLAG, ErrorCode.FRAME_INVALID))
         if request.frame is not None:
-            return encode(self._pro(request.frame))
+            if self.mode is Mode.PRO_CRC and not request.frame.crc_good:
+                return encode(refuse(request.frame.command & ~ERROR_FLAG, ErrorCode.CRC_WRONG))
+            reply = self.registers.answer(request.frame)
+            if reply.command == Command.SET_MODE:
+                self.set_mode(Mode.SIMPLE)
+            return encode(reply)
         return self._simple(request.line).encode("ascii") + END
-
-    def _pro(self, frame: Frame) -> Frame:
-        if self.mode is Mode.PRO_CRC and not frame.crc_good:
-            return refuse(frame.command & ~ERROR_FLAG, ErrorCode.CRC_WRONG)
-        reply = self.registers.answer(frame)
-        if reply.command == Command.SET_MODE:
-            self.set_mode(Mode.SIMPLE)
-        return reply
 
     def _simple(self, line: str) -> str:
         """Carry out a line, in capitals and without its end, and give the answer without an end."""
@@ -322,10 +319,11 @@ class MirrorDevice:
         state, places = self.state, [float(number) for number in found.groups()[1:] if number is not None]
         x, y = (axis[Unit.XY] for axis in state.static)
         x, y = {"X": (places[0], y), "Y": (x, places[0]), "XY": (places[0], places[-1])}[name]
-        for channel in range(CHANNELS):
+        for channel, place in enumerate((x, y)):
             registers = ChannelRegisters(channel)
             state.inputs[channel], state.controls[channel] = registers.static_system, registers.xy_system
-        state.hold({0: x, 1: y})
+            state.static[channel][Unit.XY] = place
+        state.aim()
         if not state.trimmed:
             return Reply.OK
         return Reply.BELOW if -min(places) > max(places) else Reply.ABOVE

@@ -282,12 +282,6 @@ class MirrorState:
         self.latched |= self._present(now) & _COPIES
         return now
 
-    def hold(self, targets: dict[int, float]) -> None:
-        """Set held positions, {channel: place}, and go there where the channels follow them."""
-        for channel, place in targets.items():
-            self.static[channel][Unit.XY] = place
-        self.aim()
-
     def aim(self) -> None:
         """Send the axes where the systems that they follow say, now."""
         self._aim(self.advance())

@@ -74,14 +74,8 @@ class SceneView:
     def lines(self, told: Announced, held: Floats, times_ms: tuple[float, float], started_s: float) -> Raw:
         """Give raw lines (line, sample, band) of a sweep, not binned.
 
-        Parameters
-        ----------
-        held
-            (line, step, 2) positions of the device during each exposure.
-        times_ms
-            Exposure and frame period.
-        started_s
-            When the sweep began, for what drifts, unless the source's own clock knows.
+        ``held`` are (line, step, 2) positions of the device during each exposure, ``times_ms`` exposure and frame
+        period; ``started_s`` is when the sweep began, for what drifts, unless the source's own clock knows.
         """
         sweep = replace(told.sweep, binning=1)
         rig = self._rig(times_ms)

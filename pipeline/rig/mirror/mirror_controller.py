@@ -29,8 +29,7 @@ from pipeline.rig.mirror.path_player import (
 )
 from pipeline.rig.mirror.pro_mode import Value, ask_status, cell_int, get_value, get_values, read_values, set_values
 from pipeline.rig.mirror.registers import Status, Trigger, Unit, VectorRegister, X, Y
-from pipeline.rig.mirror.transactions import Wire
-from pipeline.rig.transports import SerialTransport, Transport
+from pipeline.rig.transports import SerialTransport, Transport, Wire
 
 LOG = logging.getLogger(__name__)
 _POLL_S = 0.01

@@ -29,7 +29,7 @@ from pipeline.rig.mirror.pro_mode import (
     go_simple,
 )
 from pipeline.rig.mirror.registers import Status
-from pipeline.rig.mirror.transactions import Kind, Receiver, Wire
+from pipeline.rig.transports import Kind, Receiver, Wire
 
 LOG = logging.getLogger(__name__)
 
@@ -214,7 +214,14 @@ class ProLink:
             if self.strict_crc:
                 return None
         if found.command == sent.command | ERROR_FLAG:
-            raise self._refusal(found, name)
+            try:
+                code = cell_int(found.payload)
+            except ShapeError:
+                size = len(found.payload)
+                raise RigError(f"{name}: {port} answered with an error of {size} bytes, expected 4") from None
+            words = f"the mirror controller on {port} refused {name}: {error_words(code)}"
+            garbled = code in (ErrorCode.FRAME_INVALID, ErrorCode.CRC_WRONG)
+            raise DeviceRefused(words, code, garbled=garbled)
         if found.command != sent.command:
             # lines that were said to a controller in pro mode are complained about when a frame follows
             usual = sent.command == Command.SET_MODE and found.command & ERROR_FLAG
@@ -226,16 +233,6 @@ class ProLink:
         except ShapeError as error:
             LOG.warning("%s, while waiting for %s: an answer that does not fit: %s", port, name, error)
             return None
-
-    def _refusal(self, found: Frame, name: str) -> RigError:
-        port = self.wire.port
-        try:
-            code = cell_int(found.payload)
-        except ShapeError:
-            return RigError(f"{name}: {port} answered with an error of {len(found.payload)} bytes, expected 4")
-        garbled = code in (ErrorCode.FRAME_INVALID, ErrorCode.CRC_WRONG)
-        words = f"the mirror controller on {port} refused {name}: {error_words(code)}"
-        return DeviceRefused(words, code, garbled=garbled)
 
 
 @dataclass(frozen=True)

@@ -67,14 +67,8 @@ def wire_positions(positions: ArrayLike, mounting: Mounting = STRAIGHT) -> NDArr
 def upload(link: ProLink, cells: bytes, read_back: ReadBack, progress: Progress | None = None) -> None:
     """Write cells, X of all positions and then Y of all, to the vector memory, and compare what it holds then.
 
-    Parameters
-    ----------
-    read_back
-        "none", "sampled" (every tenth frame and the ends of both channels) or "all".
-    progress
-        Called with cells done and cells in all, those read back included.
-
-    Raises RigError where a cell holds something else; the message names it. DeviceRefused, DeadlinePassed, DeviceGone
+    ``read_back`` is "none", "sampled" (every tenth frame and the ends of both channels) or "all"; ``progress`` gets
+    cells done and cells in all, those read back included. RigError names a cell that holds something else.
     """
     frames = [cells[at : at + VECTOR_CELLS * CELL] for at in range(0, len(cells), VECTOR_CELLS * CELL)]
     checked = frames_to_check(len(frames), read_back)

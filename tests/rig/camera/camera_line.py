@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.camera.headwall_control import HeadwallControl
+from pipeline.rig.camera.headwall_camera import HeadwallCamera, HeadwallControl
 from pipeline.rig.device_settings import ControlPatience
 from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator.camera_device import CameraDevice

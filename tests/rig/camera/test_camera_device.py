@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipeline.rig.camera.headwall_control import CaptureUnknown
+from pipeline.rig.camera.headwall_camera import CaptureUnknown
 from pipeline.rig.devices import DeviceRefused, ManualClock
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
 from pipeline.rig.emulator.camera_server import CameraConnection

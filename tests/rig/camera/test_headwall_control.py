@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.camera import headwall_replies
-from pipeline.rig.camera.headwall_control import CaptureUnknown, HeadwallControl
+from pipeline.rig.camera.headwall_camera import CaptureUnknown, HeadwallControl
 from pipeline.rig.camera.headwall_replies import ReplyReader
 from pipeline.rig.device_settings import ControlPatience
 from pipeline.rig.devices import Clock, DeviceGone, DeviceRefused, ManualClock, StateUnknown

@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture.capture_journal import JOURNAL, CaptureJournal, CaptureRecord
+from pipeline.rig.capture import JOURNAL
+from pipeline.rig.capture.capture_paths import CaptureRecord
+from pipeline.rig.capture.capture_runner import CaptureJournal
 from pipeline.rig.capture.line_positions import LinePositions
 from tests.faults.growing_files import flip_journal
 from tests.rig.small_rig import COARSE, FINE

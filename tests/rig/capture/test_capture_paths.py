@@ -11,10 +11,11 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_cubes import CapturedLines
 from pipeline.rig.camera.camera_texts import LineTimes
-from pipeline.rig.capture.capture_journal import CaptureRecord, LoggedPath
 from pipeline.rig.capture.capture_paths import (
     REFERENCES,
     Announced,
+    CaptureRecord,
+    LoggedPath,
     UntiedError,
     announced,
     capture_prefix,

@@ -10,8 +10,8 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.camera.headwall_control import HeadwallControl
-from pipeline.rig.capture.capture_journal import JOURNAL
+from pipeline.rig.camera.headwall_camera import HeadwallControl
+from pipeline.rig.capture import JOURNAL
 from pipeline.rig.devices import DeviceGone, DeviceRefused, StateUnknown
 from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults, make_fault
 from pipeline.source import Line

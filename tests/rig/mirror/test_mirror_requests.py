@@ -22,7 +22,7 @@ from pipeline.rig.mirror.mirror_requests import (
     to_line,
 )
 from pipeline.rig.mirror.pro_mode import cell_int, get_value
-from pipeline.rig.mirror.transactions import Wire
+from pipeline.rig.transports import Wire
 from tests.rig.mirror.mirror_bytes import CONNECT, ENTER, GREET, LEAVE, WELL, WHO, connected, set_value
 from tests.rig.scripted import Pair, ScriptedTransport, scripted
 

@@ -13,7 +13,7 @@ from pipeline.rig.devices import DeadlinePassed, ManualClock
 from pipeline.rig.mirror.mirror_requests import ProLink
 from pipeline.rig.mirror.path_player import check_play, frames_to_check, hold_values, run_values, upload, wire_positions
 from pipeline.rig.mirror.pro_mode import Command, Frame, FrameReader, encode, read_vector, set_values
-from pipeline.rig.mirror.transactions import BITS_PER_BYTE, Wire
+from pipeline.rig.transports import BITS_PER_BYTE, Wire
 
 
 @given(st.floats(0, 1), st.floats(-7, 7))

@@ -10,7 +10,7 @@ import pytest
 from pipeline.errors import RigError
 from pipeline.rig.device_settings import Patience
 from pipeline.rig.devices import DeadlinePassed, DeviceGone, ManualClock, StateUnknown
-from pipeline.rig.mirror.transactions import Kind, Wire
+from pipeline.rig.transports import Kind, Wire
 from tests.rig.scripted import Late, Pair, ScriptedTransport, scripted
 
 
