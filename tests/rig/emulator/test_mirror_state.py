@@ -143,16 +143,12 @@ def test_edges_take_one_cell_each(kind: Trigger, cells: list[int]) -> None:
 
 
 def test_a_long_silence_costs_no_more_than_its_end() -> None:
-    """Of an hour without a question only the last steps are played, and the cell is the right one."""
+    """Of an hour only the last steps are played, to the right cell; the cell at a past time is its last step's."""
     unit = player(cycles=-1, frequency_hz=10_000.0)
     unit.run(0.0)
     steps = list(unit.due(3600.0))
     assert len(steps) <= MOST_STEPS + 1
     assert unit.index == 4 + 36_000_000 % 3
-
-
-def test_past_cells_can_be_asked_for() -> None:
-    """The cell at any past time is the one of the last step before it."""
     unit = player(cycles=1)
     assert unit.indices(np.array([0.0])).tolist() == [4]
     unit.run(0.0)
@@ -229,9 +225,12 @@ def test_a_run_moves_the_mirror_along_the_path() -> None:
 
 
 def test_the_index_and_the_output_tell_the_cell() -> None:
-    """While it runs, index and output are those of the cell that is held."""
+    """While it runs, index and output are those of the cell that is held; unfollowed, a unit moves nothing."""
     clock = ManualClock()
     device = loaded(clock, cycles=-1)
+    do(device, set_values({X.vector(VectorRegister.RUN): 1, Y.vector(VectorRegister.RUN): 1}))
+    clock.advance(1.0)
+    np.testing.assert_array_equal(device.positions(clock.now()), (0, 0))
     run(device)
     for number in range(6):
         clock.advance(0.01)
@@ -243,15 +242,6 @@ def test_the_index_and_the_output_tell_the_cell() -> None:
     do(device, set_values({X.vector(VectorRegister.RUN): 0, Y.vector(VectorRegister.RUN): 0}))
     clock.advance(1.0)
     np.testing.assert_allclose(device.positions(clock.now()), PATH[2], atol=1e-6)
-
-
-def test_a_unit_that_is_not_followed_moves_nothing() -> None:
-    """A vector unit runs without effect while the channels follow their held positions."""
-    clock = ManualClock()
-    device = loaded(clock)
-    do(device, set_values({X.vector(VectorRegister.RUN): 1, Y.vector(VectorRegister.RUN): 1}))
-    clock.advance(1.0)
-    np.testing.assert_array_equal(device.positions(clock.now()), (0, 0))
 
 
 def test_a_cameras_pulses_step_through_the_path() -> None:

@@ -18,35 +18,8 @@ from pipeline.rig.mirror import mirror_controller
 from pipeline.rig.mirror.mirror_controller import MirrorController, open_mirror
 from pipeline.rig.mirror.mirror_requests import Identity
 from pipeline.rig.mirror.registers import Status, Trigger
-from tests.rig.mirror.mirror_bytes import (
-    CONNECT,
-    DONE,
-    ENTER,
-    GOTO,
-    GREET,
-    HALT,
-    IDLE,
-    LEAVE,
-    LOAD,
-    PARK,
-    PATH,
-    PLAYING,
-    READ_BACK,
-    RUN,
-    SET_LOG,
-    SET_X,
-    SET_X_INCLUSIVE,
-    SET_Y,
-    SET_Y_INCLUSIVE,
-    START_LOG,
-    STOP_LOG,
-    TRIMMED,
-    UNREST,
-    WARM,
-    WELL,
-    connected,
-    pair,
-)
+from tests.rig.mirror import mirror_bytes as w
+from tests.rig.mirror.mirror_bytes import connected, pair
 from tests.rig.scripted import Late, Pair, ScriptedTransport, scripted
 
 WRONG = pair(
@@ -54,45 +27,50 @@ WRONG = pair(
     "7E 00 15 18 3F 00 00 00 00 00 00 00 3F 80 00 00 BE 80 00 00 3E 80 00 00 00 00 00 00 82 25 7E",
 )
 INDEX = pair("7E 00 11 02 68 0A 0B 3B 7E", "7E 00 11 04 00 00 00 02 73 40 7E")
-THERE, LOST = pair(GOTO, DONE), (bytes.fromhex(GOTO), b"")
+THERE, LOST = pair(w.GOTO, w.DONE), (bytes.fromhex(w.GOTO), b"")
 Call = Callable[[MirrorController], object]
 
 
 def play(mirror: MirrorController) -> None:
     """Load the path, and play its second and third position twice by pulses."""
-    mirror.load_path(PATH)
+    mirror.load_path(w.PATH)
     mirror.run(1, 3, 10.0, cycles=2, trigger=Trigger.RISING_EDGE)
 
 
 # what follows connecting, the call, settings, and what the call gives
 DONE_AS_ASKED: dict[str, tuple[list[Pair], Call, dict[str, Any], object]] = {
     "who is there": ([], lambda mirror: mirror.identity(), {}, Identity("MR-E-2", "1.2.4065", "ABCD0123")),
-    "going, in one frame": ([WELL, THERE], lambda mirror: mirror.goto(0.5, -0.25), {}, None),
+    "going, in one frame": ([w.WELL, THERE], lambda mirror: mirror.goto(0.5, -0.25), {}, None),
     "going, whatever the status": ([THERE], lambda mirror: mirror.goto(0.5, -0.25), {"check_status": False}, None),
-    "parking is going to 0; 0": ([WELL, pair(PARK, DONE)], lambda mirror: mirror.park(), {}, None),
+    "parking is going to 0; 0": ([w.WELL, pair(w.PARK, w.DONE)], lambda mirror: mirror.park(), {}, None),
     "a path, X before Y, half open, begun in one frame": (
-        [IDLE, LOAD, READ_BACK, HALT, SET_X, SET_Y, WELL, pair(RUN, DONE)],
+        [w.IDLE, w.LOAD, w.READ_BACK, w.HALT, w.SET_X, w.SET_Y, w.WELL, pair(w.RUN, w.DONE)],
         play,
         {"read_back": "all"},
         None,
     ),
     "a path of a device with inclusive ends": (
-        [IDLE, LOAD, HALT, SET_X_INCLUSIVE, SET_Y_INCLUSIVE, WELL, pair(RUN, DONE)],
+        [w.IDLE, w.LOAD, w.HALT, w.SET_X_INCLUSIVE, w.SET_Y_INCLUSIVE, w.WELL, pair(w.RUN, w.DONE)],
         play,
         {"ends": "inclusive", "read_back": "none"},
         None,
     ),
-    "waiting for rest": ([UNREST, UNREST, WELL], lambda mirror: mirror.settle(1.0), {}, None),
+    "waiting for rest": ([w.UNREST, w.UNREST, w.WELL], lambda mirror: mirror.settle(1.0), {}, None),
     "the temperature, in simple mode and back": (
-        [IDLE, LEAVE, GREET, (b"GETTEMP\r\n", b"31.5\r\n"), ENTER, WELL],
+        [w.IDLE, w.LEAVE, w.GREET, (b"GETTEMP\r\n", b"31.5\r\n"), w.ENTER, w.WELL],
         lambda mirror: mirror.temperature(),
         {},
         31.5,
     ),
     "the cell of X": ([INDEX], lambda mirror: mirror.index(), {}, 2),
     "letting go": ([], lambda mirror: mirror.close(), {}, None),
-    "letting go, parked": ([WELL, pair(PARK, DONE)], lambda mirror: mirror.close(), {"park_at_close": True}, None),
-    "letting go, parked in vain": ([WARM], lambda mirror: mirror.close(), {"park_at_close": True}, None),
+    "letting go, parked": (
+        [w.WELL, pair(w.PARK, w.DONE)],
+        lambda mirror: mirror.close(),
+        {"park_at_close": True},
+        None,
+    ),
+    "letting go, parked in vain": ([w.WARM], lambda mirror: mirror.close(), {"park_at_close": True}, None),
 }
 
 
@@ -100,7 +78,7 @@ DONE_AS_ASKED: dict[str, tuple[list[Pair], Call, dict[str, Any], object]] = {
 def test_each_call_is_these_bytes(name: str):
     """No other byte is sent, and each acknowledged; closing lets go of the port."""
     script, call, settings, given = DONE_AS_ASKED[name]
-    with scripted([*CONNECT, *script]) as transport:
+    with scripted([*w.CONNECT, *script]) as transport:
         assert call(connected(transport, **settings)) == given
         assert transport.closed == name.startswith("letting go")
 
@@ -111,28 +89,40 @@ REFUSED: dict[str, tuple[list[Pair], Call, dict[str, Any], type[Exception], str]
     "beyond the rim, aslant": ([], lambda mirror: mirror.goto(0.8, 0.8), {}, PoseError, OUTSIDE),
     "no number": ([], lambda mirror: mirror.goto(float("nan"), 0.0), {}, PoseError, OUTSIDE),
     "path beyond": ([], lambda mirror: mirror.load_path([(0, 0), (0.8, 0.8)]), {}, PoseError, r"\(index 1\)"),
-    "long path": ([], lambda mirror: mirror.load_path(PATH), {"vector_pairs": 2}, SettingsError, "holds 2 .* in parts"),
+    "long path": (
+        [],
+        lambda mirror: mirror.load_path(w.PATH),
+        {"vector_pairs": 2},
+        SettingsError,
+        "holds 2 .* in parts",
+    ),
     "empty path": ([], lambda mirror: mirror.load_path([]), {}, ShapeError, "at least one"),
-    "warm": ([WARM], lambda mirror: mirror.goto(0.5, 0), {}, RigError, "the mirror is too warm; mend that"),
-    "path under a path": ([PLAYING], lambda mirror: mirror.load_path(PATH), {}, RigError, "when that is over, or halt"),
+    "warm": ([w.WARM], lambda mirror: mirror.goto(0.5, 0), {}, RigError, "the mirror is too warm; mend that"),
+    "path under a path": (
+        [w.PLAYING],
+        lambda mirror: mirror.load_path(w.PATH),
+        {},
+        RigError,
+        "when that is over, or halt",
+    ),
     "mode under a path": (
-        [PLAYING],
+        [w.PLAYING],
         lambda mirror: mirror.temperature(),
         {},
         RigError,
         "when that is over, or halt it",
     ),
-    "never at rest": ([UNREST] * 6, lambda mirror: mirror.settle(0.05), {}, RigError, "not at rest after 0.05 s"),
-    "trimmed": ([TRIMMED], lambda mirror: mirror.settle(1.0), {}, RigError, "not where it was sent; .*trimmed"),
+    "never at rest": ([w.UNREST] * 6, lambda mirror: mirror.settle(0.05), {}, RigError, "not at rest after 0.05 s"),
+    "trimmed": ([w.TRIMMED], lambda mirror: mirror.settle(1.0), {}, RigError, "not where it was sent; .*trimmed"),
     "pulled cable": (
-        [WELL, (bytes.fromhex(GOTO), [DeviceGone("scripted went away")])],
+        [w.WELL, (bytes.fromhex(w.GOTO), [DeviceGone("scripted went away")])],
         lambda mirror: mirror.goto(0.5, -0.25),
         {},
         StateUnknown,
         "went away",
     ),
     "a run that is not acknowledged": (
-        [IDLE, LOAD, HALT, SET_X, SET_Y, WELL, (bytes.fromhex(RUN), b"")],
+        [w.IDLE, w.LOAD, w.HALT, w.SET_X, w.SET_Y, w.WELL, (bytes.fromhex(w.RUN), b"")],
         play,
         {"read_back": "none"},
         StateUnknown,
@@ -145,7 +135,7 @@ REFUSED: dict[str, tuple[list[Pair], Call, dict[str, Any], type[Exception], str]
 def test_what_cannot_be_is_refused_or_said(name: str):
     """What cannot be meant sends no byte, a status that forbids motion none that moves; the rest is said in words."""
     script, call, settings, error, words = REFUSED[name]
-    with scripted([*CONNECT, *script]) as transport, pytest.raises(error, match=words):
+    with scripted([*w.CONNECT, *script]) as transport, pytest.raises(error, match=words):
         call(connected(transport, **settings))
 
 
@@ -155,17 +145,17 @@ def test_nothing_is_sent_before_connecting():
     for call in (mirror.identity, mirror.status, mirror.temperature, mirror.park, mirror.halt, mirror.index):
         with pytest.raises(RigError, match="scripted is not connected; call connect first"):
             call()
-    with scripted(CONNECT) as transport, pytest.raises(RigError, match=r"whose id holds 'MR-E-9' .* got 'MR-E-2'"):
+    with scripted(w.CONNECT) as transport, pytest.raises(RigError, match=r"whose id holds 'MR-E-9' .* got 'MR-E-2'"):
         connected(transport, expected_id="MR-E-9")
 
 
 def test_what_is_not_loaded_is_not_played():
     """Ranges outside what is loaded, rates and cycles that mean nothing send no byte."""
-    with scripted([*CONNECT, IDLE, LOAD]) as transport:
+    with scripted([*w.CONNECT, w.IDLE, w.LOAD]) as transport:
         mirror = connected(transport, read_back="none")
         with pytest.raises(SettingsError, match="0:1 is no range of the 0 positions loaded; load them first"):
             mirror.run(0, 1, 10.0)
-        mirror.load_path(PATH)
+        mirror.load_path(w.PATH)
         for first, stop in ((0, 4), (2, 2), (-1, 2), (2, 1)):
             with pytest.raises(SettingsError, match=f"{first}:{stop} is no range of the 3 positions"):
                 mirror.run(first, stop, 10.0)
@@ -176,28 +166,28 @@ def test_what_is_not_loaded_is_not_played():
 
 def test_a_path_that_was_not_kept_is_not_played():
     """A cell that came back otherwise is named; so with an upload that failed, and the memory holds some of both."""
-    with scripted([*CONNECT, IDLE, LOAD, WRONG]) as transport:
+    with scripted([*w.CONNECT, w.IDLE, w.LOAD, WRONG]) as transport:
         mirror = connected(transport)
         with pytest.raises(RigError, match=r"cell 4 .*\(Y of position 1\) holds 0.25, 0 was sent"):
-            mirror.load_path(PATH)
+            mirror.load_path(w.PATH)
         with pytest.raises(SettingsError, match="0 positions loaded"):
             mirror.run(0, 3, 10.0)
-    with scripted([*CONNECT, IDLE, LOAD, IDLE, (LOAD[0], b"")]) as transport:
+    with scripted([*w.CONNECT, w.IDLE, w.LOAD, w.IDLE, (w.LOAD[0], b"")]) as transport:
         mirror = connected(transport, read_back="none")
-        mirror.load_path(PATH)
+        mirror.load_path(w.PATH)
         with pytest.raises(DeadlinePassed, match="writing cells 0 to 6"):
-            mirror.load_path(PATH)
+            mirror.load_path(w.PATH)
         with pytest.raises(SettingsError, match="0:3 is no range of the 0 positions loaded"):
             mirror.run(0, 3, 10.0)
 
 
 def test_an_unacknowledged_motion_freezes():
     """The motion goes once, later ones send no byte, closing neither; looking and halting still work."""
-    late = Late(1.02, bytes.fromhex(DONE))
-    script = [*CONNECT, IDLE, LOAD, WELL, (bytes.fromhex(GOTO), [late]), WELL, HALT]
+    late = Late(1.02, bytes.fromhex(w.DONE))
+    script = [*w.CONNECT, w.IDLE, w.LOAD, w.WELL, (bytes.fromhex(w.GOTO), [late]), w.WELL, w.HALT]
     with scripted(script) as transport:
         mirror = connected(transport, read_back="none", park_at_close=True)
-        mirror.load_path(PATH)
+        mirror.load_path(w.PATH)
         with pytest.raises(StateUnknown, match=r"going to 0.5; -0.25 was sent to scripted and may have happened"):
             mirror.goto(0.5, -0.25)
         for call in (mirror.park, lambda: mirror.goto(0, 0)):
@@ -213,7 +203,7 @@ def test_an_unacknowledged_motion_freezes():
 
 def test_pro_mode_is_entered_again_after_a_refusal():
     """Firmware that does not tell its temperature leaves the mode as it was."""
-    script = [*CONNECT, IDLE, LEAVE, GREET, (b"GETTEMP\r\n", b"NO\r\n"), ENTER, WELL, WELL]
+    script = [*w.CONNECT, w.IDLE, w.LEAVE, w.GREET, (b"GETTEMP\r\n", b"NO\r\n"), w.ENTER, w.WELL, w.WELL]
     with scripted(script) as transport:
         mirror = connected(transport)
         with pytest.raises(DeviceRefused, match="answered NO to GETTEMP"):
@@ -246,41 +236,27 @@ def give(monkeypatch: pytest.MonkeyPatch, transport: ScriptedTransport) -> None:
 SETTINGS = MirrorSettings(port="/dev/mirror", baud=256000, strict_crc=True)
 
 
-def test_opening_connects(monkeypatch: pytest.MonkeyPatch):
-    """Port and speed are those of the settings, and the controller is greeted."""
-    with scripted(CONNECT) as transport:
+def test_opening_connects_or_lets_go_of_the_port(monkeypatch: pytest.MonkeyPatch):
+    """Port and speed are those of the settings; without the controller it is let go of, unparked."""
+    silent = (b"START\r\n", b"")
+    with scripted(w.CONNECT) as transport:
         give(monkeypatch, transport)
         with open_mirror(SETTINGS, transport.clock) as mirror:
             assert mirror.identity().device == "MR-E-2"
         assert transport.closed
-
-
-def test_a_port_without_a_controller_is_let_go_of(monkeypatch: pytest.MonkeyPatch):
-    """Whoever tries again, or another program, finds the port free."""
-    silent = (b"START\r\n", b"")
-    with scripted([*[silent] * 3, (LEAVE[0], b""), *[silent] * 3]) as transport:
+    with scripted([*[silent] * 3, (w.LEAVE[0], b""), *[silent] * 3]) as transport:
         give(monkeypatch, transport)
         with pytest.raises(DeadlinePassed):
             open_mirror(SETTINGS, transport.clock)
         assert transport.closed
-
-
-def test_another_device_is_not_parked(monkeypatch: pytest.MonkeyPatch):
-    """Whoever parks at the end parks the mirror that was asked for: another controller is let go of as it was."""
-    with scripted(CONNECT) as transport:
+    with scripted(w.CONNECT) as transport:
         give(monkeypatch, transport)
         with pytest.raises(RigError, match="expected a controller whose id holds 'MR-9'"):
             open_mirror(replace(SETTINGS, expected_id="MR-9", park_at_close=True), transport.clock)
         assert transport.closed
 
 
-def test_no_port_no_mirror():
-    """A port that is not there is said before anything else."""
-    with pytest.raises(DeviceGone, match="there is no port /dev/no-such-port"):
-        open_mirror(MirrorSettings(port="/dev/no-such-port"))
-
-
-START: list[Pair] = [STOP_LOG, SET_LOG, START_LOG]
+START: list[Pair] = [w.STOP_LOG, w.SET_LOG, w.START_LOG]
 
 
 X3 = pair("7E 00 15 05 24 00 00 00 0C 34 96 7E", "7E 00 15 0C 3F 00 00 00 3F 80 00 00 00 00 00 00 93 D1 7E")
@@ -294,8 +270,8 @@ OUT_OF_RANGE = "7E 00 95 04 00 00 01 07 AC 97 7E"
 
 def test_a_log_is_started_stopped_and_fetched():
     """Both feedbacks, the rate, the run bit, and as many samples as the time since the start has."""
-    start = [STOP_LOG, SET_LOG, (START_LOG[0], [Late(0.002, bytes(START_LOG[1]))])]
-    with scripted([*CONNECT, *start, STOP_LOG, X3, Y3]) as transport:
+    start = [w.STOP_LOG, w.SET_LOG, (w.START_LOG[0], [Late(0.002, bytes(w.START_LOG[1]))])]
+    with scripted([*w.CONNECT, *start, w.STOP_LOG, X3, Y3]) as transport:
         mirror = connected(transport, log_rate_hz=1000.0)
         mirror.start_log()
         transport.clock.sleep(0.0035)
@@ -308,24 +284,15 @@ def test_a_log_is_started_stopped_and_fetched():
 def test_cells_that_are_played_are_logged_beside_positions():
     """The index of X's vector unit in slot 2, read as whole numbers."""
     slots = "24 00 24 01 24 02 24 11 00 00 23 02 00 00 23 03 00 00 68 0A 44 7A 00 00"
-    set_three = pair(f"7E 00 12 1A 00 04 {slots} 60 DF 7E", DONE)
+    set_three = pair(f"7E 00 12 1A 00 04 {slots} 60 DF 7E", w.DONE)
     index = pair("7E 00 15 05 24 02 00 00 0C 35 2E 7E", "7E 00 15 0C 00 00 00 00 00 00 00 01 00 00 00 07 79 1B 7E")
-    with scripted([*CONNECT, STOP_LOG, set_three, START_LOG, STOP_LOG, X3, Y3, index]) as transport:
+    with scripted([*w.CONNECT, w.STOP_LOG, set_three, w.START_LOG, w.STOP_LOG, X3, Y3, index]) as transport:
         mirror = connected(transport)
         mirror.start_log(1000.0, with_index=True)
         log = mirror.read_log(3)
     assert log.index is not None
     assert log.index.tolist() == [0, 1, 7]
     assert log.position.tolist() == [[0.5, -0.25], [1, 0], [0, -0.25]]
-
-
-@pytest.mark.parametrize("samples", [3, 5000])
-def test_never_more_than_the_logger_holds(samples: int):
-    """A number may be asked for; the setting bounds it."""
-    with scripted([*CONNECT, *START, STOP_LOG, X3, Y3]) as transport:
-        mirror = connected(transport, log_samples=3)
-        mirror.start_log(1000.0)
-        assert len(mirror.read_log(samples).position) == 3
 
 
 def test_a_log_ends_where_the_device_says(caplog: pytest.LogCaptureFixture):
@@ -337,30 +304,25 @@ def test_a_log_ends_where_the_device_says(caplog: pytest.LogCaptureFixture):
         pair("7E 00 15 05 24 01 00 00 28 35 71 7E", zeros),
         pair("7E 00 15 05 24 01 00 28 08 2A A9 7E", OUT_OF_RANGE),
     ]
-    with scripted([*CONNECT, *START, STOP_LOG, *script]) as transport:
+    with scripted([*w.CONNECT, *START, w.STOP_LOG, *script]) as transport:
         mirror = connected(transport)
         mirror.start_log(1000.0)
         assert mirror.read_log(12).position.shape == (10, 2)
     assert "ends at 10 of 12 samples" in caplog.text
 
 
-def test_other_refusals_are_errors():
-    """Only an index outside the log is its end."""
-    refused = pair("7E 00 15 05 24 00 00 00 0C 34 96 7E", "7E 00 95 04 00 00 01 01 2C 95 7E")
-    with scripted([*CONNECT, *START, STOP_LOG, refused]) as transport:
-        mirror = connected(transport)
-        mirror.start_log(1000.0)
-        with pytest.raises(DeviceRefused, match="no such register"):
-            mirror.read_log(3)
-
-
 def test_no_log_is_read_that_was_not_started():
-    """A log is read once."""
-    with scripted([*CONNECT, *START, STOP_LOG]) as transport:
-        mirror = connected(transport)
+    """A log is read once, never more of it than the setting says; only an index outside of it is its end."""
+    refused = pair("7E 00 15 05 24 00 00 00 0C 34 96 7E", "7E 00 95 04 00 00 01 01 2C 95 7E")
+    logs = [*START, w.STOP_LOG, X3, Y3, *START, w.STOP_LOG, refused]
+    with scripted([*w.CONNECT, *logs]) as transport:
+        mirror = connected(transport, log_samples=3)
         with pytest.raises(RigError, match="no log was started on scripted; start one"):
             mirror.read_log()
         mirror.start_log(1000.0)
-        assert mirror.read_log().position.shape == (0, 2)
+        assert len(mirror.read_log(5000).position) == 3
         with pytest.raises(RigError, match="no log was started"):
             mirror.read_log()
+        mirror.start_log(1000.0)
+        with pytest.raises(DeviceRefused, match="no such register"):
+            mirror.read_log(3)
