@@ -35,28 +35,35 @@ class Trigger(IntEnum):
 
 
 class Status(IntFlag):
-    """Status bits. The ``WAS`` bits stay until they are acknowledged."""
+    """Status bits, and what each says. The ``WAS`` bits stay until they are acknowledged."""
 
-    DISCONNECTED = 1 << 0
-    ELECTRONICS_WARM = 1 << 1
-    MIRROR_WARM = 1 << 2
-    EEPROM_INVALID = 1 << 3
-    NOT_STABLE = 1 << 4
-    OUTPUT_LIMIT = 1 << 5
-    AVERAGE_LIMIT = 1 << 6
-    TRIMMED = 1 << 7
-    WAS_DISCONNECTED = 1 << 8
-    WAS_ELECTRONICS_WARM = 1 << 9
-    WAS_MIRROR_WARM = 1 << 10
-    WAS_OUTPUT_LIMIT = 1 << 11
-    WAS_AVERAGE_LIMIT = 1 << 12
-    WAS_TRIMMED = 1 << 13
+    says: str
+
+    DISCONNECTED = 1 << 0, "the mirror head is not connected"
+    ELECTRONICS_WARM = 1 << 1, "the mirror head's electronics are too warm"
+    MIRROR_WARM = 1 << 2, "the mirror is too warm"
+    EEPROM_INVALID = 1 << 3, "the mirror's own calibration cannot be read"
+    NOT_STABLE = 1 << 4, "the mirror is not at rest"
+    OUTPUT_LIMIT = 1 << 5, "the drive is at its limit"
+    AVERAGE_LIMIT = 1 << 6, "the drive's average is at its limit"
+    TRIMMED = 1 << 7, "a target was beyond the rim, and was trimmed to it"
+    WAS_DISCONNECTED = 1 << 8, "the mirror head was not connected (since acknowledged last)"
+    WAS_ELECTRONICS_WARM = 1 << 9, "the mirror head's electronics were too warm (since acknowledged last)"
+    WAS_MIRROR_WARM = 1 << 10, "the mirror was too warm (since acknowledged last)"
+    WAS_OUTPUT_LIMIT = 1 << 11, "the drive was at its limit (since acknowledged last)"
+    WAS_AVERAGE_LIMIT = 1 << 12, "the drive's average was at its limit (since acknowledged last)"
+    WAS_TRIMMED = 1 << 13, "a target was trimmed to the rim (since acknowledged last)"
+
+    def __new__(cls, bit: int, says: str = "") -> Status:
+        status = int.__new__(cls, bit)
+        status._value_, status.says = bit, says
+        return status
 
     @property
     def words(self) -> list[str]:
         """What is on, in words for whoever stands before the rig; bits without a known meaning by their number."""
-        known = [words for bit, words in _WORDS.items() if bit in self]
-        rest = int(self) & ~sum(_WORDS)
+        known = [bit.says for bit in Status if bit in self]
+        rest = int(self) & ~sum(Status)
         return known + [f"bit {place}, whose meaning is not known" for place in range(32) if rest >> place & 1]
 
     @property
@@ -70,22 +77,6 @@ class Status(IntFlag):
         return bool(self & _STOPS)
 
 
-_WORDS = {
-    Status.DISCONNECTED: "the mirror head is not connected",
-    Status.ELECTRONICS_WARM: "the mirror head's electronics are too warm",
-    Status.MIRROR_WARM: "the mirror is too warm",
-    Status.EEPROM_INVALID: "the mirror's own calibration cannot be read",
-    Status.NOT_STABLE: "the mirror is not at rest",
-    Status.OUTPUT_LIMIT: "the drive is at its limit",
-    Status.AVERAGE_LIMIT: "the drive's average is at its limit",
-    Status.TRIMMED: "a target was beyond the rim, and was trimmed to it",
-    Status.WAS_DISCONNECTED: "the mirror head was not connected (since acknowledged last)",
-    Status.WAS_ELECTRONICS_WARM: "the mirror head's electronics were too warm (since acknowledged last)",
-    Status.WAS_MIRROR_WARM: "the mirror was too warm (since acknowledged last)",
-    Status.WAS_OUTPUT_LIMIT: "the drive was at its limit (since acknowledged last)",
-    Status.WAS_AVERAGE_LIMIT: "the drive's average was at its limit (since acknowledged last)",
-    Status.WAS_TRIMMED: "a target was trimmed to the rim (since acknowledged last)",
-}
 _STOPS = Status.DISCONNECTED | Status.ELECTRONICS_WARM | Status.MIRROR_WARM | Status.EEPROM_INVALID
 
 
