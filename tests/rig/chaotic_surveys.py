@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.source import Line, References
 from tests.rig.chaos_line import OFTEN, ChaosLine
-from tests.rig.small_rig import COARSE, FINE, SmallRig, small_rig, small_source
+from tests.rig.small_rig import COARSE, FINE, SmallRig, assert_simulated, small_rig
 
 SWEEPS = (COARSE, FINE)
 QUICK = ControlPatience(0.3, 2, 0.01)
@@ -88,6 +89,7 @@ def survey_in_chaos(seeds: range, *, every: tuple[float, float] = OFTEN) -> Chao
     return found
 
 
+@cache
 def undisturbed() -> Survey:
     """What the same rig gives without a line of chaos: the simulated source's lines."""
     with small_rig() as rig:
@@ -95,8 +97,7 @@ def undisturbed() -> Survey:
         survey.go_on(rig.source())
     assert survey.is_whole, survey.error
     for sweep in SWEEPS:
-        expected = [line.data for line in small_source().lines(sweep)]
-        np.testing.assert_array_equal([line.data for line in survey.lines[sweep.name]], expected)
+        assert_simulated(survey.lines[sweep.name], sweep)
     return survey
 
 

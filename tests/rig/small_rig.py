@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
+from pipeline.source import Line
 
 CAMERA = LineCamera(samples=48)
 NAMES = ("rotation", "slit", "smear", "vignetting", "shot", "read-noise")
@@ -41,6 +43,19 @@ def small_source(**changed: Any) -> SimulatedSource:
         rng.uniform(20, 200, (40, 48, 3)), CAMERA, name="small", wavelength_nm=np.array([460.0, 550.0, 640.0])
     )
     return replace(SimulatedSource(scene, Rig(CAMERA), 5, effects_on(*NAMES)), **changed)
+
+
+@cache
+def simulated_lines(sweep: Sweep) -> list[Line]:
+    """The simulated source's lines of a sweep, made once."""
+    return list(small_source().lines(sweep))
+
+
+def assert_simulated(found: Sequence[Line], sweep: Sweep, first: int = 0) -> None:
+    """The numbers of the simulated source's lines from ``first`` on, bit for bit and in order."""
+    expected = simulated_lines(sweep)[first:]
+    assert [line.number for line in found] == [line.number for line in expected]
+    np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
 
 
 @dataclass

@@ -25,7 +25,7 @@ from pipeline.rig.emulator.mirror_device import Fault
 from pipeline.rig.mirror.registers import Status
 from pipeline.source import Line
 from tests.rig.mirror.test_fault_suite import moves
-from tests.rig.small_rig import SmallRig, small_rig, small_source
+from tests.rig.small_rig import SmallRig, assert_simulated, small_rig
 
 SEEDS = range(20)
 SWEEP = Sweep("fine-5", "fine", "x", 1.5, -4.5, 7)
@@ -57,8 +57,7 @@ def undisturbed() -> list[Line]:
     """The sweep's lines as an undisturbed rig gives them, which are the simulated source's."""
     with small_rig(vector_pairs=PAIRS) as rig:
         lines = list(rig.source().lines(SWEEP))
-    expected = small_source().lines(SWEEP)
-    np.testing.assert_array_equal([line.data for line in lines], [line.data for line in expected])
+    assert_simulated(lines, SWEEP)
     return lines
 
 

@@ -18,17 +18,16 @@ from pipeline.rig.capture.capture_runner import CaptureJournal
 from pipeline.rig.mirror.path_player import wire_positions
 from pipeline.rig.mirror.pro_mode import Command
 from pipeline.source import Line
-from tests.rig.small_rig import CAMERA, COARSE, FINE, small_rig, small_source
+from tests.rig.small_rig import CAMERA, COARSE, FINE, assert_simulated, simulated_lines, small_rig, small_source
 
 
 def assert_same(found: list[Line], sweep: Sweep, first: int = 0) -> None:
     """The simulated source's lines: numbers bit for bit, positions at the wire's precision, times to a microsecond."""
-    expected = list(small_source().lines(sweep, first))
-    assert [line.number for line in found] == [line.number for line in expected]
-    np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
+    assert_simulated(found, sweep, first)
     wired = wire_positions(line_positions(sweep, CAMERA)[first:])
     np.testing.assert_array_equal([(line.mirror_x, line.mirror_y) for line in found], wired.astype(np.float64))
-    np.testing.assert_allclose([line.time_s for line in found], [line.time_s for line in expected], atol=1e-6)
+    times = [line.time_s for line in simulated_lines(sweep)[first:]]
+    np.testing.assert_allclose([line.time_s for line in found], times, atol=1e-6)
     assert all(line.valid and line.exposure_ms == CAMERA.exposure_ms for line in found)
 
 
@@ -62,7 +61,7 @@ def test_lines_of_a_mirror_mounted_otherwise_are_the_same_once_it_is_told(mounti
         assert source.record["rig"]["mounting"] == asdict(mounting)
     with small_rig(mounting=mounting, log_pulses=True, log_samples=16000, **told) as rig:
         found = list(rig.source().lines(FINE))
-    np.testing.assert_array_equal([line.data for line in found], [line.data for line in small_source().lines(FINE)])
+    assert_simulated(found, FINE)
     off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - line_positions(FINE, CAMERA)
     assert np.hypot(*off.T).max() * 11275 < 3  # px
     with small_rig(mounting=mounting) as rig:
@@ -81,9 +80,8 @@ def test_loads_of_the_vector_memory_change_no_line(sweep: Sweep, captures: int):
     with small_rig(vector_pairs=17) as rig:
         found = list(rig.source().lines(sweep))
         assert len(rig.captures) == captures
-    expected = list(small_source().lines(sweep))
-    np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
-    late = np.array([line.time_s for line in found]) - [line.time_s for line in expected]
+    assert_simulated(found, sweep)
+    late = np.array([line.time_s for line in found]) - [line.time_s for line in simulated_lines(sweep)]
     assert abs(late[0]) < 1e-6
     assert (np.diff(late) > -2e-6).all()
     assert np.count_nonzero(np.diff(late) > 0.01) == captures - 1
@@ -166,8 +164,7 @@ def test_edges_in_the_log_tie_lines_to_where_the_mirror_was(sweep: Sweep, pulses
         found = list(source.lines(sweep))
         middle_s = [capture.middle_s(np.arange(sweep.lines)) for capture in rig.emulated.camera.captures]
         true = rig.emulated.mirror.positions(middle_s[0])
-    expected = list(small_source().lines(sweep))
-    np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
+    assert_simulated(found, sweep)
     assert all(line.valid for line in found)
     off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - true
     assert np.hypot(*off.T).max() * 11275 < 0.2  # px
