@@ -15,7 +15,7 @@ from flows.settings.declared import SURVEY, TABLES
 from flows.settings.documents import flag_help
 from flows.settings.load import load_settings
 from flows.terminal.shown_text import print_json
-from pipeline.rig.survey_rig import SurveyRig
+from pipeline.rig.device_settings import SurveyRig
 
 IN_TABLES = {"exposure_ms": "camera.exposure_ms"}  # flags of what a settings file has in a table
 _DECLARED = SURVEY | {name: TABLES["camera"][name] for name in IN_TABLES}

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from flows.settings.survey_settings import BUILT_IN_SCENES, RIG_FIELD, MapChoice, Settings
 from models.network.vgg_sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import SettingsError
-from pipeline.rig.mirror.mirror_settings import MOST_PAIRS
+from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
 
 IN_NAT = ("gain", "entropy")  # policies whose scores are gains, or the most that these can be

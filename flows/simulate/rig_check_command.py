@@ -17,10 +17,10 @@ from flows.terminal.shown_text import on_stdout, print_json
 from pipeline.errors import SettingsError
 from pipeline.geometry.scan import CostModel
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.emulator.fault_names import fault_table
 from pipeline.rig.mirror.mirror_controller import open_mirror
 from pipeline.rig.rig_check import CheckRow, Device, check_camera, check_mirror, works
-from pipeline.rig.survey_rig import SurveyRig
 
 DONE, FAILED, PARTLY = 0, 1, 3
 LIST = "list"

@@ -13,8 +13,8 @@ from flows.settings.survey_settings import Settings
 from pipeline.geometry.mounting import STRAIGHT
 from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.camera.camera_settings import CameraLimits, check_times
-from pipeline.rig.clock import SYSTEM_CLOCK, Clock
+from pipeline.rig.device_settings import CameraLimits, check_times
+from pipeline.rig.devices import SYSTEM_CLOCK, Clock
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
@@ -122,17 +122,23 @@ def field_source(
     """
     if settings.source != "rig":
         return SimulatedField(simulated)
-    from pipeline.rig.capture.rig_source import RigSource, RigView  # drivers load pyserial, which others do without
+    from pipeline.rig.capture.rig_source import RigSource  # drivers load pyserial, which others do without
 
     camera = settings.camera
     check_times(camera.exposure_ms, camera.frame_ms, CameraLimits(most_rate_hz=camera.max_rate_hz))
     if settings.rig.mounting != STRAIGHT:
         for sweep in planned:
             settings.rig.mounting.to_device(sweep_positions(sweep, camera))
-    view = RigView(camera, scene.wavelength_nm, scene.shape)
-    pairs = settings.cost.vector_pairs
     return RigField(
-        RigSource(view, lambda: open_devices(settings), KeptInMemory(), rig=settings.rig, vector_pairs=pairs)
+        RigSource(
+            camera,
+            scene.wavelength_nm,
+            scene.shape,
+            lambda: open_devices(settings),
+            KeptInMemory(),
+            rig=settings.rig,
+            vector_pairs=settings.cost.vector_pairs,
+        )
     )
 
 

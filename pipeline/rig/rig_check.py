@@ -11,8 +11,8 @@ from typing import Literal
 
 from pipeline.errors import PipelineError, RigError
 from pipeline.rig.camera.camera_files import log_in
-from pipeline.rig.camera.camera_settings import FileServer
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.device_settings import FileServer
 from pipeline.rig.mirror.mirror_controller import MirrorController, check_model
 from pipeline.rig.mirror.registers import Status
 
@@ -80,7 +80,11 @@ def check_camera(camera: HeadwallCamera, server: FileServer) -> list[CheckRow]:
     rows: list[CheckRow] = []
     with _warnings(rows, "camera"):
         try:
-            rows.append(_capturing(camera))
+            if camera.is_capturing():
+                mend = "is another program at work? Else stop it"
+                rows.append(CheckRow("camera", "whether it captures", "a capture runs", "warn", mend))
+            else:
+                rows.append(CheckRow("camera", "whether it captures", "no capture runs"))
             _row(rows, "camera", "list its files", lambda: _listing(camera))
         except RigError as error:
             rows.append(failed("camera", CONNECT, error))
@@ -91,7 +95,12 @@ def check_camera(camera: HeadwallCamera, server: FileServer) -> list[CheckRow]:
 
 
 def _ask_mirror(mirror: MirrorController, rows: list[CheckRow], *, move: bool) -> None:
-    rows.append(_identity(mirror))
+    found = mirror.identity()
+    try:
+        check_model(found, mirror.wire.port, mirror.settings.expected_id)
+        rows.append(CheckRow("mirror", "identity", found.words))
+    except RigError as error:
+        rows.append(failed("mirror", "identity", error))
     if mirror.found_in_pro:
         rows.append(CheckRow("mirror", "mode", "it was in pro mode, as drivers leave it"))
     try:
@@ -105,21 +114,10 @@ def _ask_mirror(mirror: MirrorController, rows: list[CheckRow], *, move: bool) -
             rows.append(CheckRow("mirror", "temperature", f"{mirror.temperature():.1f} deg C"))
     except RigError as error:
         rows.append(failed("mirror", "status", error))
-    if not move:
-        return
-    if any(row.verdict == "fail" for row in rows) or playing:
+    if move and (playing or any(row.verdict == "fail" for row in rows)):
         rows.append(CheckRow("mirror", "move", "nothing was moved", "warn", "mend what is told above first"))
-        return
-    _move(mirror, rows)
-
-
-def _identity(mirror: MirrorController) -> CheckRow:
-    found = mirror.identity()
-    try:
-        check_model(found, mirror.wire.port, mirror.settings.expected_id)
-    except RigError as error:
-        return failed("mirror", "identity", error)
-    return CheckRow("mirror", "identity", found.words)
+    elif move:
+        _move(mirror, rows)
 
 
 def _status(mirror: MirrorController, *, playing: bool) -> CheckRow:
@@ -145,40 +143,26 @@ def _move(mirror: MirrorController, rows: list[CheckRow]) -> None:
         try:
             mirror.goto(x, y)
             mirror.settle(SETTLE_S)
-            rows.append(_arrived(asked, (x, y), _position(mirror)))
+            mirror.start_log(LOG_HZ)
+            mirror.wire.clock.sleep(2 * LOGGED / LOG_HZ)
+            found = mirror.read_log(LOGGED).position.astype(float).mean(axis=0)
         except RigError as error:
             rows.append(failed("mirror", asked, error))
             return
-
-
-def _position(mirror: MirrorController) -> tuple[float, float]:
-    """Where the mirror says it is, by its log."""
-    mirror.start_log(LOG_HZ)
-    mirror.wire.clock.sleep(2 * LOGGED / LOG_HZ)
-    x, y = mirror.read_log(LOGGED).position.astype(float).mean(axis=0)
-    return float(x), float(y)
-
-
-def _arrived(asked: str, wanted: tuple[float, float], found: tuple[float, float]) -> CheckRow:
-    off = math.dist(wanted, found)
-    words = f"read back {found[0]:.4f}; {found[1]:.4f}, {off:.1g} off"
-    if not off <= FAR:
-        mend = "it is not where it was sent: look at the mirror head and its cable before it moves again"
-        return CheckRow("mirror", asked, words, "fail", mend)
-    if off > NEAR:
-        return CheckRow("mirror", asked, words, "warn", "further off than 0.15 deg would explain: is it in tune?")
-    return CheckRow("mirror", asked, words)
-
-
-def _capturing(camera: HeadwallCamera) -> CheckRow:
-    asked = "whether it captures"
-    if camera.is_capturing():
-        return CheckRow("camera", asked, "a capture runs", "warn", "is another program at work? Else stop it")
-    return CheckRow("camera", asked, "no capture runs")
+        off = math.dist((x, y), found)
+        words = f"read back {found[0]:.4f}; {found[1]:.4f}, {off:.1g} off"
+        if not off <= FAR:
+            mend = "it is not where it was sent: look at the mirror head and its cable before it moves again"
+            rows.append(CheckRow("mirror", asked, words, "fail", mend))
+        elif off > NEAR:
+            mend = "further off than 0.15 deg would explain: is it in tune?"
+            rows.append(CheckRow("mirror", asked, words, "warn", mend))
+        else:
+            rows.append(CheckRow("mirror", asked, words))
 
 
 def _listing(camera: HeadwallCamera) -> str:
-    names = [file.name for file in camera.control.list_files("/")]
+    names = [file.name for file in camera.list_files("/")]
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     return f"{', '.join(names[:MOST_NAMED])}{more}" if names else "nothing there"
 
@@ -193,26 +177,15 @@ def _row(rows: list[CheckRow], device: Device, asked: str, ask: Callable[[], str
 @contextmanager
 def _warnings(rows: list[CheckRow], device: Device) -> Iterator[None]:
     """Make a row of what the drivers warned of: answers that were late, damaged, or not asked for."""
-    logger, heard = logging.getLogger("pipeline.rig"), _Heard()
+    logger, heard = logging.getLogger("pipeline.rig"), logging.Handler(logging.WARNING)
+    words: list[str] = []
+    heard.emit = lambda record: words.append(record.getMessage())  # type: ignore[method-assign]
     logger.addHandler(heard)
     try:
         yield
     finally:
         logger.removeHandler(heard)
-        words = heard.words
         if words and rows and rows[0].asked != CONNECT:  # that row says it all
             more = f"; and {len(words) - MOST_NAMED} more" if len(words) > MOST_NAMED else ""
             came = "; ".join(one.partition("; ")[0] for one in words[:MOST_NAMED])
             rows.append(CheckRow(device, "bytes on the line", came + more, "warn", LOOK_AT_LINE))
-
-
-class _Heard(logging.Handler):
-    """Keeps warnings in words."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.words: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Keep one."""
-        self.words.append(record.getMessage())

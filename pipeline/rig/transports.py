@@ -1,25 +1,38 @@
-"""Bytes to and from a device, with deadlines of a clock: over a serial port, or what else pyserial knows, or TCP."""
+"""Bytes to and from a device, with deadlines of a clock: over a serial port, or what else pyserial knows, or TCP; and
+transactions over such a line: a lock, a deadline, what is retried and what never is, and what stays frozen.
+"""
 
 from __future__ import annotations
 
 import errno
+import logging
+import math
 import socket
-from typing import Any, Protocol
+import threading
+from collections.abc import Callable
+from typing import Literal, Protocol, TypeVar
 
 import serial
 from serial import SerialException, SerialTimeoutException
 from serial.tools import list_ports
 
-from pipeline.errors import SettingsError
-from pipeline.rig.clock import SYSTEM_CLOCK, Clock
-from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
+from pipeline.errors import RigError, SettingsError
+from pipeline.rig.device_settings import Patience
+from pipeline.rig.devices import SYSTEM_CLOCK, Clock, DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
 
 USB_ID = (0x0483, 0xA31E)  # vendor and product of the mirror controller
 _SLICE_S = 0.02  # reads wait in slices: by so much a deadline may be overrun
 _WRITE_S = 0.25  # a frame takes 10 ms at 115200
-_MOST_DRAINED = 1 << 16  # bytes of a port that never ends
-_LEAST_WAIT_S = 0.001  # of a socket
-_MOST_DRAINED_TCP = 1 << 20
+_MOST_DRAINED = 1 << 16  # bytes of a port that never ends; over TCP 16 times as many
+LOG = logging.getLogger(__name__)
+BITS_PER_BYTE = 10  # a start bit, eight of data, a stop bit
+
+# a greeting is a read that a device in another mode does not answer, and before which others may have left bytes
+Kind = Literal["greeting", "read", "write", "motion"]
+_READS = ("greeting", "read")
+Answer = TypeVar("Answer")
+# Takes bytes as they come and gives the answer once it is whole.
+Receiver = Callable[[bytes], Answer | None]
 
 
 class Transport(Protocol):
@@ -46,28 +59,28 @@ class Transport(Protocol):
 
 
 class SerialTransport:
-    """A :class:`Transport` over a serial port, held exclusively.
+    """A :class:`Transport` over a serial port, held exclusively, or an address that pyserial knows (``socket://host:port``).
 
-    Parameters
-    ----------
-    port
-        Name of the port, or an address that pyserial knows (``socket://host:port``).
-    baud
-        Speed; a USB port takes any.
-
-    Raises
-    ------
-    DeviceGone : no such port, in use, or not permitted; the message says what to do.
-    SettingsError : no such kind of address, or a speed that the port does not have.
+    DeviceGone where there is no such port, it is in use, or not permitted; SettingsError for a kind of address, or a
+    speed, that there is not.
     """
 
     def __init__(self, port: str, baud: int, clock: Clock = SYSTEM_CLOCK) -> None:
         self.port = port
         self._clock = clock
-        self._serial = _open(port, baud)
+        try:
+            self._serial = serial.serial_for_url(
+                port, baudrate=baud, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True
+            )
+        except SerialException as error:
+            raise DeviceGone(_why_not(port, error)) from error
+        except (ValueError, OverflowError) as error:
+            raise SettingsError(
+                f"expected a port's name or an address that pyserial knows, and a speed, got {port!r} at {baud!r}: "
+                f"{error}"
+            ) from error
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Send all of the bytes until then; see `Transport`."""
         if self._clock.now() >= deadline:
             raise DeadlinePassed(f"no time was left to send {len(data)} bytes to {self.port}; give a longer deadline")
         try:
@@ -80,7 +93,6 @@ class SerialTransport:
             raise self._gone(error) from error
 
     def read(self, at_most: int, deadline: float) -> bytes:
-        """Give what has come, at least a byte, until then; see `Transport`."""
         try:
             while self._clock.now() < deadline:
                 first: bytes = self._serial.read(1)
@@ -92,7 +104,6 @@ class SerialTransport:
             raise self._gone(error) from error
 
     def drain(self) -> bytes:
-        """Give what lies in the buffers, waiting for nothing."""
         drained = b""
         try:
             while len(drained) < _MOST_DRAINED and (there := self._serial.in_waiting):
@@ -108,20 +119,17 @@ class SerialTransport:
         return DeviceGone(f"{self.port} went away ({error}); look at the cable and the power, then connect again")
 
 
-def _open(port: str, baud: int) -> Any:
-    try:
-        return serial.serial_for_url(port, baudrate=baud, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True)
-    except SerialException as error:
-        raise DeviceGone(_why_not(port, error)) from error
-    except (ValueError, OverflowError) as error:
-        raise SettingsError(
-            f"expected a port's name or an address that pyserial knows, and a speed, got {port!r} at {baud!r}: {error}"
-        ) from error
-
-
 def _why_not(port: str, error: OSError) -> str:
     if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-        return f"there is no port {port}; {_ports_here()}"
+        ports = list(list_ports.comports())
+        mirrors = [one.device for one in ports if (one.vid, one.pid) == USB_ID]
+        if mirrors:
+            what = f"a mirror controller is at {', '.join(mirrors)}: set the port to that"
+        elif ports:
+            what = f"there are {', '.join(sorted(one.device for one in ports))}; is the controller on?"
+        else:
+            what = "this machine has no serial port: is the controller on, and its cable in?"
+        return f"there is no port {port}; {what}"
     if error.errno in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
         return f"{port} is in use by another program; close that, since two would mix their motions"
     if error.errno in (errno.EACCES, errno.EPERM):
@@ -129,25 +137,8 @@ def _why_not(port: str, error: OSError) -> str:
     return f"{port} cannot be opened: {error}; is it a serial port, and the device on?"
 
 
-def _ports_here() -> str:
-    """Say which ports there are, and which of them is a mirror controller."""
-    ports = list(list_ports.comports())
-    mirrors = [port.device for port in ports if (port.vid, port.pid) == USB_ID]
-    if mirrors:
-        return f"a mirror controller is at {', '.join(mirrors)}: set the port to that"
-    if not ports:
-        return "this machine has no serial port: is the controller on, and its cable in?"
-    return f"there are {', '.join(sorted(port.device for port in ports))}; is the controller on?"
-
-
 class SocketTransport:
-    """A :class:`Transport` to ``host:port``.
-
-    Raises
-    ------
-    SettingsError : the host or the port cannot be one.
-    DeviceGone : nobody answers there; the message says what to do.
-    """
+    """A :class:`Transport` to ``host:port``; SettingsError where that cannot be, DeviceGone where nobody is there."""
 
     def __init__(self, host: str, port: int, clock: Clock = SYSTEM_CLOCK, *, connect_s: float = 3.0) -> None:
         if not host or not 0 < port < 65536:
@@ -167,7 +158,6 @@ class SocketTransport:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Send all of the bytes until then; see `Transport`."""
         left = deadline - self._clock.now()
         if left <= 0:
             raise DeadlinePassed(f"no time was left to send {len(data)} bytes to {self.port}; give a longer deadline")
@@ -180,12 +170,11 @@ class SocketTransport:
             raise self._gone(str(error)) from error
 
     def read(self, at_most: int, deadline: float) -> bytes:
-        """Give what has come, at least a byte, until then; see `Transport`."""
         left = deadline - self._clock.now()
         if left <= 0:
             return b""
         try:
-            self._socket.settimeout(max(left, _LEAST_WAIT_S))
+            self._socket.settimeout(max(left, 1e-3))
             data = self._socket.recv(at_most)
         except TimeoutError:
             self._clock.sleep(deadline - self._clock.now())  # a clock turned by hand has not moved meanwhile
@@ -197,11 +186,10 @@ class SocketTransport:
         return data
 
     def drain(self) -> bytes:
-        """Give what lies in the buffers, waiting for nothing."""
         drained = b""
         self._socket.setblocking(False)
         try:
-            while len(drained) < _MOST_DRAINED_TCP:
+            while len(drained) < 16 * _MOST_DRAINED:
                 data = self._socket.recv(65536)
                 if not data:
                     raise self._gone("closed by the other end")
@@ -219,3 +207,109 @@ class SocketTransport:
 
     def _gone(self, why: str) -> DeviceGone:
         return DeviceGone(f"the connection to {self.port} was lost ({why}); look at the cable and the power")
+
+
+class Wire:
+    """One device behind a transport. Only one transaction runs at a time, and each begins with an empty line.
+
+    A read is asked again, within the deadline of the first; a write never is; a motion never is, and one that is not
+    acknowledged freezes all motions: where the mirror is is for a person to see, who connects anew then.
+    """
+
+    def __init__(self, transport: Transport, clock: Clock, patience: Patience) -> None:
+        self.transport = transport
+        self.clock = clock
+        self.patience = patience
+        self.lock = threading.RLock()
+        self.unknown = ""  # why the state is unknown; empty where it is known
+        self._owed = 0  # requests whose answer may still come
+
+    @property
+    def port(self) -> str:
+        """Name of the port."""
+        return self.transport.port
+
+    def exchange(self, data: bytes, name: str, kind: Kind, receiver: Callable[[], Receiver[Answer]]) -> Answer:
+        """Send a request, called ``name`` in messages, and wait for its answer.
+
+        ``receiver`` makes a receiver, one for each time that the request is sent. Raises StateUnknown where a motion
+        was not acknowledged, or motions are frozen since an earlier one was not; DeviceRefused; DeadlinePassed where a
+        read or a write was not answered in time; DeviceGone.
+        """
+        with self.lock:
+            if kind == "motion":
+                self.check_known(name)
+            self._empty_line(f"before {name}", level=logging.INFO if kind == "greeting" else logging.WARNING)
+            deadline = self.clock.now() + self.patience.deadline_s
+            left = 1 + (self.patience.retries if kind in _READS else 0)
+            while True:
+                silence_s = (deadline - self.clock.now()) / left
+                try:
+                    return self._once(data, name, receiver(), silence_s, deadline)
+                except RigError as error:
+                    if kind == "motion" and not isinstance(error, DeviceRefused):
+                        self.unknown = f"{name} was sent and not acknowledged"
+                        raise StateUnknown(
+                            f"{name} was sent to {self.port} and may have happened or not: {error}. It is not sent "
+                            "again, and all motions are refused. Look at the mirror, then run again, which connects "
+                            "anew"
+                        ) from error
+                    left -= 1
+                    again = error.garbled if isinstance(error, DeviceRefused) else not isinstance(error, DeviceGone)
+                    if left == 0 or not again:
+                        raise
+                    usual = kind == "greeting" and isinstance(error, DeadlinePassed) and error.silent
+                    LOG.log(logging.INFO if usual else logging.WARNING, "%s; asking again", error)
+                    self._empty_line("before asking again", deadline)
+                    if self.clock.now() >= deadline:
+                        raise
+                except BaseException:  # whoever is interrupted here does not know either
+                    self.unknown = f"{name} was interrupted" if kind == "motion" else self.unknown
+                    raise
+
+    def _once(self, data: bytes, name: str, receiver: Receiver[Answer], silence_s: float, deadline: float) -> Answer:
+        """Send once, and wait until the device has said nothing for a while, or to the deadline where it goes on."""
+        began = self.clock.now()
+        self._owed += 1
+        self.transport.write(data, deadline)
+        came = b""
+        until = min(began + silence_s, deadline)
+        while self.clock.now() < until:
+            part = self.transport.read(4096, until)
+            until = min(self.clock.now() + silence_s, deadline) if part else until
+            came += part
+            try:
+                answer = receiver(part) if part else None
+            except DeviceRefused:  # an answer all the same; of what is none, the answer may still come
+                self._owed -= 1
+                raise
+            if answer is not None:
+                self._owed -= 1
+                return answer
+        said = f"{len(came)} bytes that are none came: {came[:32].hex(' ')}" if came else "nothing came"
+        raise DeadlinePassed(
+            f"no answer to {name} from {self.port} within {self.clock.now() - began:.3g} s ({said}); is the "
+            f"controller on, its cable in, and the port's speed right?",
+            silent=not came,
+        )
+
+    def _empty_line(self, when: str, latest: float = math.inf, *, level: int = logging.WARNING) -> None:
+        """Drop what is on the line. Where an answer is still owed, wait for silence: it would pass for the next one."""
+        stale = self.transport.drain()
+        now = self.clock.now()
+        latest = min(latest, now + 5 * self.patience.quiet_s)  # some devices never stop
+        until = min(now + self.patience.quiet_s, latest)
+        while self._owed and (part := self.transport.read(4096, until)):
+            stale += part
+            until = min(self.clock.now() + self.patience.quiet_s, latest)
+        self._owed = 0
+        if stale:
+            LOG.log(level, "%s: dropped %d stale bytes %s: %s", self.port, len(stale), when, stale[:64].hex(" "))
+
+    def check_known(self, name: str) -> None:
+        """Refuse a motion where an earlier one was not acknowledged (StateUnknown)."""
+        if self.unknown:
+            raise StateUnknown(
+                f"{name} is refused on {self.port}: {self.unknown}, so where the mirror is is not known. Look at it, "
+                f"then run again, which connects anew"
+            )

@@ -26,7 +26,7 @@ from typing import BinaryIO
 from urllib.parse import quote
 
 from pipeline.checked_lines import read_checked, with_check
-from pipeline.rig.device_errors import NotKept
+from pipeline.rig.devices import NotKept
 from storage.archive.plain_files import open_plain, plain_reader, plain_size, read_plain
 from storage.archive.staging import sync_path
 

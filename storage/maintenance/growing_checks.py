@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from pipeline.checked_lines import read_checked
-from pipeline.rig.capture.capture_journal import JOURNAL
+from pipeline.rig.capture import JOURNAL
 from storage.archive.ledger import FOLDER, SUFFIX
 from storage.archive.plain_files import NotPlainError, kind_of, plain_reader, read_plain
 from storage.arrays.fetched_files import SUMS, first_unlike

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.rig.envi_fields import finite_number, listed_numbers, split_header, wavelengths_nm
+from pipeline.rig.camera.camera_texts import finite_number, listed_numbers, split_header, wavelengths_nm
 
 LARGEST_HEADER = 1 << 22  # bytes; the largest seen holds 33 thousand
 INTERLEAVES = ("bil", "bip", "bsq")

@@ -19,7 +19,7 @@ from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.rig.envi_fields import MICROMETRES, NANOMETRES, UNSAID
+from pipeline.rig.camera.camera_texts import MICROMETRES, NANOMETRES, UNSAID
 from storage.arrays.layout import missing_codec
 from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, ReadLines
 from storage.readers.zarr_metadata import (

@@ -121,7 +121,7 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
     from flows.survey.run import make_source, open_run
     from flows.survey.stages.effects import chosen_effects
     from flows.survey.survey import StageRunner, survey
-    from pipeline.rig.clock import ManualClock
+    from pipeline.rig.devices import ManualClock
     from pipeline.rig.emulator.emulated_rig import EmulatedRig
 
     run = open_run(settings)

@@ -13,13 +13,12 @@ from itertools import pairwise
 import numpy as np
 from measure import Row
 
-from pipeline.rig.clock import SYSTEM_CLOCK
+from pipeline.rig.device_settings import MirrorSettings, ReadBack
+from pipeline.rig.devices import SYSTEM_CLOCK
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.emulator.mirror_ports import EmulatedPort
 from pipeline.rig.mirror.mirror_controller import open_mirror
-from pipeline.rig.mirror.mirror_settings import MirrorSettings
-from pipeline.rig.mirror.steering import ReadBack
-from pipeline.rig.mirror.transactions import BITS_PER_BYTE
+from pipeline.rig.transports import BITS_PER_BYTE
 
 PAIRS = 1500
 BAUDS = (115200, 256000)

@@ -22,7 +22,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from pipeline.errors import PipelineError
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture.capture_journal import JOURNAL, CaptureJournal, CaptureRecord
+from pipeline.rig.capture import JOURNAL
+from pipeline.rig.capture.capture_paths import CaptureRecord
+from pipeline.rig.capture.capture_runner import CaptureJournal
 from storage.archive.ledger import Ledger
 from storage.arrays.spool import Spool
 from storage.maintenance.growing_checks import growing_problems

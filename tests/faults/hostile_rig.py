@@ -24,10 +24,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.errors import PipelineError
 from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
-from pipeline.rig.camera.camera_settings import CameraAddress, ControlPatience, FileServer
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer, MirrorSettings
 from pipeline.rig.mirror.mirror_controller import open_mirror
-from pipeline.rig.mirror.mirror_settings import MirrorSettings
 from pipeline.rig.rig_check import CheckRow, check_camera, check_mirror
 from tests.faults.fault_table import Clock, Row
 from tests.rig.camera.hostile_camera import (

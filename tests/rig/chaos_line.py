@@ -61,9 +61,7 @@ class ChaosLine:
     ``every`` are bytes between two strikes, on control connections and on transfers.
     """
 
-    def __init__(
-        self, port: int, file_port: int, seed: int, *, every: tuple[float, float] = (4000.0, 20_000.0)
-    ) -> None:
+    def __init__(self, port: int, file_port: int, seed: int, *, every: tuple[float, float] = OFTEN) -> None:
         self.calm = False
         self.every = every
         self._rng = np.random.default_rng(seed)

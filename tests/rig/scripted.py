@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from pipeline.rig.clock import ManualClock
+from pipeline.rig.devices import ManualClock
 
 
 @dataclass(frozen=True)

@@ -5,27 +5,32 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mounting import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import Kept, KeptInMemory
 from pipeline.rig.capture.capture_runner import RigDevices
-from pipeline.rig.capture.rig_source import RigSource, RigView
-from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults
+from pipeline.rig.capture.rig_source import RigSource
+from pipeline.rig.device_settings import SurveyRig
+from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, InProcessRig
-from pipeline.rig.emulator.mirror_faults import Fault
+from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
+from pipeline.rig.emulator.mirror_device import Fault
 from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.survey_rig import SurveyRig
 from pipeline.simulator.effects.registry import effects_on
+from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
+from pipeline.source import Line
 
 CAMERA = LineCamera(samples=48)
 NAMES = ("rotation", "slit", "smear", "vignetting", "shot", "read-noise")
@@ -42,6 +47,19 @@ def small_source(**changed: Any) -> SimulatedSource:
     return replace(SimulatedSource(scene, Rig(CAMERA), 5, effects_on(*NAMES)), **changed)
 
 
+@cache
+def simulated_lines(sweep: Sweep) -> list[Line]:
+    """The simulated source's lines of a sweep, made once."""
+    return list(small_source().lines(sweep))
+
+
+def assert_simulated(found: Sequence[Line], sweep: Sweep, first: int = 0) -> None:
+    """The numbers of the simulated source's lines from ``first`` on, bit for bit and in order."""
+    expected = simulated_lines(sweep)[first:]
+    assert [line.number for line in found] == [line.number for line in expected]
+    np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
+
+
 @dataclass
 class SmallRig:
     """An emulated rig and what is needed to look through it."""
@@ -49,7 +67,7 @@ class SmallRig:
     line: InProcessRig
     settings: SurveyRig
     vector_pairs: int
-    view: RigView
+    wavelength_nm: NDArray[np.float64]
     opened: int = 0
 
     @property
@@ -73,7 +91,9 @@ class SmallRig:
     def source(self, kept: Kept | None = None) -> RigSource:
         """A source that looks through the rig; another call is another process."""
         return RigSource(
-            self.view,
+            self.emulated.camera.view.source.camera,
+            self.wavelength_nm,
+            self.emulated.camera.view.source.field_shape,
             self.devices,
             KeptInMemory() if kept is None else kept,
             rig=self.settings,
@@ -102,7 +122,6 @@ def small_rig(
         camera_faults=CameraFaults(dict(faults or {}), 0, passes),
         mounting=mounting,
     )
-    view = RigView(looked.camera, looked.wavelength_nm, looked.field_shape)
     with rig.in_process() as line:
         assert isinstance(line.server, CameraServer)
-        yield SmallRig(line, SurveyRig(**settings), vector_pairs, view)
+        yield SmallRig(line, SurveyRig(**settings), vector_pairs, looked.wavelength_nm)

@@ -1,4 +1,4 @@
-"""Bytes of a capture's files to lines: ENVI cubes as the camera writes them, with their frames' numbers and times.
+"""Bytes of a capture's files to lines with their frames' numbers and times, and of its references to mean frames.
 
 What the camera itself writes is read strictly here, for the loop that waits for it; folders from anywhere are read by
 ``storage.readers.headwall_folders``.
@@ -11,11 +11,12 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import RigError, SceneError
-from pipeline.rig.camera.frame_index import LineTimes, parse_frame_index, times_of_lines
-from pipeline.rig.envi_fields import split_header, wavelengths_nm
+from pipeline.errors import RigError, SceneError, ShapeError
+from pipeline.rectify.calibration.detector import TO_SIGMA, find_bad_elements
+from pipeline.rig.camera.camera_texts import LineTimes, parse_frame_index, split_header, times_of_lines
+from pipeline.source import References
 
 _PART = re.compile(r"raw_(\d{1,12})", re.IGNORECASE)
 _INDEX = re.compile(r"frameindex_(\d{1,12})\.txt", re.IGNORECASE)
@@ -24,6 +25,15 @@ MOST_MISSING = 100_000  # lines between two parts; more means that the names are
 MOST_NUMBERS = 1 << 26  # of a line: a hundred times those of any such camera
 
 Read = Callable[[str], bytes]  # the content of a file by its name
+LEAST_LIT = 0.5  # share of the elements whose white is above their dark
+FRAMES_FOR_STUCK = 8  # fewer frames cannot tell an element that never changes from a quiet one
+FRAMES_FOR_JUMPS = 16  # fewer frames do not tell how much an element scatters by itself
+JUMP_SIGMAS = 12.0  # off its median over the frames: in noise that would be one value in 1e32
+LEAST_SIGMA_DN = 1.0  # of whole numbers; below one step a spread means nothing
+MOST_JUMPING = 0.01  # of the elements
+ODD_FRAME = 3.0  # times the scatter of the frame in the middle
+_BLOCK = 64  # frames summed at a time
+_SAMPLES = 16  # looked at together
 
 
 @dataclass(frozen=True)
@@ -35,7 +45,6 @@ class CubeHeader:
     bands: int
     dtype: np.dtype[np.uint16]  # with its byte order
     offset: int
-    wavelength_nm: NDArray[np.float64] | None  # (band,)
 
     @property
     def line_bytes(self) -> int:
@@ -60,16 +69,13 @@ class CapturedLines:
     valid: NDArray[np.bool_]  # (line,)
     first_frame: int  # number of the first line's frame by the first file's name
     times: LineTimes
-    wavelength_nm: NDArray[np.float64] | None  # (band,)
     notes: tuple[str, ...]
 
 
 def parse_cube_header(text: str, where: str) -> CubeHeader:
     """Read the header of a cube as the camera writes them.
 
-    Raises
-    ------
-    RigError : it is no whole ENVI header, a size is missing, or the numbers are not 16-bit BIL.
+    RigError where it is no whole ENVI header, a size is missing, or the numbers are not 16-bit BIL.
     """
     if not text.lstrip("\ufeff \r\n").upper().startswith("ENVI"):
         raise RigError(f"{where} begins with {text[:40]!r}, expected ENVI; fetch it again")
@@ -87,12 +93,11 @@ def parse_cube_header(text: str, where: str) -> CubeHeader:
         raise RigError(f"{where}: {samples} samples and {bands} bands; expected at least one of each")
     if samples * bands > MOST_NUMBERS:
         raise RigError(f"{where}: {samples} samples and {bands} bands; no camera has so many, fetch it again")
-    order = _whole(fields | {"byte order": fields.get("byte order", "0")}, "byte order", where)
+    order = _whole(fields, "byte order", where, "0")
     if order > 1:
         raise RigError(f"{where}: byte order = {order}, expected 0 or 1")
-    offset = _whole(fields | {"header offset": fields.get("header offset", "0")}, "header offset", where)
-    wavelength, _ = wavelengths_nm(fields, bands, [])
-    return CubeHeader(samples, lines, bands, np.dtype(("<u2", ">u2")[order]), offset, wavelength)
+    offset = _whole(fields, "header offset", where, "0")
+    return CubeHeader(samples, lines, bands, np.dtype(("<u2", ">u2")[order]), offset)
 
 
 def cube_lines(header: CubeHeader, data: bytes) -> CubeLines:
@@ -104,18 +109,9 @@ def cube_lines(header: CubeHeader, data: bytes) -> CubeLines:
 
 
 def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
-    """Put a capture's files together.
+    """Put a capture's files together, by their names in the folder, which may stand before them.
 
-    Parameters
-    ----------
-    names
-        Files of the folder, with or without the folder; what is no part, header or index does not matter.
-    read
-        Gives the content of one of them.
-
-    Raises
-    ------
-    RigError : there is no line, a header is missing, wrong or promises less, or the files do not belong together.
+    RigError where there is no line, a header is missing, wrong or promises less, or the files do not belong together.
     """
     by_name = {name.rsplit("/", 1)[-1]: name for name in names}
     raw = sorted((int(match[1]), name) for name in by_name if (match := _PART.fullmatch(name)))
@@ -151,15 +147,13 @@ def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
         if (own := _times(by_name, first, cube, read, notes)) is not None:
             times.frame[start:stop], times.stamp_us[start:stop] = own.frame, own.stamp_us
             times.exposure_ms[start:stop] = own.exposure_ms
-    return CapturedLines(values, valid, parts[0][0], times, parts[0][1].header.wavelength_nm, tuple(notes))
+    return CapturedLines(values, valid, parts[0][0], times, tuple(notes))
 
 
 def read_references(names: Iterable[str], read: Read) -> dict[str, CubeLines]:
     """Give the reference cubes of a folder by ``dark`` and ``white``, where there are such.
 
-    Raises
-    ------
-    RigError : one has no header, a wrong one, or frames less or more, or there are two of a kind.
+    RigError where one has no header, a wrong one, or frames less or more, or there are two of a kind.
     """
     by_name = {name.rsplit("/", 1)[-1]: name for name in names}
     found: dict[str, CubeLines] = {}
@@ -224,7 +218,116 @@ def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, 
     return own
 
 
-def _whole(fields: Mapping[str, str], key: str, where: str) -> int:
-    if not re.fullmatch(r"\d{1,12}", fields.get(key, "")):
+def _whole(fields: Mapping[str, str], key: str, where: str, usual: str = "") -> int:
+    if not re.fullmatch(r"\d{1,12}", fields.get(key, usual)):
         raise RigError(f"{where}: {key} = {fields.get(key)!r}, expected a whole number; fetch it again")
-    return int(fields[key])
+    return int(fields.get(key, usual))
+
+
+@dataclass(frozen=True)
+class MeanFrame:
+    """The mean of a reference's frames."""
+
+    mean: NDArray[np.float32]  # (sample, band) DN
+    noise: NDArray[np.float32]  # (sample, band) DN, standard deviation of one frame; 0 for a single frame
+    frames: int
+    stuck: NDArray[np.bool_]  # (sample, band) the same number in every frame while the others change
+    jumping: NDArray[np.bool_]  # (sample, band) further off its median in some frame than noise goes
+    odd_frames: tuple[int, ...]  # that show something else than the others: shifted, or in another light
+    notes: tuple[str, ...]
+
+
+def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:
+    """Average frames (line, sample, band); exact sums, so that the order of frames does not matter.
+
+    All frames look at the same thing, so an element scatters about its median by its noise alone: by 12 sigma it
+    jumps. Sigma is 1.4826 / sqrt(2) of the median step from frame to frame, which one change amid the frames does not
+    widen, and at least that of most elements, and 1 DN. A frame whose scatter about the medians, each at most those
+    12 sigma, is 3 times that of most frames shows something else. ShapeError where there is no frame.
+    """
+    if lines.ndim != 3 or not lines.size:
+        raise ShapeError(f"expected at least one frame (line, sample, band), got {lines.shape}; capture the reference")
+    count = len(lines)
+    total, squares = np.zeros(lines.shape[1:], np.int64), np.zeros(lines.shape[1:], np.int64)
+    for start in range(0, count, _BLOCK):
+        block = lines[start : start + _BLOCK].astype(np.int64)
+        total += block.sum(axis=0)
+        squares += (block * block).sum(axis=0)
+    spread = count * squares - total * total  # whole numbers: nothing cancels
+    noise = np.sqrt(spread / (count * max(count - 1, 1)))
+    telling = count >= FRAMES_FOR_STUCK and np.median(noise) > 0  # most have some noise
+    stuck = noise == 0 if telling else np.zeros(noise.shape, np.bool_)
+    notes = [f"the mean of {count} frames; {np.count_nonzero(stuck)} of {stuck.size} elements are stuck"]
+    if count < FRAMES_FOR_STUCK:
+        notes.append(f"{count} frames cannot tell stuck elements; take {FRAMES_FOR_STUCK} or more")
+    jumping, odd = _strays(lines)
+    if jumping.any():
+        notes.append(f"{np.count_nonzero(jumping)} of {jumping.size} elements jump amid the frames")
+    return MeanFrame(
+        (total / count).astype(np.float32), noise.astype(np.float32), count, stuck, jumping, odd, tuple(notes)
+    )
+
+
+def as_references(dark: MeanFrame, white: MeanFrame, *, panel: ArrayLike = 1.0) -> tuple[References, tuple[str, ...]]:
+    """Join dark and white into the references of a sweep, and say what was found.
+
+    An element is bad where its dark frame is stuck, where either jumps amid its frames, or where
+    :func:`pipeline.rectify.calibration.detector.find_bad_elements` says so.
+
+    ``panel`` is the value of the white panel, one or (band,). RigError where the frames are of two sizes, swapped,
+    without light, do not show the same throughout, or too many elements would be bad.
+    """
+    if dark.mean.shape != white.mean.shape:
+        raise RigError(f"dark is {dark.mean.shape} (sample, band), white {white.mean.shape}; take both anew")
+    values = np.asarray(panel, np.float32)
+    if values.shape not in ((), (dark.mean.shape[1],)):
+        raise RigError(
+            f"panel has shape {values.shape}, expected one value or one for each of {dark.mean.shape[1]} bands"
+        )
+    for name, frame in (("dark", dark), ("white", white)):
+        share = np.count_nonzero(frame.jumping) / frame.jumping.size
+        if frame.odd_frames:
+            first = ", ".join(map(str, frame.odd_frames[:5]))
+            raise RigError(
+                f"{len(frame.odd_frames)} of {frame.frames} frames of the {name} reference show something else than "
+                f"the others ({first}); did the light change, or are bytes lost or added in it? Take both again"
+            )
+        if share > max(MOST_JUMPING, 1 / frame.jumping.shape[0]):
+            raise RigError(
+                f"{100 * share:.1f} % of the elements jump amid the frames of the {name} reference, at most "
+                f"{100 * MOST_JUMPING:g} % can; did the light change, or are bytes lost or added in it? Take both again"
+            )
+    lit = np.count_nonzero(white.mean > dark.mean) / dark.mean.size
+    if lit < LEAST_LIT:
+        raise RigError(
+            f"white is above dark in {100 * lit:.0f} % of the elements; are they swapped, or was the lamp off?"
+        )
+    bad = find_bad_elements(dark.mean, white.mean, saturated_dn=None)
+    bad |= dark.stuck | dark.jumping | white.jumping
+    notes = (
+        *(f"dark: {note}" for note in dark.notes),
+        *(f"white: {note}" for note in white.notes),
+        f"{np.count_nonzero(bad)} of {bad.size} elements are bad",
+    )
+    return References(dark.mean, white.mean, np.broadcast_to(values, dark.mean.shape[1]).copy(), bad), notes
+
+
+def _strays(lines: NDArray[np.integer]) -> tuple[NDArray[np.bool_], tuple[int, ...]]:
+    """Elements (sample, band) that jump, and frames that show something else; none where too few frames tell."""
+    count, samples, bands = lines.shape
+    jumping, scatter = np.zeros((samples, bands), np.bool_), np.zeros(count)
+    if count < FRAMES_FOR_JUMPS:
+        return jumping, ()
+    blocks = [slice(start, start + _SAMPLES) for start in range(0, samples, _SAMPLES)]
+    middle = [np.median(lines[:, block], axis=0) for block in blocks]
+    sigma = [
+        TO_SIGMA / np.sqrt(2) * np.median(np.abs(np.diff(lines[:, block].astype(np.int32), axis=0)), axis=0)
+        for block in blocks
+    ]
+    least = max(float(np.median(np.concatenate(sigma))), LEAST_SIGMA_DN)
+    for block, mid, own in zip(blocks, middle, sigma, strict=True):
+        off = np.abs(lines[:, block] - mid) / np.maximum(own, least)
+        jumping[block] = (off > JUMP_SIGMAS).any(axis=0)
+        scatter += (np.minimum(off, JUMP_SIGMAS) ** 2).sum(axis=(1, 2))
+    usual = max(float(np.median(scatter)), samples * bands)  # one sigma each
+    return jumping, tuple(np.flatnonzero(scatter > ODD_FRAME**2 * usual).tolist())

@@ -16,10 +16,9 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from pipeline.errors import RigError
-from pipeline.rig.camera.camera_settings import FileServer
 from pipeline.rig.camera.ftp_session import DamagedTransfer, FileSession, open_session
-from pipeline.rig.clock import SYSTEM_CLOCK, Clock
-from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, DeviceRefused
+from pipeline.rig.device_settings import FileServer
+from pipeline.rig.devices import SYSTEM_CLOCK, Clock, DeadlinePassed, DeviceGone, DeviceRefused
 
 LOG = logging.getLogger(__name__)
 NOT_LOGGED_IN = 530  # of FTP: user or password is not taken, whatever file is asked for
@@ -99,11 +98,9 @@ def fetch_files(
     What is held from an earlier call is compared before anything is added to it. A transfer that breaks off is taken
     up again; what has come stays in ``kept`` however this ends, unless it is damaged, and a later call goes on there.
 
-    Raises
-    ------
-    RigError : a file is not the one of which a part is held, is larger than it can be, or comes damaged each time.
-    DeviceRefused : the server does not give a file, or takes another password.
-    DeadlinePassed, DeviceGone : ``server.tries`` tries in a row brought nothing, or all of them took too long.
+    Raises RigError where a file is not the one of which a part is held, is larger than it can be, or comes damaged each
+    time; DeviceRefused where the server does not give it, or takes another password; DeadlinePassed or DeviceGone where
+    ``server.tries`` tries in a row brought nothing, or all of them took too long.
     """
     for file in files:
         check_remote_name(file.name)
@@ -111,12 +108,7 @@ def fetch_files(
 
 
 def log_in(server: FileServer) -> str:
-    """Log in to the server, look at nothing, and give its welcome.
-
-    Raises
-    ------
-    DeviceRefused : it takes another password. RigError : no FTP. DeadlinePassed, DeviceGone : it is not there.
-    """
+    """Log in to the server, look at nothing, and give its welcome; DeviceRefused where it takes another password."""
     try:
         with open_session(server) as session:
             return session.getwelcome().removeprefix("220").strip() or "logged in"
@@ -188,8 +180,7 @@ class _Fetch:
                     "take what is held away and fetch again"
                 )
             )
-        if self.progress is not None:
-            self.progress(self.file.name, self.held, size)
+        self._tell(size)
         if size == 0:
             self.kept.append(self.file.name, b"")
         while self.sure < size:
@@ -215,10 +206,10 @@ class _Fetch:
                     self.sure = max(self.sure, min(at + same, held))
                 at += len(data)
                 if same < len(data):
-                    self._keep(data[same:], size)
+                    self.kept.append(self.file.name, data[same:])
+                    self._tell(size)
 
-    def _keep(self, data: bytes, size: int) -> None:
-        self.kept.append(self.file.name, data)
+    def _tell(self, size: int) -> None:
         if self.progress is not None:
             self.progress(self.file.name, self.held, size)
 

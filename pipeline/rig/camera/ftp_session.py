@@ -14,8 +14,8 @@ from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 
 from pipeline.errors import PipelineError, RigError
-from pipeline.rig.camera.camera_settings import FileServer
-from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, DeviceRefused
+from pipeline.rig.device_settings import FileServer
+from pipeline.rig.devices import DeadlinePassed, DeviceGone, DeviceRefused
 
 MOST_REPLY = 1 << 16  # bytes
 _SYNTAX = (500, 501)  # of FTP: the server did not understand the words, which may have been damaged on the way
@@ -45,12 +45,7 @@ class FileSession(ftplib.FTP):
         self._together = False
 
     def size_of(self, name: str) -> int | None:
-        """Bytes of a file; None where the server does not say.
-
-        Raises
-        ------
-        DamagedTransfer : its answer is no size.
-        """
+        """Bytes of a file; None where the server does not say, DamagedTransfer where its answer is no size."""
         said = self.sendcmd(f"SIZE {name}")
         if not said.startswith("213"):
             return None
@@ -65,10 +60,8 @@ class FileSession(ftplib.FTP):
     def pieces(self, name: str, start: int, size: int) -> Generator[bytes]:
         """Give the bytes of a file from ``start`` on, to its end.
 
-        Raises
-        ------
-        DamagedTransfer : the file goes on after ``size`` bytes, or ends before them.
-        DeadlinePassed : less than ``least_kb_s`` came.
+        DamagedTransfer where the file goes on after ``size`` bytes, or ends before them; DeadlinePassed where less than
+        ``least_kb_s`` came.
         """
         reached = start
         with self.transfercmd(f"RETR {name}", start or None) as connection:
@@ -147,10 +140,8 @@ class FileSession(ftplib.FTP):
 def open_session(server: FileServer) -> Iterator[FileSession]:
     """A session that is logged in; what goes wrong inside is told in our words.
 
-    Raises
-    ------
-    DeviceRefused : the server says no. DamagedTransfer : it speaks no FTP.
-    DeadlinePassed, DeviceGone : it is not there.
+    DeviceRefused where the server says no, DamagedTransfer where it speaks no FTP, DeadlinePassed or DeviceGone where
+    it is not there.
     """
     session = FileSession(server)
     try:
@@ -164,7 +155,7 @@ def open_session(server: FileServer) -> Iterator[FileSession]:
             f"{server.where} was silent for {server.stall_s:g} s, or said too little ({session.heard}); is it on?"
         ) from error
     except ftplib.error_perm as error:
-        code = _code(error)
+        code = int(str(error)[:3]) if str(error)[:3].isdigit() else None
         if code in _SYNTAX:
             raise DamagedTransfer(f"{server.where} refused: {error!s:.200}; is it an FTP server?") from error
         raise DeviceRefused(
@@ -181,8 +172,3 @@ def open_session(server: FileServer) -> Iterator[FileSession]:
         raise DeviceGone(f"{server.where} is not there or went away ({why}); is it on?") from error
     finally:
         session.close()
-
-
-def _code(error: ftplib.Error) -> int | None:
-    digits = str(error)[:3]
-    return int(digits) if digits.isdigit() else None

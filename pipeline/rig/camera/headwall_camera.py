@@ -1,21 +1,45 @@
-"""The camera's driver: control socket and files together, as a line camera for surveys."""
+"""The camera's driver: its control socket, one command at a time, and its files, as a line camera for surveys."""
 
 from __future__ import annotations
 
+import logging
 import re
-from collections.abc import Sequence
-from dataclasses import replace
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self, TypeVar
 
-from pipeline.errors import RigError
-from pipeline.rig.camera.camera_cubes import CapturedLines, Read, read_capture, read_references
+from pipeline.errors import RigError, SettingsError
+from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame, Read, mean_frame, read_capture, read_references
 from pipeline.rig.camera.camera_files import Kept, Progress, RemoteFile, fetch_files
-from pipeline.rig.camera.camera_references import MeanFrame, mean_frame
-from pipeline.rig.camera.camera_settings import CameraAddress, CameraLimits, ControlPatience, FileServer
-from pipeline.rig.camera.headwall_control import HeadwallControl
-from pipeline.rig.camera.line_camera import Capture, FrameClaim
-from pipeline.rig.clock import SYSTEM_CLOCK, Clock
-from pipeline.rig.transports import SocketTransport
+from pipeline.rig.camera.headwall_replies import (
+    MisfitError,
+    ReplyReader,
+    as_folder,
+    as_listing,
+    as_stopped,
+    as_truth,
+    check_repeated,
+    check_times_set,
+    response_of,
+    to_request,
+)
+from pipeline.rig.device_settings import (
+    CameraAddress,
+    CameraLimits,
+    ControlPatience,
+    FileServer,
+    check_capture,
+    check_times,
+)
+from pipeline.rig.devices import SYSTEM_CLOCK, Clock, DeadlinePassed, DeviceRefused, StateUnknown
+from pipeline.rig.transports import SocketTransport, Transport
 
+LOG = logging.getLogger(__name__)
+LONGEST_GREETING = 1 << 16  # bytes
+CAPTURE_ROOT = "/captured"  # where new folders appear; assumed, the reply to a capture shows it
+MOST_PASSED_OVER = 32  # replies to other commands, while one is waited for
+Answer = TypeVar("Answer")
 MOST_TEXT = 1 << 26  # bytes of a header, a frame index or another text: an index of two million frames
 MOST_OFFSET = 1 << 16  # bytes before the first frame of a cube; cameras write none
 MOST_REFERENCE_FRAMES = 2048
@@ -24,90 +48,300 @@ _RAW = re.compile(r"raw_\d+", re.IGNORECASE)
 _REFERENCE = re.compile(r"(dark|white)[a-z_]*", re.IGNORECASE)
 
 
-class HeadwallCamera:
-    """A :class:`pipeline.rig.camera.line_camera.LineCameraDevice`. Nothing is connected before the first command."""
+@dataclass(frozen=True)
+class Capture:
+    """A capture that the camera acknowledged."""
 
-    def __init__(self, control: HeadwallControl, server: FileServer, clock: Clock = SYSTEM_CLOCK) -> None:
-        self.control = control
-        self.server = server
-        self.clock = clock
+    folder: str
+    sent_s: float  # when the command was sent, by the clock of the rig's drivers
+    acknowledged_s: float  # when its reply was whole: exposures began between the two, or soon after
 
-    @classmethod
-    def at(
-        cls,
-        address: CameraAddress,
-        server: FileServer,
+
+class CaptureUnknown(StateUnknown):
+    """A capture was sent and not acknowledged; what was found on asking stands in the message."""
+
+
+class HeadwallControl:
+    """Commands to the camera.
+
+    After a reply that was late or damaged the connection is given up and made anew, so that what comes late is never
+    taken for the next command's reply. ``connect`` makes a connection. Commands raise DeviceRefused, DeadlinePassed or
+    DeviceGone besides what they say themselves.
+    """
+
+    def __init__(
+        self,
+        connect: Callable[[], Transport],
         *,
+        clock: Clock = SYSTEM_CLOCK,
         patience: ControlPatience | None = None,
         limits: CameraLimits | None = None,
+    ) -> None:
+        self.patience = ControlPatience() if patience is None else patience
+        self.limits = CameraLimits() if limits is None else limits
+        self.clock = clock
+        self.unknown = ""  # why nobody knows whether a capture runs; empty where it is known
+        self._connect = connect
+        self._line: Transport | None = None
+        self._reader = ReplyReader()
+        self._lock = threading.RLock()
+
+    def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
+        """Set exposure and frame period. [ms]
+
+        Raises SettingsError as :func:`check_times` does, RigError where the camera says that it set others, and
+        StateUnknown where a capture may be running, see ``capture``.
+        """
+        check_times(exposure_ms, frame_period_ms, self.limits)
+        with self._lock:
+            self._check_known("configure")
+            times = {"exposure": exposure_ms, "framePeriod": frame_period_ms}
+            self._ask("configure", times, lambda response: check_times_set(response, times))
+
+    def capture(self, frames: int, *, cubes: int = 1, prefix: str = "") -> Capture:
+        """Begin a capture of ``cubes`` files (0: until stopped) of ``frames`` lines (0: the camera's own number).
+
+        Sent once. Where no reply comes the camera is asked whether it captures and which folders are new, and that is
+        said in the error; captures and settings are refused from then on: a person looks, and connects anew.
+        Raises CaptureUnknown then, and SettingsError where a number or the prefix cannot be used.
+        """
+        check_capture(frames, cubes, prefix)
+        with self._lock:
+            self._check_known("capture")
+            before = self._folders()
+            self._open()
+            sent_s = self.clock.now()
+            try:
+                folder = self._once(
+                    "capture", {"prefix": prefix, "maxCubes": cubes, "maxFramesPerCube": frames}, as_folder
+                )
+            except DeviceRefused:
+                raise
+            except RigError as error:
+                self._hang_up()
+                raise self._find_out(error, before, prefix) from error
+            except BaseException:  # interrupted while it waited
+                self.unknown = "a capture was sent and the wait for its reply was interrupted"
+                self._hang_up()
+                raise
+            return Capture(folder, sent_s, self.clock.now())
+
+    def is_capturing(self) -> bool:
+        """Ask whether a capture runs."""
+        return self._ask("isCapturing", None, as_truth)
+
+    def stop(self) -> bool:
+        """End a capture; False where none ran. Stopping twice does no harm, so it is asked again without a reply."""
+        try:
+            return self._ask("stopCapture", None, as_stopped)
+        except DeviceRefused:
+            if self.is_capturing():
+                raise
+            return False
+
+    def list_files(self, folder: str) -> list[RemoteFile]:
+        """List one folder, in the order of names; SettingsError for an empty name."""
+        if not folder:
+            raise SettingsError("expected a folder of the camera to list, such as /captured, got an empty name")
+        return self._ask("listFiles", folder, as_listing)
+
+    def close(self) -> None:
+        """Say exit and hang up. A capture goes on; nothing is raised."""
+        with self._lock:
+            if self._line is not None:
+                try:
+                    self._line.write(to_request("exit"), self.clock.now() + self.patience.deadline_s)
+                except RigError as error:
+                    LOG.info("the camera was gone before exit: %s", error)
+            self._hang_up()
+
+    def _ask(self, name: str, argument: Any, check: Callable[[Any], Answer]) -> Answer:
+        """Ask what may be asked twice: again after a lost, late or damaged reply, on a new connection."""
+        with self._lock:
+            for left in range(self.patience.retries, -1, -1):
+                try:
+                    self._open()
+                    return self._once(name, argument, check)
+                except DeviceRefused:
+                    raise
+                except RigError as error:
+                    self._hang_up()
+                    if not left:
+                        raise
+                    LOG.info("%s; asking again", error)
+                    self.clock.sleep(self.patience.pause_s)
+            raise AssertionError("unreachable")
+
+    def _open(self) -> None:
+        """Have a connection that stands at its prompt, with nothing left over from before."""
+        if self._line is not None:
+            try:
+                if stale := self._reader.held + self._line.drain():
+                    LOG.warning("%s: dropped %d stale bytes: %r", self._line.port, len(stale), stale[:64])
+                self._reader = ReplyReader()
+                return
+            except RigError as error:
+                LOG.info("%s; connecting again", error)
+                self._hang_up()
+        self._line, self._reader = self._connect(), ReplyReader()
+        try:
+            self._greet(self._line)
+        except RigError:
+            self._hang_up()
+            raise
+
+    def _greet(self, line: Transport) -> None:
+        """Wait for the first prompt, whatever stands before it, not even a line's end."""
+        deadline = self.clock.now() + self.patience.deadline_s
+        came = b""
+        while self.clock.now() < deadline:
+            data = line.read(65536, deadline)
+            came += data
+            if b"hpi> " in came:
+                return
+            if len(came) > LONGEST_GREETING:
+                raise RigError(f"{line.port} greets without end ({_told(came)}); is this the camera's control port?")
+        raise DeadlinePassed(
+            f"{line.port} sent no prompt 'hpi> ' within {self.patience.deadline_s:g} s ({_told(came)}); "
+            "is this the camera's control port (8100)?"
+        )
+
+    def _once(self, name: str, argument: Any, check: Callable[[Any], Answer]) -> Answer:
+        """Send one command and wait for its own reply; replies to others are passed over."""
+        line = self._line
+        assert line is not None
+        deadline = self.clock.now() + self.patience.deadline_s
+        request = to_request(name, argument)
+        line.write(request, deadline)
+        passed_over: list[str] = []
+        while self.clock.now() < deadline:
+            for said in self._reader.feed(line.read(65536, deadline)):
+                why = f"a reply to {said.command}" if said.command not in ("", name) else ""
+                if not why:
+                    check_repeated(said, request.decode().rstrip("\r"), line.port)
+                    response = response_of(said, name, line.port)
+                    try:
+                        return check(response)
+                    except MisfitError as misfit:
+                        why = str(misfit)
+                LOG.warning("%s, while waiting for %s: %s: %.200s", line.port, name, why, said.text)
+                passed_over.append(said.text[:80])
+                if len(passed_over) > MOST_PASSED_OVER:
+                    raise RigError(
+                        f"{line.port} answers {name} with {len(passed_over)} replies to others; does another program "
+                        "talk to the camera? End that first"
+                    )
+        came = self._reader.held or " | ".join(passed_over).encode()
+        raise DeadlinePassed(
+            f"no reply to {name} from {line.port} within {self.patience.deadline_s:g} s ({_told(came)}); "
+            "is the camera on, and not busy writing? A longer deadline_s waits longer"
+        )
+
+    def _hang_up(self) -> None:
+        if self._line is not None:
+            self._line.close()
+        self._line = None
+
+    def _check_known(self, name: str) -> None:
+        if self.unknown:
+            raise StateUnknown(
+                f"{name} is refused: {self.unknown}, so whether the camera captures is not known. Look at the "
+                "camera, stop what runs there, then run again, which connects anew"
+            )
+
+    def _folders(self) -> set[str] | None:
+        """Folders of the capture root; None where the camera does not list it."""
+        try:
+            return {entry.name for entry in self.list_files(CAPTURE_ROOT)}
+        except DeviceRefused as error:
+            LOG.warning("%s: a capture whose reply is lost will not be found by its folder", error)
+            return None
+
+    def _find_out(self, error: RigError, before: set[str] | None, prefix: str) -> CaptureUnknown:
+        """Freeze, ask the camera what it does, and say it."""
+        self.unknown = "a capture was sent and not acknowledged"
+        try:
+            does = "captures" if self.is_capturing() else "does not capture"
+            now = None if before is None else self._folders()
+            new = sorted(now - before) if before is not None and now is not None else []
+            found = f"asked again it {does}, and new are {'the folders ' + ', '.join(new) if new else 'no folders'}"
+        except RigError as other:
+            found = f"asked again it does not answer: {other}"
+        return CaptureUnknown(
+            f"capture (prefix {prefix!r}) was sent and its reply is lost: {error}. It is not sent again; {found}. "
+            "Look at the camera, stop what runs there, then run again, which connects anew"
+        )
+
+
+def _told(came: bytes) -> str:
+    return f"{len(came)} bytes came: {came[:80]!r}" if came else "nothing came"
+
+
+@dataclass(frozen=True)
+class FrameClaim:
+    """What a capture was asked for: frames, in all its cubes, of so many numbers of 16 bits."""
+
+    frames: int
+    samples: int
+    bands: int
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of a frame."""
+        return 2 * self.samples * self.bands
+
+
+class HeadwallCamera(HeadwallControl):
+    """A line camera for surveys: its commands and its files. Nothing is connected before the first command."""
+
+    def __init__(
+        self,
+        connect: Callable[[], Transport],
+        server: FileServer,
+        *,
         clock: Clock = SYSTEM_CLOCK,
-    ) -> HeadwallCamera:
+        patience: ControlPatience | None = None,
+        limits: CameraLimits | None = None,
+    ) -> None:
+        super().__init__(connect, clock=clock, patience=patience, limits=limits)
+        self.server = server
+
+    @classmethod
+    def at(cls, address: CameraAddress, server: FileServer, *, clock: Clock = SYSTEM_CLOCK, **given: Any) -> Self:
         """A camera on the network."""
 
         def connect() -> SocketTransport:
             return SocketTransport(address.host, address.port, clock, connect_s=address.connect_s)
 
-        return cls(HeadwallControl(connect, clock=clock, patience=patience, limits=limits), server, clock)
-
-    def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
-        """Set both times [ms]; see :meth:`HeadwallControl.configure`."""
-        self.control.configure(exposure_ms, frame_period_ms)
-
-    def capture(self, frames: int, *, cubes: int = 1, prefix: str = "") -> Capture:
-        """Begin to take lines, once; see :meth:`HeadwallControl.capture`."""
-        return self.control.capture(frames, cubes=cubes, prefix=prefix)
-
-    def is_capturing(self) -> bool:
-        """Whether lines are being taken."""
-        return self.control.is_capturing()
-
-    def stop(self) -> bool:
-        """End a capture; False where none ran."""
-        return self.control.stop_capture()
+        return cls(connect, server, clock=clock, **given)
 
     def fetch(
         self, folder: str, kept: Kept, progress: Progress | None = None, *, claim: FrameClaim | None = None
     ) -> CapturedLines:
         """Get a finished capture's files, small ones first, and give its lines; a later call continues.
 
-        Raises
-        ------
-        RigError : the capture still runs, its files do not belong together, or are larger than ``claim`` lets them be.
-        DeviceRefused, DeadlinePassed, DeviceGone
+        RigError where the capture still runs, its files do not belong together, or are larger than ``claim`` lets them
+        be; DeviceRefused, DeadlinePassed, DeviceGone.
         """
         files = self._finished(folder, claim)
-
-        def is_large(file: RemoteFile) -> bool:
-            base = file.base.lower()
-            return base.startswith("raw_") and not base.endswith(".hdr")
-
-        files.sort(key=lambda file: (is_large(file), file.name))
+        files.sort(key=lambda file: (bool(_RAW.fullmatch(file.base)), file.name))
         fetch_files(self.server, files, kept, progress, clock=self.clock)
         return read_capture([file.name for file in files], _reader(kept))
 
     def references(self, folder: str, kept: Kept, *, claim: FrameClaim | None = None) -> dict[str, MeanFrame]:
-        """Mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``; empty without any.
-
-        Raises
-        ------
-        RigError, DeviceRefused, DeadlinePassed, DeviceGone
-        """
+        """Mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``; empty without any."""
         files = [file for file in self._finished(folder, claim) if file.base.lower().startswith(("dark", "white"))]
         fetch_files(self.server, files, kept, clock=self.clock)
         cubes = read_references([file.name for file in files], _reader(kept))
         return {kind: mean_frame(cube.values) for kind, cube in cubes.items()}
 
-    def close(self) -> None:
-        """Hang up; a capture goes on."""
-        self.control.close()
-
     def _finished(self, folder: str, claim: FrameClaim | None) -> list[RemoteFile]:
         """Files of a folder, as two listings in a row have them: one that lost an entry on its way looks whole."""
         if self.is_capturing():
             raise RigError(f"a capture still runs, so files of {folder} may grow; wait for its end, or stop it")
-        listed = self.control.list_files(folder)
-        for _ in range(self.control.patience.retries + 1):
-            before, listed = listed, self.control.list_files(folder)
+        listed = self.list_files(folder)
+        for _ in range(self.patience.retries + 1):
+            before, listed = listed, self.list_files(folder)
             if listed == before:
                 files = [file for file in listed if not file.folder]
                 return files if claim is None else bounded(files, claim)
@@ -121,9 +355,7 @@ def _reader(kept: Kept) -> Read:
 def bounded(files: Sequence[RemoteFile], claim: FrameClaim) -> list[RemoteFile]:
     """Give the files with the most that each can have: cubes what was asked for, references and texts a fixed number.
 
-    Raises
-    ------
-    RigError : one claims more, or all cubes together do, or there are too many files.
+    RigError where one claims more, or all cubes together do, or there are too many files.
     """
     if len(files) > MOST_FILES:
         raise RigError(f"the camera lists {len(files)} files in one capture, expected {MOST_FILES} at most; look there")

@@ -14,7 +14,7 @@ from typing import Any
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import RemoteFile, check_remote_name
-from pipeline.rig.device_errors import DeviceRefused
+from pipeline.rig.devices import DeviceRefused
 
 PROMPT = b"hpi> "
 COMMANDS = ("configure", "capture", "isCapturing", "stopCapture", "listFiles", "exit")
@@ -50,6 +50,10 @@ class Said:
         return name if name in COMMANDS else ""
 
 
+class MisfitError(Exception):
+    """A response that is no answer to this command."""
+
+
 def to_request(name: str, argument: Any = None) -> bytes:
     """Write a command as the camera takes it."""
     text = name if argument is None else f"{name}({json.dumps(argument)})"
@@ -75,9 +79,7 @@ class ReplyReader:
     def feed(self, data: bytes) -> list[Said]:
         """Take bytes; give what is complete, which may be nothing or several replies.
 
-        Raises
-        ------
-        RigError : more came without a prompt than any reply has.
+        RigError where more came without a prompt than any reply has.
         """
         cut = max(len(self._held) - 2, 0)  # a negotiation may have come in part
         self._held[cut:] = _NEGOTIATION.sub(b"", bytes(self._held[cut:]) + data)
@@ -112,7 +114,10 @@ def _parse(data: bytes) -> list[Said]:
     text = data.decode("utf-8", errors="replace").strip("\0 \t\r\n")
     if not text:
         return []
-    echo, body = ("", text) if text.startswith("{") else _first_line(text)
+    echo, body = "", text
+    if not text.startswith("{"):
+        parts = re.split(r"[\r\n]+", text, maxsplit=1)
+        echo, body = parts[0].strip(), parts[1].strip("\0 \t\r\n") if len(parts) > 1 else ""
     found: list[Said] = []
     while body.startswith("{"):
         try:
@@ -124,20 +129,6 @@ def _parse(data: bytes) -> list[Said]:
     return found if found and not body else [*found, Said(echo, None, text)]
 
 
-def _first_line(text: str) -> tuple[str, str]:
-    parts = re.split(r"[\r\n]+", text, maxsplit=1)
-    return parts[0].strip(), parts[1].strip("\0 \t\r\n") if len(parts) > 1 else ""
-
-
-class MisfitError(Exception):
-    """A response that is no answer to this command."""
-
-
-def other_command(said: Said, name: str) -> str:
-    """Why this is no reply to the command; empty where it may be one."""
-    return f"a reply to {said.command}" if said.command not in ("", name) else ""
-
-
 def check_repeated(said: Said, sent: str, port: str) -> None:
     """Refuse a reply to other words than were sent (RigError): they, or those that came back, were damaged."""
     if "(" in said.echo and said.echo.split() != sent.split():
@@ -147,12 +138,7 @@ def check_repeated(said: Said, sent: str, port: str) -> None:
 
 
 def response_of(said: Said, name: str, port: str) -> Any:
-    """The response of a reply that says success.
-
-    Raises
-    ------
-    DeviceRefused : the reply says no; the message says what to do. RigError : it is no reply.
-    """
+    """The response of a reply that says success; DeviceRefused, and what to do, where it says no; RigError for none."""
     if said.reply is None:
         raise RigError(
             f"{port} answered {name} with {said.text[:200]!r}, expected JSON; is this the camera's control port?"
@@ -204,12 +190,7 @@ def as_stopped(response: Any) -> bool:
 
 
 def as_listing(response: Any) -> list[RemoteFile]:
-    """Entries of a folder, by name.
-
-    Raises
-    ------
-    MisfitError : this answers another command. RigError : a name cannot be asked for.
-    """
+    """Entries of a folder, by name; MisfitError where this answers another command, RigError for a name not to use."""
     if not isinstance(response, list):
         raise MisfitError("a reply that is no list")
     found = []
@@ -218,12 +199,9 @@ def as_listing(response: Any) -> list[RemoteFile]:
         if not isinstance(name, str):
             raise MisfitError("a list of something else than files")
         check_remote_name(name)
-        found.append(RemoteFile(re.sub("/{2,}", "/", name), _size(entry.get("size")), bool(entry.get("isDirectory"))))
+        try:
+            size = max(int(entry.get("size")), 0)
+        except (TypeError, ValueError, OverflowError):
+            size = None
+        found.append(RemoteFile(re.sub("/{2,}", "/", name), size, bool(entry.get("isDirectory"))))
     return sorted(found, key=lambda entry: entry.name)
-
-
-def _size(value: Any) -> int | None:
-    try:
-        return max(int(value), 0)
-    except (TypeError, ValueError, OverflowError):
-        return None

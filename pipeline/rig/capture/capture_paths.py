@@ -21,8 +21,6 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Axis, Sweep, line_positions, sweep_positions
 from pipeline.geometry.vector_memory import memory_loads
 from pipeline.rig.camera.camera_cubes import CapturedLines
-from pipeline.rig.camera.camera_settings import check_capture
-from pipeline.rig.capture.capture_journal import CaptureRecord
 from pipeline.rig.capture.clock_fit import FrameTimes
 from pipeline.rig.capture.line_positions import (
     CommandTimes,
@@ -33,8 +31,8 @@ from pipeline.rig.capture.line_positions import (
     lines_by_log,
     lines_by_trigger,
 )
-from pipeline.rig.mirror.steering import wire_positions
-from pipeline.rig.survey_rig import Pulses
+from pipeline.rig.device_settings import Pulses, check_capture
+from pipeline.rig.mirror.path_player import wire_positions
 
 LEAD = 1  # cells before the first line's: a unit that waits for edges takes its first cell at the run command, assumed
 REFERENCES = "references"  # prefix of a capture that is made for the dark and white frames in its folder
@@ -56,9 +54,7 @@ class Announced:
 def capture_prefix(sweep: Sweep, first: int = 0) -> str:
     """Give the prefix of a capture of a sweep's lines from ``first`` on.
 
-    Raises
-    ------
-    SettingsError : the sweep's name holds what a folder's name must not, or is too long.
+    SettingsError where the sweep's name holds what a folder's name must not, or is too long.
     """
     sizes = f"{sweep.lines}x{sweep.step}x{sweep.binning}"
     place = f"{sweep.kind[0]}{sweep.along}{_written(sweep.strip_px)}_{_written(sweep.start_px)}"
@@ -117,11 +113,6 @@ class CapturePath:
         """Lines of the capture."""
         return self.stop - self.first
 
-    @property
-    def played(self) -> PlayedPath:
-        """The path as it runs by its own clock, for lines that are tied to it by time."""
-        return PlayedPath(self.cells.astype(np.float64), self.rate_hz)
-
     def frames_at(self, index: int) -> int | None:
         """Frames that edges were counted of, where the cell ``index`` was played last; None within a line."""
         frames, rest = divmod(index + 1 - LEAD, self.sweep.step)
@@ -131,9 +122,7 @@ class CapturePath:
 def next_path(sweep: Sweep, first: int, camera: LineCamera, *, vector_pairs: int, triggered: bool) -> CapturePath:
     """Give the path of the sweep's lines from ``first`` on, as many as the vector memory takes.
 
-    Raises
-    ------
-    SettingsError : the positions of one line do not fit the memory. PoseError : one is beyond the mirror's disk.
+    SettingsError where the positions of one line do not fit the memory, PoseError where one is beyond the disk.
     """
     if vector_pairs <= LEAD:
         raise SettingsError(f"a vector memory of {vector_pairs} pairs holds no line; expected more than {LEAD}")
@@ -155,6 +144,37 @@ def path_of(sweep: Sweep, lines: tuple[int, int], camera: LineCamera, *, trigger
 def can_trigger(pulses: Pulses, sweep: Sweep) -> bool:
     """Whether the pulses at the mirror's input step through this sweep: one a position is needed."""
     return pulses == "position" or (pulses == "frame" and sweep.step == 1)
+
+
+@dataclass(frozen=True)
+class CaptureRecord:
+    """Lines ``first`` to ``stop`` of a sweep, in a folder of the camera."""
+
+    sweep: Sweep
+    first: int
+    stop: int
+    folder: str
+    triggered: bool
+    run_s: tuple[float, float]  # sent and acknowledged, by the drivers' clock
+    capture_s: tuple[float, float]
+    index_at_end: int | None = None  # cell of the path that was played last
+    log: LoggedPath | None = None
+    spent: str = ""  # why no line is to be had from it any more
+
+
+@dataclass(frozen=True)
+class LoggedPath:
+    """A log of measured positions that is kept beside the files: (sample, 2) big-endian float32.
+
+    ``index_name`` is where the cells that were played are, (sample,) big-endian int32; empty where nobody asked.
+    """
+
+    name: str
+    rate_hz: float
+    started_s: float
+    start_error_s: float
+    index_name: str = ""
+    crc32: int | None = None  # of both files, one after the other; None by an earlier version
 
 
 class UntiedError(RigError):
@@ -180,12 +200,14 @@ def place_lines(
 ) -> PlacedLines:
     """Give each line of the path its row of the capture, up to the last one that is there whole.
 
-    Raises
-    ------
-    UntiedError : nothing, or what contradicts itself, ties frames to the mirror.
+    UntiedError where nothing, or what contradicts itself, ties frames to the mirror.
     """
     held = int(np.flatnonzero(captured.valid)[-1]) + 1
-    number = _numbers(captured, held, path.lines)
+    number = captured.times.frame[:held]  # from the capture's start; rows in order if none is told or can be missing
+    if (number >= 0).any():
+        number = np.where(number >= 0, number - captured.first_frame, -1)
+    elif len(captured.values) == path.lines:
+        number = np.arange(held)
     frames = FrameTimes(number, captured.times.stamp_us[:held], camera.exposure_ms, camera.frame_ms)
     try:
         tied = _tied(frames, path, taken, camera, track, total=len(captured.values))
@@ -195,14 +217,6 @@ def place_lines(
     rows = np.flatnonzero(captured.valid[:held] & (number >= 0) & (number < path.lines))
     row[number[rows]] = rows
     return PlacedLines(row, tied, frames.stamp_us)
-
-
-def _numbers(captured: CapturedLines, held: int, lines: int) -> NDArray[np.int64]:
-    """Frames' numbers from the capture's start; where none is told, rows in order if none can be missing."""
-    told = captured.times.frame[:held]
-    if (told >= 0).any():
-        return np.where(told >= 0, told - captured.first_frame, -1)
-    return np.arange(held) if len(captured.values) == lines else told
 
 
 def _tied(
@@ -215,7 +229,7 @@ def _tied(
     total: int,
 ) -> LinePositions:
     """Positions by edges in the mirror's log, else by the edges that stepped it, by its log, by the commands' times."""
-    commands = taken.commands
+    commands = CommandTimes(taken.run_s, taken.capture_s)
     if taken.log is not None:  # then it, and not the path, was begun before the capture
         began = (taken.log.started_s - taken.log.start_error_s, taken.log.started_s)
         commands = CommandTimes(began, taken.capture_s)
@@ -235,4 +249,6 @@ def _tied(
         return lines_by_trigger(frames, camera, sent, index_at_end=last)
     if track is not None and taken.log is not None and len(track.position) > 1:
         return lines_by_log(frames, camera, track, commands=commands)
-    return lines_by_commands(frames, camera, path.played, taken.commands)
+    commands = CommandTimes(taken.run_s, taken.capture_s)
+    played = PlayedPath(path.cells.astype(np.float64), path.rate_hz)  # by its own clock
+    return lines_by_commands(frames, camera, played, commands)

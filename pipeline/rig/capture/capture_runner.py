@@ -1,36 +1,163 @@
-"""One capture after the other on a rig: path up, mirror to its start, both begun in order, and the end taken down."""
+"""One capture after the other on a rig: path up, mirror to its start, both begun in order, and the end taken down.
+
+The journal says what the rig has acknowledged of a stage's captures, one JSON object a line beside the files fetched
+from the camera. A process that is killed leaves it behind; the next one reads which folder on the camera holds which
+lines, so that nothing the rig acknowledged is captured twice. Each line has a checksum. A torn line counts as not
+written, and so does one that has changed since; but then a capture of which no end is told is not gone on with: what
+the mirror stands at now need not be what it stood at after that.
+"""
 
 from __future__ import annotations
 
 import itertools
+import json
 import logging
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from pipeline.checked_lines import read_checked, with_check
 from pipeline.errors import RigError
 from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import Kept
-from pipeline.rig.camera.line_camera import LineCameraDevice
-from pipeline.rig.capture.capture_journal import CaptureJournal, CaptureRecord, LoggedPath
-from pipeline.rig.capture.capture_paths import LEAD, CapturePath, UntiedError, capture_prefix
-from pipeline.rig.capture.line_positions import MirrorTrack, line_edges
-from pipeline.rig.clock import Clock
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.capture import JOURNAL
+from pipeline.rig.capture.capture_paths import LEAD, CapturePath, CaptureRecord, LoggedPath, UntiedError, capture_prefix
+from pipeline.rig.capture.line_positions import LinePositions, MirrorTrack, line_edges
+from pipeline.rig.device_settings import SurveyRig
+from pipeline.rig.devices import Clock
+from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.mirror.path_player import MotionLog
 from pipeline.rig.mirror.registers import Trigger
-from pipeline.rig.mirror.steering import MotionLog, Steering
-from pipeline.rig.survey_rig import SurveyRig
 from pipeline.source import AT_REST
 
 LOG = logging.getLogger(__name__)
+_TIES = ("method", "residual_us", "residual_px", "offset_s", "drift_ppm")
 SLACK_S = 5.0  # by which a capture may take longer than its frames
 WRITING_S = 120.0  # that a camera may go on writing what it has, once it was told to stop
 POLL_S = 0.05
 _CELL, _INDEX = np.dtype(">f4"), np.dtype(">i4")
 
 Say = Callable[[str], None]  # what the rig is at, in a few words
+
+
+class CaptureJournal:
+    """Records in ``kept``, read once and added to.
+
+    ``references`` is the folder that holds dark and white frames, ``damage`` what cannot be believed of the journal.
+    """
+
+    def __init__(self, kept: Kept) -> None:
+        self._kept = kept
+        self._taken: dict[str, CaptureRecord] = {}
+        self._origins: dict[str, int] = {}  # stamp of line 0 [us], by the sweep's name
+        self._ties: dict[str, dict[str, Any]] = {}
+        self._ended: set[str] = set()  # folders
+        self.references = ""
+        self.damage: list[str] = []
+        self._read()
+
+    def holding(self, sweep: Sweep, line: int) -> CaptureRecord | None:
+        """The latest capture that has a line of the sweep and is not spent."""
+        fits = [one for one in self._taken.values() if one.sweep == sweep and one.first <= line < one.stop]
+        return next((one for one in reversed(fits) if not one.spent), None)
+
+    def began(self, taken: CaptureRecord) -> None:
+        """Take down a capture that the camera acknowledged."""
+        self._write({"what": "capture", **asdict(taken)})
+
+    def ended(self, taken: CaptureRecord) -> CaptureRecord:
+        """Take down what was read of the mirror after the capture."""
+        ended = {"folder": taken.folder, "index_at_end": taken.index_at_end}
+        self._write({"what": "end", **ended, "log": None if taken.log is None else asdict(taken.log)})
+        return self._taken[taken.folder]
+
+    def spend(self, taken: CaptureRecord, why: str) -> None:
+        """Expect no further line of a capture."""
+        self._write({"what": "spent", "folder": taken.folder, "why": why})
+
+    def tied(self, taken: CaptureRecord, how: LinePositions, notes: Sequence[str]) -> None:
+        """Take down how a capture's lines were tied to the mirror, once."""
+        if taken.folder not in self._ties:
+            said = {name: getattr(how, name) for name in _TIES}
+            self._write({"what": "tied", "folder": taken.folder, **said, "notes": [*notes, *how.notes]})
+
+    @property
+    def captures(self) -> list[dict[str, Any]]:
+        """Every capture in order: lines of which sweep, where on the camera, how they were tied, why none is left."""
+        return [
+            {"folder": one.folder, "sweep": one.sweep.name, "first": one.first, "stop": one.stop}
+            | self._ties.get(one.folder, {})
+            | ({"spent": one.spent} if one.spent else {})
+            for one in self._taken.values()
+        ]
+
+    def refer(self, folder: str) -> None:
+        """Take down where the dark and white frames are."""
+        self._write({"what": "references", "folder": folder})
+
+    def origin_us(self, sweep: Sweep, stamp_us: int | None = None) -> int | None:
+        """Stamp of the sweep's line 0, taken down when it is first given."""
+        if stamp_us is not None and sweep.name not in self._origins:
+            self._write({"what": "origin", "sweep": sweep.name, "stamp_us": stamp_us})
+        return self._origins.get(sweep.name)
+
+    def _read(self) -> None:
+        for line in read_checked(self._kept.read(JOURNAL, 0, self._kept.size(JOURNAL))):
+            if line.state == "torn":
+                continue
+            why = "it has changed since it was written" if line.content is None else ""
+            try:
+                self._follow(line.content or {})
+            except (LookupError, TypeError, ValueError):
+                why = why or "what it adds to is not there"
+            if why:
+                self.damage.append(f"line {line.number} of {JOURNAL} counts for nothing: {why}")
+        if self.damage:
+            LOG.warning("%s", "; ".join(self.damage))
+            for folder in self._taken.keys() - self._ended:
+                self._taken[folder] = replace(self._taken[folder], spent="its end may be what the journal has lost")
+
+    def _write(self, record: dict[str, Any]) -> None:
+        text = json.dumps(record).encode()
+        size = self._kept.size(JOURNAL)
+        torn = size > 0 and self._kept.read(JOURNAL, size - 1, size) != b"\n"
+        self._kept.append(JOURNAL, (b"\n" if torn else b"") + with_check(text))
+        self._follow(json.loads(text))
+
+    def _follow(self, record: dict[str, Any]) -> None:
+        match record["what"]:
+            case "capture":
+                self._taken.pop(record["folder"], None)  # a camera that was emptied gives its folders' names again
+                self._ties.pop(record["folder"], None)
+                self._ended.discard(record["folder"])
+                self._taken[record["folder"]] = CaptureRecord(
+                    Sweep(**record["sweep"]),
+                    record["first"],
+                    record["stop"],
+                    record["folder"],
+                    record["triggered"],
+                    tuple(record["run_s"]),
+                    tuple(record["capture_s"]),
+                )
+            case "end":
+                log = None if record["log"] is None else LoggedPath(**record["log"])
+                found = self._taken[record["folder"]]
+                self._taken[found.folder] = replace(found, index_at_end=record["index_at_end"], log=log)
+                self._ended.add(found.folder)
+            case "spent":
+                self._taken[record["folder"]] = replace(self._taken[record["folder"]], spent=record["why"])
+            case "tied":
+                self._ties[record["folder"]] = {name: record[name] for name in (*_TIES, "notes")}
+            case "references":
+                self.references = record["folder"]
+            case "origin":
+                self._origins[record["sweep"]] = record["stamp_us"]
 
 
 def say_nothing(words: str) -> None:
@@ -41,8 +168,8 @@ def say_nothing(words: str) -> None:
 class RigDevices:
     """Both devices, connected, and the clock that their drivers go by."""
 
-    steering: Steering
-    camera: LineCameraDevice
+    steering: MirrorController
+    camera: HeadwallCamera
     clock: Clock
 
     def close(self) -> None:
@@ -77,10 +204,6 @@ class CaptureRunner:
 
         Motions and the capture are sent once. Where something fails after the mirror or the camera has begun, both are
         told to stop.
-
-        Raises
-        ------
-        StateUnknown, DeviceRefused, DeadlinePassed, DeviceGone, RigError
         """
         steering, prefix = self.devices.steering, capture_prefix(path.sweep, path.first)
         self._configure()
@@ -101,14 +224,17 @@ class CaptureRunner:
             taken = CaptureRecord(path.sweep, path.first, path.stop, capture.folder, path.triggered, run_s, at_s)
             self._journal.began(taken)
             self.wait(taken)
-        return self._end(taken)
+        if taken.triggered:
+            taken = replace(taken, index_at_end=steering.index())
+        if self._rig.log_pulses or not taken.triggered:
+            taken = replace(taken, log=self._keep_log(taken.folder, steering.read_log()))
+        steering.halt()
+        return self._journal.ended(taken)
 
     def wait(self, taken: CaptureRecord) -> None:
         """Wait until a capture is over; one that goes on too long is stopped, and what it has counts.
 
-        Raises
-        ------
-        RigError : it does not end, though it was told to. DeviceRefused, DeadlinePassed, DeviceGone
+        RigError where it does not end, though it was told to.
         """
         camera, clock = self.devices.camera, self.devices.clock
         began, wanted = clock.now(), self._seconds(taken.stop - taken.first)
@@ -146,12 +272,7 @@ class CaptureRunner:
         return capture.folder
 
     def log_of(self, taken: CaptureRecord) -> MirrorTrack | None:
-        """Read the mirror's log of a capture; None where there is none.
-
-        Raises
-        ------
-        UntiedError : what is kept of it is not what the mirror gave.
-        """
+        """Read the mirror's log of a capture; None where there is none, UntiedError where it has changed."""
         if taken.log is None:
             return None
         names = (taken.log.name, taken.log.index_name)
@@ -175,15 +296,6 @@ class CaptureRunner:
         sent = clock.now()
         self.devices.steering.run(0, len(path.cells), path.rate_hz, 1, trigger)
         return sent, clock.now()
-
-    def _end(self, taken: CaptureRecord) -> CaptureRecord:
-        steering = self.devices.steering
-        if taken.triggered:
-            taken = replace(taken, index_at_end=steering.index())
-        if self._rig.log_pulses or not taken.triggered:
-            taken = replace(taken, log=self._keep_log(taken.folder, steering.read_log()))
-        steering.halt()
-        return self._journal.ended(taken)
 
     def _keep_log(self, folder: str, log: MotionLog) -> LoggedPath:
         name, position = self._new_name(f"{folder}/mirror_log"), log.position.astype(_CELL).tobytes()

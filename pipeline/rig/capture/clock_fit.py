@@ -111,8 +111,6 @@ class ClockFit:
     offset_s: float
     drift_ppm: float
     residual_us: float  # rms of the events that count
-    worst_us: float  # of the events that count
-    events: int
     rejected: int  # events too far off to count
 
     def mirror_s(self, stamp_us: Ints) -> Floats:
@@ -125,17 +123,9 @@ def fit_clocks(stamp_us: Ints, mirror_s: Floats) -> ClockFit:
 
     A line through medians, then least squares with Tukey's weights; one event gives an offset alone.
 
-    Parameters
-    ----------
-    stamp_us
-        (event,) camera stamps. [us]
-    mirror_s
-        (event,) times of the same events by the mirror's clock. [s]
-
-    Raises
-    ------
-    ShapeError : there is no event, or the two are not of one length.
-    RigError : the drift is above 1000 ppm, so these are not the same events.
+    ``stamp_us`` (event,) are camera stamps [us], ``mirror_s`` (event,) the same events by the mirror's clock [s].
+    ShapeError where there is no event, or the two are not of one length; RigError where the drift is above 1000 ppm, so
+    these are not the same events.
     """
     if stamp_us.ndim != 1 or stamp_us.shape != mirror_s.shape or not len(stamp_us):
         raise ShapeError(f"expected as many stamps as times, at least one, got {stamp_us.shape} and {mirror_s.shape}")
@@ -146,7 +136,8 @@ def fit_clocks(stamp_us: Ints, mirror_s: Floats) -> ClockFit:
     for _ in range(_ROUNDS):
         off = mirror_s - camera - (offset + slope * camera)
         before = weight
-        weight = _tukey(off)
+        scale = max(_TO_SIGMA * float(np.median(np.abs(off))), LEAST_SCALE_S)
+        weight = np.clip(1 - (off / (_TUKEY * scale)) ** 2, 0, None) ** 2
         slope, offset = _weighted_line(camera, mirror_s - camera, weight)
         if np.allclose(weight, before, rtol=0, atol=1e-9):
             break
@@ -163,8 +154,6 @@ def fit_clocks(stamp_us: Ints, mirror_s: Floats) -> ClockFit:
         offset_s=offset,
         drift_ppm=slope * 1e6,
         residual_us=float(np.sqrt(np.sum(kept**2) / freedom)),
-        worst_us=float(np.abs(kept).max()),
-        events=len(camera),
         rejected=len(camera) - len(kept),
     )
 
@@ -187,22 +176,13 @@ def match_edges(
     ----------
     stamp_us, number
         (frame,) stamps that never go back, and numbers from the start of the capture; numbers may have gaps.
-    edge_s
-        (edge,) in order, by the mirror's clock.
-    log_s
-        From when to when the log runs.
-    period_s
-        Frame period.
+    edge_s, log_s
+        (edge,) in order, by the mirror's clock; from when to when the log runs.
     first_near_s
         When frame 0 was, within less than half a period.
 
-    Returns
-    -------
-    (frame,) number of the edge; -1 where there is none within half a period.
-
-    Raises
-    ------
-    RigError : there is no edge, or nothing tells which frame one belongs to.
+    Gives (frame,) the number of the edge; -1 where there is none within half a period. RigError where there is no edge,
+    or nothing tells which frame one belongs to.
     """
     if not len(edge_s):
         raise RigError("the log holds no edge of a frame; is the trigger's cable in, and was the log on?")
@@ -257,12 +237,6 @@ def _median_line(x: Floats, y: Floats) -> tuple[float, float]:
     apart = span != 0
     slope = float(np.median(rise[apart] / span[apart])) if apart.any() else 0.0
     return slope, float(np.median(y - slope * x))
-
-
-def _tukey(off: Floats) -> Floats:
-    scale = max(_TO_SIGMA * float(np.median(np.abs(off))), LEAST_SCALE_S)
-    weight: Floats = np.clip(1 - (off / (_TUKEY * scale)) ** 2, 0, None) ** 2
-    return weight
 
 
 def _weighted_line(x: Floats, y: Floats, weight: Floats) -> tuple[float, float]:

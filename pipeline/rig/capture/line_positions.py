@@ -74,11 +74,8 @@ def lines_by_trigger(
 ) -> LinePositions:
     """Take the position that each frame's trigger played: one vector index a frame, whatever the clocks say.
 
-    ``index_at_end``, the vector index read after the capture, shows whether frames were lost without a trace.
-
-    Raises
-    ------
-    RigError : the mirror counted other triggers than the camera frames, or the camera numbers no frame.
+    ``index_at_end``, the vector index read after the capture, shows whether frames were lost without a trace. RigError
+    where the mirror counted other triggers than the camera frames, or the camera numbers no frame.
     """
     positions = check_reach(path.position).astype(np.float64)
     number, notes = whole_numbers(frames.number)
@@ -108,14 +105,14 @@ def lines_by_log(
 
     Edges in the log give both, by a fit; without edges the commands give an offset, and drift is taken as 0. There
     ``commands.run_s`` is when the log began. A stamp that goes back or is missing is made up from its neighbours; one
-    far off its own edge counts by that edge.
-
-    Raises
-    ------
-    RigError : no stamp, no edge and no command times, or edges and stamps are of different events.
-    ShapeError : the track's arrays do not fit each other.
+    far off its own edge counts by that edge. RigError without edges and command times, or where edges and stamps are of
+    different events; ShapeError where the track's arrays do not fit each other.
     """
-    _check_track(track)
+    if track.time_s.ndim != 1 or not len(track.time_s) or track.position.shape != (len(track.time_s), 2):
+        raise ShapeError(
+            f"expected logged times (sample,) and positions (sample, 2), got {track.time_s.shape} and "
+            f"{track.position.shape}"
+        )
     stamp, number, notes = mend_times(frames)
     first_s = None if commands is None else np.mean(commands.capture_s) - np.mean(commands.run_s)
     if track.edge_s is None or not len(track.edge_s):
@@ -133,7 +130,8 @@ def lines_by_log(
     fit = fit_clocks(stamp[tied], track.edge_s[edge[tied]])
     began_s = fit.mirror_s(stamp)
     own = np.where(tied, track.edge_s[edge], began_s)
-    limit_s = max(6 * fit.residual_us * 1e-6, 3 * _step_s(track))
+    step_s = float(np.median(np.diff(track.time_s))) if len(track.time_s) > 1 else 0.0
+    limit_s = max(6 * fit.residual_us * 1e-6, 3 * step_s)
     odd = tied & (np.abs(own - began_s) > limit_s)
     began_s = np.where(odd, own, began_s)
     notes += [f"{np.count_nonzero(tied)} of {len(tied)} frames have an edge in the log"]
@@ -242,18 +240,6 @@ def _apart_px(track: MirrorTrack, camera: LineCamera, times: tuple[Floats, Float
     return float(np.sqrt(np.mean(np.sum((one - other) ** 2, axis=-1))) / camera.ifov_rad)
 
 
-def _check_track(track: MirrorTrack) -> None:
-    if track.time_s.ndim != 1 or not len(track.time_s) or track.position.shape != (len(track.time_s), 2):
-        raise ShapeError(
-            f"expected logged times (sample,) and positions (sample, 2), got {track.time_s.shape} and "
-            f"{track.position.shape}"
-        )
-
-
 def _unknown_s(commands: CommandTimes) -> float:
     """Half of the time within which the path and the first frame began."""
     return float(np.ptp(commands.run_s) + np.ptp(commands.capture_s)) / 2
-
-
-def _step_s(track: MirrorTrack) -> float:
-    return float(np.median(np.diff(track.time_s))) if len(track.time_s) > 1 else 0.0

@@ -18,7 +18,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from copy import copy
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -28,13 +29,13 @@ from pipeline.errors import RigError
 from pipeline.geometry.camera import LineCamera, bin_samples
 from pipeline.geometry.mounting import STRAIGHT
 from pipeline.geometry.scan import Sweep
+from pipeline.rig.camera.camera_cubes import as_references
 from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
-from pipeline.rig.camera.camera_references import as_references
-from pipeline.rig.camera.line_camera import FrameClaim
-from pipeline.rig.capture.capture_journal import CaptureJournal, CaptureRecord
+from pipeline.rig.camera.headwall_camera import FrameClaim
 from pipeline.rig.capture.capture_paths import (
     REFERENCES,
     CapturePath,
+    CaptureRecord,
     PlacedLines,
     UntiedError,
     can_trigger,
@@ -46,19 +47,14 @@ from pipeline.rig.capture.capture_runner import CaptureRunner, RigDevices, Say, 
 from pipeline.rig.device_errors import DeviceRefused, StateUnknown
 from pipeline.rig.survey_rig import SurveyRig
 from pipeline.simulator.simulated import check_binning
+from pipeline.rig.capture.capture_runner import CaptureJournal, CaptureRunner, RigDevices, Say, say_nothing
+from pipeline.rig.device_settings import SurveyRig
+from pipeline.rig.devices import DeviceRefused, StateUnknown
+from pipeline.simulator.instrument import check_binning
 from pipeline.source import Line, References
 
 LOG = logging.getLogger(__name__)
 BARREN = 2  # captures in a row without a line that end a sweep
-
-
-@dataclass(frozen=True)
-class RigView:
-    """What is known of a look before it is taken."""
-
-    camera: LineCamera
-    wavelength_nm: NDArray[np.float64]  # (band,)
-    field_shape: tuple[int, int]  # (y, x) [px]
 
 
 class RigSource:
@@ -66,6 +62,9 @@ class RigSource:
 
     Parameters
     ----------
+    camera, wavelength_nm, field_shape
+        What is known of a look before it is taken: the camera, as the settings have it, (band,) centres [nm] and (y, x)
+        size of the field [px].
     open_devices
         Connects both; they are closed when a session, or a call outside of one, ends.
     kept
@@ -81,7 +80,9 @@ class RigSource:
 
     def __init__(
         self,
-        view: RigView,
+        camera: LineCamera,
+        wavelength_nm: NDArray[np.float64],
+        field_shape: tuple[int, int],
         open_devices: Callable[[], RigDevices],
         kept: Kept,
         *,
@@ -89,7 +90,7 @@ class RigSource:
         vector_pairs: int = 1500,
         say: Say = say_nothing,
     ) -> None:
-        self.view = view
+        self.camera, self.wavelength_nm, self.field_shape = camera, wavelength_nm, field_shape
         self.rig = SurveyRig() if rig is None else rig
         self.vector_pairs = vector_pairs
         self._open, self._kept, self._say = open_devices, kept, say
@@ -97,21 +98,6 @@ class RigSource:
         self._unknown: list[str] = []  # why nobody knows what the rig does; shared by all that are made from this one
         self._runner: CaptureRunner | None = None
         self._whole: dict[str, tuple[References, tuple[str, ...]]] = {}  # of all samples, and notes, by folder
-
-    @property
-    def camera(self) -> LineCamera:
-        """The camera, as the settings have it."""
-        return self.view.camera
-
-    @property
-    def wavelength_nm(self) -> NDArray[np.float64]:
-        """(band,) centre wavelengths [nm]."""
-        return self.view.wavelength_nm
-
-    @property
-    def field_shape(self) -> tuple[int, int]:
-        """(y, x) size of the field [px]."""
-        return self.view.field_shape
 
     @property
     def record(self) -> dict[str, Any]:
@@ -128,27 +114,22 @@ class RigSource:
 
     def keeping(self, kept: Kept) -> RigSource:
         """Give the same source with its files elsewhere."""
-        return self._like(kept, self._say)
+        other = self.saying(self._say)
+        other._kept, other._journal, other._whole = kept, CaptureJournal(kept), {}
+        return other
 
     def saying(self, say: Say) -> RigSource:
         """Give the same source that tells somebody what the rig is at."""
-        return self._like(self._kept, say)
-
-    def _like(self, kept: Kept, say: Say) -> RigSource:
-        other = RigSource(self.view, self._open, kept, rig=self.rig, vector_pairs=self.vector_pairs, say=say)
-        other._unknown = self._unknown
-        if kept is self._kept:
-            other._whole = self._whole
+        other = copy(self)
+        other._say, other._runner = say, None
         return other
 
     @contextmanager
     def session(self) -> Iterator[CaptureRunner]:
         """Hold on to the devices over several calls; inner sessions share them.
 
-        Raises
-        ------
-        DeviceGone, DeadlinePassed, RigError : a device is not there, or another one is.
-        StateUnknown : what an earlier session sent was not acknowledged; nothing is sent again by this process.
+        Raises DeviceGone, DeadlinePassed or RigError where a device is not there, or another one is, and StateUnknown
+        where what an earlier session sent was not acknowledged; nothing is sent again by this process.
         """
         if self._runner is not None:
             yield self._runner
@@ -169,12 +150,10 @@ class RigSource:
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
         """Give the sweep's lines one by one, from line ``first`` on.
 
-        Raises
-        ------
-        ShapeError : sums of ``sweep.binning`` samples at full scale do not fit uint16.
-        PoseError : a position of the sweep is out of the mirror's reach.
-        StateUnknown : a motion or a capture was sent and not acknowledged.
-        RigError : a device failed, or what it sent does not fit; lines given so far, and captures acknowledged, stay.
+        Raises ShapeError where sums of ``sweep.binning`` samples at full scale do not fit uint16; PoseError where a
+        position of the sweep is out of the mirror's reach; StateUnknown where a motion or a capture was sent and not
+        acknowledged; RigError where a device failed, or what it sent does not fit: lines given so far, and captures
+        acknowledged, stay.
         """
         check_binning(sweep, self.camera)
         if first >= sweep.lines:
@@ -184,7 +163,12 @@ class RigSource:
             while line < sweep.lines:
                 before, why = line, "its files end there"
                 held = self._journal.holding(sweep, line)
-                taken = runner.take(self._next(sweep, line)) if held is None else runner.recovered(held)
+                if held is None:
+                    triggered = can_trigger(self.rig.pulses, sweep)
+                    path = next_path(sweep, line, self.camera, vector_pairs=self.vector_pairs, triggered=triggered)
+                    taken = runner.take(path)
+                else:
+                    taken = runner.recovered(held)
                 try:
                     for found in self._read(runner, taken, line):
                         yield found
@@ -201,11 +185,7 @@ class RigSource:
         """Give single lines of those given before, in order, from the files of the captures that hold them.
 
         Nothing is captured for them. A line that no capture gives any more comes as one that the camera dropped: there,
-        and not valid.
-
-        Raises
-        ------
-        RigError : a device failed, or the password is not taken.
+        and not valid. RigError where a device failed, or the password is not taken.
         """
         waiting = list(numbers)
         with self.session() as runner:
@@ -239,9 +219,7 @@ class RigSource:
     def references(self, sweep: Sweep) -> References:
         """Dark and white frames with the sweep's binning, captured and fetched once for all sweeps.
 
-        Raises
-        ------
-        RigError : the camera has none beside its captures, they do not fit, or a device failed.
+        RigError where the camera has none beside its captures, they do not fit, or a device failed.
         """
         if self._journal.references not in self._whole:
             with self.session() as runner:
@@ -279,15 +257,14 @@ class RigSource:
         self._check_size(whole.dark.shape, folder)
         return whole, notes
 
-    def _next(self, sweep: Sweep, line: int) -> CapturePath:
-        triggered = can_trigger(self.rig.pulses, sweep)
-        return next_path(sweep, line, self.camera, vector_pairs=self.vector_pairs, triggered=triggered)
-
     def _read(self, runner: CaptureRunner, taken: CaptureRecord, line: int) -> Iterator[Line]:
         """Fetch a capture and give its lines from ``line`` on."""
         try:
             captured = runner.devices.camera.fetch(
-                taken.folder, self._kept, self._fetched, claim=self._claim(taken.stop - taken.first)
+                taken.folder,
+                self._kept,
+                lambda _, held, size: self._say(f"fetching: {held / 1e6:.1f} of {size / 1e6:.1f} MB"),
+                claim=self._claim(taken.stop - taken.first),
             )
         except RigError as error:
             if type(error) is not RigError:  # a device that is gone, or a disk that is full: nothing is wrong with it
@@ -298,9 +275,6 @@ class RigSource:
         placed = place_lines(captured, path, taken, self.camera, runner.log_of(taken))
         self._journal.tied(taken, placed.tied, captured.notes)
         yield from self._given(captured.values, placed, path, line)
-
-    def _fetched(self, _: str, held: int, size: int) -> None:
-        self._say(f"fetching: {held / 1e6:.1f} of {size / 1e6:.1f} MB")
 
     def _given(self, values: NDArray[np.uint16], placed: PlacedLines, path: CapturePath, line: int) -> Iterator[Line]:
         """Lines from ``line`` on; one that the camera dropped, or that nothing places, is there and not valid."""

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
 from itertools import pairwise
 from typing import Any
 
@@ -18,61 +17,143 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import RigError
-from pipeline.rig.clock import Clock
-from pipeline.rig.emulator.camera_capture import EmulatedCapture, FrameClock, IndexLayout, Lines, Positions
-from pipeline.rig.emulator.exchange import Chunk
+from pipeline.rig.devices import Clock
+from pipeline.rig.emulator import Chunk
+from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 
+Floats = NDArray[Any]  # float64
+Ints = NDArray[np.int64]
+Raw = NDArray[np.uint16]
+Lines = Callable[[Floats, Floats], Raw]  # positions (line, 2), times (line,) of mid exposure -> (line, sample, band)
+Positions = Callable[[Floats], Floats]  # times (line,) -> (line, 2)
+
+_BLOCK = 64  # frames looked at together
 PROMPT = b"\r\nhpi> "
 MOST_LINE = 4096
 
 
-class CameraFault(Enum):
-    """A fault of the camera, and what happens where it strikes."""
+@dataclass(frozen=True)
+class FrameClock:
+    """The camera's clock: what it shows at 0 of the emulator's, and how fast it goes."""
 
-    words: str
+    origin_us: int = 1_500_000_000_000_000
+    drift_ppm: float = 0.0
+    delay_s: float = 0.01  # from the command to the first exposure
 
-    SLOW = "slow", "a reply comes late, and in time"
-    LATE = "late", "a reply comes after any deadline"
-    SILENT = "silent", "a command is done and its reply is lost"
-    SPLIT = "split", "a reply comes in pieces"
-    MERGED = "merged", "a reply comes together with one to a command that nobody sent"
-    STALE = "stale", "a reply to another command comes before the right one"
-    NOT_JSON = "not-json", "a reply is no JSON"
-    HANGS_UP = "hangs-up", "a command is done, and the connection closed without a reply"
-    FULL = "full", "a capture is refused: the disk is full"
-    BUSY = "busy", "a capture is refused: the camera is busy"
-    CUT_CUBE = "cut-cube", "a cube ends within a line"
-    BREAKS_OFF = "breaks-off", "a transfer of a file is closed half way"
-    REFUSES_FILES = "refuses-files", "a connection for files is closed at once"
+    def stamp_us(self, time_s: Floats) -> Ints:
+        """Stamps of times of the emulator's clock."""
+        passed: Ints = np.rint(time_s * (1 + self.drift_ppm * 1e-6) * 1e6).astype(np.int64)
+        return self.origin_us + passed
 
-    def __new__(cls, name: str, words: str) -> CameraFault:
-        fault = object.__new__(cls)
-        fault._value_, fault.words = name, words
-        return fault
+
+@dataclass(frozen=True)
+class IndexLayout:
+    """How frame indices are written; versions of the camera's program differ."""
+
+    between: str = "\t"
+    end: str = "\n"
+    restarts: bool = False  # numbers begin at 0 in each file, instead of going on
 
 
 @dataclass
-class CameraFaults:
-    """Faults still to come, each so many times, after ``passes`` occasions; where pieces are cut is by the seed."""
+class EmulatedCapture:
+    """Frames from ``began_s`` on, one each period, in cubes of ``frames_per_cube``."""
 
-    left: dict[CameraFault, int] = field(default_factory=dict)
-    seed: int = 0
-    passes: int = 0
-    slow_s: float = 1.0
-    late_s: float = 60.0
+    folder: str
+    began_s: float
+    exposure_s: float
+    period_s: float
+    frames_per_cube: int
+    most_frames: int | None  # None: until it is stopped
+    clock: FrameClock
+    layout: IndexLayout
+    wavelength_nm: Sequence[float]
+    references: dict[str, Raw] = field(default_factory=dict)  # name -> (frame, sample, band)
+    cut_bytes: int = 0  # missing at the end of the last cube
+    _lines: list[Raw] = field(default_factory=list)
+    _taken: int = 0
+    _whole: dict[str, bytes] | None = None  # all files, once no frame is to come
 
-    def __post_init__(self) -> None:
-        self.rng = np.random.default_rng(self.seed)
+    def due(self, now_s: float) -> int:
+        """Frames whose exposure is over."""
+        whole = int(np.floor((now_s - self.began_s - self.exposure_s) / self.period_s + 1e-9)) + 1
+        return max(whole if self.most_frames is None else min(whole, self.most_frames), 0)
 
-    def strikes(self, fault: CameraFault) -> bool:
-        """Whether the fault strikes now; it is then one less to come."""
-        if self.left.get(fault, 0) < 1:
-            return False
-        if self.passes > 0:
-            self.passes -= 1
-            return False
-        self.left[fault] -= 1
-        return True
+    def exposures(self, from_s: float, to_s: float) -> Floats:
+        """Begin and end (exposure, 2) of exposures that begin at ``from_s`` or later and before ``to_s``."""
+        bounds = np.ceil((np.array([from_s, to_s]) - self.began_s) / self.period_s - 1e-9).astype(np.int64)
+        first, stop = np.clip(bounds, 0, self.most_frames)
+        begins = self.began_s + np.arange(first, stop) * self.period_s
+        return np.stack([begins, begins + self.exposure_s], axis=-1)
+
+    def running(self, now_s: float) -> bool:
+        """Whether frames are still to come."""
+        return self.most_frames is None or self.due(now_s) < self.most_frames
+
+    def stop(self, now_s: float) -> None:
+        """Take no frame that is not over."""
+        self.most_frames = self.due(now_s)
+
+    def pending(self, now_s: float, most: int = _BLOCK) -> Ints:
+        """Numbers of the next frames, ``most`` at most, that are over by now and not taken yet."""
+        return np.arange(self._taken, max(min(self._taken + most, self.due(now_s)), self._taken))
+
+    def middle_s(self, numbers: Ints) -> Floats:
+        """Mid exposure of frames. [s]"""
+        middle: Floats = self.began_s + numbers * self.period_s + self.exposure_s / 2
+        return middle
+
+    def put(self, lines: NDArray[Any]) -> None:
+        """Take the next frames, (line, sample, band)."""
+        self._lines.append(np.asarray(lines, np.uint16))
+        self._taken += len(lines)
+
+    def drop(self) -> None:
+        """Have the files no longer; the capture is over."""
+        self._lines, self._whole = [], {}
+
+    def files(self) -> dict[str, bytes]:
+        """Names without the folder, and contents, of what has been taken."""
+        if self._whole is not None:
+            return self._whole
+        found: dict[str, bytes] = {
+            "imu_gps.txt": f"Roll\tPitch\tYaw\tLat\tLon\tAlt\tTimestamp{self.layout.end}".encode()
+        }
+        for name, frames in self.references.items():
+            found |= {name: _bil(frames), f"{name}.hdr": self._header(frames)}
+        self._lines = [np.concatenate(self._lines)] if self._lines else []
+        for first in range(0, self._taken, self.frames_per_cube):
+            every = self._lines[0]
+            cube = every[first : first + self.frames_per_cube]
+            data = _bil(cube)
+            if first + len(cube) == len(every) and self.cut_bytes:
+                data = data[: -self.cut_bytes]
+            found |= {f"raw_{first}": data, f"raw_{first}.hdr": self._header(cube)}
+            found[f"frameIndex_{first}.txt"] = self._index(first, len(cube))
+        if self._taken == self.most_frames:
+            self._whole = found
+        return found
+
+    def _index(self, first: int, count: int) -> bytes:
+        numbers = np.arange(first, first + count)
+        stamps = self.clock.stamp_us(self.began_s + numbers * self.period_s)
+        shown = numbers - first if self.layout.restarts else numbers
+        rows = [f"{number}{self.layout.between}{stamp}" for number, stamp in zip(shown, stamps, strict=True)]
+        return (self.layout.end.join([f"Frame#{self.layout.between}Timestamp", *rows]) + self.layout.end).encode()
+
+    def _header(self, frames: Raw) -> bytes:
+        lines, samples, bands = frames.shape
+        text = (
+            f"ENVI\ninterleave = bil\ndata type = 12\nlines = {lines}\nsamples = {samples}\nbands = {bands}\n"
+            "byte order = 0\nheader offset = 0\n"
+        )
+        if bands and len(self.wavelength_nm) == bands:
+            text += "wavelength = {\n" + ",\n".join(f"{value:.17g}" for value in self.wavelength_nm) + "\n}\n"
+        return text.encode()
+
+
+def _bil(frames: Raw) -> bytes:
+    return np.ascontiguousarray(frames.transpose(0, 2, 1), "<u2").tobytes()
 
 
 @dataclass(frozen=True)
@@ -80,8 +161,6 @@ class CameraUnit:
     """What the emulated camera is like."""
 
     root: str = "/captured"
-    echoes: bool = True
-    greeting: str = "Hyperspec control"
     usual_frames: int = 2000  # of a cube, where the command says 0
     disk_bytes: int = 480 * 10**9
     clock: FrameClock = field(default_factory=FrameClock)
@@ -90,20 +169,11 @@ class CameraUnit:
     references: dict[str, NDArray[np.uint16]] = field(default_factory=dict)  # such as darkReference, in each folder
 
 
-def at_rest(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions of a mirror that never moves."""
-    return np.zeros((len(times_s), 2))
-
-
 class CameraDevice:
     """One camera. Frames are looked at when somebody asks, so ``positions`` must answer for times gone by.
 
-    Parameters
-    ----------
-    lines
-        Gives lines (line, sample, band) uint16 of mirror positions (line, 2) and times (line,) by ``clock``.
-    positions
-        Gives mirror positions of times; at rest where none is given.
+    ``lines`` gives lines (line, sample, band) uint16 of mirror positions (line, 2) and times (line,) by ``clock``;
+    ``positions`` gives mirror positions of times, at rest where none is given.
     """
 
     def __init__(
@@ -111,7 +181,7 @@ class CameraDevice:
         lines: Lines,
         clock: Clock,
         *,
-        positions: Positions = at_rest,
+        positions: Positions = lambda times_s: np.zeros((len(times_s), 2)),
         unit: CameraUnit | None = None,
         faults: CameraFaults | None = None,
     ) -> None:
@@ -126,8 +196,7 @@ class CameraDevice:
 
     def greet(self) -> list[Chunk]:
         """What a new connection is sent."""
-        greeting = f"{self.unit.greeting}\r\n".encode() if self.unit.greeting else b""
-        return self._cut(greeting + PROMPT[2:])
+        return self._cut(b"Hyperspec control" + PROMPT)
 
     def command(self, line: str) -> list[Chunk] | None:
         """Do one command; give its reply, in pieces and in time, or None where the connection ends."""
@@ -157,9 +226,7 @@ class CameraDevice:
         """All files by their whole names, as they are now."""
         with self._lock:
             self._look()
-            return {
-                f"{capture.folder}/{name}": data for capture in self.captures for name, data in capture.files().items()
-            }
+            return {f"{one.folder}/{name}": data for one in self.captures for name, data in one.files().items()}
 
     def folders(self) -> set[str]:
         """All folders."""
@@ -176,26 +243,22 @@ class CameraDevice:
                 capture.put(self._lines(self._positions(middle_s), middle_s))
 
     def _spoken(self, line: str, reply: str) -> list[Chunk]:
-        echo = f"{line}\r\n" if self.unit.echoes else ""
         if self.faults.strikes(CameraFault.SILENT):
             return []
         if self.faults.strikes(CameraFault.NOT_JSON):
             reply = "Segmentation fault"
-        data = f"{echo}{reply}".encode() + PROMPT
+        data = f"{line}\r\n{reply}".encode() + PROMPT
+        foreign = b'%b\r\n{"success": true, "response": [], "errorMessage": ""}' + PROMPT  # its echo tells it apart
         if self.faults.strikes(CameraFault.STALE):
-            other = "listFiles" if not line.startswith("listFiles") else "isCapturing"
-            return [Chunk(0.0, self._foreign(other)), Chunk(0.1, data)]
+            other = b"isCapturing" if line.startswith("listFiles") else b"listFiles"
+            return [Chunk(0.0, foreign % other), Chunk(0.1, data)]
         if self.faults.strikes(CameraFault.MERGED):
-            return [Chunk(0.0, self._foreign("stopCapture") + data)]
+            return [Chunk(0.0, foreign % b"stopCapture" + data)]
         if self.faults.strikes(CameraFault.LATE):
             return [Chunk(self.faults.late_s, data)]
         if self.faults.strikes(CameraFault.SLOW):
             return [Chunk(self.faults.slow_s, data)]
         return self._cut(data)
-
-    def _foreign(self, name: str) -> bytes:
-        """A reply to a command that was not sent, which can be told by its echo."""
-        return f'{name}\r\n{{"success": true, "response": [], "errorMessage": ""}}'.encode() + PROMPT
 
     def _cut(self, data: bytes) -> list[Chunk]:
         if not self.faults.strikes(CameraFault.SPLIT):
@@ -213,16 +276,20 @@ class CameraDevice:
                 argument = json.loads(rest.rstrip().removesuffix(")"))
             except ValueError:
                 raise RigError(f"argument of {name} is not JSON") from None
-        does: dict[str, Callable[[Any], Any]] = {
-            "configure": self._configure,
-            "capture": self._capture,
-            "listFiles": self._list,
-            "isCapturing": lambda _: self.is_capturing(),
-            "stopCapture": self._stop,
-        }
-        if name.strip() not in does:
-            raise RigError(f"unknown command {name}")
-        return does[name.strip()](argument)
+        match name.strip():
+            case "configure":
+                return self._configure(argument)
+            case "capture":
+                return self._capture(argument)
+            case "listFiles":
+                return self._list(argument)
+            case "isCapturing":
+                return self.is_capturing()
+            case "stopCapture":
+                if runs := self.is_capturing():
+                    self.captures[-1].stop(self.clock.now())
+                return runs
+        raise RigError(f"unknown command {name}")
 
     def _configure(self, argument: Any) -> Any:
         if not isinstance(argument, dict) or not {"exposure", "framePeriod"} >= set(argument):
@@ -269,12 +336,6 @@ class CameraDevice:
             cut_bytes=cut,
         )
 
-    def _stop(self, argument: Any) -> bool:
-        if not self.is_capturing():
-            return False
-        self.captures[-1].stop(self.clock.now())
-        return True
-
     def _list(self, argument: Any) -> list[dict[str, Any]]:
         folder = "/" + str(argument or "").strip("/")
         if folder not in self.folders():
@@ -287,27 +348,3 @@ class CameraDevice:
             for name, size, is_folder in sorted(found)
             if name.startswith(under) and "/" not in name[len(under) :]
         ]
-
-
-class CameraConnection:
-    """One connection's own half of the talk: its bytes, cut into commands at carriage returns."""
-
-    def __init__(self, device: CameraDevice) -> None:
-        self._device = device
-        self._held = b""
-
-    def feed(self, data: bytes) -> tuple[list[Chunk], bool]:
-        """Take bytes; give replies, and whether the connection goes on."""
-        self._held += data
-        chunks: list[Chunk] = []
-        while (end := self._held.find(b"\r")) >= 0:
-            line, self._held = self._held[:end], self._held[end + 1 :].removeprefix(b"\n")
-            text = line.decode("utf-8", errors="replace").strip()
-            if not text:
-                chunks.append(Chunk(0.0, PROMPT))
-                continue
-            reply = self._device.command(text)
-            if reply is None:
-                return chunks, False
-            chunks += reply
-        return chunks, len(self._held) <= MOST_LINE

@@ -18,10 +18,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pipeline.errors import RigError
-from pipeline.rig.clock import Clock
-from pipeline.rig.device_errors import DeviceGone
-from pipeline.rig.emulator.camera_device import CameraConnection, CameraDevice, CameraFault
-from pipeline.rig.emulator.exchange import Chunk
+from pipeline.rig.devices import Clock, Closing, DeviceGone
+from pipeline.rig.emulator import Chunk
+from pipeline.rig.emulator.camera_device import MOST_LINE, PROMPT, CameraDevice
+from pipeline.rig.emulator.fault_names import CameraFault
 
 try:
     with warnings.catch_warnings():
@@ -36,6 +36,30 @@ except ImportError as error:
 
 LOG = logging.getLogger(__name__)
 _SLICE_S = 0.05  # how soon threads see that they are to end
+
+
+class CameraConnection:
+    """One connection's own half of the talk: its bytes, cut into commands at carriage returns."""
+
+    def __init__(self, device: CameraDevice) -> None:
+        self._device = device
+        self._held = b""
+
+    def feed(self, data: bytes) -> tuple[list[Chunk], bool]:
+        """Take bytes; give replies, and whether the connection goes on."""
+        self._held += data
+        chunks: list[Chunk] = []
+        while (end := self._held.find(b"\r")) >= 0:
+            line, self._held = self._held[:end], self._held[end + 1 :].removeprefix(b"\n")
+            text = line.decode("utf-8", errors="replace").strip()
+            if not text:
+                chunks.append(Chunk(0.0, PROMPT))
+                continue
+            reply = self._device.command(text)
+            if reply is None:
+                return chunks, False
+            chunks += reply
+        return chunks, len(self._held) <= MOST_LINE
 
 
 @dataclass
@@ -91,17 +115,10 @@ class InProcessCameraLine:
             raise DeviceGone(f"the connection to {self.port} was lost (closed by the other end)")
 
 
-class CameraServer:
-    """Both ports of a device, until ``close``. Also a context.
+class CameraServer(Closing):
+    """Both ports of a device, of its control socket and of FTP (0 takes a free one), until ``close``. Also a context.
 
-    Parameters
-    ----------
-    port, file_port
-        Of the control socket and of FTP; 0 takes a free one.
-
-    Raises
-    ------
-    RigError : a port is taken.
+    RigError where a port is taken.
     """
 
     def __init__(
@@ -134,12 +151,6 @@ class CameraServer:
         self.file_port = int(self._files.socket.getsockname()[1])
         for serve in (self._serve_control, self._serve_files):
             self._start(serve)
-
-    def __enter__(self) -> CameraServer:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Hang up on everyone, and let go of the ports."""
@@ -229,14 +240,6 @@ class _BreakingTransfer(DTPHandler):  # type: ignore[misc]
         super().push_with_producer(producer)
 
 
-class _NamedBytes(io.BytesIO):
-    """A file in memory with the name that servers ask for."""
-
-    def __init__(self, name: str, data: bytes) -> None:
-        super().__init__(data)
-        self.name = name
-
-
 class _FilesInMemory(AbstractedFS):  # type: ignore[misc]
     """A device's files as a read-only file system."""
 
@@ -273,7 +276,9 @@ class _FilesInMemory(AbstractedFS):  # type: ignore[misc]
         return len(self._content(path))
 
     def open(self, name: str, mode: str) -> io.BytesIO:
-        return _NamedBytes(name, self._content(name))
+        file = io.BytesIO(self._content(name))
+        file.name = name  # servers ask for it
+        return file
 
     def listdir(self, path: str) -> list[str]:
         under = path.rstrip("/") + "/"

@@ -1,16 +1,10 @@
 """A whole emulated rig: mirror and camera on one clock, the camera's exposures at the mirror's trigger, and a scene.
 
 A planned sweep that is announced (by a capture's prefix, :func:`pipeline.rig.capture.capture_paths.capture_prefix`),
-loaded and played gives the simulated source's lines, bit for bit:
-
-- The mirror's vector unit takes the first cell as it is run, and one more at each rising edge. A path that is played by
-  trigger therefore begins with a lead-in cell; line 0's first position is its second.
-- A line that holds several positions gets as many pulses, evenly over its exposure, or what ``wired`` says. Without
-  trigger the path is run at (positions of a line) / (frame period), and is the planned one where it begins within half
-  a held position of the first exposure.
-- Frames count as the line whose planned positions the mirror holds. See :mod:`pipeline.rig.emulator.scene_camera`.
-- The frames hold all samples of the camera; binning is the reader's. A capture with the prefix ``references`` has dark
-  and white cubes beside its frames.
+loaded and played gives the simulated source's lines, bit for bit; see :mod:`pipeline.rig.emulator.scene_camera`. A path
+that is played by trigger begins with a lead-in cell: the mirror takes the first as it is run, and one more at each
+rising edge. Without trigger it is run at (positions of a line) / (frame period), and is the planned one where it begins
+within half a held position of the first exposure. A capture with the prefix ``references`` has dark and white cubes.
 """
 
 from __future__ import annotations
@@ -22,18 +16,16 @@ from dataclasses import dataclass
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.mounting import STRAIGHT, Mounting
-from pipeline.rig.camera.camera_settings import FileServer
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.camera.headwall_control import HeadwallControl
-from pipeline.rig.clock import SYSTEM_CLOCK, Clock, ManualClock
-from pipeline.rig.emulator.camera_device import CameraFaults, CameraUnit
+from pipeline.rig.device_settings import FileServer, Pulses
+from pipeline.rig.devices import SYSTEM_CLOCK, Clock, Closing, ManualClock
+from pipeline.rig.emulator.camera_device import CameraUnit
 from pipeline.rig.emulator.camera_server import CameraServer, InProcessCameraLine
-from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.mirror_faults import Fault
+from pipeline.rig.emulator.fault_names import CameraFaults
+from pipeline.rig.emulator.mirror_device import Fault, MirrorDevice
 from pipeline.rig.emulator.mirror_ports import EmulatedPort, InProcessTransport
 from pipeline.rig.emulator.mirror_state import MirrorUnit
-from pipeline.rig.emulator.scene_camera import Look, SceneCamera, SceneView
-from pipeline.rig.survey_rig import Pulses
+from pipeline.rig.emulator.scene_camera import SceneCamera, SceneView
 from pipeline.simulator.simulated import SimulatedSource
 
 LOG = logging.getLogger(__name__)
@@ -76,8 +68,6 @@ class EmulatedRig:
         Of both devices: one turned by hand for :meth:`in_process`, a ``FastClock`` for :meth:`serve`.
     wired
         What pulses the mirror's trigger input gets: one for each held ``position``, each ``frame``, or ``none``.
-    look
-        Whether frames are seen from where the mirror was sent, or from where its motion has it; see ``SceneCamera``.
     kept
         So many finished captures keep their files; 0 is all.
     mounting
@@ -92,7 +82,6 @@ class EmulatedRig:
         mirror_faults: Sequence[Fault] = (),
         camera_faults: CameraFaults | None = None,
         wired: Pulses = "position",
-        look: Look = "sent",
         kept: int = 0,
         mirror: MirrorUnit | None = None,
         camera: CameraUnit | None = None,
@@ -105,7 +94,6 @@ class EmulatedRig:
             self.mirror,
             self.clock,
             wired=wired,
-            look=look,
             kept=kept,
             unit=camera,
             faults=camera_faults,
@@ -119,33 +107,22 @@ class EmulatedRig:
         mode = "gone" if self.mirror.gone else "hung" if self.mirror.hung else self.mirror.mode.value
         return RigState((float(x), float(y)), mode, last, self.camera.is_capturing(), len(self.camera.captures))
 
-    def in_process(self, *, baud: int = 0) -> InProcessRig:
+    def in_process(self) -> InProcessRig:
         """Give lines to both devices without ports; only the camera's files go through a socket of this machine."""
-        return InProcessRig(self, InProcessTransport(self.mirror, self.clock, baud), CameraServer(self.camera))
+        return InProcessRig(self, InProcessTransport(self.mirror, self.clock), CameraServer(self.camera))
 
-    def serve(self, *, baud: int = 0, host: str = "127.0.0.1", camera_port: int = 0, file_port: int = 0) -> ServedRig:
-        """Open a pty for the mirror, and the camera's sockets; use it as a context, or close it.
-
-        Raises
-        ------
-        RigError : this system has no ptys, or a port is taken.
-        """
-        return ServedRig(self, baud, (host, camera_port, file_port))
+    def serve(self, *, baud: int = 0) -> ServedRig:
+        """Open a pty for the mirror, and the camera's sockets (else RigError); use it as a context, or close it."""
+        return ServedRig(self, baud)
 
 
 @dataclass
-class InProcessRig:
+class InProcessRig(Closing):
     """Lines to an emulated rig on a clock that waiting moves. Close it: a thread serves the camera's files."""
 
     rig: EmulatedRig
     transport: InProcessTransport
     server: CameraServer
-
-    def __enter__(self) -> InProcessRig:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     @property
     def clock(self) -> Clock:
@@ -163,41 +140,34 @@ class InProcessRig:
 
     def camera(self) -> HeadwallCamera:
         """Give a driver that is connected to the camera."""
-        return HeadwallCamera(HeadwallControl(self.camera_line, clock=self.clock), self.files, self.clock)
+        return HeadwallCamera(self.camera_line, self.files, clock=self.clock)
 
     def close(self) -> None:
         """Let go of the port for files."""
         self.server.close()
 
 
-class ServedRig:
+class ServedRig(Closing):
     """An emulated rig behind a pty and sockets, from its making to :meth:`close`.
 
     ``port`` is the mirror's, to be opened as a serial port; the camera listens at ``host``, ``camera_port`` and
     ``file_port``.
     """
 
-    def __init__(self, rig: EmulatedRig, baud: int, address: tuple[str, int, int]) -> None:
+    def __init__(self, rig: EmulatedRig, baud: int) -> None:
         self.rig = rig
-        self.host, camera_port, file_port = address
         self._port = EmulatedPort(rig.mirror, baud=baud)
         self.port = self._port.open()
         try:
-            self._server = CameraServer(rig.camera, host=self.host, port=camera_port, file_port=file_port)
+            self._server = CameraServer(rig.camera)
         except BaseException:
             self._port.close()
             raise
-        self.camera_port, self.file_port = self._server.port, self._server.file_port
+        self.host, self.camera_port, self.file_port = self._server.host, self._server.port, self._server.file_port
         rig.camera.aside = True
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._look, name="emulated camera's eye", daemon=True)
         self._thread.start()
-
-    def __enter__(self) -> ServedRig:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Let go of the pty and the sockets; whoever is connected sees the devices go."""

@@ -9,34 +9,140 @@ after GOPROCRC alone, and replies always carry it.
 
 from __future__ import annotations
 
+import errno
 import math
 import re
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import Enum
+from random import Random
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.rig.clock import Clock
-from pipeline.rig.emulator.exchange import Chunk, Mode, Request, VanishedError
-from pipeline.rig.emulator.mirror_faults import Fault
+from pipeline.rig.devices import Clock
+from pipeline.rig.emulator import Chunk
 from pipeline.rig.emulator.mirror_registers import RegisterFile
 from pipeline.rig.emulator.mirror_state import MirrorState, MirrorUnit
-from pipeline.rig.mirror import simple_mode
-from pipeline.rig.mirror.pro_mode import BOUNDARY, ERROR_FLAG, Command, ErrorCode, Frame, FrameReader, encode
-from pipeline.rig.mirror.pro_payloads import refuse
-from pipeline.rig.mirror.registers import CHANNELS, ChannelRegisters, Unit
-from pipeline.rig.mirror.simple_mode import END, MOST_LINE, Answer
+from pipeline.rig.mirror import mirror_requests as simple
+from pipeline.rig.mirror.mirror_requests import END, MOST_LINE, Reply
+from pipeline.rig.mirror.pro_mode import (
+    BOUNDARY,
+    ERROR_FLAG,
+    Command,
+    Damaged,
+    ErrorCode,
+    Frame,
+    FrameReader,
+    encode,
+    refuse,
+)
+from pipeline.rig.mirror.registers import ChannelRegisters, Unit
 
 KEPT_ACTS = 5_000
-_BOUNDARY = bytes((BOUNDARY,))
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:E[-+]?\d+)?"
 _PLACE = re.compile(rf"(X|Y|XY)=({_NUMBER})(?:;({_NUMBER}))?")
 
 Floats = NDArray[np.float64]
 Pulses = Callable[[float, float], Floats]  # (pulse, 2) rises and falls of pulses that rise within a span of time
+
+
+class Mode(Enum):
+    """How the controller is spoken to."""
+
+    SIMPLE = "simple"
+    PRO = "pro"
+    PRO_CRC = "pro, requests checked"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What came: a line of simple mode without its end, a frame, or bytes between boundaries that are none."""
+
+    mode: Mode
+    line: str = ""
+    frame: Frame | None = None
+    damaged: Damaged | None = None
+
+    @property
+    def command(self) -> int | None:
+        """Command of the frame."""
+        return None if self.frame is None else self.frame.command
+
+    @property
+    def words(self) -> str:
+        """What was asked, for people: the line, or the command's name."""
+        if self.frame is None:
+            return self.line or "bytes that are no frame"
+        known = {command.value: command.name for command in Command}
+        return known.get(self.frame.command, f"command {self.frame.command:02X}").lower().replace("_", " ")
+
+
+class VanishedError(OSError):
+    """The device went away: no port knows it any more."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(errno.EIO, why)
+
+
+@dataclass
+class Chance:
+    """When a fault strikes: at one of the opportunities that come, early ones as likely as later twice as many."""
+
+    random: Random
+    at: int
+    seen: int = 0
+    struck: int = 0
+
+    @classmethod
+    def drawn(cls, name: str, seed: int, span: int, at: int | None = None) -> Chance:
+        """Draw the opportunity, from 0 to ``span``, exclusive; ``at`` says it instead."""
+        random = Random(f"{name} {seed}")
+        drawn = int(2 ** random.uniform(0, math.log2(span + 1))) - 1
+        return cls(random, min(drawn, span - 1) if at is None else at)
+
+    def comes(self) -> bool:
+        """Take note of an opportunity and say whether it is the one."""
+        self.seen += 1
+        now = self.seen == self.at + 1
+        self.struck += now
+        return now
+
+    def lasts(self) -> bool:
+        """Take note of an opportunity and say whether it is the one, or comes after it."""
+        return self.comes() or self.seen > self.at
+
+
+@dataclass
+class Fault:
+    """A fault that never strikes. Hooks are called in the order in which they stand here."""
+
+    chance: Chance
+
+    def begin(self, device: MirrorDevice) -> None:
+        """Take a hand as the controller is switched on."""
+
+    def opened(self, device: MirrorDevice) -> list[Chunk]:
+        """Give what is found in the port as it is opened."""
+        return []
+
+    def instead(self, device: MirrorDevice, data: bytes) -> list[Chunk] | None:
+        """Answer bytes in the controller's place; None leaves them to it."""
+        return None
+
+    def incoming(self, device: MirrorDevice, data: bytes) -> bytes:
+        """Give the bytes that reach the controller."""
+        return data
+
+    def verdict(self, device: MirrorDevice, request: Request) -> bytes | None:
+        """Give a reply to a request that then is not carried out; None lets the controller do it."""
+        return None
+
+    def outgoing(self, device: MirrorDevice, request: Request, chunks: list[Chunk]) -> list[Chunk]:
+        """Give the bytes that leave the controller, and when."""
+        return chunks
 
 
 @dataclass(frozen=True)
@@ -88,15 +194,6 @@ class MirrorDevice:
             while data and not self.gone and self.clock.now() >= self._boots_until:
                 data = self._take_line(data, out) if self.mode is Mode.SIMPLE else self._take_frame(data, out)
             return out
-
-    def trigger(
-        self, count: int = 1, *, period_s: float = 0.0, started_s: float | None = None, width_s: float = 1e-4
-    ) -> None:
-        """Take ``count`` pulses at the trigger input, one every ``period_s``, from now or from ``started_s`` on."""
-        with self._lock:
-            now_s = self.state.advance()
-            rises = (now_s if started_s is None else started_s) + np.arange(count, dtype=np.float64) * period_s
-            self.state.trigger(rises, rises + width_s)
 
     def take_pulses(self) -> None:
         """Step through the vector memory as the pulses at the trigger input since the last call say."""
@@ -150,7 +247,7 @@ class MirrorDevice:
 
     def _take_frame(self, data: bytes, out: list[Chunk]) -> bytes:
         """Take bytes up to a boundary, and give those behind it: a frame may change the mode."""
-        taken, end, rest = data.partition(_BOUNDARY)
+        taken, end, rest = data.partition(bytes((BOUNDARY,)))
         for found in self._reader.feed(taken + end):
             whole, damaged = (found, None) if isinstance(found, Frame) else (None, found)
             self._answer(Request(self.mode, frame=whole, damaged=damaged), out)
@@ -175,60 +272,58 @@ class MirrorDevice:
             command = request.damaged.data[1] if len(request.damaged.data) > 1 else 0
             return encode(refuse(command & ~ERROR_FLAG, ErrorCode.FRAME_INVALID))
         if request.frame is not None:
-            return encode(self._pro(request.frame))
+            if self.mode is Mode.PRO_CRC and not request.frame.crc_good:
+                return encode(refuse(request.frame.command & ~ERROR_FLAG, ErrorCode.CRC_WRONG))
+            reply = self.registers.answer(request.frame)
+            if reply.command == Command.SET_MODE:
+                self.set_mode(Mode.SIMPLE)
+            return encode(reply)
         return self._simple(request.line).encode("ascii") + END
-
-    def _pro(self, frame: Frame) -> Frame:
-        if self.mode is Mode.PRO_CRC and not frame.crc_good:
-            return refuse(frame.command & ~ERROR_FLAG, ErrorCode.CRC_WRONG)
-        reply = self.registers.answer(frame)
-        if reply.command == Command.SET_MODE:
-            self.set_mode(Mode.SIMPLE)
-        return reply
 
     def _simple(self, line: str) -> str:
         """Carry out a line, in capitals and without its end, and give the answer without an end."""
         if len(line) + len(END) > MOST_LINE:
-            return Answer.ERROR
+            return Reply.ERROR
         match line:
-            case simple_mode.ID:
+            case simple.ID:
                 return self.unit.model
-            case simple_mode.VERSION:
+            case simple.VERSION:
                 return self.unit.version
-            case simple_mode.SERIAL:
+            case simple.SERIAL:
                 return self.unit.serial_number
-            case simple_mode.TEMPERATURE:
+            case simple.TEMPERATURE:
                 return f"{self.unit.temperature_c:.2f}"
-            case simple_mode.STATUS:
+            case simple.STATUS:
                 return f"{int(self.state.status()):08X}"
-            case simple_mode.ACKNOWLEDGE:
+            case simple.ACKNOWLEDGE:
                 self.state.acknowledge()
-            case simple_mode.GO_PRO:
+            case simple.GO_PRO:
                 self.set_mode(Mode.PRO)
-            case simple_mode.GO_PRO_CRC:
+            case simple.GO_PRO_CRC:
                 self.set_mode(Mode.PRO_CRC)
-            case simple_mode.RESET:
+            case simple.RESET:
                 self.restart()
-            case simple_mode.START:
+            case simple.START:
                 pass
             case _:
                 return self._go(line)
-        return Answer.OK
+        return Reply.OK
 
-    def _go(self, line: str) -> Answer:
+    def _go(self, line: str) -> Reply:
         name, equals, _ = line.partition("=")
         if not equals or name not in ("X", "Y", "XY"):
-            return Answer.NO
+            return Reply.NO
         found = _PLACE.fullmatch(line)
         if found is None or (name == "XY") != (found[3] is not None):
-            return Answer.ERROR
+            return Reply.ERROR
         state, places = self.state, [float(number) for number in found.groups()[1:] if number is not None]
         x, y = (axis[Unit.XY] for axis in state.static)
         x, y = {"X": (places[0], y), "Y": (x, places[0]), "XY": (places[0], places[-1])}[name]
-        for channel in range(CHANNELS):
+        for channel, place in enumerate((x, y)):
             registers = ChannelRegisters(channel)
             state.inputs[channel], state.controls[channel] = registers.static_system, registers.xy_system
-        state.hold({0: x, 1: y})
+            state.static[channel][Unit.XY] = place
+        state.aim()
         if not state.trimmed:
-            return Answer.OK
-        return Answer.BELOW if -min(places) > max(places) else Answer.ABOVE
+            return Reply.OK
+        return Reply.BELOW if -min(places) > max(places) else Reply.ABOVE

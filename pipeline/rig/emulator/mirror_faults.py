@@ -9,11 +9,11 @@ from random import Random
 
 import numpy as np
 
-from pipeline.rig.emulator.exchange import Chunk, Mode, Request, StruckMirror, VanishedError
-from pipeline.rig.mirror.pro_mode import Command, Frame, encode
-from pipeline.rig.mirror.pro_payloads import CELL, int_cell, read_vector, refuse
+from pipeline.rig.emulator import Chunk
+from pipeline.rig.emulator.mirror_device import Fault, MirrorDevice, Mode, Request, VanishedError
+from pipeline.rig.mirror.mirror_requests import END, ID, VERSION
+from pipeline.rig.mirror.pro_mode import CELL, Command, Frame, encode, int_cell, read_vector, refuse
 from pipeline.rig.mirror.registers import VECTOR_MEMORY, Status
-from pipeline.rig.mirror.simple_mode import END, ID, VERSION
 
 LATE_S = 20.0  # beyond any deadline
 SLOW_S = 0.02  # from byte to byte
@@ -24,65 +24,7 @@ _OTHER_TEXTS = {ID: "LENS-DRIVER-4", VERSION: "0.0.1"}
 _OTHER_FIRMWARE = 0xDEAD0001
 
 Change = Callable[[bytes, int, Random], bytes]  # some bytes, and the place of the one that is changed
-Spoil = Callable[[StruckMirror, list[Chunk], Random], list[Chunk]]
-
-
-@dataclass
-class Chance:
-    """When a fault strikes: at one of the opportunities that come, early ones as likely as later twice as many."""
-
-    random: Random
-    at: int
-    seen: int = 0
-    struck: int = 0
-
-    @classmethod
-    def drawn(cls, name: str, seed: int, span: int, at: int | None = None) -> Chance:
-        """Draw the opportunity, from 0 to ``span``, exclusive; ``at`` says it instead."""
-        random = Random(f"{name} {seed}")
-        drawn = int(2 ** random.uniform(0, math.log2(span + 1))) - 1
-        return cls(random, min(drawn, span - 1) if at is None else at)
-
-    def comes(self) -> bool:
-        """Take note of an opportunity and say whether it is the one."""
-        self.seen += 1
-        now = self.seen == self.at + 1
-        self.struck += now
-        return now
-
-    def lasts(self) -> bool:
-        """Take note of an opportunity and say whether it is the one, or comes after it."""
-        return self.comes() or self.seen > self.at
-
-
-@dataclass
-class Fault:
-    """A fault that never strikes. Hooks are called in the order in which they stand here."""
-
-    chance: Chance
-
-    def begin(self, device: StruckMirror) -> None:
-        """Take a hand as the controller is switched on."""
-
-    def opened(self, device: StruckMirror) -> list[Chunk]:
-        """Give what is found in the port as it is opened."""
-        return []
-
-    def instead(self, device: StruckMirror, data: bytes) -> list[Chunk] | None:
-        """Answer bytes in the controller's place; None leaves them to it."""
-        return None
-
-    def incoming(self, device: StruckMirror, data: bytes) -> bytes:
-        """Give the bytes that reach the controller."""
-        return data
-
-    def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
-        """Give a reply to a request that then is not carried out; None lets the controller do it."""
-        return None
-
-    def outgoing(self, device: StruckMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
-        """Give the bytes that leave the controller, and when."""
-        return chunks
+Spoil = Callable[[MirrorDevice, list[Chunk], Random], list[Chunk]]
 
 
 # what may become of bytes
@@ -109,14 +51,14 @@ def double(data: bytes, at: int, random: Random) -> bytes:
 def changed(change: Change) -> Spoil:
     """Change one byte."""
 
-    def spoil(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+    def spoil(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
         delay_s, data = chunks[0]
         return [Chunk(delay_s, change(data, random.randrange(len(data)), random)), *chunks[1:]]
 
     return spoil
 
 
-def split(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+def split(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
     """Cut it into pieces of a few bytes, a millisecond apart."""
     pieces = []
     for delay_s, data in chunks:
@@ -127,33 +69,33 @@ def split(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chu
     return pieces
 
 
-def merge(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+def merge(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
     """Let it wait for the next tick of a slow clock, with those that wait already."""
     now = device.clock.now()
     return [Chunk(math.ceil((now + delay_s) / TICK_S) * TICK_S - now, data) for delay_s, data in chunks]
 
 
-def noise(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+def noise(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
     """Put bytes that mean nothing before it."""
     return [Chunk(chunks[0].delay_s, random.randbytes(random.randint(1, 12))), *chunks]
 
 
-def late(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+def late(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
     """Hold it back beyond any deadline."""
     return [Chunk(delay_s + LATE_S, data) for delay_s, data in chunks]
 
 
-def just_late(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+def just_late(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
     """Hold it back until around its deadline of a second, so that it may meet the next request."""
     return [Chunk(delay_s + random.uniform(0.3, 1.5), data) for delay_s, data in chunks]
 
 
-def lost(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+def lost(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
     """Keep it."""
     return []
 
 
-def slow(device: StruckMirror, chunks: list[Chunk], random: Random) -> list[Chunk]:
+def slow(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chunk]:
     """Send its bytes one at a time, with long gaps."""
     whole = b"".join(data for _, data in chunks)
     return [Chunk(chunks[0].delay_s + place * SLOW_S, whole[place : place + 1]) for place in range(len(whole))]
@@ -166,7 +108,7 @@ class SpoiltReply(Fault):
     spoil: Spoil
     lasting: bool = False
 
-    def outgoing(self, device: StruckMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
+    def outgoing(self, device: MirrorDevice, request: Request, chunks: list[Chunk]) -> list[Chunk]:
         if not chunks or not (self.chance.lasts() if self.lasting else self.chance.comes()):
             return chunks
         return self.spoil(device, chunks, self.chance.random)
@@ -178,7 +120,7 @@ class OldReplyAgain(Fault):
 
     last: bytes = b""
 
-    def outgoing(self, device: StruckMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
+    def outgoing(self, device: MirrorDevice, request: Request, chunks: list[Chunk]) -> list[Chunk]:
         whole = b"".join(data for _, data in chunks)
         if not whole:
             return chunks
@@ -191,7 +133,7 @@ class OldReplyAgain(Fault):
 class StaleBytes(Fault):
     """What another program asked for lies in the port when it is opened, and some more follows."""
 
-    def opened(self, device: StruckMirror) -> list[Chunk]:
+    def opened(self, device: MirrorDevice) -> list[Chunk]:
         self.chance.struck += 1
         left = self.chance.random.choice(_LEFT_BEHIND)
         cut = self.chance.random.randrange(1, len(left))
@@ -204,7 +146,7 @@ class RequestByte(Fault):
 
     change: Change
 
-    def incoming(self, device: StruckMirror, data: bytes) -> bytes:
+    def incoming(self, device: MirrorDevice, data: bytes) -> bytes:
         out = b""
         for byte in data:
             one = bytes((byte,))
@@ -216,7 +158,7 @@ class RequestByte(Fault):
 class ProAtConnect(Fault):
     """An earlier session left the controller in pro mode."""
 
-    def begin(self, device: StruckMirror) -> None:
+    def begin(self, device: MirrorDevice) -> None:
         self.chance.struck += 1
         device.set_mode(self.chance.random.choice((Mode.PRO, Mode.PRO_CRC)))
 
@@ -228,7 +170,8 @@ class SilentReset(Fault):
     boot_s: float
     commands: Collection[int] | None = None  # frames that can be struck; None is any request
 
-    def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
+    def verdict(self, device: MirrorDevice, request: Request) -> bytes | None:
+        """Restart instead of doing what was asked, and answer nothing."""
         if (self.commands is not None and request.command not in self.commands) or not self.chance.comes():
             return None
         device.restart(boot_s=self.boot_s)
@@ -241,7 +184,7 @@ class AnswersLine(Fault):
 
     answer: str
 
-    def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
+    def verdict(self, device: MirrorDevice, request: Request) -> bytes | None:
         if request.mode is not Mode.SIMPLE or not self.chance.comes():
             return None
         return self.answer.encode("ascii") + END
@@ -254,7 +197,7 @@ class AnswersError(Fault):
     code: int
     commands: Collection[int] | None = None  # that can be struck; None is any
 
-    def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
+    def verdict(self, device: MirrorDevice, request: Request) -> bytes | None:
         command = request.command
         if command is None or (self.commands is not None and command not in self.commands):
             return None
@@ -265,7 +208,8 @@ class AnswersError(Fault):
 class CellLost(Fault):
     """One cell of the vector memory keeps what it held, though its writing is acknowledged."""
 
-    def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
+    def verdict(self, device: MirrorDevice, request: Request) -> bytes | None:
+        """Have the cells written, put one that changed back, and acknowledge all of them."""
         if request.frame is None or request.command != Command.SET_VECTOR or len(request.frame.payload) < 5 + CELL:
             return None
         register, offset, length, _ = read_vector(request.frame.payload)
@@ -287,7 +231,7 @@ class StatusBit(Fault):
 
     bit: Status
 
-    def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
+    def verdict(self, device: MirrorDevice, request: Request) -> bytes | None:
         if self.chance.lasts():
             device.state.flags |= self.bit
         return None
@@ -297,7 +241,8 @@ class StatusBit(Fault):
 class OtherFirmware(Fault):
     """The controller is another model of its maker."""
 
-    def verdict(self, device: StruckMirror, request: Request) -> bytes | None:
+    def verdict(self, device: MirrorDevice, request: Request) -> bytes | None:
+        """Answer whoever asks for the model, the version or the firmware as that other model would."""
         if request.line in _OTHER_TEXTS:
             self.chance.struck += 1
             return _OTHER_TEXTS[request.line].encode("ascii") + END
@@ -311,7 +256,7 @@ class OtherFirmware(Fault):
 class GoneBefore(Fault):
     """The device goes away before a request reaches it."""
 
-    def incoming(self, device: StruckMirror, data: bytes) -> bytes:
+    def incoming(self, device: MirrorDevice, data: bytes) -> bytes:
         if self.chance.comes():
             device.gone = True
             raise VanishedError("the device went away")
@@ -322,7 +267,7 @@ class GoneBefore(Fault):
 class GoneWithin(Fault):
     """The device goes away in the middle of a request, of which it took a part."""
 
-    def incoming(self, device: StruckMirror, data: bytes) -> bytes:
+    def incoming(self, device: MirrorDevice, data: bytes) -> bytes:
         for place in range(len(data)):
             if self.chance.comes():
                 device.gone = True
@@ -334,7 +279,7 @@ class GoneWithin(Fault):
 class GoneAfter(Fault):
     """The device carries a request out and goes away before it answers."""
 
-    def outgoing(self, device: StruckMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
+    def outgoing(self, device: MirrorDevice, request: Request, chunks: list[Chunk]) -> list[Chunk]:
         if self.chance.comes():
             device.gone = True
             return []
@@ -345,7 +290,7 @@ class GoneAfter(Fault):
 class PortHangs(Fault):
     """From one request on the port takes no more bytes, and writing to it blocks."""
 
-    def incoming(self, device: StruckMirror, data: bytes) -> bytes:
+    def incoming(self, device: MirrorDevice, data: bytes) -> bytes:
         if self.chance.lasts():
             device.hung = True
             return b""
@@ -356,7 +301,8 @@ class PortHangs(Fault):
 class Echo(Fault):
     """A loop of wire instead of a controller: all that is sent comes back."""
 
-    def instead(self, device: StruckMirror, data: bytes) -> list[Chunk]:
+    def instead(self, device: MirrorDevice, data: bytes) -> list[Chunk]:
+        """Send back all that came."""
         self.chance.struck += 1
         return [Chunk(device.unit.turnaround_s, data)]
 
@@ -367,7 +313,8 @@ class Modem(Fault):
 
     typed: bytes = field(default=b"", init=False)
 
-    def instead(self, device: StruckMirror, data: bytes) -> list[Chunk]:
+    def instead(self, device: MirrorDevice, data: bytes) -> list[Chunk]:
+        """Show what is typed, and at each CR answer OK to a line that begins with AT, ERROR to any other."""
         self.chance.struck += 1
         answers = []
         for byte in data:

@@ -12,11 +12,10 @@ from dataclasses import dataclass, field
 from itertools import count
 
 from pipeline.errors import RigError
-from pipeline.rig.clock import Clock
-from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
-from pipeline.rig.emulator.exchange import Chunk, VanishedError
-from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.mirror.transactions import BITS_PER_BYTE
+from pipeline.rig.devices import Clock, DeadlinePassed, DeviceGone
+from pipeline.rig.emulator import Chunk
+from pipeline.rig.emulator.mirror_device import MirrorDevice, VanishedError
+from pipeline.rig.transports import BITS_PER_BYTE
 
 LOG = logging.getLogger(__name__)
 _AT_ONCE = 4096  # bytes
@@ -99,12 +98,8 @@ class InProcessTransport:
 class EmulatedPort:
     """A pty and the thread that serves it, from :meth:`open` to :meth:`close`; use it as a context.
 
-    Parameters
-    ----------
-    device
-        Its clock paces the bytes, too.
-    baud
-        Speed in both directions; 0 lets bytes through as they come. USB ports do that whatever their speed says.
+    The device's clock paces the bytes, too. ``baud`` is the speed in both directions; 0 lets bytes through as they
+    come: USB ports do that whatever their speed says.
     """
 
     def __init__(self, device: MirrorDevice, *, baud: int = 0) -> None:

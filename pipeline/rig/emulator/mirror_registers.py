@@ -13,10 +13,13 @@ import numpy as np
 
 from pipeline.errors import ShapeError
 from pipeline.rig.emulator.mirror_state import MirrorState, PositionLogger
-from pipeline.rig.mirror.pro_mode import ERROR_FLAG, MOST_PAYLOAD, Command, ErrorCode, Frame
-from pipeline.rig.mirror.pro_payloads import (
+from pipeline.rig.mirror.pro_mode import (
     CELL,
-    acknowledge,
+    ERROR_FLAG,
+    MOST_PAYLOAD,
+    Command,
+    ErrorCode,
+    Frame,
     cell_float,
     cell_int,
     float_cell,
@@ -66,11 +69,6 @@ class Register:
     most: float = math.inf
     whole: bool = False
     signed: bool = False
-
-    def to_cell(self) -> bytes:
-        """Give the cell of what is in it."""
-        value = self.read()
-        return int_cell(int(value)) if self.whole else float_cell(float(value))
 
     def check(self, cell: bytes) -> float | int:
         """Read a cell that is to be written; RefusedError where it may not be, or is out of range."""
@@ -138,20 +136,20 @@ class RegisterFile:
                 self.put_cells(register, offset, cells)
             case _:
                 raise RefusedError(ErrorCode.COMMAND_UNKNOWN)
-        return acknowledge(command)
+        return Frame(command)
 
     def get(self, number: int) -> bytes:
         """Give a register's cell; RefusedError where there is no such register."""
         self._state.advance()
-        return self._find(number).to_cell()
+        register = self._find(number)
+        value = register.read()
+        return int_cell(int(value)) if register.whole else float_cell(float(value))
 
     def put(self, cells: Mapping[int, bytes]) -> None:
         """Write registers at one moment; held positions go out together.
 
-        Raises
-        ------
-        RefusedError : a register is missing, read only or out of range, and then none is written; or one does not take
-            its value as things stand, and then those before it are.
+        RefusedError where a register is missing, read only or out of range, and then none is written; or one does not
+        take its value as things stand, and then those before it are.
         """
         values = {number: self._find(number).check(cell) for number, cell in cells.items()}
         self._state.advance()

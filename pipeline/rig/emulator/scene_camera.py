@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,23 +27,25 @@ from pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from pipeline.geometry.mounting import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.capture.capture_paths import REFERENCES, Announced, announced
-from pipeline.rig.clock import Clock
-from pipeline.rig.emulator.camera_capture import EmulatedCapture, Floats, Ints, Raw
-from pipeline.rig.emulator.camera_device import CameraDevice, CameraFaults, CameraUnit
+from pipeline.rig.device_settings import Pulses
+from pipeline.rig.devices import Clock
+from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit, EmulatedCapture, Floats, Ints, Raw
+from pipeline.rig.emulator.fault_names import CameraFaults
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.mirror.steering import wire_positions
 from pipeline.rig.survey_rig import Pulses
 from pipeline.simulator.effects.effect import Aim, Bound, SweepBlock
+from pipeline.rig.mirror.path_player import wire_positions
+from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import Aim, Bound
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.render import Choice
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource, render_lines
 from pipeline.source import AT_REST
 
-Look = Literal["sent", "measured"]
 REFERENCE_FRAMES = 32
 _AT_ONCE = 8  # frames looked at while nobody else may speak to the camera
-_MOMENTS = 8  # within a held position
 
 
 @dataclass(frozen=True)
@@ -75,14 +76,8 @@ class SceneView:
     def lines(self, told: Announced, held: Floats, times_ms: tuple[float, float], started_s: float) -> Raw:
         """Give raw lines (line, sample, band) of a sweep, not binned.
 
-        Parameters
-        ----------
-        held
-            (line, step, 2) positions of the device during each exposure.
-        times_ms
-            Exposure and frame period.
-        started_s
-            When the sweep began, for what drifts, unless the source's own clock knows.
+        ``held`` are (line, step, 2) positions of the device during each exposure, ``times_ms`` exposure and frame
+        period; ``started_s`` is when the sweep began, for what drifts, unless the source's own clock knows.
         """
         sweep = replace(told.sweep, binning=1)
         rig = self._rig(times_ms)
@@ -154,17 +149,17 @@ def _runs(number: Ints, alike: NDArray[np.bool_]) -> Iterator[slice]:
 class SceneCamera(CameraDevice):
     """A camera that looks at a scene where a mirror sends it.
 
+    The mirror counts as where it was sent: how it gets there is for the simulator's effects, so that it is in the lines
+    once.
+
     Parameters
     ----------
     wired
         What comes at the mirror's trigger input: a pulse for each ``position``, each ``frame``, or ``none``.
-    look
-        ``sent``: the mirror counts as where it was sent; how it gets there is for the simulator's effects, so that it
-        is in the lines once. ``measured``: where its motion has it.
-    aside
-        Frames are looked at by calls of :meth:`look_on` alone, from a thread; until then the camera is capturing.
     kept
         So many finished captures keep their files, and references always; 0 is all.
+
+    With ``aside`` frames are looked at by calls of :meth:`look_on` alone, from a thread; until then it is capturing.
     """
 
     def __init__(
@@ -174,8 +169,6 @@ class SceneCamera(CameraDevice):
         clock: Clock,
         *,
         wired: Pulses = "position",
-        look: Look = "sent",
-        aside: bool = False,
         kept: int = 0,
         unit: CameraUnit | None = None,
         faults: CameraFaults | None = None,
@@ -183,7 +176,8 @@ class SceneCamera(CameraDevice):
         unit = CameraUnit() if unit is None else unit
         unit = replace(unit, wavelength_nm=tuple(view.source.wavelength_nm.tolist()))
         super().__init__(self._seen, clock, positions=mirror.sent, unit=unit, faults=faults)
-        self.view, self.mirror, self.wired, self.look, self.aside, self.kept = view, mirror, wired, look, aside, kept
+        self.view, self.mirror, self.wired, self.kept = view, mirror, wired, kept
+        self.aside = False
 
     def pulses(self, from_s: float, to_s: float) -> Floats:
         """Give rises and falls (pulse, 2) of the trigger pulses that rise from ``from_s`` on and before ``to_s``."""
@@ -243,19 +237,11 @@ class SceneCamera(CameraDevice):
             names = [f"{capture.folder}-{one}" for one in number]
             looks = zip(names, positions, strict=True)
             return np.concatenate([self.view.alone(name, place, times_ms, capture.began_s) for name, place in looks])
-        held = self._held(middle_s, told.sweep.step, capture.exposure_s)
+        step = told.sweep.step  # positions during each exposure
+        moments = (np.arange(step) + 0.5) * (capture.exposure_s / step)
+        held = self.mirror.sent(middle_s[:, None] - capture.exposure_s / 2 + moments)
         whole_began_s = capture.began_s - told.first * capture.period_s  # had the sweep been taken at once
         return self.view.lines(told, held, times_ms, whole_began_s)
-
-    def _held(self, middle_s: Floats, step: int, exposure_s: float) -> Floats:
-        """Positions (line, step, 2) during each exposure."""
-        begins = middle_s[:, None] - exposure_s / 2
-        if self.look == "sent":
-            return self.mirror.sent(begins + (np.arange(step) + 0.5) * (exposure_s / step))
-        moments = (np.arange(step * _MOMENTS) + 0.5) * (exposure_s / (step * _MOMENTS))
-        places = self.mirror.positions(begins + moments)
-        mean: Floats = places.reshape(len(middle_s), step, _MOMENTS, 2).mean(axis=2)
-        return mean
 
 
 def _prefix(capture: EmulatedCapture) -> str:

@@ -1,4 +1,4 @@
-"""The mirror controller: the device behind :class:`pipeline.rig.mirror.steering.Steering`.
+"""The mirror controller's driver: a mirror that can be sent somewhere, or along a path.
 
 Written for the documented protocol and tested against an emulator; never run on hardware. Positions are those of a
 mirror mounted straight; on the wire they are the device's own, as the settings say that it is mounted.
@@ -13,22 +13,30 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipeline.errors import RigError, SettingsError
-from pipeline.rig.clock import SYSTEM_CLOCK, Clock
-from pipeline.rig.mirror.mirror_requests import Modes, ProLink
-from pipeline.rig.mirror.mirror_settings import MirrorSettings
-from pipeline.rig.mirror.path_player import Logger, PathPlayer, Play, hold_values, run_values, upload
-from pipeline.rig.mirror.pro_payloads import Value, ask_status, cell_int, set_values
-from pipeline.rig.mirror.registers import Status, Trigger
-from pipeline.rig.mirror.steering import Identity, MotionLog, Progress, ReadBack, as_cells, wire_positions
-from pipeline.rig.mirror.transactions import Wire
-from pipeline.rig.transports import SerialTransport, Transport
+from pipeline.geometry.vector_memory import device_range
+from pipeline.rig.device_settings import MirrorSettings, ReadBack
+from pipeline.rig.devices import SYSTEM_CLOCK, Clock, Closing
+from pipeline.rig.mirror.mirror_requests import Identity, Modes, ProLink
+from pipeline.rig.mirror.path_player import (
+    Logger,
+    MotionLog,
+    Progress,
+    check_play,
+    hold_values,
+    run_values,
+    upload,
+    wire_positions,
+)
+from pipeline.rig.mirror.pro_mode import Value, ask_status, cell_int, get_value, get_values, read_values, set_values
+from pipeline.rig.mirror.registers import Status, Trigger, Unit, VectorRegister, X, Y
+from pipeline.rig.transports import SerialTransport, Transport, Wire
 
 LOG = logging.getLogger(__name__)
 _POLL_S = 0.01
 KNOWN_MODELS = ("MR-E", "MRE")  # begin the ids of the controllers that the documents are of
 
 
-class MirrorController:
+class MirrorController(Closing):
     """A mirror controller on a port. :meth:`connect` first; use it as a context, or close it.
 
     Motions (goto, run, park) are sent once. One that is not acknowledged raises StateUnknown, and so does every later
@@ -43,25 +51,15 @@ class MirrorController:
         self.wire = Wire(transport, clock, self.settings.patience)
         self._link = ProLink(self.wire, self.settings.with_crc, self.settings.strict_crc)
         self._modes = Modes(self._link)
-        self._player = PathPlayer(self._link, self.settings.ends)
         self._log = Logger(self._link, self.settings.log_samples)
         self._identity: Identity | None = None
         self._pairs = 0  # that the vector memory holds
 
-    def __enter__(self) -> MirrorController:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
     def connect(self, *, known: bool = False) -> Identity:
         """Find the controller in whichever mode it is, and bring it to pro mode. Nothing moves.
 
-        With ``known`` only the models that the documents are of are taken, or the one that the settings expect.
-
-        Raises
-        ------
-        DeadlinePassed, DeviceGone : nothing answers. RigError : another device does.
+        With ``known`` only the models that the documents are of are taken, or the one that the settings expect. Raises
+        DeadlinePassed or DeviceGone where nothing answers, RigError where another device does.
         """
         self._pairs, self._identity = 0, None
         found, expected = self._modes.connect(), self.settings.expected_id
@@ -100,10 +98,8 @@ class MirrorController:
     def goto(self, x: float, y: float) -> None:
         """Send the mirror to a position and hold it there; comes back once that is acknowledged, not at rest.
 
-        Raises
-        ------
-        PoseError : outside the disk; nothing is sent.
-        StateUnknown : not acknowledged, or motions are frozen. RigError : the status forbids motion.
+        Raises PoseError outside the disk, before anything is sent, RigError where the status forbids motion, and
+        StateUnknown where it was not acknowledged, or motions are frozen.
         """
         target = wire_positions([(x, y)], self.settings.mounting)[0]
         self._move(hold_values(*target), f"going to {target[0]:.6g}; {target[1]:.6g}")
@@ -121,21 +117,12 @@ class MirrorController:
     def load_path(
         self, positions: ArrayLike, read_back: ReadBack | None = None, progress: Progress | None = None
     ) -> None:
-        """Put positions into the vector memory: X of all, then Y of all, from cell 0 on. Nothing moves.
+        """Put positions (position, 2) into the vector memory: X of all, then Y of all, from cell 0 on. Nothing moves.
 
-        Parameters
-        ----------
-        positions
-            (position, 2) X and Y.
-        read_back
-            How much is read back and compared; None takes it from the settings.
-        progress
-            Called with cells done and cells in all.
-
-        Raises
-        ------
-        PoseError, ShapeError : a position is outside the disk, or too many; nothing is sent.
-        RigError : a path plays, or the memory holds something else than was sent.
+        ``read_back`` says how much is read back and compared; None takes it from the settings. ``progress`` is called
+        with cells done and cells in all. Raises PoseError or ShapeError where a position is outside the disk,
+        SettingsError where there are too many, before anything is sent; RigError where a path plays, or the memory
+        holds something else than was sent.
         """
         cells = wire_positions(positions, self.settings.mounting)
         if len(cells) > self.settings.vector_pairs:
@@ -144,46 +131,49 @@ class MirrorController:
             )
         self._check_idle("load another one")
         self._pairs = 0
-        upload(self._link, as_cells(cells), read_back or self.settings.read_back, progress)
+        upload(self._link, cells.T.astype(">f4").tobytes(), read_back or self.settings.read_back, progress)
         self._pairs = len(cells)
 
     def run(self, first: int, stop: int, rate_hz: float, cycles: int = 1, trigger: Trigger = Trigger.OFF) -> None:
         """Play the loaded positions ``first`` to ``stop``, half open, at ``rate_hz`` positions a second.
 
-        Parameters
-        ----------
-        cycles
-            How often; -1 is without end.
-        trigger
-            Edges that step to the next position.
-
-        Raises
-        ------
-        SettingsError : the range is not within what is loaded, or the rate or the cycles mean nothing.
-        StateUnknown : not acknowledged, or motions are frozen. RigError : the status forbids motion.
+        X plays from cell 0 on, Y from behind the X of all loaded positions, ``cycles`` times (-1: without end);
+        ``trigger`` says which edges step to the next position instead. Raises SettingsError where the range is not
+        within what is loaded, or a number means nothing, and what :meth:`goto` does.
         """
-        play = Play(first, stop, rate_hz, cycles, trigger)
-        play.check(self._pairs)
+        check_play(first, stop, rate_hz, cycles, self._pairs)
         with self.wire.lock:
             self.wire.check_known("running a path")
             self.halt()
-            self._player.set_up(play, self._pairs)
+            for name, begin, channel in (("X", 0, X), ("Y", self._pairs, Y)):
+                start, end = device_range((begin + first, begin + stop), self.settings.ends)
+                values: dict[VectorRegister, Value] = {
+                    VectorRegister.UNIT: int(Unit.XY),
+                    VectorRegister.START: start,
+                    VectorRegister.END: end,
+                    VectorRegister.FREQUENCY: float(rate_hz),
+                    VectorRegister.CYCLES: cycles,
+                    VectorRegister.TRIGGER: int(trigger),
+                }
+                frame = set_values({channel.vector(register): value for register, value in values.items()})
+                self._link.tell(frame, f"setting up the path's {name}")
             self._move(run_values(), f"running positions {first}:{stop}")
 
     def halt(self) -> None:
         """Stop playing; the mirror stays where it is. Works where motions are frozen, too."""
         self._check_connected()
-        self._player.halt()
+        self._link.tell(set_values({channel.vector(VectorRegister.RUN): 0 for channel in (X, Y)}), "halting the path")
 
     def is_playing(self) -> bool:
-        """Whether a path plays."""
+        """Whether a unit plays a path."""
         self._check_connected()
-        return self._player.is_playing()
+        registers = [channel.vector(VectorRegister.RUN) for channel in (X, Y)]
+        return any(map(cell_int, self._link.ask(get_values(registers), "whether a path plays", read_values)))
 
     def index(self) -> int:
         """Position of the loaded path that plays now: the cell of X."""
         self._check_connected()
-        return self._player.index()
+        return self._link.ask(get_value(X.vector(VectorRegister.INDEX)), "the place in the path", cell_int)
 
     def start_log(self, rate_hz: float | None = None, *, with_index: bool = False) -> None:
         """Begin to log measured positions, and the cells that are played, at the settings' rate if none is given."""
@@ -229,9 +219,7 @@ class MirrorController:
 def open_mirror(settings: MirrorSettings, clock: Clock = SYSTEM_CLOCK, *, known: bool = False) -> MirrorController:
     """Open the port that the settings name and connect to the controller there, see its connect. Nothing moves.
 
-    Raises
-    ------
-    DeviceGone : no such port, in use, or not permitted. DeadlinePassed : nothing answers. RigError : another device.
+    Raises DeviceGone where there is no such port, it is in use, or not permitted.
     """
     mirror = MirrorController(SerialTransport(settings.port, settings.baud, clock), settings, clock)
     try:

@@ -1,16 +1,20 @@
-"""Requests to the mirror controller in either mode: what is sent, what is accepted as the answer, and mode changes."""
+"""Requests to the mirror controller in either mode: what is sent, what is accepted as the answer, and mode changes.
+
+Lines of simple mode are ASCII, CR LF behind each, at most 64 bytes, in either case. Frames of pro mode: `pro_mode`.
+"""
 
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import TypeVar
 
 from pipeline.errors import RigError, ShapeError
-from pipeline.rig.device_errors import DeadlinePassed, DeviceRefused
-from pipeline.rig.mirror import simple_mode
+from pipeline.rig.devices import DeadlinePassed, DeviceRefused
 from pipeline.rig.mirror.pro_mode import (
     ERROR_FLAG,
     Command,
@@ -18,18 +22,147 @@ from pipeline.rig.mirror.pro_mode import (
     ErrorCode,
     Frame,
     FrameReader,
+    ask_status,
+    cell_int,
     encode,
     error_words,
+    go_simple,
 )
-from pipeline.rig.mirror.pro_payloads import ask_status, cell_int, go_simple
 from pipeline.rig.mirror.registers import Status
-from pipeline.rig.mirror.steering import Identity
-from pipeline.rig.mirror.transactions import Kind, Receiver, Wire
+from pipeline.rig.transports import Kind, Receiver, Wire
 
 LOG = logging.getLogger(__name__)
 
+END = b"\r\n"
+MOST_LINE = 64  # bytes, with the end
+
+START, STATUS, ACKNOWLEDGE, RESET = "START", "STATUS", "ACKNOWLEDGE", "RESET"
+TEMPERATURE, ID, VERSION, SERIAL = "GETTEMP", "GETID", "GETVERSION", "GETSN"
+GO_PRO, GO_PRO_CRC = "GOPRO", "GOPROCRC"
+
 Answer = TypeVar("Answer")
-_GARBLED = (ErrorCode.FRAME_INVALID, ErrorCode.CRC_WRONG)
+
+
+class Reply(StrEnum):
+    """Replies to requests that ask for nothing but to be done."""
+
+    OK = "OK"
+    NO = "NO"
+    BELOW = "OL"
+    ABOVE = "OU"
+    ERROR = "ERROR"
+
+
+_WORDS = {
+    Reply.NO: "it does not know the request, or not now",
+    Reply.BELOW: "a value lies below the range and was set to its end",
+    Reply.ABOVE: "a value lies above the range and was set to its end",
+    Reply.ERROR: "an error on the device",
+}
+
+
+def to_line(request: str) -> bytes:
+    """Give the bytes of a request; ShapeError where it is not ASCII, empty, too long, or has an end of its own."""
+    if not request.isascii() or not request or any(character in request for character in "\r\n"):
+        raise ShapeError(f"expected one line of ASCII, got {request!r}")
+    line = request.encode("ascii") + END
+    if len(line) > MOST_LINE:
+        raise ShapeError(f"the controller takes lines of {MOST_LINE} bytes, got {len(line)}: {request!r}")
+    return line
+
+
+class LineReader:
+    """Finds lines in a stream, however it is cut."""
+
+    def __init__(self) -> None:
+        self._held = b""
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Take bytes and give the lines that they complete, without their ends; empty lines are left out."""
+        *lines, self._held = (self._held + data).split(b"\n")
+        return [line for line in (line.rstrip(b"\r") for line in lines) if line]
+
+
+def check_done(line: bytes, request: str, port: str) -> None:
+    """Accept the reply OK and nothing else: DeviceRefused at any other that the protocol has, RigError at the rest."""
+    text = line.decode("ascii", "backslashreplace").strip()
+    if text.upper() not in Reply.__members__.values():
+        raise RigError(f"expected OK to {request} from {port}, got {text!r}; is this the mirror controller?")
+    reply = Reply(text.upper())
+    if reply is not Reply.OK:
+        raise DeviceRefused(f"the mirror controller on {port} answered {reply} to {request}: {_WORDS[reply]}")
+
+
+def read_text(line: bytes, request: str, port: str) -> str:
+    """Read a reply that is text of the device's own, such as its id.
+
+    It and the readers below raise DeviceRefused where the device said no, and RigError where the reply is none.
+    """
+    text = line.decode("ascii", "backslashreplace").strip()
+    if not re.fullmatch(r"[ -~]+", text) or "\\x" in text:
+        raise RigError(f"expected text to {request} from {port}, got {line!r}; is the port's speed right?")
+    if text.upper() in (Reply.NO, Reply.ERROR):
+        check_done(line, request, port)
+    return text
+
+
+def read_status(line: bytes, port: str) -> Status:
+    """Read the 32 status bits, in hexadecimal with or without 0x before them."""
+    text = read_text(line, STATUS, port)
+    if not re.fullmatch(r"(0[xX])?[0-9a-fA-F]{1,8}", text):
+        raise RigError(f"expected up to 8 hexadecimal digits to {STATUS} from {port}, got {text!r}")
+    return Status(int(text, 16))
+
+
+def read_temperature(line: bytes, port: str) -> float:
+    """Read a temperature. [deg C]"""
+    text = read_text(line, TEMPERATURE, port)
+    found = re.fullmatch(r"([-+]?\d+(\.\d*)?)( ?C)?", text)
+    if found is None:
+        raise RigError(f"expected a temperature to {TEMPERATURE} from {port}, got {text!r}")
+    return float(found[1])
+
+
+@dataclass(frozen=True)
+class SimpleLink:
+    """Lines of simple mode over a wire.
+
+    Requests raise DeviceRefused, DeadlinePassed or DeviceGone, one that moves the mirror StateUnknown, and RigError
+    where the answer is none.
+    """
+
+    wire: Wire
+
+    def do(self, request: str, kind: Kind) -> None:
+        """Send a request that is answered by OK; going to a range's end is a refusal."""
+
+        def done(line: bytes) -> bool:
+            check_done(line, request, self.wire.port)
+            return True
+
+        self.ask(request, done, kind)
+
+    def text(self, request: str) -> str:
+        """Ask for the controller's id, version or serial number."""
+        return self.ask(request, lambda line: read_text(line, request, self.wire.port))
+
+    def temperature(self) -> float:
+        """Ask for the temperature. [deg C]"""
+        return self.ask(TEMPERATURE, lambda line: read_temperature(line, self.wire.port))
+
+    def ask(self, request: str, parse: Callable[[bytes], Answer], kind: Kind = "read") -> Answer:
+        """Send a request and give what ``parse`` makes of the line that answers it."""
+
+        def receiver() -> Receiver[Answer]:
+            reader = LineReader()
+
+            def receive(data: bytes) -> Answer | None:
+                lines = reader.feed(data)
+                return parse(lines[0]) if lines else None
+
+            return receive
+
+        return self.wire.exchange(to_line(request), request, kind, receiver)
 
 
 @dataclass(frozen=True)
@@ -75,10 +208,20 @@ class ProLink:
         if isinstance(found, Damaged):
             LOG.warning("%s, while waiting for %s: %s: %s", port, name, found.reason, found.data.hex(" "))
             return None
-        if not self._crc_passes(found, name):
-            return None
+        if self.with_crc and not found.crc_good:
+            what = "refused" if self.strict_crc else "taken all the same (set strict_crc to refuse it)"
+            LOG.warning("%s: the CRC of an answer to %s does not fit; %s", port, name, what)
+            if self.strict_crc:
+                return None
         if found.command == sent.command | ERROR_FLAG:
-            raise self._refusal(found, name)
+            try:
+                code = cell_int(found.payload)
+            except ShapeError:
+                size = len(found.payload)
+                raise RigError(f"{name}: {port} answered with an error of {size} bytes, expected 4") from None
+            words = f"the mirror controller on {port} refused {name}: {error_words(code)}"
+            garbled = code in (ErrorCode.FRAME_INVALID, ErrorCode.CRC_WRONG)
+            raise DeviceRefused(words, code, garbled=garbled)
         if found.command != sent.command:
             # lines that were said to a controller in pro mode are complained about when a frame follows
             usual = sent.command == Command.SET_MODE and found.command & ERROR_FLAG
@@ -91,78 +234,19 @@ class ProLink:
             LOG.warning("%s, while waiting for %s: an answer that does not fit: %s", port, name, error)
             return None
 
-    def _crc_passes(self, found: Frame, name: str) -> bool:
-        if found.crc_good or not self.with_crc:
-            return True
-        what = "refused" if self.strict_crc else "taken all the same (set strict_crc to refuse it)"
-        LOG.warning("%s: the CRC of an answer to %s does not fit; %s", self.wire.port, name, what)
-        return not self.strict_crc
-
-    def _refusal(self, found: Frame, name: str) -> RigError:
-        port = self.wire.port
-        try:
-            code = cell_int(found.payload)
-        except ShapeError:
-            return RigError(f"{name}: {port} answered with an error of {len(found.payload)} bytes, expected 4")
-        return DeviceRefused(
-            f"the mirror controller on {port} refused {name}: {error_words(code)}", code, garbled=code in _GARBLED
-        )
-
 
 @dataclass(frozen=True)
-class SimpleLink:
-    """Lines of simple mode over a wire.
+class Identity:
+    """What a controller says it is; a field is empty where it does not know the request."""
 
-    Requests raise DeviceRefused, DeadlinePassed or DeviceGone, one that moves the mirror StateUnknown, and RigError
-    where the answer is none.
-    """
+    device: str
+    version: str
+    serial: str
 
-    wire: Wire
-
-    def start(self) -> None:
-        """Greet the controller, which answers in simple mode alone."""
-        self._do(simple_mode.START, "greeting")
-
-    def text(self, request: str) -> str:
-        """Ask for the controller's id, version or serial number."""
-        return self._line(request, "read", lambda line: simple_mode.read_text(line, request, self.wire.port))
-
-    def status(self) -> Status:
-        """Ask for the status bits."""
-        return self._line(simple_mode.STATUS, "read", lambda line: simple_mode.read_status(line, self.wire.port))
-
-    def temperature(self) -> float:
-        """Ask for the temperature. [deg C]"""
-        return self._line(
-            simple_mode.TEMPERATURE, "read", lambda line: simple_mode.read_temperature(line, self.wire.port)
-        )
-
-    def tell(self, request: str) -> None:
-        """Send a request that moves nothing and is answered by OK, once."""
-        self._do(request, "write")
-
-    def move(self, request: str) -> None:
-        """Send a request that moves the mirror (a position, a reset), once; going to a range's end is a refusal."""
-        self._do(request, "motion")
-
-    def _do(self, request: str, kind: Kind) -> None:
-        def done(line: bytes) -> bool:
-            simple_mode.check_done(line, request, self.wire.port)
-            return True
-
-        self._line(request, kind, done)
-
-    def _line(self, request: str, kind: Kind, parse: Callable[[bytes], Answer]) -> Answer:
-        def receiver() -> Receiver[Answer]:
-            reader = simple_mode.LineReader()
-
-            def receive(data: bytes) -> Answer | None:
-                lines = reader.feed(data)
-                return parse(lines[0]) if lines else None
-
-            return receive
-
-        return self.wire.exchange(simple_mode.to_line(request), request, kind, receiver)
+    @property
+    def words(self) -> str:
+        """All of it, for people."""
+        return f"{self.device or 'no id'}, version {self.version or 'unknown'}, serial {self.serial or 'unknown'}"
 
 
 class Modes:
@@ -176,11 +260,7 @@ class Modes:
     def connect(self) -> Identity:
         """Find the controller in either mode, ask what it is, and leave it in pro mode. Nothing moves.
 
-        Raises
-        ------
-        DeadlinePassed : nothing answers in either mode.
-        RigError : something else answers.
-        DeviceGone : the port went away.
+        Raises DeadlinePassed where nothing answers in either mode, RigError where something else does, or DeviceGone.
         """
         with self.pro.wire.lock:
             self.found_in_pro = False
@@ -190,18 +270,21 @@ class Modes:
                 LOG.info("%s does not answer in simple mode; it may be in pro mode", self.pro.wire.port)
                 self._leave_pro()
                 self.found_in_pro = True
-            words = (simple_mode.ID, simple_mode.VERSION, simple_mode.SERIAL)
-            device, version, serial = (self._text(word) for word in words)
+            said = []
+            for request in (ID, VERSION, SERIAL):
+                try:
+                    said.append(self._lines.text(request))
+                except DeviceRefused as error:  # other firmware may not know it
+                    LOG.warning("%s", error)
+                    said.append("")
             self._enter_pro()
-            return Identity(device, version, serial)
+            return Identity(*said)
 
     @contextmanager
     def simple(self) -> Iterator[SimpleLink]:
-        """Simple mode for as long as the block lasts.
+        """Simple mode for as long as the block lasts; where a mode is not reached, connect again.
 
-        Raises
-        ------
-        DeadlinePassed, DeviceRefused, DeviceGone : a mode was not reached; connect again.
+        Raises DeadlinePassed, DeviceRefused or DeviceGone.
         """
         with self.pro.wire.lock:
             self._leave_pro()
@@ -219,25 +302,17 @@ class Modes:
 
     def _greet(self) -> None:
         try:
-            self._lines.start()
+            self._lines.do(START, "greeting")
         except DeviceRefused as error:  # the greeting ended a line that somebody had begun
             LOG.info("%s; greeting it once more", error)
-            self._lines.start()
+            self._lines.do(START, "greeting")
 
     def _enter_pro(self) -> None:
-        words = simple_mode.GO_PRO_CRC if self.pro.with_crc else simple_mode.GO_PRO
+        words = GO_PRO_CRC if self.pro.with_crc else GO_PRO
         try:
-            self._lines.tell(words)
+            self._lines.do(words, "write")
         except DeadlinePassed as error:  # it may have changed all the same; the status tells
             LOG.info("%s; asking for the status all the same", error)
         except DeviceRefused as error:
             raise DeviceRefused(f"{error}. Firmware without {words}? Turn mirror.with_crc over") from error
         self.pro.ask(ask_status(), "the status", cell_int)
-
-    def _text(self, request: str) -> str:
-        """The answer to a request that other firmware may not know."""
-        try:
-            return self._lines.text(request)
-        except DeviceRefused as error:
-            LOG.warning("%s", error)
-            return ""

@@ -1,28 +1,28 @@
-"""Paths in the controller's vector memory: sent there, read back and compared, played; and its log of the motion."""
+"""Paths in the controller's vector memory: positions for the wire, sent and read back, played; and its motion's log."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import RigError, SettingsError, ShapeError
-from pipeline.geometry.vector_memory import Ends, device_range
-from pipeline.rig.device_errors import DeviceRefused
+from pipeline.geometry.mirror import check_reach
+from pipeline.geometry.mounting import STRAIGHT, Mounting
+from pipeline.rig.device_settings import ReadBack
+from pipeline.rig.devices import DeviceRefused
 from pipeline.rig.mirror.mirror_requests import ProLink
-from pipeline.rig.mirror.pro_mode import ErrorCode
-from pipeline.rig.mirror.pro_payloads import (
+from pipeline.rig.mirror.pro_mode import (
     CELL,
     VECTOR_CELLS,
+    ErrorCode,
     Value,
     cell_float,
-    cell_int,
-    get_value,
-    get_values,
     get_vector,
-    read_values,
     set_values,
     set_vector,
     split_cells,
@@ -33,35 +33,42 @@ from pipeline.rig.mirror.registers import (
     LOG_RATE,
     LOG_RUN,
     VECTOR_MEMORY,
-    Trigger,
-    Unit,
     VectorRegister,
     X,
     Y,
     log_slot,
 )
-from pipeline.rig.mirror.steering import MotionLog, Progress, ReadBack
 
 LOG = logging.getLogger(__name__)
 SAMPLED_EVERY = 10  # frames: the share that "sampled" reads back, besides the ends of both channels
 _KINDS = (">f4", ">f4", ">u4")  # of the cells in the log's slots
+Progress = Callable[[int, int], None]  # cells done, cells in all
+
+
+def wire_positions(positions: ArrayLike, mounting: Mounting = STRAIGHT) -> NDArray[np.float32]:
+    """Give positions (position, 2) at the precision of the wire, float32, where rounding carries none beyond the rim.
+
+    They are those of the device that is mounted so, for what a straight one gets by the wire.
+
+    Raises ShapeError where they are not of that shape, or none, and PoseError where one is not finite or beyond the
+    rim; the message names the first.
+    """
+    given = np.asarray(positions)
+    if given.ndim != 2 or given.shape[1:] != (2,) or not len(given):
+        raise ShapeError(f"a path needs positions as (position, 2), at least one, got shape {given.shape}")
+    exact = check_reach(given).astype(np.float64)
+    exact /= np.maximum(np.hypot(exact[:, :1], exact[:, 1:]), 1)  # what the rim's slack let pass
+    rounded: NDArray[np.float32] = exact.astype(np.float32)
+    beyond = np.hypot(*rounded.astype(np.float64).T) > 1
+    rounded[beyond] = np.nextafter(rounded[beyond], np.float32(0))
+    return rounded if mounting == STRAIGHT else wire_positions(mounting.to_device(rounded))
 
 
 def upload(link: ProLink, cells: bytes, read_back: ReadBack, progress: Progress | None = None) -> None:
-    """Write cells to the vector memory from 0 on, and compare what it holds then.
+    """Write cells, X of all positions and then Y of all, to the vector memory, and compare what it holds then.
 
-    Parameters
-    ----------
-    cells
-        X of all positions, then Y of all.
-    read_back
-        "none", "sampled" (every tenth frame and the ends of both channels) or "all".
-    progress
-        Called with cells done and cells in all, those read back included.
-
-    Raises
-    ------
-    RigError : a cell holds something else; the message names it. DeviceRefused, DeadlinePassed, DeviceGone
+    ``read_back`` is "none", "sampled" (every tenth frame and the ends of both channels) or "all"; ``progress`` gets
+    cells done and cells in all, those read back included. RigError names a cell that holds something else.
     """
     frames = [cells[at : at + VECTOR_CELLS * CELL] for at in range(0, len(cells), VECTOR_CELLS * CELL)]
     checked = frames_to_check(len(frames), read_back)
@@ -114,69 +121,15 @@ def read_cells(link: ProLink, register: int, start: int, count: int) -> bytes:
     return link.ask(get_vector(register, start, count), f"reading cells {start} to {start + count}", parse)
 
 
-@dataclass(frozen=True)
-class Play:
-    """What plays: positions ``first`` to ``stop`` of those loaded, half open, at ``rate_hz``, ``cycles`` times."""
-
-    first: int
-    stop: int
-    rate_hz: float
-    cycles: int = 1  # -1 is without end
-    trigger: Trigger = Trigger.OFF
-
-    def check(self, loaded: int) -> None:
-        """Refuse what cannot play.
-
-        Raises
-        ------
-        SettingsError : the range is not within the ``loaded`` positions, or the rate or the cycles mean nothing.
-        """
-        if not (0 <= self.first < self.stop <= loaded):
-            raise SettingsError(
-                f"{self.first}:{self.stop} is no range of the {loaded} positions loaded; load them first"
-            )
-        if not (0 < self.rate_hz < float("inf")) or self.cycles == 0 or not -1 <= self.cycles < 2**31:
-            raise SettingsError(
-                f"expected a rate above 0 Hz, and cycles of 1 or more, or -1 for no end, got {self.rate_hz} Hz and "
-                f"{self.cycles} cycles"
-            )
-
-
-class PathPlayer:
-    """The vector units of both channels. X plays from cell 0 on, Y from behind the X of all loaded positions."""
-
-    def __init__(self, link: ProLink, ends: Ends) -> None:
-        self._link = link
-        self._ends = ends
-
-    def set_up(self, play: Play, loaded: int) -> None:
-        """Tell both units what to play; nothing moves."""
-        for name, begin, channel in (("X", 0, X), ("Y", loaded, Y)):
-            start, end = device_range((begin + play.first, begin + play.stop), self._ends)
-            values: dict[VectorRegister, Value] = {
-                VectorRegister.UNIT: int(Unit.XY),
-                VectorRegister.START: start,
-                VectorRegister.END: end,
-                VectorRegister.FREQUENCY: float(play.rate_hz),
-                VectorRegister.CYCLES: play.cycles,
-                VectorRegister.TRIGGER: int(play.trigger),
-            }
-            frame = set_values({channel.vector(register): value for register, value in values.items()})
-            self._link.tell(frame, f"setting up the path's {name}")
-
-    def halt(self) -> None:
-        """Stop both units."""
-        self._link.tell(set_values({channel.vector(VectorRegister.RUN): 0 for channel in (X, Y)}), "halting the path")
-
-    def is_playing(self) -> bool:
-        """Whether a unit plays."""
-        registers = [channel.vector(VectorRegister.RUN) for channel in (X, Y)]
-        cells = self._link.ask(get_values(registers), "whether a path plays", read_values)
-        return any(cell_int(cell) for cell in cells)
-
-    def index(self) -> int:
-        """Cell that X plays now, which is the position."""
-        return self._link.ask(get_value(X.vector(VectorRegister.INDEX)), "the place in the path", cell_int)
+def check_play(first: int, stop: int, rate_hz: float, cycles: int, loaded: int) -> None:
+    """Refuse a range that is not within the ``loaded`` positions, and a rate or cycles that mean nothing."""
+    if not (0 <= first < stop <= loaded):
+        raise SettingsError(f"{first}:{stop} is no range of the {loaded} positions loaded; load them first")
+    if not (0 < rate_hz < float("inf")) or cycles == 0 or not -1 <= cycles < 2**31:
+        raise SettingsError(
+            f"expected a rate above 0 Hz, and cycles of 1 or more, or -1 for no end, got {rate_hz} Hz and {cycles} "
+            "cycles"
+        )
 
 
 def run_values() -> dict[int, Value]:
@@ -192,6 +145,22 @@ def hold_values(x: float, y: float) -> dict[int, Value]:
     return {X.static_xy: float(x), Y.static_xy: float(y), **follow, **halt}
 
 
+@dataclass(frozen=True)
+class MotionLog:
+    """Positions that the controller measured at a steady rate.
+
+    ``started_s`` is when the start was acknowledged, by the driver's clock, and ``start_error_s`` how much earlier it
+    may have been: the time of the request itself. Offset and drift against frame times are for whoever ties lines to
+    positions.
+    """
+
+    position: NDArray[np.float32]  # (sample, 2) X and Y
+    rate_hz: float
+    started_s: float
+    start_error_s: float
+    index: NDArray[np.int64] | None = None  # (sample,) cell of the path that X played, where it was asked for
+
+
 class Logger:
     """The logger of one controller. It takes down X in slot 0, Y in slot 1 and the cell that X plays in slot 2."""
 
@@ -203,12 +172,7 @@ class Logger:
         self._started: tuple[float, float] | None = None  # before the request and after its acknowledgement
 
     def start(self, rate_hz: float, *, with_index: bool = False) -> None:
-        """Say what to log, positions and the path's index with them or not, and begin.
-
-        Raises
-        ------
-        DeviceRefused, DeadlinePassed, DeviceGone
-        """
+        """Say what to log, positions and the path's index with them or not, and begin."""
         clock = self._link.wire.clock
         self._started = None
         self._link.tell(set_values({LOG_RUN: 0}), "stopping the log")
@@ -224,10 +188,7 @@ class Logger:
         """End the log and fetch ``samples`` of it, or as many as the time since the start has.
 
         Never more than the logger holds. Where it holds fewer than expected, the device says so and the log ends there.
-
-        Raises
-        ------
-        RigError : no log was started. DeviceRefused, DeadlinePassed, DeviceGone
+        RigError where no log was started.
         """
         if self._started is None:
             raise RigError(f"no log was started on {self._link.wire.port}; start one before the path runs")

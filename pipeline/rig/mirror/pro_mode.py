@@ -1,15 +1,23 @@
-"""Frames of the mirror controller's pro mode: bytes to frames and back. What their payloads mean: `pro_payloads`.
+"""Frames of the mirror controller's pro mode, bytes to frames and back, and what their payloads carry.
 
 A frame is ``7E | address 00 | command | size | payload | CRC, low byte first | 7E``; 7D and 7E between the boundaries
 are sent as 7D and the byte with bit 5 turned. The CRC is CRC-16/ARC over address to payload. It fits the one documented
 frame (``00 11 04 00 00 00 00 | F2 81``) and is not confirmed on hardware, so a reader only says whether it fits. That
 it begins at 0 leaves open whether the address counts; as the address is 0, either way gives the same CRC.
+
+Numbers in payloads are big-endian. A register's id takes two bytes, its cell four: a float32, or an integer. Several
+registers go as their count, all ids, then all cells. A vector's cells are addressed by register, offset in BYTES and
+length in bytes. Requests without an argument carry 00 00. Layouts are those of the controller's public software; what
+an acknowledgement carries is not documented there, it is taken to be nothing.
 """
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import cache
 
 from pipeline.errors import ShapeError
 
@@ -35,54 +43,39 @@ class Command(IntEnum):
 
 
 class ErrorCode(IntEnum):
-    """Why the device says no."""
+    """Why the device says no, and that in words."""
 
-    FRAME_INVALID = 0x0001
-    COMMAND_UNKNOWN = 0x0002
-    LENGTH_MISMATCH = 0x0003
-    CRC_WRONG = 0x0004
-    NOT_IMPLEMENTED = 0x0005
-    NO_REGISTER = 0x0101
-    WRITE_FAILED = 0x0102
-    OUT_OF_RANGE = 0x0103
-    REGISTER_INVALID = 0x0104
-    READ_FAILED = 0x0105
-    READ_ONLY = 0x0106
-    VECTOR_INDEX = 0x0107
-    VECTOR_ALIGNMENT = 0x0108
-    LOCKED = 0x0109
-    NOT_READABLE = 0x010A
-    NO_SYSTEM = 0x0201
-    SYSTEM_NOT_SELECTABLE = 0x0202
-    CHAIN = 0x0203
+    words: str
 
+    FRAME_INVALID = 0x0001, "the frame is not valid"
+    COMMAND_UNKNOWN = 0x0002, "the command is unknown"
+    LENGTH_MISMATCH = 0x0003, "the length does not fit the command"
+    CRC_WRONG = 0x0004, "the CRC is wrong"
+    NOT_IMPLEMENTED = 0x0005, "the command is not implemented"
+    NO_REGISTER = 0x0101, "there is no such register"
+    WRITE_FAILED = 0x0102, "the register could not be written"
+    OUT_OF_RANGE = 0x0103, "the value is out of the register's range"
+    REGISTER_INVALID = 0x0104, "the register is not valid here"
+    READ_FAILED = 0x0105, "the register could not be read"
+    READ_ONLY = 0x0106, "the register can only be read"
+    VECTOR_INDEX = 0x0107, "the index lies outside the vector"
+    VECTOR_ALIGNMENT = 0x0108, "the index does not begin a cell of the vector"
+    LOCKED = 0x0109, "the register is locked"
+    NOT_READABLE = 0x010A, "the register cannot be read"
+    NO_SYSTEM = 0x0201, "there is no such system"
+    SYSTEM_NOT_SELECTABLE = 0x0202, "the system cannot be chosen here"
+    CHAIN = 0x0203, "the systems do not make a chain from input to output"
 
-_WORDS = {
-    ErrorCode.FRAME_INVALID: "the frame is not valid",
-    ErrorCode.COMMAND_UNKNOWN: "the command is unknown",
-    ErrorCode.LENGTH_MISMATCH: "the length does not fit the command",
-    ErrorCode.CRC_WRONG: "the CRC is wrong",
-    ErrorCode.NOT_IMPLEMENTED: "the command is not implemented",
-    ErrorCode.NO_REGISTER: "there is no such register",
-    ErrorCode.WRITE_FAILED: "the register could not be written",
-    ErrorCode.OUT_OF_RANGE: "the value is out of the register's range",
-    ErrorCode.REGISTER_INVALID: "the register is not valid here",
-    ErrorCode.READ_FAILED: "the register could not be read",
-    ErrorCode.READ_ONLY: "the register can only be read",
-    ErrorCode.VECTOR_INDEX: "the index lies outside the vector",
-    ErrorCode.VECTOR_ALIGNMENT: "the index does not begin a cell of the vector",
-    ErrorCode.LOCKED: "the register is locked",
-    ErrorCode.NOT_READABLE: "the register cannot be read",
-    ErrorCode.NO_SYSTEM: "there is no such system",
-    ErrorCode.SYSTEM_NOT_SELECTABLE: "the system cannot be chosen here",
-    ErrorCode.CHAIN: "the systems do not make a chain from input to output",
-}
+    def __new__(cls, code: int, words: str) -> ErrorCode:
+        error = int.__new__(cls, code)
+        error._value_, error.words = code, words
+        return error
 
 
 def error_words(code: int) -> str:
     """Say an error code of the device in words, with its number."""
-    known = code in ErrorCode.__members__.values()
-    return f"{_WORDS[ErrorCode(code)] if known else 'an error that this driver does not know'} (code {code:04X})"
+    known = {error.value: error.words for error in ErrorCode}
+    return f"{known.get(code, 'an error that this driver does not know')} (code {code:04X})"
 
 
 @dataclass(frozen=True)
@@ -103,32 +96,25 @@ class Damaged:
     data: bytes
 
 
-def _table() -> tuple[int, ...]:
-    table = []
-    for value in range(256):
-        for _ in range(8):
-            value = value >> 1 ^ (0xA001 if value & 1 else 0)
-        table.append(value)
-    return tuple(table)
-
-
-_TABLE = _table()
+@cache
+def _crc_step(value: int) -> int:
+    for _ in range(8):
+        value = value >> 1 ^ (0xA001 if value & 1 else 0)
+    return value
 
 
 def crc_arc(data: bytes) -> int:
     """Give the CRC-16/ARC of bytes: polynomial 8005 reflected, beginning at 0."""
     crc = 0
     for byte in data:
-        crc = crc >> 8 ^ _TABLE[(crc ^ byte) & 0xFF]
+        crc = crc >> 8 ^ _crc_step((crc ^ byte) & 0xFF)
     return crc
 
 
 def encode(frame: Frame, *, with_crc: bool = True) -> bytes:
     """Give the bytes of a frame, boundaries and escapes included; 00 00 in the CRC's place without one.
 
-    Raises
-    ------
-    ShapeError : the payload is too long, or the address or the command is no byte.
+    Raises ShapeError where the payload is too long, or the address or the command is no byte.
     """
     if len(frame.payload) > MOST_PAYLOAD:
         raise ShapeError(f"a frame carries at most {MOST_PAYLOAD} bytes, got {len(frame.payload)}; send several")
@@ -164,17 +150,13 @@ class FrameReader:
                     found.append(self._drop(f"more than {_LONGEST} bytes without a boundary"))
         return found
 
-    @property
-    def waiting(self) -> bytes:
-        """Bytes that came and are not a frame yet."""
-        return bytes(self._held)
-
     def _read(self) -> Frame | Damaged:
         if not self._begun:
             return self._drop("bytes that no boundary begins")
-        plain = _unescape(self._held)
-        if plain is None:
+        first, *rest = bytes(self._held).split(b"\x7d")
+        if any(part[:1] not in (b"\x5d", b"\x5e") for part in rest):
             return self._drop("an escape that escapes nothing")
+        plain = first + b"".join(bytes((part[0] ^ TURNED,)) + part[1:] for part in rest)
         if len(plain) < _HEAD + _CRC:
             return self._drop(f"{len(plain)} bytes, where a frame has at least {_HEAD + _CRC}")
         if plain[2] != len(plain) - _HEAD - _CRC:
@@ -192,9 +174,147 @@ class FrameReader:
         return damaged
 
 
-def _unescape(data: bytearray) -> bytes | None:
-    """Undo the escapes; None where a byte behind an escape is none of the two that need one."""
-    first, *rest = bytes(data).split(b"\x7d")
-    if any(part[:1] not in (b"\x5d", b"\x5e") for part in rest):
-        return None
-    return first + b"".join(bytes((part[0] ^ TURNED,)) + part[1:] for part in rest)
+CELL = 4  # bytes
+MOST_REGISTERS = 8  # in one frame: 2 + 8 * (2 + 4) bytes are 50
+VECTOR_CELLS = 10  # in one frame, as the public software does; 11 would fit
+_NO_ARGUMENT = b"\x00\x00"
+
+Value = float | int
+
+
+def float_cell(value: float) -> bytes:
+    """Give the cell of a float32; ShapeError where the value does not fit."""
+    try:
+        return struct.pack(">f", value)
+    except OverflowError:
+        raise ShapeError(f"expected a number that fits a float32, got {value}") from None
+
+
+def int_cell(value: int) -> bytes:
+    """Give the cell of an integer of 32 bits, with or without a sign; ShapeError where the value does not fit."""
+    if not -(2**31) <= value < 2**32:
+        raise ShapeError(f"expected an integer of 32 bits, got {value}")
+    return (value & 0xFFFFFFFF).to_bytes(CELL, "big")
+
+
+def to_cell(value: Value) -> bytes:
+    """Give the cell of a float or of an integer, by its type."""
+    return int_cell(value) if isinstance(value, int) else float_cell(value)
+
+
+def cell_float(cell: bytes) -> float:
+    """Read a cell as a float32."""
+    return float(struct.unpack(">f", _checked(cell, CELL, "a cell"))[0])
+
+
+def cell_int(cell: bytes) -> int:
+    """Read a cell as an integer without a sign."""
+    return int.from_bytes(_checked(cell, CELL, "a cell"), "big")
+
+
+def ask_status() -> Frame:
+    """Ask for the status bits; the reply is one cell."""
+    return Frame(Command.STATUS, _NO_ARGUMENT)
+
+
+def go_simple() -> Frame:
+    """Ask for simple mode, which is communication mode 0."""
+    return Frame(Command.SET_MODE, _NO_ARGUMENT)
+
+
+def get_value(register: int) -> Frame:
+    """Ask for a register; the reply is its cell."""
+    return Frame(Command.GET_VALUE, _id(register))
+
+
+def get_values(registers: Sequence[int]) -> Frame:
+    """Ask for 1 to 8 registers (else ShapeError); the reply is their count and their cells."""
+    return Frame(Command.GET_VALUES, _count(len(registers)) + b"".join(map(_id, registers)))
+
+
+def set_values(values: Mapping[int, Value]) -> Frame:
+    """Set 1 to 8 registers (else ShapeError) at once, in the order given."""
+    ids, cells = b"".join(map(_id, values)), b"".join(map(to_cell, values.values()))
+    return Frame(Command.SET_VALUES, _count(len(values)) + ids + cells)
+
+
+def get_vector(register: int, start: int, count: int) -> Frame:
+    """Ask for the cells ``start`` to ``start + count`` of a vector; the reply is the cells."""
+    return Frame(Command.GET_VECTOR, _span(register, start, count))
+
+
+def set_vector(register: int, start: int, cells: bytes) -> Frame:
+    """Set the cells of a vector from ``start`` on."""
+    return Frame(Command.SET_VECTOR, _span(register, start, len(cells) // CELL) + cells)
+
+
+def refuse(command: int, code: int) -> Frame:
+    """Build the device's reply that it did not."""
+    return Frame(command | ERROR_FLAG, int_cell(code))
+
+
+def values_reply(cells: Sequence[bytes]) -> Frame:
+    """Build the device's reply with several registers' cells."""
+    return Frame(Command.GET_VALUES, _count(len(cells)) + b"".join(cells))
+
+
+def read_register(payload: bytes) -> tuple[int, bytes]:
+    """Read the register that a request names, and what follows it: nothing, or its cell.
+
+    All readers here raise ShapeError where a length does not fit.
+    """
+    if len(payload) not in (2, 2 + CELL):
+        raise ShapeError(f"expected a register's id and at most its cell, 2 or 6 bytes, got {len(payload)}")
+    return int.from_bytes(payload[:2], "big"), payload[2:]
+
+
+def read_registers(payload: bytes, *, with_cells: bool) -> list[tuple[int, bytes]]:
+    """Read the registers that a request names, each with its cell, or with nothing where only ids came."""
+    count = int.from_bytes(payload[:2], "big")
+    _checked(payload, 2 + count * (2 + CELL * with_cells), f"{count} registers")
+    ids = [int.from_bytes(payload[at : at + 2], "big") for at in range(2, 2 + 2 * count, 2)]
+    cells = split_cells(payload[2 + 2 * count :]) if with_cells else [b""] * count
+    return list(zip(ids, cells, strict=True))
+
+
+def read_values(payload: bytes) -> list[bytes]:
+    """Read the cells of a reply with several registers."""
+    count = int.from_bytes(payload[:2], "big")
+    return split_cells(_checked(payload, 2 + CELL * count, f"{count} values")[2:])
+
+
+def read_vector(payload: bytes) -> tuple[int, int, int, bytes]:
+    """Read a request for cells of a vector: register, offset and length in bytes, and the cells, if they came."""
+    if len(payload) < 5:
+        raise ShapeError(f"expected a register, an offset and a length, 5 bytes or more, got {len(payload)}")
+    register, offset, length = struct.unpack(">HHB", payload[:5])
+    return register, offset, length, payload[5:]
+
+
+def split_cells(data: bytes) -> list[bytes]:
+    """Cut bytes into cells."""
+    if len(data) % CELL:
+        raise ShapeError(f"expected whole cells of {CELL} bytes, got {len(data)} bytes")
+    return [data[at : at + CELL] for at in range(0, len(data), CELL)]
+
+
+def _id(register: int) -> bytes:
+    return register.to_bytes(2, "big")
+
+
+def _count(registers: int) -> bytes:
+    if not 1 <= registers <= MOST_REGISTERS:
+        raise ShapeError(f"a frame takes 1 to {MOST_REGISTERS} registers, got {registers}; send several frames")
+    return registers.to_bytes(2, "big")
+
+
+def _span(register: int, start: int, count: int) -> bytes:
+    if start < 0 or count < 1 or (start + count) * CELL > 0xFFFF:
+        raise ShapeError(f"expected cells of a vector from 0 on, at least one, got {count} from {start}")
+    return struct.pack(">HHB", register, start * CELL, count * CELL)
+
+
+def _checked(data: bytes, size: int, what: str) -> bytes:
+    if len(data) != size:
+        raise ShapeError(f"expected {size} bytes for {what}, got {len(data)}")
+    return data

@@ -11,16 +11,11 @@ from enum import IntEnum, IntFlag
 
 CHANNELS = 2  # 0 is X, 1 is Y
 
-_FEEDBACK, _LOGGER, _MEMORY, _CHAIN = 0x23, 0x24, 0x26, 0x40
-_STATIC, _VECTOR_UNIT, _XY_CONTROL = 0x50, 0x68, 0xC0  # plus the channel
-
-FEEDBACK_A = _FEEDBACK << 8 | 0x00  # of the first axis; the second's is the next one
-FEEDBACK_X, FEEDBACK_Y = _FEEDBACK << 8 | 0x02, _FEEDBACK << 8 | 0x03
-
-VECTOR_MEMORY = _MEMORY << 8  # one vector, shared by the channels
-
+FEEDBACK_A = 0x2300  # of the first axis; the second's is the next one
+FEEDBACK_X, FEEDBACK_Y = 0x2302, 0x2303
 LOG_SLOTS = 6
-LOG_RUN, LOG_RATE = _LOGGER << 8 | 0x10, _LOGGER << 8 | 0x11
+LOG_RUN, LOG_RATE = 0x2410, 0x2411
+VECTOR_MEMORY = 0x2600  # one vector, shared by the channels
 
 
 class Unit(IntEnum):
@@ -40,28 +35,35 @@ class Trigger(IntEnum):
 
 
 class Status(IntFlag):
-    """Status bits. The ``WAS`` bits stay until they are acknowledged."""
+    """Status bits, and what each says. The ``WAS`` bits stay until they are acknowledged."""
 
-    DISCONNECTED = 1 << 0
-    ELECTRONICS_WARM = 1 << 1
-    MIRROR_WARM = 1 << 2
-    EEPROM_INVALID = 1 << 3
-    NOT_STABLE = 1 << 4
-    OUTPUT_LIMIT = 1 << 5
-    AVERAGE_LIMIT = 1 << 6
-    TRIMMED = 1 << 7
-    WAS_DISCONNECTED = 1 << 8
-    WAS_ELECTRONICS_WARM = 1 << 9
-    WAS_MIRROR_WARM = 1 << 10
-    WAS_OUTPUT_LIMIT = 1 << 11
-    WAS_AVERAGE_LIMIT = 1 << 12
-    WAS_TRIMMED = 1 << 13
+    says: str
+
+    DISCONNECTED = 1 << 0, "the mirror head is not connected"
+    ELECTRONICS_WARM = 1 << 1, "the mirror head's electronics are too warm"
+    MIRROR_WARM = 1 << 2, "the mirror is too warm"
+    EEPROM_INVALID = 1 << 3, "the mirror's own calibration cannot be read"
+    NOT_STABLE = 1 << 4, "the mirror is not at rest"
+    OUTPUT_LIMIT = 1 << 5, "the drive is at its limit"
+    AVERAGE_LIMIT = 1 << 6, "the drive's average is at its limit"
+    TRIMMED = 1 << 7, "a target was beyond the rim, and was trimmed to it"
+    WAS_DISCONNECTED = 1 << 8, "the mirror head was not connected (since acknowledged last)"
+    WAS_ELECTRONICS_WARM = 1 << 9, "the mirror head's electronics were too warm (since acknowledged last)"
+    WAS_MIRROR_WARM = 1 << 10, "the mirror was too warm (since acknowledged last)"
+    WAS_OUTPUT_LIMIT = 1 << 11, "the drive was at its limit (since acknowledged last)"
+    WAS_AVERAGE_LIMIT = 1 << 12, "the drive's average was at its limit (since acknowledged last)"
+    WAS_TRIMMED = 1 << 13, "a target was trimmed to the rim (since acknowledged last)"
+
+    def __new__(cls, bit: int, says: str = "") -> Status:
+        status = int.__new__(cls, bit)
+        status._value_, status.says = bit, says
+        return status
 
     @property
     def words(self) -> list[str]:
         """What is on, in words for whoever stands before the rig; bits without a known meaning by their number."""
-        known = [words for bit, words in _WORDS.items() if bit in self]
-        rest = int(self) & ~sum(_WORDS)
+        known = [bit.says for bit in Status if bit in self]
+        rest = int(self) & ~sum(Status)
         return known + [f"bit {place}, whose meaning is not known" for place in range(32) if rest >> place & 1]
 
     @property
@@ -75,60 +77,22 @@ class Status(IntFlag):
         return bool(self & _STOPS)
 
 
-_WORDS = {
-    Status.DISCONNECTED: "the mirror head is not connected",
-    Status.ELECTRONICS_WARM: "the mirror head's electronics are too warm",
-    Status.MIRROR_WARM: "the mirror is too warm",
-    Status.EEPROM_INVALID: "the mirror's own calibration cannot be read",
-    Status.NOT_STABLE: "the mirror is not at rest",
-    Status.OUTPUT_LIMIT: "the drive is at its limit",
-    Status.AVERAGE_LIMIT: "the drive's average is at its limit",
-    Status.TRIMMED: "a target was beyond the rim, and was trimmed to it",
-    Status.WAS_DISCONNECTED: "the mirror head was not connected (since acknowledged last)",
-    Status.WAS_ELECTRONICS_WARM: "the mirror head's electronics were too warm (since acknowledged last)",
-    Status.WAS_MIRROR_WARM: "the mirror was too warm (since acknowledged last)",
-    Status.WAS_OUTPUT_LIMIT: "the drive was at its limit (since acknowledged last)",
-    Status.WAS_AVERAGE_LIMIT: "the drive's average was at its limit (since acknowledged last)",
-    Status.WAS_TRIMMED: "a target was trimmed to the rim (since acknowledged last)",
-}
 _STOPS = Status.DISCONNECTED | Status.ELECTRONICS_WARM | Status.MIRROR_WARM | Status.EEPROM_INVALID
 
 
-@dataclass(frozen=True)
+@dataclass
 class ChannelRegisters:
     """The registers of one channel: the inputs it can follow, and which of them it does."""
 
     channel: int
 
-    @property
-    def static_xy(self) -> int:
-        """Held position, float."""
-        return self.static_system << 8 | Unit.XY
-
-    @property
-    def input(self) -> int:
-        """Which system the channel follows."""
-        return _CHAIN << 8 | 5 * self.channel
-
-    @property
-    def control(self) -> int:
-        """Which system controls the channel."""
-        return _CHAIN << 8 | 5 * self.channel + 2
-
-    @property
-    def static_system(self) -> int:
-        """System of held positions."""
-        return _STATIC + self.channel
-
-    @property
-    def vector_system(self) -> int:
-        """System that plays the vector memory."""
-        return _VECTOR_UNIT + self.channel
-
-    @property
-    def xy_system(self) -> int:
-        """System that controls position."""
-        return _XY_CONTROL + self.channel
+    def __post_init__(self) -> None:
+        self.static_system = 0x50 + self.channel  # of held positions
+        self.vector_system = 0x68 + self.channel  # plays the vector memory
+        self.xy_system = 0xC0 + self.channel  # controls position
+        self.static_xy = self.static_system << 8 | Unit.XY  # held position, float
+        self.input = 0x4000 + 5 * self.channel  # which system the channel follows
+        self.control = 0x4002 + 5 * self.channel  # which system controls the channel
 
     def vector(self, register: VectorRegister) -> int:
         """Id of a register of the vector unit."""
@@ -160,4 +124,4 @@ X, Y = ChannelRegisters(0), ChannelRegisters(1)
 
 def log_slot(slot: int) -> int:
     """Id of the register that says what a slot of the logger takes down, and of the vector that it takes down."""
-    return _LOGGER << 8 | slot
+    return 0x2400 | slot

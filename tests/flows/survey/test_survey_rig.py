@@ -32,14 +32,12 @@ from flows.survey.stages.effects import chosen_effects
 from pipeline.errors import PoseError, SettingsError
 from pipeline.geometry.mounting import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep
-from pipeline.rig.camera.camera_references import mean_frame
+from pipeline.rig.camera.camera_cubes import mean_frame
 from pipeline.rig.capture.capture_paths import REFERENCES
 from pipeline.rig.capture.capture_runner import RigDevices
-from pipeline.rig.clock import SYSTEM_CLOCK, ManualClock
-from pipeline.rig.device_errors import DeviceGone
-from pipeline.rig.emulator.camera_device import CameraFault
+from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone, ManualClock
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
-from pipeline.rig.emulator.fault_names import make_fault
+from pipeline.rig.emulator.fault_names import CameraFault, make_fault
 from pipeline.rig.emulator.scene_camera import REFERENCE_FRAMES, SceneView
 from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.mirror.pro_mode import Command

@@ -5,22 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.rig.camera.camera_settings import ControlPatience
-from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.camera.headwall_control import HeadwallControl
-from pipeline.rig.clock import ManualClock
+from pipeline.rig.camera.headwall_camera import HeadwallCamera, HeadwallControl
+from pipeline.rig.device_settings import ControlPatience
+from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator.camera_device import CameraDevice
 from pipeline.rig.emulator.camera_server import InProcessCameraLine
 
 
 def control_of(device: CameraDevice, clock: ManualClock, retries: int = 2) -> HeadwallControl:
     """A control client of an emulated camera in this process."""
-    return HeadwallControl(
-        lambda: InProcessCameraLine(device, clock, "emulated:8100"),
-        clock=clock,
-        patience=ControlPatience(5.0, retries),
-        capture_root="/captured",
-    )
+    line = lambda: InProcessCameraLine(device, clock, "emulated:8100")  # noqa: E731
+    return HeadwallControl(line, clock=clock, patience=ControlPatience(5.0, retries))
 
 
 def wait_for(camera: HeadwallCamera, at_most_s: float) -> None:
@@ -31,15 +26,10 @@ def wait_for(camera: HeadwallCamera, at_most_s: float) -> None:
         camera.clock.sleep(0.2)
 
 
-def scene_lines(samples: int = 6, bands: int = 4) -> LinesOf:
-    """What an emulated camera sees: numbers that tell time, position, sample and band."""
-    return LinesOf(samples, bands)
-
-
 class LinesOf:
     """Lines that only their own time and position have, kept as they were given."""
 
-    def __init__(self, samples: int, bands: int) -> None:
+    def __init__(self, samples: int = 6, bands: int = 4) -> None:
         self.size = (samples, bands)
         self.given: list[NDArray[np.uint16]] = []
 

@@ -1,4 +1,4 @@
-"""Bytes of a capture's files come out as the lines that went in, whatever is missing."""
+"""Bytes of a capture's files come out as the lines that went in, and references as exact means, whatever is missing."""
 
 from __future__ import annotations
 
@@ -6,10 +6,19 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.errors import RigError
-from pipeline.rig.camera.camera_cubes import cube_lines, parse_cube_header, read_capture, read_references
+from pipeline.errors import RigError, ShapeError
+from pipeline.rig.camera.camera_cubes import (
+    as_references,
+    cube_lines,
+    mean_frame,
+    parse_cube_header,
+    read_capture,
+    read_references,
+)
 
 HEADER = (
     "ENVI\n; a comment\ninterleave = bil\ndata type = 12\nlines = {lines}\nsamples = 5\nbands = 3\nbyte order = 0\n"
@@ -39,23 +48,12 @@ def header(lines: int) -> bytes:
 
 
 def test_header_by_hand() -> None:
-    """Sizes, byte order, offset and wavelengths are read; band after band stands within a line."""
+    """Sizes, byte order and offset are read; band after band stands within a line."""
     found = parse_cube_header(HEADER.format(lines=1).replace("\n", "\r\n"), "raw_0.hdr")
     assert (found.samples, found.lines, found.bands, found.offset, found.line_bytes) == (5, 1, 3, 0, 30)
-    assert found.wavelength_nm is not None
-    assert found.wavelength_nm.tolist() == [400.5, 500, 600]
     values = cube_lines(found, bytes(range(30))).values
     assert values[0, 1, 0] == 0x0302
     assert values[0, 0, 1] == 0x0B0A
-
-
-def test_wavelengths_come_out_in_nm() -> None:
-    """Whatever their unit; a list that does not fit the bands is left out."""
-    text = HEADER.format(lines=1).replace("400.5,\n500,\n600", "0.4, 0.5, 0.6\n} \nwavelength units = {um")
-    found = parse_cube_header(text, "h").wavelength_nm
-    assert found is not None
-    assert found.tolist() == [400, 500, 600]
-    assert parse_cube_header(text.replace("0.4, ", ""), "h").wavelength_nm is None
 
 
 def test_big_endian_with_an_offset() -> None:
@@ -103,8 +101,8 @@ def test_parts_in_order() -> None:
     assert "frameIndex_0.txt: 1 frames are listed twice, the first counts" in found.notes
 
 
-def test_cut_off_within_a_line() -> None:
-    """Lines that are whole are kept, the others are 0 and not valid, and a note says it."""
+def test_lines_that_are_in_no_file() -> None:
+    """Behind a cube that is cut off within a line, or before a part of a later frame: 0, not valid, and a note."""
     names, read = folder(
         raw_0=bil(numbers(4))[:-40], raw_0__hdr=header(4), frameIndex_0__txt=b"f t\n0 1\n1 2\n2 3\n3 4\n"
     )
@@ -114,10 +112,6 @@ def test_cut_off_within_a_line() -> None:
     assert not found.values[2:].any()
     assert found.times.stamp_us.tolist() == [1, 2, -1, -1]
     assert "raw_0 is cut off: 2 of 4 lines are whole" in found.notes
-
-
-def test_lines_between_parts_in_no_file() -> None:
-    """A part whose name says a later frame leaves lines that are not valid."""
     names, read = folder(raw_0=bil(numbers(2)), raw_0__hdr=header(2), raw_3=bil(numbers(1, 3)), raw_3__hdr=header(1))
     found = read_capture(names, read)
     assert found.valid.tolist() == [True, True, False, True]
@@ -161,3 +155,92 @@ def test_references_of_a_folder() -> None:
     names, read = folder(dark=bil(numbers(1)), dark__hdr=header(1), darkRef=bil(numbers(1)), darkRef__hdr=header(1))
     with pytest.raises(RigError, match="two dark references"):
         read_references(names, read)
+
+
+def frames(level: float, count: int = 40, shape: tuple[int, int] = (40, 10)) -> np.ndarray:
+    """Noisy frames (frame, sample, band) around a level."""
+    rng = np.random.default_rng(3)
+    return np.clip(np.rint(rng.normal(level, 4, (count, *shape))), 0, 4095).astype(np.uint16)
+
+
+def test_mean_and_noise_are_exact() -> None:
+    """They are those of float64 over all frames, in any order."""
+    taken = frames(200, 200)
+    found = mean_frame(taken)
+    np.testing.assert_array_equal(found.mean, taken.mean(axis=0).astype(np.float32))
+    np.testing.assert_allclose(found.noise, taken.std(axis=0, ddof=1), rtol=1e-6)
+    np.testing.assert_array_equal(mean_frame(taken[::-1]).mean, found.mean)
+
+
+def test_stuck_and_dead_elements_are_told() -> None:
+    """One that never changes and one that hardly responds are bad, and the notes count them."""
+    dark, white = frames(64), frames(3000)
+    dark[:, 3, 4] = 70
+    white[:, 20, 5] = 66
+    references, notes = as_references(mean_frame(dark), mean_frame(white), panel=0.5)
+    assert references.bad is not None
+    assert np.argwhere(references.bad).tolist() == [[3, 4], [20, 5]]
+    assert references.panel.tolist() == [0.5] * 10
+    assert "dark: the mean of 40 frames; 1 of 400 elements are stuck" in notes
+    assert "2 of 400 elements are bad" in notes
+
+
+def test_references_that_do_not_fit() -> None:
+    """Swapped frames, two sizes and a panel of other bands are refused; one frame cannot tell stuck elements."""
+    dark, white = mean_frame(frames(64)), mean_frame(frames(3000))
+    with pytest.raises(RigError, match="are they swapped, or was the lamp off"):
+        as_references(white, dark)
+    with pytest.raises(RigError, match="take both anew"):
+        as_references(dark, mean_frame(frames(3000, shape=(40, 9))))
+    with pytest.raises(RigError, match="one value or one for each of 10 bands"):
+        as_references(dark, white, panel=[1, 2])
+    with pytest.raises(ShapeError, match="at least one frame"):
+        mean_frame(np.zeros((0, 2, 3), np.uint16))
+    one = mean_frame(frames(64, 1))
+    assert not one.noise.any()
+    assert not one.stuck.any()
+    assert "1 frames cannot tell stuck elements; take 8 or more" in one.notes
+
+
+def shifted(taken: np.ndarray, at: int, count: int) -> np.ndarray:
+    """Frames as they are read after so many bytes came in between, from a byte on."""
+    written = np.ascontiguousarray(taken.transpose(0, 2, 1)).tobytes()
+    data = (written[:at] + bytes(count) + written[at:])[: len(written)]
+    return np.frombuffer(data, np.uint16).reshape(taken.shape[0], taken.shape[2], -1).transpose(0, 2, 1)
+
+
+@settings(max_examples=60, deadline=None)
+@example(frame=16, count=2, offset=0)
+@given(st.integers(1, 31), st.integers(1, 16), st.integers(0, 799))
+def test_shifted_frames_are_no_reference(frame: int, count: int, offset: int) -> None:
+    """Bytes put in between change no element by more than its noise: it is bad, or the reference is refused."""
+    rng = np.random.default_rng(frame)
+    level = 64 + 3000 * (rng.random((40, 10)) < 0.02)
+    dark = np.clip(np.rint(level + rng.normal(0, 4, (32, 40, 10))), 0, 4095).astype(np.uint16)
+    whole, white = mean_frame(dark), mean_frame(frames(3500))
+    found = mean_frame(shifted(dark, frame * 800 + offset, count))
+    try:
+        references, _ = as_references(found, white)
+    except RigError:
+        return
+    assert references.bad is not None
+    off = np.abs(references.dark - whole.mean)
+    assert off[~references.bad].max() < 12 * 5
+
+
+def test_references_that_are_not_steady() -> None:
+    """A cloud amid the white frames, and rows that begin elsewhere in some frames, are refused; one hit is flagged."""
+    dark, white = frames(64), frames(3000) + 10 * np.arange(40, dtype=np.uint16)[:, None]
+    cloudy = white.copy()
+    cloudy[30:] //= 2
+    with pytest.raises(RigError, match=r"10 of 40 frames of the white reference show something else .*30, 31, 32"):
+        as_references(mean_frame(dark), mean_frame(cloudy))
+    rolled = white.copy()
+    rolled[20:25] = np.roll(white[20:25], 3, axis=1)
+    with pytest.raises(RigError, match="of the white reference"):
+        as_references(mean_frame(dark), mean_frame(rolled))
+    hit = dark.copy()
+    hit[7, 11, 2] = 64 + 20 * 4  # sigmas of its noise
+    references, notes = as_references(mean_frame(hit), mean_frame(white))
+    assert np.argwhere(references.bad).tolist() == [[11, 2]]
+    assert "dark: 1 of 400 elements jump amid the frames" in notes

@@ -18,17 +18,14 @@ import pytest
 from pipeline.errors import RigError
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.camera.camera_settings import ControlPatience
-from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_runner import RigDevices
-from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults
-from pipeline.rig.emulator.fault_names import make_fault
-from pipeline.rig.emulator.mirror_faults import Fault
-from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.device_settings import ControlPatience
+from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults, make_fault
+from pipeline.rig.emulator.mirror_device import Fault
 from pipeline.rig.mirror.registers import Status
 from pipeline.source import Line
 from tests.rig.mirror.test_fault_suite import moves
-from tests.rig.small_rig import SmallRig, small_rig, small_source
+from tests.rig.small_rig import SmallRig, assert_simulated, small_rig
 
 SEEDS = range(20)
 SWEEP = Sweep("fine-5", "fine", "x", 1.5, -4.5, 7)
@@ -60,8 +57,7 @@ def undisturbed() -> list[Line]:
     """The sweep's lines as an undisturbed rig gives them, which are the simulated source's."""
     with small_rig(vector_pairs=PAIRS) as rig:
         lines = list(rig.source().lines(SWEEP))
-    expected = small_source().lines(SWEEP)
-    np.testing.assert_array_equal([line.data for line in lines], [line.data for line in expected])
+    assert_simulated(lines, SWEEP)
     return lines
 
 
@@ -80,9 +76,7 @@ class Looks:
 
         def devices() -> RigDevices:
             opened = connect()
-            assert isinstance(opened.camera, HeadwallCamera)
-            assert isinstance(opened.steering, MirrorController)
-            control = opened.camera.control
+            control = opened.camera
             for name, noted in {"_ask": self.asked_s, "capture": self.captured_s}.items():
                 setattr(control, name, self.timed(getattr(control, name), noted))
             self.sent = self.rig.line.transport.sent

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import socket
 import threading
 from collections.abc import Iterator
@@ -13,15 +12,14 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
-from pipeline.rig.camera.camera_settings import CameraAddress, ControlPatience, FileServer
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.clock import SYSTEM_CLOCK, ManualClock
-from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, DeviceRefused
-from pipeline.rig.emulator.camera_capture import FrameClock, IndexLayout
-from pipeline.rig.emulator.camera_device import CameraDevice, CameraFault, CameraFaults, CameraUnit
+from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer
+from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone, DeviceRefused, ManualClock
+from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit, FrameClock, IndexLayout
 from pipeline.rig.emulator.camera_server import CameraServer
+from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 from pipeline.rig.transports import SocketTransport
-from tests.rig.camera.camera_line import LinesOf, scene_lines, wait_for
+from tests.rig.camera.camera_line import LinesOf, wait_for
 
 
 def remote_files(device: CameraDevice, folder: str) -> list[RemoteFile]:
@@ -35,7 +33,7 @@ def camera(
     faults: dict[CameraFault, int] | None = None, unit: CameraUnit | None = None, **server: object
 ) -> Iterator[tuple[HeadwallCamera, CameraDevice, LinesOf]]:
     """A served camera, its driver by the same clock, and what it sees."""
-    clock, lines = ManualClock(100.0), scene_lines()
+    clock, lines = ManualClock(100.0), LinesOf()
     device = CameraDevice(lines, clock, unit=unit, faults=CameraFaults(dict(faults or {})))
     with CameraServer(device) as served:
         files = FileServer(served.host, served.file_port, stall_s=2.0, pause_s=0.01, **server)  # type: ignore[arg-type]
@@ -46,8 +44,9 @@ def camera(
 
 @pytest.mark.parametrize("layout", [IndexLayout("\t", "\n"), IndexLayout(" ", "\r\n", restarts=True)])
 def test_whole_loop(layout: IndexLayout) -> None:
-    """Configure, capture, poll, fetch, lines: exactly what the camera saw, with its own frames' times."""
-    unit = CameraUnit(layout=layout, clock=FrameClock(drift_ppm=100.0), wavelength_nm=(400.5, 500.25, 600.0, 700.0))
+    """Configure, capture, poll, fetch, lines and references: what the camera saw, with its own frames' times."""
+    dark = np.random.default_rng(1).integers(60, 70, (20, 6, 4)).astype(np.uint16)
+    unit = CameraUnit(layout=layout, clock=FrameClock(drift_ppm=100.0), references={"darkReference": dark})
     with camera(unit=unit) as (driver, device, lines):
         driver.configure(8.0, 10.0)
         capture = driver.capture(60, cubes=3, prefix="field")
@@ -59,22 +58,12 @@ def test_whole_loop(layout: IndexLayout) -> None:
         assert found.values.shape == (180, 6, 4)
         assert found.valid.all()
         assert found.notes == ()
-        assert found.wavelength_nm is not None
-        assert found.wavelength_nm.tolist() == [400.5, 500.25, 600.0, 700.0]
         assert np.diff(found.times.stamp_us).tolist() == [10001] * 179
         assert seen[-1] == (f"{capture.folder}/raw_60", 60 * 48, 60 * 48)
         assert device.commands.count("isCapturing") > 2
-
-
-def test_references_from_the_folder() -> None:
-    """A dark reference that lies in the capture's folder is fetched and averaged."""
-    dark = np.random.default_rng(1).integers(60, 70, (20, 6, 4)).astype(np.uint16)
-    with camera(unit=CameraUnit(references={"darkReference": dark})) as (driver, _, _):
-        folder = driver.capture(3).folder
-        wait_for(driver, 5.0)
-        found = driver.references(folder, KeptInMemory())
-        assert list(found) == ["dark"]
-        np.testing.assert_array_equal(found["dark"].mean, dark.mean(axis=0).astype(np.float32))
+        (kind,) = (means := driver.references(capture.folder, KeptInMemory()))
+        assert kind == "dark"
+        np.testing.assert_array_equal(means["dark"].mean, dark.mean(axis=0).astype(np.float32))
 
 
 def test_transfer_that_breaks_off_goes_on() -> None:
@@ -158,26 +147,12 @@ def test_files_that_are_refused() -> None:
 
 
 def test_fetch_while_it_captures() -> None:
-    """Files that may still grow are not fetched."""
+    """Files that may still grow are not fetched; nobody there, and a port that cannot be, are told before anything."""
     with camera() as (driver, _, _):
         folder = driver.capture(1000).folder
         with pytest.raises(RigError, match="a capture still runs"):
             driver.fetch(folder, KeptInMemory())
         assert driver.stop()
-
-
-def test_cut_off_in_a_cube() -> None:
-    """A cube that ends within a line gives its whole lines."""
-    with camera({CameraFault.CUT_CUBE: 1}) as (driver, _, lines):
-        folder = driver.capture(20).folder
-        wait_for(driver, 5.0)
-        found = driver.fetch(folder, KeptInMemory())
-        assert found.valid.tolist() == [True] * 18 + [False] * 2
-        np.testing.assert_array_equal(found.values[:18], np.concatenate(lines.given[1:])[:18])
-
-
-def test_nobody_listens() -> None:
-    """A port that nobody listens on, and one that cannot be, are told before anything else."""
     with pytest.raises(DeviceGone, match=r"no connection to 127.0.0.1:1: connection refused; is the camera on"):
         SocketTransport("127.0.0.1", 1)
     with pytest.raises(ValueError, match="from 1 to 65535"):
@@ -187,7 +162,7 @@ def test_nobody_listens() -> None:
 def test_server_closes_cleanly() -> None:
     """Threads end and ports are free again; a taken port is refused."""
     before = threading.active_count()
-    device = CameraDevice(scene_lines(), ManualClock())
+    device = CameraDevice(LinesOf(), ManualClock())
     with CameraServer(device) as served:
         line = SocketTransport(served.host, served.port)
         with pytest.raises(RigError, match="cannot be listened on"):
@@ -200,44 +175,9 @@ def test_server_closes_cleanly() -> None:
         pass
 
 
-@contextmanager
-def somebody(says: bytes) -> Iterator[int]:
-    """A port where somebody says this and then nothing."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        talks: list[socket.socket] = []
-
-        def answer() -> None:
-            with contextlib.suppress(OSError):
-                talks.append(listener.accept()[0])
-                talks[0].sendall(says)
-
-        thread = threading.Thread(target=answer)
-        thread.start()
-        try:
-            yield int(listener.getsockname()[1])
-        finally:
-            thread.join()
-            for talk in talks:
-                talk.close()
-
-
-@pytest.mark.parametrize(
-    ("says", "kind", "words"),
-    [
-        (b"", DeadlinePassed, r"was silent for 0\.1 s"),
-        (b"HTTP/1.1 400\r\n", RigError, "is no FTP; check host and port"),
-    ],
-)
-def test_other_servers(says: bytes, kind: type[RigError], words: str) -> None:
-    """One that stays silent and one that speaks something else are told by the deadline."""
-    file = RemoteFile("/captured/raw_0", 3, False)
-    with somebody(says) as port, pytest.raises(kind, match=words):
-        fetch_files(FileServer("127.0.0.1", port, stall_s=0.1, tries=1), [file], KeptInMemory())
-
-
 def test_silence_on_a_real_socket() -> None:
     """By the system's clock a lost reply costs its deadline, and the next connection answers."""
-    device = CameraDevice(scene_lines(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.SILENT: 1}))
+    device = CameraDevice(LinesOf(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.SILENT: 1}))
     with CameraServer(device) as served:
         driver = HeadwallCamera.at(
             CameraAddress(served.host, served.port), FileServer(), patience=ControlPatience(0.3, 1, 0.01)
@@ -249,7 +189,7 @@ def test_silence_on_a_real_socket() -> None:
 
 def test_closing_does_not_wait_for_what_is_late() -> None:
     """A reply that a fault holds back for a minute holds back nobody who closes the camera."""
-    device = CameraDevice(scene_lines(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.LATE: 1}))
+    device = CameraDevice(LinesOf(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.LATE: 1}))
     with CameraServer(device) as served, socket.create_connection((served.host, served.port), timeout=5) as client:
         client.sendall(b"isCapturing\r")
         while not device.commands:

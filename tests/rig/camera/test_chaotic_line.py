@@ -10,11 +10,12 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
-from pipeline.rig.camera.camera_settings import FileServer
-from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.camera_device import CameraDevice, CameraFault, CameraUnit
+from pipeline.rig.device_settings import FileServer
+from pipeline.rig.devices import ManualClock
+from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
 from pipeline.rig.emulator.camera_server import CameraServer
-from tests.rig.camera.camera_line import control_of, scene_lines
+from pipeline.rig.emulator.fault_names import CameraFault
+from tests.rig.camera.camera_line import LinesOf, control_of
 from tests.rig.chaos_line import ChaosLine
 from tests.rig.chaotic_surveys import survey_in_chaos
 
@@ -36,7 +37,7 @@ def dark_frames() -> Iterator[tuple[bytes, CameraServer]]:
     frames = np.full((32, 6, 4), 64, np.uint16)
     frames[:, 2, 1] = frames[:, 5, 3] = 3910
     clock = ManualClock()
-    device = CameraDevice(scene_lines(), clock, unit=CameraUnit(references={"darkReference": frames}))
+    device = CameraDevice(LinesOf(), clock, unit=CameraUnit(references={"darkReference": frames}))
     control_of(device, clock).capture(1)
     clock.advance(1.0)
     with CameraServer(device) as served:

@@ -9,9 +9,9 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files, log_in
-from pipeline.rig.camera.camera_settings import CameraAddress, ControlPatience, FileServer
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
+from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer
+from pipeline.rig.devices import DeadlinePassed, DeviceGone
 from pipeline.rig.rig_check import check_camera
 from tests.rig.camera.hostile_camera import Answers, HostileControl, HostileFiles, Pieces, flood, trickled
 
@@ -41,6 +41,7 @@ def assert_one_message(error: BaseException) -> None:
         (flood(b"220-more\r\n"), RigError),
         (flood(b"x"), RigError),
         ((b"\xff\xfe\xfd\r\n",), RigError),
+        ((b"HTTP/1.1 400\r\n",), RigError),
         ((b"220", 9.0), DeadlinePassed),
         ((), DeadlinePassed),
     ],
@@ -50,6 +51,7 @@ def assert_one_message(error: BaseException) -> None:
         "lines without end",
         "a line without end",
         "no text",
+        "no FTP",
         "half",
         "none",
     ],
@@ -192,5 +194,5 @@ def test_size_without_measure_in_a_listing() -> None:
     listing = REPLY % b'[{"name": "/a", "size": Infinity}, {"name": "/b", "size": NaN}, {"name": "/c", "size": "x"}]'
     with HostileControl(Answers(says={"listFiles": (listing,)})) as control:
         camera = HeadwallCamera.at(CameraAddress("127.0.0.1", control.port), FileServer())
-        assert [file.size for file in camera.control.list_files("/")] == [None] * 3
+        assert [file.size for file in camera.list_files("/")] == [None] * 3
         camera.close()

@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture.capture_journal import JOURNAL, CaptureJournal, CaptureRecord
+from pipeline.rig.capture import JOURNAL
+from pipeline.rig.capture.capture_paths import CaptureRecord
+from pipeline.rig.capture.capture_runner import CaptureJournal
 from pipeline.rig.capture.line_positions import LinePositions
 from tests.faults.growing_files import flip_journal
 from tests.rig.small_rig import COARSE, FINE
@@ -59,17 +61,6 @@ def tied(residual_us: float) -> LinePositions:
     return LinePositions(np.zeros((0, 2)), nothing, np.zeros(0, np.bool_), "log", residual_us, 0.1)
 
 
-def test_sweep_keeps_its_first_origin() -> None:
-    """Stamps of a line 0 that is captured again change no time of lines given before, and write nothing."""
-    kept = KeptInMemory()
-    journal = CaptureJournal(kept)
-    assert journal.origin_us(FINE) is None
-    assert journal.origin_us(FINE, 500) == 500
-    assert journal.origin_us(FINE, 700) == 500
-    assert journal.origin_us(FINE) == CaptureJournal(kept).origin_us(FINE) == 500
-    assert bytes(kept.files[JOURNAL]).count(b"\n") == 1
-
-
 def test_flipped_bit_of_the_journal_changes_no_capture():
     """Whichever it is: each capture is held as it was or not at all, one is lost at most, and the journal says so."""
     found = flip_journal(150, seed=3)
@@ -77,13 +68,18 @@ def test_flipped_bit_of_the_journal_changes_no_capture():
     assert found.told >= found.flips - 1  # the end of the last line is no part of it
 
 
-def test_journal_without_checksums_is_read():
-    """As an earlier version wrote it; what is added to it has them."""
+def test_journal_of_an_earlier_version_or_torn_is_read():
+    """Without checksums, which what is added has; behind a torn record the next is whole; line 0 keeps its stamp."""
     kept = KeptInMemory()
     CaptureJournal(kept).began(ONE)
     kept.files[JOURNAL] = bytearray(re.sub(rb', "check": "[0-9a-f]{8}"', b"", bytes(kept.files[JOURNAL])))
+    kept.append(JOURNAL, b'{"what": "spent", "fol')
     CaptureJournal(kept).began(OTHER)
     journal = CaptureJournal(kept)
     assert folders(journal) == [*"aaabbbbbb", ""]
     assert journal.damage == []
     assert bytes(kept.files[JOURNAL]).count(b'"check"') == 1
+    assert journal.origin_us(FINE) is None
+    assert journal.origin_us(FINE, 500) == journal.origin_us(FINE, 700) == 500
+    assert journal.origin_us(FINE) == CaptureJournal(kept).origin_us(FINE) == 500
+    assert bytes(kept.files[JOURNAL]).count(b'"origin"') == 1

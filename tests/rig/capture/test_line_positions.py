@@ -106,27 +106,31 @@ def test_log_shorter_than_the_capture() -> None:
     check_truth(lines_by_log(frames(), CAMERA, replace(track(3.0, from_s=0.0)), commands=COMMANDS))
 
 
-def test_jitter_and_strays() -> None:
-    """Edges that jitter by 0.3 ms average out; the residual says so."""
+def test_jitter_and_no_stamps() -> None:
+    """Edges that jitter by 0.3 ms average out, and the residual says so; without an index they follow their period."""
     rng = np.random.default_rng(4)
     whole = track()
     jittered = replace(whole, edge_s=np.sort(edges() + rng.normal(0, 3e-4, LINES)))
     found = lines_by_log(frames(), CAMERA, jittered)
     check_truth(found, atol_s=1.5e-4)
     assert found.residual_us == pytest.approx(300, rel=0.15)
+    found = lines_by_log(FrameTimes(np.full(LINES, -1), np.full(LINES, -1), 8.0, 10.0), CAMERA, whole)
+    check_truth(found, atol_s=1e-4)
+    assert "no line has a time stamp: frames are taken to follow their period" in found.notes
 
 
 def test_stamps_that_go_back() -> None:
-    """Stamps that jump back, and ones that are missing, follow their neighbours."""
+    """Stamps that jump back, and ones that are missing, follow their neighbours; edges say what moment they are of."""
     whole = frames()
     stamp = whole.stamp_us.copy()
     stamp[100] -= 5_000_000
     stamp[200:210] = -1
     stamp[300] += 9_000_000_000
-    found = lines_by_log(replace(whole, stamp_us=stamp), CAMERA, track())
-    check_truth(found)
-    assert found.valid.all()
-    assert "12 time stamps are missing or stray, and follow their neighbours" in found.notes
+    for stamp_at in ("start", "middle", "end"):
+        found = lines_by_log(replace(whole, stamp_us=stamp, stamp_at=stamp_at), CAMERA, track())
+        check_truth(found)
+        assert found.valid.all()
+        assert "12 time stamps are missing or stray, and follow their neighbours" in found.notes
 
 
 @pytest.mark.parametrize("line", [1, 200, 300, 399])
@@ -151,21 +155,16 @@ def test_one_frame() -> None:
     assert lines_by_commands(frames(1), CAMERA, PlayedPath(sweep(edges(200)), 100.0), COMMANDS).valid.all()
 
 
-def test_stamps_by_other_moments() -> None:
-    """What moment a stamp is of does not matter where edges say it."""
-    whole = frames()
-    for stamp_at in ("start", "middle", "end"):
-        check_truth(lines_by_log(replace(whole, stamp_at=stamp_at), CAMERA, track()))
-
-
 def test_log_without_edges() -> None:
-    """By the commands' times alone the offset is as uncertain as they are, and that is said."""
+    """By the commands' times alone the offset is as uncertain as they are, and that is said; without them none."""
     found = lines_by_log(frames(), CAMERA, track(with_edges=False), commands=COMMANDS)
     check_truth(found, atol_s=2e-3)
     assert found.residual_us == pytest.approx(2000)
     assert any("a constant line offset of about" in note for note in found.notes)
     with pytest.raises(RigError, match="no edges and there are no command times"):
         lines_by_log(frames(), CAMERA, track(with_edges=False))
+    with pytest.raises(ShapeError, match="expected logged times"):
+        lines_by_log(frames(), CAMERA, replace(track(), time_s=np.arange(3.0)))
 
 
 def test_moments_of_stamps_count_without_edges() -> None:
@@ -239,20 +238,6 @@ def test_by_commands() -> None:
     assert any("software timing: a constant line offset" in note for note in found.notes)
     short = lines_by_commands(frames(), CAMERA, replace(path, position=path.position[:2000]), COMMANDS)
     assert 0 < np.count_nonzero(short.valid) < LINES
-
-
-def test_without_stamps() -> None:
-    """Without an index frames follow their period, and that is said."""
-    blank = FrameTimes(np.full(LINES, -1), np.full(LINES, -1), 8.0, 10.0)
-    found = lines_by_log(blank, CAMERA, track())
-    check_truth(found, atol_s=1e-4)
-    assert "no line has a time stamp: frames are taken to follow their period" in found.notes
-
-
-def test_tracks_that_do_not_fit() -> None:
-    """Times and positions of two lengths are refused."""
-    with pytest.raises(ShapeError, match="expected logged times"):
-        lines_by_log(frames(), CAMERA, replace(track(), time_s=np.arange(3.0)))
 
 
 def test_line_edges() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from ftplib import FTP
 from itertools import islice
 
@@ -14,29 +14,32 @@ from pipeline.errors import RigError
 from pipeline.geometry.mounting import Mounting
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture.capture_journal import CaptureJournal
+from pipeline.rig.capture.capture_runner import CaptureJournal
+from pipeline.rig.mirror.path_player import wire_positions
 from pipeline.rig.mirror.pro_mode import Command
-from pipeline.rig.mirror.steering import wire_positions
 from pipeline.source import Line
-from tests.rig.small_rig import CAMERA, COARSE, FINE, small_rig, small_source
+from tests.rig.small_rig import CAMERA, COARSE, FINE, assert_simulated, simulated_lines, small_rig, small_source
 
 
 def assert_same(found: list[Line], sweep: Sweep, first: int = 0) -> None:
     """The simulated source's lines: numbers bit for bit, positions at the wire's precision, times to a microsecond."""
-    expected = list(small_source().lines(sweep, first))
-    assert [line.number for line in found] == [line.number for line in expected]
-    np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
+    assert_simulated(found, sweep, first)
     wired = wire_positions(line_positions(sweep, CAMERA)[first:])
     np.testing.assert_array_equal([(line.mirror_x, line.mirror_y) for line in found], wired.astype(np.float64))
-    np.testing.assert_allclose([line.time_s for line in found], [line.time_s for line in expected], atol=1e-6)
+    times = [line.time_s for line in simulated_lines(sweep)[first:]]
+    np.testing.assert_allclose([line.time_s for line in found], times, atol=1e-6)
     assert all(line.valid and line.exposure_ms == CAMERA.exposure_ms for line in found)
 
 
 @pytest.mark.parametrize("sweep", [COARSE, FINE], ids=lambda sweep: sweep.kind)
-def test_lines_are_those_of_the_simulated_source(sweep: Sweep):
-    """Coarse lines that hold four positions each and are summed by four, and fine ones."""
+@pytest.mark.parametrize("first", [0, 9])
+def test_lines_are_those_of_the_simulated_source(sweep: Sweep, first: int):
+    """Coarse lines that hold four positions each and are summed by four, and fine ones; from the middle too."""
     with small_rig() as rig:
-        assert_same(list(rig.source().lines(sweep)), sweep)
+        source = rig.source()
+        found = list(source.lines(sweep, first))
+        assert_same(found, sweep, first)
+        assert list(source.lines(sweep, sweep.lines)) == []
         assert len(rig.captures) == 1
 
 
@@ -58,7 +61,7 @@ def test_lines_of_a_mirror_mounted_otherwise_are_the_same_once_it_is_told(mounti
         assert source.record["rig"]["mounting"] == asdict(mounting)
     with small_rig(mounting=mounting, log_pulses=True, log_samples=16000, **told) as rig:
         found = list(rig.source().lines(FINE))
-    np.testing.assert_array_equal([line.data for line in found], [line.data for line in small_source().lines(FINE)])
+    assert_simulated(found, FINE)
     off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - line_positions(FINE, CAMERA)
     assert np.hypot(*off.T).max() * 11275 < 3  # px
     with small_rig(mounting=mounting) as rig:
@@ -77,37 +80,27 @@ def test_loads_of_the_vector_memory_change_no_line(sweep: Sweep, captures: int):
     with small_rig(vector_pairs=17) as rig:
         found = list(rig.source().lines(sweep))
         assert len(rig.captures) == captures
-    expected = list(small_source().lines(sweep))
-    np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
-    late = np.array([line.time_s for line in found]) - [line.time_s for line in expected]
+    assert_simulated(found, sweep)
+    late = np.array([line.time_s for line in found]) - [line.time_s for line in simulated_lines(sweep)]
     assert abs(late[0]) < 1e-6
     assert (np.diff(late) > -2e-6).all()
     assert np.count_nonzero(np.diff(late) > 0.01) == captures - 1
 
 
-def test_lines_from_the_middle_of_a_sweep():
-    """A sweep that is gone on with has the lines that it would have had."""
-    with small_rig() as rig:
-        source = rig.source()
-        found = list(source.lines(FINE, first=9))
-        assert list(source.lines(FINE, first=FINE.lines)) == []
-    expected = list(small_source().lines(FINE, 9))
-    np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
-    assert [line.number for line in found] == list(range(9, FINE.lines))
-
-
-def test_references_are_the_mean_of_the_cameras_frames():
-    """Dark and white are those of the simulated source to the frames' rounding, for every binning from one capture."""
-    with small_rig(panel=2.0) as rig:
+@pytest.mark.parametrize("white_at_rest", [True, False])
+def test_references_are_the_mean_of_the_cameras_frames(white_at_rest: bool):
+    """Those of the simulated source to the frames' rounding, of one capture; the mirror moves only if it shall rest."""
+    with small_rig(panel=2.0, white_at_rest=white_at_rest) as rig:
         source = rig.source()
         for sweep in (COARSE, FINE):
             found, expected = source.references(sweep), small_source().references(sweep)
             np.testing.assert_allclose(found.dark, expected.dark, atol=sweep.binning / 64)
             np.testing.assert_allclose(found.white, expected.white, atol=sweep.binning / 64)
             assert found.panel.tolist() == [2.0] * 3
-            assert found.by_mirror
+            assert found.by_mirror == white_at_rest
             assert found.bad is None
         assert sum("references" in said for said in rig.emulated.camera.commands if "capture(" in said) == 1
+        assert any(act.request.command == Command.SET_VALUES for act in rig.emulated.mirror.acts) == white_at_rest
 
 
 def test_references_are_fetched_once(monkeypatch: pytest.MonkeyPatch):
@@ -144,36 +137,23 @@ def counted(call: Callable[..., object], calls: list[object]) -> Callable[..., o
     return counting
 
 
-def test_mirror_is_left_alone_where_the_settings_say_so():
-    """Where white is not taken at rest, looking for references moves nothing; else it goes to 0; 0 and rests."""
-    for white_at_rest in (False, True):
-        with small_rig(white_at_rest=white_at_rest) as rig:
-            assert rig.source().references(FINE).by_mirror == white_at_rest
-            assert any(act.request.command == Command.SET_VALUES for act in rig.emulated.mirror.acts) == white_at_rest
-
-
-def test_without_pulses_lines_lie_where_the_log_measured():
-    """A path that runs by its own clock: lines are placed by the mirror's log, within what software timing leaves."""
-    with small_rig(pulses="none", log_samples=16000) as rig:
+@pytest.mark.parametrize("pulses", ["none", "frame"])
+def test_without_pulses_lines_lie_where_the_log_measured(pulses: str):
+    """A path that runs by its own clock: lines are placed by the log; a pulse a frame steps fine sweeps only."""
+    with small_rig(pulses=pulses, log_samples=16000) as rig:
         source = rig.source()
         found = list(source.lines(COARSE))
+        (told,) = source.record["captures"]
+        if pulses == "frame":
+            assert_same(list(source.lines(FINE)), FINE)
+            assert source.record["captures"][1]["method"] == "trigger"
     assert [line.number for line in found] == list(range(COARSE.lines))
     assert all(line.valid for line in found)
     off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - line_positions(COARSE, CAMERA)
     assert 1e-6 < np.hypot(*off.T).max() * 11275 < 3  # about as many px as a unit of the disk has
-    (told,) = source.record["captures"]
     assert (told["method"], told["sweep"], told["first"], told["stop"]) == ("log", "coarse-0", 0, 10)
     assert 0 < told["residual_px"] < 3
     assert any("software timing" in note for note in told["notes"])
-
-
-def test_one_pulse_a_frame_steps_fine_sweeps_only():
-    """Coarse lines hold several positions each, so there the path runs by its own clock."""
-    with small_rig(pulses="frame", log_samples=16000) as rig:
-        source = rig.source()
-        assert_same(list(source.lines(FINE)), FINE)
-        list(source.lines(COARSE))
-        assert [told["method"] for told in source.record["captures"]] == ["trigger", "log"]
 
 
 @pytest.mark.parametrize(("sweep", "pulses"), [(FINE, "frame"), (FINE, "position"), (COARSE, "position")])
@@ -184,8 +164,7 @@ def test_edges_in_the_log_tie_lines_to_where_the_mirror_was(sweep: Sweep, pulses
         found = list(source.lines(sweep))
         middle_s = [capture.middle_s(np.arange(sweep.lines)) for capture in rig.emulated.camera.captures]
         true = rig.emulated.mirror.positions(middle_s[0])
-    expected = list(small_source().lines(sweep))
-    np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
+    assert_simulated(found, sweep)
     assert all(line.valid for line in found)
     off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - true
     assert np.hypot(*off.T).max() * 11275 < 0.2  # px
@@ -215,6 +194,6 @@ def test_devices_are_let_go_of_whatever_ends_a_look():
 def test_lines_of_another_size_are_refused():
     """A camera that gives other lines than the settings say ends the sweep, with what to set."""
     with small_rig() as rig:
-        rig.view = replace(rig.view, wavelength_nm=np.array([500.0, 600.0]))
+        rig.wavelength_nm = np.array([500.0, 600.0])
         with pytest.raises(RigError, match=r"holds lines of \(48, 3\) \(sample, band\), the settings say \(48, 2\)"):
             list(rig.source().lines(FINE))

@@ -1,4 +1,4 @@
-"""Captures that break: nothing acknowledged is lost or taken twice, and nothing is sent to a rig of unknown state."""
+"""Captures that break, by fault or kill: nothing acknowledged is lost or taken twice, and what is left is used."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture.capture_journal import JOURNAL
-from pipeline.rig.device_errors import DeviceGone, DeviceRefused, StateUnknown
-from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults
+from pipeline.rig.camera.headwall_camera import HeadwallControl
+from pipeline.rig.capture import JOURNAL
+from pipeline.rig.devices import DeviceGone, DeviceRefused, StateUnknown
+from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults, make_fault
 from pipeline.source import Line
-from tests.rig.small_rig import COARSE, FINE, SmallRig, small_rig, small_source
+from tests.rig.small_rig import COARSE, FINE, SmallRig, assert_simulated, small_rig, small_source
 
 
 def assert_same(found: list[Line], first: int = 0) -> None:
-    """The numbers of the simulated source's lines, in order."""
-    expected = list(small_source().lines(FINE, first))
-    assert [line.number for line in found] == [line.number for line in expected]
-    np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
+    """The simulated source's numbers, all valid."""
+    assert_simulated(found, FINE, first)
     assert all(line.valid for line in found)
 
 
@@ -42,13 +41,6 @@ class KeptUntil(KeptInMemory):
         super().append(name, data)
 
 
-def test_cut_cube_is_taken_again_from_its_first_missing_line():
-    """Whole lines of a cube that was cut off count; the others are captured again, with the same numbers."""
-    with small_rig(faults={CameraFault.CUT_CUBE: 1}) as rig:
-        assert_same(list(rig.source().lines(FINE)))
-        assert [said.split("_")[-1].split('"')[0] for said in rig.captures] == ["0", "15"]
-
-
 def test_cubes_that_are_always_cut_end_the_sweep():
     """Two captures in a row without a new line are enough; the message says what is kept."""
     with small_rig(faults={CameraFault.CUT_CUBE: 99}, vector_pairs=2) as rig:
@@ -58,11 +50,14 @@ def test_cubes_that_are_always_cut_end_the_sweep():
         assert len(rig.captures) == 2
 
 
-def test_captures_that_are_cut_one_after_the_other_go_on():
-    """Each gave lines, so none of them is in vain, however many are cut."""
-    with small_rig(faults={CameraFault.CUT_CUBE: 3}, vector_pairs=6) as rig:
+@pytest.mark.parametrize(
+    ("cut", "pairs", "begun"), [(1, 1500, ["0", "15"]), (3, 6, ["0", "3", "6", "9", "14"])], ids=["once", "often"]
+)
+def test_cut_cubes_are_taken_again_from_their_first_missing_line(cut: int, pairs: int, begun: list[str]):
+    """Whole lines of a cube that was cut off count, so none is in vain; the others come with the same numbers."""
+    with small_rig(faults={CameraFault.CUT_CUBE: cut}, vector_pairs=pairs) as rig:
         assert_same(list(rig.source().lines(FINE)))
-        assert [said.split("_")[-1].split('"')[0] for said in rig.captures] == ["0", "3", "6", "9", "14"]
+        assert [said.split("_")[-1].split('"')[0] for said in rig.captures] == begun
 
 
 def breaks_off(faults: CameraFaults) -> None:
@@ -89,24 +84,14 @@ def test_broken_transfer_goes_on_in_the_next_process():
         assert len(rig.captures) == 1
 
 
-def test_lines_given_are_not_given_again():
-    """A process that goes on from line 5 of a capture fetches nothing that it has, and captures nothing."""
-    with small_rig() as rig:
-        kept = KeptInMemory()
-        lines = rig.source(kept).lines(FINE)
-        assert [next(lines).number for _ in range(5)] == list(range(5))
-        lines.close()  # type: ignore[attr-defined]
-        assert_same(list(rig.source(kept).lines(FINE, first=5)), 5)
-        assert len(rig.captures) == 1
+def kill() -> None:
+    """The process ends here."""
+    raise KilledError
 
 
 @pytest.mark.parametrize("mark", [b'"what": "end"', b"frameIndex_0.txt", b"origin"])
 def test_killed_process_is_gone_on_with(mark: bytes):
     """Killed before a capture's end is taken down, a file has come, or a line is given: the capture is used."""
-
-    def kill() -> None:
-        raise KilledError
-
     with small_rig() as rig:
         kept = KeptUntil(acts={mark: kill})
         with pytest.raises(KilledError):
@@ -149,16 +134,18 @@ def test_lost_edge_is_seen_and_the_lines_taken_again():
         assert len(rig.captures) == 2
 
 
-def test_capture_that_the_camera_lost_is_taken_again():
-    """A folder that was taken away between two processes is no reason to stop."""
+@pytest.mark.parametrize("lost", [False, True], ids=["there", "taken away"])
+def test_lines_given_are_not_given_again(lost: bool):
+    """A process that goes on from line 5 captures nothing, unless the folder was taken away in between."""
     with small_rig() as rig:
         kept = KeptInMemory()
         lines = rig.source(kept).lines(FINE)
-        next(lines)
+        assert [next(lines).number for _ in range(5)] == list(range(5))
         lines.close()  # type: ignore[attr-defined]
-        rig.emulated.camera.captures[-1].folder = "/captured/elsewhere"
-        assert_same(list(rig.source(kept).lines(FINE, first=1)), 1)
-        assert len(rig.captures) == 2
+        if lost:
+            rig.emulated.camera.captures[-1].folder = "/captured/elsewhere"
+        assert_same(list(rig.source(kept).lines(FINE, first=5)), 5)
+        assert len(rig.captures) == 1 + lost
 
 
 @dataclass
@@ -181,15 +168,11 @@ class SlowEye:
 
 
 def test_camera_that_writes_for_long_is_waited_for():
-    """Frames that are still being written after the capture's time are not given up and taken again."""
+    """Frames that come late are not taken again; two minutes after it was told to stop it is told."""
     with small_rig() as rig:
         SlowEye(rig, rig.line.clock.now() + 60)
         assert_same(list(rig.source().lines(FINE)))
         assert len(rig.captures) == 1
-
-
-def test_camera_that_never_ends_is_told_and_gone_on_with():
-    """Two minutes after it was told to stop that is an error; what it has by the next time is fetched then."""
     with small_rig() as rig:
         kept, eye = KeptInMemory(), SlowEye(rig, np.inf)
         with pytest.raises(RigError, match=r"still captures /captured/fine-3\S+, 120 s after it was told to stop"):
@@ -231,3 +214,140 @@ def test_nothing_is_sent_to_a_rig_of_unknown_state():
         with pytest.raises(StateUnknown, match="nothing more is sent to the rig"):
             list(source.keeping(kept).lines(FINE))
         assert len(rig.emulated.camera.commands) == said
+
+
+def killed_amid(rig: SmallRig, kept: KeptInMemory, patch: pytest.MonkeyPatch | None = None) -> None:
+    """Begin to capture the sweep, and die while it is waited for; with ``patch`` before the camera can be stopped."""
+    if patch is not None:
+        patch.setattr(HeadwallControl, "stop", lambda _: kill())
+    with pytest.raises(KilledError):
+        list(rig.source(kept).saying(lambda words: kill() if words.startswith("capturing") else None).lines(FINE))
+
+
+def test_capture_that_still_runs_is_waited_for():
+    """Killed while the camera captures: the next process waits for its end and has all of it, counted and tied."""
+    with small_rig() as rig:
+        kept = KeptInMemory()
+        SlowEye(rig, rig.line.clock.now() + 60)
+        with pytest.MonkeyPatch.context() as patch:
+            killed_amid(rig, kept, patch)
+        assert rig.emulated.camera.is_capturing()
+        source = rig.source(kept)
+        assert_same(list(source.lines(FINE)))
+        assert len(rig.captures) == 1
+        (told,) = source.record["captures"]
+        assert (told["method"], told["residual_us"]) == ("trigger", 0.0)
+
+
+def test_error_while_it_captures_stops_both():
+    """Whoever is interrupted leaves neither a camera that captures nor a mirror that waits for edges."""
+    with small_rig() as rig:
+        killed_amid(rig, KeptInMemory())
+        assert not rig.emulated.camera.is_capturing()
+        assert rig.emulated.camera.captures[0].due(1e9) < FINE.lines
+        assert not any(player.running for player in rig.emulated.mirror.state.players)
+
+
+def test_capture_by_its_own_clock_is_not_counted():
+    """Killed before its log is read: lines are tied by the commands' times, and no index is taken for a count."""
+    with small_rig(pulses="none", log_samples=16000) as rig:
+        kept = KeptUntil(acts={b"mirror_log": kill})
+        with pytest.raises(KilledError):
+            list(rig.source(kept).lines(FINE))
+        source = rig.source(kept)
+        assert len(list(source.lines(FINE))) == FINE.lines
+        assert [one["method"] for one in source.record["captures"]] == ["command"]
+        assert b'"what": "end"' not in kept.files[JOURNAL]
+
+
+@pytest.mark.parametrize("earlier", [0, 3], ids=["fewer folders than before", "folders of the same names"])
+def test_camera_that_was_emptied_in_between_is_gone_on_with(earlier: int):
+    """Its disk was cleared, or it is another: frames and lines that it has no more are taken again."""
+    kept = KeptInMemory()
+    with small_rig() as rig:
+        source = rig.source(kept)
+        source.references(FINE)
+        for _ in range(earlier):
+            list(rig.source().lines(COARSE))
+        killed_amid(rig, kept)
+    with small_rig() as rig:
+        for _ in range(3 - earlier):
+            list(rig.source().lines(COARSE))
+        source = rig.source(kept)
+        found = source.references(FINE)
+        assert_same(list(source.lines(FINE)))
+    wanted = small_source().references(FINE)
+    assert abs(found.white - wanted.white).max() <= 1 / 64
+    assert source.record["captures"][0]["spent"]
+
+
+@pytest.mark.parametrize("look", ["lines", "references"])
+def test_mirror_that_never_rests_is_not_captured_with(look: str):
+    """Neither a path nor a look at rest is begun while the mirror is not there yet."""
+    with small_rig(mirror_faults=[make_fault("never-stable", at=0)]) as rig:
+        source = rig.source()
+        with pytest.raises(RigError, match="is not at rest after"):
+            list(source.lines(FINE)) if look == "lines" else source.references(FINE)
+        assert not any(said.startswith("capture(") for said in rig.emulated.camera.commands)
+
+
+def test_lines_that_were_lost_come_from_the_kept_files():
+    """Single lines of an earlier session are given again as they were, over several captures; nothing is captured."""
+    with small_rig(vector_pairs=12) as rig:
+        kept = KeptInMemory()
+        given = list(rig.source(kept).lines(FINE))
+        taken = len(rig.captures)
+        assert taken > 1
+        numbers = [0, 3, 8, 9, 16]
+        again = list(rig.source(kept).lines_again(FINE, numbers))
+        assert len(rig.captures) == taken
+    for line, number in zip(again, numbers, strict=True):
+        assert replace(line, data=given[number].data) == given[number]
+        np.testing.assert_array_equal(line.data, given[number].data)
+
+
+@pytest.mark.parametrize("gone", ["the journal", "the camera's files"])
+def test_lines_that_no_capture_gives_any_more_are_lost(gone: str):
+    """They come as lines that the camera dropped: in their places, dark and not valid; nothing is captured for them."""
+    kept = KeptInMemory()
+    with small_rig() as rig:
+        given = list(rig.source(kept).lines(FINE))
+    if gone == "the journal":
+        kept.files.clear()
+    with small_rig() as rig:
+        lost = list(rig.source(kept).lines_again(FINE, [2, 5]))
+        assert not rig.captures
+    assert [(line.number, line.valid, line.data.any()) for line in lost] == [(2, False, False), (5, False, False)]
+    assert [line.data.shape for line in lost] == [given[2].data.shape] * 2
+    for line in lost:
+        assert (line.mirror_x, line.mirror_y) == (given[line.number].mirror_x, given[line.number].mirror_y)
+
+
+def test_log_that_has_changed_ties_no_line():
+    """A bit of the kept log flips: its capture is taken again, and no position of it is believed."""
+    with small_rig(pulses="none", log_samples=16000) as rig:
+        kept = KeptInMemory()
+        list(rig.source(kept).lines(FINE))
+        name = next(name for name in kept.files if name.endswith("mirror_log"))
+        kept.files[name][len(kept.files[name]) // 2] ^= 4
+        source = rig.source(kept)
+        assert len(list(source.lines(FINE))) == FINE.lines
+        assert len(rig.captures) == 2
+        assert "mirror's log" in source.record["captures"][0]["spent"]
+
+
+def test_end_that_the_journal_has_lost_is_not_read_from_another_path():
+    """The mirror has played another path since: what it stands at now is not taken for the end of the first."""
+    with small_rig() as rig:
+        kept = KeptInMemory()
+        list(rig.source(kept).lines(FINE))
+        list(rig.source().lines(COARSE))
+        assert_same(list(rig.source(kept).lines(FINE)))
+        assert len(rig.captures) == 2
+        at = bytes(kept.files[JOURNAL]).index(b'"what": "end"')
+        kept.files[JOURNAL][at + 3] ^= 1
+        source = rig.source(kept)
+        assert_same(list(source.lines(FINE)))
+        assert len(rig.captures) == 3
+        assert "what the journal has lost" in source.record["captures"][0]["spent"]
+        assert "counts for nothing: it has changed" in source.record["journal"][0]

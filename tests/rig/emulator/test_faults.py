@@ -1,26 +1,17 @@
-"""The emulated controller's faults by name, and that each does what its words say."""
+"""The emulated controller's faults by name, and that each does what its words say, for both devices."""
 
 from __future__ import annotations
 
 import pytest
 
 from pipeline.errors import SettingsError
-from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.exchange import Mode, VanishedError
-from pipeline.rig.emulator.fault_names import KINDS, make_fault, read_fault
-from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.mirror_faults import LATE_S, SLOW_S, TICK_S, Chance, Fault
-from pipeline.rig.mirror.pro_mode import ErrorCode, Frame, encode
-from pipeline.rig.mirror.pro_payloads import (
-    ask_firmware,
-    ask_status,
-    float_cell,
-    get_value,
-    refuse,
-    set_value,
-    set_vector,
-)
+from pipeline.rig.devices import ManualClock
+from pipeline.rig.emulator.fault_names import KINDS, CameraFault, fault_table, make_fault, read_fault, read_faults
+from pipeline.rig.emulator.mirror_device import Chance, Fault, MirrorDevice, Mode, VanishedError
+from pipeline.rig.emulator.mirror_faults import LATE_S, SLOW_S, TICK_S
+from pipeline.rig.mirror.pro_mode import ErrorCode, Frame, ask_status, encode, float_cell, get_value, refuse, set_vector
 from pipeline.rig.mirror.registers import VECTOR_MEMORY, Status, X
+from tests.rig.mirror.mirror_bytes import ASK_FIRMWARE, set_value
 
 CODES = {
     "error-frame": ErrorCode.FRAME_INVALID,
@@ -32,6 +23,8 @@ CODES = {
     "error-chain": ErrorCode.CHAIN,
     "error-unknown": 0xBEEF,
 }
+
+
 BITS = {
     "never-stable": Status.NOT_STABLE,
     "trimmed": Status.TRIMMED | Status.WAS_TRIMMED,
@@ -98,32 +91,11 @@ def test_a_fault_that_never_strikes_changes_nothing() -> None:
     assert device.opened() == []
 
 
-@pytest.mark.parametrize(
-    ("name", "expected"), [("request-byte-lost", b"NO\r\nOK\r\n"), ("request-byte-doubled", b"NO\r\nOK\r\n")]
-)
-def test_one_byte_to_the_controller_is_changed(name: str, expected: bytes) -> None:
-    """The third byte of a line is lost, or comes twice; the next line is as it was sent."""
-    assert answer(device_with(name, at=2), b"START\r\nSTART\r\n") == expected
-
-
 def test_one_bit_to_the_controller_is_turned() -> None:
     """A frame with a turned bit is refused for its CRC, and not carried out."""
     device = device_with("request-bit-flipped", at=8, mode=Mode.PRO_CRC)
     assert answer(device, encode(set_value(X.static_xy, 0.5))) == encode(refuse(0x10, ErrorCode.CRC_WRONG))
     assert device.state.axes[0].commanded == 0
-
-
-@pytest.mark.parametrize(
-    ("name", "size"), [("reply-byte-lost", 7), ("reply-byte-doubled", 9), ("reply-bit-flipped", 8)]
-)
-def test_one_byte_of_one_reply_is_changed(name: str, size: int) -> None:
-    """The reply to the second request is damaged, those around it are not."""
-    device = device_with(name, at=1)
-    assert answer(device, b"GETID\r\n") == b"MR-E-2\r\n"
-    damaged = answer(device, b"GETID\r\n")
-    assert len(damaged) == size
-    assert damaged != b"MR-E-2\r\n"
-    assert answer(device, b"GETID\r\n") == b"MR-E-2\r\n"
 
 
 def test_replies_are_split_merged_slow_and_late() -> None:
@@ -144,33 +116,40 @@ def test_replies_are_split_merged_slow_and_late() -> None:
             assert delays[0] >= LATE_S
 
 
-def test_what_never_comes() -> None:
-    """One reply, or all from one on, while the requests are carried out."""
-    device = device_with("no-reply")
-    assert answer(device, b"X=0.5\r\nSTART\r\n") == b"OK\r\n"
-    assert device.state.axes[0].commanded == 0.5
-    device = device_with("mute")
-    assert answer(device, b"START\r\nSTART\r\n") == b""
+LINES = {  # where the fault strikes, what is said, what comes back, and where the mirror was sent then
+    "request-byte-lost": (2, b"START\r\nSTART\r\n", b"NO\r\nOK\r\n", 0.0),
+    "request-byte-doubled": (2, b"START\r\nSTART\r\n", b"NO\r\nOK\r\n", 0.0),
+    "no-reply": (0, b"X=0.5\r\nSTART\r\n", b"OK\r\n", 0.5),
+    "mute": (0, b"X=0.5\r\nSTART\r\n", b"", 0.5),
+    "old-reply-again": (1, b"GETID\r\nSTART\r\n", b"MR-E-2\r\nMR-E-2\r\nOK\r\n", 0.0),
+    "answers-no": (0, b"X=0.5\r\nSTART\r\n", b"NO\r\nOK\r\n", 0.0),
+    "answers-ol": (0, b"X=0.5\r\nSTART\r\n", b"OL\r\nOK\r\n", 0.0),
+    "answers-ou": (0, b"X=0.5\r\nSTART\r\n", b"OU\r\nOK\r\n", 0.0),
+    "answers-error": (0, b"X=0.5\r\nSTART\r\n", b"ERROR\r\nOK\r\n", 0.0),
+    "echo": (0, b"START\r\n", b"START\r\n", 0.0),
+    "modem": (0, b"START\r\nAT\r\n", b"START\r\nAT\r\n\r\nERROR\r\n\r\nOK\r\n", 0.0),
+    "wrong-firmware": (0, b"GETID\r\n", b"LENS-DRIVER-4\r\n", 0.0),
+}
 
 
-def test_what_comes_besides() -> None:
-    """Noise and old replies come before a reply that is whole, stale bytes as the port is opened."""
-    noisy = answer(device_with("noise"), b"START\r\n")
-    assert noisy.endswith(b"OK\r\n")
-    assert len(noisy) > 4
-    assert answer(device_with("old-reply-again", at=1), b"GETID\r\nSTART\r\n") == b"MR-E-2\r\nMR-E-2\r\nOK\r\n"
-    assert device_with("stale-bytes").opened()
+@pytest.mark.parametrize("name", LINES)
+def test_a_fault_of_lines_does_what_it_says(name: str) -> None:
+    """One line is garbled, refused or not answered, the others are as ever; what is refused is not carried out."""
+    at, said, expected, sent_to = LINES[name]
+    device = device_with(name, at)
+    assert answer(device, said) == expected
+    assert device.state.axes[0].commanded == sent_to
 
 
 @pytest.mark.parametrize(
-    ("name", "reply"),
-    [("answers-no", b"NO"), ("answers-ol", b"OL"), ("answers-ou", b"OU"), ("answers-error", b"ERROR")],
+    ("name", "size"), [("reply-byte-lost", 7), ("reply-byte-doubled", 9), ("reply-bit-flipped", 8), ("noise", None)]
 )
-def test_a_line_is_refused(name: str, reply: bytes) -> None:
-    """One line has another answer and is not carried out."""
-    device = device_with(name)
-    assert answer(device, b"X=0.5\r\nSTART\r\n") == reply + b"\r\nOK\r\n"
-    assert device.state.axes[0].commanded == 0
+def test_one_reply_is_damaged(name: str, size: int | None) -> None:
+    """The reply to the second request is, those around it are not; before noise the reply is whole."""
+    device = device_with(name, at=1)
+    whole, damaged, next_one = (answer(device, b"GETID\r\n") for _ in range(3))
+    assert whole == next_one == b"MR-E-2\r\n" != damaged
+    assert len(damaged) == size or damaged.endswith(whole)
 
 
 @pytest.mark.parametrize("name", CODES)
@@ -226,15 +205,12 @@ def test_restarts() -> None:
     assert answer(device, b"START\r\n") == b""
 
 
-def test_other_devices() -> None:
-    """A loop of wire, a modem, another model of the maker, and a controller that was left in pro mode."""
-    assert answer(device_with("echo"), b"START\r\n") == b"START\r\n"
-    modem = device_with("modem")
-    assert answer(modem, b"START\r\nAT\r\n") == b"START\r\nAT\r\n\r\nERROR\r\n\r\nOK\r\n"
+def test_another_model_and_an_earlier_session() -> None:
+    """The firmware is another model's, too; a controller that was left in pro mode is in either of its forms."""
     other = device_with("wrong-firmware")
-    assert answer(other, b"GETID\r\n") == b"LENS-DRIVER-4\r\n"
-    assert answer(other, b"GOPRO\r\n" + encode(ask_firmware())).endswith(encode(Frame(1, bytes.fromhex("dead0001"))))
+    assert answer(other, b"GOPRO\r\n" + encode(ASK_FIRMWARE)).endswith(encode(Frame(1, bytes.fromhex("dead0001"))))
     assert {device_with("pro-at-connect", seed=seed).mode for seed in range(9)} == {Mode.PRO, Mode.PRO_CRC}
+    assert device_with("stale-bytes").opened()
 
 
 def test_devices_that_go() -> None:
@@ -253,3 +229,30 @@ def test_devices_that_go() -> None:
     assert hung.receive(b"START\r\n") == []
     assert hung.hung
     assert not hung.acts
+
+
+def test_every_fault_of_the_table_can_be_asked_for() -> None:
+    """Names are apart, and each builds the fault that it names."""
+    names = [name for name, _, _ in fault_table()]
+    assert len(set(names)) == len(names) == len(KINDS) + len(CameraFault)
+    mirror, camera = read_faults([f"{name}:3" for name in names])
+    assert len(mirror) == len(KINDS)
+    assert camera.left == dict.fromkeys(CameraFault, 1)
+
+
+def test_camera_fault_given_twice_strikes_twice() -> None:
+    """Each with a seed of its own."""
+    assert read_faults(["camera-full:1", "camera-full:2"])[1].left == {CameraFault.FULL: 2}
+
+
+@pytest.mark.parametrize("word", ["lost", "camera-full:x", "camera-full:-1", "mute:one", "camera"])
+def test_words_that_name_no_fault_are_refused(word: str) -> None:
+    """With the word that was wrong."""
+    with pytest.raises(SettingsError, match=word.partition(":")[0]):
+        read_faults([word])
+
+
+def test_a_name_that_is_nearly_right_is_told() -> None:
+    """As keys of the settings are."""
+    with pytest.raises(SettingsError, match=r"no fault 'camera-ful'; did you mean camera-full\?"):
+        read_faults(["camera-ful"])

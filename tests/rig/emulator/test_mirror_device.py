@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.rig.clock import ManualClock
-from pipeline.rig.emulator.exchange import Mode
-from pipeline.rig.emulator.mirror_device import MirrorDevice
+from pipeline.rig.devices import ManualClock
+from pipeline.rig.emulator.mirror_device import MirrorDevice, Mode
 from pipeline.rig.emulator.mirror_state import MirrorUnit
 from pipeline.rig.mirror.registers import Status
 
@@ -136,27 +135,18 @@ def test_what_is_set_can_be_read() -> None:
         assert answer(device, bytes.fromhex(sent)).hex(" ") == expected
 
 
-def test_requests_without_crc_pass_after_gopro_alone() -> None:
-    """The same status request with 00 00 for a CRC is answered after GOPRO, and refused after GOPROCRC."""
-    request = bytes.fromhex("7e 00 02 02 00 00 00 00 7e")
-    assert answer(pro_device(b"GOPRO\r\n"), request) == bytes.fromhex("7e 00 02 04 00 00 00 00 f0 22 7e")
-    assert answer(pro_device(), request) == bytes.fromhex("7e 00 82 04 00 00 00 04 ee 21 7e")
-
-
-def test_pro_mode_knows_no_lines() -> None:
-    """A line has no answer in pro mode until a boundary ends it; the frame behind it is answered as ever."""
+def test_each_mode_knows_its_own_requests_alone() -> None:
+    """A line has no answer in pro mode, but is answered again after mode 0, in the same write; CRCs pass by mode."""
     device = pro_device()
     assert answer(device, b"START\r\n") == b""
     request, reply = map(bytes.fromhex, PRO["status"])
     assert answer(device, request).endswith(reply)
-
-
-def test_simple_mode_comes_back() -> None:
-    """After communication mode 0 lines are answered again, in the same write too."""
-    device = pro_device()
-    request, reply = map(bytes.fromhex, PRO["simple mode"])
-    assert answer(device, request + b"START\r\n") == reply + b"OK\r\n"
+    back, done = map(bytes.fromhex, PRO["simple mode"])
+    assert answer(device, back + b"START\r\n") == done + b"OK\r\n"
     assert device.mode is Mode.SIMPLE
+    without = bytes.fromhex("7e 00 02 02 00 00 00 00 7e")
+    assert answer(pro_device(b"GOPRO\r\n"), without) == reply
+    assert answer(pro_device(), without) == bytes.fromhex("7e 00 82 04 00 00 00 04 ee 21 7e")
 
 
 def test_a_reset_forgets_everything() -> None:
@@ -242,17 +232,9 @@ def test_no_bytes_confuse_the_controller_for_long(junk: bytes) -> None:
         assert answer(device, request).endswith(reply)
 
 
-def test_the_acts_tell_what_was_done() -> None:
-    """What was carried out is kept with its time, and refused requests too; the oldest are dropped in the end."""
-    clock = ManualClock(5.0)
-    device = MirrorDevice(clock)
-    answer(device, b"START\r\nX=0.5\r\n")
-    assert [(act.time_s, act.request.line) for act in device.acts] == [(5.0, "START"), (5.0, "X=0.5")]
-
-
-def test_another_unit_is_told_by_settings() -> None:
-    """Texts, firmware and the size of the memory are settings."""
-    unit = MirrorUnit(model="MR-E-3", firmware_id=7, vector_pairs=2)
-    device = MirrorDevice(ManualClock(), unit=unit)
-    assert answer(device, b"GETID\r\n") == b"MR-E-3\r\n"
+def test_the_acts_tell_what_was_done_by_which_unit() -> None:
+    """What was carried out is kept with its time; texts and the size of the memory are settings."""
+    device = MirrorDevice(ManualClock(5.0), unit=MirrorUnit(model="MR-E-3", vector_pairs=2))
+    assert answer(device, b"GETID\r\nX=0.5\r\n") == b"MR-E-3\r\nOK\r\n"
+    assert [(act.time_s, act.request.line) for act in device.acts] == [(5.0, "GETID"), (5.0, "X=0.5")]
     assert device.state.memory.size == 4

@@ -1,121 +1,161 @@
-"""The mirror controller, byte by byte: connecting, going, loading, playing, parking, freezing."""
+"""The mirror controller, byte by byte: connecting, going, loading, playing, logging, parking, freezing."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
 import pytest
 
 from pipeline.errors import PoseError, RigError, SettingsError, ShapeError
-from pipeline.rig.clock import ManualClock
-from pipeline.rig.device_errors import DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
-from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.device_settings import MirrorSettings
+from pipeline.rig.devices import DeadlinePassed, DeviceGone, DeviceRefused, ManualClock, StateUnknown
+from pipeline.rig.emulator.mirror_device import MirrorDevice
+from pipeline.rig.emulator.mirror_ports import InProcessTransport
+from pipeline.rig.mirror import mirror_controller
+from pipeline.rig.mirror.mirror_controller import MirrorController, open_mirror
+from pipeline.rig.mirror.mirror_requests import Identity
 from pipeline.rig.mirror.registers import Status, Trigger
-from pipeline.rig.mirror.steering import Identity, Steering
-from tests.rig.mirror.mirror_bytes import (
-    CONNECT,
-    DONE,
-    ENTER,
-    GOTO,
-    GREET,
-    HALT,
-    IDLE,
-    LEAVE,
-    LOAD,
-    PARK,
-    PATH,
-    PLAYING,
-    READ_BACK,
-    RUN,
-    SET_X,
-    SET_X_INCLUSIVE,
-    SET_Y,
-    SET_Y_INCLUSIVE,
-    TRIMMED,
-    UNREST,
-    WARM,
-    WELL,
-    connected,
-    pair,
+from tests.rig.mirror import mirror_bytes as w
+from tests.rig.mirror.mirror_bytes import connected, pair
+from tests.rig.scripted import Late, Pair, ScriptedTransport, scripted
+
+WRONG = pair(
+    "7E 00 15 05 26 00 00 00 18 4D 59 7E",
+    "7E 00 15 18 3F 00 00 00 00 00 00 00 3F 80 00 00 BE 80 00 00 3E 80 00 00 00 00 00 00 82 25 7E",
 )
-from tests.rig.scripted import Late, ScriptedTransport, scripted
+INDEX = pair("7E 00 11 02 68 0A 0B 3B 7E", "7E 00 11 04 00 00 00 02 73 40 7E")
+THERE, LOST = pair(w.GOTO, w.DONE), (bytes.fromhex(w.GOTO), b"")
+Call = Callable[[MirrorController], object]
 
 
-def test_connecting_moves_nothing_and_says_who_is_there():
-    """Greeting, id, version, serial number, pro mode, status: no other byte is sent."""
-    with scripted(CONNECT) as transport:
-        mirror: Steering = connected(transport)
-        assert mirror.identity() == Identity("MR-E-2", "1.2.4065", "ABCD0123")
+def play(mirror: MirrorController) -> None:
+    """Load the path, and play its second and third position twice by pulses."""
+    mirror.load_path(w.PATH)
+    mirror.run(1, 3, 10.0, cycles=2, trigger=Trigger.RISING_EDGE)
+
+
+# what follows connecting, the call, settings, and what the call gives
+DONE_AS_ASKED: dict[str, tuple[list[Pair], Call, dict[str, Any], object]] = {
+    "who is there": ([], lambda mirror: mirror.identity(), {}, Identity("MR-E-2", "1.2.4065", "ABCD0123")),
+    "going, in one frame": ([w.WELL, THERE], lambda mirror: mirror.goto(0.5, -0.25), {}, None),
+    "going, whatever the status": ([THERE], lambda mirror: mirror.goto(0.5, -0.25), {"check_status": False}, None),
+    "parking is going to 0; 0": ([w.WELL, pair(w.PARK, w.DONE)], lambda mirror: mirror.park(), {}, None),
+    "a path, X before Y, half open, begun in one frame": (
+        [w.IDLE, w.LOAD, w.READ_BACK, w.HALT, w.SET_X, w.SET_Y, w.WELL, pair(w.RUN, w.DONE)],
+        play,
+        {"read_back": "all"},
+        None,
+    ),
+    "a path of a device with inclusive ends": (
+        [w.IDLE, w.LOAD, w.HALT, w.SET_X_INCLUSIVE, w.SET_Y_INCLUSIVE, w.WELL, pair(w.RUN, w.DONE)],
+        play,
+        {"ends": "inclusive", "read_back": "none"},
+        None,
+    ),
+    "waiting for rest": ([w.UNREST, w.UNREST, w.WELL], lambda mirror: mirror.settle(1.0), {}, None),
+    "the temperature, in simple mode and back": (
+        [w.IDLE, w.LEAVE, w.GREET, (b"GETTEMP\r\n", b"31.5\r\n"), w.ENTER, w.WELL],
+        lambda mirror: mirror.temperature(),
+        {},
+        31.5,
+    ),
+    "the cell of X": ([INDEX], lambda mirror: mirror.index(), {}, 2),
+    "letting go": ([], lambda mirror: mirror.close(), {}, None),
+    "letting go, parked": (
+        [w.WELL, pair(w.PARK, w.DONE)],
+        lambda mirror: mirror.close(),
+        {"park_at_close": True},
+        None,
+    ),
+    "letting go, parked in vain": ([w.WARM], lambda mirror: mirror.close(), {"park_at_close": True}, None),
+}
+
+
+@pytest.mark.parametrize("name", DONE_AS_ASKED)
+def test_each_call_is_these_bytes(name: str):
+    """No other byte is sent, and each acknowledged; closing lets go of the port."""
+    script, call, settings, given = DONE_AS_ASKED[name]
+    with scripted([*w.CONNECT, *script]) as transport:
+        assert call(connected(transport, **settings)) == given
+        assert transport.closed == name.startswith("letting go")
+
+
+OUTSIDE = "keep the field within the mirror's range"
+REFUSED: dict[str, tuple[list[Pair], Call, dict[str, Any], type[Exception], str]] = {
+    "beyond the rim": ([], lambda mirror: mirror.goto(1.01, 0.0), {}, PoseError, OUTSIDE),
+    "beyond the rim, aslant": ([], lambda mirror: mirror.goto(0.8, 0.8), {}, PoseError, OUTSIDE),
+    "no number": ([], lambda mirror: mirror.goto(float("nan"), 0.0), {}, PoseError, OUTSIDE),
+    "path beyond": ([], lambda mirror: mirror.load_path([(0, 0), (0.8, 0.8)]), {}, PoseError, r"\(index 1\)"),
+    "long path": (
+        [],
+        lambda mirror: mirror.load_path(w.PATH),
+        {"vector_pairs": 2},
+        SettingsError,
+        "holds 2 .* in parts",
+    ),
+    "empty path": ([], lambda mirror: mirror.load_path([]), {}, ShapeError, "at least one"),
+    "warm": ([w.WARM], lambda mirror: mirror.goto(0.5, 0), {}, RigError, "the mirror is too warm; mend that"),
+    "path under a path": (
+        [w.PLAYING],
+        lambda mirror: mirror.load_path(w.PATH),
+        {},
+        RigError,
+        "when that is over, or halt",
+    ),
+    "mode under a path": (
+        [w.PLAYING],
+        lambda mirror: mirror.temperature(),
+        {},
+        RigError,
+        "when that is over, or halt it",
+    ),
+    "never at rest": ([w.UNREST] * 6, lambda mirror: mirror.settle(0.05), {}, RigError, "not at rest after 0.05 s"),
+    "trimmed": ([w.TRIMMED], lambda mirror: mirror.settle(1.0), {}, RigError, "not where it was sent; .*trimmed"),
+    "pulled cable": (
+        [w.WELL, (bytes.fromhex(w.GOTO), [DeviceGone("scripted went away")])],
+        lambda mirror: mirror.goto(0.5, -0.25),
+        {},
+        StateUnknown,
+        "went away",
+    ),
+    "a run that is not acknowledged": (
+        [w.IDLE, w.LOAD, w.HALT, w.SET_X, w.SET_Y, w.WELL, (bytes.fromhex(w.RUN), b"")],
+        play,
+        {"read_back": "none"},
+        StateUnknown,
+        "running positions 1:3 was sent",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_is_refused_or_said(name: str):
+    """What cannot be meant sends no byte, a status that forbids motion none that moves; the rest is said in words."""
+    script, call, settings, error, words = REFUSED[name]
+    with scripted([*w.CONNECT, *script]) as transport, pytest.raises(error, match=words):
+        call(connected(transport, **settings))
 
 
 def test_nothing_is_sent_before_connecting():
-    """All that speaks to the device wants it connected."""
+    """All that speaks to the device wants it connected, and to the controller that the settings expect."""
     mirror = MirrorController(ScriptedTransport([], ManualClock()), clock=ManualClock())
     for call in (mirror.identity, mirror.status, mirror.temperature, mirror.park, mirror.halt, mirror.index):
         with pytest.raises(RigError, match="scripted is not connected; call connect first"):
             call()
-
-
-def test_another_controller_is_refused():
-    """The id that the settings expect is looked for in what the device says."""
-    with scripted(CONNECT) as transport, pytest.raises(RigError, match=r"whose id holds 'MR-E-9' .* got 'MR-E-2'"):
+    with scripted(w.CONNECT) as transport, pytest.raises(RigError, match=r"whose id holds 'MR-E-9' .* got 'MR-E-2'"):
         connected(transport, expected_id="MR-E-9")
-
-
-def test_going_is_one_frame():
-    """Both positions, control, inputs and the stopped units go in one frame, after a look at the status."""
-    with scripted([*CONNECT, WELL, pair(GOTO, DONE)]) as transport:
-        connected(transport).goto(0.5, -0.25)
-
-
-def test_parking_is_going_to_the_middle():
-    """Park is 0; 0."""
-    with scripted([*CONNECT, WELL, pair(PARK, DONE)]) as transport:
-        connected(transport).park()
-
-
-@pytest.mark.parametrize(("x", "y"), [(1.01, 0.0), (0.8, 0.8), (float("nan"), 0.0)])
-def test_targets_outside_the_disk_send_no_byte(x: float, y: float):
-    """What the device would trim to its rim unasked is refused before the wire, as a target and in a path."""
-    with scripted(CONNECT) as transport:
-        mirror = connected(transport)
-        with pytest.raises(PoseError, match="keep the field within the mirror's range"):
-            mirror.goto(x, y)
-        with pytest.raises(PoseError, match=r"\(index 1\)"):
-            mirror.load_path([(0, 0), (x, y)])
-
-
-def test_a_warm_mirror_is_not_moved():
-    """A status that forbids motion is said in words, and no motion is sent; without the check it is."""
-    with scripted([*CONNECT, WARM]) as transport, pytest.raises(RigError, match="the mirror is too warm; mend that"):
-        connected(transport).goto(0.5, -0.25)
-    with scripted([*CONNECT, pair(GOTO, DONE)]) as transport:
-        connected(transport, check_status=False).goto(0.5, -0.25)
-
-
-def test_a_path_is_loaded_and_played_half_open():
-    """X lies before Y, a part of the path is a range of both, and both units start in one frame."""
-    script = [*CONNECT, IDLE, LOAD, READ_BACK, HALT, SET_X, SET_Y, WELL, pair(RUN, DONE)]
-    with scripted(script) as transport:
-        mirror = connected(transport)
-        mirror.load_path(PATH, read_back="all")
-        mirror.run(1, 3, 10.0, cycles=2, trigger=Trigger.RISING_EDGE)
-
-
-def test_a_device_with_inclusive_ends_gets_the_last_cell():
-    """The one place where half-open ranges become the device's is a setting."""
-    script = [*CONNECT, IDLE, LOAD, HALT, SET_X_INCLUSIVE, SET_Y_INCLUSIVE, WELL, pair(RUN, DONE)]
-    with scripted(script) as transport:
-        mirror = connected(transport, ends="inclusive", read_back="none")
-        mirror.load_path(PATH)
-        mirror.run(1, 3, 10.0, cycles=2, trigger=Trigger.RISING_EDGE)
 
 
 def test_what_is_not_loaded_is_not_played():
     """Ranges outside what is loaded, rates and cycles that mean nothing send no byte."""
-    with scripted([*CONNECT, IDLE, LOAD]) as transport:
+    with scripted([*w.CONNECT, w.IDLE, w.LOAD]) as transport:
         mirror = connected(transport, read_back="none")
         with pytest.raises(SettingsError, match="0:1 is no range of the 0 positions loaded; load them first"):
             mirror.run(0, 1, 10.0)
-        mirror.load_path(PATH)
+        mirror.load_path(w.PATH)
         for first, stop in ((0, 4), (2, 2), (-1, 2), (2, 1)):
             with pytest.raises(SettingsError, match=f"{first}:{stop} is no range of the 3 positions"):
                 mirror.run(first, stop, 10.0)
@@ -124,122 +164,46 @@ def test_what_is_not_loaded_is_not_played():
                 mirror.run(0, 3, rate_hz, cycles)
 
 
-def test_a_path_that_is_too_long_sends_no_byte():
-    """1500 positions to a load, or what the settings say."""
-    with scripted(CONNECT) as transport:
-        mirror = connected(transport, vector_pairs=2)
-        with pytest.raises(SettingsError, match="holds 2 positions, got 3; load in parts"):
-            mirror.load_path(PATH)
-        with pytest.raises(ShapeError, match="at least one"):
-            mirror.load_path([])
-
-
-def test_nothing_is_loaded_under_a_playing_path():
-    """The memory that plays is not written, and modes are not changed under it."""
-    with scripted([*CONNECT, PLAYING, PLAYING]) as transport:
-        mirror = connected(transport)
-        for call in (lambda: mirror.load_path(PATH), mirror.temperature):
-            with pytest.raises(RigError, match=r"plays a path; .* when that is over, or halt it"):
-                call()
-
-
 def test_a_path_that_was_not_kept_is_not_played():
-    """A cell that came back otherwise is named, nothing moves, and the path does not count as loaded."""
-    wrong = pair(
-        "7E 00 15 05 26 00 00 00 18 4D 59 7E",
-        "7E 00 15 18 3F 00 00 00 00 00 00 00 3F 80 00 00 BE 80 00 00 3E 80 00 00 00 00 00 00 82 25 7E",
-    )
-    with scripted([*CONNECT, IDLE, LOAD, wrong]) as transport:
+    """A cell that came back otherwise is named; so with an upload that failed, and the memory holds some of both."""
+    with scripted([*w.CONNECT, w.IDLE, w.LOAD, WRONG]) as transport:
         mirror = connected(transport)
         with pytest.raises(RigError, match=r"cell 4 .*\(Y of position 1\) holds 0.25, 0 was sent"):
-            mirror.load_path(PATH)
+            mirror.load_path(w.PATH)
         with pytest.raises(SettingsError, match="0 positions loaded"):
             mirror.run(0, 3, 10.0)
-
-
-def test_path_whose_upload_failed_is_not_played():
-    """Neither it nor the one before: the memory holds some of both, however many cells were written."""
-    with scripted([*CONNECT, IDLE, LOAD, IDLE, (LOAD[0], b"")]) as transport:
+    with scripted([*w.CONNECT, w.IDLE, w.LOAD, w.IDLE, (w.LOAD[0], b"")]) as transport:
         mirror = connected(transport, read_back="none")
-        mirror.load_path(PATH)
+        mirror.load_path(w.PATH)
         with pytest.raises(DeadlinePassed, match="writing cells 0 to 6"):
-            mirror.load_path(PATH)
+            mirror.load_path(w.PATH)
         with pytest.raises(SettingsError, match="0:3 is no range of the 0 positions loaded"):
             mirror.run(0, 3, 10.0)
 
 
 def test_an_unacknowledged_motion_freezes():
-    """The motion goes once, later ones send no byte; looking and halting still work."""
-    late = Late(1.02, bytes.fromhex(DONE))
-    script = [*CONNECT, WELL, (bytes.fromhex(GOTO), [late]), WELL, HALT]
+    """The motion goes once, later ones send no byte, closing neither; looking and halting still work."""
+    late = Late(1.02, bytes.fromhex(w.DONE))
+    script = [*w.CONNECT, w.IDLE, w.LOAD, w.WELL, (bytes.fromhex(w.GOTO), [late]), w.WELL, w.HALT]
     with scripted(script) as transport:
-        mirror = connected(transport)
+        mirror = connected(transport, read_back="none", park_at_close=True)
+        mirror.load_path(w.PATH)
         with pytest.raises(StateUnknown, match=r"going to 0.5; -0.25 was sent to scripted and may have happened"):
             mirror.goto(0.5, -0.25)
         for call in (mirror.park, lambda: mirror.goto(0, 0)):
             with pytest.raises(StateUnknown, match="going to 0; 0 is refused"):
                 call()
-        assert mirror.status() == Status(0)
-        mirror.halt()
-
-
-def test_a_frozen_mirror_plays_no_path():
-    """Running is a motion, too: it is refused before anything is set up."""
-    with scripted([*CONNECT, IDLE, LOAD, WELL, (bytes.fromhex(GOTO), b"")]) as transport:
-        mirror = connected(transport, read_back="none")
-        mirror.load_path(PATH)
-        with pytest.raises(StateUnknown):
-            mirror.goto(0.5, -0.25)
         with pytest.raises(StateUnknown, match="running a path is refused"):
             mirror.run(0, 3, 10.0)
-
-
-def test_a_run_without_acknowledgement_is_sent_once():
-    """Whether the path plays is not known then."""
-    script = [*CONNECT, IDLE, LOAD, HALT, SET_X, SET_Y, WELL, (bytes.fromhex(RUN), b"")]
-    with scripted(script) as transport:
-        mirror = connected(transport, read_back="none")
-        mirror.load_path(PATH)
-        with pytest.raises(StateUnknown, match="running positions 1:3 was sent"):
-            mirror.run(1, 3, 10.0, cycles=2, trigger=Trigger.RISING_EDGE)
-
-
-def test_a_cable_pulled_in_a_motion_freezes():
-    """The port went away while the acknowledgement was due."""
-    script = [*CONNECT, WELL, (bytes.fromhex(GOTO), [DeviceGone("scripted went away")])]
-    with scripted(script) as transport, pytest.raises(StateUnknown, match="went away"):
-        connected(transport).goto(0.5, -0.25)
-
-
-def test_settling_waits_for_rest():
-    """Polled until the bit is gone."""
-    with scripted([*CONNECT, UNREST, UNREST, WELL]) as transport:
-        connected(transport).settle(1.0)
-        assert transport.clock.now() == pytest.approx(0.02)
-
-
-def test_a_mirror_that_never_rests_is_said():
-    """The time that it was given, and the status in words."""
-    with scripted([*CONNECT, *[UNREST] * 6]) as transport, pytest.raises(RigError, match=r"not at rest after 0.05 s"):
-        connected(transport).settle(0.05)
-
-
-def test_a_trimmed_target_is_said():
-    """A device that trims a target within the disk does not stand where it was sent."""
-    with scripted([*CONNECT, TRIMMED]) as transport, pytest.raises(RigError, match=r"not where it was sent; .*trimmed"):
-        connected(transport).settle(1.0)
-
-
-def test_temperature_is_asked_in_simple_mode_and_back():
-    """The mode is changed and changed back; nothing moves."""
-    script = [*CONNECT, IDLE, LEAVE, GREET, (b"GETTEMP\r\n", b"31.5\r\n"), ENTER, WELL]
-    with scripted(script) as transport:
-        assert connected(transport).temperature() == 31.5
+        assert mirror.status() == Status(0)
+        mirror.halt()
+        mirror.close()
+        assert transport.closed
 
 
 def test_pro_mode_is_entered_again_after_a_refusal():
     """Firmware that does not tell its temperature leaves the mode as it was."""
-    script = [*CONNECT, IDLE, LEAVE, GREET, (b"GETTEMP\r\n", b"NO\r\n"), ENTER, WELL, WELL]
+    script = [*w.CONNECT, w.IDLE, w.LEAVE, w.GREET, (b"GETTEMP\r\n", b"NO\r\n"), w.ENTER, w.WELL, w.WELL]
     with scripted(script) as transport:
         mirror = connected(transport)
         with pytest.raises(DeviceRefused, match="answered NO to GETTEMP"):
@@ -247,33 +211,118 @@ def test_pro_mode_is_entered_again_after_a_refusal():
         assert mirror.status() == Status(0)
 
 
-def test_the_place_in_the_path_is_the_cell_of_x():
-    """Index register of the first unit."""
-    asked = pair("7E 00 11 02 68 0A 0B 3B 7E", "7E 00 11 04 00 00 00 02 73 40 7E")
-    with scripted([*CONNECT, asked]) as transport:
-        assert connected(transport).index() == 2
+def test_a_part_of_a_path_is_played_from_its_own_cells():
+    """Y lies behind the X of all loaded positions, also where only the first of them play."""
+    clock = ManualClock()
+    device = MirrorDevice(clock)
+    mirror = MirrorController(InProcessTransport(device, clock), clock=clock)
+    mirror.connect()
+    mirror.load_path([(0.1, 0.2), (0.3, 0.4), (0.5, 0.6)])
+    mirror.run(0, 2, 100.0)
+    clock.advance(1.0)
+    np.testing.assert_allclose(device.positions(clock.now()), (0.3, 0.4), atol=1e-5)
 
 
-def test_closing_parks_only_when_asked():
-    """By default not a byte is sent at the end."""
-    with scripted(CONNECT) as transport:
-        with connected(transport):
-            pass
+def give(monkeypatch: pytest.MonkeyPatch, transport: ScriptedTransport) -> None:
+    """Let the port that the settings name be the transport."""
+
+    def opened(port: str, baud: int, clock: object) -> ScriptedTransport:
+        assert (port, baud, clock) == ("/dev/mirror", 256000, transport.clock)
+        return transport
+
+    monkeypatch.setattr(mirror_controller, "SerialTransport", opened)
+
+
+SETTINGS = MirrorSettings(port="/dev/mirror", baud=256000, strict_crc=True)
+
+
+def test_opening_connects_or_lets_go_of_the_port(monkeypatch: pytest.MonkeyPatch):
+    """Port and speed are those of the settings; without the controller it is let go of, unparked."""
+    silent = (b"START\r\n", b"")
+    with scripted(w.CONNECT) as transport:
+        give(monkeypatch, transport)
+        with open_mirror(SETTINGS, transport.clock) as mirror:
+            assert mirror.identity().device == "MR-E-2"
         assert transport.closed
-    with scripted([*CONNECT, WELL, pair(PARK, DONE)]) as transport:
-        connected(transport, park_at_close=True).close()
+    with scripted([*[silent] * 3, (w.LEAVE[0], b""), *[silent] * 3]) as transport:
+        give(monkeypatch, transport)
+        with pytest.raises(DeadlinePassed):
+            open_mirror(SETTINGS, transport.clock)
+        assert transport.closed
+    with scripted(w.CONNECT) as transport:
+        give(monkeypatch, transport)
+        with pytest.raises(RigError, match="expected a controller whose id holds 'MR-9'"):
+            open_mirror(replace(SETTINGS, expected_id="MR-9", park_at_close=True), transport.clock)
         assert transport.closed
 
 
-def test_closing_never_moves_a_frozen_mirror(caplog: pytest.LogCaptureFixture):
-    """Where motions are frozen, or parking fails, the port is let go of all the same."""
-    with scripted([*CONNECT, WELL, (bytes.fromhex(GOTO), b"")]) as transport:
-        mirror = connected(transport, park_at_close=True)
-        with pytest.raises(StateUnknown):
-            mirror.goto(0.5, -0.25)
-        mirror.close()
-        assert transport.closed
-    with scripted([*CONNECT, WARM]) as transport:
-        connected(transport, park_at_close=True).close()
-        assert transport.closed
-    assert "not parked" in caplog.text
+START: list[Pair] = [w.STOP_LOG, w.SET_LOG, w.START_LOG]
+
+
+X3 = pair("7E 00 15 05 24 00 00 00 0C 34 96 7E", "7E 00 15 0C 3F 00 00 00 3F 80 00 00 00 00 00 00 93 D1 7E")
+
+
+Y3 = pair("7E 00 15 05 24 01 00 00 0C 35 6A 7E", "7E 00 15 0C BE 80 00 00 00 00 00 00 BE 80 00 00 22 F2 7E")
+
+
+OUT_OF_RANGE = "7E 00 95 04 00 00 01 07 AC 97 7E"
+
+
+def test_a_log_is_started_stopped_and_fetched():
+    """Both feedbacks, the rate, the run bit, and as many samples as the time since the start has."""
+    start = [w.STOP_LOG, w.SET_LOG, (w.START_LOG[0], [Late(0.002, bytes(w.START_LOG[1]))])]
+    with scripted([*w.CONNECT, *start, w.STOP_LOG, X3, Y3]) as transport:
+        mirror = connected(transport, log_rate_hz=1000.0)
+        mirror.start_log()
+        transport.clock.sleep(0.0035)
+        log = mirror.read_log()
+    np.testing.assert_array_equal(log.position, np.array([[0.5, -0.25], [1, 0], [0, -0.25]], np.float32))
+    assert log.rate_hz == 1000.0
+    assert (log.started_s, log.start_error_s) == (pytest.approx(0.002), pytest.approx(0.002))
+
+
+def test_cells_that_are_played_are_logged_beside_positions():
+    """The index of X's vector unit in slot 2, read as whole numbers."""
+    slots = "24 00 24 01 24 02 24 11 00 00 23 02 00 00 23 03 00 00 68 0A 44 7A 00 00"
+    set_three = pair(f"7E 00 12 1A 00 04 {slots} 60 DF 7E", w.DONE)
+    index = pair("7E 00 15 05 24 02 00 00 0C 35 2E 7E", "7E 00 15 0C 00 00 00 00 00 00 00 01 00 00 00 07 79 1B 7E")
+    with scripted([*w.CONNECT, w.STOP_LOG, set_three, w.START_LOG, w.STOP_LOG, X3, Y3, index]) as transport:
+        mirror = connected(transport)
+        mirror.start_log(1000.0, with_index=True)
+        log = mirror.read_log(3)
+    assert log.index is not None
+    assert log.index.tolist() == [0, 1, 7]
+    assert log.position.tolist() == [[0.5, -0.25], [1, 0], [0, -0.25]]
+
+
+def test_a_log_ends_where_the_device_says(caplog: pytest.LogCaptureFixture):
+    """An index outside the log ends it; both channels are as long as the shorter."""
+    zeros = "7E 00 15 28" + " 00" * 40 + " 39 6E 7E"
+    script = [
+        pair("7E 00 15 05 24 00 00 00 28 34 8D 7E", zeros),
+        pair("7E 00 15 05 24 00 00 28 08 2B 55 7E", OUT_OF_RANGE),
+        pair("7E 00 15 05 24 01 00 00 28 35 71 7E", zeros),
+        pair("7E 00 15 05 24 01 00 28 08 2A A9 7E", OUT_OF_RANGE),
+    ]
+    with scripted([*w.CONNECT, *START, w.STOP_LOG, *script]) as transport:
+        mirror = connected(transport)
+        mirror.start_log(1000.0)
+        assert mirror.read_log(12).position.shape == (10, 2)
+    assert "ends at 10 of 12 samples" in caplog.text
+
+
+def test_no_log_is_read_that_was_not_started():
+    """A log is read once, never more of it than the setting says; only an index outside of it is its end."""
+    refused = pair("7E 00 15 05 24 00 00 00 0C 34 96 7E", "7E 00 95 04 00 00 01 01 2C 95 7E")
+    logs = [*START, w.STOP_LOG, X3, Y3, *START, w.STOP_LOG, refused]
+    with scripted([*w.CONNECT, *logs]) as transport:
+        mirror = connected(transport, log_samples=3)
+        with pytest.raises(RigError, match="no log was started on scripted; start one"):
+            mirror.read_log()
+        mirror.start_log(1000.0)
+        assert len(mirror.read_log(5000).position) == 3
+        with pytest.raises(RigError, match="no log was started"):
+            mirror.read_log()
+        mirror.start_log(1000.0)
+        with pytest.raises(DeviceRefused, match="no such register"):
+            mirror.read_log(3)

@@ -1,38 +1,42 @@
-"""Requests in both modes as (sent, received) bytes, and what is accepted as an answer."""
+"""Requests in both modes as (sent, received) bytes, what is accepted as an answer, and connecting in either mode."""
 
 from __future__ import annotations
 
 import logging
+from contextlib import nullcontext
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from pipeline.errors import RigError
-from pipeline.rig.device_errors import DeadlinePassed, DeviceRefused, StateUnknown
-from pipeline.rig.mirror.mirror_requests import ProLink, SimpleLink
-from pipeline.rig.mirror.mirror_settings import Patience
-from pipeline.rig.mirror.pro_payloads import (
-    ask_firmware,
-    ask_status,
-    cell_float,
-    cell_int,
-    get_value,
-    get_values,
-    get_vector,
-    go_simple,
-    read_values,
-    set_value,
-    set_values,
-    set_vector,
+from pipeline.errors import RigError, ShapeError
+from pipeline.rig.device_settings import Patience
+from pipeline.rig.devices import DeadlinePassed, DeviceRefused, StateUnknown
+from pipeline.rig.mirror.mirror_requests import (
+    LineReader,
+    ProLink,
+    SimpleLink,
+    check_done,
+    read_temperature,
+    read_text,
+    to_line,
 )
-from pipeline.rig.mirror.registers import Status
-from pipeline.rig.mirror.simple_mode import go_x, go_xy, go_y
-from pipeline.rig.mirror.transactions import Wire
-from tests.rig.scripted import Pair, ScriptedTransport, scripted
+from pipeline.rig.mirror.pro_mode import cell_int, get_value
+from pipeline.rig.transports import Wire
+from tests.rig.mirror.mirror_bytes import CONNECT, ENTER, GREET, LEAVE, WELL, WHO, connected, set_value
+from tests.rig.scripted import Pair, Reply, ScriptedTransport, scripted
 
-ASK = bytes.fromhex("7E 00 11 02 68 0A 0B 3B 7E")
-REPLY = bytes.fromhex("7E 00 11 04 00 00 01 2C F2 CC 7E")
-WRONG_CRC = bytes.fromhex("7E 00 11 04 00 00 01 2C F2 CD 7E")
 OTHER = bytes.fromhex("7E 00 13 0A 00 02 3F 00 00 00 BE 80 00 00 9B D7 7E")
+SET, DONE = bytes.fromhex("7E 00 10 06 50 02 3F 00 00 00 1E 88 7E"), bytes.fromhex("7E 00 10 00 0D C0 7E")
+ASK = bytes.fromhex("7E 00 11 02 68 0A 0B 3B 7E")
+
+
+REPLY = bytes.fromhex("7E 00 11 04 00 00 01 2C F2 CC 7E")
+
+
+WRONG_CRC = bytes.fromhex("7E 00 11 04 00 00 01 2C F2 CD 7E")
+
+
 HALF, MINUS_QUARTER = bytes.fromhex("3F 00 00 00"), bytes.fromhex("BE 80 00 00")
 
 
@@ -46,57 +50,29 @@ def pro(transport: ScriptedTransport, **settings: bool) -> ProLink:
     return ProLink(wire(transport), **{"strict_crc": True, **settings})
 
 
-PRO_READS = [
-    (ask_firmware(), bytes, "7E 00 01 02 00 00 A0 3C 7E", "7E 00 01 04 4D 52 45 32 F5 E9 7E", b"MRE2"),
-    (ask_status(), cell_int, "7E 00 02 02 00 00 A0 78 7E", "7E 00 02 04 00 00 00 11 30 2E 7E", 0x11),
-    (get_value(0x680A), cell_int, "7E 00 11 02 68 0A 0B 3B 7E", "7E 00 11 04 00 00 01 2C F2 CC 7E", 300),
-    (get_value(0x2302), cell_float, "7E 00 11 02 23 02 3C 0D 7E", "7E 00 11 04 00 00 00 00 F2 81 7E", 0.0),
-    (
-        get_values([0x2302, 0x2303]),
-        read_values,
-        "7E 00 13 06 00 02 23 02 23 03 AD AC 7E",
-        "7E 00 13 0A 00 02 3F 00 00 00 BE 80 00 00 9B D7 7E",
-        [HALF, MINUS_QUARTER],
-    ),
-    (
-        get_vector(0x2600, 10, 2),
-        bytes,
-        "7E 00 15 05 26 00 00 28 08 52 95 7E",
-        "7E 00 15 08 3F 00 00 00 BE 80 00 00 10 D1 7E",
-        HALF + MINUS_QUARTER,
-    ),
-]
-PRO_WRITES = [
-    (go_simple(), "7E 00 06 02 00 00 A1 48 7E", "7E 00 06 00 03 A0 7E"),
-    (set_value(0x5002, 0.5), "7E 00 10 06 50 02 3F 00 00 00 1E 88 7E", "7E 00 10 00 0D C0 7E"),
-    (
-        set_values({0x6801: 1, 0x6901: 1}),
-        "7E 00 12 0E 00 02 68 01 69 01 00 00 00 01 00 00 00 01 42 49 7E",
-        "7E 00 12 00 0C A0 7E",
-    ),
-    (
-        set_vector(0x2600, 10, HALF + MINUS_QUARTER),
-        "7E 00 14 0D 26 00 00 28 08 3F 00 00 00 BE 80 00 00 EF B0 7E",
-        "7E 00 14 00 0F 00 7E",
-    ),
-]
-
-
-@pytest.mark.parametrize(("frame", "parse", "sent", "received", "answer"), PRO_READS)
-def test_reads_in_pro_mode(frame, parse, sent, received, answer):
-    """Each request is these bytes, and each reply means this."""
-    with scripted([(bytes.fromhex(sent), bytes.fromhex(received))]) as transport:
-        assert pro(transport).ask(frame, "it", parse) == answer
-
-
-@pytest.mark.parametrize(("frame", "sent", "received"), PRO_WRITES)
-def test_writes_in_pro_mode(frame, sent, received):
-    """Each request is these bytes, whether it moves or not, and is acknowledged by these."""
-    pair = (bytes.fromhex(sent), bytes.fromhex(received))
-    with scripted([pair, pair]) as transport:
+def test_every_kind_of_request_in_pro_mode():
+    """Each request is these bytes, whether it asks, sets or moves, and each reply means this."""
+    with scripted([(ASK, REPLY), (SET, DONE), (SET, DONE)]) as transport:
         link = pro(transport)
-        link.tell(frame, "it")
-        link.move(frame, "it")
+        assert link.ask(get_value(0x680A), "it", cell_int) == 300
+        link.tell(set_value(0x5002, 0.5), "it")
+        link.move(set_value(0x5002, 0.5), "it")
+
+
+@pytest.mark.parametrize(
+    ("received", "words"),
+    [
+        ("7E 00 90 04 00 00 01 03 AD 01 7E", "out of the register's range"),
+        ("7E 00 90 04 00 00 01 06 6D 02 7E", "can only be read"),
+    ],
+)
+def test_error_replies_to_motions(received: str, words: str):
+    """A motion that the device refused did not happen: nothing freezes."""
+    with scripted([(SET, bytes.fromhex(received))]) as transport:
+        link = pro(transport)
+        with pytest.raises(DeviceRefused, match=words):
+            link.move(set_value(0x5002, 0.5), "it")
+        assert not link.wire.unknown
 
 
 @pytest.mark.parametrize(
@@ -114,24 +90,6 @@ def test_error_replies_to_reads(received: str, words: str, code: int):
         assert caught.value.code == code
 
 
-@pytest.mark.parametrize(
-    ("frame", "sent", "received", "words"),
-    [
-        (set_value(0x5002, 0.5), PRO_WRITES[1][1], "7E 00 90 04 00 00 01 03 AD 01 7E", "out of the register's range"),
-        (set_value(0x5002, 0.5), PRO_WRITES[1][1], "7E 00 90 04 00 00 01 06 6D 02 7E", "can only be read"),
-        (set_values({0x6801: 1, 0x6901: 1}), PRO_WRITES[2][1], "7E 00 92 04 00 00 02 03 AC 13 7E", "make a chain"),
-        (set_vector(0x2600, 10, HALF + MINUS_QUARTER), PRO_WRITES[3][1], "7E 00 94 04 00 00 01 07 AD 46 7E", "outside"),
-    ],
-)
-def test_error_replies_to_motions(frame, sent, received, words):
-    """A motion that the device refused did not happen: nothing freezes."""
-    with scripted([(bytes.fromhex(sent), bytes.fromhex(received))]) as transport:
-        link = pro(transport)
-        with pytest.raises(DeviceRefused, match=words):
-            link.move(frame, "it")
-        assert not link.wire.unknown
-
-
 @pytest.mark.parametrize("received", ["7E 00 91 04 00 00 00 01 2C 81 7E", "7E 00 91 04 00 00 00 04 EC 82 7E"])
 def test_what_the_device_got_garbled_is_asked_again(received: str):
     """Where the device saw a wrong frame or CRC, a read is asked again."""
@@ -139,22 +97,15 @@ def test_what_the_device_got_garbled_is_asked_again(received: str):
         assert pro(transport).ask(get_value(0x680A), "it", cell_int) == 300
 
 
-def test_a_wrong_crc_is_taken_with_a_warning(caplog: pytest.LogCaptureFixture):
-    """Until a capture on hardware confirms the CRC, one that does not fit is logged and the answer taken."""
-    with scripted([(ASK, WRONG_CRC)]) as transport, caplog.at_level(logging.WARNING):
+def test_a_wrong_crc_is_what_the_settings_say(caplog: pytest.LogCaptureFixture):
+    """Until hardware confirms the CRC, one that does not fit is logged and taken; strictly refused; or none is sent."""
+    with scripted([(ASK, WRONG_CRC)]) as transport:
         assert pro(transport, strict_crc=False).ask(get_value(0x680A), "the place", cell_int) == 300
     assert "CRC of an answer to the place does not fit; taken" in caplog.text
-
-
-def test_strict_crc_refuses_a_wrong_one(caplog: pytest.LogCaptureFixture):
-    """With the setting, the answer is thrown away and asked for again."""
     with scripted([(ASK, WRONG_CRC), (ASK, REPLY)]) as transport:
         assert pro(transport, strict_crc=True).ask(get_value(0x680A), "it", cell_int) == 300
     assert "does not fit; refused" in caplog.text
-
-
-def test_without_crc_none_is_sent_or_checked(caplog: pytest.LogCaptureFixture):
-    """In pro mode without CRC the place holds zeros on both sides."""
+    caplog.clear()
     pair = (bytes.fromhex("7E 00 11 02 68 0A 00 00 7E"), bytes.fromhex("7E 00 11 04 00 00 01 2C 00 00 7E"))
     with scripted([pair]) as transport:
         assert pro(transport, with_crc=False).ask(get_value(0x680A), "it", cell_int) == 300
@@ -163,66 +114,32 @@ def test_without_crc_none_is_sent_or_checked(caplog: pytest.LogCaptureFixture):
 
 @pytest.mark.parametrize("noise", [b"junk\x7e", b"\x7e\x00\x11\x7e", OTHER, bytes.fromhex("7E 00 11 00 0C 50 7E")])
 def test_what_is_no_answer_is_passed_over(noise: bytes, caplog: pytest.LogCaptureFixture):
-    """Rubbish, halves of frames, answers to other commands, and answers of another size are logged, not taken."""
-    with scripted([(ASK, [noise + REPLY])]) as transport:
-        assert pro(transport).ask(get_value(0x680A), "the place", cell_int) == 300
+    """Rubbish, halves of frames, answers to other commands, of another size are logged, not taken; in pieces too."""
+    pieces: list[Reply] = [bytes((byte,)) for byte in noise + REPLY]
+    with scripted([(ASK, [noise + REPLY]), (ASK, pieces)]) as transport:
+        for _ in range(2):
+            assert pro(transport).ask(get_value(0x680A), "the place", cell_int) == 300
     assert "while waiting for the place" in caplog.text
 
 
-def test_answers_may_come_byte_by_byte():
-    """How an answer is split does not matter."""
-    with scripted([(ASK, [bytes((byte,)) for byte in REPLY])]) as transport:
-        assert pro(transport).ask(get_value(0x680A), "it", cell_int) == 300
-
-
-SIMPLE_TEXTS = [
-    ("GETID", b"GETID\r\n", b"MR-E-2\r\n", "MR-E-2"),
-    ("GETVERSION", b"GETVERSION\r\n", b"1.2.3\r\n", "1.2.3"),
-    ("GETSN", b"GETSN\r\n", b"ABCD0123\r\n", "ABCD0123"),
-]
-SIMPLE_MOTIONS = [
-    (go_x(0.5), b"X=0.500000\r\n"),
-    (go_y(-0.25), b"Y=-0.250000\r\n"),
-    (go_xy(0.5, -0.25), b"XY=0.500000;-0.250000\r\n"),
-    ("RESET", b"RESET\r\n"),
-]
-
-
-def test_greeting_status_and_temperature_in_simple_mode():
-    """START, STATUS and GETTEMP with their replies."""
-    pairs: list[Pair] = [(b"START\r\n", b"OK\r\n"), (b"STATUS\r\n", b"00000110\r\n"), (b"GETTEMP\r\n", b"31.5\r\n")]
+def test_every_kind_of_request_in_simple_mode():
+    """Greeting, text, temperature and mode with their replies, and each refusal of a motion, which freezes nothing."""
+    pairs: list[Pair] = [
+        (b"START\r\n", b"OK\r\n"),
+        (b"GETID\r\n", b"MR-E-2\r\n"),
+        (b"GETTEMP\r\n", b"31.5\r\n"),
+        (b"GOPRO\r\n", b"OK\r\n"),
+        *((b"X=0.500000\r\n", reply + b"\r\n") for reply in (b"NO", b"OL", b"OU", b"ERROR")),
+    ]
     with scripted(pairs) as transport:
         link = SimpleLink(wire(transport))
-        link.start()
-        assert link.status() == Status.NOT_STABLE | Status.WAS_DISCONNECTED
+        link.do("START", "greeting")
+        assert link.text("GETID") == "MR-E-2"
         assert link.temperature() == 31.5
-
-
-@pytest.mark.parametrize(("request_", "sent", "received", "answer"), SIMPLE_TEXTS)
-def test_texts_in_simple_mode(request_: str, sent: bytes, received: bytes, answer: str):
-    """GETID, GETVERSION and GETSN with their replies."""
-    with scripted([(sent, received)]) as transport:
-        assert SimpleLink(wire(transport)).text(request_) == answer
-
-
-@pytest.mark.parametrize("request_", ["GOPRO", "GOPROCRC", "ACKNOWLEDGE"])
-def test_writes_in_simple_mode(request_: str):
-    """Requests that move nothing are answered by OK."""
-    with scripted([(request_.encode() + b"\r\n", b"OK\r\n")]) as transport:
-        SimpleLink(wire(transport)).tell(request_)
-
-
-@pytest.mark.parametrize(("request_", "sent"), SIMPLE_MOTIONS)
-@pytest.mark.parametrize("received", [b"OK\r\n", b"NO\r\n", b"OL\r\n", b"OU\r\n", b"ERROR\r\n"])
-def test_motions_in_simple_mode(request_: str, sent: bytes, received: bytes):
-    """Positions and resets with every reply: OK is done, the others are refusals, and none of them freezes."""
-    with scripted([(sent, received)]) as transport:
-        link = SimpleLink(wire(transport))
-        if received == b"OK\r\n":
-            link.move(request_)
-        else:
-            with pytest.raises(DeviceRefused, match=received.decode().strip()):
-                link.move(request_)
+        link.do("GOPRO", "write")
+        for reply in ("NO", "OL", "OU", "ERROR"):
+            with pytest.raises(DeviceRefused, match=reply):
+                link.do("X=0.500000", "motion")
         assert not link.wire.unknown
 
 
@@ -230,21 +147,136 @@ def test_a_motion_answered_by_nonsense_freezes():
     """A reply that the protocol does not have says nothing about where the mirror is."""
     pair = (b"XY=0.500000;0.000000\r\n", b"O\xcb\r\n")
     with scripted([pair]) as transport, pytest.raises(StateUnknown, match="may have happened or not: expected OK"):
-        SimpleLink(wire(transport)).move(go_xy(0.5, 0))
+        SimpleLink(wire(transport)).do("XY=0.500000;0.000000", "motion")
 
 
-def test_another_device_is_named_by_what_it_says():
-    """A position receiver on the port is not the mirror."""
+@pytest.mark.parametrize("request_", ["", "X=1\r\nX=2", "X=½", "X" * 63])
+def test_requests_are_lines(request_: str):
+    """A request ends in CR LF; empty, double, foreign and long lines are refused, 64 bytes with the end still go."""
+    assert to_line("START") == b"START\r\n"
+    assert len(to_line("X" * 62)) == 64
+    with pytest.raises(ShapeError, match=r"one line of ASCII|lines of 64 bytes, got 65"):
+        to_line(request_)
+
+
+@given(st.lists(st.text(st.characters(min_codepoint=33, max_codepoint=126), min_size=1), max_size=6), st.data())
+def test_lines_come_whole_however_cut(lines: list[str], data: st.DataObject):
+    """Split and merged input give the same lines; empty lines and lone ends do not count."""
+    stream = b"\r\n" + b"".join(line.encode() + b"\r\n" for line in lines)
+    cut = data.draw(st.integers(0, len(stream)))
+    reader = LineReader()
+    assert reader.feed(stream[:cut]) + reader.feed(stream[cut:]) == [line.encode() for line in lines]
+
+
+@pytest.mark.parametrize(
+    ("line", "error", "words"),
+    [
+        (b"OK", None, ""),
+        (b" ok ", None, ""),
+        (b"NO", DeviceRefused, "on /dev/m answered NO to X=2: it does not know"),
+        (b"OL", DeviceRefused, "below the range"),
+        (b"OU", DeviceRefused, "above the range"),
+        (b"error", DeviceRefused, "ERROR"),
+        *((line, RigError, "is this the mirror controller") for line in (b"", b"OKOK", b"$GPGGA,1", b"\xff\xfe")),
+    ],
+)
+def test_replies_that_say_whether_it_was_done(line: bytes, error: type[RigError] | None, words: str):
+    """OK in any case is done; refusals are said in words, and what the protocol does not have is another device."""
+    with nullcontext() if error is None else pytest.raises(error, match=words):
+        check_done(line, "X=2", "/dev/m")
+
+
+@pytest.mark.parametrize(("line", "degrees"), [(b"31.5", 31.5), (b"-4", -4.0), (b"+31.25 C", 31.25)])
+def test_temperatures_are_numbers(line: bytes, degrees: float):
+    """A temperature with or without decimals and unit."""
+    assert read_temperature(line, "p") == degrees
+    with pytest.raises(RigError, match="a temperature to GETTEMP from p, got 'warm'"):
+        read_temperature(b"warm", "p")
+
+
+def test_texts_are_text():
+    """An id is printable; NO and ERROR are refusals of it."""
+    assert read_text(b"MR-E-2 ", "GETID", "p") == "MR-E-2"
+    with pytest.raises(DeviceRefused, match="NO to GETID"):
+        read_text(b"NO", "GETID", "p")
+    with pytest.raises(RigError, match="port's speed"):
+        read_text(b"\x00\x81", "GETID", "p")
+
+
+SILENT = (b"START\r\n", b"")
+
+
+DAMAGED = bytes.fromhex("7E 00 D4 04 00 00 00 01 22 14 7E")  # what the greeting gets in pro mode
+
+
+REST: list[Pair] = [*WHO, ENTER, WELL]
+FOUND: dict[str, list[Pair]] = {
+    "in pro mode": [SILENT, SILENT, SILENT, LEAVE, GREET, *REST],
+    "in pro mode, complaining of the greeting": [*[SILENT] * 3, (LEAVE[0], [DAMAGED, LEAVE[1]]), GREET, *REST],
+    "in a line that somebody began": [(b"START\r\n", b"NO\r\n"), *CONNECT],
+    "in a line that somebody began, and that is known": [(b"START\r\n", b"ERROR\r\n"), *CONNECT],
+    "after a greeting that was lost": [SILENT, *CONNECT],
+    "though the change's answer was lost": [GREET, *WHO, (ENTER[0], b""), WELL],
+}
+
+
+@pytest.mark.parametrize("name", FOUND)
+def test_a_controller_is_found(name: str):
+    """In whichever mode an earlier session left it; a greeting moves nothing and is repeated."""
+    with scripted(FOUND[name]) as transport:
+        assert connected(transport).identity().device == "MR-E-2"
+
+
+def test_a_usual_reconnect_warns_of_nothing(caplog: pytest.LogCaptureFixture):
+    """In pro mode as drivers leave it, with bytes of another program before: noted, no cause to look."""
+    leave = (LEAVE[0], [DAMAGED, LEAVE[1]])
     with (
-        scripted([(b"START\r\n", b"$GPGGA,1\r\n")] * 3) as transport,
-        pytest.raises(RigError, match=r"got '\$GPGGA,1'"),
+        caplog.at_level(logging.INFO),
+        scripted([SILENT, SILENT, SILENT, leave, GREET, *WHO, ENTER, WELL]) as transport,
     ):
-        SimpleLink(wire(transport)).start()
+        assert connected(transport).found_in_pro
+    with caplog.at_level(logging.INFO), scripted(CONNECT, stale=b"NO", drained=b"NO") as transport:
+        assert not connected(transport).found_in_pro
+    assert "it may be in pro mode" in caplog.text
+    assert "dropped 2 stale bytes" in caplog.text
+    assert {record.levelno for record in caplog.records} == {logging.INFO}
 
 
-def test_no_answer_says_what_to_look_at():
-    """Nothing came: the request, the port, the time, and what to do."""
-    with scripted([(ASK, b"")] * 3) as transport:
-        with pytest.raises(DeadlinePassed, match=r"no answer to the place from scripted .*nothing came.*cable"):
-            pro(transport).ask(get_value(0x680A), "the place", cell_int)
-        assert transport.clock.now() == pytest.approx(1.0)
+def test_damage_at_a_reconnect_is_warned_of(caplog: pytest.LogCaptureFixture):
+    """Half of an answer to the greeting is nothing that another mode explains."""
+    with caplog.at_level(logging.INFO), scripted([(b"START\r\n", b"O"), *CONNECT]) as transport:
+        connected(transport)
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+
+
+def test_stale_bytes_and_unknown_questions_at_connect():
+    """Whatever lies on the line from before is dropped; a version that is not told stays empty."""
+    stale = b"NO\r\n" + bytes.fromhex("7E 00 11 04 00 00")
+    who = [WHO[0], (b"GETVERSION\r\n", b"NO\r\n"), (b"GETSN\r\n", b"NO\r\n")]
+    with scripted([GREET, *who, ENTER, WELL], stale=stale, drained=stale) as transport:
+        identity = connected(transport).identity()
+    assert (identity.device, identity.version, identity.serial) == ("MR-E-2", "", "")
+
+
+def test_nobody_there_is_said_within_the_deadlines():
+    """No answer in either mode: three transactions' time, and what to look at."""
+    with scripted([*[SILENT] * 3, (LEAVE[0], b""), *[SILENT] * 3]) as transport:
+        with pytest.raises(DeadlinePassed, match=r"no answer to START from scripted .*is the controller on"):
+            connected(transport)
+        assert transport.clock.now() < 4
+
+
+def test_firmware_without_crc_says_which_setting_to_turn():
+    """GOPROCRC is unknown: the message names the setting, and the setting sends GOPRO."""
+    words = r"Firmware without GOPROCRC\? Turn mirror.with_crc over"
+    with scripted([GREET, *WHO, (ENTER[0], b"NO\r\n")]) as transport, pytest.raises(DeviceRefused, match=words):
+        connected(transport)
+    status = (bytes.fromhex("7E 00 02 02 00 00 00 00 7E"), bytes.fromhex("7E 00 02 04 00 00 00 00 00 00 7E"))
+    with scripted([GREET, *WHO, (b"GOPRO\r\n", b"OK\r\n"), status]) as transport:
+        connected(transport, with_crc=False)
+
+
+def test_another_device_is_refused():
+    """What talks without being asked, or answers otherwise, is not the mirror."""
+    with scripted([(b"START\r\n", b"login: \r\n")] * 3) as transport, pytest.raises(RigError, match="got 'login:'"):
+        connected(transport)

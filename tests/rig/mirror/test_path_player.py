@@ -1,12 +1,185 @@
-"""What plays, as registers."""
+"""Positions at the precision of the wire, uploads and what is read back, and what plays as registers."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from pipeline.errors import SettingsError
-from pipeline.rig.mirror.path_player import Play, hold_values, run_values
-from pipeline.rig.mirror.pro_payloads import set_values
+from pipeline.errors import PoseError, RigError, SettingsError, ShapeError
+from pipeline.rig.device_settings import Patience, ReadBack
+from pipeline.rig.devices import DeadlinePassed, ManualClock
+from pipeline.rig.mirror.mirror_requests import ProLink
+from pipeline.rig.mirror.path_player import check_play, frames_to_check, hold_values, run_values, upload, wire_positions
+from pipeline.rig.mirror.pro_mode import Command, Frame, FrameReader, encode, read_vector, set_values
+from pipeline.rig.transports import BITS_PER_BYTE, Wire
+
+
+@given(st.floats(0, 1), st.floats(-7, 7))
+def test_no_position_is_rounded_beyond_the_rim(radius: float, angle: float):
+    """Positions stay in the disk, near where they were, and are not rounded twice."""
+    given_ = np.array([[radius * np.cos(angle), radius * np.sin(angle)]])
+    rounded = wire_positions(given_)
+    assert rounded.dtype == np.float32
+    assert np.hypot(*rounded[0].astype(np.float64)) <= 1
+    np.testing.assert_allclose(rounded, given_, atol=2e-7)
+    np.testing.assert_array_equal(wire_positions(rounded), rounded)
+
+
+def test_a_rim_of_float32_is_taken():
+    """A float32 position that rounding put beyond the rim comes back to it."""
+    beyond = np.array([[0.6, 0.8]], np.float32) * np.float32(1 + 3e-7)
+    assert np.hypot(*wire_positions(beyond)[0].astype(np.float64)) <= 1
+
+
+@pytest.mark.parametrize(("x", "y"), [(1.0001, 0), (0.8, 0.8), (float("nan"), 0), (0, float("inf"))])
+def test_targets_outside_the_disk_are_refused(x: float, y: float):
+    """Beyond the rim, and what is no number."""
+    with pytest.raises(PoseError, match=r"index 1\)"):
+        wire_positions([(0, 0), (x, y)])
+
+
+@pytest.mark.parametrize("shape", [(0, 2), (2,), (3, 3), (2, 2, 2)])
+def test_a_path_is_a_list_of_pairs(shape: tuple[int, ...]):
+    """Anything but (position, 2) is refused, and an empty path."""
+    with pytest.raises(ShapeError, match=r"\(position, 2\), at least one, got shape"):
+        wire_positions(np.zeros(shape))
+
+
+BAUD = 115200
+
+
+class Memory:
+    """A vector memory behind a transport: keeps what is written, but for ``wrong`` cells, and takes the wire's time."""
+
+    port = "memory"
+
+    def __init__(self, wrong: tuple[int, ...] = (), deaf_after: int = 10**9) -> None:
+        self.clock = ManualClock()
+        self.cells = bytearray(0x10000)
+        self.frames: list[Frame] = []
+        self._wrong, self._deaf_after = wrong, deaf_after
+        self._reader, self._reply = FrameReader(), b""
+        self.passed = 0  # bytes, in both directions
+
+    def write(self, data: bytes, deadline: float) -> None:
+        """Take a frame and prepare the reply."""
+        self.clock.sleep(len(data) * 10 / BAUD)
+        self.passed += len(data)
+        (frame,) = self._reader.feed(data)
+        assert isinstance(frame, Frame)
+        self.frames.append(frame)
+        _, offset, size, cells = read_vector(frame.payload)
+        if len(self.frames) > self._deaf_after:
+            return
+        if frame.command == Command.SET_VECTOR:
+            self.cells[offset : offset + size] = cells
+            for cell in self._wrong:
+                if offset <= 4 * cell < offset + size:
+                    self.cells[4 * cell + 3] ^= 1
+            self._reply = encode(Frame(frame.command))
+        else:
+            self._reply = encode(Frame(frame.command, bytes(self.cells[offset : offset + size])))
+
+    def read(self, at_most: int, deadline: float) -> bytes:
+        """Give the reply, or wait in vain."""
+        reply, self._reply = self._reply, b""
+        self.passed += len(reply)
+        self.clock.sleep(len(reply) * 10 / BAUD if reply else deadline - self.clock.now())
+        return reply
+
+    def drain(self) -> bytes:
+        """Nothing is ever left."""
+        return b""
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+
+def link(memory: Memory) -> ProLink:
+    """Pro mode over the memory."""
+    return ProLink(Wire(memory, memory.clock, Patience()))
+
+
+def path(count: int) -> bytes:
+    """Cells of positions on a spiral."""
+    turn = np.linspace(0, 40, count)
+    positions = wire_positions(np.stack([np.cos(turn), np.sin(turn)], axis=-1) * (turn / 40)[:, None])
+    return positions.T.astype(">f4").tobytes()
+
+
+@given(st.integers(1, 120), st.sampled_from(["none", "sampled", "all"]))
+@settings(max_examples=30, deadline=None)
+def test_what_was_sent_is_what_is_held(count: int, read_back: ReadBack):
+    """Any path arrives whole, ten cells to a frame, and progress goes up to all of it."""
+    memory, said = Memory(), []
+    cells = path(count)
+    upload(link(memory), cells, read_back, lambda done, total: said.append((done, total)))
+    assert memory.cells[: len(cells)] == cells
+    assert not any(memory.cells[len(cells) :])
+    written = [frame for frame in memory.frames if frame.command == Command.SET_VECTOR]
+    assert len(written) == -(-2 * count // 10)
+    assert [done for done, _ in said] == sorted({done for done, _ in said})
+    assert said[-1][0] == said[-1][1] == sum(total for _, _, total, _ in map(_cells, memory.frames)) // 4
+
+
+def _cells(frame: Frame) -> tuple[int, int, int, bytes]:
+    return read_vector(frame.payload)
+
+
+@pytest.mark.parametrize("cell", [0, 9, 10, 57, 99, 100, 149, 199])
+def test_a_wrong_cell_is_named(cell: int):
+    """Reading all back finds any cell, and says which position and axis it is of."""
+    axis, position = ("X", cell) if cell < 100 else ("Y", cell - 100)
+    with pytest.raises(RigError, match=rf"cell {cell} of .* on memory \({axis} of position {position}\) holds"):
+        upload(link(Memory(wrong=(cell,))), path(100), "all")
+
+
+@pytest.mark.parametrize("cell", [0, 98, 101, 199])
+def test_a_sample_finds_the_ends_of_both_channels(cell: int):
+    """Where ranges are most often wrong, a sample looks, too."""
+    with pytest.raises(RigError, match=f"cell {cell} of"):
+        upload(link(Memory(wrong=(cell,))), path(100), "sampled")
+
+
+def test_without_reading_back_nothing_is_found():
+    """The choice is a choice: nothing is asked."""
+    memory = Memory(wrong=(5,))
+    upload(link(memory), path(100), "none")
+    assert {frame.command for frame in memory.frames} == {Command.SET_VECTOR}
+
+
+@given(st.integers(1, 400))
+def test_samples_are_few_and_within(frames: int):
+    """First and last frame are always read, and not many more than a tenth."""
+    checked = frames_to_check(frames, "sampled")
+    assert {0, frames - 1} <= set(checked) <= set(range(frames))
+    assert len(checked) <= frames / 10 + 5
+    assert frames_to_check(frames, "none") == []
+    assert frames_to_check(frames, "all") == list(range(frames))
+
+
+def test_a_lost_frame_ends_the_upload():
+    """A write is not sent again; the message names the cells."""
+    memory = Memory(deaf_after=3)
+    with pytest.raises(DeadlinePassed, match="no answer to writing cells 30 to 40 from memory"):
+        upload(link(memory), path(100), "all")
+    assert len(memory.frames) == 4
+
+
+@pytest.mark.parametrize(("read_back", "share"), [("none", 0.0), ("sampled", 0.11), ("all", 1.0)])
+def test_an_upload_takes_the_wire_time(read_back: ReadBack, share: float):
+    """1500 positions are 300 frames of 52 bytes and acknowledgements of 7, and reading back costs as much again.
+
+    Bytes that need an escape come on top, below 1 %; nothing else does: the clock passed by what the wire took.
+    """
+    memory = Memory()
+    upload(link(memory), path(1500), read_back)
+    plain_s = 300 * (52 + 7) * 10 / BAUD
+    wire_s = memory.passed * BITS_PER_BYTE / BAUD
+    assert wire_s == pytest.approx(plain_s * (1 + share), rel=0.02)
+    assert memory.clock.now() == pytest.approx(wire_s)
 
 
 def test_motions_fit_one_frame():
@@ -15,14 +188,14 @@ def test_motions_fit_one_frame():
     assert len(set_values(run_values()).payload) == 38
 
 
-@pytest.mark.parametrize("play", [Play(0, 1, 1e-3), Play(0, 1500, 1e4, -1), Play(1499, 1500, 10, 2**31 - 1)])
-def test_ranges_within_what_is_loaded_play(play: Play):
+@pytest.mark.parametrize("play", [(0, 1, 1e-3, 1), (0, 1500, 1e4, -1), (1499, 1500, 10, 2**31 - 1)])
+def test_ranges_within_what_is_loaded_play(play: tuple[int, int, float, int]):
     """From the first position to the last, half open."""
-    play.check(1500)
+    check_play(*play, 1500)
 
 
-@pytest.mark.parametrize("play", [Play(0, 1501, 10), Play(-1, 3, 10), Play(3, 3, 10), Play(0, 3, 10, 2**31)])
-def test_other_ranges_do_not(play: Play):
+@pytest.mark.parametrize("play", [(0, 1501, 10, 1), (-1, 3, 10, 1), (3, 3, 10, 1), (0, 3, 10, 2**31)])
+def test_other_ranges_do_not(play: tuple[int, int, float, int]):
     """Nothing outside, nothing empty, no number that its cell does not hold."""
     with pytest.raises(SettingsError, match=r"no range of the 1500 positions|cycles of 1 or more"):
-        play.check(1500)
+        check_play(*play, 1500)

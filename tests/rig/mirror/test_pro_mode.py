@@ -1,4 +1,4 @@
-"""Frames of pro mode: the documented bytes, and laws over any payload and any stream."""
+"""Pro mode: the documented bytes of frames and payloads, laws over any stream, and the published registers."""
 
 from __future__ import annotations
 
@@ -10,12 +10,45 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import ShapeError
-from pipeline.rig.mirror.pro_mode import Command, Damaged, ErrorCode, Frame, FrameReader, crc_arc, encode, error_words
+from pipeline.rig.mirror.pro_mode import (
+    Command,
+    Damaged,
+    ErrorCode,
+    Frame,
+    FrameReader,
+    ask_status,
+    cell_float,
+    cell_int,
+    encode,
+    error_words,
+    float_cell,
+    get_value,
+    get_values,
+    get_vector,
+    go_simple,
+    int_cell,
+    read_register,
+    read_registers,
+    read_values,
+    read_vector,
+    refuse,
+    set_values,
+    set_vector,
+    split_cells,
+    to_cell,
+    values_reply,
+)
+from pipeline.rig.mirror.registers import FEEDBACK_X, FEEDBACK_Y, VECTOR_MEMORY, Status, VectorRegister, X, Y, log_slot
+from tests.rig.mirror.mirror_bytes import ASK_FIRMWARE, set_value
 
 nasty = st.one_of(
     st.binary(max_size=50), st.lists(st.sampled_from([0x7D, 0x7E, 0x5D, 0x5E, 0]), max_size=50).map(bytes)
 )
+
+
 frames = st.builds(Frame, st.integers(0, 255), nasty, st.integers(0, 255))
+
+
 rubbish = st.binary(max_size=30).map(lambda data: data.replace(b"\x7e", b"?"))
 
 
@@ -26,9 +59,10 @@ def parts(stream: bytes, cuts: list[int]) -> list[bytes]:
 
 
 def test_the_documented_frame():
-    """The one reply whose CRC is documented, 00 11 04 00 00 00 00 with F2 81, is written and read so."""
+    """The one reply whose CRC is documented, 00 11 04 00 00 00 00, is written and read so; without a CRC zeros."""
     data = bytes.fromhex("7E 00 11 04 00 00 00 00 F2 81 7E")
     assert encode(Frame(Command.GET_VALUE, bytes(4))) == data
+    assert encode(Frame(Command.GET_VALUE, bytes(4)), with_crc=False) == data[:-3] + b"\x00\x00\x7e"
     (found,) = FrameReader().feed(data)
     assert found == Frame(0x11, bytes(4))
     assert found.crc_good
@@ -40,17 +74,6 @@ def test_both_marks_are_escaped():
     frame = Frame(0x11, b"\x7d\x7e\x7d\x7e")
     assert encode(frame) == data
     assert FrameReader().feed(data) == [frame]
-
-
-def test_without_a_crc_zeros_are_sent():
-    """The CRC's place is never left out."""
-    assert encode(Frame(0x11, b"\x68\x0a"), with_crc=False) == bytes.fromhex("7E 00 11 02 68 0A 00 00 7E")
-
-
-@given(st.binary(max_size=60))
-def test_an_address_of_zero_does_not_change_the_crc(data: bytes):
-    """Whether the CRC covers the address, which is not documented, does not matter at address 0."""
-    assert crc_arc(b"\x00" + data) == crc_arc(data)
 
 
 @given(frames)
@@ -69,7 +92,6 @@ def test_how_a_stream_is_cut_changes_nothing(sent: list[Frame], cuts: list[int])
     stream = b"".join(map(encode, sent))
     reader = FrameReader()
     assert [found for part in parts(stream, cuts) for found in reader.feed(part)] == sent
-    assert reader.waiting == b""
 
 
 @given(st.lists(st.tuples(rubbish, frames), max_size=5), rubbish)
@@ -89,8 +111,8 @@ def test_no_stream_stops_a_reader(stream: bytes, cuts: list[int]):
     whole, cut = FrameReader(), FrameReader()
     found = whole.feed(stream)
     assert [item for part in parts(stream, cuts) for item in cut.feed(part)] == found
-    assert whole.waiting == cut.waiting
-    assert len(whole.waiting) <= 110
+    assert whole._held == cut._held
+    assert len(whole._held) <= 110
     frame = Frame(0x15, b"abcd")
     assert whole.feed(b"\x7e" + encode(frame))[-1] == frame
 
@@ -126,6 +148,14 @@ def test_damage_is_said(data: str, reason: str):
     assert found.data == bytes.fromhex(data).strip(b"\x7e")
 
 
+def test_error_codes_have_words():
+    """Every known code is said in words and by number; others by number."""
+    for code in ErrorCode:
+        assert f"(code {code:04X})" in error_words(code)
+        assert "does not know" not in error_words(code)
+    assert "does not know (code 7777)" in error_words(0x7777)
+
+
 def test_a_wrong_crc_is_a_frame_all_the_same():
     """A reader says that the CRC does not fit; what to make of it is the driver's."""
     (found,) = FrameReader().feed(bytes.fromhex("7E 00 11 04 00 00 00 00 F2 82 7E"))
@@ -133,16 +163,152 @@ def test_a_wrong_crc_is_a_frame_all_the_same():
     assert not found.crc_good
 
 
-@pytest.mark.parametrize(("frame", "match"), [(Frame(1, bytes(51)), "at most 50 bytes, got 51"), (Frame(256), "256")])
-def test_what_does_not_fit_is_refused(frame: Frame, match: str):
-    """Too long a payload and too large a command are refused."""
+HALF, MINUS_QUARTER = b"\x3f\x00\x00\x00", b"\xbe\x80\x00\x00"
+
+
+REQUESTS = [
+    (ASK_FIRMWARE, "7E 00 01 02 00 00 A0 3C 7E"),
+    (ask_status(), "7E 00 02 02 00 00 A0 78 7E"),
+    (go_simple(), "7E 00 06 02 00 00 A1 48 7E"),
+    (set_value(0x5002, 0.5), "7E 00 10 06 50 02 3F 00 00 00 1E 88 7E"),
+    (get_value(0x680A), "7E 00 11 02 68 0A 0B 3B 7E"),
+    (set_values({0x6801: 1, 0x6901: 1}), "7E 00 12 0E 00 02 68 01 69 01 00 00 00 01 00 00 00 01 42 49 7E"),
+    (get_values([0x2302, 0x2303]), "7E 00 13 06 00 02 23 02 23 03 AD AC 7E"),
+    (set_vector(0x2600, 10, HALF + MINUS_QUARTER), "7E 00 14 0D 26 00 00 28 08 3F 00 00 00 BE 80 00 00 EF B0 7E"),
+    (get_vector(0x2600, 10, 2), "7E 00 15 05 26 00 00 28 08 52 95 7E"),
+]
+
+
+REPLIES = [
+    (Frame(0x01, b"MRE2"), "7E 00 01 04 4D 52 45 32 F5 E9 7E"),
+    (Frame(0x02, int_cell(0x11)), "7E 00 02 04 00 00 00 11 30 2E 7E"),
+    (Frame(0x06), "7E 00 06 00 03 A0 7E"),
+    (Frame(0x10), "7E 00 10 00 0D C0 7E"),
+    (Frame(0x11, int_cell(300)), "7E 00 11 04 00 00 01 2C F2 CC 7E"),
+    (Frame(0x12), "7E 00 12 00 0C A0 7E"),
+    (values_reply([HALF, MINUS_QUARTER]), "7E 00 13 0A 00 02 3F 00 00 00 BE 80 00 00 9B D7 7E"),
+    (Frame(0x14), "7E 00 14 00 0F 00 7E"),
+    (Frame(0x15, HALF + MINUS_QUARTER), "7E 00 15 08 3F 00 00 00 BE 80 00 00 10 D1 7E"),
+    (refuse(0x11, ErrorCode.FRAME_INVALID), "7E 00 91 04 00 00 00 01 2C 81 7E"),
+    (refuse(0x11, ErrorCode.LENGTH_MISMATCH), "7E 00 91 04 00 00 00 03 AD 40 7E"),
+    (refuse(0x11, ErrorCode.CRC_WRONG), "7E 00 91 04 00 00 00 04 EC 82 7E"),
+    (refuse(0x11, ErrorCode.NO_REGISTER), "7E 00 91 04 00 00 01 01 2D 11 7E"),
+    (refuse(0x10, ErrorCode.OUT_OF_RANGE), "7E 00 90 04 00 00 01 03 AD 01 7E"),
+    (refuse(0x10, ErrorCode.READ_ONLY), "7E 00 90 04 00 00 01 06 6D 02 7E"),
+    (refuse(0x14, ErrorCode.VECTOR_INDEX), "7E 00 94 04 00 00 01 07 AD 46 7E"),
+    (refuse(0x12, ErrorCode.CHAIN), "7E 00 92 04 00 00 02 03 AC 13 7E"),
+]
+
+
+a_cell = st.binary(min_size=4, max_size=4)
+
+
+@pytest.mark.parametrize(("frame", "data"), [*REQUESTS, *REPLIES])
+def test_forms_are_these_bytes(frame: Frame, data: str):
+    """Every request and reply is these bytes, and these bytes are it."""
+    assert encode(frame) == bytes.fromhex(data)
+    assert FrameReader().feed(bytes.fromhex(data)) == [frame]
+
+
+@given(
+    st.dictionaries(
+        st.integers(0, 0xFFFF), st.one_of(st.floats(width=32), st.integers(0, 2**32 - 1)), min_size=1, max_size=8
+    )
+)
+def test_registers_come_back(values: dict[int, float | int]):
+    """What is set in several registers is what the device reads, in order."""
+    found = read_registers(set_values(values).payload, with_cells=True)
+    assert found == [(register, to_cell(value)) for register, value in values.items()]
+    assert read_registers(get_values(list(values)).payload, with_cells=False) == [(one, b"") for one in values]
+    assert read_values(values_reply([cell for _, cell in found]).payload) == [cell for _, cell in found]
+    for register, value in values.items():
+        assert read_register(set_value(register, value).payload) == (register, to_cell(value))
+        assert read_register(get_value(register).payload) == (register, b"")
+
+
+@given(st.integers(0, 16000), st.lists(a_cell, min_size=1, max_size=10))
+def test_vectors_come_back(start: int, held: list[bytes]):
+    """Cells of a vector are addressed in bytes, and come back."""
+    data = b"".join(held)
+    assert read_vector(set_vector(0x2600, start, data).payload) == (0x2600, 4 * start, 4 * len(held), data)
+    assert read_vector(get_vector(0x2600, start, len(held)).payload) == (0x2600, 4 * start, 4 * len(held), b"")
+    assert split_cells(data) == held
+
+
+@given(st.floats(width=32, allow_nan=False), st.integers(-(2**31), 2**32 - 1))
+def test_cells_come_back(number: float, whole: int):
+    """A float32 and an integer of 32 bits pass through a cell."""
+    assert cell_float(float_cell(number)) == number
+    assert cell_int(int_cell(whole)) == whole % 2**32
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (lambda: encode(Frame(1, bytes(51))), "at most 50 bytes, got 51"),
+        (lambda: encode(Frame(256)), "256"),
+        (lambda: float_cell(1e39), "fits a float32, got 1e"),
+        (lambda: int_cell(2**32), "32 bits, got 4294967296"),
+        (lambda: get_values([]), "1 to 8 registers, got 0"),
+        (lambda: get_values(list(range(9))), "1 to 8 registers, got 9; send several"),
+        (lambda: get_vector(0x2600, -1, 2), "got 2 from -1"),
+        (lambda: get_vector(0x2600, 16383, 2), "got 2 from 16383"),
+        (lambda: read_register(b"\x00"), "2 or 6 bytes, got 1"),
+        (lambda: read_registers(b"\x00\x02\x11", with_cells=False), "expected 6 bytes for 2 registers, got 3"),
+        (lambda: read_values(b"\x00\x02\x11"), "expected 10 bytes for 2 values, got 3"),
+        (lambda: read_vector(b"\x26"), "5 bytes or more, got 1"),
+        (lambda: split_cells(b"12345"), "whole cells of 4 bytes, got 5"),
+        (lambda: cell_int(b"123"), "expected 4 bytes for a cell, got 3"),
+    ],
+)
+def test_payloads_that_do_not_fit_are_refused(make, match):
+    """Numbers and lengths that no payload has are refused, with what was expected."""
     with pytest.raises(ShapeError, match=match):
-        encode(frame)
+        make()
 
 
-@pytest.mark.parametrize("code", list(ErrorCode))
-def test_error_codes_have_words(code: ErrorCode):
-    """Every known code is said in words and by number; others by number."""
-    assert f"(code {code:04X})" in error_words(code)
-    assert "does not know" not in error_words(code)
-    assert "does not know (code 7777)" in error_words(0x7777)
+def test_registers_have_the_published_ids():
+    """Ids are system times 256 plus number."""
+    assert (X.static_xy, Y.static_xy) == (0x5002, 0x5102)
+    assert [X.vector(register) for register in VectorRegister] == list(range(0x6800, 0x680B))
+    assert Y.vector(VectorRegister.INDEX) == 0x690A
+    assert (X.input, X.control, Y.input, Y.control) == (0x4000, 0x4002, 0x4005, 0x4007)
+    assert (X.xy_system, Y.xy_system, X.vector_system, Y.static_system) == (0xC0, 0xC1, 0x68, 0x51)
+    assert (VECTOR_MEMORY, FEEDBACK_X, FEEDBACK_Y, log_slot(5)) == (0x2600, 0x2302, 0x2303, 0x2405)
+
+
+@pytest.mark.parametrize(
+    ("bit", "words"),
+    [
+        (0, "not connected"),
+        (1, "electronics are too warm"),
+        (2, "mirror is too warm"),
+        (3, "calibration"),
+        (4, "not at rest"),
+        (5, "drive is at its limit"),
+        (6, "average is at"),
+        (7, "trimmed"),
+        (8, "was not connected"),
+        (9, "electronics were"),
+        (10, "mirror was too warm"),
+        (11, "drive was at"),
+        (12, "average was at"),
+        (13, "target was trimmed"),
+        (14, "bit 14, whose meaning"),
+        (31, "bit 31"),
+    ],
+)
+def test_every_bit_has_words(bit: int, words: str):
+    """An operator reads what is the case, not a number; only what holds now, and moves no mirror, stops motion."""
+    status = Status(1 << bit)
+    assert len(status.words) == 1
+    assert words in status.words[0]
+    assert f"status {1 << bit:08X}: " in status.sentence
+    assert status.stops_motion == (bit in (0, 1, 2, 3))
+
+
+def test_all_is_well_is_said_too():
+    """No bit, no trouble."""
+    assert Status(0).words == []
+    assert "nothing is amiss" in Status(0).sentence
+    assert not Status(0).stops_motion

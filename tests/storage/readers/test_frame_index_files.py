@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SceneError
-from pipeline.rig.camera.frame_index import times_of_lines
+from pipeline.rig.camera.camera_texts import times_of_lines
 from storage.readers.headwall_folders import load_frame_index
 
 

@@ -1,4 +1,4 @@
-"""Frames of a capture and lines of its sweep: what the camera dropped is not valid, what contradicts is not used."""
+"""What captures are called, and their frames as lines: none that was dropped, or is contradicted, counts."""
 
 from __future__ import annotations
 
@@ -7,14 +7,65 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.errors import SettingsError
+from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_cubes import CapturedLines
-from pipeline.rig.camera.frame_index import LineTimes
-from pipeline.rig.capture.capture_journal import CaptureRecord, LoggedPath
-from pipeline.rig.capture.capture_paths import UntiedError, next_path, place_lines
+from pipeline.rig.camera.camera_texts import LineTimes
+from pipeline.rig.capture.capture_paths import (
+    REFERENCES,
+    Announced,
+    CaptureRecord,
+    LoggedPath,
+    UntiedError,
+    announced,
+    capture_prefix,
+    next_path,
+    place_lines,
+)
 from pipeline.rig.capture.line_positions import MirrorTrack
+from pipeline.rig.device_settings import check_capture
 from tests.rig.small_rig import CAMERA, COARSE, FINE
 
+
+def test_prefix_of_a_sweep_is_readable() -> None:
+    """Short numbers stand there as they are."""
+    sweep = Sweep("coarse-0", "coarse", "y", -31.5, 0.5, 96, 16, 16)
+    assert capture_prefix(sweep) == "coarse-0_cy-31p5_0p5_96x16x16_0"
+
+
+def test_every_sweep_comes_back() -> None:
+    """To the last bit of its numbers, from any line on, and always as a name that cameras take."""
+    rng = np.random.default_rng(0)
+    for number in range(300):
+        odd = rng.normal(size=2) * 10.0 ** rng.integers(-9, 9, 2)
+        strip, start = (float(rng.choice([one, -0.5, -0.0, 7.0, 1e300])) for one in odd)
+        turned = Sweep(f"fine-{number:03d}", "fine", "y", strip, start, int(rng.integers(1, 3000)), 4, 4)
+        sweep = turned if number % 2 else replace(turned, kind="coarse", along="x")
+        told = Announced(sweep, int(rng.integers(sweep.lines)))
+        prefix = capture_prefix(*vars(told).values())
+        check_capture(1, 1, prefix)
+        assert announced(prefix) == told
+        assert str(announced(prefix)) == str(told)  # the sign of zero
+
+
+@pytest.mark.parametrize(
+    "prefix", ["", "field", REFERENCES, "a_cx0_0_0x1x1_0", "a_cx0_0_5x1x1_5", "a_cz0_0_5x1x1_0", "a_cx0_0_5x1_0"]
+)
+def test_other_prefixes_announce_nothing(prefix: str) -> None:
+    """Names that others gave, and sweeps that cannot be."""
+    assert announced(prefix) is None
+
+
+@pytest.mark.parametrize("name", ["a b", "é", "x" * 60])
+def test_names_that_no_folder_has_are_refused(name: str) -> None:
+    """Before anything is sent."""
+    with pytest.raises(SettingsError, match="letters, digits"):
+        capture_prefix(Sweep(name, "fine", "x", 0.0, 0.0, 5))
+
+
 PATH = next_path(FINE, 3, CAMERA, vector_pairs=7, triggered=True)  # lines 3 to 9
+
+
 TAKEN = CaptureRecord(FINE, 3, 9, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=6)
 
 
@@ -25,7 +76,7 @@ def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
     valid = np.arange(count) < len(numbers)
     stamps = np.where(told >= 0, 10**15 + told * 100_000, -1)
     return CapturedLines(
-        np.zeros((count, 48, 3), np.uint16), valid, first, LineTimes(told, stamps, np.full(count, np.nan), ()), None, ()
+        np.zeros((count, 48, 3), np.uint16), valid, first, LineTimes(told, stamps, np.full(count, np.nan), ()), ()
     )
 
 
@@ -57,21 +108,18 @@ def test_whole_capture_without_an_index_is_in_order():
         place_lines(frames([-1] * 5), PATH, replace(TAKEN, index_at_end=None), CAMERA, None)
 
 
-@pytest.mark.parametrize("index", [0, 5, 7])
-def test_mirror_that_stepped_otherwise_is_not_believed(index: int):
-    """One edge too few or too many: which lines are off is not known."""
-    with pytest.raises(UntiedError, match=rf"stands at cell {index} of its path, after 6 frames cell 6 was expected"):
-        place_lines(frames(list(range(6))), PATH, replace(TAKEN, index_at_end=index), CAMERA, None)
-
-
-@pytest.mark.parametrize("index", [5, 6, 7, 9])
-def test_mirror_that_stands_within_a_line_is_not_believed(index: int):
-    """Coarse lines hold four cells each: two of them end at cell 8, and whoever stands beside it lost an edge."""
-    path = next_path(COARSE, 2, CAMERA, vector_pairs=12, triggered=True)
-    taken = CaptureRecord(COARSE, 2, 4, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=8)
-    assert place_lines(frames([0, 1]), path, taken, CAMERA, None).row.tolist() == [0, 1]
-    with pytest.raises(UntiedError, match=rf"stands at cell {index} of its path, after 2 frames cell 8 was expected"):
-        place_lines(frames([0, 1]), path, replace(taken, index_at_end=index), CAMERA, None)
+@pytest.mark.parametrize(("sweep", "last"), [(FINE, 6), (COARSE, 8)], ids=lambda value: getattr(value, "kind", ""))
+def test_mirror_that_stepped_otherwise_is_not_believed(sweep: Sweep, last: int):
+    """One edge too few or too many, in a coarse line's four cells too: which lines are off is not known."""
+    path = next_path(sweep, 2, CAMERA, vector_pairs=12, triggered=True)
+    count = last // sweep.step
+    taken = CaptureRecord(sweep, 2, 2 + count, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=last)
+    seen = frames(list(range(count)))
+    assert place_lines(seen, path, taken, CAMERA, None).row.tolist() == list(range(count))
+    for index in (0, last - 3, last - 2, last - 1, last + 1):
+        words = rf"stands at cell {index} of its path, after {count} frames cell {last} was expected"
+        with pytest.raises(UntiedError, match=words):
+            place_lines(seen, path, replace(taken, index_at_end=index), CAMERA, None)
 
 
 def test_log_began_before_its_acknowledgement():

@@ -1,4 +1,4 @@
-"""Serial ports: a pseudo terminal in place of the device, and every way in which a port is not there."""
+"""What devices are waited for with, their settings, and serial ports in every way in which one is not there."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import sys
 import threading
 import tty
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import serial
 
 from pipeline.errors import SettingsError
-from pipeline.rig.clock import SYSTEM_CLOCK
-from pipeline.rig.device_errors import DeadlinePassed, DeviceGone
+from pipeline.rig.device_settings import MirrorSettings
+from pipeline.rig.devices import SYSTEM_CLOCK, DeadlinePassed, DeviceGone, ManualClock
 from pipeline.rig.transports import SerialTransport
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo terminals are of POSIX systems")
@@ -56,19 +57,13 @@ def test_bytes_pass_both_ways(ends: tuple[int, str], baud: int):
     line.close()
 
 
-def test_reading_ends_at_the_deadline(ends: tuple[int, str]):
-    """Nothing comes: nothing is given, and a deadline that has passed is not waited for."""
+def test_reading_ends_at_the_deadline_and_draining_at_once(ends: tuple[int, str]):
+    """Nothing comes: nothing is given, and a deadline that has passed is not waited for; what is there is, once."""
     line = SerialTransport(ends[1], 115200)
     assert line.read(10, SYSTEM_CLOCK.now() + 0.03) == b""
     assert line.read(10, SYSTEM_CLOCK.now() - 1) == b""
     with pytest.raises(DeadlinePassed, match="no time was left to send 1 bytes"):
         line.write(b"x", SYSTEM_CLOCK.now() - 1)
-    line.close()
-
-
-def test_draining_gives_what_is_there(ends: tuple[int, str]):
-    """Without waiting, and once."""
-    line = SerialTransport(ends[1], 115200)
     os.write(ends[0], b"stale")
     assert line.read(1, soon()) == b"s"
     assert line.drain() == b"tale"
@@ -97,11 +92,15 @@ def test_a_device_that_goes_away_is_said(ends: tuple[int, str]):
 
 
 def test_a_full_line_does_not_hold_up(ends: tuple[int, str]):
-    """A device that takes no bytes costs the write's own time, not forever."""
+    """A device that takes no bytes costs the write's own time; addresses and speeds that mean nothing are settings."""
     line = SerialTransport(ends[1], 115200)
     with pytest.raises(DeadlinePassed, match=r"did not take 1000000 bytes within 0.25 s"):
         line.write(bytes(1_000_000), soon())
     line.close()
+    with pytest.raises(SettingsError, match=r"an address that pyserial knows, .* got 'nonsense://x'"):
+        SerialTransport("nonsense://x", 115200)
+    with pytest.raises(SettingsError, match=r"and a speed, got .* at -5"):
+        SerialTransport(ends[1], -5)
 
 
 def test_no_port_says_which_there_are(monkeypatch: pytest.MonkeyPatch):
@@ -139,14 +138,6 @@ def test_other_refusals_to_open_say_what_to_do(monkeypatch: pytest.MonkeyPatch, 
         SerialTransport("x", 115200)
 
 
-def test_addresses_that_mean_nothing_are_settings(ends: tuple[int, str]):
-    """A kind of address that pyserial does not have, and a speed below 0."""
-    with pytest.raises(SettingsError, match=r"an address that pyserial knows, .* got 'nonsense://x'"):
-        SerialTransport("nonsense://x", 115200)
-    with pytest.raises(SettingsError, match=r"and a speed, got .* at -5"):
-        SerialTransport(ends[1], -5)
-
-
 def test_a_socket_is_a_port_too():
     """The same driver reaches a device over the network, or an emulator."""
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -167,3 +158,48 @@ def test_a_socket_is_a_port_too():
         assert got == b"START\r\n"
         line.close()
         thread.join(5)
+
+
+def test_clocks_never_go_back():
+    """One that is turned by hand, by sleeping and by advancing; the system's, also where nothing is waited for."""
+    clock = ManualClock(5.0)
+    clock.sleep(1.5)
+    clock.sleep(-3.0)
+    clock.advance(0.5)
+    assert clock.now() == 7.0
+    with pytest.raises(SettingsError, match="only goes forward, got -1"):
+        clock.advance(-1)
+    before = SYSTEM_CLOCK.now()
+    SYSTEM_CLOCK.sleep(-1)
+    SYSTEM_CLOCK.sleep(1e-4)
+    assert SYSTEM_CLOCK.now() > before
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("baud", 0),
+        ("deadline_s", 1000),
+        ("deadline_s", float("nan")),
+        ("retries", -1),
+        ("quiet_s", -1),
+        ("vector_pairs", 0),
+        ("vector_pairs", 8192),
+        ("log_rate_hz", 20000),
+        ("log_samples", True),
+        ("ends", "open"),
+        ("read_back", "some"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(name: str, value: Any):
+    """A number that nothing can mean (a deadline in ms) names the setting and the range, a choice those there are."""
+    with pytest.raises(SettingsError, match=f"mirror.{name} must be (a number from .* to|one of) .*, got '?{value}"):
+        MirrorSettings(**{name: value})
+
+
+def test_defaults_are_assumed_and_say_so():
+    """Nothing was confirmed on hardware."""
+    settings = MirrorSettings()
+    assert settings.provenance == "assumed"
+    assert (settings.vector_pairs, settings.ends, settings.strict_crc) == (1500, "exclusive", False)
+    assert settings.patience.deadline_s == settings.deadline_s

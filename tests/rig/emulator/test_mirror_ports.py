@@ -1,4 +1,4 @@
-"""The emulated controller behind a pty, spoken to by pyserial and by the driver as a real port is."""
+"""Ways to the emulated controller: a line in this process, and a pty that is used as a real port is."""
 
 from __future__ import annotations
 
@@ -12,17 +12,79 @@ import pytest
 import serial
 
 from pipeline.errors import RigError, SettingsError
-from pipeline.rig.clock import SYSTEM_CLOCK
-from pipeline.rig.device_errors import DeviceGone
+from pipeline.rig.device_settings import MirrorSettings
+from pipeline.rig.devices import SYSTEM_CLOCK, DeadlinePassed, DeviceGone, ManualClock
 from pipeline.rig.emulator.emulated_rig import FastClock
 from pipeline.rig.emulator.fault_names import make_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.mirror_ports import EmulatedPort
+from pipeline.rig.emulator.mirror_ports import EmulatedPort, InProcessTransport
 from pipeline.rig.mirror.mirror_controller import open_mirror
-from pipeline.rig.mirror.mirror_settings import MirrorSettings
 
-GET = bytes.fromhex("7e 00 11 02 50 01 59 3c 7e")
-GOT = bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e")
+
+def line(*faults: str, baud: int = 0) -> InProcessTransport:
+    """A line to a controller with faults that strike at once."""
+    clock = ManualClock()
+    return InProcessTransport(MirrorDevice(clock, [make_fault(name, at=0) for name in faults]), clock, baud=baud)
+
+
+def test_bytes_come_in_order_and_no_more_than_asked_for() -> None:
+    """Reads give what is there, in parts if fewer are asked for."""
+    transport = line()
+    transport.write(b"START\r\nGETID\r\n", 1.0)
+    assert transport.drain() == b""
+    assert [transport.read(5, 1.0), transport.read(3, 1.0), transport.read(99, 1.0)] == [b"OK\r\nM", b"R-E", b"-2\r\n"]
+    assert transport.clock.now() < 0.01
+    assert transport.sent == [b"START\r\nGETID\r\n"]
+
+
+def test_bytes_take_their_time_on_the_line() -> None:
+    """At 9600 baud 7 bytes there and 4 back take 11 times 10 bits, besides the controller's own time."""
+    transport = line(baud=9600)
+    transport.write(b"START\r\n", 1.0)
+    assert transport.read(10, 1.0) == b"OK\r\n"
+    assert transport.clock.now() == pytest.approx(110 / 9600 + 2e-4)
+
+
+@pytest.mark.parametrize(("name", "acts"), [("gone-before", 0), ("gone-within", 0), ("gone-after", 1)])
+def test_a_device_that_goes_is_gone(name: str, acts: int) -> None:
+    """Whether it is gone at once or when it is read from, and for good; only after a request it was carried out."""
+    transport = line(name)
+
+    def ask() -> None:
+        transport.write(b"START\r\n", 1.0)
+        transport.read(10, 1.0)
+
+    for _ in range(2):
+        with pytest.raises(DeviceGone, match="went away; look at the cable"):
+            ask()
+    assert len(transport.device.acts) == acts
+
+
+def test_a_port_that_hangs_takes_nothing_until_the_deadline() -> None:
+    """The first bytes go nowhere, then writing blocks until its deadline."""
+    transport = line("hangs")
+    transport.write(b"START\r\n", 1.0)
+    assert transport.read(10, 1.0) == b""
+    with pytest.raises(DeadlinePassed, match="did not take 7 bytes"):
+        transport.write(b"START\r\n", 3.0)
+    assert transport.clock.now() == 3.0
+
+
+def test_a_line_waits_until_its_deadline_and_is_closed_for_good() -> None:
+    """Where nothing comes, the clock stands at the deadline; once it is closed nothing can be sent or read."""
+    transport = line()
+    assert transport.read(10, 2.5) == b""
+    assert transport.clock.now() == 2.5
+    transport.close()
+    for use in (lambda: transport.write(b"START\r\n", 1.0), lambda: transport.read(1, 1.0)):
+        with pytest.raises(DeviceGone, match="is closed"):
+            use()
+
+
+ASKED = bytes.fromhex("7e 00 11 02 50 01 59 3c 7e")
+
+
+REPLIED = bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e")
 
 
 @contextmanager
@@ -46,10 +108,10 @@ def test_both_modes_speak_through_the_pty() -> None:
     with opened() as (_, user):
         user.write(b"START\r\n")
         assert user.read_until(b"\n") == b"OK\r\n"
-        user.write(b"GOPROCRC\r\n" + GET)
-        assert user.read(4 + len(GOT)) == b"OK\r\n" + GOT
-        user.write(bytes.fromhex("7e 00 03 1a 11 13 0a 0d 7e") + GET)
-        assert user.read_until(GOT).endswith(GOT)
+        user.write(b"GOPROCRC\r\n" + ASKED)
+        assert user.read(4 + len(REPLIED)) == b"OK\r\n" + REPLIED
+        user.write(bytes.fromhex("7e 00 03 1a 11 13 0a 0d 7e") + ASKED)
+        assert user.read_until(REPLIED).endswith(REPLIED)
 
 
 def test_two_users_cannot_have_one_port() -> None:
@@ -62,7 +124,7 @@ def test_a_port_can_be_used_again_and_the_controller_goes_on() -> None:
     """A user who goes and one who comes find the controller as it was left: in pro mode."""
     device = MirrorDevice(SYSTEM_CLOCK)
     with EmulatedPort(device) as port:
-        for sent, back in ((b"GOPRO\r\n", b"OK\r\n"), (GET, GOT)):
+        for sent, back in ((b"GOPRO\r\n", b"OK\r\n"), (ASKED, REPLIED)):
             with serial.Serial(port.path, 115200, timeout=2.0, exclusive=True) as user:
                 user.write(sent)
                 assert user.read(len(back)) == back
@@ -111,7 +173,7 @@ def test_bytes_keep_to_the_speed() -> None:
 
 
 def test_the_driver_drives_it() -> None:
-    """The driver connects, moves, loads and lets go, through a real pty."""
+    """The driver connects, moves, loads and lets go, through a real pty; a device that goes is told as such."""
     device = MirrorDevice(SYSTEM_CLOCK)
     with EmulatedPort(device) as port, open_mirror(MirrorSettings(port=port.path)) as mirror:
         assert mirror.identity().device == "MR-E-2"
@@ -119,10 +181,6 @@ def test_the_driver_drives_it() -> None:
         mirror.settle(2.0)
         assert device.positions(SYSTEM_CLOCK.now()) == pytest.approx((0.1, -0.2), abs=1e-3)
         mirror.load_path([(0.0, 0.0), (0.1, 0.1)], "all")
-
-
-def test_the_driver_says_that_the_cable_was_pulled() -> None:
-    """A device that goes is told as such, with what to do."""
     device = MirrorDevice(SYSTEM_CLOCK, [make_fault("gone-before", at=5)])
     with EmulatedPort(device) as port, pytest.raises(DeviceGone, match=f"{port.path} went away"):
         open_mirror(MirrorSettings(port=port.path)).goto(0.0, 0.0)

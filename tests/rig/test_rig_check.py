@@ -11,20 +11,18 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import log_in
-from pipeline.rig.camera.camera_settings import FileServer
 from pipeline.rig.capture.capture_paths import capture_prefix
-from pipeline.rig.clock import ManualClock
-from pipeline.rig.device_errors import DeviceGone, DeviceRefused
-from pipeline.rig.emulator.camera_device import CameraFault, CameraFaults, CameraUnit
+from pipeline.rig.device_settings import FileServer, MirrorSettings
+from pipeline.rig.devices import DeviceGone, DeviceRefused, ManualClock
+from pipeline.rig.emulator.camera_device import CameraUnit
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, InProcessRig
-from pipeline.rig.emulator.exchange import Mode
-from pipeline.rig.emulator.fault_names import make_fault
+from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults, make_fault
+from pipeline.rig.emulator.mirror_device import Mode
 from pipeline.rig.mirror.mirror_controller import MirrorController
-from pipeline.rig.mirror.mirror_settings import MirrorSettings
+from pipeline.rig.mirror.path_player import MotionLog
 from pipeline.rig.mirror.pro_mode import Command
 from pipeline.rig.mirror.registers import Status
-from pipeline.rig.mirror.steering import MotionLog
-from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, works
+from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, failed, works
 from tests.rig.small_rig import FINE, small_source
 
 SETS = {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
@@ -94,6 +92,7 @@ def test_square_is_gone_round_and_read_back() -> None:
         ("wrong-firmware", "identity", "rig.expected_id"),
         ("mirror-warm", "status", "motions are refused"),
         ("disconnected", "status", "motions are refused"),
+        ("never-stable", "status", "waits for rest in vain"),  # as a survey would wait
         ("modem", "connect", ""),
         ("echo", "connect", ""),
         ("mute", "connect", "is the controller on"),
@@ -112,13 +111,20 @@ def test_faults_fail_and_nothing_moves(fault: str, asked: str, mend: str) -> Non
             assert "move" in told(rows, "warn")
 
 
-def test_expected_id_is_taken_for_the_mirror() -> None:
-    """A controller of another name is no failure where the settings name it, and one where they name another."""
+def test_rows_of_what_is_odd() -> None:
+    """Another name is no failure where the settings name it; lost bytes are a warning; a trimmed motion ends it."""
     with rig("wrong-firmware") as line:
         assert works(mirror_rows(line, expected_id="LENS"), "mirror")
     with rig() as line:
         rows = mirror_rows(line, expected_id="MR-9")
         assert "expected a controller whose id holds 'MR-9'" in rows[0].came
+    with rig("reply-byte-lost") as line:
+        rows = mirror_rows(line)
+        assert told(rows, "warn") == ["bytes on the line"]
+        assert works(rows, "mirror")
+    with rig("trimmed") as line:
+        assert told(mirror_rows(line, move=True), "fail") == ["go to 0.03; 0.03"]
+    assert failed("mirror", "connect", RigError("no")) == CheckRow("mirror", "connect", "no", "fail", "")
 
 
 def test_controller_in_pro_mode_is_no_fault() -> None:
@@ -128,25 +134,6 @@ def test_controller_in_pro_mode_is_no_fault() -> None:
         rows = mirror_rows(line)
         assert [row.asked for row in rows] == ["identity", "mode", "status", "path", "temperature"]
         assert {row.verdict for row in rows} == {"ok"}
-
-
-def test_damaged_answers_are_told() -> None:
-    """An answer that was lost and asked for again is a warning about the line."""
-    with rig("reply-byte-lost") as line:
-        rows = mirror_rows(line)
-        assert told(rows, "warn") == ["bytes on the line"]
-        assert works(rows, "mirror")
-
-
-def test_mirror_that_never_rests() -> None:
-    """A survey would wait for it in vain: it is told as failing, and nothing is moved."""
-    with rig("never-stable") as line:
-        rows = mirror_rows(line, move=True)
-        assert told(rows, "fail") == ["status"]
-        (status,) = [row for row in rows if row.asked == "status"]
-        assert "not at rest" in status.came
-        assert "waits for rest in vain" in status.mend
-        assert rows[-1].came == "nothing was moved"
 
 
 def test_mirror_that_comes_to_rest_in_time() -> None:
@@ -159,12 +146,6 @@ def test_mirror_that_comes_to_rest_in_time() -> None:
             rows = mirror_rows(line)
         assert told(rows, "fail") == told(rows, "warn") == []
         assert left == []
-
-
-def test_mirror_elsewhere_fails() -> None:
-    """A motion that the device took for a trimmed one is not walked on from."""
-    with rig("trimmed") as line:
-        assert told(mirror_rows(line, move=True), "fail") == ["go to 0.03; 0.03"]
 
 
 def test_position_that_is_no_number_fails(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,7 +183,7 @@ def test_camera_in_order() -> None:
 
 
 def test_camera_out_of_order() -> None:
-    """No control, no files, another password: a row each, and the other is asked all the same."""
+    """No control, no files, another password, an empty listing: a row each, and the other is asked all the same."""
     with rig(camera=CameraFaults({CameraFault.HANGS_UP: 9})) as line:
         assert told(check_camera(line.camera(), line.files), "fail") == ["connect"]
     with rig() as line:
@@ -212,17 +193,6 @@ def test_camera_out_of_order() -> None:
         with pytest.raises(DeviceRefused, match="password"):
             log_in(other)
         assert log_in(line.files) == "emulated camera"
-
-
-def test_error_without_a_remedy_is_a_row() -> None:
-    """Nothing is lost of a message without a semicolon."""
-    from pipeline.rig.rig_check import failed
-
-    assert failed("mirror", "connect", RigError("no")) == CheckRow("mirror", "connect", "no", "fail", "")
-
-
-def test_empty_camera_has_nothing() -> None:
-    """A listing without entries says so."""
     with rig() as line:
         line.rig.camera.unit = CameraUnit(root="/")
         assert [row.came for row in check_camera(line.camera(), line.files)][1] == "nothing there"

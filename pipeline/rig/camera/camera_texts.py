@@ -1,0 +1,268 @@
+"""Texts that cameras write beside their numbers: ENVI headers taken apart into fields, and frame indices.
+
+A header is ``key = value`` lines after the word ENVI; values in braces may run over lines and be nested. Headwall adds
+lines that begin with ``;``, some of which hold settings of their own. What a header must say is for whoever reads it:
+files from anywhere (``storage.readers.envi_cubes``), or a camera's own (``camera_cubes``).
+
+``frameIndex_<n>.txt`` lies beside ``raw_<n>``: a heading, then a line a frame with its number and its time in
+microseconds. Versions of the camera's program differ in what stands between the two (a tab or spaces) and in the line
+ends; frames may be missing or listed twice. Tested on small indices made in these layouts.
+"""
+
+from __future__ import annotations
+
+import re
+from array import array
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+
+UNBALANCED = "opens more braces than it closes"
+MOST_UNBALANCED = 16  # values that open more braces than they close: looking for each one's end reads the rest
+NANOMETRES = {"nm", "nanometer", "nanometers", "nanometre", "nanometres"}
+MICROMETRES = {"um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"}
+UNSAID = {"", "unknown"}
+LONGEST_LINE = 1000  # characters; a frame's line has about 25
+_LARGEST = 2**62
+_WHOLE = re.compile(r"-?\d{1,19}")
+_BETWEEN_COLUMNS = re.compile(r"[\t,;]+|\s{2,}")  # where a heading has such; a single space may stand in a name
+_MS = {"us": 1e-3, "µs": 1e-3, "μs": 1e-3, "microseconds": 1e-3, "s": 1e3, "sec": 1e3, "seconds": 1e3}
+
+
+def split_header(text: str, where: str, notes: list[str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Fields, and settings in comments: as written, keys in lower case, the outer braces taken off.
+
+    What was made of strange forms is added to ``notes``; messages call the header ``where``. SceneError where it does
+    not begin with ENVI (ArcGIS headers do not), or a brace is never closed.
+    """
+    lines = text.lstrip("\ufeff").splitlines()
+    first = next((number for number, line in enumerate(lines) if line.strip()), None)
+    if first is None or lines[first].strip().upper() != "ENVI":
+        begins = "is empty" if first is None else f"begins with {lines[first].strip()[:40]!r}"
+        raise SceneError(f"{where} {begins}, expected ENVI on its own line; it is no ENVI header, name another")
+    settings: dict[str, str] = {}
+    plain: list[str] = []
+    for line in lines[first + 1 :]:
+        if not line.lstrip().startswith(";"):
+            plain.append(line)
+        elif sign := re.search(r"[=:]", line):
+            key = line[: sign.start()].lstrip()[1:].strip()
+            if key:
+                settings[key.lower()] = line[sign.end() :].strip()
+    fields: dict[str, str] = {}
+    for key, value in _pairs(plain, where, notes):
+        if fields.get(key, value) != value:
+            notes.append(f"{key} is given twice, the last one counts")
+        fields[key] = value
+    return fields, settings
+
+
+def _pairs(lines: list[str], where: str, notes: list[str]) -> Iterator[tuple[str, str]]:
+    """Keys and values, the outer braces taken off."""
+    number = 0
+    while number < len(lines):
+        line = lines[number].strip()
+        number += 1
+        key, sign, value = (part.strip() for part in line.partition("="))
+        if not sign or not key or re.search(r"[{}]", key):
+            if line:
+                notes.append(f"passed over {line[:40]!r}, which is no key = value")
+            continue
+        key = " ".join(key.split()).lower()
+        if value.startswith("{"):
+            value, number = _braced(value, lines, number, f"{where}: {key}", notes)
+        yield key, value
+
+
+def _braced(value: str, lines: list[str], number: int, where: str, notes: list[str]) -> tuple[str, int]:
+    """The inside of a value that begins with a brace, to where it closes, and the number of the line after it."""
+    parts = [value]
+    depth = _depth(value)
+    end = number
+    while depth > 0 and end < len(lines):
+        parts.append(lines[end])
+        depth += _depth(lines[end])
+        end += 1
+    if depth > 0:  # one brace too many inside: the first line that ends with one closes it all
+        ends = [at for at, part in enumerate(parts) if part.rstrip().endswith("}")]
+        if not ends:
+            raise SceneError(f"{where} opens a brace that is never closed; is the header cut off?")
+        parts, end = parts[: ends[0] + 1], number + ends[0]
+        notes.append(f"{where} {UNBALANCED}")
+        if sum(note.endswith(UNBALANCED) for note in notes) > MOST_UNBALANCED:
+            raise SceneError(f"{where} {UNBALANCED}, as do {MOST_UNBALANCED} values before it; correct the header")
+    whole = "\n".join(parts)
+    close = whole.rfind("}")
+    return whole[1 : close if close > 0 else None].strip(), end
+
+
+def _depth(text: str) -> int:
+    """Braces opened less those closed; escaped ones do not count."""
+    bare = re.sub(r"\\[{}]", "", text)
+    return bare.count("{") - bare.count("}")
+
+
+def finite_number(text: str) -> float | None:
+    """The number that a text is; None where it is none, or not finite."""
+    try:
+        number = float(text)
+    except ValueError:
+        return None
+    return number if np.isfinite(number) else None
+
+
+def wavelengths_nm(
+    fields: Mapping[str, str], channels: int, notes: list[str]
+) -> tuple[NDArray[np.float64] | None, float]:
+    """(band,) centres [nm] and what one of the header's units is in nm.
+
+    Without a unit they are read as nm or micrometres by their size; those that do not fit the bands are left out. Notes
+    say so.
+    """
+    values = listed_numbers(fields, "wavelength", channels, notes)
+    if values is None:
+        return None, 1.0
+    unit = fields.get("wavelength units", "").strip().lower()
+    if unit in NANOMETRES:
+        scale = 1.0
+    elif unit in MICROMETRES:
+        scale = 1000.0
+    elif unit in UNSAID and 200 <= values.min() <= values.max() <= 20000:
+        scale = 1.0
+        notes.append("the wavelengths have no unit, read as nm by their size")
+    elif unit in UNSAID and 0.2 <= values.min() <= values.max() <= 20:
+        scale = 1000.0
+        notes.append("the wavelengths have no unit, read as micrometres by their size")
+    else:
+        notes.append(f"wavelength units = {unit!r} are no lengths that can be read; the wavelengths are left out")
+        return None, 1.0
+    return values * scale, scale
+
+
+def listed_numbers(fields: Mapping[str, str], key: str, count: int, notes: list[str]) -> NDArray[np.float64] | None:
+    """Numbers of a list, whatever commas and spaces stand between them; None with a note where it is none."""
+    if key not in fields:
+        return None
+    words = [word for word in re.split(r"[,\s]+", fields[key]) if word]
+    numbers = [finite_number(word) for word in words]
+    if len(words) != count or None in numbers:
+        wrong = next((word for word, number in zip(words, numbers, strict=True) if number is None), None)
+        why = f"{len(words)} for {count} bands" if wrong is None else f"{wrong!r} is no number"
+        notes.append(f"{key} is left out: {why}")
+        return None
+    return np.array(numbers, np.float64)
+
+
+@dataclass(frozen=True)
+class FrameIndex:
+    """Frames by ascending number, each once."""
+
+    frame: NDArray[np.int64]  # (entry,)
+    stamp_us: NDArray[np.int64]  # (entry,) microseconds, of an origin that the file does not say
+    exposure_ms: NDArray[np.float64] | None  # (entry,) where the heading names such a column
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class LineTimes:
+    """What an index says of the lines of one file; -1 or NaN where it says nothing."""
+
+    frame: NDArray[np.int64]  # (line,)
+    stamp_us: NDArray[np.int64]  # (line,)
+    exposure_ms: NDArray[np.float64]  # (line,)
+    notes: tuple[str, ...]
+
+
+@dataclass
+class _Rows:
+    """Lines of an index, as they stand in it."""
+
+    frame: array[int] = field(default_factory=lambda: array("q"))
+    stamp: array[int] = field(default_factory=lambda: array("q"))
+    exposure_ms: array[float] | None = None
+    odd: int = 0  # lines that are no frame
+
+
+def parse_frame_index(lines: Iterable[str], name: str = "the frame index", where: str = "") -> FrameIndex:
+    """Read an index's lines; what is no frame is passed over and counted, of a frame listed twice the first counts.
+
+    Notes call it ``name``, messages ``where`` if its name alone does not say. SceneError where no line is a frame.
+    """
+    rows = _rows(lines)
+    if not rows.frame:
+        raise SceneError(
+            f"{where or name} lists no frame, expected lines of number and microseconds; take it away or repair it"
+        )
+    numbers, first = np.unique(np.array(rows.frame, np.int64), return_index=True)
+    notes = [f"{name}: {rows.odd} lines are no frames"] if rows.odd else []
+    if len(numbers) < len(rows.frame):
+        notes.append(f"{name}: {len(rows.frame) - len(numbers)} frames are listed twice, the first counts")
+    exposures = None if rows.exposure_ms is None else np.array(rows.exposure_ms)[first]
+    stamps = np.array(rows.stamp, np.int64)[first]
+    if (np.diff(stamps) < 0).any():
+        notes.append(f"{name}: time goes back {np.count_nonzero(np.diff(stamps) < 0)} times")
+    return FrameIndex(numbers, stamps, exposures, tuple(notes))
+
+
+def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 0) -> LineTimes:
+    """Give each of a file's ``lines`` its frame and time.
+
+    Lines are frames in order, the first of them ``first_frame`` (the number in the file's name). Where as many frames
+    are listed as there are lines, they are its lines whatever their numbers: the camera dropped those missing. So they
+    are where as many are listed as there were lines before the file lost its last ``lost`` ones. An index whose numbers
+    begin at 0 in a later file counts from that file's start.
+    """
+    if len(index.frame) in (lines, lines + lost):
+        exposure = np.full(lines, np.nan) if index.exposure_ms is None else index.exposure_ms[:lines]
+        dropped = int(index.frame[-1] - index.frame[0]) + 1 - len(index.frame)
+        notes = (f"{dropped} frames between the first and the last were dropped by the camera",) if dropped else ()
+        return LineTimes(index.frame[:lines], index.stamp_us[:lines], exposure, notes)
+    origin = 0 if index.frame[0] == 0 else first_frame
+    found = LineTimes(np.full(lines, -1), np.full(lines, -1), np.full(lines, np.nan), ())
+    place = index.frame - origin
+    inside = (place >= 0) & (place < lines)
+    found.frame[place[inside]] = index.frame[inside]
+    found.stamp_us[place[inside]] = index.stamp_us[inside]
+    if index.exposure_ms is not None:
+        found.exposure_ms[place[inside]] = index.exposure_ms[inside]
+    told, beyond = int(np.count_nonzero(inside)), int(np.count_nonzero(~inside))
+    said: tuple[str, ...] = () if told == lines else (f"the frame index tells the time of {told} of {lines} lines",)
+    said += (f"the frame index lists {beyond} frames beyond the lines",) if beyond else ()
+    return replace(found, notes=said)
+
+
+def _rows(lines: Iterable[str]) -> _Rows:
+    """Numbers of all lines that are frames; other lines are counted."""
+    rows = _Rows()
+    column, scale = None, 1.0
+    for number, line in enumerate(lines):
+        words = [word for word in re.split(r"[\t ,;]+", line.strip()) if word]
+        if len(words) >= 2 and all(_WHOLE.fullmatch(word) for word in words[:2]):
+            frame, stamp = int(words[0]), int(words[1])
+            if 0 <= frame < _LARGEST and 0 <= stamp < _LARGEST:
+                rows.frame.append(frame)
+                rows.stamp.append(stamp)
+                if rows.exposure_ms is not None and column is not None:
+                    number_there = finite_number(words[column]) if column < len(words) else None
+                    rows.exposure_ms.append(float("nan") if number_there is None else number_there * scale)
+                continue
+        if number == 0:
+            column, scale = _exposure_column(line.strip().lower())
+            rows.exposure_ms = None if column is None else array("d")
+        elif words:
+            rows.odd += 1
+    return rows
+
+
+def _exposure_column(heading: str) -> tuple[int | None, float]:
+    """Which column holds exposures, and what one of its units is in ms; they are ms where nothing is said."""
+    titles = [word for word in _BETWEEN_COLUMNS.split(heading) if word]
+    if len(titles) < 2:
+        titles = heading.split()
+    column = next((at for at, word in enumerate(titles) if at > 1 and word.strip().startswith("exposure")), None)
+    unit = "" if column is None else re.sub(r"^exposure[^(\[]*[(\[]?|[)\]\s]+$", "", titles[column].strip())
+    return column, _MS.get(unit, 1.0)
