@@ -32,18 +32,14 @@ class Beyond:
 
 def beyond_range(values: NDArray[Any], most: float = MOST_VALUE) -> NDArray[np.bool_] | None:
     """Which values are larger than ``most`` by size, infinite ones too; None where none is. NaN is no value at all."""
-    if not values.size or values.dtype.kind not in "fiu" or _too_short(values.dtype, most):
+    kind = values.dtype
+    if not values.size or kind.kind not in "fiu" or (kind.kind in "iu" and np.iinfo(kind).max <= most):
         return None
     low, high = values.min(), values.max()
     if -most <= low and high <= most:
         return None
     found: NDArray[np.bool_] = (values > most) | (values < -most)
     return found if found.any() else None
-
-
-def _too_short(kind: np.dtype[Any], most: float) -> bool:
-    """Whether numbers of a kind cannot be larger."""
-    return bool(kind.kind in "iu" and np.iinfo(kind).max <= most)
 
 
 def find_beyond(values: NDArray[Any], most: float = MOST_VALUE) -> Beyond | None:

@@ -21,7 +21,7 @@ from flows.simulate.command import open_simulation
 from flows.survey.stages.effects import choose_effects, source_with
 from flows.terminal.shown_text import print_json
 from pipeline.errors import SettingsError
-from pipeline.geometry.mounting import STRAIGHT
+from pipeline.geometry.mirror import STRAIGHT
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
 from pipeline.rig.emulator.fault_names import read_faults
 from pipeline.rig.survey_rig import SurveyRig

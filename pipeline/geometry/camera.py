@@ -104,23 +104,17 @@ def _linear_integral(t: NDArray[np.float64]) -> NDArray[np.float64]:
 def digitise(
     electrons: NDArray[np.floating], camera: LineCamera, rng: np.random.Generator | None
 ) -> NDArray[np.uint16]:
-    """Turn expected electrons of one exposure into DN: shot noise, read noise, dark level, saturation, rounding.
+    """Turn expected electrons (..., band) of one exposure into DN: shot noise, read noise, dark level, saturation.
 
-    Parameters
-    ----------
-    electrons
-        (..., band) expected electrons; negative values count as 0. [e-]
-    rng
-        None leaves the noise out.
-
-    Returns
-    -------
-    (..., band) uint16, clipped to the converter's range and rounded half to even.
+    Negative electrons count as 0; DN are clipped to the converter's range and rounded half to even. ``rng`` None leaves
+    the noise out.
     """
     signal = np.maximum(electrons, 0).astype(np.float32, copy=False)
-    if rng is not None:
-        one_draw = camera.read_noise_e >= ONE_DRAW_READ_NOISE_E
-        signal = _shot_and_read(signal, camera, rng) if one_draw else _poisson_and_read(signal, camera, rng)
+    if rng is not None and camera.read_noise_e >= ONE_DRAW_READ_NOISE_E:
+        signal = _shot_and_read(signal, camera, rng)
+    elif rng is not None:  # exact Poisson counts plus normal read noise
+        read = rng.standard_normal(signal.shape, dtype=np.float32) * np.float32(camera.read_noise_e)
+        signal = read + rng.poisson(signal).astype(np.float32)
     dn = np.rint(signal / np.float32(camera.electrons_per_dn) + np.float32(camera.dark_dn))
     raw: NDArray[np.uint16] = np.clip(dn, 0, camera.full_scale_dn).astype(np.uint16)
     return raw
@@ -140,14 +134,6 @@ def _shot_and_read(expected: NDArray[np.float32], camera: LineCamera, rng: np.ra
     variance *= z
     variance -= skew
     return variance + expected
-
-
-def _poisson_and_read(
-    expected: NDArray[np.float32], camera: LineCamera, rng: np.random.Generator
-) -> NDArray[np.float32]:
-    """Exact Poisson counts plus normal read noise."""
-    read = rng.standard_normal(expected.shape, dtype=np.float32) * np.float32(camera.read_noise_e)
-    return read + rng.poisson(expected).astype(np.float32)
 
 
 def bin_samples(dn: NDArray[np.uint16], binning: int) -> NDArray[np.uint16]:
@@ -194,9 +180,8 @@ def look(
 
     Raises
     ------
-    ShapeError : a size does not divide by ``step``, or a binned sum does not fit 16 bits.
+    ShapeError : as of :func:`expose`.
     """
-    _check_divides(electrons.shape, step)
     return expose(footprint(electrons, camera), camera, step=step, rng=rng)
 
 
@@ -214,16 +199,12 @@ def expose(
     ------
     ShapeError : a size does not divide by ``step``, or a binned sum does not fit 16 bits.
     """
-    _check_divides(seen.shape, step)
     y, x, bands = seen.shape
+    if y % step or x % step:
+        raise ShapeError(f"a scene of {(y, x)} px does not divide by the step {step}; pad it first")
     held = seen.reshape(y // step, step, x, bands).mean(axis=1)
     dn = bin_samples(digitise(held, camera, rng), step).astype(np.float32)
     return (dn / np.float32(step) - np.float32(camera.dark_dn)) * np.float32(camera.electrons_per_dn)
-
-
-def _check_divides(shape: tuple[int, ...], step: int) -> None:
-    if shape[0] % step or shape[1] % step:
-        raise ShapeError(f"a scene of {shape[:2]} px does not divide by the step {step}; pad it first")
 
 
 def _convolve(image: NDArray[np.floating], kernel: NDArray[np.float64], axis: int) -> NDArray[np.float32]:

@@ -140,21 +140,15 @@ class GroundView:
         return w
 
     def scene_to_ground(self, points_px: ArrayLike) -> Floats:
-        """Give where the rays of scene points meet the ground.
+        """Give where the rays of scene points (..., 2), y and x [px], meet the ground: (..., 3) of the foot [m].
 
-        Parameters
-        ----------
-        points_px
-            (..., 2) y and x from the scene's centre. [px]
-
-        Returns
-        -------
-        (..., 3) east, north and up of the foot [m]; NaN where the ray is at or above the horizon.
+        NaN where the ray is at or above the horizon.
         """
         tangents = _pairs(points_px) * self.ifov_rad
         view, right, down = self.axes
         rays = view + tangents[..., 1:] * right + tangents[..., :1] * down
-        points: Floats = rays * self._depth(self.sink(points_px))[..., None]
+        w = self.sink(points_px)
+        points: Floats = rays * (self.height_m / np.where(w > LEAST_SINK, w, np.nan))[..., None]
         points[..., 2] += self.height_m
         return points
 
@@ -168,16 +162,6 @@ class GroundView:
         depth = np.where(seen[..., :1] > 0, seen[..., :1], np.nan)
         points: Floats = seen[..., :0:-1] / (depth * self.ifov_rad)
         return points
-
-    def footprint_m(self, points_px: ArrayLike) -> Floats:
-        """Give how far the ground reaches under one pixel down and right, (..., 2) along y and x [m]; NaN off it."""
-        tangents = _pairs(points_px) * self.ifov_rad
-        view, right, down = self.axes
-        w = self.sink(points_px)[..., None]
-        rays = view + tangents[..., 1:] * right + tangents[..., :1] * down
-        scale = self.height_m * self.ifov_rad / np.where(w > LEAST_SINK, w, np.nan) ** 2
-        steps = [down * w - rays * self.sinks[2], right * w - rays * self.sinks[1]]
-        return np.stack([np.linalg.norm(step * scale, axis=-1) for step in steps], axis=-1)
 
     def area_m2(self, points_px: ArrayLike) -> Floats:
         """Give the ground under a pixel as a map shows it (of a slope its level share), (...) [m2]; NaN off it.
@@ -210,9 +194,6 @@ class GroundView:
                 share = excess[here] / (excess[here] - excess[there])
                 kept.append(corners[here] + share * (corners[there] - corners[here]))
         return np.array(kept).reshape(-1, 2)
-
-    def _depth(self, w: Floats) -> Floats:
-        return self.height_m / np.where(w > LEAST_SINK, w, np.nan)
 
 
 def pixel_places(scene_shape: tuple[int, int]) -> tuple[Floats, Floats]:

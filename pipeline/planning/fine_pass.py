@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from math import ceil, frexp, isfinite
+from dataclasses import dataclass
+from math import frexp, isfinite
 from typing import Literal
 
 import numpy as np
@@ -16,13 +16,11 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.budget_search import cheapest_cover, full_scan_pays, spend
 from pipeline.planning.coverage import check_reach, full_sweeps
-from pipeline.planning.line_cover import NEGLIGIBLE, Cover, Field
-from pipeline.planning.scan_runs import ScanPrices, ScanRun
+from pipeline.planning.prices import prices_of
+from pipeline.planning.scan_runs import NEGLIGIBLE, Cover, Field, cut_strip
 from pipeline.planning.selection import check_threshold
 from pipeline.planning.strips import covered_seats, look_from, strips_at_seats
 
-LEAST_DIGITS = 4  # of the least budget that a refusal names
-ROUNDING = 1e-9
 MOST_WORTH = 1e100  # of one seat: larger scores are planned in a larger unit
 MOST_FLOAT = float(np.finfo(np.float64).max)
 
@@ -91,40 +89,6 @@ class SeatsPrice:
         return f"{own}; the full scan takes {self.full_lines} lines and {self.full_seconds:.1f} s, {cheaper}"
 
 
-def least_budget(coarse_seconds: float, full_seconds: float) -> float:
-    """Give the least budget that pays for the coarse pass alone, rounded up to four digits; above 1 none does."""
-    return ceil(coarse_seconds / full_seconds * 10.0**LEAST_DIGITS - ROUNDING) / 10.0**LEAST_DIGITS
-
-
-def check_budget(budget: float, coarse_seconds: float, full_seconds: float) -> float:
-    """Give the seconds that ``budget`` leaves for the fine pass.
-
-    Parameters
-    ----------
-    budget
-        Seconds of coarse and fine capture over those of the full scan, above 0 and at most 1.
-
-    Raises
-    ------
-    BudgetError : the budget is not a number in that range, or less than the coarse pass alone; names the least.
-    """
-    if not isfinite(budget) or not 0 < budget <= 1:
-        raise BudgetError(f"--budget must be a share of the full scan's time above 0 and at most 1, got {budget}")
-    if coarse_seconds > full_seconds:
-        raise BudgetError(
-            f"the coarse pass alone ({coarse_seconds:.1f} s) takes longer than the full scan ({full_seconds:.1f} s), "
-            f"so no budget can be met, got {budget}; scan in full, or take a larger coarse factor"
-        )
-    left = budget * full_seconds - coarse_seconds
-    if left < -ROUNDING * full_seconds:
-        raise BudgetError(
-            f"--budget {budget} gives {budget * full_seconds:.1f} s, but the coarse pass alone takes "
-            f"{coarse_seconds:.1f} of the full scan's {full_seconds:.1f} s; "
-            f"the least possible is {least_budget(coarse_seconds, full_seconds)}"
-        )
-    return max(left, 0.0)
-
-
 def plan_fine(
     grid: SceneGrid,
     camera: LineCamera,
@@ -190,6 +154,11 @@ def plan_fine(
     sweeps = _sweeps(field, plan)
     check_reach(sweeps, camera)
     seconds = cost.seconds(sweeps, camera)
+    beside = (
+        "; a full scan is beyond the mirror's range"
+        if full_s is None
+        else f", less than the full scan's {full_s:.1f} s"
+    )
     seats = covered_seats(grid, camera, sweeps, margin_px=margin_px)
     return FinePlan(
         sweeps,
@@ -197,19 +166,13 @@ def plan_fine(
         seconds,
         plan.worth * told,
         "lines",
-        _lines_reason(seconds, full_s),
+        f"runs of lines take {seconds:.1f} s{beside}",
         field.total * told,
         full_s,
         missed,
         threshold,
         budget_s - seconds if floor and not everything else None,
     )
-
-
-def _lines_reason(seconds: float, full_s: float | None) -> str:
-    if full_s is None:
-        return f"runs of lines take {seconds:.1f} s; a full scan is beyond the mirror's range"
-    return f"runs of lines take {seconds:.1f} s, less than the full scan's {full_s:.1f} s"
 
 
 def _full(grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis) -> tuple[list[Sweep], float] | None:
@@ -237,19 +200,10 @@ def _field(
     return Field(views, worth, column if along == "x" else row, prices_of(camera, cost))
 
 
-def prices_of(camera: LineCamera, cost: CostModel) -> ScanPrices:
-    """Give the cost model's prices of fine lines (one held position each) and runs."""
-    return ScanPrices(camera.frame_ms * 1e-3, cost.setup_seconds(camera), cost.reload_s, cost.vector_pairs)
-
-
 def _sweeps(field: Field, cover: Cover) -> list[Sweep]:
     """Runs as sweeps, strip by strip; a name holds strip and first line, so that names sort in the same order."""
-    return [_cut(field.views.strips[run.strip], run) for run in sorted(cover.runs)]
-
-
-def _cut(strip: Sweep, run: ScanRun) -> Sweep:
-    name = f"{strip.name}-{run.first:05d}"
-    return replace(strip, name=name, start_px=strip.start_px + run.first, lines=run.stop - run.first)
+    strips = field.views.strips
+    return [cut_strip(strips[run.strip], run, strips[run.strip].name) for run in sorted(cover.runs)]
 
 
 def _scale(scores: NDArray[np.floating]) -> float:

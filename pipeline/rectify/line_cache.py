@@ -82,7 +82,11 @@ class LineCache:
             self._blocks.move_to_end(key)
         with block.reading:
             if block.raw is None:
-                raw = _read(lines, number, samples)
+                rows = slice(number * BLOCK_LINES, min((number + 1) * BLOCK_LINES, len(lines.valid_line)))
+                if isinstance(lines, WindowedLines):
+                    raw = lines.read_window(rows, samples)
+                else:
+                    raw = lines.read(rows.start, rows.stop)
                 with self._lock:
                     block.raw = raw
                     self.reads += 1
@@ -111,17 +115,5 @@ def held_samples(lines: SweepLines, samples: slice, likely: slice | None = None)
     if not isinstance(lines, WindowedLines):
         return slice(0, count)
     other = samples if likely is None else likely
-    return _whole_chunks(slice(min(samples.start, other.start), max(samples.stop, other.stop)), count)
-
-
-def _whole_chunks(samples: slice, count: int) -> slice:
-    """Grow a range of samples to whole chunks of 32, within 0..count."""
-    first = samples.start // CHUNK_SAMPLES * CHUNK_SAMPLES
-    return slice(first, min(-(-samples.stop // CHUNK_SAMPLES) * CHUNK_SAMPLES, count))
-
-
-def _read(lines: SweepLines, number: int, samples: slice) -> Raw:
-    rows = slice(number * BLOCK_LINES, min((number + 1) * BLOCK_LINES, len(lines.valid_line)))
-    if isinstance(lines, WindowedLines):
-        return lines.read_window(rows, samples)
-    return lines.read(rows.start, rows.stop)
+    first, stop = min(samples.start, other.start), max(samples.stop, other.stop)
+    return slice(first // CHUNK_SAMPLES * CHUNK_SAMPLES, min(-(-stop // CHUNK_SAMPLES) * CHUNK_SAMPLES, count))

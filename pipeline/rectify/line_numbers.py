@@ -1,4 +1,4 @@
-"""Line numbers: which line of the plan each arriving frame is, and where the mirror was at its time."""
+"""Line numbers: which line of the plan each arriving frame is, by its time stamp."""
 
 from __future__ import annotations
 
@@ -9,12 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError, ShapeError
-from pipeline.geometry.mirror import (
-    direction_to_position,
-    direction_to_scene,
-    position_to_direction,
-    scene_to_direction,
-)
 
 LATE_FRAMES = 0.25
 LEAST_FRAMES = 3  # below that none can be told to be the late one
@@ -78,47 +72,6 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
         backward=int((~usable).sum()) - repeated,
         late=_count_late(time_s[usable], count, frame_s),
     )
-
-
-def positions_at(time_s: Floats, command_time_s: Floats, command_position: Floats) -> Floats:
-    """Give the mirror positions at the lines' own times, along the commanded path.
-
-    Between two commands the scene tangents are interpolated linearly: exact for a path that is straight in the scene
-    and runs at an even pace, as planned sweeps do. A mirror that goes straight in X and Y instead, from one command
-    to another 1 px away, is less than 1e-5 px elsewhere.
-
-    Parameters
-    ----------
-    time_s
-        (line,) [s]
-    command_time_s
-        (command,) ascending. [s]
-    command_position
-        (command, 2) mirror X and Y at these times.
-
-    Returns
-    -------
-    (line, 2) mirror X and Y; NaN where the time is no number or not between the first and the last command.
-
-    Raises
-    ------
-    ShapeError : times and positions of the commands do not fit, or the times do not ascend.
-    PoseError : a commanded position is beyond the mirror's disk.
-    """
-    if command_position.shape != (len(command_time_s), 2) or not len(command_time_s):
-        raise ShapeError(
-            f"expected commands (command, 2) at times (command,), at least one, got {command_position.shape} and"
-            f" {command_time_s.shape}"
-        )
-    if not (np.diff(command_time_s) > 0).all():
-        at = int(np.argmax(~(np.diff(command_time_s) > 0)))
-        raise ShapeError(f"the times of commands {at} and {at + 1} do not ascend; give each command one time")
-    tangent = direction_to_scene(position_to_direction(command_position))
-    found = np.full((len(time_s), 2), np.nan)
-    known = (time_s >= command_time_s[0]) & (time_s <= command_time_s[-1])
-    at_time = np.stack([np.interp(time_s[known], command_time_s, tangent[:, axis]) for axis in (0, 1)], axis=-1)
-    found[known] = direction_to_position(scene_to_direction(at_time))
-    return found
 
 
 def _longest_ascent(values: Floats) -> NDArray[np.intp]:

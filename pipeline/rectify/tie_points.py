@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Axis, points_of_scan
-from pipeline.rectify.knot_curve import KnotCurve, drop_unseen, grid_points, knots_of_points
+from pipeline.rectify.lookup import KnotCurve, drop_unseen, grid_points, knots_of_points
 from pipeline.rectify.tracks import Track
 
 SAFETY = 1.05  # on the bound, which holds to the second order
@@ -36,43 +36,30 @@ class TieTable:
     kept: tuple[int, int]  # rows and columns of it
 
     def coordinates(self, rows: slice, columns: slice) -> Floats:
-        """Coordinates of a part of the grid, (y, x, 2) float64, as of :func:`pipeline.rectify.lookup.track_lookup`.
-
-        Parameters
-        ----------
-        rows, columns
-            Contiguous, within the grid.
-        """
+        """Coordinates of a contiguous part of the grid, (y, x, 2), as of ``track_lookup``."""
         asked = [range(size)[one] for one, size in zip((rows, columns), self.shape, strict=True)]
         here = [
             slice(min(max(one.start - first, 0), count), max(min(one.stop - first, count), 0))
             for one, first, count in zip(asked, self.corner, self.kept, strict=True)
         ]
-        found = self._of_kept(*here)
+        if any(part.stop <= part.start for part in here):
+            found: Floats = np.empty((0, 0, 2))
+        elif self.spacing == 1:
+            found = self.ties[here[0], here[1]].copy()
+        else:
+            found = self._between(*here)
+            ties = self.ties[tuple(slice(one.start // self.spacing, -(-one.stop // self.spacing) + 1) for one in here)]
+            most = np.array([len(self.seen), self.samples]) - 0.5
+            if not (
+                self.seen.all() and (ties >= -0.5).all() and (ties <= most).all()
+            ):  # else all between lie on the track
+                drop_unseen(found, self.seen, self.samples)
         if found.shape[:2] == (len(asked[0]), len(asked[1])):
             return found
         whole = np.full((len(asked[0]), len(asked[1]), 2), np.nan)
         top, left = (first + one.start - part.start for first, one, part in zip(self.corner, here, asked, strict=True))
         whole[top : top + found.shape[0], left : left + found.shape[1]] = found
         return whole
-
-    def _of_kept(self, rows: slice, columns: slice) -> Floats:
-        """Coordinates of rows and columns counted from the corner."""
-        if rows.stop <= rows.start or columns.stop <= columns.start:
-            return np.empty((0, 0, 2))
-        if self.spacing == 1:
-            return self.ties[rows, columns].copy()
-        found = self._between(rows, columns)
-        if not self._all_seen(rows, columns):
-            drop_unseen(found, self.seen, self.samples)
-        return found
-
-    def _all_seen(self, rows: slice, columns: slice) -> bool:
-        """Whether the ties around a part all lie on the track; then all between them do."""
-        near = (slice(one.start // self.spacing, -(-one.stop // self.spacing) + 1) for one in (rows, columns))
-        ties = self.ties[tuple(near)]
-        most = np.array([len(self.seen), self.samples]) - 0.5
-        return bool(self.seen.all() and (ties >= -0.5).all() and (ties <= most).all())
 
     def _between(self, rows: slice, columns: slice) -> Floats:
         """Straight lines along the few rows of ties first, then, in long runs of memory, down the columns."""
@@ -144,7 +131,7 @@ def tie_table(
             bound = SAFETY * (bound + _tie_bound(ties, cells))
             if bound <= tolerance_px:
                 middle = exact(tie / 2, tie, (rows - 1, columns - 1))
-                bound = max(bound, _largest(np.abs(middle - _cell_means(ties))[cells]))
+                bound = max(bound, _largest(np.abs(middle - _corners(ties).mean(axis=0))[cells]))
         if bound <= tolerance_px:
             return TieTable(ties, tie, shape, bound, track.seen, samples, corner, kept)
         tie //= 2
@@ -204,11 +191,6 @@ def _tie_bound(ties: Floats, cells: NDArray[np.bool_]) -> float:
 def _corners(ties: Floats) -> Floats:
     """The four ties of each cell, (4, row, column, 2)."""
     return np.stack([ties[:-1, :-1], ties[:-1, 1:], ties[1:, :-1], ties[1:, 1:]])
-
-
-def _cell_means(ties: Floats) -> Floats:
-    means: Floats = _corners(ties).mean(axis=0)
-    return means
 
 
 def _largest(values: Floats) -> float:

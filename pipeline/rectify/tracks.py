@@ -105,16 +105,11 @@ def line_centres(
 ) -> tuple[Floats, Floats, NDArray[np.intp]]:
     """Give where the usable lines of a sweep have their centres, in the order of capture.
 
-    Parameters as of :func:`make_tracks`.
+    Parameters and errors are those of :func:`make_tracks`.
 
     Returns
     -------
     Tangents on the scan axis and along the line, (usable line,) each, and the numbers of these lines.
-
-    Raises
-    ------
-    PoseError : the position of a usable line is not finite or beyond the mirror's disk; names the first.
-    ShapeError : arrays do not fit the lines.
     """
     if position.ndim != 2 or position.shape[1] != 2:
         raise ShapeError(f"expected mirror positions (line, 2), got {position.shape}")
@@ -124,7 +119,14 @@ def line_centres(
         raise ShapeError(f"shift_px has shape {shift_px.shape}, expected {position.shape}: along and scan of each line")
     lines = np.arange(len(position)) if usable is None else np.flatnonzero(usable)
     place = np.asarray(position[lines], np.float64)
-    _check_positions(place, lines)
+    out = ~(np.hypot(place[:, 0], place[:, 1]) <= 1 + RIM_SLACK["float64"])
+    if out.any():
+        first = int(np.argmax(out))
+        x, y = place[first]
+        raise PoseError(
+            f"line {lines[first]} is at mirror position ({x:.15g}, {y:.15g}), expected finite numbers in the unit"
+            " disk; mark the line as not usable, or keep the field within the mirror's range"
+        )
     tangent = direction_to_scene(position_to_direction(place))
     if shift_px is not None:
         tangent = tangent + shift_px[lines] * camera.ifov_rad
@@ -140,18 +142,6 @@ def single_track(position: Floats, camera: LineCamera, binning: int = 1) -> Trac
     return Track(
         scan, across[order], lines[order], np.arange(len(lines)), np.ones(len(lines), np.bool_), _width(scan, step)
     )
-
-
-def _check_positions(place: Floats, lines: NDArray[np.intp]) -> None:
-    radius = np.hypot(place[:, 0], place[:, 1])
-    out = ~(radius <= 1 + RIM_SLACK["float64"])
-    if out.any():
-        first = int(np.argmax(out))
-        x, y = place[first]
-        raise PoseError(
-            f"line {lines[first]} is at mirror position ({x:.15g}, {y:.15g}), expected finite numbers in the unit"
-            " disk; mark the line as not usable, or keep the field within the mirror's range"
-        )
 
 
 def _usual_step(scan: Floats, lines: NDArray[np.intp], apart: float) -> float:
@@ -176,7 +166,9 @@ def _runs(scan: Floats, most_back: float, still: float) -> list[slice]:
     The first line within ``still`` of the turn ends its part; those that stand there longer begin the next.
     """
     runs = []
-    first, rising = 0, _rises_first(scan, most_back)
+    up = scan - np.minimum.accumulate(scan) > most_back
+    down = np.maximum.accumulate(scan) - scan > most_back
+    first, rising = 0, bool(up.any() and (not down.any() or np.argmax(up) < np.argmax(down)))
     while first < len(scan):
         way = scan[first:] if rising else -scan[first:]
         back = np.maximum.accumulate(way) - way > most_back
@@ -185,13 +177,6 @@ def _runs(scan: Floats, most_back: float, still: float) -> list[slice]:
         runs.append(slice(first, stop))
         first, rising = stop, not rising
     return runs
-
-
-def _rises_first(scan: Floats, far: float) -> bool:
-    """Whether the path first goes up by more than ``far``, and not down; where it does neither, it does not matter."""
-    up = scan - np.minimum.accumulate(scan) > far
-    down = np.maximum.accumulate(scan) - scan > far
-    return bool(up.any() and (not down.any() or np.argmax(up) < np.argmax(down)))
 
 
 def _track(scan: Floats, across: Floats, lines: NDArray[np.intp], step: float) -> Track:

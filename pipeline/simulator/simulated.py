@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import CostModel, Sweep, line_positions
-from pipeline.geometry.vector_memory import memory_loads
+from pipeline.geometry.scan import CostModel, Sweep, line_positions, memory_loads
 from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.pointing import Pointing
 from pipeline.simulator.instrument import BLOCK_LINES, USUAL, check_binning, render_lines, sweep_block, take_references

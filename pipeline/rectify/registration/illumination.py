@@ -52,17 +52,10 @@ class SweepLights:
 def light_ratio(
     reference_values: NDArray[np.floating], moving_values: NDArray[np.floating], *, pair: tuple[int, int]
 ) -> LightRatio:
-    """Compare two sweeps over the same points.
+    """Compare a ``pair`` of sweeps over the same points: calibrated values (group, point, band), NaN where not seen.
 
     The points come in groups (squares of pixels). The ratio is the median over groups of the ratio of their sums: sums
     first, so that noise has no say in the sign of a pixel; the median, so that what moved between the sweeps has none.
-
-    Parameters
-    ----------
-    reference_values, moving_values
-        (group, point, band) calibrated values; NaN where not seen.
-    pair
-        Numbers of the two sweeps.
 
     Raises
     ------
@@ -91,17 +84,10 @@ def light_ratio(
 def solve_lights(
     ratios: Sequence[LightRatio], sweeps: int, wavelength_nm: Floats, *, order: int = ORDER
 ) -> SweepLights:
-    """Find the light of every sweep from the ratios of all pairs.
+    """Find the light of every sweep from the ratios of all pairs; ``wavelength_nm`` is (band,) in any order.
 
     Least squares of log ratios, each weighted by its error, with the log light of a sweep a polynomial in wavelength.
     Overlaps see ratios only: the mean log light of sweeps that they join is 0 at every wavelength.
-
-    Parameters
-    ----------
-    sweeps
-        How many there are.
-    wavelength_nm
-        (band,) in any order. [nm]
 
     Raises
     ------
@@ -136,22 +122,11 @@ def solve_lights(
 
 
 def overlap_light(placed: Sequence[Placed], camera: LineCamera, windows: Sequence[Window]) -> list[LightRatio]:
-    """Read both sweeps of every pair at the middle rows of their windows, and compare them band by band.
+    """Read both sweeps of every pair at the middle rows of their windows, and compare them: one ratio for every pair.
 
     A window takes 96 rows from either sweep, every pixel of them, summed in squares of 16 px: single rows, or every
     few pixels, would meet crop rows always at one place between two plants, which two sweeps do not blur alike, and
-    their ratio would pass for light.
-
-    Parameters
-    ----------
-    placed
-        Sweeps where registration has put them, without a gain.
-    windows
-        Of registration, wide enough ones.
-
-    Returns
-    -------
-    One ratio for every pair in ``windows``.
+    their ratio would pass for light. The sweeps are placed where registration has put them, without a gain.
     """
     ratios = []
     for pair in sorted({(window.reference, window.moving) for window in windows}):

@@ -6,7 +6,7 @@ Places are (along, scan) in px from the undeflected direction, as in ``pipeline.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +16,7 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Axis, Sweep, shifted_position
-from pipeline.rectify.calibration.calibrate import calibrate
+from pipeline.rectify.calibration.calibrate import calibrate, of_bands
 from pipeline.rectify.lookup import track_lookup
 from pipeline.rectify.resample import resample
 from pipeline.rectify.tracks import Track, make_tracks
@@ -51,7 +51,7 @@ class BroadSweep:
             (line,) lines whose position may be believed; None takes ``lines.valid_line``.
         """
         chosen = broad_bands(lines.references, bands)
-        references = _of_bands(lines.references, chosen)
+        references = of_bands(lines.references, chosen.tolist())
         total = len(lines.valid_line)
         image = np.full((total, references.dark.shape[0]), np.nan, np.float32)
         saturated = camera.full_scale_dn * lines.sweep.binning
@@ -95,9 +95,14 @@ class PlacedImage:
     @cached_property
     def tracks(self) -> tuple[tuple[Track, NDArray[np.float32]], ...]:
         """Every track with its image, (knot, sample): lines that show one place are averaged."""
-        return tuple(
-            (track, _knot_image(track, self.broad.image)) for track in self.broad.tracks(self.camera, self.shift_px)
-        )
+        found = []
+        for track in self.broad.tracks(self.camera, self.shift_px):
+            values: NDArray[np.float32] = self.broad.image[track.lines]
+            if len(track.starts) < len(track.lines):
+                count = np.diff(track.starts, append=len(track.lines))
+                values = (np.add.reduceat(values, track.starts, axis=0) / count[:, None]).astype(np.float32)
+            found.append((track, np.where(track.seen[:, None], values, np.float32(np.nan))))
+        return tuple(found)
 
     def seen_at(self, along_px: Floats, scan_px: Floats) -> NDArray[np.float32]:
         """Rectify a window, (scan, along) float32; NaN where nothing was seen."""
@@ -207,14 +212,6 @@ def _points(along_px: Floats, scan_px: Floats, along: Axis) -> Floats:
     return points
 
 
-def _knot_image(track: Track, image: NDArray[np.float32]) -> NDArray[np.float32]:
-    values: NDArray[np.float32] = image[track.lines]
-    count = np.diff(track.starts, append=len(track.lines))
-    if len(track.starts) < len(track.lines):
-        values = (np.add.reduceat(values, track.starts, axis=0) / count[:, None]).astype(np.float32)
-    return np.where(track.seen[:, None], values, np.float32(np.nan))
-
-
 def broad_bands(references: References, bands: int = BROAD_BANDS) -> NDArray[np.intp]:
     """Choose the bands of a broad-band image: spread over those that nine samples in ten are calibrated in."""
     good = references.white > references.dark
@@ -224,15 +221,3 @@ def broad_bands(references: References, bands: int = BROAD_BANDS) -> NDArray[np.
     if not len(known):
         known = np.arange(len(references.panel))
     return known[np.unique(np.linspace(0, len(known) - 1, max(bands, 1)).round().astype(np.intp))]
-
-
-def _of_bands(references: References, chosen: NDArray[np.intp]) -> References:
-    bad, flat = references.bad, references.flat
-    return replace(
-        references,
-        dark=references.dark[:, chosen],
-        white=references.white[:, chosen],
-        panel=references.panel[chosen],
-        bad=None if bad is None else bad[:, chosen],
-        flat=None if flat is None else flat[:, chosen],
-    )

@@ -1,4 +1,4 @@
-"""Registration of one pass: the pointing of its sweeps, from the overlaps of neighbours."""
+"""Registration: the pointing of a pass from the overlaps of its sweeps, and of a fine sweep from the coarse mosaic."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.coverage import field_px
 from pipeline.rectify.registration.alignment import (
     SweepShift,
     SweepShifts,
@@ -20,7 +22,8 @@ from pipeline.rectify.registration.alignment import (
     tied_to,
 )
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX, BroadSweep, PlacedImage, Window, overlap_windows
-from pipeline.rectify.registration.shifts import PairShift, pair_shift
+from pipeline.rectify.registration.shifts import PairShift, nothing_found, pair_shift
+from pipeline.rectify.resample import resample
 
 Floats = NDArray[np.float64]
 
@@ -99,16 +102,27 @@ def register_sweeps(
             f"expected a finite prior >= 0 px and one round or more, got {prior_px} px, {rounds} rounds"
         )
     shifts, among = no_shifts([one.sweep.name for one in sweeps]), frozenset(range(len(sweeps)))
+    names, lines = [one.sweep.name for one in sweeps], [len(one.position) for one in sweeps]
     made: list[tuple[list[SeamWindow], SweepShifts]] = []
     for number in range(rounds):
         reach = 2 * prior_px if number == 0 else min(SETTLED_PRIOR_PX, 2 * prior_px)
         images = place_images(sweeps, shifts, camera)
         seen = measure_windows(images, reach_px=reach, window_px=window_px, among=among)
-        solved = _solve(seen, sweeps, reference)
+        measured = [each.measured for each in seen if each.measured is not None]
+        solved = solve_sweeps(measured, names, lines, reference=reference)
         shifts = tuple(old.plus(new) for old, new in zip(shifts, solved.shifts, strict=True))
         reference, among = solved.reference, among - set(solved.untied)
-        made.append((_with_residuals(seen, solved.residual), solved))
-    return _registration(sweeps, shifts, made, 2 * prior_px)
+        left = iter(solved.residual)
+        seen = [each if each.measured is None else replace(each, residual_px=next(left)) for each in seen]
+        made.append((seen, solved))
+    first, solved = made[0]
+    return Registration(
+        shifts=shifts,
+        reference=names[solved.reference] if names else None,
+        untied=tuple(names[number] for number in solved.untied),
+        narrow=tuple(_narrow(first, names, 2 * prior_px)),
+        windows=tuple(made[-1][0]),
+    )
 
 
 def place_images(
@@ -176,34 +190,6 @@ def _measured(window: Window, found: PairShift, images: Sequence[PlacedImage]) -
     )
 
 
-def _solve(seen: Sequence[SeamWindow], sweeps: Sequence[BroadSweep], reference: int | None) -> SweepShifts:
-    measured = [each.measured for each in seen if each.measured is not None]
-    names, lines = [one.sweep.name for one in sweeps], [len(one.position) for one in sweeps]
-    return solve_sweeps(measured, names, lines, reference=reference)
-
-
-def _with_residuals(seen: Sequence[SeamWindow], residual: Floats) -> list[SeamWindow]:
-    left = iter(residual)
-    return [each if each.measured is None else replace(each, residual_px=next(left)) for each in seen]
-
-
-def _registration(
-    sweeps: Sequence[BroadSweep],
-    shifts: tuple[SweepShift, ...],
-    made: Sequence[tuple[list[SeamWindow], SweepShifts]],
-    reach_px: float,
-) -> Registration:
-    names = [one.sweep.name for one in sweeps]
-    first, solved = made[0]
-    return Registration(
-        shifts=shifts,
-        reference=names[solved.reference] if names else None,
-        untied=tuple(names[number] for number in solved.untied),
-        narrow=tuple(_narrow(first, names, reach_px)),
-        windows=tuple(made[-1][0]),
-    )
-
-
 def _narrow(seen: Sequence[SeamWindow], names: Sequence[str], reach_px: float) -> Iterator[NarrowOverlap]:
     """Pairs none of whose windows was wide enough, unless other overlaps join the two."""
     measured = [each.measured for each in seen if each.measured is not None]
@@ -213,3 +199,99 @@ def _narrow(seen: Sequence[SeamWindow], names: Sequence[str], reach_px: float) -
         if apart and all(each.found is None for each in windows):
             width = max(each.window.width_px for each in windows)
             yield NarrowOverlap(names[one], names[other], width, LEAST_OVERLAP_PX + reach_px)
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A sweep's correction, and what the last comparison said; without ``found`` the correction is 0."""
+
+    shift: SweepShift
+    found: PairShift  # in scene px, rows along the scan
+
+
+def anchor_sweep(
+    sweep: BroadSweep, camera: LineCamera, grid: SceneGrid, mosaic: NDArray[np.floating], *, prior_px: float
+) -> Anchor:
+    """Find where a fine sweep lies on the coarse mosaic.
+
+    The sweep is rectified at the scene's pixels, blurred to what a coarse pixel sees, and compared with the mosaic
+    interpolated there. One offset for the whole sweep: runs of the fine pass are short.
+
+    Parameters
+    ----------
+    mosaic
+        (y, x) broad-band mean of the coarse mosaic, the mean of the same bands as the sweep's image.
+    prior_px
+        How far the sweep may look beside its reported positions, in either axis. [px]
+
+    Raises
+    ------
+    SettingsError : the prior is negative or not finite.
+    PoseError : a corrected position is beyond the mirror's rim.
+    """
+    if not (np.isfinite(prior_px) and prior_px >= 0):
+        raise SettingsError(f"expected a finite prior >= 0 px, got {prior_px}")
+    (shift,) = no_shifts([sweep.sweep.name])
+    lines = len(sweep.position)
+    if not sweep.usable.any():
+        return Anchor(shift, nothing_found("empty"))
+    for turn in range(2):  # the second looks again from where the first has put the sweep
+        reach = prior_px if turn == 0 else min(prior_px, SETTLED_PRIOR_PX)
+        image = PlacedImage(sweep, camera, shift.of_lines(lines))
+        found = _compare_with_mosaic(image, grid, mosaic, reach)
+        if found.status != "found":
+            return Anchor(no_shifts([sweep.sweep.name])[0], found)
+        moved = np.asarray(np.linalg.solve(image.turn_at_middle, found.shift[::-1]), np.float64)
+        shift = shift.plus(SweepShift(shift.name, moved, np.zeros(2)))
+    return Anchor(shift, found)
+
+
+def _compare_with_mosaic(
+    image: PlacedImage, grid: SceneGrid, mosaic: NDArray[np.floating], reach_px: float
+) -> PairShift:
+    """Compare a sweep with the mosaic under it."""
+    from scipy.ndimage import convolve1d
+
+    along_px, scan_px = _box(image, grid, reach_px)
+    if not (len(along_px) and len(scan_px)):
+        return nothing_found("empty")
+    seen = image.seen_at(along_px, scan_px).astype(np.float64)
+    for axis in (0, 1):  # a coarse pixel is a mean over factor x factor; what is not seen spreads by as much
+        seen = convolve1d(seen, _coarse_footprint(grid.factor), axis=axis, mode="constant", cval=np.nan)
+    under = _interpolated(mosaic, grid, image, (along_px, scan_px))
+    return pair_shift(under, seen, prior_px=reach_px)
+
+
+def _coarse_footprint(factor: int) -> Floats:
+    """Mean over ``factor`` pixels, centred; of an even number the outer two count half."""
+    if factor % 2:
+        return np.full(factor, 1 / factor)
+    return np.concatenate([[0.5], np.ones(factor - 1), [0.5]]) / factor
+
+
+def _interpolated(
+    mosaic: NDArray[np.floating], grid: SceneGrid, image: PlacedImage, places: tuple[Floats, Floats]
+) -> Floats:
+    """The coarse mosaic at fine places, (scan, along); NaN where it holds nothing."""
+    scan, along = np.meshgrid(places[1], places[0], indexing="ij")
+    y, x = (scan, along) if image.broad.sweep.along == "x" else (along, scan)
+    rows, columns = (
+        (place + (size - 1) / 2 - (grid.factor - 1) / 2) / grid.factor
+        for place, size in ((y, grid.height), (x, grid.width))
+    )
+    points = np.stack([rows.ravel(), columns.ravel()], axis=-1)
+    values = np.ascontiguousarray(mosaic[..., None], np.float32)
+    seen, _ = resample(values, np.isfinite(mosaic), points)
+    return seen[:, 0].astype(np.float64).reshape(scan.shape)
+
+
+def _box(image: PlacedImage, grid: SceneGrid, reach_px: float) -> tuple[Floats, Floats]:
+    """Scene pixels along the line and along the scan that the sweep may have seen [px]."""
+    across, scan = field_px(grid, image.broad.sweep.along)
+    places = image.edges.reshape(-1, 2)
+    found: list[Floats] = []
+    for axis, size in ((0, across), (1, scan)):
+        low, high = (float(end) + (size - 1) / 2 for end in (places[:, axis].min(), places[:, axis].max()))
+        first, last = max(int(np.floor(low - reach_px)), 0), min(int(np.ceil(high + reach_px)), size - 1)
+        found.append(np.arange(first, last + 1, dtype=np.float64) - (size - 1) / 2)
+    return found[0], found[1]

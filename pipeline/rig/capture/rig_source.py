@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import RigError
 from pipeline.geometry.camera import LineCamera, bin_samples
-from pipeline.geometry.mounting import STRAIGHT
+from pipeline.geometry.mirror import STRAIGHT
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
 from pipeline.rig.camera.camera_references import as_references

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pipeline.errors import SettingsError
-from pipeline.geometry.mounting import STRAIGHT, Mounting
+from pipeline.geometry.mirror import STRAIGHT, Mounting
 from pipeline.rig.camera.camera_settings import FileServer
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.camera.headwall_control import HeadwallControl

@@ -17,7 +17,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.geometry.vector_memory import Ends
+from pipeline.geometry.scan import Ends
 from pipeline.rig.mirror.registers import Trigger, Unit
 from pipeline.simulator.effects.mirror_path import responses
 

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import get_args
 
 from pipeline.errors import SettingsError
-from pipeline.geometry.mounting import STRAIGHT, Mounting
-from pipeline.geometry.scan import CostModel
-from pipeline.geometry.vector_memory import Ends
+from pipeline.geometry.mirror import STRAIGHT, Mounting
+from pipeline.geometry.scan import CostModel, Ends
 from pipeline.rig.mirror.steering import ReadBack
 from pipeline.stated import assumed, check_stated, stated
 

@@ -9,7 +9,7 @@ from itertools import chain
 import numpy as np
 
 from pipeline.errors import RigError, SettingsError, ShapeError
-from pipeline.geometry.vector_memory import Ends, device_range
+from pipeline.geometry.scan import Ends, device_range
 from pipeline.rig.device_errors import DeviceRefused
 from pipeline.rig.mirror.mirror_requests import ProLink
 from pipeline.rig.mirror.pro_mode import ErrorCode

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import ShapeError
-from pipeline.geometry.mirror import check_reach
-from pipeline.geometry.mounting import STRAIGHT, Mounting
+from pipeline.geometry.mirror import STRAIGHT, Mounting, check_reach
 from pipeline.rig.mirror.registers import Status, Trigger
 
 ReadBack = Literal["none", "sampled", "all"]

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import PoseError, SettingsError
-from pipeline.geometry.mounting import AXES, Mounting
+from pipeline.geometry.mirror import AXES, Mounting
 
 
 @given(st.sampled_from(AXES), st.floats(-5, 5), st.floats(-0.05, 0.05), st.floats(0, 0.9), st.floats(0, 7))

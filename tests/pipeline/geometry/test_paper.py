@@ -10,6 +10,7 @@ from models.network.tokens import paper_numbers
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import (
     REST_TANGENT,
+    Mounting,
     direction_to_normal,
     direction_to_position,
     direction_to_scene,
@@ -18,7 +19,6 @@ from pipeline.geometry.mirror import (
     position_to_direction,
     scene_to_direction,
 )
-from pipeline.geometry.mounting import Mounting
 from pipeline.geometry.paper_equations import (
     LINE_MODELS,
     line_points,
@@ -37,8 +37,7 @@ from pipeline.geometry.paper_equations import (
     straight_slope_rotation,
     unlimited_position,
 )
-from pipeline.geometry.scan import CostModel, Sweep
-from pipeline.geometry.vector_memory import device_range, memory_loads
+from pipeline.geometry.scan import CostModel, Sweep, device_range, memory_loads
 
 CAMERA = LineCamera()
 IFOV = CAMERA.ifov_rad

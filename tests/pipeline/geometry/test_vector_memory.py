@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import CostModel, Sweep
-from pipeline.geometry.vector_memory import count_loads, device_range, memory_loads
+from pipeline.geometry.scan import CostModel, Sweep, count_loads, device_range, memory_loads
 
 CAMERA, COST = LineCamera(), CostModel()
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.geometry.scan import Sweep
-from pipeline.planning.line_cover import Cover, Field, best_cover
-from pipeline.planning.scan_runs import ScanPrices, ScanRun
+from pipeline.planning.prices import ScanPrices
+from pipeline.planning.scan_runs import Cover, Field, ScanRun, best_cover
 from pipeline.planning.strips import Views
 
 PRICES = ScanPrices(line_s=1.0, run_s=3.0, reload_s=0.0, lines_per_reload=1500)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import ShapeError
-from pipeline.planning.crop_rows import CropRows, find_rows
+from pipeline.planning.orientation import CropRows, find_rows
 
 
 def rows(angle_deg: float, period: float, noise: float, shape: tuple[int, int] = (200, 256)) -> np.ndarray:

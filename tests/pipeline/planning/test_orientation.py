@@ -9,9 +9,8 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import coarse_sweeps
-from pipeline.planning.crop_rows import CropRows
 from pipeline.planning.fine_pass import plan_fine
-from pipeline.planning.orientation import compare_orientations
+from pipeline.planning.orientation import CropRows, compare_orientations
 
 CAMERA, COST = LineCamera(), CostModel()
 GRID = SceneGrid(640, 640, 32, 4)

@@ -14,7 +14,8 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps
-from pipeline.planning.fine_pass import SeatsPrice, check_budget, least_budget, plan_fine, price_of_seats
+from pipeline.planning.fine_pass import SeatsPrice, plan_fine, price_of_seats
+from pipeline.planning.prices import check_budget, least_budget
 from pipeline.planning.strips import covered_seats
 
 CAMERA, COST = LineCamera(), CostModel()

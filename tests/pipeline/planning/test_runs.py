@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.planning.scan_runs import ScanPrices, ScanRun, Tables, best_chains, joined
+from pipeline.planning.prices import ScanPrices
+from pipeline.planning.scan_runs import ScanRun, Tables, best_chains, joined
 
 LINES = 7
 PRICES = ScanPrices(line_s=1.0, run_s=1.5, reload_s=2.0, lines_per_reload=5)

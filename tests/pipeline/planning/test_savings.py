@@ -11,7 +11,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import coarse_sweeps, full_sweeps
-from pipeline.planning.savings import SavingEntry, capture_savings, count_lines, count_samples, raw_bytes
+from pipeline.planning.prices import SavingEntry, capture_savings, count_lines, count_samples, raw_bytes
 
 CAMERA, COST = LineCamera(), CostModel()
 

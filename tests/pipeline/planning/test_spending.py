@@ -11,8 +11,8 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.budget_search import cheapest_cover, spend
-from pipeline.planning.line_cover import Field
-from pipeline.planning.scan_runs import ScanPrices
+from pipeline.planning.prices import ScanPrices
+from pipeline.planning.scan_runs import Field
 from pipeline.planning.strips import Views
 
 PRICES = ScanPrices(line_s=0.1, run_s=0.9, reload_s=1.6, lines_per_reload=150)

@@ -12,9 +12,10 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Axis, Sweep
 from pipeline.planning.coverage import on_scene
 from pipeline.rectify.calibration.calibrate import calibrate
+from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.lookup import grid_lookup
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
-from pipeline.rectify.resample import Kernel, resample
+from pipeline.rectify.resample import resample
 from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource

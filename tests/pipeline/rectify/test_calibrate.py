@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.mirror import mirror_throughput
-from pipeline.rectify.calibration.calibrate import calibrate, of_bands, reflectance
-from pipeline.rectify.calibration.flat_field import judge_elements
+from pipeline.rectify.calibration.calibrate import calibrate, judge_elements, of_bands, reflectance
 from pipeline.source import References
 
 

@@ -13,7 +13,8 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, Sweep
 from pipeline.planning.coverage import full_sweeps
-from pipeline.rectify.region import PixelGrid, mosaic_tile, place
+from pipeline.rectify.placed import PixelGrid, place
+from pipeline.rectify.region import mosaic_tile
 from pipeline.rectify.registration.illumination import LightRatio, light_ratio, overlap_light, solve_lights
 from pipeline.rectify.registration.overlaps import Window
 from pipeline.simulator.instrument import effects_on

@@ -19,8 +19,7 @@ from pipeline.geometry.mirror import (
     scene_to_direction,
 )
 from pipeline.geometry.scan import Sweep, line_positions, points_of_scan, scene_to_sweep
-from pipeline.rectify.knot_curve import KnotCurve
-from pipeline.rectify.lookup import grid_lookup, lookup, track_lookup
+from pipeline.rectify.lookup import KnotCurve, grid_lookup, lookup, track_lookup
 from pipeline.rectify.resample import resample
 from pipeline.rectify.tracks import Track, make_tracks
 

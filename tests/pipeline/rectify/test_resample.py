@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pipeline.errors import ShapeError
-from pipeline.rectify.resample import BLOCK_PX, Kernel, gather, kernel_taps, merge_lines, resample, to_uint16
+from pipeline.rectify.kernels import Kernel, kernel_taps
+from pipeline.rectify.resample import BLOCK_PX, gather, merge_lines, resample, to_uint16
 
 KERNELS: tuple[Kernel, ...] = ("catmull-rom", "bilinear", "nearest")
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_position, scene_to_direction
-from pipeline.rectify.lookup import tie_table, track_lookup
-from pipeline.rectify.tie_points import TieTable
+from pipeline.rectify.lookup import track_lookup
+from pipeline.rectify.tie_points import TieTable, tie_table
 from pipeline.rectify.tracks import Track, make_tracks
 
 CAMERA = LineCamera()

@@ -14,11 +14,9 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rectify.kernels import kernel_taps
 from pipeline.rectify.line_cache import LineCache
-from pipeline.rectify.placed import PixelGrid, Placed, place
-from pipeline.rectify.reach import TrackReach
-from pipeline.rectify.region import mosaic_tile
-from pipeline.rectify.tiles import cache_bytes, plan_tiles
-from pipeline.rectify.window import cut_runs
+from pipeline.rectify.mosaic import cut_runs
+from pipeline.rectify.placed import PixelGrid, Placed, TrackReach, place
+from pipeline.rectify.region import cache_bytes, mosaic_tile, plan_tiles
 from pipeline.source import References
 
 CAMERA = LineCamera(samples=160)
@@ -145,7 +143,7 @@ def test_cutting_a_tile_into_runs_changes_no_bit(monkeypatch: pytest.MonkeyPatch
     """Windows as short as they can be give what one window for the whole tile gives."""
     grid = PixelGrid(CORNER, 1, (40, 140))
     whole = in_tiles(two_turned(None), grid, grid.shape)
-    monkeypatch.setattr("pipeline.rectify.window.RUN_ELEMENTS", 0)
+    monkeypatch.setattr("pipeline.rectify.mosaic.RUN_ELEMENTS", 0)
     cut = in_tiles(two_turned(None), grid, grid.shape)
     for one, other in zip(whole, cut, strict=True):
         np.testing.assert_array_equal(one, other)

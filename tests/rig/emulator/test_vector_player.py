@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.geometry.vector_memory import Ends
+from pipeline.geometry.scan import Ends
 from pipeline.rig.emulator.mirror_motion import MOST_STEPS, VectorPlayer
 from pipeline.rig.mirror.registers import Trigger
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.planning.crop_rows import find_rows
+from pipeline.planning.orientation import find_rows
 from pipeline.simulator.scenes.farm.canvas import Ground
 from pipeline.simulator.scenes.farm.farm_plan import FarmPlan, FieldPlan, farm_plan
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
