@@ -97,8 +97,7 @@ def footprint_kernel(width_px: float) -> NDArray[np.float64]:
 def _linear_integral(t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Integral of the kernel of linear interpolation from minus infinity to t."""
     a = np.minimum(np.abs(t), 1.0)
-    integral: NDArray[np.float64] = 0.5 + np.sign(t) * a * (1 - a / 2)
-    return integral
+    return 0.5 + np.sign(t) * a * (1 - a / 2)
 
 
 def digitise(

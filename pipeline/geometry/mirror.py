@@ -136,8 +136,7 @@ def direction_to_scene(direction: ArrayLike) -> Floats:
     """
     o = _vectors(direction, 3, "view direction")
     _refuse(o[..., 0] <= 0, o, "looks away from the scene plane (its x must be above 0)")
-    tangents: Floats = o[..., 1:] / o[..., :1]
-    return tangents
+    return o[..., 1:] / o[..., :1]
 
 
 def line_rotation(direction: ArrayLike) -> Floats:
@@ -151,8 +150,7 @@ def line_rotation(direction: ArrayLike) -> Floats:
     PoseError : a direction is not finite, not of length 1, or is the camera's own ray.
     """
     o = _units(direction, "view direction")
-    psi: Floats = np.arctan2(o[..., 1], _one_minus_z(o))
-    return psi
+    return np.arctan2(o[..., 1], _one_minus_z(o))
 
 
 def mirror_throughput(position: ArrayLike) -> Floats:
@@ -301,8 +299,7 @@ class Mounting:
         """The orthogonal part, whose transpose undoes it."""
         turn = np.deg2rad(self.clocking_deg)
         rotation = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-        matrix: NDArray[np.float64] = np.array([_ROWS[axis] for axis in self.axes.split(",")]) @ rotation
-        return matrix
+        return np.array([_ROWS[axis] for axis in self.axes.split(",")]) @ rotation
 
 
 STRAIGHT = Mounting()

@@ -33,16 +33,14 @@ def paper_position(normal: ArrayLike) -> Floats:
 
     Agrees with the device at rest and at the rim, and is up to 6.40 deg (1056 px) wrong between.
     """
-    position: Floats = normal_to_device(normal)[..., :2] / _RIM_SINE
-    return position
+    return normal_to_device(normal)[..., :2] / _RIM_SINE
 
 
 def unlimited_position(normal: ArrayLike) -> Floats:
     """Give the exact position of normals, beyond the rim as well, so that the paper's forms can be followed there."""
     device = normal_to_device(normal)
     c2 = 2 * device[..., 2:] ** 2 - 1
-    position: Floats = 2 * device[..., 2:] * device[..., :2] / (c2 * REST_TANGENT)
-    return position
+    return 2 * device[..., 2:] * device[..., :2] / (c2 * REST_TANGENT)
 
 
 def slope_rotation(position: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -111,5 +109,4 @@ def _local_scale(strip_px: float, scan_px: NDArray[np.float64], camera: LineCame
     """
     xi0, e = strip_px * camera.ifov_rad, scan_px[:, None] * camera.ifov_rad
     size = np.sqrt(1 + xi0**2 + e**2)
-    scale: NDArray[np.float64] = size * np.hypot(1.0, xi0 / (size - e))
-    return scale
+    return size * np.hypot(1.0, xi0 / (size - e))

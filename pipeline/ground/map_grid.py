@@ -109,8 +109,7 @@ class MapFrame:
         point = _stacked(self._around_foot.transform(lon, lat, level))
         up = self._vertical(np.asarray(lon), np.asarray(lat))
         rise = -(point @ self.view.normal) / (up @ self.view.normal)
-        ground: Floats = point + rise[..., None] * up
-        return ground
+        return point + rise[..., None] * up
 
     def _vertical(self, lon_deg: Floats, lat_deg: Floats) -> Floats:
         """(..., 3) normals of the ellipsoid at other places, in east, north, up of the foot."""

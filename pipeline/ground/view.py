@@ -112,8 +112,7 @@ class GroundView:
     @cached_property
     def sinks(self) -> Floats:
         """(3,) w of view, right and down."""
-        sinks: Floats = -self.axes @ self.normal
-        return sinks
+        return -self.axes @ self.normal
 
     @cached_property
     def height_m(self) -> float:
@@ -170,8 +169,7 @@ class GroundView:
         dependence on the direction.
         """
         w = self.sink(points_px)
-        area: Floats = (self.height_m * self.ifov_rad) ** 2 / np.where(w > LEAST_SINK, w, np.nan) ** 3
-        return area
+        return (self.height_m * self.ifov_rad) ** 2 / np.where(w > LEAST_SINK, w, np.nan) ** 3
 
     def count_ground(self, scene_shape: tuple[int, int], least_sink: float = LEAST_SINK) -> int:
         """Count the pixels of a scene of (y, x) px whose rays meet the ground, sinking by more than ``least_sink``."""

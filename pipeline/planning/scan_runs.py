@@ -179,8 +179,7 @@ class Field:
 
     def shown_seats(self, run: ScanRun) -> Ints:
         """Seats that lie in a run, (seat,)."""
-        seats: Ints = self.views.seat[self.shown(run)]
-        return seats
+        return self.views.seat[self.shown(run)]
 
     def left(self, runs: Sequence[ScanRun]) -> Floats:
         """Worth of each seat that no run shows, 0 for the others, (seat,)."""

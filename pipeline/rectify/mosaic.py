@@ -39,8 +39,7 @@ def edge_distance(coordinates: NDArray[np.float64], lines: int, samples: int) ->
     line, sample = coordinates[..., 0], coordinates[..., 1]
     down = np.minimum(line + 0.5, lines - 0.5 - line)
     across = np.minimum(sample + 0.5, samples - 0.5 - sample)
-    distance: NDArray[np.float64] = np.minimum(down, across)
-    return distance
+    return np.minimum(down, across)
 
 
 def mosaic(parts: Sequence[MosaicPart]) -> tuple[NDArray[np.float32], NDArray[np.intp]]:

@@ -199,5 +199,4 @@ def _spans(place: NDArray[np.float64], margin: float) -> tuple[NDArray[np.float3
 def member_lines(track: Track, knots: slice) -> NDArray[np.intp]:
     """Numbers of the lines that some knots are made of, knot by knot."""
     stop = track.starts[knots.stop] if knots.stop < len(track) else len(track.lines)
-    members: NDArray[np.intp] = track.lines[track.starts[knots.start] : stop]
-    return members
+    return track.lines[track.starts[knots.start] : stop]

@@ -208,8 +208,7 @@ def _pair_windows(images: Sequence[PlacedImage], one: int, other: int, window_px
 def _points(along_px: Floats, scan_px: Floats, along: Axis) -> Floats:
     """Places of a window row by row, (n, 2) y and x [px]."""
     scan, line = (values.ravel() for values in np.meshgrid(scan_px, along_px, indexing="ij"))
-    points: Floats = np.stack([scan, line] if along == "x" else [line, scan], axis=-1)
-    return points
+    return np.stack([scan, line] if along == "x" else [line, scan], axis=-1)
 
 
 def broad_bands(references: References, bands: int = BROAD_BANDS) -> NDArray[np.intp]:

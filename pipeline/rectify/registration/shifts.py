@@ -152,8 +152,7 @@ def _standardised(image: NDArray[np.floating]) -> Floats | None:
     mean, spread = float(np.nanmean(values)), float(np.nanstd(values))
     if spread <= FLAT_SPREAD * abs(mean) or spread == 0:
         return None
-    standard: Floats = (values - mean) / spread
-    return standard
+    return (values - mean) / spread
 
 
 def _is_textured(image: Floats) -> bool:
