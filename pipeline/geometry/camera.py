@@ -140,9 +140,7 @@ def bin_samples(dn: NDArray[np.uint16], binning: int) -> NDArray[np.uint16]:
 
     A remainder is dropped.
 
-    Raises
-    ------
-    ShapeError : fewer samples than ``binning``, or a sum that 16 bits do not hold.
+    Raises ShapeError: fewer samples than ``binning``, or a sum that 16 bits do not hold.
     """
     if binning == 1:
         return dn
@@ -160,30 +158,6 @@ def bin_samples(dn: NDArray[np.uint16], binning: int) -> NDArray[np.uint16]:
     return raw
 
 
-def look(
-    electrons: NDArray[np.floating], camera: LineCamera, *, step: int, rng: np.random.Generator | None
-) -> NDArray[np.float32]:
-    """What one pass gives of a grid-aligned scene: footprint, motion smear, one exposure a line, binning.
-
-    The coarse pass takes every ``step``-th line: the mirror moves ``step`` px during the one exposure and ``step``
-    neighbouring samples are averaged, so that noise falls by sqrt(step), not by step. ``step=1`` is the fine pass.
-
-    Parameters
-    ----------
-    electrons
-        (y, x, band) expected electrons per exposure of a fine pixel; the scan goes along y. Sizes divide by ``step``.
-
-    Returns
-    -------
-    (y / step, x / step, band) float32 electrons, dark level taken off.
-
-    Raises
-    ------
-    ShapeError : as of :func:`expose`.
-    """
-    return expose(footprint(electrons, camera), camera, step=step, rng=rng)
-
-
 def footprint(light: NDArray[np.floating], camera: LineCamera) -> NDArray[np.float32]:
     """Blur a grid-aligned scene by the slit along y and the pixel along x; any linear measure of light, (y, x, k)."""
     return _convolve(_convolve(light, footprint_kernel(camera.slit_px), 0), footprint_kernel(1.0), 1)
@@ -192,11 +166,13 @@ def footprint(light: NDArray[np.floating], camera: LineCamera) -> NDArray[np.flo
 def expose(
     seen: NDArray[np.floating], camera: LineCamera, *, step: int, rng: np.random.Generator | None
 ) -> NDArray[np.float32]:
-    """Second half of ``look``: what one exposure a line gives of light that has passed the footprint.
+    """What one exposure a line gives of a grid-aligned scene (y, x, band) [e-] behind the footprint; scan along y.
 
-    Raises
-    ------
-    ShapeError : a size does not divide by ``step``, or a binned sum does not fit 16 bits.
+    The coarse pass takes every ``step``-th line: the mirror moves ``step`` px during the one exposure and ``step``
+    neighbouring samples are averaged, so that noise falls by sqrt(step), not by step. ``step=1`` is the fine pass.
+    (y / step, x / step, band) float32 electrons, dark level taken off.
+
+    Raises ShapeError: a size does not divide by ``step``, or a binned sum does not fit 16 bits.
     """
     y, x, bands = seen.shape
     if y % step or x % step:

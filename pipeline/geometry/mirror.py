@@ -36,9 +36,7 @@ def check_reach(position: ArrayLike) -> Floats:
 
     A device would clamp them to its rim unasked.
 
-    Raises
-    ------
-    PoseError : a position is not finite or beyond the rim; the message names the first.
+    Raises PoseError: a position is not finite or beyond the rim; the message names the first.
     """
     xy = _vectors(position, 2, "mirror position")
     beyond = np.hypot(xy[..., 0], xy[..., 1]) > 1 + RIM_SLACK[xy.dtype.name]
@@ -49,9 +47,7 @@ def check_reach(position: ArrayLike) -> Floats:
 def position_to_normal(position: ArrayLike) -> Floats:
     """Give the unit mirror normals (..., 3), in the camera frame, of device positions (..., 2) in the closed unit disk.
 
-    Raises
-    ------
-    PoseError : a position is not finite or beyond the rim; the message names the first.
+    Raises PoseError: a position is not finite or beyond the rim; the message names the first.
     """
     xy = check_reach(position)
     half = np.empty((*xy.shape[:-1], 3), xy.dtype)
@@ -65,9 +61,8 @@ def position_to_normal(position: ArrayLike) -> Floats:
 def normal_to_position(normal: ArrayLike) -> Floats:
     """Give the device positions (..., 2) of unit normals (..., 3): the inverse of ``position_to_normal``.
 
-    Raises
-    ------
-    PoseError : a normal is not finite, not of length 1, or turned beyond the rim. The disk is checked before anything
+    Raises PoseError: a normal is not finite, not of length 1, or turned beyond the rim. The disk is checked before
+    anything
         is divided, since X overflows as the tilt nears 45 deg (erratum E2).
     """
     n = _units(normal, "mirror normal")
@@ -93,9 +88,7 @@ def direction_to_normal(direction: ArrayLike) -> Floats:
 
     Stable up to grazing (o_z -> 1, erratum E7): there 1 - o_z is taken as (o_x^2 + o_y^2) / (1 + o_z).
 
-    Raises
-    ------
-    PoseError : a direction is not finite, not of length 1, or is the chief ray itself, which no mirror makes.
+    Raises PoseError: a direction is not finite, not of length 1, or is the chief ray itself, which no mirror makes.
     """
     o = _units(direction, "view direction")
     n = o.copy()
@@ -130,9 +123,7 @@ def scene_to_direction(tangents: ArrayLike) -> Floats:
 def direction_to_scene(direction: ArrayLike) -> Floats:
     """Give scene tangents (..., 2) of directions (..., 3).
 
-    Raises
-    ------
-    PoseError : a direction does not look at the scene plane (o_x <= 0).
+    Raises PoseError: a direction does not look at the scene plane (o_x <= 0).
     """
     o = _vectors(direction, 3, "view direction")
     _refuse(o[..., 0] <= 0, o, "looks away from the scene plane (its x must be above 0)")
@@ -145,9 +136,7 @@ def line_rotation(direction: ArrayLike) -> Floats:
     A property of the pose and not of the path (erratum E8): psi = atan2(o_y, 1 - o_z), anticlockwise from xi to eta,
     for a slit along y. The line stays straight and runs along (cos psi, sin psi) in (xi, eta), exactly. [rad]
 
-    Raises
-    ------
-    PoseError : a direction is not finite, not of length 1, or is the camera's own ray.
+    Raises PoseError: a direction is not finite, not of length 1, or is the camera's own ray.
     """
     o = _units(direction, "view direction")
     return np.arctan2(o[..., 1], _one_minus_z(o))
@@ -159,9 +148,7 @@ def mirror_throughput(position: ArrayLike) -> Floats:
     |n_z| / |n_z at rest|: the mirror is the aperture stop, and what it passes goes with its area as the camera sees it.
     1 at rest, 0.48 to 1.33 over the disk.
 
-    Raises
-    ------
-    PoseError : a position is not finite or beyond the rim.
+    Raises PoseError: a position is not finite or beyond the rim.
     """
     normal = position_to_normal(position)
     share: Floats = -normal[..., 2] / normal.dtype.type(_HALF)
@@ -270,9 +257,7 @@ class Mounting:
     def to_device(self, position: ArrayLike) -> NDArray[np.floating]:
         """Give what to send to the device for model positions (..., 2).
 
-        Raises
-        ------
-        PoseError : a position is beyond the disk for the model, or for the device, which would clamp it unasked.
+        Raises PoseError: a position is beyond the disk for the model, or for the device, which would clamp it unasked.
         """
         model = check_reach(position)
         if self == STRAIGHT:

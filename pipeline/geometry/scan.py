@@ -80,9 +80,7 @@ class CostModel:
 def sweep_positions(sweep: Sweep, camera: LineCamera) -> Floats:
     """Give the mirror positions that a sweep holds, (line, step, 2) device X and Y.
 
-    Raises
-    ------
-    PoseError : a position is beyond the mirror's disk.
+    Raises PoseError: a position is beyond the mirror's disk.
     """
     return _aim(sweep, camera, sweep.held_px())
 
@@ -90,9 +88,7 @@ def sweep_positions(sweep: Sweep, camera: LineCamera) -> Floats:
 def line_positions(sweep: Sweep, camera: LineCamera) -> Floats:
     """Give the mirror position at mid exposure of every line, (line, 2) device X and Y.
 
-    Raises
-    ------
-    PoseError : a position is beyond the mirror's disk.
+    Raises PoseError: a position is beyond the mirror's disk.
     """
     return _aim(sweep, camera, sweep.line_px())
 
@@ -107,9 +103,7 @@ def shifted_position(position: Floats, shift_px: Floats, camera: LineCamera) -> 
 
     Both are (..., 2) and broadcast.
 
-    Raises
-    ------
-    PoseError : a position is beyond the rim, before or after the shift.
+    Raises PoseError: a position is beyond the rim, before or after the shift.
     """
     tangents = direction_to_scene(position_to_direction(position)) + shift_px * camera.ifov_rad
     return direction_to_position(scene_to_direction(tangents))
@@ -190,9 +184,7 @@ def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> list[Load]:
 
     A load takes what is left of one sweep and begins the next; a line's held positions are never parted.
 
-    Raises
-    ------
-    SettingsError : the positions of one line do not fit the memory.
+    Raises SettingsError: the positions of one line do not fit the memory.
     """
     loads: list[Load] = []
     parts: list[MemoryPart] = []
@@ -241,9 +233,7 @@ def device_range(cells: tuple[int, int], ends: Ends) -> tuple[int, int]:
     Which of the two the device means is not settled (erratum E14), so it is a setting of the driver; everything else
     here is half open.
 
-    Raises
-    ------
-    SettingsError : the range is empty or begins below 0.
+    Raises SettingsError: the range is empty or begins below 0.
     """
     start, stop = cells
     if start < 0 or stop <= start:

@@ -44,9 +44,7 @@ def default_epsg(pose: RigPose) -> int:
 def map_crs(pose: RigPose, epsg: int | None = None) -> CRS:
     """Give the projected CRS of a map around the rig: the one asked for, or that of ``default_epsg``.
 
-    Raises
-    ------
-    PoseError : no such code, not a projected CRS in metres, or the rig stands outside the area it is made for.
+    Raises PoseError: no such code, not a projected CRS in metres, or the rig stands outside the area it is made for.
     """
     from pyproj import CRS
     from pyproj.exceptions import CRSError
@@ -202,9 +200,7 @@ class GroundGrid:
         Of the pixels that the map shows, and from their footprints: counting the map's pixels would be off by as many
         as lie on borders between classes.
 
-        Raises
-        ------
-        ShapeError : the class map is not the scene's.
+        Raises ShapeError: the class map is not the scene's.
         """
         if classes.shape != self.scene_shape:
             raise ShapeError(f"expected the classes of a scene of {self.scene_shape} px (y, x), got {classes.shape}")

@@ -40,9 +40,7 @@ class RigPose:
 
     Give ``height_m`` above the foot, or ``range_m`` to the ground along the undeflected direction.
 
-    Raises
-    ------
-    PoseError : a value is not finite or out of range, or not exactly one of height and range is given.
+    Raises PoseError: a value is not finite or out of range, or not exactly one of height and range is given.
     """
 
     lon_deg: float = stated(MISSING, "Longitude, WGS 84; west is negative", "deg", -180, 180, example=9.5)
@@ -118,9 +116,7 @@ class GroundView:
     def height_m(self) -> float:
         """Height of the pivot above the foot.
 
-        Raises
-        ------
-        PoseError : a range is given, and the undeflected direction does not meet the ground.
+        Raises PoseError: a range is given, and the undeflected direction does not meet the ground.
         """
         if self.pose.height_m is not None:
             return self.pose.height_m

@@ -32,10 +32,8 @@ def full_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis, *, overlap_px:
 
     ``overlap_px`` is the least width that neighbouring strips share, and half of it beyond either end of the field.
 
-    Raises
-    ------
-    PoseError : the field is beyond the mirror's range.
-    SettingsError : an overlap that is negative or leaves nothing of a line.
+    Raises PoseError: the field is beyond the mirror's range.
+    Raises SettingsError: an overlap that is negative or leaves nothing of a line.
     """
     return _cover(grid, camera, along, step=1, overlap_px=overlap_px)
 
@@ -45,11 +43,9 @@ def coarse_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis, *, overlap_p
 
     ``overlap_px`` is that of :func:`full_sweeps`, in px of the full resolution.
 
-    Raises
-    ------
-    SettingsError : the sum of ``grid.factor`` samples does not fit 16 bits, or a line has fewer samples; or the
+    Raises SettingsError: the sum of ``grid.factor`` samples does not fit 16 bits, or a line has fewer samples; or the
         overlap is negative or leaves nothing of a line.
-    PoseError : the field is beyond the mirror's range.
+    Raises PoseError: the field is beyond the mirror's range.
     """
     most = min(camera.most_binning, camera.samples)
     if grid.factor > most:
@@ -65,9 +61,7 @@ def cheapest_full(
 ) -> tuple[Axis, list[Sweep], float]:
     """Choose the orientation of the full scan that takes the least time: axis of the lines, sweeps, seconds.
 
-    Raises
-    ------
-    PoseError : neither orientation is within the mirror's range.
+    Raises PoseError: neither orientation is within the mirror's range.
     """
     found: list[tuple[Axis, list[Sweep], float]] = []
     axes: tuple[Axis, Axis] = ("x", "y")
@@ -85,9 +79,7 @@ def cheapest_full(
 def with_margin(sweeps: Sequence[Sweep], camera: LineCamera, margin_px: float) -> list[Sweep]:
     """Begin every sweep so much earlier and end it so much later, for a mirror that may look beside the plan.
 
-    Raises
-    ------
-    PoseError : a sweep then leaves the mirror's range.
+    Raises PoseError: a sweep then leaves the mirror's range.
     """
     more = [-(-margin_px // sweep.step) for sweep in sweeps]
     grown = [

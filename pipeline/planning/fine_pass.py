@@ -16,7 +16,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.budget_search import cheapest_cover, full_scan_pays, spend
 from pipeline.planning.coverage import check_reach, full_sweeps
-from pipeline.planning.prices import prices_of
+from pipeline.planning.prices import count_lines, prices_of
 from pipeline.planning.scan_runs import NEGLIGIBLE, Cover, Field, cut_strip
 from pipeline.planning.selection import check_threshold
 from pipeline.planning.strips import covered_seats, look_from, strips_at_seats
@@ -50,7 +50,7 @@ class FinePlan:
     @property
     def lines(self) -> int:
         """Lines of all sweeps."""
-        return sum(sweep.lines for sweep in self.sweeps)
+        return count_lines(self.sweeps)
 
     @property
     def worth_per_second(self) -> float | None:
@@ -68,25 +68,11 @@ class SeatsPrice:
     full_seconds: float | None
 
     @property
-    def kind(self) -> Literal["lines", "full"]:
-        """The cheaper way: runs of lines, or the full scan."""
-        return "full" if self.full_seconds is not None and self.full_seconds <= self.seconds else "lines"
-
-    @property
     def least(self) -> tuple[int, float]:
         """Lines and seconds of the cheaper way."""
-        if self.kind == "full" and self.full_lines is not None and self.full_seconds is not None:
+        if self.full_lines is not None and self.full_seconds is not None and self.full_seconds <= self.seconds:
             return self.full_lines, self.full_seconds
         return self.lines, self.seconds
-
-    @property
-    def sentence(self) -> str:
-        """Both prices in words."""
-        own = f"by runs of lines these seats take {self.lines} lines and {self.seconds:.1f} s"
-        if self.full_seconds is None:
-            return f"{own}; a full scan is beyond the mirror's range"
-        cheaper = "which is cheaper and shows every seat" if self.kind == "full" else "which is dearer"
-        return f"{own}; the full scan takes {self.full_lines} lines and {self.full_seconds:.1f} s, {cheaper}"
 
 
 def plan_fine(
@@ -245,9 +231,7 @@ def price_of_seats(
 
     What ``frame`` mode leaves out: it buys seats free of each other, the rig pays for the lines beneath them.
 
-    Raises
-    ------
-    PoseError : a seat is shown by no line within the mirror's range.
+    Raises PoseError: a seat is shown by no line within the mirror's range.
     """
     worth = np.zeros(int(np.prod(grid.seat_shape)))
     worth[np.asarray(seats, np.intp)] = 1.0
@@ -260,6 +244,5 @@ def price_of_seats(
         )
     sweeps = _sweeps(field, cheapest_cover(field))
     full = _full(grid, camera, cost, along)
-    lines = sum(sweep.lines for sweep in sweeps)
-    full_lines = None if full is None else sum(sweep.lines for sweep in full[0])
-    return SeatsPrice(lines, cost.seconds(sweeps, camera), full_lines, None if full is None else full[1])
+    whole = (None, None) if full is None else (count_lines(full[0]), full[1])
+    return SeatsPrice(count_lines(sweeps), cost.seconds(sweeps, camera), *whole)

@@ -71,9 +71,7 @@ def check_budget(budget: float, coarse_seconds: float, full_seconds: float) -> f
 
     The budget is the seconds of coarse and fine capture over those of the full scan, above 0 and at most 1.
 
-    Raises
-    ------
-    BudgetError : the budget is not a number in that range, or less than the coarse pass alone; names the least.
+    Raises BudgetError: the budget is not a number in that range, or less than the coarse pass alone; names the least.
     """
     if not isfinite(budget) or not 0 < budget <= 1:
         raise BudgetError(f"--budget must be a share of the full scan's time above 0 and at most 1, got {budget}")

@@ -27,9 +27,7 @@ class Selection:
 def seat_count(share: float, valid: int) -> int:
     """Turn a share of the valid seats into a number of seats, halves rounded up.
 
-    Raises
-    ------
-    BudgetError : the share is not a number from 0 to 1.
+    Raises BudgetError: the share is not a number from 0 to 1.
     """
     if not 0 <= share <= 1:  # NaN too
         raise BudgetError(f"the share of seats to buy must be from 0 to 1, got {share} (of {valid} seats)")
@@ -39,9 +37,7 @@ def seat_count(share: float, valid: int) -> int:
 def check_threshold(threshold: float) -> float:
     """Give the threshold back.
 
-    Raises
-    ------
-    BudgetError : it is not a finite number of 0 or more.
+    Raises BudgetError: it is not a finite number of 0 or more.
     """
     if not (np.isfinite(threshold) and threshold >= 0):
         raise BudgetError(f"the threshold must be a finite score of 0 or more, got {threshold}")
@@ -55,9 +51,7 @@ def select_seats(score: Scores, count: int, valid: NDArray[np.bool_] | None = No
     larger choice are the choice of K. When no valid seat has a score to rank (all NaN or -inf), seats are spread evenly
     over the valid ones, nested too, and the result says so. ``clip`` takes all valid seats where ``count`` is larger.
 
-    Raises
-    ------
-    BudgetError : ``count`` is not a whole number, below 0, or above the number of valid seats.
+    Raises BudgetError: ``count`` is not a whole number, below 0, or above the number of valid seats.
     """
     allowed = _allowed(score, valid)
     try:

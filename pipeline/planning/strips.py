@@ -117,9 +117,7 @@ def strips_at_seats(grid: SceneGrid, camera: LineCamera, along: Axis, *, margin_
     between two such offsets shows no seat that one of them does not. The sweeps have no lines yet; they start on the
     scene's first row, ascending along the line.
 
-    Raises
-    ------
-    SettingsError : a patch is wider than a line.
+    Raises SettingsError: a patch is wider than a line.
     """
     if camera.samples < grid.patch + 2 * margin_px:
         beside = f" and {margin_px:g} px on either side" if margin_px else ""

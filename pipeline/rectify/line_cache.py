@@ -91,17 +91,11 @@ class LineCache:
                     block.raw = raw
                     self.reads += 1
                     self.bytes_held += raw.nbytes
-                    self._let_go(key)
+                    for old, held in list(self._blocks.items()):  # the newest and those still being read stay
+                        if self.bytes_held > self.most_bytes and old != key and held.raw is not None:
+                            self.bytes_held -= held.raw.nbytes
+                            del self._blocks[old]
             return block.raw
-
-    def _let_go(self, newest: _Key) -> None:
-        """Drop the oldest blocks where too much is held; the newest and those still being read stay."""
-        for key, block in list(self._blocks.items()):
-            if self.bytes_held <= self.most_bytes:
-                return
-            if key != newest and block.raw is not None:
-                self.bytes_held -= block.raw.nbytes
-                del self._blocks[key]
 
 
 def line_blocks(lines: slice) -> range:

@@ -64,8 +64,13 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
     row = fresh[_longest_ascent(time_s[fresh])]
     usable[row[_without_wild_ends(time_s[row], frame_s)]] = True
     count = _numbers(time_s[usable], frame_s)
+    number = np.zeros(len(time_s), np.intp)
+    if len(count):
+        same = np.minimum(np.searchsorted(time_s[usable], time_s), len(count) - 1)
+        before = count[np.maximum(np.cumsum(usable) - 1, 0)]
+        number = np.where(time_s[usable][same] == time_s, count[same], before)
     return LineNumbers(
-        number=_numbers_of_all(time_s, usable, count),
+        number=number,
         usable=usable,
         lost=int(count[-1]) + 1 - len(count) if len(count) else 0,
         repeated=repeated,
@@ -110,15 +115,6 @@ def _numbers(time_s: Floats, frame_s: float) -> NDArray[np.intp]:
     order = np.arange(len(count))
     count = order + np.minimum.accumulate((count - order)[::-1])[::-1]
     return count - count[:1]
-
-
-def _numbers_of_all(time_s: Floats, usable: NDArray[np.bool_], count: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Line numbers of all frames from those of the usable ones."""
-    if not len(count):
-        return np.zeros(len(time_s), np.intp)
-    before = count[np.maximum(np.cumsum(usable) - 1, 0)]
-    same = np.minimum(np.searchsorted(time_s[usable], time_s), len(count) - 1)
-    return np.where(time_s[usable][same] == time_s, count[same], before)
 
 
 def _count_late(time_s: Floats, count: NDArray[np.intp], frame_s: float) -> int:

@@ -258,9 +258,7 @@ def track_lookup(track: Track, camera: LineCamera, points_px: Floats, *, along: 
     the point is off the track by more than half a step or half a sample, where the nearest knot is one that nothing
     saw, and where no crossing with the path was found.
 
-    Raises
-    ------
-    ShapeError : points are not pairs.
+    Raises ShapeError: points are not pairs.
     """
     if points_px.shape[-1] != 2:
         raise ShapeError(f"expected points (..., 2) of y and x, got {points_px.shape}")

@@ -19,6 +19,7 @@ from pipeline.rectify.resample import merge_lines, resample
 from pipeline.rectify.tracks import Track
 
 LEAST_EDGE_PX = 1e-3  # the very edge of a sweep counts where nothing else reaches
+RUN_ELEMENTS = 250_000  # what one more window costs, in elements (sample and band of a line) calibrated
 BLOCK_POINTS = 1024  # what is mixed at once stays in cache
 
 
@@ -117,9 +118,6 @@ def _by_band(
     return found
 
 
-RUN_ELEMENTS = 250_000  # what one more window costs, in elements (sample and band of a line) calibrated
-
-
 @dataclass(frozen=True)
 class LookedUp:
     """A track and the (..., 2) knots and samples at which it saw some points, NaN off it."""
@@ -171,28 +169,22 @@ def cut_runs(looked: Sequence[NDArray[np.float64]], bands: int) -> list[slice]:
     lookup coordinates of each track.
     """
     boxes = np.stack([_boxes(coordinates) for coordinates in looked])
-    cuts: list[slice] = []
-    _cut(boxes, slice(0, boxes.shape[1]), bands, cuts)
-    return cuts
 
+    def price(
+        run: slice,
+    ) -> float:  # elements to calibrate, and what a run costs by itself; none where no track reaches
+        low = np.fmin.reduce(boxes[:, run][:, :, [0, 2]], axis=1)  # NaN aside
+        high = np.fmax.reduce(boxes[:, run][:, :, [1, 3]], axis=1)
+        return float(np.nansum(np.prod(high - low + 2 * TAPS, axis=1) * bands + RUN_ELEMENTS))
 
-def _cut(boxes: NDArray[np.float64], run: slice, bands: int, cuts: list[slice]) -> None:
-    middle = (run.start + run.stop) // 2
-    one, other = slice(run.start, middle), slice(middle, run.stop)
-    if run.stop - run.start > 1 and _price(boxes[:, one], bands) + _price(boxes[:, other], bands) < _price(
-        boxes[:, run], bands
-    ):
-        _cut(boxes, one, bands, cuts)
-        _cut(boxes, other, bands, cuts)
-    else:
-        cuts.append(run)
+    def cut(run: slice) -> list[slice]:
+        middle = (run.start + run.stop) // 2
+        one, other = slice(run.start, middle), slice(middle, run.stop)
+        if run.stop - run.start > 1 and price(one) + price(other) < price(run):
+            return cut(one) + cut(other)
+        return [run]
 
-
-def _price(boxes: NDArray[np.float64], bands: int) -> float:
-    """Elements to calibrate for a run of groups, its fixed price included; nothing where no track reaches."""
-    low, high = np.fmin.reduce(boxes[:, :, [0, 2]], axis=1), np.fmax.reduce(boxes[:, :, [1, 3]], axis=1)  # NaN aside
-    elements = np.prod(high - low + 2 * TAPS, axis=1) * bands + RUN_ELEMENTS
-    return float(np.nansum(elements))
+    return cut(slice(0, boxes.shape[1]))
 
 
 def _boxes(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from pipeline.rectify.tie_points import TieTable, tie_table
 from pipeline.rectify.tracks import Track, make_tracks
 from pipeline.source import SweepLines
 
+PIECE_SAMPLES = 64
+MARGIN_PX = 2.0  # of the grid: half a pixel, half a sample, and rounding
+TAPS = 3  # knots and samples that a kernel reads beyond the outermost coordinate
 LEAST_TIE_PX = 4  # closer ties take a byte a pixel and more
 
 
@@ -119,26 +122,9 @@ def place(
 
 def _table(track: Track, lines: SweepLines, camera: LineCamera, grid: PixelGrid) -> TieTable | None:
     """A table of the whole grid; None where lines lie too unevenly for ties to save anything."""
-
-    def of_shape(shape: tuple[int, int]) -> TieTable:
-        return tie_table(
-            track,
-            camera,
-            along=lines.sweep.along,
-            binning=lines.sweep.binning,
-            origin_px=grid.origin_px,
-            spacing_px=grid.spacing_px,
-            shape=shape,
-        )
-
-    if of_shape((1, 1)).spacing < LEAST_TIE_PX:
-        return None
-    return of_shape(grid.shape)
-
-
-PIECE_SAMPLES = 64
-MARGIN_PX = 2.0  # of the grid: half a pixel, half a sample, and rounding
-TAPS = 3  # knots and samples that a kernel reads beyond the outermost coordinate
+    place, sweep = {"origin_px": grid.origin_px, "spacing_px": grid.spacing_px}, lines.sweep
+    of_shape = partial(tie_table, track, camera, along=sweep.along, binning=sweep.binning, **place)
+    return None if of_shape(shape=(1, 1)).spacing < LEAST_TIE_PX else of_shape(shape=grid.shape)
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,11 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.line_cache import BLOCK_LINES, LineCache, Raw, ReadWindow, held_samples, line_blocks
 from pipeline.rectify.mosaic import LookedUp, cut_runs, mosaic, read_part
-from pipeline.rectify.placed import TAPS, ColumnReach, TrackReach, member_lines
-from pipeline.rectify.placed import PixelGrid as PixelGrid
-from pipeline.rectify.placed import Placed as Placed
-from pipeline.rectify.placed import place as place
+from pipeline.rectify.placed import TAPS, ColumnReach, PixelGrid, Placed, TrackReach, member_lines, place
 from pipeline.rectify.tracks import Track
 from pipeline.source import SweepLines
 
+COPIES = 5  # of a tile in memory at once: values, parts and calibrated lines, rounded, chunks and shard
 GROUP_COLUMNS = 32  # tiles are cut between groups of so many columns
 
 Values = NDArray[np.float32]
@@ -201,9 +199,6 @@ def _reader(
     origin = int(members.min())
     raw: Raw = one.lines.read(origin, int(members.max()) + 1)
     return lambda wanted, samples: raw[wanted.start - origin : wanted.stop - origin, samples]
-
-
-COPIES = 5  # of a tile in memory at once: values, parts and calibrated lines, rounded, chunks and shard
 
 
 @dataclass(frozen=True)

@@ -127,11 +127,15 @@ def tie_table(
         if bound <= tolerance_px and min(kept) > 0:
             rows, columns = ((size - 1) // tie + 2 for size in kept)
             ties = exact(0, tie, (rows, columns))
-            cells = _cells_on_track(ties, len(track), samples)
+            corners = _corners(ties)
+            ends = np.array([len(track), samples]) - 0.5
+            cells = ((corners.max(axis=0) >= -0.5) & (corners.min(axis=0) <= ends)).all(
+                axis=-1
+            )  # hold points of the track
             bound = SAFETY * (bound + _tie_bound(ties, cells))
             if bound <= tolerance_px:
                 middle = exact(tie / 2, tie, (rows - 1, columns - 1))
-                bound = max(bound, _largest(np.abs(middle - _corners(ties).mean(axis=0))[cells]))
+                bound = max(bound, _largest(np.abs(middle - corners.mean(axis=0))[cells]))
         if bound <= tolerance_px:
             return TieTable(ties, tie, shape, bound, track.seen, samples, corner, kept)
         tie //= 2
@@ -168,14 +172,6 @@ def _knot_bound(track: Track, knots: float) -> float:
             middle = (tangent[: -2 * half] + tangent[2 * half :]) / 2
             worst = max(worst, float(np.abs(tangent[half:-half] - middle).max()) / track.width)
     return worst
-
-
-def _cells_on_track(ties: Floats, knots: int, samples: int) -> NDArray[np.bool_]:
-    """Cells between four ties that hold points of the track."""
-    corners = _corners(ties)
-    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
-    on: NDArray[np.bool_] = ((high >= -0.5) & (low <= np.array([knots, samples]) - 0.5)).all(axis=-1)
-    return on
 
 
 def _tie_bound(ties: Floats, cells: NDArray[np.bool_]) -> float:

@@ -96,7 +96,9 @@ def make_tracks(
         return ()
     apart = camera.ifov_rad * binning
     step = _usual_step(scan, lines, apart) if step_px is None else step_px * camera.ifov_rad
-    runs = _runs(scan, max(GAP_STEPS * step, NOISE_SIGMAS * _noise(scan)), DWELL_STEPS * step)
+    bends = np.abs(np.diff(scan, 2))  # of a position's own noise: sqrt 6 times its standard deviation
+    noise = float(np.median(bends)) * SIGMA_OF_MEDIAN / 6**0.5 if len(bends) else 0.0
+    runs = _runs(scan, max(GAP_STEPS * step, NOISE_SIGMAS * noise), DWELL_STEPS * step)
     return tuple(_track(scan[run], across[run], lines[run], step) for run in runs)
 
 
@@ -151,13 +153,6 @@ def _usual_step(scan: Floats, lines: NDArray[np.intp], apart: float) -> float:
     if not len(steps):
         return apart
     return float(np.percentile(steps, 50, method="lower"))  # of one step and one gap, the step
-
-
-def _noise(scan: Floats) -> float:
-    """Standard deviation of a position about its path, from the median of the second differences."""
-    if len(scan) < 3:
-        return 0.0
-    return float(np.median(np.abs(np.diff(scan, 2)))) * SIGMA_OF_MEDIAN / 6**0.5
 
 
 def _runs(scan: Floats, most_back: float, still: float) -> list[slice]:

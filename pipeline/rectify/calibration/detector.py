@@ -93,7 +93,9 @@ def find_bad_elements(
 
 def _off_neighbours(response: Floats, noise: Floats, limits: BadElementCriteria) -> Bools:
     """Elements whose response is missing or odd beside their neighbours'."""
-    local = _local_median(response, limits.window)
+    size = min(limits.window, len(response))
+    around = (max(size - 1 + size % 2, 1), 1)  # an odd number of samples
+    local = ndimage.median_filter(_without_gaps(response), around, mode="reflect")
     least = np.maximum(limits.lit_sigmas * noise, limits.lit_share * _median(response, axis=0))
     judged = np.isfinite(response) & (local > least)
     relative = np.full(response.shape, np.nan)
@@ -115,14 +117,6 @@ def _beyond_nearest(response: Floats, limits: BadElementCriteria) -> Bools:
     low, high = (ndimage.rank_filter(filled, rank, (limits.near, 1), mode="reflect") for rank in (2, -3))
     beyond: Bools = (response < low * (1 - limits.odd_share)) | (response > high * (1 + limits.odd_share))
     return beyond
-
-
-def _local_median(columns: Floats, window: int) -> Floats:
-    """Running median along the samples, mirrored at the ends; a gap takes the median of its band."""
-    size = min(window, len(columns))
-    size = max(size - 1 + size % 2, 1)  # odd
-    local: Floats = ndimage.median_filter(_without_gaps(columns), (size, 1), mode="reflect")
-    return local
 
 
 def _without_gaps(columns: Floats) -> Floats:

@@ -78,10 +78,8 @@ def solve_sweeps(
     in no window stay at 0; those joined to each other but not to the reference stay at 0 on average. Both are named as
     untied.
 
-    Raises
-    ------
-    SettingsError : the reference is no sweep.
-    ShapeError : a window names a sweep that is not there.
+    Raises SettingsError: the reference is no sweep.
+    Raises ShapeError: a window names a sweep that is not there.
     """
     if len(names) != len(lines):
         raise ShapeError(f"expected a number of lines for each of {len(names)} sweeps, got {len(lines)}")

@@ -57,9 +57,7 @@ def light_ratio(
     The points come in groups (squares of pixels). The ratio is the median over groups of the ratio of their sums: sums
     first, so that noise has no say in the sign of a pixel; the median, so that what moved between the sweeps has none.
 
-    Raises
-    ------
-    ShapeError : the two differ in shape or are not (group, point, band).
+    Raises ShapeError: the two differ in shape or are not (group, point, band).
     """
     if reference_values.ndim != 3 or reference_values.shape != moving_values.shape:
         raise ShapeError(
@@ -89,10 +87,8 @@ def solve_lights(
     Least squares of log ratios, each weighted by its error, with the log light of a sweep a polynomial in wavelength.
     Overlaps see ratios only: the mean log light of sweeps that they join is 0 at every wavelength.
 
-    Raises
-    ------
-    SettingsError : the order is negative.
-    ShapeError : a ratio has another number of bands, or names a sweep that is not there.
+    Raises SettingsError: the order is negative.
+    Raises ShapeError: a ratio has another number of bands, or names a sweep that is not there.
     """
     bands = len(wavelength_nm)
     if order < 0:
@@ -104,7 +100,10 @@ def solve_lights(
                 f"there are {sweeps} sweeps of {bands} bands"
             )
     known = [ratio for ratio in ratios if np.isfinite(ratio.log_ratio).any()]
-    basis = _basis(wavelength_nm, order)
+    low, high = float(np.min(wavelength_nm)), float(np.max(wavelength_nm))
+    span = (2 * np.asarray(wavelength_nm, np.float64) - low - high) / max(high - low, 1e-9)
+    most = len(np.unique(wavelength_nm)) - 1  # no more polynomials than there are bands
+    basis = np.polynomial.legendre.legvander(span, min(order, most)).astype(np.float64)
     answer = np.zeros((sweeps, basis.shape[1]))
     if known:
         rows, wanted = zip(*(_equations(ratio, sweeps, basis) for ratio in known), strict=True)
@@ -157,14 +156,6 @@ def _squares(values: NDArray[np.float32], rows: int, columns: int) -> NDArray[np
     down, across, bands = values.shape[0] // rows, values.shape[1] // columns, values.shape[2]
     whole = values[: down * rows, : across * columns].reshape(down, rows, across, columns, bands)
     return whole.swapaxes(1, 2).reshape(down * across, rows * columns, bands)
-
-
-def _basis(wavelength_nm: Floats, order: int) -> Floats:
-    """Legendre polynomials over the range of the wavelengths, (band, order + 1); no more than there are bands."""
-    low, high = float(np.min(wavelength_nm)), float(np.max(wavelength_nm))
-    place = (2 * np.asarray(wavelength_nm, np.float64) - low - high) / max(high - low, 1e-9)
-    different = len(np.unique(wavelength_nm))
-    return np.polynomial.legendre.legvander(place, min(order, different - 1)).astype(np.float64)
 
 
 def _equations(ratio: LightRatio, sweeps: int, basis: Floats) -> tuple[Floats, Floats]:

@@ -157,18 +157,13 @@ def measure_windows(
         if window.width_px < LEAST_OVERLAP_PX + reach_px:
             seen.append(SeamWindow(window, None, None, np.full(2, np.nan)))
             continue
-        found = _compare(window, images, reach_px)
+        one, other = images[window.reference], images[window.moving]
+        pitch = one.broad.sweep.step  # the distance of the pass's lines
+        along, scan = (np.arange(low, high, pitch) for low, high in (window.along_px, window.scan_px))
+        found = pair_shift(one.seen_at(along, scan), other.seen_at(along, scan), prior_px=reach_px / pitch)
         measured = _measured(window, found, images)
         seen.append(SeamWindow(window, found, measured, np.full(2, np.nan) if measured is None else measured.shift))
     return seen
-
-
-def _compare(window: Window, images: Sequence[PlacedImage], reach_px: float) -> PairShift:
-    """Rectify both sweeps in a window, at the distance of the pass's lines, and register them."""
-    one, other = images[window.reference], images[window.moving]
-    pitch = one.broad.sweep.step
-    along, scan = (np.arange(low, high, pitch) for low, high in (window.along_px, window.scan_px))
-    return pair_shift(one.seen_at(along, scan), other.seen_at(along, scan), prior_px=reach_px / pitch)
 
 
 def _measured(window: Window, found: PairShift, images: Sequence[PlacedImage]) -> WindowShift | None:
@@ -249,49 +244,29 @@ def anchor_sweep(
 def _compare_with_mosaic(
     image: PlacedImage, grid: SceneGrid, mosaic: NDArray[np.floating], reach_px: float
 ) -> PairShift:
-    """Compare a sweep with the mosaic under it."""
+    """Compare a sweep with the mosaic under it, at the scene's pixels that it may have seen."""
     from scipy.ndimage import convolve1d
 
-    along_px, scan_px = _box(image, grid, reach_px)
+    places, shown = image.edges.reshape(-1, 2), []
+    for axis, size in enumerate(field_px(grid, image.broad.sweep.along)):
+        low, high = (float(end) + (size - 1) / 2 for end in (places[:, axis].min(), places[:, axis].max()))
+        first, last = max(int(np.floor(low - reach_px)), 0), min(int(np.ceil(high + reach_px)), size - 1)
+        shown.append(np.arange(first, last + 1, dtype=np.float64) - (size - 1) / 2)
+    along_px, scan_px = shown
     if not (len(along_px) and len(scan_px)):
         return nothing_found("empty")
+    mean = np.full(grid.factor, 1 / grid.factor)
+    if grid.factor % 2 == 0:  # centred: the outer two count half
+        mean = np.concatenate([[0.5], np.ones(grid.factor - 1), [0.5]]) / grid.factor
     seen = image.seen_at(along_px, scan_px).astype(np.float64)
     for axis in (0, 1):  # a coarse pixel is a mean over factor x factor; what is not seen spreads by as much
-        seen = convolve1d(seen, _coarse_footprint(grid.factor), axis=axis, mode="constant", cval=np.nan)
-    under = _interpolated(mosaic, grid, image, (along_px, scan_px))
-    return pair_shift(under, seen, prior_px=reach_px)
-
-
-def _coarse_footprint(factor: int) -> Floats:
-    """Mean over ``factor`` pixels, centred; of an even number the outer two count half."""
-    if factor % 2:
-        return np.full(factor, 1 / factor)
-    return np.concatenate([[0.5], np.ones(factor - 1), [0.5]]) / factor
-
-
-def _interpolated(
-    mosaic: NDArray[np.floating], grid: SceneGrid, image: PlacedImage, places: tuple[Floats, Floats]
-) -> Floats:
-    """The coarse mosaic at fine places, (scan, along); NaN where it holds nothing."""
-    scan, along = np.meshgrid(places[1], places[0], indexing="ij")
+        seen = convolve1d(seen, mean, axis=axis, mode="constant", cval=np.nan)
+    scan, along = np.meshgrid(scan_px, along_px, indexing="ij")
     y, x = (scan, along) if image.broad.sweep.along == "x" else (along, scan)
     rows, columns = (
         (place + (size - 1) / 2 - (grid.factor - 1) / 2) / grid.factor
         for place, size in ((y, grid.height), (x, grid.width))
     )
     points = np.stack([rows.ravel(), columns.ravel()], axis=-1)
-    values = np.ascontiguousarray(mosaic[..., None], np.float32)
-    seen, _ = resample(values, np.isfinite(mosaic), points)
-    return seen[:, 0].astype(np.float64).reshape(scan.shape)
-
-
-def _box(image: PlacedImage, grid: SceneGrid, reach_px: float) -> tuple[Floats, Floats]:
-    """Scene pixels along the line and along the scan that the sweep may have seen [px]."""
-    across, scan = field_px(grid, image.broad.sweep.along)
-    places = image.edges.reshape(-1, 2)
-    found: list[Floats] = []
-    for axis, size in ((0, across), (1, scan)):
-        low, high = (float(end) + (size - 1) / 2 for end in (places[:, axis].min(), places[:, axis].max()))
-        first, last = max(int(np.floor(low - reach_px)), 0), min(int(np.ceil(high + reach_px)), size - 1)
-        found.append(np.arange(first, last + 1, dtype=np.float64) - (size - 1) / 2)
-    return found[0], found[1]
+    under, _ = resample(np.ascontiguousarray(mosaic[..., None], np.float32), np.isfinite(mosaic), points)
+    return pair_shift(under[:, 0].astype(np.float64).reshape(scan.shape), seen, prior_px=reach_px)
