@@ -122,8 +122,8 @@ def place(
 
 def _table(track: Track, lines: SweepLines, camera: LineCamera, grid: PixelGrid) -> TieTable | None:
     """A table of the whole grid; None where lines lie too unevenly for ties to save anything."""
-    place, sweep = {"origin_px": grid.origin_px, "spacing_px": grid.spacing_px}, lines.sweep
-    of_shape = partial(tie_table, track, camera, along=sweep.along, binning=sweep.binning, **place)
+    of_grid = partial(tie_table, track, camera, along=lines.sweep.along, binning=lines.sweep.binning)
+    of_shape = partial(of_grid, origin_px=grid.origin_px, spacing_px=grid.spacing_px)
     return None if of_shape(shape=(1, 1)).spacing < LEAST_TIE_PX else of_shape(shape=grid.shape)
 
 

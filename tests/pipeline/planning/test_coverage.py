@@ -71,12 +71,6 @@ def test_the_known_fields_have_their_known_lines():
     assert (along, len(sweeps)) == ("y", 2)
 
 
-def test_a_longer_line_needs_fewer_strips():
-    """A 1280-sample camera sees 2560 px in two strips: strips move inwards to meet."""
-    camera = replace(CAMERA, samples=1280)
-    assert len(full_sweeps(SceneGrid(100, 2560, 16, 4), camera, "x")) == 2
-
-
 def test_fields_beyond_the_mirror_are_refused():
     """The error names the sweep, where it would have to look, and what to do."""
     grid = SceneGrid(23_000, 640, 32, 4)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps
 from pipeline.planning.fine_pass import SeatsPrice, plan_fine, price_of_seats
-from pipeline.planning.prices import check_budget, least_budget
+from pipeline.planning.prices import check_budget
 from pipeline.planning.strips import covered_seats
 
 CAMERA, COST = LineCamera(), CostModel()
@@ -27,12 +28,16 @@ def drawn(grid: SceneGrid, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).exponential(size=int(np.prod(grid.seat_shape))) ** 3
 
 
-@settings(max_examples=12, deadline=None)
-@given(st.floats(0, 60), st.floats(0, 60), st.integers(0, 99), st.sampled_from(["x", "y"]))
-def test_price_within_budget_and_worth_grows_with_it(one: float, other: float, seed: int, along: str):
-    """The plan never costs more than the budget, and a bigger budget never buys less score."""
-    scores = drawn(GRID, seed)
-    small, large = (plan_fine(GRID, CAMERA, COST, along, scores, budget_s=b) for b in sorted((one, other)))
+@settings(max_examples=20, deadline=None)
+@given(
+    st.floats(0, 60), st.floats(0, 60), st.integers(0, 99), st.sampled_from(["x", "y"]), st.none() | st.floats(0.05, 3)
+)
+def test_price_within_budget_and_worth_grows_with_it(
+    one: float, other: float, seed: int, along: str, threshold: float | None
+):
+    """The plan never costs more than the budget, and a bigger budget never buys less score, whatever the threshold."""
+    plan = partial(plan_fine, GRID, CAMERA, COST, along, drawn(GRID, seed), threshold=threshold)
+    small, large = (plan(budget_s=budget_s) for budget_s in sorted((one, other)))
     assert small.seconds <= min(one, other)
     assert large.seconds <= max(one, other)
     assert large.worth >= small.worth * (1 - 1e-12)
@@ -80,16 +85,6 @@ def test_scores_of_no_worth_buy_nothing(value: float):
     assert (plan.sweeps, plan.seconds, plan.worth, len(plan.seats)) == ([], 0.0, 0.0, 0)
 
 
-def test_infinite_scores_come_first():
-    """A seat of score +inf outweighs all others together."""
-    scores = drawn(GRID)
-    weak = int(np.argmin(np.where(np.isin(np.arange(len(scores)), GRID.valid_seats()), scores, np.inf)))
-    scores[weak] = np.inf
-    plan = plan_fine(GRID, CAMERA, COST, "x", scores, budget_s=6.5)
-    assert weak in plan.seats
-    assert np.isfinite(plan.worth)
-
-
 def test_an_infinite_score_outweighs_the_one_other():
     """Of two seats far apart with time for one, the one of score +inf is bought."""
     first, last = GRID.valid_seats()[[0, -1]]
@@ -122,36 +117,6 @@ def test_planning_a_farm_pays():
     plan = plan_fine(grid, CAMERA, COST, "x", scores, budget_s=left)
     assert plan.seconds > left - 3
     assert plan.worth > 2 * plan.seconds / full * scores.sum()
-
-
-@pytest.mark.parametrize("budget", [0.0, -0.5, 1.0001, float("nan"), float("inf")])
-def test_budgets_out_of_range_are_refused(budget: float):
-    """A budget is above 0 and at most 1."""
-    with pytest.raises(BudgetError, match="above 0 and at most 1, got"):
-        check_budget(budget, 50.0, 200.0)
-
-
-def test_budgets_below_the_coarse_pass_name_the_least():
-    """The least that a refusal names is accepted."""
-    with pytest.raises(BudgetError, match=r"least possible is 0\.2847"):
-        check_budget(0.1, 56.93, 200.0)
-    assert check_budget(0.2847, 56.93, 200.0) == pytest.approx(0.01)
-    assert check_budget(1.0, 56.93, 200.0) == pytest.approx(143.07)
-
-
-@given(st.floats(1, 500), st.floats(0.01, 1))
-def test_the_least_budget_is_accepted_and_is_the_least(full: float, share: float):
-    """It pays for the coarse pass, and one step of the last digit less does not."""
-    least = least_budget(full * share, full)
-    assert 0 <= check_budget(min(least, 1.0), full * share, full) <= full * 1.01e-4
-    with pytest.raises(BudgetError, match=f"the least possible is {least}"):
-        check_budget(least - 1.01e-4, full * share, full)
-
-
-def test_a_coarse_pass_dearer_than_the_full_scan_is_refused():
-    """Without a saving to be had the message says to scan in full."""
-    with pytest.raises(BudgetError, match="scan in full"):
-        check_budget(1.0, 210.0, 200.0)
 
 
 def test_a_seat_alone_costs_its_own_lines():
@@ -217,7 +182,7 @@ def test_the_full_scan_is_taken_where_runs_are_no_cheaper():
     below = plan_fine(grid, CAMERA, COST, "x", scores, budget_s=full_s - 1e-6)
     assert below.kind == "lines"
     assert below.worth < 8.0
-    assert price_of_seats(grid, CAMERA, COST, "x", np.arange(8)).kind == "full"
+    assert price_of_seats(grid, CAMERA, COST, "x", np.arange(8)).least[1] == full_s
 
 
 @pytest.mark.parametrize("budget_s", [0.0, 20.0, 40.0, 80.0, 500.0])
@@ -229,22 +194,12 @@ def test_no_plan_takes_longer_than_the_full_scan(budget_s: float):
     assert f"{plan.full_seconds:.1f} s" in plan.reason
 
 
-def test_prices_of_seats_stand_beside_the_full_scan():
-    """Few seats are cheaper by runs of lines; of dear runs the full scan is, and both figures stay visible."""
+def test_the_cheaper_way_is_taken():
+    """Few seats are cheaper by runs of lines, dear runs by the full scan, where the mirror reaches all of it."""
     few = price_of_seats(GRID, CAMERA, COST, "x", GRID.valid_seats()[:2])
-    assert few.kind == "lines"
     assert few.least == (few.lines, few.seconds)
-    assert "which is dearer" in few.sentence
-    dear = SeatsPrice(900, 95.0, 800, 82.0)
-    assert (dear.kind, dear.least) == ("full", (800, 82.0))
-    assert dear.sentence.startswith("by runs of lines these seats take 900 lines and 95.0 s; the full scan takes 800")
-
-
-def test_prices_without_a_full_scan():
-    """Beyond the mirror's range there is no full scan to fall back to."""
-    price = SeatsPrice(900, 95.0, None, None)
-    assert (price.kind, price.least) == ("lines", (900, 95.0))
-    assert "beyond the mirror's range" in price.sentence
+    assert SeatsPrice(900, 95.0, 800, 82.0).least == (800, 82.0)
+    assert SeatsPrice(900, 95.0, None, None).least == (900, 95.0)
 
 
 def test_a_margin_shows_the_seats_wherever_the_mirror_looks() -> None:
@@ -272,17 +227,6 @@ def test_a_higher_threshold_never_buys_more(one: float, other: float, budget_s: 
     assert max(low.seconds, high.seconds) <= budget_s
     for plan, limit in ((low, min(one, other)), (high, max(one, other))):
         assert plan.worth >= limit * (plan.seconds - COST.reload_s) * (1 - 1e-9)
-
-
-@settings(max_examples=8, deadline=None)
-@given(st.floats(0, 60), st.floats(0, 60), st.floats(0.05, 3), st.integers(0, 99))
-def test_a_bigger_budget_never_buys_less_above_a_threshold(one: float, other: float, threshold: float, seed: int):
-    """The law of budgets holds for every threshold."""
-    small, large = (
-        plan_fine(GRID, CAMERA, COST, "x", drawn(GRID, seed), budget_s=budget_s, threshold=threshold)
-        for budget_s in sorted((one, other))
-    )
-    assert large.worth >= small.worth * (1 - 1e-12)
 
 
 @pytest.mark.parametrize("budget_s", [0.0, 7.0, 25.0, 60.0])

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import PoseError, SettingsError, ShapeError
+from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep, line_positions, scene_to_sweep
@@ -105,12 +105,6 @@ def test_views_agree_with_sweeps_cut_from_the_strips():
     assert sorted(views.seat[inside].tolist()) == covered_seats(GRID, CAMERA, [cut]).tolist()
     assert views.first.min() == 0
     assert views.stop.max() == views.lines
-
-
-def test_a_patch_wider_than_a_line_is_refused():
-    """No strip shows it whole."""
-    with pytest.raises(SettingsError, match="patch of 700 px is wider than a line of 640"):
-        strips_at_seats(SceneGrid(700, 700, 700, 1), CAMERA, "x")
 
 
 @given(st.floats(-12_000, 12_000), st.floats(-12_000, 12_000))

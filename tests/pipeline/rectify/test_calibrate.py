@@ -34,25 +34,35 @@ def test_hand_worked_values() -> None:
     np.testing.assert_allclose(values[1, :, 0], [0, 2, 0.5, -0.1], atol=1e-6)
 
 
-def test_saturated_band_spoils_only_itself() -> None:
-    """One saturated band is invalid and leaves its sample's other bands valid; all of them put the sample out."""
-    raw = np.full((2, 4, 3), 500, np.uint16)
-    raw[1, 2] = 4095
-    _, valid = calibrate(raw, frames(), saturated_dn=4095)
-    assert np.argwhere(~valid).tolist() == [[1, 2]]
-    raw[1, 3, 0] = 4095
-    _, valid = calibrate(raw, frames(), saturated_dn=4095)
-    assert np.argwhere(~valid).tolist() == [[1, 2, 0], [1, 2, 1], [1, 2, 2], [1, 3, 0]]
-
-
-def test_element_without_response_spoils_only_itself() -> None:
-    """Where white is not above dark the value is NaN and invalid on every line, the sample's other bands are not."""
-    references = frames()
-    references.white[3, 1] = 60
-    values, valid = calibrate(np.full((2, 4, 3), 500, np.uint16), references, saturated_dn=4095)
-    assert np.isnan(values[:, 3, 1]).all()
-    assert np.isfinite(values).sum() == values.size - 2
-    assert np.argwhere(~valid).tolist() == [[0, 3, 1], [1, 3, 1]]
+@pytest.mark.parametrize(
+    ("unlit", "bad", "hot", "out"),
+    [
+        ([], [], [(1, 2, 0), (1, 2, 1), (1, 2, 2)], [[1, 2]]),
+        ([], [], [(1, 2, 0), (1, 2, 1), (1, 2, 2), (1, 3, 0)], [[1, 2, 0], [1, 2, 1], [1, 2, 2], [1, 3, 0]]),
+        ([(3, 1)], [], [], [[0, 3, 1], [1, 3, 1]]),
+        ([(3, 1)], [], [(0, 3, 2)], [[0, 3, 1], [0, 3, 2], [1, 3, 1]]),
+        ([], [(1, 2)], [(0, 2, 2), (1, 0, 2)], [[0, 1, 2], [0, 2, 2], [1, 0, 2], [1, 1, 2]]),
+        (
+            [(n, 2) for n in range(4)],
+            [],
+            [(0, 0, 0), (0, 0, 1), (0, 3, 0)],
+            [[0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 3, 0]],
+        ),
+    ],
+    ids=["sample", "band", "unlit", "both", "filled from saturated", "band without light"],
+)
+def test_an_element_spoils_only_itself(unlit: list, bad: list, hot: list, out: list) -> None:
+    """Saturated, uncalibrated and wrongly filled elements are invalid; a sample is where all bands with light are."""
+    references, raw = replace(frames(), bad=np.zeros((4, 3), np.bool_)), np.full((2, 4, 3), 500, np.uint16)
+    for place in unlit:
+        references.white[place] = 60
+    for place in bad:
+        references.bad[place] = True
+    for place in hot:
+        raw[place] = 4095
+    values, valid = calibrate(raw, references, saturated_dn=4095)
+    assert np.argwhere(~valid).tolist() == out
+    assert np.argwhere(np.isnan(values[0])).tolist() == [list(place) for place in sorted(unlit)]
 
 
 def test_bad_elements_are_filled_along_the_line() -> None:
@@ -65,26 +75,6 @@ def test_bad_elements_are_filled_along_the_line() -> None:
     np.testing.assert_allclose(values[0, :, 1], [0.2, 0.2, 0.4, 0.6, 0.8, 1.0], rtol=1e-6)
     assert valid.shape == (1, 6)
     assert valid.all()
-
-
-def test_filled_from_saturated_is_invalid() -> None:
-    """What is filled from a saturated neighbour is as unknown as that neighbour."""
-    raw = np.full((2, 4, 3), 500, np.uint16)
-    raw[0, 2, 2] = raw[1, 0, 2] = 4095
-    bad = np.zeros((4, 3), np.bool_)
-    bad[1, 2] = True
-    _, valid = calibrate(raw, replace(frames(), bad=bad), saturated_dn=4095)
-    assert np.argwhere(~valid).tolist() == [[0, 1, 2], [0, 2, 2], [1, 0, 2], [1, 1, 2]]
-
-
-def test_saturated_beside_uncalibrated() -> None:
-    """In one sample a saturated band and a band without a calibration are both out, and the third is not."""
-    references = frames()
-    references.white[3, 1] = 60
-    raw = np.full((1, 4, 3), 500, np.uint16)
-    raw[0, 3, 2] = 4095
-    _, valid = calibrate(raw, references, saturated_dn=4095)
-    assert np.argwhere(~valid).tolist() == [[0, 3, 1], [0, 3, 2]]
 
 
 def test_a_sample_that_is_out_fills_nothing() -> None:
@@ -205,23 +195,6 @@ def test_band_without_light_stays_alone() -> None:
     values, valid = calibrate(np.full((2, 4, 3), 500, np.uint16), references, saturated_dn=4095)
     assert np.isnan(values[..., 2]).all()
     assert np.isfinite(values[..., :2]).all()
-    assert valid.all()
-
-
-def test_bands_without_light_do_not_hold_a_sample() -> None:
-    """A sample saturated in all bands that have light is out whole, and one saturated in some only in those."""
-    references = frames()
-    references.white[:, 2] = references.dark[:, 2]
-    raw = np.full((1, 4, 3), 500, np.uint16)
-    raw[0, 0, :2] = raw[0, 3, 0] = 4095
-    _, valid = calibrate(raw, references, saturated_dn=4095)
-    assert np.argwhere(~valid).tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 3, 0]]
-
-
-def test_all_dark_lines_are_zero_and_valid() -> None:
-    """Lines at the dark level give exactly 0."""
-    values, valid = calibrate(np.full((3, 4, 3), 60, np.uint16), frames(), saturated_dn=4095)
-    assert (values == 0).all()
     assert valid.all()
 
 

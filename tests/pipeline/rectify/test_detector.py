@@ -1,19 +1,13 @@
-"""Bad elements are found and good ones left alone; flats take stripes off and leave the scene."""
+"""Bad elements are found and good ones left alone."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from pipeline.errors import RigError, ShapeError
-from pipeline.rectify.calibration.detector import (
-    BadElementCriteria,
-    find_bad_elements,
-    flat_from_lines,
-    flat_from_white,
-)
+from pipeline.rectify.calibration.detector import BadElementCriteria, find_bad_elements
 
 Frame = NDArray[np.float64]
 
@@ -87,65 +81,3 @@ def test_frames_must_fit() -> None:
     """Frames of two sizes are refused."""
     with pytest.raises(ShapeError, match=r"\(4, 3\) and \(4, 2\)"):
         find_bad_elements(np.zeros((4, 3)), np.zeros((4, 2)))
-
-
-def uneven(samples: int = 640, bands: int = 2) -> Frame:
-    """1 % of uneven response, mean 1 in each band."""
-    response = np.random.default_rng(5).normal(1, 0.01, (samples, bands))
-    return response / response.mean(axis=0)
-
-
-def ripple(columns: Frame) -> float:
-    """Standard deviation of what differs between neighbouring columns, as if each had its own."""
-    return float(np.diff(columns, axis=0).std() / np.sqrt(2))
-
-
-def test_flat_of_a_smooth_white() -> None:
-    """Response is told from vignetting: a fifth of the stripes is left, and the mean is 1."""
-    response = uneven()
-    light = 3000 * np.cos(np.linspace(-0.6, 0.6, 640))[:, None] ** 4
-    flat = flat_from_white(np.full_like(response, 60), 60 + light * response)
-    assert flat.dtype == np.float32
-    np.testing.assert_allclose(flat.mean(axis=0), 1, atol=1e-6)
-    assert ripple(response / flat) < ripple(response) / 5
-
-
-def test_flat_of_lines_with_edges() -> None:
-    """Blobs three times as bright as the soil leave less than a third of the stripes after the flat."""
-    rng, response = np.random.default_rng(6), uneven()
-    blobs = ndimage.gaussian_filter(rng.standard_normal((600, 640)), 6)
-    field = np.where(blobs > 0.5 * blobs.std(), 0.45, 0.15) * rng.normal(1, 0.02, blobs.shape)
-    lines = (field[..., None] * response).astype(np.float32)
-    flat = flat_from_lines(lines)
-    assert ripple(response / flat) < ripple(response) / 3
-    by_means = lines.mean(axis=0) / ndimage.uniform_filter1d(lines.mean(axis=0), 41, axis=0)
-    assert ripple(response / flat) < ripple(response / by_means) / 3
-
-
-def test_flat_of_lines_passes_over_what_is_not_valid() -> None:
-    """Invalid, missing and negative values do not count; a column without any keeps 1."""
-    response = uneven(50)
-    lines = np.broadcast_to(response, (40, 50, 2)).copy()
-    whole = flat_from_lines(lines)
-    lines[::4, 7] = np.nan
-    lines[1::4, 9] = -1
-    valid = np.ones((40, 50), np.bool_)
-    lines[2::4, 11], valid[2::4, 11] = 9.0, False
-    np.testing.assert_allclose(flat_from_lines(lines, valid=valid), whole, rtol=1e-6)
-    lines[:, 20] = np.nan
-    assert (flat_from_lines(lines, valid=valid)[20] == 1).all()
-
-
-@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 4, 2), (0, 4, 2), (3, 1, 2)])
-def test_flat_of_next_to_nothing_is_even(shape: tuple[int, int, int]) -> None:
-    """Lines that cannot tell columns apart give a flat near 1, without warnings."""
-    flat = flat_from_lines(np.ones(shape, np.float32))
-    np.testing.assert_allclose(flat, np.ones(shape[1:]), atol=1e-6)
-
-
-def test_lines_must_have_three_axes() -> None:
-    """A frame is no run of lines, and the mask has to fit."""
-    with pytest.raises(ShapeError, match=r"\(line, sample, band\)"):
-        flat_from_lines(np.ones((4, 3)))
-    with pytest.raises(ShapeError, match=r"valid \(2, 5\)"):
-        flat_from_lines(np.ones((2, 4, 3)), valid=np.ones((2, 5), np.bool_))

@@ -10,27 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import PoseError, ShapeError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import (
-    direction_to_position,
-    direction_to_scene,
-    position_to_normal,
-    reflect,
-    scene_to_direction,
-)
+from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, line_positions, points_of_scan, scene_to_sweep
 from pipeline.rectify.lookup import KnotCurve, grid_lookup, lookup, track_lookup
 from pipeline.rectify.resample import resample
 from pipeline.rectify.tracks import Track, make_tracks
+from tests.pipeline.rectify.aiming import CAMERA, aim
 
-CAMERA = LineCamera()
 places = st.floats(-4500, 4500)
-
-
-def aim(along_px: np.ndarray | float, scan_px: np.ndarray) -> np.ndarray:
-    """Mirror positions (line, 2) that look at points given in px along the line and the scan."""
-    tangents = np.stack(np.broadcast_arrays(along_px, scan_px), axis=-1) * CAMERA.ifov_rad
-    return direction_to_position(scene_to_direction(tangents))
 
 
 def see(position: np.ndarray, sample: np.ndarray, binning: int = 1) -> np.ndarray:
@@ -83,13 +70,6 @@ def test_backward_sweep_counts_from_its_own_start() -> None:
     points = np.random.default_rng(2).uniform((10, -400), (40, 0), (30, 2))
     forward, backward = (lookup(p, CAMERA, points, along="x") for p in (position, position[::-1]))
     np.testing.assert_allclose(backward, [49, 0] + forward * [-1, 1], atol=1e-7)
-
-
-def test_line_along_y_swaps_the_axes() -> None:
-    """Turning the rig by 90 degrees is the same as swapping y and x of the points."""
-    position, points = aim(30.0, np.arange(40.0)), np.random.default_rng(3).uniform(0, 39, (20, 2))
-    turned = lookup(position, CAMERA, points[:, ::-1], along="y")
-    np.testing.assert_array_equal(turned, lookup(position, CAMERA, points, along="x"))
 
 
 def test_grid_is_lookup_of_its_points() -> None:

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from pipeline.errors import ShapeError
 from pipeline.rectify.kernels import Kernel, kernel_taps
-from pipeline.rectify.resample import BLOCK_PX, gather, merge_lines, resample, to_uint16
+from pipeline.rectify.resample import BLOCK_PX, gather, merge_lines, resample
 
 KERNELS: tuple[Kernel, ...] = ("catmull-rom", "bilinear", "nearest")
 
@@ -197,16 +197,6 @@ def test_writes_to_given_memory() -> None:
         resample(values, valid, at, out=memory.astype(float))
 
 
-def test_nan_of_invalid_samples_does_not_leak() -> None:
-    """Between pixels, masked NaN never shows: a point has a value or has weight 0."""
-    rng = np.random.default_rng(6)
-    values, valid = rng.random((30, 30, 3), np.float32), rng.random((30, 30)) > 0.2
-    values[~valid] = np.nan
-    out, share = resample(values, valid, everywhere(29, 29, 0.4))
-    assert np.isfinite(out[share > 0]).all()
-    assert 0.5 < (share > 0).mean() < 1
-
-
 def test_borders_reach_half_a_pixel() -> None:
     """Points up to half a pixel beyond the outermost centres have values, farther ones and NaN do not."""
     values = np.ones((5, 6, 1), np.float32)
@@ -300,15 +290,6 @@ def test_dwells_must_part_the_lines(starts: list[int]) -> None:
     """First lines that do not begin at 0, do not ascend or lie beyond the end are refused."""
     with pytest.raises(ShapeError, match="ascending first lines from 0 on, below 3"):
         merge_lines(np.ones((3, 2, 1), np.float32), np.ones((3, 2), bool), np.array(starts, np.intp))
-
-
-def test_rounds_to_uint16() -> None:
-    """Clipped to the range, halves to even, NaN to 0 with its place told."""
-    values = np.array([0.5, 1.5, 2.5, -3, 65_535.4, 70_000, np.inf, np.nan], np.float32)
-    rounded, known = to_uint16(values)
-    assert rounded.dtype == np.uint16
-    assert rounded.tolist() == [0, 2, 2, 0, 65_535, 65_535, 65_535, 0]
-    assert known.tolist() == [True] * 7 + [False]
 
 
 @pytest.mark.parametrize("kernel", KERNELS)

@@ -8,18 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import PoseError, ShapeError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import direction_to_position, scene_to_direction
 from pipeline.rectify.tracks import Track, line_centres, make_tracks, single_track
+from tests.pipeline.rectify.aiming import CAMERA, aim
 
-CAMERA = LineCamera()
 STEPS = st.lists(st.sampled_from([-3.0, -1.0, 0.0, 0.1, 1.0, 1.0, 1.2, 4.0]), min_size=0, max_size=60)
-
-
-def aim(along_px: np.ndarray | float, scan_px: np.ndarray) -> np.ndarray:
-    """Mirror positions (line, 2) that look at points given in px along the line and the scan."""
-    tangents = np.stack(np.broadcast_arrays(along_px, scan_px), axis=-1) * CAMERA.ifov_rad
-    return direction_to_position(scene_to_direction(tangents))
 
 
 def members(track: Track) -> list[np.ndarray]:

@@ -13,7 +13,7 @@ from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.mirror_pointing import JITTER, tilt_to_scene
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig
-from tests.pipeline.geometry.second_order import pointing_error
+from tests.pipeline.geometry.test_second_order import pointing_error
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -500.0, 1001)
 RIG = Rig(mirror=replace(MirrorMotion(), repeatability_urad=40.0))

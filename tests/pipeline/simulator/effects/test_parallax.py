@@ -14,7 +14,7 @@ from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.effects.relief import PARALLAX, closeness
 from pipeline.simulator.rig_model import Air, Rig
-from tests.pipeline.geometry.second_order import relief_error
+from tests.pipeline.geometry.test_second_order import relief_error
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -100.0, 201)
 STEP = Air(distance_m=30.0, relief="step", nearest_m=3.0)

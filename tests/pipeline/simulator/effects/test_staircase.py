@@ -14,7 +14,7 @@ from pipeline.simulator.block import SweepBlock
 from pipeline.simulator.effects.mirror_path import STAIRCASE, beside_plan
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig
-from tests.pipeline.geometry.second_order import staircase_jitter
+from tests.pipeline.geometry.test_second_order import staircase_jitter
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -20.0, 41)
 

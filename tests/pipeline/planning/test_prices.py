@@ -1,4 +1,4 @@
-"""Savings: entries, and what a sweep counts for in lines, samples, bytes and seconds."""
+"""Prices: what a sweep counts for in lines, samples, bytes and seconds, savings, and the least budget."""
 
 from __future__ import annotations
 
@@ -7,11 +7,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.errors import BudgetError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import coarse_sweeps, full_sweeps
-from pipeline.planning.prices import SavingEntry, capture_savings, count_lines, count_samples, raw_bytes
+from pipeline.planning.prices import (
+    SavingEntry,
+    capture_savings,
+    check_budget,
+    count_lines,
+    count_samples,
+    least_budget,
+    raw_bytes,
+)
 
 CAMERA, COST = LineCamera(), CostModel()
 
@@ -27,6 +36,9 @@ def test_samples_beside_the_scene_are_not_counted():
     path = Sweep("a", "fine", "x", 0.0, -32.5, 66)
     assert count_samples([path], CAMERA, SceneGrid(60, 100, 16, 4)) == 60 * 100
     assert count_samples([path], CAMERA, SceneGrid(60, 640, 16, 4)) == 60 * 640
+    beside = Sweep("a", "fine", "x", 0.0, 5000.0, 3)
+    assert count_samples([beside], CAMERA, SceneGrid(60, 100, 16, 4)) == 0
+    assert raw_bytes([beside], CAMERA, 10) == 3 * 640 * 10 * 2
 
 
 def test_samples_far_off_the_axis_follow_their_rays():
@@ -55,13 +67,6 @@ def test_binned_lines_have_fewer_samples_and_bytes():
     assert raw_bytes(full, CAMERA, 270) == 403 * 640 * 270 * 2
 
 
-def test_a_line_costs_all_its_bytes_wherever_it_falls():
-    """Bytes count captured samples, not those on the scene."""
-    path = Sweep("a", "fine", "x", 0.0, 5000.0, 3)
-    assert count_samples([path], CAMERA, SceneGrid(60, 100, 16, 4)) == 0
-    assert raw_bytes([path], CAMERA, 10) == 3 * 640 * 10 * 2
-
-
 def test_the_ledger_compares_like_with_like():
     """The full scan against itself is 1 in every entry; nothing against it is 0."""
     grid = SceneGrid(100, 700, 16, 4)
@@ -84,3 +89,33 @@ def test_savings_of_parts_add_up():
         assert both[name].done == sum(part[name].done for part in apart)
     total = sum(part["capture_s"].done for part in apart)
     assert both["capture_s"].done <= total == pytest.approx(both["capture_s"].done, abs=COST.reload_s + 1e-9)
+
+
+@pytest.mark.parametrize("budget", [0.0, -0.5, 1.0001, float("nan"), float("inf")])
+def test_budgets_out_of_range_are_refused(budget: float):
+    """A budget is above 0 and at most 1."""
+    with pytest.raises(BudgetError, match="above 0 and at most 1, got"):
+        check_budget(budget, 50.0, 200.0)
+
+
+def test_budgets_below_the_coarse_pass_name_the_least():
+    """The least that a refusal names is accepted."""
+    with pytest.raises(BudgetError, match=r"least possible is 0\.2847"):
+        check_budget(0.1, 56.93, 200.0)
+    assert check_budget(0.2847, 56.93, 200.0) == pytest.approx(0.01)
+    assert check_budget(1.0, 56.93, 200.0) == pytest.approx(143.07)
+
+
+@given(st.floats(1, 500), st.floats(0.01, 1))
+def test_the_least_budget_is_accepted_and_is_the_least(full: float, share: float):
+    """It pays for the coarse pass, and one step of the last digit less does not."""
+    least = least_budget(full * share, full)
+    assert 0 <= check_budget(min(least, 1.0), full * share, full) <= full * 1.01e-4
+    with pytest.raises(BudgetError, match=f"the least possible is {least}"):
+        check_budget(least - 1.01e-4, full * share, full)
+
+
+def test_a_coarse_pass_dearer_than_the_full_scan_is_refused():
+    """Without a saving to be had the message says to scan in full."""
+    with pytest.raises(BudgetError, match="scan in full"):
+        check_budget(1.0, 210.0, 200.0)
