@@ -321,16 +321,10 @@ def test_line_models_err_as_tabulated(field_deg: float, px: tuple[float, ...]):
     assert errors[4] == 0
 
 
-def test_every_line_model_agrees_on_the_line_centre():
-    """Models differ in turn and scale only; and an unknown one is refused."""
-    centre = np.array([-3000.0, 0.0, 2500.0])
-    for model in LINE_MODELS:
-        along, scan = line_points(model, 700.0, centre, CAMERA)
-        assert along.shape == scan.shape == (3, 640)
-        assert along[:, 319:321].mean(axis=1) == pytest.approx(700.0, abs=1e-3)
-        assert scan[:, 319:321].mean(axis=1) == pytest.approx(centre, abs=1e-3)
+def test_an_unknown_line_model_is_refused():
+    """The message names those there are."""
     with pytest.raises(ValueError, match="one of L0, L1, L2, L3, L4, got 'L5'"):
-        line_points("L5", 0.0, centre, CAMERA)
+        line_points("L5", 0.0, np.zeros(1), CAMERA)
 
 
 def test_lines_turn_and_stretch_over_the_field():
@@ -341,17 +335,6 @@ def test_lines_turn_and_stretch_over_the_field():
     assert np.rad2deg([psi.mean(), psi.max()]) == pytest.approx([14.5, 37.0], abs=0.06)
     assert np.tan(psi).mean() == pytest.approx(0.265, abs=5e-4)
     assert (0.5 / np.abs(normal[..., 0] * normal[..., 2])).max() == pytest.approx(1.26, abs=0.005)
-
-
-def test_residual_of_the_slope_at_the_line_end():
-    """Five of the values of the design table, XY to px at the end of a 640-px line."""
-    table = {(-0.8, 0.3): 72, (-0.4, 0.5): 50, (0.0, 0.4): 23, (0.4, 0.4): 23, (0.8, 0.5): 35}
-    for position, px in table.items():
-        xi, eta = looked_at(np.array(position))
-        along, scan = line_points("L4", xi, np.array([eta]), CAMERA)
-        length = np.hypot(along - xi, scan - eta).max()
-        off = straight_slope_rotation(xi, eta, CAMERA) - turn_of(np.array(position))
-        assert length * 2 * np.abs(np.sin(off / 2)) == pytest.approx(px, abs=1)
 
 
 def test_six_decimals_are_enough_to_point():

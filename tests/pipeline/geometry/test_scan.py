@@ -116,14 +116,6 @@ def held(lines: int, step: int = 1, name: str = "a") -> Sweep:
 sweeps = st.lists(st.builds(held, st.integers(0, 40), st.integers(1, 9)), max_size=6)
 
 
-@pytest.mark.parametrize(("lines", "step", "loads"), [(1500, 1, 1), (1501, 1, 2), (375, 4, 1), (376, 4, 2), (0, 1, 0)])
-def test_fifteen_hundred_pairs_fit_one_load(lines: int, step: int, loads: int):
-    """1500 positions are one load, 1501 two, held one or four to a line."""
-    assert len(memory_loads([held(lines, step)], 1500)) == loads
-    price = COST.seconds([held(lines, step)], CAMERA)
-    assert price == pytest.approx(lines * 0.1 + COST.setup_seconds(CAMERA) + loads * COST.reload_s)
-
-
 @given(sweeps, st.integers(9, 60))
 def test_loads_hold_every_line_once_in_order(given_sweeps: list[Sweep], capacity: int):
     """Parts take the lines of all sweeps one after the other, lie end to end, and no load is too large."""

@@ -104,13 +104,6 @@ def test_all_seats_at_nearly_the_least_price(seed: int):
     assert optimum(worth, 4, None) * (1 - 1e-9) <= cover.seconds(PRICES) <= optimum(worth, 4, None) * 1.02
 
 
-def test_equal_worth_everywhere_fills_the_budget():
-    """With nothing to tell seats apart one run takes all the rows that the budget allows."""
-    field = seats(np.ones((30, 4)), 4)
-    cover = spend(field, 0.9 + 1.6 + 17 * 0.8 + 0.5)
-    assert [(run.first % LINES, run.stop - run.first) for run in cover.runs] == [(0, 17 * LINES)]
-
-
 def test_worths_far_apart_are_all_bought_in_the_end():
     """A seat a million times weaker than another is bought by a budget for all."""
     worth = np.zeros((9, 6))

@@ -11,7 +11,7 @@ from pipeline.errors import ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
-from pipeline.planning.coverage import coarse_sweeps
+from pipeline.planning.coverage import coarse_sweeps, with_margin
 from pipeline.planning.fine_pass import plan_fine
 from pipeline.planning.orientation import CropRows, compare_orientations, find_rows
 
@@ -142,24 +142,16 @@ def test_what_a_threshold_left_is_left_in_either_orientation():
     assert report.other.coarse_s + report.other.fine_s <= report.taken.coarse_s + report.taken.fine_s
 
 
-def test_coarse_strips_that_overlap_are_paid_for():
-    """The coarse seconds of either orientation are those of strips that overlap by as much."""
+@pytest.mark.parametrize("more", [{"overlap_px": 300}, {"margin_px": 40}])
+def test_overlaps_and_margins_of_the_coarse_pass_are_paid_for(more: dict[str, int]):
+    """The coarse seconds of either orientation are those of strips that overlap, or begin earlier, by as much."""
     grid = SceneGrid(700, 1280, 32, 4)
     scores = np.zeros(int(np.prod(grid.seat_shape)))
-    report = compare_orientations(grid, CAMERA, COST, "x", scores, budget_s=60.0, overlap_px=300)
+    report = compare_orientations(grid, CAMERA, COST, "x", scores, budget_s=60.0, **more)
     for one in (report.taken, report.other):
-        assert one.coarse_s == COST.seconds(coarse_sweeps(grid, CAMERA, one.along, overlap_px=300), CAMERA)
+        sweeps = coarse_sweeps(grid, CAMERA, one.along, overlap_px=more.get("overlap_px", 0))
+        assert one.coarse_s == COST.seconds(with_margin(sweeps, CAMERA, more.get("margin_px", 0)), CAMERA)
         assert one.coarse_s > COST.seconds(coarse_sweeps(grid, CAMERA, one.along), CAMERA)
-
-
-def test_margins_are_paid_for_in_either_orientation():
-    """Coarse sweeps that begin earlier and end later cost their lines: two strips along x, one along y."""
-    grid = SceneGrid(300, 1280, 32, 4)
-    scores = np.zeros(int(np.prod(grid.seat_shape)))
-    plain = compare_orientations(grid, CAMERA, COST, "x", scores, budget_s=30.0)
-    wide = compare_orientations(grid, CAMERA, COST, "x", scores, budget_s=30.0, margin_px=40)
-    assert wide.taken.coarse_s - plain.taken.coarse_s == pytest.approx(2 * 20 * 0.1)
-    assert wide.other.coarse_s - plain.other.coarse_s == pytest.approx(1 * 20 * 0.1)
 
 
 def test_a_plan_made_already_is_not_made_again():

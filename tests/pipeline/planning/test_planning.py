@@ -78,13 +78,6 @@ def test_one_strong_seat_is_bought_alone():
         assert plan.worth == 3.0
 
 
-@pytest.mark.parametrize("value", [np.nan, -np.inf, -1.0, 0.0])
-def test_scores_of_no_worth_buy_nothing(value: float):
-    """NaN, -inf, negative and zero scores are never paid for."""
-    plan = plan_fine(GRID, CAMERA, COST, "x", np.full(np.prod(GRID.seat_shape), value), budget_s=50.0)
-    assert (plan.sweeps, plan.seconds, plan.worth, len(plan.seats)) == ([], 0.0, 0.0, 0)
-
-
 def test_an_infinite_score_outweighs_the_one_other():
     """Of two seats far apart with time for one, the one of score +inf is bought."""
     first, last = GRID.valid_seats()[[0, -1]]

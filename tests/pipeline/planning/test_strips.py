@@ -57,13 +57,6 @@ def test_seats_are_cut_from_fine_sweeps_only():
         seat_lines(GRID, CAMERA, Sweep("c", "coarse", "x", 0.0, 0.0, 9, 4, 4), GRID.valid_seats())
 
 
-def test_a_full_scan_covers_all_seats():
-    """Sweeps of the full scan hold every valid seat when no seat straddles two strips."""
-    grid = SceneGrid(256, 1280, 16, 4)
-    seats = covered_seats(grid, CAMERA, full_sweeps(grid, CAMERA, "x"))
-    assert seats.tolist() == grid.valid_seats().tolist()
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.integers(-4000, 4000), st.integers(-4000, 4000), st.integers(1, 900), st.sampled_from(["x", "y"]))
 def test_no_shown_seat_lies_beyond_the_rectangle(strip: int, start: int, lines: int, along: str):

@@ -188,23 +188,6 @@ def test_of_bands_takes_everything_along() -> None:
     np.testing.assert_array_equal(some, reflectance(raw, references)[..., [3, 0]])
 
 
-def test_band_without_light_stays_alone() -> None:
-    """A band that no sample is calibrated in is NaN, and the other bands remain usable."""
-    references = frames()
-    references.white[:, 2] = references.dark[:, 2]
-    values, valid = calibrate(np.full((2, 4, 3), 500, np.uint16), references, saturated_dn=4095)
-    assert np.isnan(values[..., 2]).all()
-    assert np.isfinite(values[..., :2]).all()
-    assert valid.all()
-
-
-def test_no_lines_give_no_values() -> None:
-    """An empty block of lines passes through."""
-    values, valid = calibrate(np.zeros((0, 4, 3), np.uint16), frames(), saturated_dn=4095)
-    assert values.shape == (0, 4, 3)
-    assert valid.shape == (0, 4)
-
-
 def test_references_of_another_binning_are_refused() -> None:
     """The message names both sizes and says what to do."""
     with pytest.raises(ShapeError, match=r"8 samples and 3 bands, the dark frame \(4, 3\); take references"):

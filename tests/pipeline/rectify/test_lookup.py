@@ -55,15 +55,6 @@ def test_lookup_agrees_with_the_plan(strip: float, start: float, along: str, ste
     np.testing.assert_allclose(found[outer], planned[outer], atol=1e-3)
 
 
-def test_wandering_uneven_path_is_followed() -> None:
-    """Uneven lines on a path that wanders sideways are met at the line centres to 1e-5 px."""
-    rng = np.random.default_rng(1)
-    position = aim(250 + rng.normal(0, 0.3, 80), np.arange(80.0) + rng.uniform(-0.3, 0.3, 80))
-    line, sample = rng.integers(0, 80, 200), rng.uniform(0, 639, 200)
-    found = lookup(position, CAMERA, see(position[line], sample), along="x")
-    np.testing.assert_allclose(found, np.stack([line, sample], axis=-1), atol=1e-5)
-
-
 def test_backward_sweep_counts_from_its_own_start() -> None:
     """A sweep run the other way gives the same samples and mirrored line numbers."""
     position = aim(-200.0, np.arange(50.0))
@@ -106,15 +97,6 @@ def test_what_is_found_was_seen(strip: float, seed: int) -> None:
     seen = see(aim(strip, centre[inner]), found[hit, 1][inner])
     np.testing.assert_allclose(seen, points[hit][inner], atol=1e-5)
     assert inner.sum() > 20
-
-
-@pytest.mark.parametrize("binning", [1, 4])
-def test_one_line_sweep_reaches_half_a_line(binning: int) -> None:
-    """One line alone is as wide as its samples: points within half of that are found, others not."""
-    y = np.array([-0.51, -0.49, 0, 0.25, 0.51]) * binning + 12
-    found = lookup(aim(0.0, np.array([12.0])), CAMERA, np.stack([y, 0 * y], axis=-1), along="x", binning=binning)
-    np.testing.assert_allclose(found[:, 0], [np.nan, -0.49, 0, 0.25, np.nan], atol=1e-6)
-    np.testing.assert_allclose(found[1:4, 1], (CAMERA.samples / binning - 1) / 2)
 
 
 def test_sweeps_that_turn_or_dwell_are_refused() -> None:

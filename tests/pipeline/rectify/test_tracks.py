@@ -126,12 +126,6 @@ def test_a_pace_off_the_plan_is_still_even() -> None:
     np.testing.assert_allclose(uneven.width, CAMERA.ifov_rad, rtol=1e-9)
 
 
-def test_float32_positions_are_taken() -> None:
-    """Positions kept in float32 give the track to the 1e-3 px that they hold."""
-    (track,) = make_tracks(aim(50.0, np.arange(9.0)).astype(np.float32), CAMERA)
-    np.testing.assert_allclose(track.scan / CAMERA.ifov_rad, np.arange(9), atol=1e-3)
-
-
 def test_single_track_has_a_knot_for_every_line() -> None:
     """Lines however near each other stay knots of their own, and gaps stay gaps."""
     track = single_track(aim(0.0, np.array([0.0, 1, 1.1, 5])), CAMERA)

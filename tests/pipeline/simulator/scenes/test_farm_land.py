@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from pipeline.geometry.camera import LineCamera, look
+from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.farm.land import (
     Parcel,
@@ -96,7 +96,9 @@ def test_detail_is_where_a_second_look_pays(farms: list[RasterScene]) -> None:
 def twin_accuracy(scene: RasterScene, bands: NDArray[np.intp]) -> float:
     """Accuracy of Fisher's discriminant between the twins on one look's pixels, fitted on every other one."""
     electrons = scene.planes @ np.ascontiguousarray(scene.electrons[:, bands])
-    seen = look(electrons, LineCamera(), step=1, rng=np.random.default_rng(0)).reshape(-1, len(bands))
+    seen = expose(footprint(electrons, LineCamera()), LineCamera(), step=1, rng=np.random.default_rng(0)).reshape(
+        -1, len(bands)
+    )
     labels = labels_of(scene).ravel()
     twins = [seen[labels == scene.class_names.index(name)] for name in ("wheat_a", "wheat_b")]
     size = min(map(len, twins))
