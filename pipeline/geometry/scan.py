@@ -27,6 +27,7 @@ from pipeline.stated import stated
 
 Axis = Literal["x", "y"]
 Floats = NDArray[np.float64]
+Ends = Literal["exclusive", "inclusive"]
 
 
 @dataclass(frozen=True)
@@ -148,9 +149,6 @@ def sweep_to_scene(sweep: Sweep, camera: LineCamera) -> tuple[Floats, Floats]:
     """Give the scene points of every sample at mid exposure: along and scan, (line, sample) each [px]."""
     slopes = camera.pixel_slopes(sweep.binning)
     return points_of_scan(sweep.strip_px, camera, sweep.line_px()[:, None], slopes[None, :])
-
-
-Ends = Literal["exclusive", "inclusive"]
 
 
 @dataclass(frozen=True)

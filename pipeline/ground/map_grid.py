@@ -21,7 +21,6 @@ from pipeline.rectify.resample import resample
 
 if TYPE_CHECKING:  # half a second to import, for maps alone
     from odc.geo.geobox import GeoBox
-if TYPE_CHECKING:
     from pyproj import CRS, Transformer
 
 Floats = NDArray[np.float64]
@@ -30,6 +29,13 @@ WGS84 = 4326
 UTM_LATITUDES = (-80.0, 84.0)
 POLAR = {False: 5042, True: 5041}  # universal polar stereographic, south and north, axes east and north
 AREA_SLACK_DEG = 1.0  # a field may lie this far outside the area that a CRS is made for
+FAR_PIXELS = 8.0  # pixels of the scene whose footprint has more than so many times the median's side are left out
+MOST_GROWTH = 64  # a map may have so many times the scene's pixels,
+USUAL_GROWTH = 8  # and so many where its resolution is not asked for
+TIE = 32  # map pixels between exact places
+ROUND_STEPS = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+SAMPLES = 129  # places a side at which the median footprint is taken
+EDGE_POINTS = 33  # on each side of the footprint: straight on the ground, bent on the map
 
 
 def default_epsg(pose: RigPose) -> int:
@@ -141,15 +147,6 @@ def _stacked(parts: tuple[ArrayLike, ...]) -> Floats:
     return np.where(np.isfinite(whole), whole, np.nan)
 
 
-FAR_PIXELS = 8.0  # pixels of the scene whose footprint has more than so many times the median's side are left out
-MOST_GROWTH = 64  # a map may have so many times the scene's pixels,
-USUAL_GROWTH = 8  # and so many where its resolution is not asked for
-TIE = 32  # map pixels between exact places
-ROUND_STEPS = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
-SAMPLES = 129  # places a side at which the median footprint is taken
-EDGE_POINTS = 33  # on each side of the footprint: straight on the ground, bent on the map
-
-
 @dataclass(frozen=True)
 class GroundGrid:
     """A map's grid and the field that it shows. Made by ``ground_grid``."""
@@ -219,17 +216,12 @@ def ground_grid(
 ) -> GroundGrid:
     """Lay a map's grid over the footprint of a field of (y, x) px. Its pixels start at multiples of their side.
 
-    Parameters
-    ----------
-    epsg
-        Code of a projected CRS in metres; None for the rig's UTM zone.
-    resolution_m
-        Side of the map's pixels; None for the median side of a scene pixel's footprint, rounded, or more where a long
-        and narrow footprint would need a far larger map than the scene.
+    ``epsg`` is the code of a projected CRS in metres, None for the rig's UTM zone; ``resolution_m`` the side of the
+    map's pixels, None for the median side of a scene pixel's footprint, rounded, or more where a long and narrow
+    footprint would need a far larger map than the scene.
 
-    Raises
-    ------
-    PoseError : no ray of the field meets the ground, the CRS does not suit the place, or the grid would have far more
+    Raises PoseError: no ray of the field meets the ground, the CRS does not suit the place, or the grid would have far
+    more
         pixels than the scene.
     """
     from odc.geo.geobox import GeoBox

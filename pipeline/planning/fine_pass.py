@@ -18,7 +18,6 @@ from pipeline.planning.budget_search import cheapest_cover, full_scan_pays, spen
 from pipeline.planning.coverage import check_reach, full_sweeps
 from pipeline.planning.prices import count_lines, prices_of
 from pipeline.planning.scan_runs import NEGLIGIBLE, Cover, Field, cut_strip
-from pipeline.planning.selection import check_threshold
 from pipeline.planning.strips import covered_seats, look_from, strips_at_seats
 
 MOST_WORTH = 1e100  # of one seat: larger scores are planned in a larger unit
@@ -119,7 +118,9 @@ def plan_fine(
     """
     if not isfinite(budget_s) or budget_s < 0:
         raise BudgetError(f"the fine pass needs a finite number of seconds, 0 or more, got {budget_s}")
-    limit = 0.0 if threshold is None else check_threshold(threshold)
+    limit = 0.0 if threshold is None else threshold
+    if not (isfinite(limit) and limit >= 0):
+        raise BudgetError(f"the threshold must be a finite score of 0 or more, got {threshold}")
     scale = _scale(scores)
     worth, unit = _worth(grid, np.asarray(scores, np.float64) / scale, min(limit / scale * budget_s, MOST_WORTH))
     floor = limit / scale / unit

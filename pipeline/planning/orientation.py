@@ -22,6 +22,8 @@ LEAST_TILE = 12  # pixels a side
 LEAST_STRENGTH = 0.12
 LEAST_SIGMAS = 4.0  # that the mean over tiles lies from none
 STRONG_SHARE = 0.98  # quantile at which gradients are cut, so that a track or a wall does not speak for the field
+TURNED: dict[Axis, Axis] = {"x": "y", "y": "x"}
+WORDS: dict[Axis, str] = {"x": "across the picture", "y": "down the picture"}  # for people, where lines lie
 
 
 @dataclass(frozen=True)
@@ -44,23 +46,14 @@ class CropRows:
 
 
 def find_rows(image: ArrayLike) -> CropRows:
-    """Find the direction of crop rows in a broad-band image, such as the mean over bands of the coarse mosaic.
+    """Find the direction of crop rows in a broad-band image (y, x), such as the mean over bands of the coarse mosaic.
 
     Gradients are taken between the pixels of 2 x 2 blocks, which is right to four degrees for rows four pixels apart
-    or more, and averaged with their angles doubled, tile by tile. Rows are what many tiles agree on: the direction
-    counts where the mean over tiles lies four standard errors from none.
+    or more, and averaged with their angles doubled, tile by tile [1]_. Rows are what many tiles agree on: the direction
+    counts where the mean over tiles lies four standard errors from none. NaN pixels count nothing.
 
-    Parameters
-    ----------
-    image
-        (y, x) in any unit; NaN pixels count nothing.
+    Raises ShapeError: the image has not two axes.
 
-    Raises
-    ------
-    ShapeError : the image has not two axes.
-
-    References
-    ----------
     .. [1] Bigun, Granlund, "Optimal orientation detection of linear symmetry", ICCV 1987.
     """
     pixels = np.asarray(image, np.float64)
@@ -99,10 +92,6 @@ def _tile_vectors(pixels: Floats) -> NDArray[np.complex128]:
     total = np.add.reduceat(np.add.reduceat(size, rows, axis=0), columns, axis=1).ravel()
     vector = np.add.reduceat(np.add.reduceat(pointed, rows, axis=0), columns, axis=1).ravel()
     return np.asarray(vector[total > 0] / total[total > 0], np.complex128)
-
-
-TURNED: dict[Axis, Axis] = {"x": "y", "y": "x"}
-WORDS: dict[Axis, str] = {"x": "across the picture", "y": "down the picture"}  # for people, where lines lie
 
 
 @dataclass(frozen=True)
@@ -169,18 +158,11 @@ def compare_orientations(
     """Plan the same scores with lines along the other axis, for the seconds that both passes have here.
 
     Scores, budget, margin and threshold are those of :func:`pipeline.planning.fine_pass.plan_fine`, ``overlap_px`` that
-    of the coarse pass; its sweeps begin earlier and end later by the margin.
+    of the coarse pass; its sweeps begin earlier and end later by the margin. ``plan`` is the plan with lines along
+    ``along`` where it is made already, ``rows`` the crop rows of the coarse image, for the sentence.
 
-    Parameters
-    ----------
-    plan
-        The plan with lines along ``along`` where it is made already.
-    rows
-        Crop rows of the coarse image, for the sentence.
-
-    Raises
-    ------
-    PoseError : the field is beyond the mirror's range with lines along ``along``; the other axis is only reported.
+    Raises PoseError: the field is beyond the mirror's range with lines along ``along``; the other axis is only
+    reported.
     """
 
     def coarse_seconds(axis: Axis) -> float:

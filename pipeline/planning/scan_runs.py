@@ -20,6 +20,10 @@ from pipeline.planning.strips import Views
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+MOST_ROUNDS, WIDE_ROUNDS = 6, 2
+LEAST_BLOCK = 4
+TABLE_CELLS = 1_000_000
+NEGLIGIBLE = 1e-12  # of the total worth
 
 
 @dataclass(frozen=True, order=True)
@@ -103,12 +107,6 @@ def joined(runs: Sequence[ScanRun], gap: int) -> list[ScanRun]:
             run = ScanRun(last.strip, last.first, max(last.stop, run.stop))
         found.append(run)
     return found
-
-
-MOST_ROUNDS, WIDE_ROUNDS = 6, 2
-LEAST_BLOCK = 4
-TABLE_CELLS = 1_000_000
-NEGLIGIBLE = 1e-12  # of the total worth
 
 
 @dataclass(frozen=True)

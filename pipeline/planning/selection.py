@@ -34,16 +34,6 @@ def seat_count(share: float, valid: int) -> int:
     return min(int(np.floor(share * valid + 0.5)), valid)
 
 
-def check_threshold(threshold: float) -> float:
-    """Give the threshold back.
-
-    Raises BudgetError: it is not a finite number of 0 or more.
-    """
-    if not (np.isfinite(threshold) and threshold >= 0):
-        raise BudgetError(f"the threshold must be a finite score of 0 or more, got {threshold}")
-    return threshold
-
-
 def select_seats(score: Scores, count: int, valid: NDArray[np.bool_] | None = None, *, clip: bool = False) -> Selection:
     """Choose the ``count`` valid seats with the highest ``score``, (seat,) of any float type.
 

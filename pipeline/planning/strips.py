@@ -48,23 +48,13 @@ def seat_lines(
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Give the lines of a fine sweep that each seat needs, resampling taps included.
 
-    Parameters
-    ----------
-    sweep
-        A ``step=1`` sweep; lines count from its first. They need not exist: compare with ``sweep.lines``.
-    seats
-        (seat,) numbers. Only their pixels on the scene count.
-    margin_px
-        How far beside the plan the mirror may look: so many lines and samples more are needed all around. [px]
+    Lines count from the sweep's first and need not exist: compare with ``sweep.lines``. Only pixels on the scene count.
+    ``margin_px`` is how far beside the plan the mirror may look: so many lines and samples more are needed all around.
 
-    Returns
-    -------
     (seat, 2) first line and the one after the last; (seat,) whether the line's samples reach all pixels. A seat
     without a pixel on the scene is never reached.
 
-    Raises
-    ------
-    ShapeError : the sweep is not fine.
+    Raises ShapeError: the sweep is not fine.
     """
     if sweep.step != 1:
         raise ShapeError(f"seats are cut from fine sweeps of step 1, got {sweep.name} with step {sweep.step}")

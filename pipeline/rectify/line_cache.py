@@ -52,19 +52,10 @@ class LineCache:
         self._lock = threading.Lock()
 
     def window(self, lines: SweepLines, wanted: slice, samples: slice, *, likely: slice | None = None) -> Raw:
-        """Give raw numbers of some lines and samples, read before or now.
+        """Give raw numbers (line, sample, band) of some lines and samples, read before or now; not to be written to.
 
-        Parameters
-        ----------
-        wanted, samples
-            Ranges of line numbers and samples, with start and stop.
-        likely
-            Samples that later calls will want of the same lines: they are read together, and only calls that name the
-            same ones share what was read.
-
-        Returns
-        -------
-        (line, sample, band) uint16; not to be written to.
+        ``likely`` are samples that later calls will want of the same lines: they are read together, and only calls that
+        name the same ones share what was read.
         """
         held = held_samples(lines, samples, likely)
         within = slice(samples.start - held.start, samples.stop - held.start)

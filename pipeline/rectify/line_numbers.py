@@ -32,24 +32,16 @@ class LineNumbers:
 
 
 def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
-    """Tell from time stamps which line each frame is.
+    """Tell from time stamps (frame,), of mid exposure in the order of arrival [s], which line each frame is.
 
     A gap of more than 1.5 periods leaves numbers out. Of frames with equal stamps the first is kept. A stamp that goes
     back is not believed: the longest ascending row of stamps is, and of equally long ones that with the earlier frames,
     so that one wild stamp costs one line; so does a wild one that comes first or last. A late frame is used: its
-    position is that of its own time.
+    position is that of its own time. ``frame_s`` is the planned frame period; its true value is taken from the stamps,
+    so that a slow clock makes no frame late.
 
-    Parameters
-    ----------
-    time_s
-        (frame,) time of mid exposure, in the order of arrival. [s]
-    frame_s
-        Planned frame period. Its true value is taken from the stamps, so that a slow clock makes no frame late. [s]
-
-    Raises
-    ------
-    SettingsError : the period is not above 0.
-    ShapeError : the stamps are not one row.
+    Raises SettingsError: the period is not above 0.
+    Raises ShapeError: the stamps are not one row.
     """
     if not frame_s > 0:
         raise SettingsError(f"the frame period must be above 0 s, got {frame_s}")

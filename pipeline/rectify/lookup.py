@@ -199,25 +199,16 @@ def _bisect(curve: KnotCurve, a: Floats, b: Floats, rough: Floats) -> Floats:
 
 
 def lookup(position: Floats, camera: LineCamera, points_px: Floats, *, along: Axis, binning: int = 1) -> Floats:
-    """Find the line and sample at which a sweep that runs one way saw each point.
+    """Find the line and sample at which a sweep that runs one way saw each of some points (..., 2), y and x [px].
 
-    Parameters
-    ----------
-    position
-        (line, 2) mirror X and Y at mid exposure. The sweep may run either way but must not turn or stand still; such
-        sweeps are split by :func:`pipeline.rectify.tracks.make_tracks` first.
-    points_px
-        (..., 2) y and x from the scene's centre. [px]
+    The sweep, given by mirror X and Y at mid exposure (line, 2), may run either way but must not turn or stand still;
+    such sweeps are split by :func:`pipeline.rectify.tracks.make_tracks` first.
 
-    Returns
-    -------
     (..., 2) float64 line and sample, integers at centres; NaN where the point is off the sweep by more than half a
     line or half a sample. The line of a one-line sweep is taken to be as wide as its (binned) samples.
 
-    Raises
-    ------
-    PoseError : the sweep turns or stands still, naming the line; or a position is out of reach.
-    ShapeError : positions or points are not pairs.
+    Raises PoseError: the sweep turns or stands still, naming the line; or a position is out of reach.
+    Raises ShapeError: positions or points are not pairs.
     """
     if not len(position):
         raise ShapeError(f"expected mirror positions (line, 2) of at least one line, got {position.shape}")
@@ -230,24 +221,6 @@ def lookup(position: Floats, camera: LineCamera, points_px: Floats, *, along: Ax
     if falling:
         found[..., 0] = len(position) - 1 - found[..., 0]
     return found
-
-
-def grid_lookup(
-    position: Floats,
-    camera: LineCamera,
-    *,
-    along: Axis,
-    binning: int,
-    origin_px: tuple[float, float],
-    spacing_px: float,
-    shape: tuple[int, int],
-) -> Floats:
-    """Find the line and sample for every pixel of a regular grid, (y, x, 2) float64 as of :func:`lookup`.
-
-    The grid is given by y and x of its first centre from the scene's centre, the distance of centres [px], and (y, x).
-    """
-    points = grid_points(origin_px, spacing_px, shape)
-    return lookup(position, camera, points, along=along, binning=binning)
 
 
 def track_lookup(track: Track, camera: LineCamera, points_px: Floats, *, along: Axis, binning: int = 1) -> Floats:

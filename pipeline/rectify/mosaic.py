@@ -44,24 +44,15 @@ def edge_distance(coordinates: NDArray[np.float64], lines: int, samples: int) ->
 
 
 def mosaic(parts: Sequence[MosaicPart]) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-    """Blend sweeps by weights that grow linearly from each sweep's edge.
+    """Blend sweeps, resampled at the same n points, by weights that grow linearly from each sweep's edge.
 
     The weights are the same for all bands, so every spectrum is a convex mixture of captured ones; only a band that a
     sweep has no value in is the others' alone. One sweep alone comes back unchanged, bit by bit (it may be the very
-    array that went in).
+    array that went in). What a part holds where its weight is 0 does not matter.
 
-    Parameters
-    ----------
-    parts
-        Sweeps resampled at the same n points, at least one. What a part holds where its weight is 0 does not matter.
-
-    Returns
-    -------
     (n, band) float32, NaN where no sweep reached, and (n,) how many sweeps did.
 
-    Raises
-    ------
-    ShapeError : no part, or parts of different sizes.
+    Raises ShapeError: no part, or parts of different sizes.
     """
     if not parts:
         raise ShapeError("a mosaic needs at least one sweep, got none")

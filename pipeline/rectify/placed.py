@@ -91,21 +91,13 @@ def place(
 ) -> Placed:
     """Find where the lines of a sweep lie.
 
-    Parameters
-    ----------
-    grid
-        Pixels to make tie tables for, which a large mosaic is made with; None looks every point up directly.
-    usable
-        (line,) lines whose position may be believed; None takes ``lines.valid_line``.
-    shift_px
-        (line, 2) pointing corrections along the line and along the scan. [px]
-    gain
-        (band,) illumination correction of the sweep.
+    ``grid`` are pixels to make tie tables for, which a large mosaic is made with; None looks every point up directly.
+    ``usable`` (line,) are lines whose position may be believed, None takes ``lines.valid_line``; ``shift_px`` (line, 2)
+    pointing corrections along the line and along the scan [px]; ``gain`` (band,) the illumination correction of the
+    sweep.
 
-    Raises
-    ------
-    PoseError : a line's position is beyond the mirror's disk, or its path has no direction.
-    ShapeError : arrays that do not fit the lines.
+    Raises PoseError: a line's position is beyond the mirror's disk, or its path has no direction.
+    Raises ShapeError: arrays that do not fit the lines.
     """
     sweep = lines.sweep
     tracks = make_tracks(

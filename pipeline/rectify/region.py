@@ -41,21 +41,12 @@ def mosaic_tile(
     cache: LineCache | None = None,
     reach: Reaches | None = None,
 ) -> tuple[Values, Counts]:
-    """Rectify and blend the sweeps on a part of a grid.
+    """Rectify and blend the sweeps on a part of a grid, given by slices with start and stop.
 
-    What comes out for a pixel does not depend on how the grid is cut into tiles, bit for bit.
+    What comes out for a pixel does not depend on how the grid is cut into tiles, bit for bit. ``cache`` holds raw lines
+    that earlier tiles read, None reads what is needed, once; ``reach`` is that of :func:`column_reach` for these
+    columns or more, None makes it.
 
-    Parameters
-    ----------
-    rows, columns
-        The part, with start and stop.
-    cache
-        Raw lines that earlier tiles read; None reads what is needed, once.
-    reach
-        Of :func:`column_reach` for these columns or more; None makes it.
-
-    Returns
-    -------
     (y, x, band) float32 with NaN where no line reached, (y, x) how many sweeps did (a sweep that turns may count
     once for each of its runs).
     """
@@ -85,11 +76,8 @@ def mosaic_rows(
 ) -> Iterator[tuple[int, Values, Counts]]:
     """Rectify and blend the sweeps of one pass onto its grid, ``rows`` rows at a time.
 
-    The pass's step says which grid: 1 the scene's pixels, ``grid.factor`` the coarse ones.
-
-    Yields
-    ------
-    First row, (row, x, band) float32 with NaN where no line reached, (row, x) how many sweeps did.
+    The pass's step says which grid: 1 the scene's pixels, ``grid.factor`` the coarse ones. Yields the first row,
+    (row, x, band) float32 with NaN where no line reached, and (row, x) how many sweeps did.
     """
     pixels = PixelGrid.of_scene(grid, sweeps[0].sweep.step)
     placed = [place(lines, camera) for lines in sweeps]
@@ -129,19 +117,11 @@ def read_seats(
     *,
     cache: LineCache | None = None,
 ) -> tuple[Values, NDArray[np.bool_]]:
-    """Rectify whole patches from the sweeps that saw them.
+    """Rectify whole patches from the sweeps that saw them: placed with :func:`place`, or lines to be placed now.
 
-    Parameters
-    ----------
-    sweeps
-        Sweeps placed with :func:`place`, or their lines alone. Placed ones are not placed again at every call.
-    seats
-        Best in the order in which the sweeps pass them: neighbours share what is read and calibrated.
-    cache
-        Raw lines that earlier calls read; None reads what is needed, once.
+    Best in the order in which the sweeps pass the seats: neighbours share what is read and calibrated. ``cache`` holds
+    raw lines that earlier calls read; None reads what is needed, once.
 
-    Returns
-    -------
     (seat, p, p, band) float32, NaN where no line reached, and (seat, p, p) pixels that lie on the scene and were seen.
     """
     placed = [one if isinstance(one, Placed) else place(one, camera) for one in sweeps]

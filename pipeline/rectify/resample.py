@@ -20,6 +20,7 @@ Values: TypeAlias = NDArray[np.float32] | NDArray[np.uint16]
 
 LEAST_WEIGHT = 0.5
 ROUNDING = 1e-6
+BLOCK_PX = 16384  # smaller blocks pay calls, and larger ones gain nothing
 
 
 def divisor(total: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -226,9 +227,6 @@ def _lies_on(placed: Windows, shape: tuple[int, int], corners: NDArray[np.bool_]
     return inside
 
 
-BLOCK_PX = 16384  # smaller blocks pay calls, and larger ones gain nothing
-
-
 def gather(
     planes: NDArray[np.float32], y: NDArray[np.float64], x: NDArray[np.float64], kernel: Kernel = "catmull-rom"
 ) -> NDArray[np.float32]:
@@ -316,24 +314,15 @@ def resample(
 def merge_lines(
     values: Values, valid: NDArray[np.bool_], starts: NDArray[np.intp]
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Average the lines of each dwell: those taken while the mirror stood still.
+    """Average the lines of each dwell, those taken while the mirror stood still; they lie next to each other.
 
-    Parameters
-    ----------
-    values, valid
-        (line, sample, band) float32 or uint16, the lines of one dwell next to each other, and a mask by sample or
-        element.
-    starts
-        (dwell,) ascending number of the first line of each; the first is 0.
+    ``starts`` (dwell,) are the ascending numbers of the first line of each, the first being 0. The mask is by sample or
+    by element.
 
-    Returns
-    -------
     (dwell, sample, band) float32 mean of the valid lines, NaN where there is none (a line alone as it was; the input
     itself, uint16 too, where every line is alone); and whether there is any, with the dimensions of ``valid``.
 
-    Raises
-    ------
-    ShapeError : ``starts`` does not part the lines, or the mask does not fit the values.
+    Raises ShapeError: ``starts`` does not part the lines, or the mask does not fit the values.
     """
     _check_mask(values, valid)
     counts = np.diff(starts, append=len(values))

@@ -91,25 +91,14 @@ def tie_table(
     tie: int = 16,
     tolerance_px: float = 2e-3,
 ) -> TieTable:
-    """Tabulate a track's lookup over a regular grid.
+    """Tabulate a track's lookup over a grid, given by its first centre, the distance of centres [px] and (y, x).
 
-    The distance of ties starts at ``tie`` pixels and is halved until the error of the pixels between is bound by
-    ``tolerance_px``. The bound is an eighth of the ties' second differences (of both axes together) and how far the
-    knots lie off straight lines of a tie's length, which shows a single line out of place that no tie may meet; or the
-    error found half-way between ties, if that is more.
+    The distance of ties starts at ``tie`` pixels and is halved until the error of the pixels between, in lines and in
+    samples, is bound by ``tolerance_px`` [px of the sweep]. The bound is an eighth of the ties' second differences (of
+    both axes together) and how far the knots lie off straight lines of a tie's length, which shows a single line out of
+    place that no tie may meet; or the error found half-way between ties, if that is more.
 
-    Parameters
-    ----------
-    origin_px, spacing_px, shape
-        Grid, as of :func:`pipeline.rectify.lookup.grid_lookup`.
-    tie
-        Largest distance of ties. [px of the grid]
-    tolerance_px
-        Largest error, in lines and in samples. [px of the sweep]
-
-    Raises
-    ------
-    SettingsError : the distance of ties is below 1, or the tolerance below 0.
+    Raises SettingsError: the distance of ties is below 1, or the tolerance below 0.
     """
     if tie < 1 or not tolerance_px >= 0:
         raise SettingsError(f"expected ties at least 1 px apart and a tolerance from 0, got {tie} and {tolerance_px}")
@@ -135,7 +124,7 @@ def tie_table(
             bound = SAFETY * (bound + _tie_bound(ties, cells))
             if bound <= tolerance_px:
                 middle = exact(tie / 2, tie, (rows - 1, columns - 1))
-                bound = max(bound, _largest(np.abs(middle - corners.mean(axis=0))[cells]))
+                bound = max(bound, float(np.abs(middle - corners.mean(axis=0))[cells].max(initial=0)))
         if bound <= tolerance_px:
             return TieTable(ties, tie, shape, bound, track.seen, samples, corner, kept)
         tie //= 2
@@ -181,14 +170,9 @@ def _tie_bound(ties: Floats, cells: NDArray[np.bool_]) -> float:
         if ties.shape[axis] > 2:
             inner = np.abs(np.diff(ties, 2, axis=axis))
             total += np.pad(inner, [(1, 1) if at == axis else (0, 0) for at in range(3)], mode="edge")
-    return _largest(np.max(_corners(total), axis=0)[cells]) / 8
+    return float(np.max(_corners(total), axis=0)[cells].max(initial=0)) / 8
 
 
 def _corners(ties: Floats) -> Floats:
     """The four ties of each cell, (4, row, column, 2)."""
     return np.stack([ties[:-1, :-1], ties[:-1, 1:], ties[1:, :-1], ties[1:, 1:]])
-
-
-def _largest(values: Floats) -> float:
-    """Largest value, NaN where one is; 0 of none."""
-    return float(values.max()) if values.size else 0.0

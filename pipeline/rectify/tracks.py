@@ -72,9 +72,7 @@ def make_tracks(
     Parameters
     ----------
     position
-        (line, 2) mirror X and Y at mid exposure. Those of lines that are not usable do not matter.
-    usable
-        (line,) lines to be used; None for all.
+        (line, 2) mirror X and Y at mid exposure. Those of lines that are not ``usable`` (line,) do not matter.
     shift_px
         (line, 2) pointing corrections, along the line and along the scan, added to the line centres. [px]
     binning

@@ -10,7 +10,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_position, scene_to_direction
 from pipeline.geometry.scan import points_of_scan
 from pipeline.rectify.line_numbers import number_lines
-from pipeline.rectify.lookup import grid_lookup, lookup, track_lookup
+from pipeline.rectify.lookup import grid_points, lookup, track_lookup
 from pipeline.rectify.resample import merge_lines, resample
 from pipeline.rectify.tie_points import tie_table
 from pipeline.rectify.tracks import Track, make_tracks
@@ -180,7 +180,7 @@ def test_grid_outside_the_swath_is_nan() -> None:
     (track,) = make_tracks(position, CAMERA)
     for origin in ((0.0, 3100.0), (400.0, 2600.0), (-9000.0, -9000.0), (9000.0, 20_000.0)):
         grid = {"origin_px": origin, "spacing_px": 1.0, "shape": (40, 50)}
-        assert np.isnan(grid_lookup(position, CAMERA, along="x", binning=1, **grid)).all()  # type: ignore[arg-type]
+        assert np.isnan(lookup(position, CAMERA, grid_points(**grid), along="x")).all()  # type: ignore[arg-type]
         table = tie_table(track, CAMERA, along="x", **grid)  # type: ignore[arg-type]
         assert np.isnan(table.coordinates(slice(None), slice(None))).all()
 

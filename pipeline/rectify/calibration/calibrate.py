@@ -12,6 +12,7 @@ from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.mirror import mirror_throughput
 from pipeline.source import References
 
+BLOCK_ELEMENTS = 1 << 18  # 1 MB of float32: cast, subtraction and product meet the block in the cache
 FILL_REACH = 8  # samples; what is good farther away has seen something else
 
 Floats32 = NDArray[np.float32]
@@ -125,34 +126,19 @@ def _fill_of(wanted: Bools, good: Bools) -> Fill:
     return Fill(sample * width + band, before * width + band, after * width + band, share.astype(np.float32))
 
 
-BLOCK_ELEMENTS = 1 << 18  # 1 MB of float32: cast, subtraction and product meet the block in the cache
-
-
 def reflectance(raw: NDArray[np.uint16], references: References, *, position: ArrayLike | None = None) -> Floats32:
     """Turn raw lines into scene values, ``(raw - dark) / (white - dark) * panel / flat / throughput``.
 
     A bad element takes the value between the nearest good samples of its line and band, at most 8 away, linear in
     sample, so that it spoils only itself; in a sample with more than half of its bands bad none is filled.
 
-    Parameters
-    ----------
-    raw
-        (line, sample, band) uint16 DN.
-    references
-        Frames with the binning of ``raw``.
-    position
-        (line, 2) mirror X and Y; needed where the references say ``by_mirror``. A line whose position is not finite
-        becomes NaN there.
+    ``raw`` is (line, sample, band) uint16 DN; ``position`` (line, 2) mirror X and Y, needed where the references say
+    ``by_mirror``: a line whose position is not finite becomes NaN there. (line, sample, band) float32 in the unit of
+    the panel's values, negative below dark; NaN where the white frame is not above the dark one, a reference is not
+    finite, or a bad element is not filled.
 
-    Returns
-    -------
-    (line, sample, band) float32, unit of the panel's values, negative below dark; NaN where the white frame is not
-    above the dark one, a reference is not finite, or a bad element is not filled.
-
-    Raises
-    ------
-    ShapeError : the references or the positions do not fit the lines.
-    PoseError : positions are needed and missing, or one lies beyond the mirror's rim.
+    Raises ShapeError: the references or the positions do not fit the lines.
+    Raises PoseError: positions are needed and missing, or one lies beyond the mirror's rim.
     """
     elements = _judged(raw, references)
     return _scene_values(raw, elements, _line_gain(raw, references, position))
@@ -165,7 +151,7 @@ def calibrate(
     saturated_dn: float,
     position: ArrayLike | None = None,
 ) -> tuple[Floats32, Bools]:
-    """Turn raw lines into scene values and say which of them may be used.
+    """Turn raw lines into scene values, as :func:`reflectance` does, and say which of them may be used.
 
     Out are what :func:`judge_elements` puts out, saturated elements, and filled
     ones whose neighbours are saturated. A band that no sample is calibrated in (no light at all) puts nothing out: it
@@ -174,26 +160,11 @@ def calibrate(
     Of a sum of n samples (the coarse pass) DN tell less than of one. Let F be full scale: at n F all of them were
     saturated, above n (F - 1) one of them at least was, below F none was, and between nothing can be known. By how
     much a sum is short is not known either, so it is no fault that shows as noise: a small bright thing beside dark
-    soil loses its peak unseen.
+    soil loses its peak unseen. ``saturated_dn`` is the least DN that counts: n F, or n (F - 1) + 1.
 
-    Parameters
-    ----------
-    raw, position
-        As of :func:`reflectance`.
-    references
-        Of the whole line; or elements judged already, where ``raw`` holds some of the samples or for the sake of time.
-    saturated_dn
-        Least DN that counts as saturated, for the binning of ``raw``: n times full scale finds sums saturated
-        throughout, n times one less and 1 those known to be saturated in part.
-
-    Returns
-    -------
-    Values (line, sample, band) float32 as of :func:`reflectance`, and bool of which are valid: (line, sample), or
-    (line, sample, band) where some but not all bands of a sample are out.
-
-    Raises
-    ------
-    ShapeError, PoseError : as of :func:`reflectance`.
+    The references are those of the whole line; or elements judged already, where ``raw`` holds some of the samples or
+    for the sake of time. Values (line, sample, band) float32, and bool of which are valid: (line, sample), or (line,
+    sample, band) where some but not all bands of a sample are out.
     """
     elements = _judged(raw, references)
     line_gain = _line_gain(raw, elements.references, position)

@@ -40,34 +40,19 @@ def find_bad_elements(
     criteria: BadElementCriteria | None = None,
     saturated_dn: float | None = None,
 ) -> Bools:
-    """Find elements of the detector that are not to be believed.
+    """Find elements (sample, band) of the detector that are not to be believed, from mean dark and white frames [DN].
 
-    One is bad if a frame is not finite there, the white frame is saturated, its dark level stands out of its band's
-    (hot), it hardly responds although its neighbours do (dead), or its response stands out of its neighbours' in the
-    band by more than its column does in most bands (odd). Dust on the slit darkens a column in all bands and is no
-    fault, the white frame takes it off; nor is a slope, as at the slit's ends. Where the neighbours see no light
-    nothing is said of the response.
+    One is bad if a frame is not finite there, the white frame is saturated (at ``saturated_dn`` or more), its dark
+    level stands out of its band's (hot), it hardly responds although its neighbours do (dead), or its response stands
+    out of its neighbours' in the band by more than its column does in most bands (odd). Dust on the slit darkens a
+    column in all bands and is no fault, the white frame takes it off; nor is a slope, as at the slit's ends. Where the
+    neighbours see no light nothing is said of the response.
 
     Spreads are medians of absolute deviations. Fewer samples than ``criteria.near`` cannot tell what is odd, and one
     sample can be compared with nothing: there only what is not finite or saturated is bad.
 
-    Parameters
-    ----------
-    dark, white
-        (sample, band) mean frames. [DN]
-    criteria
-        Thresholds; the defaults where none are given.
-    saturated_dn
-        Least DN of a saturated white frame; None where it is known not to be.
-
-    Returns
-    -------
-    (sample, band) bool.
-
-    Raises
-    ------
-    ShapeError : the frames are not (sample, band), or not of one size.
-    RigError : more elements than ``criteria.most``, and than one column, would be bad.
+    Raises ShapeError: the frames are not (sample, band), or not of one size.
+    Raises RigError: more elements than ``criteria.most``, and than one column, would be bad.
     """
     limits = BadElementCriteria() if criteria is None else criteria
     if dark.ndim != 2 or dark.shape != white.shape:
@@ -95,7 +80,7 @@ def _off_neighbours(response: Floats, noise: Floats, limits: BadElementCriteria)
     """Elements whose response is missing or odd beside their neighbours'."""
     size = min(limits.window, len(response))
     around = (max(size - 1 + size % 2, 1), 1)  # an odd number of samples
-    local = ndimage.median_filter(_without_gaps(response), around, mode="reflect")
+    local: Floats = ndimage.median_filter(_without_gaps(response), around, mode="reflect")
     least = np.maximum(limits.lit_sigmas * noise, limits.lit_share * _median(response, axis=0))
     judged = np.isfinite(response) & (local > least)
     relative = np.full(response.shape, np.nan)

@@ -45,10 +45,7 @@ class BroadSweep:
     ) -> BroadSweep:
         """Read and calibrate a sweep's lines, 64 at a time, keeping the mean of ``bands`` bands spread over all.
 
-        Parameters
-        ----------
-        usable
-            (line,) lines whose position may be believed; None takes ``lines.valid_line``.
+        ``usable`` (line,) are lines whose position may be believed; None takes ``lines.valid_line``.
         """
         chosen = broad_bands(lines.references, bands)
         references = of_bands(lines.references, chosen.tolist())

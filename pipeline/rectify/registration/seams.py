@@ -143,12 +143,7 @@ def measure_windows(
 ) -> list[SeamWindow]:
     """Compare all neighbours window by window, as they are placed; residuals are what was found.
 
-    Parameters
-    ----------
-    reach_px
-        Largest shift of a pair. [px]
-    among
-        Numbers of the sweeps to be compared; None takes all.
+    ``reach_px`` is the largest shift of a pair; ``among`` the numbers of the sweeps to be compared, None takes all.
     """
     seen = []
     for window in overlap_windows(images, window_px=window_px):
@@ -207,22 +202,14 @@ class Anchor:
 def anchor_sweep(
     sweep: BroadSweep, camera: LineCamera, grid: SceneGrid, mosaic: NDArray[np.floating], *, prior_px: float
 ) -> Anchor:
-    """Find where a fine sweep lies on the coarse mosaic.
+    """Find where a fine sweep lies on the coarse mosaic, (y, x), the broad-band mean of the same bands as its image.
 
     The sweep is rectified at the scene's pixels, blurred to what a coarse pixel sees, and compared with the mosaic
-    interpolated there. One offset for the whole sweep: runs of the fine pass are short.
+    interpolated there, up to ``prior_px`` beside its reported positions in either axis [px]. One offset for the whole
+    sweep: runs of the fine pass are short.
 
-    Parameters
-    ----------
-    mosaic
-        (y, x) broad-band mean of the coarse mosaic, the mean of the same bands as the sweep's image.
-    prior_px
-        How far the sweep may look beside its reported positions, in either axis. [px]
-
-    Raises
-    ------
-    SettingsError : the prior is negative or not finite.
-    PoseError : a corrected position is beyond the mirror's rim.
+    Raises SettingsError: the prior is negative or not finite.
+    Raises PoseError: a corrected position is beyond the mirror's rim.
     """
     if not (np.isfinite(prior_px) and prior_px >= 0):
         raise SettingsError(f"expected a finite prior >= 0 px, got {prior_px}")

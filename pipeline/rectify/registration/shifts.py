@@ -75,17 +75,11 @@ def pair_shift(reference: NDArray[np.floating], moving: NDArray[np.floating], *,
     grey values, for which the windowed phase correlation [2] is the start: on its own its window pulls the shift of
     broad texture towards the integer. The best stands only if every other leaves clearly more unexplained.
 
-    Parameters
-    ----------
-    reference, moving
-        (row, column) broad-band images on the same grid; NaN where nothing was seen. Gain and offset may differ.
-    prior_px
-        Largest shift possible in either direction. [px]
+    Both are (row, column) broad-band images on the same grid, NaN where nothing was seen; gain and offset may differ.
+    ``prior_px`` is the largest shift possible in either direction.
 
-    Raises
-    ------
-    ShapeError : not two images of one size.
-    SettingsError : the prior is negative or not finite.
+    Raises ShapeError: not two images of one size.
+    Raises SettingsError: the prior is negative or not finite.
 
     References
     ----------

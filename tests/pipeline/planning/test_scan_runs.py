@@ -147,14 +147,6 @@ def test_each_run_has_its_own_offset():
     assert best_cover(seats(worth, 4), (), 0.5).runs == (ScanRun(0, 0, 4), ScanRun(3, 32, 36))
 
 
-def test_strips_overlap_where_the_field_is_no_multiple_of_them():
-    """A field of 6 columns seen 4 at a time takes two strips; the seats that both show count once."""
-    cover = best_cover(seats(np.ones((5, 6)), 4), (), 0.01)
-    assert cover.worth == 30.0
-    assert [(run.first, run.stop) for run in cover.runs] == [(0, 20), (0, 20)]
-    assert cover.lines == 40
-
-
 def test_runs_are_cut_to_what_they_add():
     """Lines that show only what another run shows are dropped, and so are runs that add nothing."""
     field = seats(np.ones((4, 6)), 4)
@@ -182,13 +174,6 @@ def test_strips_side_by_side_share_no_column():
     """The layout of a full scan holds every column, overlapping at the end alone."""
     field = seats(np.ones((2, 10)), 4)
     assert field.side_by_side.ravel().tolist() == [0, 4, 6]
-
-
-def test_nothing_wanted_gives_no_runs():
-    """A field without views has an empty cover."""
-    field = seats(np.zeros((3, 5)), 2)
-    assert best_cover(field, (), 1.0) == Cover()
-    assert field.total == 0
 
 
 @settings(max_examples=15, deadline=None)

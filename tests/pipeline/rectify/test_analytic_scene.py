@@ -13,7 +13,7 @@ from pipeline.geometry.scan import Axis, Sweep
 from pipeline.planning.coverage import on_scene
 from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.lookup import grid_lookup
+from pipeline.rectify.lookup import grid_points, lookup
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.resample import resample
 from pipeline.simulator.instrument import effects_on
@@ -106,15 +106,9 @@ def rectified_strip(scene: Waves, strip: float, along: Axis, *, step: int, kerne
     if spoil:
         inside = on_scene(scene.shape, CAMERA, sweep)
         values[~inside], valid = np.nan, valid & inside
-    at = grid_lookup(
-        position,
-        CAMERA,
-        along=along,
-        binning=step,
-        origin_px=((step - scene.shape[0]) / 2, (step - scene.shape[1]) / 2),
-        spacing_px=step,
-        shape=(scene.shape[0] // step, scene.shape[1] // step),
-    ).reshape(-1, 2)
+    origin = (step - scene.shape[0]) / 2, (step - scene.shape[1]) / 2
+    points = grid_points(origin, step, (scene.shape[0] // step, scene.shape[1] // step)).reshape(-1, 2)
+    at = lookup(position, CAMERA, points, along=along, binning=step)
     return MosaicPart(*resample(values, valid, at, kernel), edge_distance(at, raw.shape[0], raw.shape[1]))
 
 

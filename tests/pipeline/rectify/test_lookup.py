@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,7 +10,7 @@ from hypothesis import strategies as st
 from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, line_positions, points_of_scan, scene_to_sweep
-from pipeline.rectify.lookup import KnotCurve, grid_lookup, lookup, track_lookup
+from pipeline.rectify.lookup import KnotCurve, grid_points, lookup, track_lookup
 from pipeline.rectify.resample import resample
 from pipeline.rectify.tracks import Track, make_tracks
 from tests.pipeline.rectify.aiming import CAMERA, aim
@@ -61,17 +59,6 @@ def test_backward_sweep_counts_from_its_own_start() -> None:
     points = np.random.default_rng(2).uniform((10, -400), (40, 0), (30, 2))
     forward, backward = (lookup(p, CAMERA, points, along="x") for p in (position, position[::-1]))
     np.testing.assert_allclose(backward, [49, 0] + forward * [-1, 1], atol=1e-7)
-
-
-def test_grid_is_lookup_of_its_points() -> None:
-    """A regular grid gives what its points give one by one, in (y, x) order; tiles agree with the whole."""
-    position = aim(100.0, np.arange(64.0))
-    on_grid = partial(grid_lookup, position, CAMERA, along="x", binning=2, spacing_px=2.0)
-    whole = on_grid(origin_px=(1.5, -20.5), shape=(30, 40))
-    tile = on_grid(origin_px=(1.5 + 20, -20.5 + 30), shape=(5, 7))
-    point = lookup(position, CAMERA, np.array([1.5 + 2 * 3, -20.5 + 2 * 4]), along="x", binning=2)
-    np.testing.assert_array_equal(whole[10:15, 15:22], tile)
-    np.testing.assert_array_equal(whole[3, 4], point)
 
 
 def test_points_off_the_sweep_are_nan() -> None:
@@ -123,8 +110,7 @@ def test_no_points_give_none() -> None:
     """An empty list of points and an empty grid pass through."""
     position = aim(0.0, np.arange(3.0))
     assert lookup(position, CAMERA, np.zeros((0, 2)), along="x").shape == (0, 2)
-    empty = grid_lookup(position, CAMERA, along="x", binning=1, origin_px=(0, 0), spacing_px=1, shape=(0, 5))
-    assert empty.shape == (0, 5, 2)
+    assert lookup(position, CAMERA, grid_points((0, 0), 1, (0, 5)), along="x").shape == (0, 5, 2)
 
 
 def wandering_track(seed: int, amount_px: float, strip: float = 2600.0) -> Track:

@@ -166,15 +166,6 @@ def test_writes_to_given_memory() -> None:
         resample(values, valid, at, out=memory.astype(float))
 
 
-@pytest.mark.parametrize(("shape", "points"), [((0, 4, 2), 3), ((4, 4, 2), 0), ((1, 1, 2), 3)])
-def test_empty_and_tiny_sweeps(shape: tuple[int, int, int], points: int) -> None:
-    """No lines, no points and a single sample give results of the right shape."""
-    out, share = resample(np.ones(shape, np.float32), np.ones(shape[:2], bool), np.zeros((points, 2)))
-    assert out.shape == (points, 2)
-    assert (np.isfinite(out).all(axis=1) == (share > 0)).all()
-    assert (share > 0).all() == (shape[0] > 0)
-
-
 def test_read_only_values_are_accepted() -> None:
     """Arrays that may not be written, as read from a store, pass without a warning."""
     values = np.ones((4, 4, 1), np.float32)

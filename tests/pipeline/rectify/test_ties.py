@@ -127,13 +127,6 @@ def test_track_smaller_than_a_cell_is_not_lost() -> None:
     assert np.nanmax(np.abs(found - exact(track))) <= table.bound_px
 
 
-def test_grid_beside_the_track_has_no_coordinates() -> None:
-    """Where no line passes all is NaN, at no cost in ties."""
-    table = tie_table(track_of(*PATHS["even"]), CAMERA, along="x", **(GRID | {"origin_px": (3000.0, -4000.0)}))
-    assert np.isnan(table.coordinates(*EVERYTHING)).all()
-    assert (table.spacing, table.bound_px) == (16, 0.0)
-
-
 @pytest.mark.parametrize("tie", [16, 1])
 def test_only_what_the_track_can_have_seen_is_kept(tie: int) -> None:
     """Of a large grid the table keeps the part around the track, and answers for the rest with NaN."""
