@@ -1,7 +1,7 @@
-"""What the paper prints, for comparison with the stable forms only, never for computing; and five models of a line.
+"""Five models of where a line's samples look, from no rotation to exact rays, the paper's own among them.
 
-Errata in brackets; ERRATA.md tells each with its figure. Normals and directions are in the frame of
-:mod:`pipeline.geometry.mirror`.
+For comparison only, never for computing; errata in brackets, ERRATA.md tells each with its figure. Normals and
+directions are in the frame of :mod:`pipeline.geometry.mirror`.
 """
 
 from __future__ import annotations
@@ -24,16 +24,7 @@ from pipeline.geometry.scan import points_of_scan
 
 LineModel = Literal["L0", "L1", "L2", "L3", "L4"]
 LINE_MODELS: tuple[LineModel, ...] = get_args(LineModel)
-_RIM_SINE = float(np.sin(np.deg2rad(25.0)))
 _SMALL_SLOPE = 1e-6
-
-
-def paper_position(normal: ArrayLike) -> Floats:
-    """Give the position by equation (7), X = n_x / sin 25 deg [E2].
-
-    Agrees with the device at rest and at the rim, and is up to 6.40 deg (1056 px) wrong between.
-    """
-    return normal_to_device(normal)[..., :2] / _RIM_SINE
 
 
 def unlimited_position(normal: ArrayLike) -> Floats:
@@ -41,17 +32,6 @@ def unlimited_position(normal: ArrayLike) -> Floats:
     device = normal_to_device(normal)
     c2 = 2 * device[..., 2:] ** 2 - 1
     return 2 * device[..., 2:] * device[..., :2] / (c2 * REST_TANGENT)
-
-
-def slope_rotation(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Give the rotation as the paper takes it from a path (line, 2) of X and Y, -atan(dY/dX) [E8, E9].
-
-    (line - 1,) angles between one line and the next; NaN where a position is repeated. [rad]
-    """
-    step = np.diff(position, axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        angle: NDArray[np.float64] = -np.arctan(step[:, 1] / step[:, 0])
-    return angle
 
 
 def straight_slope_rotation(strip_px: ArrayLike, scan_px: ArrayLike, camera: LineCamera) -> NDArray[np.float64]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import frexp, isfinite
 from typing import Literal
 
@@ -130,36 +131,24 @@ def plan_fine(
     whole = _full(grid, camera, cost, along) if full is None else (list(full), cost.seconds(list(full), camera))
     full_s = None if whole is None else whole[1]
     plan = spend(field, budget_s if full_s is None else min(budget_s, float(np.nextafter(full_s, 0.0))), floor)
-    everything = plan.worth >= field.total * (1 - NEGLIGIBLE)
+    everything, total = plan.worth >= field.total * (1 - NEGLIGIBLE), field.total * told
+    planned = partial(FinePlan, wanted_worth=total, full_seconds=full_s, out_of_reach=missed, threshold=threshold)
     if whole is not None and whole[1] <= budget_s and not everything and full_scan_pays(field, whole[1], floor):
         reason = (
             f"to show every place worth a second look takes no less time than to scan everything in detail, "
             f"{whole[1]:.1f} s; the full scan is taken, which shows all of the field"
         )
-        total = field.total * told
-        return FinePlan(whole[0], grid.valid_seats(), whole[1], total, "full", reason, total, full_s, missed, threshold)
+        return planned(whole[0], grid.valid_seats(), whole[1], total, "full", reason)
     sweeps = _sweeps(field, plan)
     check_reach(sweeps, camera)
     seconds = cost.seconds(sweeps, camera)
-    beside = (
-        "; a full scan is beyond the mirror's range"
-        if full_s is None
-        else f", less than the full scan's {full_s:.1f} s"
-    )
+    beside = "; a full scan is beyond the mirror's range"
+    if full_s is not None:
+        beside = f", less than the full scan's {full_s:.1f} s"
+    reason = f"runs of lines take {seconds:.1f} s{beside}"
     seats = covered_seats(grid, camera, sweeps, margin_px=margin_px)
-    return FinePlan(
-        sweeps,
-        seats,
-        seconds,
-        plan.worth * told,
-        "lines",
-        f"runs of lines take {seconds:.1f} s{beside}",
-        field.total * told,
-        full_s,
-        missed,
-        threshold,
-        budget_s - seconds if floor and not everything else None,
-    )
+    spared = budget_s - seconds if floor and not everything else None
+    return planned(sweeps, seats, seconds, plan.worth * told, "lines", reason, spared_s=spared)
 
 
 def _full(grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis) -> tuple[list[Sweep], float] | None:

@@ -332,24 +332,18 @@ def merge_lines(
         return values, valid
     merged, known = values[starts].astype(np.float32), valid[starts]
     several = np.flatnonzero(counts > 1)
-    merged[several], known[several] = _means(values, valid, starts[several], counts[several])
-    return merged, known
-
-
-def _means(
-    values: Values, valid: NDArray[np.bool_], starts: NDArray[np.intp], counts: NDArray[np.intp]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Mean over the valid of ``counts`` lines from ``starts`` on; summed in float64, which holds any dwell's uint16."""
+    starts, counts = starts[several], counts[several]
     mask = valid if valid.ndim == 3 else valid[..., None]
-    total = np.zeros((len(starts), *values.shape[1:]))
+    total = np.zeros((len(starts), *values.shape[1:]))  # float64 holds the sums of any dwell's uint16
     number = np.zeros((len(starts), *mask.shape[1:]), np.intp)
     for member in range(counts.max(initial=0)):
         held = np.flatnonzero(counts > member)
         line = starts[held] + member
         total[held] += np.where(mask[line], values[line], 0)
         number[held] += mask[line]
-    mean = np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
-    return mean, (number > 0).reshape(len(starts), *valid.shape[1:])
+    merged[several] = np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
+    known[several] = (number > 0).reshape(len(starts), *valid.shape[1:])
+    return merged, known
 
 
 def _blocks(count: int) -> Iterator[slice]:

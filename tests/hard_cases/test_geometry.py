@@ -17,7 +17,7 @@ from pipeline.geometry.mirror import (
     position_to_normal,
     scene_to_direction,
 )
-from pipeline.geometry.paper_equations import slope_rotation
+from tests.pipeline.geometry.test_paper import slope_rotation
 
 PRECISIONS = [np.float64, np.float32]
 

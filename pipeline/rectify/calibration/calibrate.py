@@ -231,8 +231,8 @@ def _valid(raw: NDArray[np.uint16], elements: Elements, saturated_dn: float) -> 
     found = [_saturated(raw, block, elements, saturated_dn) for block in _blocks(raw)]
     line, sample = (np.concatenate([np.zeros(0, np.intp), *(part[k] for part in found)]) for k in (0, 1))
     hot = np.concatenate([out[:0], *(part[2] for part in found)]) | out[sample]
-    whole, whole_hot = _sample_out(out, lit), _sample_out(hot, lit)
-    if _is_parted(out, whole) or _is_parted(hot, whole_hot):
+    whole, whole_hot = (np.all(mask | ~lit, axis=-1) for mask in (out, hot))  # every band with light is out
+    if np.any(out.any(axis=-1) & ~whole) or np.any(hot.any(axis=-1) & ~whole_hot):  # some but not all bands of a sample
         valid = np.empty(raw.shape, np.bool_)
         valid[...] = ~(out | whole[:, None])
         valid[line, sample] = ~(hot | whole_hot[:, None])
@@ -259,17 +259,6 @@ def _saturated(
         flat[:, fill.element] = flat[:, fill.before] | flat[:, fill.after]
     line, sample = np.nonzero(hot.any(axis=2))
     return line + block.start, sample, hot[line, sample]
-
-
-def _sample_out(out: Bools, lit: Bools) -> Bools:
-    """Samples of which every band with light is out, (..., sample)."""
-    whole: Bools = np.all(out | ~lit, axis=-1)
-    return whole
-
-
-def _is_parted(out: Bools, whole: Bools) -> bool:
-    """Whether some but not all bands of a sample are out."""
-    return bool(np.any(out.any(axis=-1) & ~whole))
 
 
 def _judged(raw: NDArray[np.uint16], references: References | Elements) -> Elements:

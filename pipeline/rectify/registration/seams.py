@@ -67,44 +67,28 @@ class Registration:
 
 
 def register_sweeps(
-    sweeps: Sequence[BroadSweep],
-    camera: LineCamera,
-    *,
-    prior_px: float,
-    window_px: float = WINDOW_PX,
-    rounds: int = 2,
-    reference: int | None = None,
+    sweeps: Sequence[BroadSweep], camera: LineCamera, *, prior_px: float, window_px: float = WINDOW_PX
 ) -> Registration:
-    """Find where the lines of all sweeps of one pass lie, relative to one of them.
+    """Find where the lines of all sweeps of one pass lie, relative to the middle one of the largest group that overlap.
 
-    Neighbours are rectified where they should overlap, compared window by window, and one offset and drift per sweep
-    is solved for from all windows. The second round rectifies again with these corrections and looks within 3 px: a
-    line turns with its centre, and the first round cannot see by how much. No pixel is shifted twice: the corrections
-    go into ``place(shift_px=...)``, which makes the lookup again.
+    Neighbours are rectified where they should overlap, compared window by window (``window_px`` long), and one offset
+    and drift per sweep is solved for from all windows. A second round rectifies again with these corrections and looks
+    within 3 px: a line turns with its centre, and the first round cannot see by how much. No pixel is shifted twice:
+    the corrections go into ``place(shift_px=...)``, which makes the lookup again.
 
-    Parameters
-    ----------
-    prior_px
-        How far any sweep may look beside the position that it reports, in either axis; a pair may be apart by twice
-        that. Overlaps need 64 px beyond. [px]
-    window_px
-        Length of the windows along the scan. [px]
-    reference
-        Number of the sweep that is held; by default the middle one of the largest group that overlaps join.
+    ``prior_px`` is how far any sweep may look beside the position that it reports, in either axis; a pair may be apart
+    by twice that. Overlaps need 64 px beyond.
 
-    Raises
-    ------
-    SettingsError : the prior is negative or not finite, no rounds, or windows that are too short.
-    PoseError : a corrected position is beyond the mirror's rim.
+    Raises SettingsError: the prior is negative or not finite, or windows that are too short.
+    Raises PoseError: a corrected position is beyond the mirror's rim.
     """
-    if not (np.isfinite(prior_px) and prior_px >= 0 and rounds >= 1):
-        raise SettingsError(
-            f"expected a finite prior >= 0 px and one round or more, got {prior_px} px, {rounds} rounds"
-        )
+    if not (np.isfinite(prior_px) and prior_px >= 0):
+        raise SettingsError(f"expected a finite prior >= 0 px, got {prior_px} px")
     shifts, among = no_shifts([one.sweep.name for one in sweeps]), frozenset(range(len(sweeps)))
     names, lines = [one.sweep.name for one in sweeps], [len(one.position) for one in sweeps]
     made: list[tuple[list[SeamWindow], SweepShifts]] = []
-    for number in range(rounds):
+    reference: int | None = None
+    for number in range(2):
         reach = 2 * prior_px if number == 0 else min(SETTLED_PRIOR_PX, 2 * prior_px)
         images = place_images(sweeps, shifts, camera)
         seen = measure_windows(images, reach_px=reach, window_px=window_px, among=among)

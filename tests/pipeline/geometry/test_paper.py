@@ -20,19 +20,24 @@ from pipeline.geometry.mirror import (
     position_to_direction,
     scene_to_direction,
 )
-from pipeline.geometry.paper_equations import (
-    LINE_MODELS,
-    line_points,
-    paper_position,
-    slope_rotation,
-    straight_slope_rotation,
-    unlimited_position,
-)
+from pipeline.geometry.paper_equations import LINE_MODELS, line_points, straight_slope_rotation, unlimited_position
 from pipeline.geometry.scan import CostModel, Sweep, device_range, memory_loads
 
 CAMERA = LineCamera()
 IFOV = CAMERA.ifov_rad
 E1, E3 = np.array([-1.0, 0.0, -1.0]) / np.sqrt(2), np.array([1.0, 0.0, -1.0]) / np.sqrt(2)
+
+
+def paper_position(normal: np.ndarray) -> np.ndarray:
+    """Equation (7), X = n_x / sin 25 deg [E2]: right at rest and at the rim, up to 6.40 deg (1056 px) wrong between."""
+    return normal_to_device(normal)[..., :2] / np.sin(np.deg2rad(25.0))
+
+
+def slope_rotation(position: np.ndarray) -> np.ndarray:
+    """The rotation as the paper takes it from a path (line, 2), -atan(dY/dX), NaN where one is repeated [E8, E9]."""
+    step = np.diff(position, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return -np.arctan(step[:, 1] / step[:, 0])
 
 
 def paper_normal(direction: np.ndarray) -> np.ndarray:
