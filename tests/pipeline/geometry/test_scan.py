@@ -141,14 +141,6 @@ def test_the_count_is_that_of_the_layout(given_sweeps: list[Sweep], capacity: in
         assert load.pairs + given_sweeps[after.parts[0].sweep].step > capacity
 
 
-def test_a_line_is_never_parted():
-    """Of lines that hold 7 positions 214 fit 1500 pairs; the two cells left stay empty."""
-    first, second = memory_loads([held(215, 7)], 1500)
-    assert first.parts[0].lines == (0, 214)
-    assert first.pairs == 1498
-    assert second.parts[0].lines == (214, 215)
-
-
 def test_channels_lie_one_behind_the_other():
     """X and Y of a part have as many cells, Y behind all X of the load."""
     (load,) = memory_loads([held(10), held(5)], 1500)

@@ -95,6 +95,8 @@ def test_wrong_scores_budgets_and_patches_are_refused():
     for bad in (-1.0, np.nan, np.inf):
         with pytest.raises(BudgetError, match="finite number of seconds, 0 or more, got"):
             plan_fine(GRID, CAMERA, COST, "x", drawn(GRID), budget_s=bad)
+        with pytest.raises(BudgetError, match="threshold must be a finite score of 0 or more, got"):
+            plan_fine(GRID, CAMERA, COST, "x", drawn(GRID), budget_s=9.0, threshold=bad)
     wide = SceneGrid(700, 700, 700, 1)
     with pytest.raises(SettingsError, match="patch of 700 px is wider than a line of 640"):
         plan_fine(wide, CAMERA, COST, "x", np.zeros(1), budget_s=1.0)
@@ -131,13 +133,6 @@ def test_neighbours_share_their_lines(seats: set[int]):
     alone = [price_of_seats(grid, CAMERA, COST, "y", np.array([seat])).lines for seat in valid]
     together = price_of_seats(grid, CAMERA, COST, "y", np.array(valid, np.intp)).lines
     assert max(alone, default=0) <= together <= sum(alone)
-
-
-def test_seats_of_one_row_cost_one_run():
-    """A whole row of seats on one strip takes the lines of a single seat."""
-    grid = SceneGrid(100, 150, 16, 4)
-    row = np.arange(12, 12 + 9)
-    assert price_of_seats(grid, CAMERA, COST, "x", row) == price_of_seats(grid, CAMERA, COST, "x", row[:1])
 
 
 def test_runs_lie_at_their_own_offsets():
@@ -284,10 +279,3 @@ def test_a_threshold_counts_scores_beside_an_infinite_one():
     assert plan.spared_s is not None
     few = plan_fine(GRID, CAMERA, COST, "x", scores.ravel(), budget_s=40.0, threshold=12.0)
     assert columns + 4 in few.seats
-
-
-@pytest.mark.parametrize("threshold", [-1.0, np.nan, np.inf])
-def test_thresholds_that_cannot_be_are_refused(threshold: float):
-    """A threshold is a finite score of 0 or more."""
-    with pytest.raises(BudgetError, match="threshold must be a finite score of 0 or more, got"):
-        plan_fine(GRID, CAMERA, COST, "x", drawn(GRID), budget_s=9.0, threshold=threshold)

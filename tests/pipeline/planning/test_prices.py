@@ -70,43 +70,25 @@ def test_the_ledger_compares_like_with_like():
     assert none["lines"].full_is == "measured"
 
 
-def test_savings_of_parts_add_up():
-    """Lines, samples and bytes of two groups of sweeps are the sums of each; seconds are at most that."""
-    grid = SceneGrid(300, 700, 16, 4)
-    coarse, full = coarse_sweeps(grid, CAMERA, "y"), full_sweeps(grid, CAMERA, "x")
-    both = capture_savings([*coarse, *full], full, CAMERA, grid, cost=COST, bands=3)
-    apart = [capture_savings(part, full, CAMERA, grid, cost=COST, bands=3) for part in (coarse, full)]
-    for name in ("lines", "samples", "bytes_raw"):
-        assert both[name].done == sum(part[name].done for part in apart)
-    total = sum(part["capture_s"].done for part in apart)
-    assert both["capture_s"].done <= total == pytest.approx(both["capture_s"].done, abs=COST.reload_s + 1e-9)
-
-
-@pytest.mark.parametrize("budget", [0.0, -0.5, 1.0001, float("nan"), float("inf")])
-def test_budgets_out_of_range_are_refused(budget: float):
-    """A budget is above 0 and at most 1."""
-    with pytest.raises(BudgetError, match="above 0 and at most 1, got"):
-        check_budget(budget, 50.0, 200.0)
-
-
-def test_budgets_below_the_coarse_pass_name_the_least():
-    """The least that a refusal names is accepted."""
-    with pytest.raises(BudgetError, match=r"least possible is 0\.2847"):
-        check_budget(0.1, 56.93, 200.0)
-    assert check_budget(0.2847, 56.93, 200.0) == pytest.approx(0.01)
-    assert check_budget(1.0, 56.93, 200.0) == pytest.approx(143.07)
+@pytest.mark.parametrize(
+    ("budget", "coarse_s", "words"),
+    [
+        *((budget, 50.0, "above 0 and at most 1, got") for budget in (0.0, -0.5, 1.0001, float("nan"), float("inf"))),
+        (0.1, 56.93, r"least possible is 0\.2847"),
+        (1.0, 210.0, "scan in full"),
+    ],
+)
+def test_budgets_that_cannot_be_met_are_refused(budget: float, coarse_s: float, words: str):
+    """Out of range, below the coarse pass, or of a coarse pass dearer than the full scan, each with what to do."""
+    with pytest.raises(BudgetError, match=words):
+        check_budget(budget, coarse_s, 200.0)
 
 
 @given(st.floats(1, 500), st.floats(0.01, 1))
 def test_the_least_budget_is_accepted_and_is_the_least(full: float, share: float):
     """It pays for the coarse pass, and one step of the last digit less does not."""
+    assert check_budget(1.0, 56.93, 200.0) == pytest.approx(143.07)
     least = least_budget(full * share, full)
     assert 0 <= check_budget(min(least, 1.0), full * share, full) <= full * 1.01e-4
     with pytest.raises(BudgetError, match=f"the least possible is {least}"):
         check_budget(least - 1.01e-4, full * share, full)
-
-
-def test_a_coarse_pass_dearer_than_the_full_scan_is_refused():
-    """Without a saving to be had the message says to scan in full."""
-    with pytest.raises(BudgetError, match="scan in full"):
-        check_budget(1.0, 210.0, 200.0)

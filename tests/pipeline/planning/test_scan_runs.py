@@ -71,13 +71,6 @@ def test_windows_are_chosen_apart():
     assert both == alone == [[ScanRun(0, 0, 2), ScanRun(1, 3, 5)], [ScanRun(2, 1, 3)]]
 
 
-def test_near_runs_are_one_and_far_ones_are_not():
-    """A gap shorter than a set-up is scanned through; a longer one is not."""
-    near, far = [[(0, 2, 9.0), (3, 2, 9.0)]], [[(0, 2, 9.0), (5, 2, 9.0)]]
-    assert best_chains(tables(near), np.array([[0]]), 1.0, 1.5) == [[ScanRun(0, 0, 5)]]
-    assert best_chains(tables(far), np.array([[0]]), 1.0, 1.5) == [[ScanRun(0, 0, 2), ScanRun(0, 5, 7)]]
-
-
 @given(st.floats(0, 60), st.integers(0, 6))
 def test_most_lines_are_the_most_that_the_seconds_pay_for(seconds: float, runs: int):
     """One line more would cost more than the seconds; a budget below the set-ups pays for less than nothing."""
@@ -138,13 +131,6 @@ def test_a_strip_between_two_layouts_is_found():
     worth = np.zeros((3, 8))
     worth[1, 2:6] = 5.0
     assert best_cover(seats(worth, 4), (), 0.5) == Cover((ScanRun(2, 4, 8),), 20.0, 7.0)
-
-
-def test_each_run_has_its_own_offset():
-    """Two groups of seats below each other and apart in columns are shown by two runs at two offsets."""
-    worth = np.zeros((9, 8))
-    worth[0, :4], worth[8, 3:7] = 5.0, 5.0
-    assert best_cover(seats(worth, 4), (), 0.5).runs == (ScanRun(0, 0, 4), ScanRun(3, 32, 36))
 
 
 def test_runs_are_cut_to_what_they_add():

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, line_positions, points_of_scan, scene_to_sweep
-from pipeline.rectify.lookup import KnotCurve, grid_points, lookup, track_lookup
+from pipeline.rectify.lookup import KnotCurve, lookup, track_lookup
 from pipeline.rectify.resample import resample
 from pipeline.rectify.tracks import Track, make_tracks
 from tests.pipeline.rectify.aiming import CAMERA, aim
@@ -104,13 +104,6 @@ def test_unusable_input_is_refused() -> None:
         lookup(position, CAMERA, np.zeros((1, 3)), along="x")
     with pytest.raises(PoseError, match="unit disk"):
         lookup(position + np.array([0, 1.5]), CAMERA, np.zeros((1, 2)), along="x")
-
-
-def test_no_points_give_none() -> None:
-    """An empty list of points and an empty grid pass through."""
-    position = aim(0.0, np.arange(3.0))
-    assert lookup(position, CAMERA, np.zeros((0, 2)), along="x").shape == (0, 2)
-    assert lookup(position, CAMERA, grid_points((0, 0), 1, (0, 5)), along="x").shape == (0, 5, 2)
 
 
 def wandering_track(seed: int, amount_px: float, strip: float = 2600.0) -> Track:

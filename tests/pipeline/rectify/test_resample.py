@@ -146,15 +146,6 @@ def test_raw_numbers_come_back_as_they_are() -> None:
     assert not out[failed].any()
 
 
-@pytest.mark.parametrize("kernel", ["bilinear", "catmull-rom"])
-def test_uint16_is_read_as_its_numbers(kernel: Kernel) -> None:
-    """Raw uint16 and the same numbers in float32 give the same sums."""
-    values = np.random.default_rng(15).integers(0, 65_536, (9, 9, 2), dtype=np.uint16)
-    at = np.random.default_rng(16).uniform(-0.4, 8.4, (50, 2))
-    out, _ = resample(values, np.ones((9, 9), bool), at, kernel)
-    np.testing.assert_array_equal(out, resample(values.astype(np.float32), np.ones((9, 9), bool), at, kernel)[0])
-
-
 def test_writes_to_given_memory() -> None:
     """``out`` receives the result and comes back; one that does not fit is refused."""
     values, valid, at = np.random.default_rng(17).random((6, 6, 2), np.float32), np.ones((6, 6), bool), everywhere(6, 6)

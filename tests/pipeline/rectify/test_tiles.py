@@ -223,17 +223,6 @@ def test_where_no_line_shows_anything_all_is_empty(beside: bool) -> None:
     assert not lines.asked
 
 
-def test_sweeps_that_do_not_meet_stand_side_by_side() -> None:
-    """With nothing in common every pixel is one sweep's own, bit by bit."""
-    grid = PixelGrid((-20.0, -200.0), 1, (40, 400))
-    sweeps = [Sweep(f"at {strip}", "fine", "x", strip, -30.0, 60) for strip in (-100.0, 100.0)]
-    placed = [place(taken(sweep, seed=number), CAMERA) for number, sweep in enumerate(sweeps)]
-    both, coverage = in_tiles(placed, grid, (64, 640))
-    one, other = (in_tiles([alone], grid, (64, 640))[0] for alone in placed)
-    assert set(np.unique(coverage)) == {0, 1}
-    np.testing.assert_array_equal(both, np.where(np.isnan(one), other, one))
-
-
 @pytest.mark.parametrize("placed_by_it", [False, True])
 def test_a_dead_line_leaves_its_own_row_empty(placed_by_it: bool) -> None:
     """What a dead line holds reaches no pixel, even if its place is believed; only pixels nearest to it are lost."""
