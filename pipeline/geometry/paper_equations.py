@@ -55,16 +55,9 @@ def line_points(
     """Give where each sample of each line looks by one of five models of a line: along and scan, (line, sample) [px].
 
     L0 no rotation; L1 the paper's -atan(dY/dX); L2 the exact rotation; L3 exact rotation and local scale; L4 exact
-    rays. L0 to L2 keep the scale of the undeflected line.
+    rays. L0 to L2 keep the scale of the undeflected line. ``scan_px`` is (line,).
 
-    Parameters
-    ----------
-    strip_px, scan_px
-        Of the line centres: along the line, and (line,) on the scan. [px]
-
-    Raises
-    ------
-    ValueError : no such model.
+    Raises ValueError: no such model.
     """
     if model not in LINE_MODELS:
         raise ValueError(f"line model must be one of {', '.join(LINE_MODELS)}, got {model!r}")

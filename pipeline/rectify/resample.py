@@ -260,7 +260,7 @@ def resample(
     *,
     out: NDArray[Any] | None = None,
 ) -> tuple[NDArray[Any], NDArray[np.float32]]:
-    """Read a sweep at scattered coordinates, leaving out what is not valid.
+    """Read a sweep (line, sample, band), float32 or uint16, at scattered coordinates, leaving out what is not valid.
 
     Taps that are not valid or lie off the sweep count nothing and the rest is renormalised; a point whose valid taps
     weigh less than a half fails. Where single elements are invalid this holds for each band on its own. Values of what
@@ -268,8 +268,6 @@ def resample(
 
     Parameters
     ----------
-    values
-        (line, sample, band) float32 or uint16.
     valid
         (line, sample) whether a sample may be used, or (line, sample, band) whether an element may. Where ``values``
         holds 0 at single invalid elements the lines need not be copied.

@@ -69,25 +69,14 @@ def make_tracks(
     Lines that are not usable say nothing of the path; where one is missing, or was lost, knots that nothing saw stand
     in its place. Resampling then counts their values nothing, and fails where what is left weighs less than a half.
 
-    Parameters
-    ----------
-    position
-        (line, 2) mirror X and Y at mid exposure. Those of lines that are not ``usable`` (line,) do not matter.
-    shift_px
-        (line, 2) pointing corrections, along the line and along the scan, added to the line centres. [px]
-    binning
-        Neighbouring samples summed: lines are taken to be as far apart where the path itself does not say.
-    step_px
-        Planned distance of the lines; None takes the median of the path's own steps. [px]
+    ``position`` is (line, 2) mirror X and Y at mid exposure, ``shift_px`` (line, 2) pointing corrections along the line
+    and along the scan, added to the line centres. ``step_px`` is the planned distance of the lines; None takes the
+    median of the path's own steps, or where the path does not say the width of a sample of ``binning`` px.
 
-    Returns
-    -------
     Tracks in the order in which they were taken; none where no line is usable.
 
-    Raises
-    ------
-    PoseError : the position of a usable line is not finite or beyond the mirror's disk; names the first.
-    ShapeError : arrays do not fit the lines.
+    Raises PoseError: the position of a usable line is not finite or beyond the mirror's disk; names the first.
+    Raises ShapeError: arrays do not fit the lines.
     """
     scan, across, lines = line_centres(position, camera, usable, shift_px)
     if not len(lines):
@@ -103,12 +92,8 @@ def make_tracks(
 def line_centres(
     position: Floats, camera: LineCamera, usable: NDArray[np.bool_] | None = None, shift_px: Floats | None = None
 ) -> tuple[Floats, Floats, NDArray[np.intp]]:
-    """Give where the usable lines of a sweep have their centres, in the order of capture.
+    """Give where the usable lines of a sweep have their centres, in order of capture; raises as :func:`make_tracks`.
 
-    Parameters and errors are those of :func:`make_tracks`.
-
-    Returns
-    -------
     Tangents on the scan axis and along the line, (usable line,) each, and the numbers of these lines.
     """
     if position.ndim != 2 or position.shape[1] != 2:

@@ -90,18 +90,14 @@ def _off_neighbours(response: Floats, noise: Floats, limits: BadElementCriteria)
     if response.shape[1] >= BANDS_FOR_COLUMN:
         off -= _median(off, axis=1)
     spread = TO_SIGMA * _median(np.abs(off), axis=0)
-    odd = (np.abs(off) > limits.odd_sigmas * spread) & _beyond_nearest(response, limits)
-    return dead | odd
-
-
-def _beyond_nearest(response: Floats, limits: BadElementCriteria) -> Bools:
-    """Elements above or below their nearest neighbours; two that stand out side by side do not hide each other."""
     if len(response) < limits.near:
-        return np.zeros(response.shape, np.bool_)
+        return dead
+    # Beyond the nearest neighbours as well; two that stand out side by side do not hide each other.
     filled = _without_gaps(response)
     low, high = (ndimage.rank_filter(filled, rank, (limits.near, 1), mode="reflect") for rank in (2, -3))
-    beyond: Bools = (response < low * (1 - limits.odd_share)) | (response > high * (1 + limits.odd_share))
-    return beyond
+    beyond = (response < low * (1 - limits.odd_share)) | (response > high * (1 + limits.odd_share))
+    odd: Bools = (np.abs(off) > limits.odd_sigmas * spread) & beyond
+    return dead | odd
 
 
 def _without_gaps(columns: Floats) -> Floats:
