@@ -42,12 +42,12 @@ def beyond_range(values: NDArray[Any], most: float = MOST_VALUE) -> NDArray[np.b
     return found if found.any() else None
 
 
-def find_beyond(values: NDArray[Any], most: float = MOST_VALUE) -> Beyond | None:
+def find_beyond(values: NDArray[Any]) -> Beyond | None:
     """Count the finite values of a (y, x, band) cube that are no readings, and name the first; None where all are.
 
     Infinite ones are missing values, as NaN is.
     """
-    found = beyond_range(values, most)
+    found = beyond_range(values)
     if found is None or not (found := found & np.isfinite(values)).any():
         return None
     place = tuple(int(at) for at in np.unravel_index(int(found.argmax()), found.shape))

@@ -72,7 +72,7 @@ def mosaic_tile(
 
 
 def mosaic_rows(
-    sweeps: Sequence[SweepLines], camera: LineCamera, grid: SceneGrid, *, rows: int, kernel: Kernel = "catmull-rom"
+    sweeps: Sequence[SweepLines], camera: LineCamera, grid: SceneGrid, *, rows: int
 ) -> Iterator[tuple[int, Values, Counts]]:
     """Rectify and blend the sweeps of one pass onto its grid, ``rows`` rows at a time.
 
@@ -85,7 +85,7 @@ def mosaic_rows(
     reach = column_reach(placed, camera, pixels, columns)
     for first in range(0, pixels.shape[0], rows):
         part = slice(first, min(first + rows, pixels.shape[0]))
-        yield first, *mosaic_tile(placed, camera, pixels, part, columns, kernel=kernel, reach=reach)
+        yield first, *mosaic_tile(placed, camera, pixels, part, columns, reach=reach)
 
 
 def seat_pixels(grid: SceneGrid, seats: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

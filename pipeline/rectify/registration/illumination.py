@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SettingsError, ShapeError
+from pipeline.errors import ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.placed import PixelGrid, Placed
 from pipeline.rectify.region import mosaic_tile
@@ -79,20 +79,15 @@ def light_ratio(
     return LightRatio(*pair, ratio, error)
 
 
-def solve_lights(
-    ratios: Sequence[LightRatio], sweeps: int, wavelength_nm: Floats, *, order: int = ORDER
-) -> SweepLights:
+def solve_lights(ratios: Sequence[LightRatio], sweeps: int, wavelength_nm: Floats) -> SweepLights:
     """Find the light of every sweep from the ratios of all pairs; ``wavelength_nm`` is (band,) in any order.
 
     Least squares of log ratios, each weighted by its error, with the log light of a sweep a polynomial in wavelength.
     Overlaps see ratios only: the mean log light of sweeps that they join is 0 at every wavelength.
 
-    Raises SettingsError: the order is negative.
     Raises ShapeError: a ratio has another number of bands, or names a sweep that is not there.
     """
     bands = len(wavelength_nm)
-    if order < 0:
-        raise SettingsError(f"the order in wavelength must be 0 or more, got {order}")
     for ratio in ratios:
         if ratio.log_ratio.shape != (bands,) or not {ratio.reference, ratio.moving} <= set(range(sweeps)):
             raise ShapeError(
@@ -103,7 +98,7 @@ def solve_lights(
     low, high = float(np.min(wavelength_nm)), float(np.max(wavelength_nm))
     span = (2 * np.asarray(wavelength_nm, np.float64) - low - high) / max(high - low, 1e-9)
     most = len(np.unique(wavelength_nm)) - 1  # no more polynomials than there are bands
-    basis = np.polynomial.legendre.legvander(span, min(order, most)).astype(np.float64)
+    basis = np.polynomial.legendre.legvander(span, min(ORDER, most)).astype(np.float64)
     answer = np.zeros((sweeps, basis.shape[1]))
     if known:
         rows, wanted = zip(*(_equations(ratio, sweeps, basis) for ratio in known), strict=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import SettingsError, ShapeError
+from pipeline.errors import ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, Sweep
@@ -156,7 +156,7 @@ def test_crop_rows_are_not_taken_for_light(period: float, along: Axis):
 
 
 def test_arrays_that_do_not_fit_are_refused():
-    """Unlike arrays, unknown sweeps, other bands and negative orders are named."""
+    """Unlike arrays, unknown sweeps and other bands are named."""
     with pytest.raises(ShapeError, match="same points"):
         light_ratio(np.zeros((3, 4, 5)), np.zeros((3, 4, 6)), pair=(0, 1))
     ratio = LightRatio(0, 1, np.zeros(31), np.ones(31))
@@ -164,5 +164,3 @@ def test_arrays_that_do_not_fit_are_refused():
         solve_lights([ratio], 1, WAVELENGTH)
     with pytest.raises(ShapeError, match="has 31 bands"):
         solve_lights([ratio], 2, WAVELENGTH[:5])
-    with pytest.raises(SettingsError, match="must be 0 or more, got -1"):
-        solve_lights([ratio], 2, WAVELENGTH, order=-1)
