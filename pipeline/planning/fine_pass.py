@@ -99,8 +99,6 @@ def plan_fine(
     scores
         (seat,) gain of each seat of ``grid``, of any size; NaN, -inf and negative ones are worth nothing, +inf more
         than all others.
-    budget_s
-        Seconds for the fine pass, 0 or more.
     margin_px
         How far beside the plan the mirror may look: every run shows its seats even so. [px]
     full
