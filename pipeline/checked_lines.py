@@ -62,7 +62,12 @@ def _line(number: int, text: bytes, seed: int) -> Iterator[CheckedLine]:
             if found is not None:
                 yield CheckedLine(number, part, found, "whole")
                 break
-    yield _unchecked(number, text) if not ends else CheckedLine(number, text, None, "changed")
+    content = None if ends or _had_check(text) else _object(text)
+    if content is not None:
+        yield CheckedLine(number, text, content, "unchecked")
+    else:
+        changed = ends or _had_check(text) or text.endswith(b"}")
+        yield CheckedLine(number, text, None, "changed" if changed else "torn")
 
 
 def _whole(text: bytes, seed: int) -> dict[str, Any] | None:
@@ -71,13 +76,6 @@ def _whole(text: bytes, seed: int) -> dict[str, Any] | None:
     if check is None or int(check[1], 16) != zlib.crc32(body, seed):
         return None
     return _object(body + b"}")
-
-
-def _unchecked(number: int, text: bytes) -> CheckedLine:
-    content = None if _had_check(text) else _object(text)
-    if content is not None:
-        return CheckedLine(number, text, content, "unchecked")
-    return CheckedLine(number, text, None, "changed" if _had_check(text) or text.endswith(b"}") else "torn")
 
 
 def _had_check(text: bytes) -> bool:

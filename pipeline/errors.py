@@ -1,33 +1,46 @@
-"""The error tree. Every message says what was expected, what came, where, and what to do.
+"""The error tree, and how text from files and devices is shown.
 
-=====================  ==========================================================  ========
-error                  when                                                        exit code
-=====================  ==========================================================  ========
-SettingsError          a flag or a settings file says something that cannot be     2
-BudgetError            a budget or a number of seats that cannot be met            2
-SceneError             a scene, label or mask file that cannot be used             1
-WavelengthError        wavelengths that do not fit the bands or the unit           1
-ShapeError             arrays whose shapes do not fit each other                   1
-PoseError              a direction or position the mirror cannot take              1
-WeightsError           weights that do not fit the scene or are damaged            1
-RigError               a device (or the spool behind it) failed                    1
-ArchiveError           the archive cannot be read or written                       1
-ChunkError             a region that splits stored chunks                          1
-IncompleteStoreError   a store without a valid manifest, or one that fails it      1
-WorkerError            processes that work for this one died or went away          1
-BoundError             a simulated effect changes more than its bound says         1
-=====================  ==========================================================  ========
+Every message says what was expected, what came, where, and what to do.
 """
 
 from __future__ import annotations
 
-from pipeline.visible_text import visible
+import re
+import unicodedata
+from collections.abc import Callable
+
+_LAYOUT = "\n\t"  # control characters that text for people has
+_DIRECTION = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
+_UNSEEN = "\u00ad\u061c\u200b\u200e\u200f\u2060\ufeff"  # marks of direction, and what takes no room
+_SUSPECT = re.compile(r"[^\n\t\x20-\x7e\u00a1-\u00ac\u00ae-\u02ff\u0370-\u058f\u2010-\u2027\u2030-\u205e\u4e00-\u9fff]")
+
+
+def _escaped(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")
+
+
+def visible(text: str, escaped: Callable[[str], str] = _escaped) -> str:
+    r"""Text in which control characters, marks of direction and unseen ones stand as escapes: ``\x1b``, ``\u202e``.
+
+    Lines, tabs and the letters of all scripts stay; so do the joiners that some scripts are written with.
+    """
+    return _SUSPECT.sub(lambda found: found[0] if is_visible(found[0]) else escaped(found[0]), text)
+
+
+def is_visible(character: str) -> bool:
+    """Whether a character is one that `visible` leaves as it is."""
+    if character in _LAYOUT:
+        return True
+    if character in _UNSEEN or unicodedata.bidirectional(character) in _DIRECTION:
+        return False
+    tag = "\U000e0000" <= character <= "\U000e007f"
+    return not tag and unicodedata.category(character) not in ("Cc", "Cs", "Zl", "Zp")
 
 
 class PipelineError(Exception):
     """Base of every error that the user is meant to read; ``exit_code`` is the process's.
 
-    Words of files and devices in it are shown as `visible_text` shows them.
+    Words of files and devices in it are shown as `visible` shows them.
     """
 
     exit_code = 1

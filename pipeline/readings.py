@@ -32,7 +32,8 @@ class Beyond:
 
 def beyond_range(values: NDArray[Any], most: float = MOST_VALUE) -> NDArray[np.bool_] | None:
     """Which values are larger than ``most`` by size, infinite ones too; None where none is. NaN is no value at all."""
-    if not values.size or values.dtype.kind not in "fiu" or _too_short(values.dtype, most):
+    kind = values.dtype
+    if not values.size or kind.kind not in "fiu" or (kind.kind in "iu" and np.iinfo(kind).max <= most):
         return None
     low, high = values.min(), values.max()
     if -most <= low and high <= most:
@@ -41,17 +42,12 @@ def beyond_range(values: NDArray[Any], most: float = MOST_VALUE) -> NDArray[np.b
     return found if found.any() else None
 
 
-def _too_short(kind: np.dtype[Any], most: float) -> bool:
-    """Whether numbers of a kind cannot be larger."""
-    return bool(kind.kind in "iu" and np.iinfo(kind).max <= most)
-
-
-def find_beyond(values: NDArray[Any], most: float = MOST_VALUE) -> Beyond | None:
+def find_beyond(values: NDArray[Any]) -> Beyond | None:
     """Count the finite values of a (y, x, band) cube that are no readings, and name the first; None where all are.
 
     Infinite ones are missing values, as NaN is.
     """
-    found = beyond_range(values, most)
+    found = beyond_range(values)
     if found is None or not (found := found & np.isfinite(values)).any():
         return None
     place = tuple(int(at) for at in np.unravel_index(int(found.argmax()), found.shape))

@@ -26,20 +26,10 @@ def stated(
 ) -> Any:
     """A dataclass's field that says all there is to know of it; nothing else repeats it.
 
-    Parameters
-    ----------
-    default
-        ``dataclasses.MISSING`` where it has to be given. A number is finite, unless its default is infinite.
-    about
-        One line of help.
-    ge, le
-        Least and greatest value, both allowed. [unit]
-    source
-        Where the default comes from: nothing here was measured on a unit unless it says so.
-    example
-        What to show where there is no default, or where it is written in another way.
-    why
-        What a refusal adds to the range.
+    ``default`` is ``dataclasses.MISSING`` where it has to be given; a number is finite, unless its default is infinite.
+    ``about`` is one line of help, ``ge`` and ``le`` the least and greatest value, both allowed [unit]. ``source`` says
+    where the default comes from: nothing here was measured on a unit unless it says so. ``example`` is what to show
+    where there is no default, or it is written in another way, and ``why`` what a refusal adds to the range.
     """
     known = {"description": about, "ge": ge, "le": le}  # as pydantic's Field calls them
     told = {"unit": unit, "source": source, "example": example, "why": why}

@@ -31,8 +31,7 @@ from flows.archive.stale_runs import (
 from flows.settings.survey_settings import Settings
 from flows.survey.scores import score_of
 from flows.terminal.figures import format_points, format_seconds
-from pipeline.errors import PipelineError, SettingsError
-from pipeline.visible_text import visible
+from pipeline.errors import PipelineError, SettingsError, visible
 from storage.archive.lineage import Catalogue
 from storage.archive.records import read_run
 from storage.archive.whole_files import new_file, to_json, write_whole

@@ -18,9 +18,9 @@ from pipeline.errors import BudgetError, PoseError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps
-from pipeline.planning.fine_pass import check_budget, plan_fine
+from pipeline.planning.fine_pass import plan_fine
 from pipeline.planning.line_blocks import WIDTHS, line_blocks, most_shown
-from pipeline.planning.savings import count_lines
+from pipeline.planning.prices import check_budget, count_lines
 
 BUDGETS = (0.35, 0.4, 0.5, 0.65, 0.8)  # of the full scan's seconds, coarse pass included
 PLANNED = ("gain", "entropy")

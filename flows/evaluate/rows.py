@@ -19,7 +19,7 @@ from models.policies.policies import score_seats
 from models.reading.inference import segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.planning.savings import BYTES_PER_SAMPLE
+from pipeline.planning.prices import BYTES_PER_SAMPLE
 from pipeline.planning.selection import frame_seats
 
 ORACLE = "oracle"

@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from flows.publish.effect_table import format_change
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
-from pipeline.visible_text import visible
+from pipeline.errors import visible
 
 _MARKDOWN = "\\`*_{}[]<>#|"
 

@@ -34,7 +34,7 @@ from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
-from pipeline.planning.savings import SavingEntry, capture_savings
+from pipeline.planning.prices import SavingEntry, capture_savings
 from pipeline.rectify.calibration.calibrate import of_bands, reflectance
 from storage.archive.archive import StageRef
 from storage.archive.records import StageRecord, read_run

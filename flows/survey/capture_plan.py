@@ -11,10 +11,10 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, Sweep
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps, with_margin
-from pipeline.planning.fine_pass import check_budget
+from pipeline.planning.prices import check_budget
 from pipeline.rectify.placed import PixelGrid, place
+from pipeline.rectify.region import plan_tiles
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
-from pipeline.rectify.tiles import plan_tiles
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from pipeline.source import References
 from storage.arrays.layout import image_spec

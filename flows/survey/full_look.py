@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from models.weights.files import Weights
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
+from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.region import read_seats
-from pipeline.rectify.resample import Kernel
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 MEMORY_SHARE = 32  # a band of seats may take this part of the memory

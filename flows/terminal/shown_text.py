@@ -10,7 +10,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.text import Text
 
-from pipeline.visible_text import visible
+from pipeline.errors import visible
 
 PIPED_WIDTH = 120  # of tables where no terminal says how wide it is
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register
 from pipeline.geometry.camera import LineCamera
-from pipeline.rectify.resample import Kernel, resample
+from pipeline.rectify.kernels import Kernel
+from pipeline.rectify.resample import resample
 
 SIDE, BANDS, POINTS = 256, 64, 40_000
 PERIODS_PX = (4.0, 40.0)

@@ -11,7 +11,7 @@ from flows.tradeoff.entries import Level, Setting, Tradeoff, register
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.rectify.calibration.calibrate import reflectance
-from pipeline.rectify.lookup import grid_lookup
+from pipeline.rectify.lookup import grid_points, lookup
 from pipeline.rectify.resample import resample
 from pipeline.simulator.effects.registry import QUIET
 from pipeline.simulator.rig_model import Rig
@@ -55,9 +55,7 @@ def _capture(source: SimulatedSource, step: int) -> tuple[SimulatedSweep, Values
 def _rectify(camera: LineCamera, lines: SimulatedSweep, values: Values) -> Values:
     """The scene at its own pixels."""
     origin = (-(SHAPE[0] - 1) / 2, -(SHAPE[1] - 1) / 2)
-    coordinates = grid_lookup(
-        lines.position, camera, along="x", binning=1, origin_px=origin, spacing_px=1.0, shape=SHAPE
-    )
+    coordinates = lookup(lines.position, camera, grid_points(origin, 1.0, SHAPE), along="x")
     seen, _ = resample(values, np.ones(values.shape[:2], bool), coordinates.reshape(-1, 2))
     return seen.reshape(*SHAPE, -1)
 

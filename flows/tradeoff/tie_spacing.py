@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, line_positions, scene_to_sweep
-from pipeline.rectify.lookup import tie_table
+from pipeline.rectify.tie_points import tie_table
 from pipeline.rectify.tracks import Track, make_tracks
 
 SWEEP = Sweep("ties", "fine", "x", strip_px=2500.0, start_px=-2000.0, lines=620)  # turned by 13 to 15 deg

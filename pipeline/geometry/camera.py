@@ -97,30 +97,23 @@ def footprint_kernel(width_px: float) -> NDArray[np.float64]:
 def _linear_integral(t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Integral of the kernel of linear interpolation from minus infinity to t."""
     a = np.minimum(np.abs(t), 1.0)
-    integral: NDArray[np.float64] = 0.5 + np.sign(t) * a * (1 - a / 2)
-    return integral
+    return 0.5 + np.sign(t) * a * (1 - a / 2)
 
 
 def digitise(
     electrons: NDArray[np.floating], camera: LineCamera, rng: np.random.Generator | None
 ) -> NDArray[np.uint16]:
-    """Turn expected electrons of one exposure into DN: shot noise, read noise, dark level, saturation, rounding.
+    """Turn expected electrons (..., band) of one exposure into DN: shot noise, read noise, dark level, saturation.
 
-    Parameters
-    ----------
-    electrons
-        (..., band) expected electrons; negative values count as 0. [e-]
-    rng
-        None leaves the noise out.
-
-    Returns
-    -------
-    (..., band) uint16, clipped to the converter's range and rounded half to even.
+    Negative electrons count as 0; DN are clipped to the converter's range and rounded half to even. ``rng`` None leaves
+    the noise out.
     """
     signal = np.maximum(electrons, 0).astype(np.float32, copy=False)
-    if rng is not None:
-        one_draw = camera.read_noise_e >= ONE_DRAW_READ_NOISE_E
-        signal = _shot_and_read(signal, camera, rng) if one_draw else _poisson_and_read(signal, camera, rng)
+    if rng is not None and camera.read_noise_e >= ONE_DRAW_READ_NOISE_E:
+        signal = _shot_and_read(signal, camera, rng)
+    elif rng is not None:  # exact Poisson counts plus normal read noise
+        read = rng.standard_normal(signal.shape, dtype=np.float32) * np.float32(camera.read_noise_e)
+        signal = read + rng.poisson(signal).astype(np.float32)
     dn = np.rint(signal / np.float32(camera.electrons_per_dn) + np.float32(camera.dark_dn))
     raw: NDArray[np.uint16] = np.clip(dn, 0, camera.full_scale_dn).astype(np.uint16)
     return raw
@@ -142,22 +135,12 @@ def _shot_and_read(expected: NDArray[np.float32], camera: LineCamera, rng: np.ra
     return variance + expected
 
 
-def _poisson_and_read(
-    expected: NDArray[np.float32], camera: LineCamera, rng: np.random.Generator
-) -> NDArray[np.float32]:
-    """Exact Poisson counts plus normal read noise."""
-    read = rng.standard_normal(expected.shape, dtype=np.float32) * np.float32(camera.read_noise_e)
-    return read + rng.poisson(expected).astype(np.float32)
-
-
 def bin_samples(dn: NDArray[np.uint16], binning: int) -> NDArray[np.uint16]:
     """Sum ``binning`` neighbouring samples, (..., sample, band) -> (..., sample // binning, band).
 
     A remainder is dropped.
 
-    Raises
-    ------
-    ShapeError : fewer samples than ``binning``, or a sum that 16 bits do not hold.
+    Raises ShapeError: fewer samples than ``binning``, or a sum that 16 bits do not hold.
     """
     if binning == 1:
         return dn
@@ -175,31 +158,6 @@ def bin_samples(dn: NDArray[np.uint16], binning: int) -> NDArray[np.uint16]:
     return raw
 
 
-def look(
-    electrons: NDArray[np.floating], camera: LineCamera, *, step: int, rng: np.random.Generator | None
-) -> NDArray[np.float32]:
-    """What one pass gives of a grid-aligned scene: footprint, motion smear, one exposure a line, binning.
-
-    The coarse pass takes every ``step``-th line: the mirror moves ``step`` px during the one exposure and ``step``
-    neighbouring samples are averaged, so that noise falls by sqrt(step), not by step. ``step=1`` is the fine pass.
-
-    Parameters
-    ----------
-    electrons
-        (y, x, band) expected electrons per exposure of a fine pixel; the scan goes along y. Sizes divide by ``step``.
-
-    Returns
-    -------
-    (y / step, x / step, band) float32 electrons, dark level taken off.
-
-    Raises
-    ------
-    ShapeError : a size does not divide by ``step``, or a binned sum does not fit 16 bits.
-    """
-    _check_divides(electrons.shape, step)
-    return expose(footprint(electrons, camera), camera, step=step, rng=rng)
-
-
 def footprint(light: NDArray[np.floating], camera: LineCamera) -> NDArray[np.float32]:
     """Blur a grid-aligned scene by the slit along y and the pixel along x; any linear measure of light, (y, x, k)."""
     return _convolve(_convolve(light, footprint_kernel(camera.slit_px), 0), footprint_kernel(1.0), 1)
@@ -208,22 +166,20 @@ def footprint(light: NDArray[np.floating], camera: LineCamera) -> NDArray[np.flo
 def expose(
     seen: NDArray[np.floating], camera: LineCamera, *, step: int, rng: np.random.Generator | None
 ) -> NDArray[np.float32]:
-    """Second half of ``look``: what one exposure a line gives of light that has passed the footprint.
+    """What one exposure a line gives of a grid-aligned scene (y, x, band) [e-] behind the footprint; scan along y.
 
-    Raises
-    ------
-    ShapeError : a size does not divide by ``step``, or a binned sum does not fit 16 bits.
+    The coarse pass takes every ``step``-th line: the mirror moves ``step`` px during the one exposure and ``step``
+    neighbouring samples are averaged, so that noise falls by sqrt(step), not by step. ``step=1`` is the fine pass.
+    (y / step, x / step, band) float32 electrons, dark level taken off.
+
+    Raises ShapeError: a size does not divide by ``step``, or a binned sum does not fit 16 bits.
     """
-    _check_divides(seen.shape, step)
     y, x, bands = seen.shape
+    if y % step or x % step:
+        raise ShapeError(f"a scene of {(y, x)} px does not divide by the step {step}; pad it first")
     held = seen.reshape(y // step, step, x, bands).mean(axis=1)
     dn = bin_samples(digitise(held, camera, rng), step).astype(np.float32)
     return (dn / np.float32(step) - np.float32(camera.dark_dn)) * np.float32(camera.electrons_per_dn)
-
-
-def _check_divides(shape: tuple[int, ...], step: int) -> None:
-    if shape[0] % step or shape[1] % step:
-        raise ShapeError(f"a scene of {shape[:2]} px does not divide by the step {step}; pad it first")
 
 
 def _convolve(image: NDArray[np.floating], kernel: NDArray[np.float64], axis: int) -> NDArray[np.float32]:

@@ -10,40 +10,33 @@ instead is in :mod:`pipeline.geometry.paper_equations`, and the errata E1 to E18
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import PoseError, ShapeError
+from pipeline.errors import PoseError, SettingsError, ShapeError
 
 Floats = NDArray[Any]  # float64, or float32 where that came in
-Slit = Literal["across", "in-plane"]
 
 REST_TANGENT = float(np.tan(np.deg2rad(50.0)))
 # How far beyond the rim, and off length 1, a vector may lie by rounding, by the precision that it came in.
 RIM_SLACK = {"float64": 1e-12, "float32": 1e-6}
 LENGTH_SLACK = {"float64": 1e-6, "float32": 1e-5}
 _HALF = float(np.sqrt(0.5))
+Axes = Literal["x,y", "x,-y", "-x,y", "-x,-y", "y,x", "y,-x", "-y,x", "-y,-x"]
+_ROWS = {"x": (1, 0), "-x": (-1, 0), "y": (0, 1), "-y": (0, -1)}
 # Rows are e1, e2, e3 in the camera frame: the axes of device X, device Y, and the rest normal.
 _DEVICE_AXES = np.array([[-_HALF, 0.0, -_HALF], [0.0, 1.0, 0.0], [_HALF, 0.0, -_HALF]])
 
 
 def check_reach(position: ArrayLike) -> Floats:
-    """Refuse device positions beyond the unit disk, before a device clamps them to its rim unasked (erratum E3).
+    """Give device positions (..., 2) back as floats; refuse those beyond the unit disk (erratum E3).
 
-    Parameters
-    ----------
-    position
-        (..., 2) device X and Y.
+    A device would clamp them to its rim unasked.
 
-    Returns
-    -------
-    The positions as (..., 2) floats.
-
-    Raises
-    ------
-    PoseError : a position is not finite or beyond the rim; the message names the first.
+    Raises PoseError: a position is not finite or beyond the rim; the message names the first.
     """
     xy = _vectors(position, 2, "mirror position")
     beyond = np.hypot(xy[..., 0], xy[..., 1]) > 1 + RIM_SLACK[xy.dtype.name]
@@ -52,20 +45,9 @@ def check_reach(position: ArrayLike) -> Floats:
 
 
 def position_to_normal(position: ArrayLike) -> Floats:
-    """Give the mirror normal of device positions.
+    """Give the unit mirror normals (..., 3), in the camera frame, of device positions (..., 2) in the closed unit disk.
 
-    Parameters
-    ----------
-    position
-        (..., 2) device X and Y, in the closed unit disk.
-
-    Returns
-    -------
-    (..., 3) unit normals in the camera frame.
-
-    Raises
-    ------
-    PoseError : a position is not finite or beyond the rim; the message names the first.
+    Raises PoseError: a position is not finite or beyond the rim; the message names the first.
     """
     xy = check_reach(position)
     half = np.empty((*xy.shape[:-1], 3), xy.dtype)
@@ -77,20 +59,10 @@ def position_to_normal(position: ArrayLike) -> Floats:
 
 
 def normal_to_position(normal: ArrayLike) -> Floats:
-    """Give the device position of mirror normals: the inverse of ``position_to_normal``.
+    """Give the device positions (..., 2) of unit normals (..., 3): the inverse of ``position_to_normal``.
 
-    Parameters
-    ----------
-    normal
-        (..., 3) unit normals in the camera frame.
-
-    Returns
-    -------
-    (..., 2) device X and Y.
-
-    Raises
-    ------
-    PoseError : a normal is not finite, not of length 1, or turned beyond the rim. The disk is checked before anything
+    Raises PoseError: a normal is not finite, not of length 1, or turned beyond the rim. The disk is checked before
+    anything
         is divided, since X overflows as the tilt nears 45 deg (erratum E2).
     """
     n = _units(normal, "mirror normal")
@@ -112,18 +84,11 @@ def normal_to_device(normal: ArrayLike) -> Floats:
 
 
 def direction_to_normal(direction: ArrayLike) -> Floats:
-    """Give the normal that sends the chief ray along unit directions, n ~ o - k.
+    """Give the normals (..., 3) that send the chief ray along unit directions (..., 3), n ~ o - k.
 
     Stable up to grazing (o_z -> 1, erratum E7): there 1 - o_z is taken as (o_x^2 + o_y^2) / (1 + o_z).
 
-    Parameters
-    ----------
-    direction
-        (..., 3) unit view directions in the camera frame.
-
-    Raises
-    ------
-    PoseError : a direction is not finite, not of length 1, or is the chief ray itself, which no mirror makes.
+    Raises PoseError: a direction is not finite, not of length 1, or is the chief ray itself, which no mirror makes.
     """
     o = _units(direction, "view direction")
     n = o.copy()
@@ -158,63 +123,32 @@ def scene_to_direction(tangents: ArrayLike) -> Floats:
 def direction_to_scene(direction: ArrayLike) -> Floats:
     """Give scene tangents (..., 2) of directions (..., 3).
 
-    Raises
-    ------
-    PoseError : a direction does not look at the scene plane (o_x <= 0).
+    Raises PoseError: a direction does not look at the scene plane (o_x <= 0).
     """
     o = _vectors(direction, 3, "view direction")
     _refuse(o[..., 0] <= 0, o, "looks away from the scene plane (its x must be above 0)")
-    tangents: Floats = o[..., 1:] / o[..., :1]
-    return tangents
+    return o[..., 1:] / o[..., :1]
 
 
-def line_rotation(direction: ArrayLike, slit: Slit = "across") -> Floats:
-    """Give the angle by which the image of the slit is turned in the scene tangent plane, against rest.
+def line_rotation(direction: ArrayLike) -> Floats:
+    """Give the angle by which the slit's image is turned in the scene tangent plane, for unit directions (..., 3).
 
-    A property of the pose and not of the path (erratum E8). For the slit across the plane of incidence, along y,
-    psi = atan2(o_y, 1 - o_z); the line stays straight and runs along (cos psi, sin psi) in (xi, eta), exactly. For
-    the slit in the plane of incidence psi = atan2(o_y, 1 - o_y^2 / (1 - o_z)); its line runs along (-sin, cos).
+    A property of the pose and not of the path (erratum E8): psi = atan2(o_y, 1 - o_z), anticlockwise from xi to eta,
+    for a slit along y. The line stays straight and runs along (cos psi, sin psi) in (xi, eta), exactly. [rad]
 
-    Parameters
-    ----------
-    direction
-        (..., 3) unit view directions of the line's centre.
-    slit
-        "across" the plane of incidence or "in-plane".
-
-    Returns
-    -------
-    (...) angle, anticlockwise from xi to eta. [rad]
-
-    Raises
-    ------
-    PoseError : a direction is not finite, not of length 1, or is the camera's own ray.
-    ValueError : no such slit.
+    Raises PoseError: a direction is not finite, not of length 1, or is the camera's own ray.
     """
-    if slit not in ("across", "in-plane"):
-        raise ValueError(f"slit must be 'across' or 'in-plane', got {slit!r}")
     o = _units(direction, "view direction")
-    psi: Floats = np.arctan2(o[..., 1], _one_minus_z(o) if slit == "across" else _in_plane_run(o))
-    return psi
+    return np.arctan2(o[..., 1], _one_minus_z(o))
 
 
 def mirror_throughput(position: ArrayLike) -> Floats:
-    """Give the share of light that the mirror passes, over its share at rest: |n_z| / |n_z at rest| (erratum E16).
+    """Give the light that the mirror passes at device positions (..., 2), over that at rest (erratum E16).
 
-    The mirror is the aperture stop; what it passes goes with its area as the camera sees it.
+    |n_z| / |n_z at rest|: the mirror is the aperture stop, and what it passes goes with its area as the camera sees it.
+    1 at rest, 0.48 to 1.33 over the disk.
 
-    Parameters
-    ----------
-    position
-        (..., 2) device X and Y, in the closed unit disk.
-
-    Returns
-    -------
-    (...) factor [-]: 1 at rest, 0.48 to 1.33 over the disk.
-
-    Raises
-    ------
-    PoseError : a position is not finite or beyond the rim.
+    Raises PoseError: a position is not finite or beyond the rim.
     """
     normal = position_to_normal(position)
     share: Floats = -normal[..., 2] / normal.dtype.type(_HALF)
@@ -224,19 +158,10 @@ def mirror_throughput(position: ArrayLike) -> Floats:
 def line_centre(along: Floats, scan: Floats, across: ArrayLike) -> Floats:
     """Give where the line that passes through a point has its centre, as a tangent on the scan axis.
 
-    The ray to a point meets the slit's plane for exactly one tilt of the mirror. With a and b the tangents of the
-    point along the line and on the scan, c that of the line's centre along the line, P = c (c - a) and
+    The ray to a point meets the slit's plane for exactly one tilt of the mirror. With a and b the tangents of the point
+    ``along`` the line and on the ``scan``, c (``across``) that of the line's centre along the line, P = c (c - a) and
     D = 1 + a^2 - (a - c)^2, the centre lies at ``b + P (b + sqrt(D + b^2)) / D``; nothing cancels within the mirror's
-    reach.
-
-    Parameters
-    ----------
-    along, scan, across
-        a, b and c; arrays that broadcast.
-
-    Returns
-    -------
-    (...) tangents, NaN where no line passes: beyond 45 deg to the side.
+    reach. Arrays broadcast; NaN where no line passes: beyond 45 deg to the side.
     """
     c = np.asarray(across, _kept(along, scan, across))
     gap = along - c
@@ -265,14 +190,6 @@ def _one_minus_z(o: Floats) -> Floats:
     across = o[..., 0] ** 2 + o[..., 1] ** 2
     _refuse((o[..., 0] == 0) & (o[..., 1] == 0) & (z > 0), o, "is the camera's own ray, which no mirror makes")
     return np.where(z > 0, across / (1 + np.maximum(z, 0)), 1 - z)
-
-
-def _in_plane_run(o: Floats) -> Floats:
-    """1 - o_y^2 / (1 - o_z) of unit vectors; towards o_z = 1 the quotient is (o_y / hypot(o_x, o_y))^2 (1 + o_z)."""
-    z, side = o[..., 2], np.hypot(o[..., 0], o[..., 1])
-    sine = o[..., 1] / np.where(side > 0, side, 1)
-    run: Floats = 1 - np.where(z > 0, sine**2 * (1 + z), o[..., 1] ** 2 / (1 - np.minimum(z, 0)))
-    return run
 
 
 def _unit(vectors: Floats) -> Floats:
@@ -314,3 +231,60 @@ def _refuse(bad: NDArray[np.bool_] | np.bool_, values: Floats, reason: str) -> N
     what = {2: "position or tangent", 3: "direction or normal"}[values.shape[-1]]
     numbers = ", ".join(f"{value:.15g}" for value in values[tuple(first)])
     raise PoseError(f"{what} ({numbers}){where} {reason}; keep the field within the mirror's range")
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Between the XY of a device and of the model: device = axes @ rotation(clocking_deg) @ model + offset.
+
+    The paper leaves out which axis of the device is which and which way it turns (erratum E6). ``axes`` says what the
+    device's X and Y are: "y,-x" that its X is the model's Y and its Y the model's -X. ``clocking_deg`` is the small
+    turn of the mirror about its rest normal, anticlockwise from X to Y, and the offset the device's XY at the model's
+    rest.
+    """
+
+    axes: str = "x,y"
+    clocking_deg: float = 0.0
+    offset_x: float = 0.0
+    offset_y: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.axes not in get_args(Axes):
+            raise SettingsError(f"a mirror's axes must be one of {'  '.join(get_args(Axes))}; got {self.axes!r}")
+        if not np.isfinite([self.clocking_deg, self.offset_x, self.offset_y]).all():
+            raise SettingsError(f"a mirror's clocking and offset must be finite, got {self}")
+
+    def to_device(self, position: ArrayLike) -> NDArray[np.floating]:
+        """Give what to send to the device for model positions (..., 2).
+
+        Raises PoseError: a position is beyond the disk for the model, or for the device, which would clamp it unasked.
+        """
+        model = check_reach(position)
+        if self == STRAIGHT:
+            return model
+        device = model @ self._matrix().T + (self.offset_x, self.offset_y)
+        try:
+            return check_reach(device)
+        except PoseError as error:
+            raise PoseError(
+                f"as mounted (offset {self.offset_x:g}; {self.offset_y:g}), the device's {error}; survey less of the "
+                "field, or mount the mirror nearer to its middle"
+            ) from error
+
+    def to_model(self, device: ArrayLike) -> NDArray[np.float64]:
+        """Give the model positions (..., 2) of what the device reports: the inverse of ``to_device``.
+
+        What was measured may lie a little beyond the rim, and is not refused.
+        """
+        given = np.asarray(device, np.float64)
+        model: NDArray[np.float64] = (given - (self.offset_x, self.offset_y)) @ self._matrix()
+        return given if self == STRAIGHT else model
+
+    def _matrix(self) -> NDArray[np.float64]:
+        """The orthogonal part, whose transpose undoes it."""
+        turn = np.deg2rad(self.clocking_deg)
+        rotation = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+        return np.array([_ROWS[axis] for axis in self.axes.split(",")]) @ rotation
+
+
+STRAIGHT = Mounting()

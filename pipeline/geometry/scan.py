@@ -1,4 +1,4 @@
-"""Scan paths: sweeps of lines through the mirror, where their lines fall on the scene, and what they cost in seconds.
+"""Scan paths: sweeps of lines, where they fall on the scene, their seconds, and how they fill the mirror's memory.
 
 Points of a sweep are (along, scan) in px from the undeflected direction: (x, y) of the scene for ``along="x"``,
 (y, x) for ``along="y"``. A line is the straight image of the slit, so scene and sweep map to each other in closed form.
@@ -6,13 +6,14 @@ Points of a sweep are (along, scan) in px from the undeflected direction: (x, y)
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import ShapeError
+from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import (
     camera_slope,
@@ -22,11 +23,11 @@ from pipeline.geometry.mirror import (
     position_to_direction,
     scene_to_direction,
 )
-from pipeline.geometry.vector_memory import count_loads
 from pipeline.stated import stated
 
 Axis = Literal["x", "y"]
 Floats = NDArray[np.float64]
+Ends = Literal["exclusive", "inclusive"]
 
 
 @dataclass(frozen=True)
@@ -80,9 +81,7 @@ class CostModel:
 def sweep_positions(sweep: Sweep, camera: LineCamera) -> Floats:
     """Give the mirror positions that a sweep holds, (line, step, 2) device X and Y.
 
-    Raises
-    ------
-    PoseError : a position is beyond the mirror's disk.
+    Raises PoseError: a position is beyond the mirror's disk.
     """
     return _aim(sweep, camera, sweep.held_px())
 
@@ -90,9 +89,7 @@ def sweep_positions(sweep: Sweep, camera: LineCamera) -> Floats:
 def line_positions(sweep: Sweep, camera: LineCamera) -> Floats:
     """Give the mirror position at mid exposure of every line, (line, 2) device X and Y.
 
-    Raises
-    ------
-    PoseError : a position is beyond the mirror's disk.
+    Raises PoseError: a position is beyond the mirror's disk.
     """
     return _aim(sweep, camera, sweep.line_px())
 
@@ -103,18 +100,11 @@ def _aim(sweep: Sweep, camera: LineCamera, scan_px: Floats) -> Floats:
 
 
 def shifted_position(position: Floats, shift_px: Floats, camera: LineCamera) -> Floats:
-    """Give the mirror positions whose line centres lie ``shift_px`` beside those of ``position``.
+    """Give positions whose line centres lie ``shift_px`` (along the line and the scan) beside those of ``position``.
 
-    Parameters
-    ----------
-    position
-        (..., 2) device X and Y.
-    shift_px
-        (..., 2) along the line and the scan; broadcasts. [px]
+    Both are (..., 2) and broadcast.
 
-    Raises
-    ------
-    PoseError : a position is beyond the rim, before or after the shift.
+    Raises PoseError: a position is beyond the rim, before or after the shift.
     """
     tangents = direction_to_scene(position_to_direction(position)) + shift_px * camera.ifov_rad
     return direction_to_position(scene_to_direction(tangents))
@@ -125,14 +115,8 @@ def scan_of_points(
 ) -> tuple[Floats, Floats]:
     """Give the line through scene points and where on it they lie, for line centres on ``strip_px``.
 
-    Parameters
-    ----------
-    along_px, scan_px
-        Scene points; arrays that broadcast. [px]
-
-    Returns
-    -------
-    Scan coordinate of the line's centre [px], and the slope k_y / k_z at which the camera sees the point.
+    Scan coordinate of the line's centre [px], and the slope k_y / k_z at which the camera sees the point; the points
+    ``along_px`` and ``scan_px`` broadcast [px].
     """
     xi0 = strip_px * camera.ifov_rad
     xi, eta = np.asarray(along_px, np.float64) * camera.ifov_rad, np.asarray(scan_px, np.float64) * camera.ifov_rad
@@ -168,36 +152,88 @@ def sweep_to_scene(sweep: Sweep, camera: LineCamera) -> tuple[Floats, Floats]:
 
 
 @dataclass(frozen=True)
-class CaptureOption:
-    """One way to spend a fixed time on one strip, and what it gives up."""
+class MemoryPart:
+    """Lines ``lines[0]`` to ``lines[1]`` of a sweep in the pairs ``pairs[0]`` to ``pairs[1]`` of a load, half open."""
 
-    name: str
-    lines: int
-    exposure_ms: float
-    field_px: float  # length of the scan
-    line_px: float  # distance between lines; 1 px is square pixels
-    seconds: float
-    gives_up: str
+    sweep: int  # place in the list of sweeps
+    lines: tuple[int, int]
+    pairs: tuple[int, int]
 
 
-def capture_options(camera: LineCamera, lines: int, factor: int = 2) -> list[CaptureOption]:
-    """List three ways to use the time of ``lines`` aligned lines (the paper's worked case, errata E12 and E13).
+@dataclass(frozen=True)
+class Load:
+    """What the memory holds at one time. A pair is an X and a Y; both channels lie in one vector, Y behind X."""
 
-    Square pixels; ``factor`` times fewer lines with a longer exposure; ``factor`` times the field with as many lines.
-    All take the same seconds: 640 x 600 at 100 ms, 640 x 300 at 200 ms and twice the field take 60 s each.
+    parts: tuple[MemoryPart, ...]
 
-    Raises
-    ------
-    ShapeError : ``lines`` is not a positive multiple of ``factor``.
+    @property
+    def pairs(self) -> int:
+        """Pairs in the memory."""
+        return self.parts[-1].pairs[1]
+
+    def channels(self, part: MemoryPart) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Give the cells (start, stop) of a part's X and of its Y in the one vector, half open."""
+        start, stop = part.pairs
+        return (start, stop), (self.pairs + start, self.pairs + stop)
+
+
+def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> list[Load]:
+    """Lay the positions of sweeps into a memory of ``vector_pairs`` pairs, each load as full as whole lines allow.
+
+    A load takes what is left of one sweep and begins the next; a line's held positions are never parted.
+
+    Raises SettingsError: the positions of one line do not fit the memory.
     """
-    if lines < 1 or factor < 1 or lines % factor:
-        raise ShapeError(f"expected a positive number of lines that divides by the factor {factor}, got {lines}")
-    slow = replace(camera, exposure_ms=factor * camera.frame_ms - camera.readout_ms)
-    few = lines // factor
-    seconds, slow_seconds = camera.scan_seconds(lines), slow.scan_seconds(few)
-    wide = f"lines {factor} px apart: {factor} times coarser along the scan"
-    return [
-        CaptureOption("aligned", lines, camera.exposure_ms, lines, 1.0, seconds, "nothing"),
-        CaptureOption("long exposure", few, slow.exposure_ms, lines, factor, slow_seconds, f"{wide}, less data"),
-        CaptureOption("wide field", lines, camera.exposure_ms, lines * factor, factor, seconds, wide),
-    ]
+    loads: list[Load] = []
+    parts: list[MemoryPart] = []
+    used = 0
+    for number, sweep in enumerate(sweeps):
+        _check_line(sweep, vector_pairs)
+        line = 0
+        while line < sweep.lines:
+            room = (vector_pairs - used) // sweep.step
+            if room == 0:
+                loads.append(Load(tuple(parts)))
+                parts, used = [], 0
+                continue
+            taken = min(room, sweep.lines - line)
+            parts.append(MemoryPart(number, (line, line + taken), (used, used + taken * sweep.step)))
+            line, used = line + taken, used + taken * sweep.step
+    return [*loads, Load(tuple(parts))] if parts else loads
+
+
+def count_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> int:
+    """Count the loads of :func:`memory_loads`, without laying them out; raises as that does."""
+    loads, used = 0, vector_pairs
+    for sweep in sweeps:
+        _check_line(sweep, vector_pairs)
+        rest = sweep.lines - min((vector_pairs - used) // sweep.step, sweep.lines)
+        if rest == 0:
+            used += sweep.lines * sweep.step
+            continue
+        most = vector_pairs // sweep.step
+        more = -(-rest // most)
+        loads, used = loads + more, (rest - (more - 1) * most) * sweep.step
+    return loads
+
+
+def _check_line(sweep: Sweep, vector_pairs: int) -> None:
+    if sweep.step > vector_pairs:
+        raise SettingsError(
+            f"sweep {sweep.name} holds {sweep.step} positions in each line, the mirror's vector memory {vector_pairs} "
+            f"pairs; take a smaller coarse factor"
+        )
+
+
+def device_range(cells: tuple[int, int], ends: Ends) -> tuple[int, int]:
+    """Give a half-open range as the device counts it: the end is the cell after the last, or the last itself.
+
+    Which of the two the device means is not settled (erratum E14), so it is a setting of the driver; everything else
+    here is half open.
+
+    Raises SettingsError: the range is empty or begins below 0.
+    """
+    start, stop = cells
+    if start < 0 or stop <= start:
+        raise SettingsError(f"a channel plays at least one cell from 0 on, got the half-open range {start}:{stop}")
+    return start, stop if ends == "exclusive" else stop - 1

@@ -1,25 +1,34 @@
-"""The map's pixels: a grid in a projected CRS over the field's footprint, and what each shows of the scene."""
+"""The map's pixels: metres around the rig's foot in a projected CRS and back, and a grid there of what a scene shows.
+
+The metres are of the plane that touches the ellipsoid's normal at the foot (east, north, up); they go to longitude and
+latitude through Cartesian coordinates of the earth, so that nothing is taken for flat. By PROJ, without a network.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.projection import MapFrame, map_crs
-from pipeline.ground.view import LEAST_SINK, ROWS_AT_ONCE, GroundView, pixel_places
+from pipeline.ground.view import LEAST_SINK, ROWS_AT_ONCE, GroundView, RigPose, pixel_places
 from pipeline.rectify.resample import resample
 
 if TYPE_CHECKING:  # half a second to import, for maps alone
     from odc.geo.geobox import GeoBox
+    from pyproj import CRS, Transformer
 
 Floats = NDArray[np.float64]
 
+WGS84 = 4326
+UTM_LATITUDES = (-80.0, 84.0)
+POLAR = {False: 5042, True: 5041}  # universal polar stereographic, south and north, axes east and north
+AREA_SLACK_DEG = 1.0  # a field may lie this far outside the area that a CRS is made for
 FAR_PIXELS = 8.0  # pixels of the scene whose footprint has more than so many times the median's side are left out
 MOST_GROWTH = 64  # a map may have so many times the scene's pixels,
 USUAL_GROWTH = 8  # and so many where its resolution is not asked for
@@ -27,6 +36,115 @@ TIE = 32  # map pixels between exact places
 ROUND_STEPS = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 SAMPLES = 129  # places a side at which the median footprint is taken
 EDGE_POINTS = 33  # on each side of the footprint: straight on the ground, bent on the map
+
+
+def default_epsg(pose: RigPose) -> int:
+    """Give the EPSG code of the rig's UTM zone (WGS 84), of polar stereographic beyond 84 N and 80 S."""
+    south, north = UTM_LATITUDES
+    if not south <= pose.lat_deg <= north:
+        return POLAR[pose.lat_deg > 0]
+    zone = int((pose.lon_deg + 180) % 360 // 6) + 1
+    return (32600 if pose.lat_deg >= 0 else 32700) + zone
+
+
+def map_crs(pose: RigPose, epsg: int | None = None) -> CRS:
+    """Give the projected CRS of a map around the rig: the one asked for, or that of ``default_epsg``.
+
+    Raises PoseError: no such code, not a projected CRS in metres, or the rig stands outside the area it is made for.
+    """
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    code = default_epsg(pose) if epsg is None else epsg
+    hint = f"leave epsg out for EPSG:{default_epsg(pose)}"
+    try:
+        crs = CRS.from_epsg(code)
+    except CRSError:
+        raise PoseError(f"there is no EPSG:{code}; give the code of a projected CRS in metres, or {hint}") from None
+    if not crs.is_projected or any(axis.unit_conversion_factor != 1 for axis in crs.axis_info[:2]):
+        raise PoseError(f"EPSG:{code} ({crs.name}) is no projected CRS in metres; {hint}")
+    if not _made_for(crs, pose):
+        assert crs.area_of_use is not None
+        west, south, east, north = crs.area_of_use.bounds
+        raise PoseError(
+            f"EPSG:{code} ({crs.name}) is made for longitudes {west:g} to {east:g}, latitudes {south:g} to {north:g}; "
+            f"the rig stands at lon_deg {pose.lon_deg:g}, lat_deg {pose.lat_deg:g}; {hint}"
+        )
+    return crs
+
+
+def _made_for(crs: CRS, pose: RigPose) -> bool:
+    """Whether the rig stands in the CRS's area, which may reach across the date line."""
+    if crs.area_of_use is None:
+        return True
+    west, south, east, north = crs.area_of_use.bounds
+    if not south - AREA_SLACK_DEG <= pose.lat_deg <= north + AREA_SLACK_DEG:
+        return False
+    width = (east - west) % 360 or 360.0
+    return (pose.lon_deg - west + AREA_SLACK_DEG) % 360 <= width + 2 * AREA_SLACK_DEG
+
+
+@dataclass(frozen=True)
+class MapFrame:
+    """Between the plane of ground under a posed rig and the coordinates of a map (x east, y north) [m]."""
+
+    view: GroundView
+    crs: CRS
+
+    def ground_to_geodetic(self, ground_m: ArrayLike) -> Floats:
+        """Give (..., 3) longitude, latitude [deg] and height above the ellipsoid [m] of east, north, up of the foot."""
+        ground = np.asarray(ground_m, np.float64)
+        east, north, up = np.moveaxis(ground, -1, 0)
+        return _stacked(self._around_foot.transform(east, north, up, direction="INVERSE"))
+
+    def ground_to_map(self, ground_m: ArrayLike) -> Floats:
+        """Give map coordinates (..., 2) of points (..., 3) east, north, up of the foot [m]; NaN for NaN."""
+        place = self.ground_to_geodetic(ground_m)
+        return _stacked(self._on_map.transform(place[..., 0], place[..., 1]))
+
+    def map_to_ground(self, map_m: ArrayLike) -> Floats:
+        """Give the point of the ground's plane over map coordinates (..., 2), as (..., 3) east, north, up of the foot.
+
+        The map gives longitude and latitude; the height follows from where their vertical meets the plane.
+        """
+        place = np.asarray(map_m, np.float64)
+        lon, lat = self._on_map.transform(place[..., 0], place[..., 1], direction="INVERSE")
+        level = np.full_like(np.asarray(lon, np.float64), self.view.pose.elevation_m)
+        point = _stacked(self._around_foot.transform(lon, lat, level))
+        up = self._vertical(np.asarray(lon), np.asarray(lat))
+        rise = -(point @ self.view.normal) / (up @ self.view.normal)
+        return point + rise[..., None] * up
+
+    def _vertical(self, lon_deg: Floats, lat_deg: Floats) -> Floats:
+        """(..., 3) normals of the ellipsoid at other places, in east, north, up of the foot."""
+        away = np.deg2rad(lon_deg - self.view.pose.lon_deg)
+        lat, foot = np.deg2rad(lat_deg), np.deg2rad(self.view.pose.lat_deg)
+        north = np.sin(lat) * np.cos(foot) - np.cos(lat) * np.sin(foot) * np.cos(away)
+        up = np.sin(lat) * np.sin(foot) + np.cos(lat) * np.cos(foot) * np.cos(away)
+        return np.stack([np.cos(lat) * np.sin(away), north, up], axis=-1)
+
+    @cached_property
+    def _around_foot(self) -> Transformer:
+        from pyproj import Transformer
+
+        pose = self.view.pose
+        return Transformer.from_pipeline(
+            "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84"
+            f" +step +proj=topocentric +ellps=WGS84 +lon_0={float(pose.lon_deg)!r} +lat_0={float(pose.lat_deg)!r}"
+            f" +h_0={float(pose.elevation_m)!r}"
+        )
+
+    @cached_property
+    def _on_map(self) -> Transformer:
+        from pyproj import Transformer
+
+        return Transformer.from_crs(WGS84, self.crs, always_xy=True)
+
+
+def _stacked(parts: tuple[ArrayLike, ...]) -> Floats:
+    """Coordinates on the last axis; PROJ marks what it cannot do as infinite."""
+    whole = np.stack([np.asarray(part, np.float64) for part in parts], axis=-1)
+    return np.where(np.isfinite(whole), whole, np.nan)
 
 
 @dataclass(frozen=True)
@@ -61,7 +179,8 @@ class GroundGrid:
         Exact every ``TIE`` pixels and linear between. A map bends against the ground's plane by about the earth's
         radius, so that this is off by TIE^2 resolution / 8 R of a pixel: 1e-6 at 5 cm, 2e-5 at 1 m (tested).
         """
-        affine, (row, column) = self.geobox.affine, (_ties(part) for part in (rows, columns))
+        affine, cuts = self.geobox.affine, (-(-(part.stop - part.start) // TIE) + 1 for part in (rows, columns))
+        row, column = (np.linspace(part.start, part.stop, cut) for part, cut in zip((rows, columns), cuts, strict=True))
         x, y = np.meshgrid(affine.c + affine.a * column, affine.f + affine.e * row)
         exact = self.frame.map_to_ground(np.stack([x, y], axis=-1))
         return _between(_between(exact, columns, 1), rows, 0)
@@ -78,9 +197,7 @@ class GroundGrid:
         Of the pixels that the map shows, and from their footprints: counting the map's pixels would be off by as many
         as lie on borders between classes.
 
-        Raises
-        ------
-        ShapeError : the class map is not the scene's.
+        Raises ShapeError: the class map is not the scene's.
         """
         if classes.shape != self.scene_shape:
             raise ShapeError(f"expected the classes of a scene of {self.scene_shape} px (y, x), got {classes.shape}")
@@ -99,17 +216,12 @@ def ground_grid(
 ) -> GroundGrid:
     """Lay a map's grid over the footprint of a field of (y, x) px. Its pixels start at multiples of their side.
 
-    Parameters
-    ----------
-    epsg
-        Code of a projected CRS in metres; None for the rig's UTM zone.
-    resolution_m
-        Side of the map's pixels; None for the median side of a scene pixel's footprint, rounded, or more where a long
-        and narrow footprint would need a far larger map than the scene.
+    ``epsg`` is the code of a projected CRS in metres, None for the rig's UTM zone; ``resolution_m`` the side of the
+    map's pixels, None for the median side of a scene pixel's footprint, rounded, or more where a long and narrow
+    footprint would need a far larger map than the scene.
 
-    Raises
-    ------
-    PoseError : no ray of the field meets the ground, the CRS does not suit the place, or the grid would have far more
+    Raises PoseError: no ray of the field meets the ground, the CRS does not suit the place, or the grid would have far
+    more
         pixels than the scene.
     """
     from odc.geo.geobox import GeoBox
@@ -168,11 +280,6 @@ def _bounds(frame: MapFrame, outline: Floats) -> tuple[float, float, float, floa
     return left, bottom, right, top
 
 
-def _ties(pixels: slice) -> Floats:
-    """Edges of pixels at which the ground is exact, from the first to the last."""
-    return np.linspace(pixels.start, pixels.stop, -(-(pixels.stop - pixels.start) // TIE) + 1)
-
-
 def _between(exact: Floats, pixels: slice, axis: int) -> Floats:
     """Interpolate values at ties linearly to the centres of the pixels along one axis."""
     count, last = pixels.stop - pixels.start, exact.shape[axis] - 1
@@ -200,18 +307,10 @@ def classes_at(classes: NDArray[np.uint8], pixels: Floats) -> NDArray[np.uint8]:
 
 
 def image_at(image: NDArray[np.float32], pixels: Floats, *, factor: int = 1) -> NDArray[np.float32]:
-    """Read an image bilinearly at places of the scene.
+    """Read an image (y, x, band) of pixels ``factor`` scene px wide, bilinearly, at scene places (row, column, 2).
 
-    Parameters
-    ----------
-    image
-        (y, x, band) float32 of pixels ``factor`` scene px wide; NaN is left out, as in ``resample``.
-    pixels
-        (row, column, 2) places in the scene's image, NaN for none. [px]
-
-    Returns
-    -------
-    (row, column, band) float32; NaN where there is no place or no value.
+    (row, column, band) float32; NaN where there is no place or no value. NaN of the image is left out, as in
+    ``resample``.
     """
     if image.ndim != 3:
         raise ShapeError(f"an image has axes (y, x, band), got shape {image.shape}")

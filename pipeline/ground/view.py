@@ -40,9 +40,7 @@ class RigPose:
 
     Give ``height_m`` above the foot, or ``range_m`` to the ground along the undeflected direction.
 
-    Raises
-    ------
-    PoseError : a value is not finite or out of range, or not exactly one of height and range is given.
+    Raises PoseError: a value is not finite or out of range, or not exactly one of height and range is given.
     """
 
     lon_deg: float = stated(MISSING, "Longitude, WGS 84; west is negative", "deg", -180, 180, example=9.5)
@@ -112,16 +110,13 @@ class GroundView:
     @cached_property
     def sinks(self) -> Floats:
         """(3,) w of view, right and down."""
-        sinks: Floats = -self.axes @ self.normal
-        return sinks
+        return -self.axes @ self.normal
 
     @cached_property
     def height_m(self) -> float:
         """Height of the pivot above the foot.
 
-        Raises
-        ------
-        PoseError : a range is given, and the undeflected direction does not meet the ground.
+        Raises PoseError: a range is given, and the undeflected direction does not meet the ground.
         """
         if self.pose.height_m is not None:
             return self.pose.height_m
@@ -140,21 +135,15 @@ class GroundView:
         return w
 
     def scene_to_ground(self, points_px: ArrayLike) -> Floats:
-        """Give where the rays of scene points meet the ground.
+        """Give where the rays of scene points (..., 2), y and x [px], meet the ground: (..., 3) of the foot [m].
 
-        Parameters
-        ----------
-        points_px
-            (..., 2) y and x from the scene's centre. [px]
-
-        Returns
-        -------
-        (..., 3) east, north and up of the foot [m]; NaN where the ray is at or above the horizon.
+        NaN where the ray is at or above the horizon.
         """
         tangents = _pairs(points_px) * self.ifov_rad
         view, right, down = self.axes
         rays = view + tangents[..., 1:] * right + tangents[..., :1] * down
-        points: Floats = rays * self._depth(self.sink(points_px))[..., None]
+        w = self.sink(points_px)
+        points: Floats = rays * (self.height_m / np.where(w > LEAST_SINK, w, np.nan))[..., None]
         points[..., 2] += self.height_m
         return points
 
@@ -169,16 +158,6 @@ class GroundView:
         points: Floats = seen[..., :0:-1] / (depth * self.ifov_rad)
         return points
 
-    def footprint_m(self, points_px: ArrayLike) -> Floats:
-        """Give how far the ground reaches under one pixel down and right, (..., 2) along y and x [m]; NaN off it."""
-        tangents = _pairs(points_px) * self.ifov_rad
-        view, right, down = self.axes
-        w = self.sink(points_px)[..., None]
-        rays = view + tangents[..., 1:] * right + tangents[..., :1] * down
-        scale = self.height_m * self.ifov_rad / np.where(w > LEAST_SINK, w, np.nan) ** 2
-        steps = [down * w - rays * self.sinks[2], right * w - rays * self.sinks[1]]
-        return np.stack([np.linalg.norm(step * scale, axis=-1) for step in steps], axis=-1)
-
     def area_m2(self, points_px: ArrayLike) -> Floats:
         """Give the ground under a pixel as a map shows it (of a slope its level share), (...) [m2]; NaN off it.
 
@@ -186,8 +165,7 @@ class GroundView:
         dependence on the direction.
         """
         w = self.sink(points_px)
-        area: Floats = (self.height_m * self.ifov_rad) ** 2 / np.where(w > LEAST_SINK, w, np.nan) ** 3
-        return area
+        return (self.height_m * self.ifov_rad) ** 2 / np.where(w > LEAST_SINK, w, np.nan) ** 3
 
     def count_ground(self, scene_shape: tuple[int, int], least_sink: float = LEAST_SINK) -> int:
         """Count the pixels of a scene of (y, x) px whose rays meet the ground, sinking by more than ``least_sink``."""
@@ -210,9 +188,6 @@ class GroundView:
                 share = excess[here] / (excess[here] - excess[there])
                 kept.append(corners[here] + share * (corners[there] - corners[here]))
         return np.array(kept).reshape(-1, 2)
-
-    def _depth(self, w: Floats) -> Floats:
-        return self.height_m / np.where(w > LEAST_SINK, w, np.nan)
 
 
 def pixel_places(scene_shape: tuple[int, int]) -> tuple[Floats, Floats]:

@@ -11,8 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.planning.line_cover import NEGLIGIBLE, Cover, Field, Floats, best_cover
-from pipeline.planning.scan_runs import ScanRun, joined
+from pipeline.planning.scan_runs import NEGLIGIBLE, Cover, Field, Floats, ScanRun, best_cover, joined
 
 HALVINGS = 4
 PEELS = 8
@@ -78,14 +77,10 @@ def _between(
             high, high_rate = middle, rate
     for cover in (low, *_peeled(field, high)):
         for found in (cover,) if floor else (cover, _one_more(field, cover, budget_s)):
-            if found.seconds(field.prices) <= budget_s and _pays(found, low, floor):
+            pays = not floor or found.worth - low.worth >= floor * (found.even_s - low.even_s)
+            if pays and found.seconds(field.prices) <= budget_s:
                 best = _better(best, replace(found, worth=min(found.worth, high.worth)))
     return best
-
-
-def _pays(found: Cover, low: Cover, floor: float) -> bool:
-    """Whether what a cover has beyond another is worth its seconds at the floor; without a floor everything is."""
-    return not floor or found.worth - low.worth >= floor * (found.even_s - low.even_s)
 
 
 def _peeled(field: Field, cover: Cover) -> Iterator[Cover]:

@@ -30,15 +30,10 @@ _PROBES = 65  # scan positions at which a strip's reach is taken; it changes by 
 def full_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis, *, overlap_px: float = 0) -> list[Sweep]:
     """Cover the whole scene at full resolution with the fewest strips of lines along one axis.
 
-    Parameters
-    ----------
-    overlap_px
-        Least width that neighbouring strips share, and half of it beyond either end of the field. [px]
+    ``overlap_px`` is the least width that neighbouring strips share, and half of it beyond either end of the field.
 
-    Raises
-    ------
-    PoseError : the field is beyond the mirror's range.
-    SettingsError : an overlap that is negative or leaves nothing of a line.
+    Raises PoseError: the field is beyond the mirror's range.
+    Raises SettingsError: an overlap that is negative or leaves nothing of a line.
     """
     return _cover(grid, camera, along, step=1, overlap_px=overlap_px)
 
@@ -46,16 +41,11 @@ def full_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis, *, overlap_px:
 def coarse_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis, *, overlap_px: float = 0) -> list[Sweep]:
     """Cover the whole scene with lines of ``grid.factor`` held positions and as many samples summed.
 
-    Parameters
-    ----------
-    overlap_px
-        As of :func:`full_sweeps`, in px of the full resolution.
+    ``overlap_px`` is that of :func:`full_sweeps`, in px of the full resolution.
 
-    Raises
-    ------
-    SettingsError : the sum of ``grid.factor`` samples does not fit 16 bits, or a line has fewer samples; or the
+    Raises SettingsError: the sum of ``grid.factor`` samples does not fit 16 bits, or a line has fewer samples; or the
         overlap is negative or leaves nothing of a line.
-    PoseError : the field is beyond the mirror's range.
+    Raises PoseError: the field is beyond the mirror's range.
     """
     most = min(camera.most_binning, camera.samples)
     if grid.factor > most:
@@ -71,37 +61,25 @@ def cheapest_full(
 ) -> tuple[Axis, list[Sweep], float]:
     """Choose the orientation of the full scan that takes the least time: axis of the lines, sweeps, seconds.
 
-    Parameters
-    ----------
-    overlap_px
-        As of :func:`full_sweeps`.
-
-    Raises
-    ------
-    PoseError : neither orientation is within the mirror's range.
+    Raises PoseError: neither orientation is within the mirror's range.
     """
     found: list[tuple[Axis, list[Sweep], float]] = []
-    refused: PoseError | None = None
     axes: tuple[Axis, Axis] = ("x", "y")
     for along in axes:
         try:
             sweeps = full_sweeps(grid, camera, along, overlap_px=overlap_px)
-        except PoseError as error:
-            refused = error
+        except PoseError:
+            if along == axes[-1] and not found:
+                raise
             continue
         found.append((along, sweeps, cost.seconds(sweeps, camera)))
-    if not found:
-        assert refused is not None
-        raise refused
     return min(found, key=lambda option: option[2])
 
 
 def with_margin(sweeps: Sequence[Sweep], camera: LineCamera, margin_px: float) -> list[Sweep]:
     """Begin every sweep so much earlier and end it so much later, for a mirror that may look beside the plan.
 
-    Raises
-    ------
-    PoseError : a sweep then leaves the mirror's range.
+    Raises PoseError: a sweep then leaves the mirror's range.
     """
     more = [-(-margin_px // sweep.step) for sweep in sweeps]
     grown = [
@@ -113,13 +91,9 @@ def with_margin(sweeps: Sequence[Sweep], camera: LineCamera, margin_px: float) -
 
 
 def on_scene(shape: tuple[int, int], camera: LineCamera, sweep: Sweep) -> NDArray[np.bool_]:
-    """Tell which (binned) samples of a sweep look at a pixel of a (y, x) scene, by their rays at mid exposure.
+    """Tell which (binned) samples (line, sample) of a sweep look at a pixel of a (y, x) scene.
 
-    Rays are exact: line rotation and stretch included.
-
-    Returns
-    -------
-    (line, sample) bool.
+    By their rays at mid exposure, which are exact: line rotation and stretch included.
     """
     height, width = shape
     across, scan = (width, height) if sweep.along == "x" else (height, width)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from math import ceil, frexp, isfinite
+from dataclasses import dataclass
+from functools import partial
+from math import frexp, isfinite
 from typing import Literal
 
 import numpy as np
@@ -16,13 +17,10 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.budget_search import cheapest_cover, full_scan_pays, spend
 from pipeline.planning.coverage import check_reach, full_sweeps
-from pipeline.planning.line_cover import NEGLIGIBLE, Cover, Field
-from pipeline.planning.scan_runs import ScanPrices, ScanRun
-from pipeline.planning.selection import check_threshold
+from pipeline.planning.prices import count_lines, prices_of
+from pipeline.planning.scan_runs import NEGLIGIBLE, Cover, Field, cut_strip
 from pipeline.planning.strips import covered_seats, look_from, strips_at_seats
 
-LEAST_DIGITS = 4  # of the least budget that a refusal names
-ROUNDING = 1e-9
 MOST_WORTH = 1e100  # of one seat: larger scores are planned in a larger unit
 MOST_FLOAT = float(np.finfo(np.float64).max)
 
@@ -52,7 +50,7 @@ class FinePlan:
     @property
     def lines(self) -> int:
         """Lines of all sweeps."""
-        return sum(sweep.lines for sweep in self.sweeps)
+        return count_lines(self.sweeps)
 
     @property
     def worth_per_second(self) -> float | None:
@@ -70,59 +68,11 @@ class SeatsPrice:
     full_seconds: float | None
 
     @property
-    def kind(self) -> Literal["lines", "full"]:
-        """The cheaper way: runs of lines, or the full scan."""
-        return "full" if self.full_seconds is not None and self.full_seconds <= self.seconds else "lines"
-
-    @property
     def least(self) -> tuple[int, float]:
         """Lines and seconds of the cheaper way."""
-        if self.kind == "full" and self.full_lines is not None and self.full_seconds is not None:
+        if self.full_lines is not None and self.full_seconds is not None and self.full_seconds <= self.seconds:
             return self.full_lines, self.full_seconds
         return self.lines, self.seconds
-
-    @property
-    def sentence(self) -> str:
-        """Both prices in words."""
-        own = f"by runs of lines these seats take {self.lines} lines and {self.seconds:.1f} s"
-        if self.full_seconds is None:
-            return f"{own}; a full scan is beyond the mirror's range"
-        cheaper = "which is cheaper and shows every seat" if self.kind == "full" else "which is dearer"
-        return f"{own}; the full scan takes {self.full_lines} lines and {self.full_seconds:.1f} s, {cheaper}"
-
-
-def least_budget(coarse_seconds: float, full_seconds: float) -> float:
-    """Give the least budget that pays for the coarse pass alone, rounded up to four digits; above 1 none does."""
-    return ceil(coarse_seconds / full_seconds * 10.0**LEAST_DIGITS - ROUNDING) / 10.0**LEAST_DIGITS
-
-
-def check_budget(budget: float, coarse_seconds: float, full_seconds: float) -> float:
-    """Give the seconds that ``budget`` leaves for the fine pass.
-
-    Parameters
-    ----------
-    budget
-        Seconds of coarse and fine capture over those of the full scan, above 0 and at most 1.
-
-    Raises
-    ------
-    BudgetError : the budget is not a number in that range, or less than the coarse pass alone; names the least.
-    """
-    if not isfinite(budget) or not 0 < budget <= 1:
-        raise BudgetError(f"--budget must be a share of the full scan's time above 0 and at most 1, got {budget}")
-    if coarse_seconds > full_seconds:
-        raise BudgetError(
-            f"the coarse pass alone ({coarse_seconds:.1f} s) takes longer than the full scan ({full_seconds:.1f} s), "
-            f"so no budget can be met, got {budget}; scan in full, or take a larger coarse factor"
-        )
-    left = budget * full_seconds - coarse_seconds
-    if left < -ROUNDING * full_seconds:
-        raise BudgetError(
-            f"--budget {budget} gives {budget * full_seconds:.1f} s, but the coarse pass alone takes "
-            f"{coarse_seconds:.1f} of the full scan's {full_seconds:.1f} s; "
-            f"the least possible is {least_budget(coarse_seconds, full_seconds)}"
-        )
-    return max(left, 0.0)
 
 
 def plan_fine(
@@ -149,8 +99,6 @@ def plan_fine(
     scores
         (seat,) gain of each seat of ``grid``, of any size; NaN, -inf and negative ones are worth nothing, +inf more
         than all others.
-    budget_s
-        Seconds for the fine pass, 0 or more.
     margin_px
         How far beside the plan the mirror may look: every run shows its seats even so. [px]
     full
@@ -169,7 +117,9 @@ def plan_fine(
     """
     if not isfinite(budget_s) or budget_s < 0:
         raise BudgetError(f"the fine pass needs a finite number of seconds, 0 or more, got {budget_s}")
-    limit = 0.0 if threshold is None else check_threshold(threshold)
+    limit = 0.0 if threshold is None else threshold
+    if not (isfinite(limit) and limit >= 0):
+        raise BudgetError(f"the threshold must be a finite score of 0 or more, got {threshold}")
     scale = _scale(scores)
     worth, unit = _worth(grid, np.asarray(scores, np.float64) / scale, min(limit / scale * budget_s, MOST_WORTH))
     floor = limit / scale / unit
@@ -179,37 +129,24 @@ def plan_fine(
     whole = _full(grid, camera, cost, along) if full is None else (list(full), cost.seconds(list(full), camera))
     full_s = None if whole is None else whole[1]
     plan = spend(field, budget_s if full_s is None else min(budget_s, float(np.nextafter(full_s, 0.0))), floor)
-    everything = plan.worth >= field.total * (1 - NEGLIGIBLE)
+    everything, total = plan.worth >= field.total * (1 - NEGLIGIBLE), field.total * told
+    planned = partial(FinePlan, wanted_worth=total, full_seconds=full_s, out_of_reach=missed, threshold=threshold)
     if whole is not None and whole[1] <= budget_s and not everything and full_scan_pays(field, whole[1], floor):
         reason = (
             f"to show every place worth a second look takes no less time than to scan everything in detail, "
             f"{whole[1]:.1f} s; the full scan is taken, which shows all of the field"
         )
-        total = field.total * told
-        return FinePlan(whole[0], grid.valid_seats(), whole[1], total, "full", reason, total, full_s, missed, threshold)
+        return planned(whole[0], grid.valid_seats(), whole[1], total, "full", reason)
     sweeps = _sweeps(field, plan)
     check_reach(sweeps, camera)
     seconds = cost.seconds(sweeps, camera)
+    beside = "; a full scan is beyond the mirror's range"
+    if full_s is not None:
+        beside = f", less than the full scan's {full_s:.1f} s"
+    reason = f"runs of lines take {seconds:.1f} s{beside}"
     seats = covered_seats(grid, camera, sweeps, margin_px=margin_px)
-    return FinePlan(
-        sweeps,
-        seats,
-        seconds,
-        plan.worth * told,
-        "lines",
-        _lines_reason(seconds, full_s),
-        field.total * told,
-        full_s,
-        missed,
-        threshold,
-        budget_s - seconds if floor and not everything else None,
-    )
-
-
-def _lines_reason(seconds: float, full_s: float | None) -> str:
-    if full_s is None:
-        return f"runs of lines take {seconds:.1f} s; a full scan is beyond the mirror's range"
-    return f"runs of lines take {seconds:.1f} s, less than the full scan's {full_s:.1f} s"
+    spared = budget_s - seconds if floor and not everything else None
+    return planned(sweeps, seats, seconds, plan.worth * told, "lines", reason, spared_s=spared)
 
 
 def _full(grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis) -> tuple[list[Sweep], float] | None:
@@ -237,19 +174,10 @@ def _field(
     return Field(views, worth, column if along == "x" else row, prices_of(camera, cost))
 
 
-def prices_of(camera: LineCamera, cost: CostModel) -> ScanPrices:
-    """Give the cost model's prices of fine lines (one held position each) and runs."""
-    return ScanPrices(camera.frame_ms * 1e-3, cost.setup_seconds(camera), cost.reload_s, cost.vector_pairs)
-
-
 def _sweeps(field: Field, cover: Cover) -> list[Sweep]:
     """Runs as sweeps, strip by strip; a name holds strip and first line, so that names sort in the same order."""
-    return [_cut(field.views.strips[run.strip], run) for run in sorted(cover.runs)]
-
-
-def _cut(strip: Sweep, run: ScanRun) -> Sweep:
-    name = f"{strip.name}-{run.first:05d}"
-    return replace(strip, name=name, start_px=strip.start_px + run.first, lines=run.stop - run.first)
+    strips = field.views.strips
+    return [cut_strip(strips[run.strip], run, strips[run.strip].name) for run in sorted(cover.runs)]
 
 
 def _scale(scores: NDArray[np.floating]) -> float:
@@ -291,9 +219,7 @@ def price_of_seats(
 
     What ``frame`` mode leaves out: it buys seats free of each other, the rig pays for the lines beneath them.
 
-    Raises
-    ------
-    PoseError : a seat is shown by no line within the mirror's range.
+    Raises PoseError: a seat is shown by no line within the mirror's range.
     """
     worth = np.zeros(int(np.prod(grid.seat_shape)))
     worth[np.asarray(seats, np.intp)] = 1.0
@@ -306,6 +232,5 @@ def price_of_seats(
         )
     sweeps = _sweeps(field, cheapest_cover(field))
     full = _full(grid, camera, cost, along)
-    lines = sum(sweep.lines for sweep in sweeps)
-    full_lines = None if full is None else sum(sweep.lines for sweep in full[0])
-    return SeatsPrice(lines, cost.seconds(sweeps, camera), full_lines, None if full is None else full[1])
+    whole = (None, None) if full is None else (count_lines(full[0]), full[1])
+    return SeatsPrice(count_lines(sweeps), cost.seconds(sweeps, camera), *whole)

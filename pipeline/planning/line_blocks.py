@@ -8,7 +8,7 @@ that shows most seats for the seconds is taken.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +16,10 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
+from pipeline.planning.scan_runs import ScanRun, cut_strip, joined
 from pipeline.planning.strips import Views, covered_seats, look_from, strips_at_seats
 
 WIDTHS = (1, 2, 3, 4, 6, 8, 16)  # rows of seats in a block
-
-
-@dataclass(frozen=True)
-class LineBlock:
-    """Lines ``first`` to ``stop`` of one strip: what rows of its seats need."""
-
-    strip: int
-    first: int
-    stop: int
 
 
 @dataclass(frozen=True)
@@ -46,40 +38,26 @@ class LineBlocks:
     camera: LineCamera
     cost: CostModel
     strips: tuple[Sweep, ...]
-    blocks: tuple[LineBlock, ...]
+    blocks: tuple[ScanRun, ...]
 
-    def sweeps(self, chosen: Sequence[LineBlock]) -> list[Sweep]:
+    def sweeps(self, chosen: Sequence[ScanRun]) -> list[Sweep]:
         """Blocks as sweeps; those closer than a second set-up takes are scanned through."""
-        setup = self.cost.setup_seconds(self.camera) / (self.camera.frame_ms * 1e-3)
-        runs: list[LineBlock] = []
-        for block in sorted(chosen, key=lambda one: (one.strip, one.first)):
-            if runs and runs[-1].strip == block.strip and block.first - runs[-1].stop <= setup:
-                runs[-1] = replace(runs[-1], stop=max(runs[-1].stop, block.stop))
-            else:
-                runs.append(block)
-        return [
-            replace(
-                self.strips[run.strip],
-                name=f"block-{run.strip}-{run.first:05d}",
-                start_px=self.strips[run.strip].start_px + run.first,
-                lines=run.stop - run.first,
-            )
-            for run in runs
-        ]
+        setup = int(self.cost.setup_seconds(self.camera) / (self.camera.frame_ms * 1e-3))
+        return [cut_strip(self.strips[run.strip], run, f"block-{run.strip}") for run in joined(chosen, setup)]
 
-    def seconds(self, chosen: Sequence[LineBlock]) -> float:
+    def seconds(self, chosen: Sequence[ScanRun]) -> float:
         """Price of some blocks [s]."""
         return self.cost.seconds(self.sweeps(chosen), self.camera)
 
-    def seats(self, chosen: Sequence[LineBlock]) -> NDArray[np.intp]:
+    def seats(self, chosen: Sequence[ScanRun]) -> NDArray[np.intp]:
         """Give the seats that blocks show, ascending."""
         return covered_seats(self.grid, self.camera, self.sweeps(chosen))
 
-    def evenly(self, budget_s: float) -> list[LineBlock]:
+    def evenly(self, budget_s: float) -> list[ScanRun]:
         """Choose the most evenly spaced blocks that the seconds pay for."""
         total = len(self.blocks)
 
-        def spaced(count: int) -> list[LineBlock]:
+        def spaced(count: int) -> list[ScanRun]:
             return [self.blocks[int((number + 0.5) * total / count)] for number in range(count)]
 
         for count in range(total, 0, -1):
@@ -87,9 +65,9 @@ class LineBlocks:
                 return spaced(count)
         return []
 
-    def at_random(self, budget_s: float, rng: np.random.Generator) -> list[LineBlock]:
+    def at_random(self, budget_s: float, rng: np.random.Generator) -> list[ScanRun]:
         """Choose blocks in a random order, leaving out those that the seconds do not pay for any more."""
-        chosen: list[LineBlock] = []
+        chosen: list[ScanRun] = []
         for number in rng.permutation(len(self.blocks)):
             grown = [*chosen, self.blocks[number]]
             if self.seconds(grown) <= budget_s:
@@ -97,7 +75,7 @@ class LineBlocks:
         return chosen
 
 
-def most_shown(options: Sequence[LineBlocks], choose: Callable[[LineBlocks], list[LineBlock]]) -> Lines:
+def most_shown(options: Sequence[LineBlocks], choose: Callable[[LineBlocks], list[ScanRun]]) -> Lines:
     """Choose blocks of every width, and give the lines of the one that shows the most seats."""
     chosen = [Lines(blocks.sweeps(some), blocks.seats(some)) for blocks in options for some in [choose(blocks)]]
     return max(chosen, key=lambda lines: len(lines.seats))
@@ -107,21 +85,17 @@ def line_blocks(grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axi
     """Cut the field into blocks of ``rows`` rows of seats, on the fewest strips that show every seat that can be."""
     valid = grid.valid_share().ravel() > 0
     views = look_from(grid, camera, strips_at_seats(grid, camera, along), valid)
-    across = _places_across(grid, along)
+    row, column = np.divmod(np.arange(len(valid)), grid.seat_shape[1])
+    across, down = (column, row) if along == "x" else (row, column)
     strips = _fewest_strips(views, across)
-    down = np.arange(len(valid)) // grid.seat_shape[1] if along == "x" else np.arange(len(valid)) % grid.seat_shape[1]
     blocks = []
     for number, strip in enumerate(strips):
         own = slice(views.edges[strip], views.edges[strip + 1])
-        row, first, stop = down[views.seat[own]] // rows, views.first[own], views.stop[own]
-        blocks += [LineBlock(number, int(first[row == at].min()), int(stop[row == at].max())) for at in np.unique(row)]
+        place, first, stop = down[views.seat[own]] // rows, views.first[own], views.stop[own]
+        blocks += [
+            ScanRun(number, int(first[place == at].min()), int(stop[place == at].max())) for at in np.unique(place)
+        ]
     return LineBlocks(grid, camera, cost, tuple(views.strips[strip] for strip in strips), tuple(blocks))
-
-
-def _places_across(grid: SceneGrid, along: Axis) -> NDArray[np.intp]:
-    """Place of each seat along the line, (seat,)."""
-    row, column = np.divmod(np.arange(int(np.prod(grid.seat_shape))), grid.seat_shape[1])
-    return column if along == "x" else row
 
 
 def _fewest_strips(views: Views, across: NDArray[np.intp]) -> list[int]:

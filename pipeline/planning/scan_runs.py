@@ -1,15 +1,29 @@
-"""Runs of lines, what they cost, and the best chains of them: a dynamic programme over all strip offsets at once."""
+"""Runs of lines, the best chains of them at a price of a second, and covers: runs that show the most for their price.
+
+Strips overlap and lie at any offset, so a seat is seen from several and counts once. A cover is several chains of
+runs, one run after the other along the scan; each chain in turn is chosen anew over all offsets, exactly (a dynamic
+programme), with the others held, until none gets better.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.geometry.scan import Sweep
+from pipeline.planning.prices import ScanPrices
+from pipeline.planning.strips import Views
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+MOST_ROUNDS, WIDE_ROUNDS = 6, 2
+LEAST_BLOCK = 4
+TABLE_CELLS = 1_000_000
+NEGLIGIBLE = 1e-12  # of the total worth
 
 
 @dataclass(frozen=True, order=True)
@@ -19,40 +33,6 @@ class ScanRun:
     strip: int
     first: int
     stop: int
-
-
-@dataclass(frozen=True)
-class ScanPrices:
-    """Seconds of a line, of opening a run, and of a reload that is due once every ``lines_per_reload`` lines."""
-
-    line_s: float
-    run_s: float
-    reload_s: float
-    lines_per_reload: int
-
-    @property
-    def even_line_s(self) -> float:
-        """A line with its share of a reload: with this the price is additive, and below the true one by < a reload."""
-        return self.line_s + self.reload_s / self.lines_per_reload
-
-    def seconds(self, lines: int, runs: int) -> float:
-        """True price of so many lines in so many runs [s]."""
-        return lines * self.line_s + runs * self.run_s + -(-lines // self.lines_per_reload) * self.reload_s
-
-    def even_seconds(self, lines: int, runs: int) -> float:
-        """Additive price [s]."""
-        return lines * self.even_line_s + runs * self.run_s
-
-    def most_lines(self, seconds: float, runs: int) -> int:
-        """Most lines that so many runs may have for a true price of at most ``seconds``; below 0 where none may."""
-        left = seconds - runs * self.run_s
-        load = self.lines_per_reload * self.line_s + self.reload_s
-        loads = int(left // load)
-        rest = max(int((left - loads * load - self.reload_s) / self.line_s), 0)
-        lines = loads * self.lines_per_reload + rest
-        while lines >= 0 and self.seconds(lines, runs) > seconds:  # rounding
-            lines -= 1
-        return lines
 
 
 @dataclass(frozen=True)
@@ -69,23 +49,20 @@ class Tables:
     block: int  # borders closer than this hold no view between them
 
 
+def cut_strip(strip: Sweep, run: ScanRun, name: str) -> Sweep:
+    """Give the sweep of a run's lines, named by its first one."""
+    first, lines = strip.start_px + run.first, run.stop - run.first
+    return replace(strip, name=f"{name}-{run.first:05d}", start_px=first, lines=lines)
+
+
 def best_chains(tables: Tables, windows: Ints, line_price: float, run_price: float) -> list[list[ScanRun]]:
     """Find, for each window of strips, the chain of runs with the most worth less price, one run after the other.
 
     best(e) = max(best(e - 1), max over strips and c of best(c) + closed(e) - begun(c) - (e - c) line - run), a block
     of borders at a time: no run opens and closes within one.
 
-    Parameters
-    ----------
-    windows
-        (window, strip) numbers of strips.
-    line_price, run_price
-        Of one line and of one run, in units of worth.
-
-    Returns
-    -------
-    A chain for each window, ascending. A seat that two runs of a chain show, which only lines turned far apart allow,
-    was counted twice: the caller has to check.
+    ``windows`` are (window, strip) numbers of strips, the prices of one line and of one run in units of worth. A seat
+    that two runs of a chain show, which only lines turned far apart allow, was counted twice: the caller has to check.
     """
     borders = tables.closed.shape[1]
     ramp = line_price * tables.unit * np.arange(borders)
@@ -130,3 +107,213 @@ def joined(runs: Sequence[ScanRun], gap: int) -> list[ScanRun]:
             run = ScanRun(last.strip, last.first, max(last.stop, run.stop))
         found.append(run)
     return found
+
+
+@dataclass(frozen=True)
+class Cover:
+    """Runs, what the seats they show are worth together, and their additive price."""
+
+    runs: tuple[ScanRun, ...] = ()
+    worth: float = 0.0
+    even_s: float = 0.0
+
+    @property
+    def lines(self) -> int:
+        """Lines of all runs."""
+        return sum(run.stop - run.first for run in self.runs)
+
+    def seconds(self, prices: ScanPrices) -> float:
+        """True price, whole reloads [s]."""
+        return prices.seconds(self.lines, len(self.runs))
+
+
+@dataclass(frozen=True)
+class Field:
+    """What can be seen from where, what it is worth, and what lines cost."""
+
+    views: Views
+    worth: Floats  # (seat,), 0 for seats that are not wanted
+    column: Ints  # (seat,) place along the line: strips that share none are planned apart
+    prices: ScanPrices
+
+    @cached_property
+    def total(self) -> float:
+        """Worth of all seats that some strip shows."""
+        return float(self.worth[np.unique(self.views.seat)].sum())
+
+    @property
+    def gap(self) -> int:
+        """Lines between two runs of a strip that cost no more than a second set-up."""
+        return int(self.prices.run_s / self.prices.even_line_s)
+
+    @cached_property
+    def unit(self) -> int:
+        """Lines between two borders of the tables: 1 unless the field is too large for that."""
+        return max(-(-(self.views.lines + 1) * len(self.views.strips) // TABLE_CELLS), 1)
+
+    @cached_property
+    def _cells(self) -> tuple[int, Ints, Ints]:
+        """Borders along the scan, and the flat table cells of the views' stops (rounded up) and first lines (down)."""
+        borders = -(-self.views.lines // self.unit) + 1
+        row = self.views.strip * borders
+        begun = np.minimum(self.views.first // self.unit + 1, borders - 1)
+        return borders, row - (-self.views.stop // self.unit), row + begun
+
+    def tables(self, left: Floats) -> Tables:
+        """Cumulate what is left to show, (seat,), over the lines of every strip."""
+        borders, *places = self._cells
+        weight, shape = left[self.views.seat], (len(self.views.strips), borders)
+        closed, begun = (np.bincount(at, weight, shape[0] * borders).reshape(shape) for at in places)
+        length = int((self.views.stop - self.views.first).min(initial=self.views.lines))
+        block = max(length // self.unit, LEAST_BLOCK)
+        return Tables(np.cumsum(closed, axis=1), np.cumsum(begun, axis=1), self.unit, block)
+
+    def shown(self, run: ScanRun) -> Ints:
+        """Numbers of the views that lie in a run, (view,)."""
+        low, high = self.views.edges[run.strip : run.strip + 2]
+        inside = (self.views.first[low:high] >= run.first) & (self.views.stop[low:high] <= run.stop)
+        shown: Ints = low + np.flatnonzero(inside)
+        return shown
+
+    def shown_seats(self, run: ScanRun) -> Ints:
+        """Seats that lie in a run, (seat,)."""
+        return self.views.seat[self.shown(run)]
+
+    def left(self, runs: Sequence[ScanRun]) -> Floats:
+        """Worth of each seat that no run shows, 0 for the others, (seat,)."""
+        left = self.worth.copy()
+        for run in runs:
+            left[self.shown_seats(run)] = 0.0
+        return left
+
+    def cover(self, runs: Sequence[ScanRun]) -> Cover:
+        """Price runs and count what they show."""
+        lines = sum(run.stop - run.first for run in runs)
+        return Cover(tuple(runs), self._seen(runs, self.worth), self.prices.even_seconds(lines, len(runs)))
+
+    def net(self, runs: Sequence[ScanRun], left: Floats, rate: float) -> float:
+        """Worth less price of runs, given what is left to show and that a second costs ``rate``."""
+        lines = sum(run.stop - run.first for run in runs)
+        return self._seen(runs, left) - rate * self.prices.even_seconds(lines, len(runs))
+
+    def _seen(self, runs: Sequence[ScanRun], worth: Floats) -> float:
+        """Worth of all seats that runs show, each counted once."""
+        seats = np.unique(np.concatenate([np.zeros(0, np.intp), *map(self.shown_seats, runs)]))
+        return float(worth[seats].sum())
+
+    def trimmed(self, runs: Sequence[ScanRun], left: Floats) -> list[ScanRun]:
+        """Shorten runs to the views that each adds to what is left, one after the other; drop those that add none."""
+        left, kept = left.copy(), []
+        for run in runs:
+            views = self.shown(run)
+            views = views[left[self.views.seat[views]] > 0]
+            if len(views):
+                first, stop = int(self.views.first[views].min()), int(self.views.stop[views].max())
+                kept.append(replace(run, first=first, stop=stop))
+                left[self.views.seat[views]] = 0.0
+        return kept
+
+    @cached_property
+    def windows(self) -> tuple[Ints, ...]:
+        """Sets of windows, (window, strip) each, that together hold every strip; those of a set share no seat column.
+
+        One window of all strips where the field is up to about three of them wide.
+        """
+        low, high = self._spans
+        count, width = len(low), int((high - low).max(initial=0)) + 1
+        if count <= 2 * width + 2:
+            return (np.arange(count)[None, :],)
+        sets = []
+        for start in range(0, 2 * width, width):
+            rows, at = [], start
+            while at < count:
+                rows.append(np.minimum(np.arange(at, at + width), count - 1))
+                at = max(int(np.searchsorted(low, high[rows[-1][-1]], side="right")), at + width)
+            sets.append(np.stack(rows))
+        return tuple(sets)
+
+    @cached_property
+    def side_by_side(self) -> Ints:
+        """Strips that share no seat column, from the lower end up, (window, 1): the layout of a full scan."""
+        low, high = self._spans
+        found, last = [0], len(low) - 1
+        while high[found[-1]] < high[-1]:
+            found.append(min(max(int(np.searchsorted(low, high[found[-1]], side="right")), found[-1] + 1), last))
+        return np.array(found)[:, None]
+
+    @cached_property
+    def _spans(self) -> tuple[Ints, Ints]:
+        """First and last column of the seats that each strip shows, made ascending."""
+        column, count = self.column[self.views.seat], len(self.views.strips)
+        low, high = np.full(count, int(column.max(initial=0))), np.zeros(count, np.intp)
+        np.minimum.at(low, self.views.strip, column)
+        np.maximum.at(high, self.views.strip, column)
+        return np.minimum.accumulate(low[::-1])[::-1], np.maximum.accumulate(high)
+
+
+def best_cover(field: Field, start: Sequence[ScanRun], rate: float) -> Cover:
+    """Find the runs with the most worth less price when a second costs ``rate`` of worth.
+
+    The search goes from ``start``, and from the strips of a full scan where the field is up to about three of them wide
+    or ``start`` has no runs; each step is better than the one before, and it ends where no chain can be bettered.
+    """
+    starts = [list(start)]
+    if len(field.windows) == 1 or not start:
+        side = best_chains(field.tables(field.worth), field.side_by_side, *_priced(field, rate))
+        starts.append(field.trimmed([run for chain in side for run in chain], field.worth))
+    found = [field.cover(_settle(field, runs, rate)) for runs in starts]
+    return max(found, key=lambda cover: cover.worth - rate * cover.even_s)
+
+
+def _settle(field: Field, start: Sequence[ScanRun], rate: float) -> list[ScanRun]:
+    """Choose chain after chain anew until a round changes none."""
+    runs = joined(start, field.gap)
+    for _ in range(MOST_ROUNDS if len(field.windows) == 1 else WIDE_ROUNDS):
+        before = runs
+        for windows in field.windows:
+            runs = _round(field, runs, windows, rate)
+        if runs == before:
+            break
+    return runs
+
+
+def _round(field: Field, runs: list[ScanRun], windows: Ints, rate: float) -> list[ScanRun]:
+    """Choose each chain of each window anew, and try one chain more."""
+    members = [set(window.tolist()) for window in windows]
+    layer, layers = 0, 1
+    while layer < layers:
+        chains = [_chains([run for run in runs if run.strip in strips]) for strips in members]
+        layers = max(map(len, chains)) + 1
+        chosen = [chain[layer] if layer < len(chain) else [] for chain in chains]
+        runs = _again(field, runs, windows, chosen, rate)
+        layer += 1
+    return runs
+
+
+def _chains(runs: Sequence[ScanRun]) -> list[list[ScanRun]]:
+    """Share runs among as few chains as it takes."""
+    chains: list[list[ScanRun]] = []
+    for run in sorted(runs, key=lambda run: (run.first, run.strip)):
+        home = next((chain for chain in chains if chain[-1].stop <= run.first), None)
+        if home is None:
+            chains.append(home := [])
+        home.append(run)
+    return chains
+
+
+def _again(field: Field, runs: list[ScanRun], windows: Ints, chosen: list[list[ScanRun]], rate: float) -> list[ScanRun]:
+    """Choose one chain of each window anew, the other runs held; keep the old one where it is not bettered."""
+    old = {run for chain in chosen for run in chain}
+    kept = [run for run in runs if run not in old]
+    left = field.left(kept)
+    found = best_chains(field.tables(left), windows, *_priced(field, rate))
+    for new, chain in zip(found, chosen, strict=True):
+        trimmed = field.trimmed(new, left)
+        better = field.net(trimmed, left, rate) > field.net(chain, left, rate) + NEGLIGIBLE * field.total
+        kept += trimmed if better else chain
+    return joined(kept, field.gap)
+
+
+def _priced(field: Field, rate: float) -> tuple[float, float]:
+    """Line and set-up in units of worth."""
+    return rate * field.prices.even_line_s, rate * field.prices.run_s

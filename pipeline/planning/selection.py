@@ -27,52 +27,34 @@ class Selection:
 def seat_count(share: float, valid: int) -> int:
     """Turn a share of the valid seats into a number of seats, halves rounded up.
 
-    Raises
-    ------
-    BudgetError : the share is not a number from 0 to 1.
+    Raises BudgetError: the share is not a number from 0 to 1.
     """
     if not 0 <= share <= 1:  # NaN too
         raise BudgetError(f"the share of seats to buy must be from 0 to 1, got {share} (of {valid} seats)")
     return min(int(np.floor(share * valid + 0.5)), valid)
 
 
-def check_threshold(threshold: float) -> float:
-    """Give the threshold back.
-
-    Raises
-    ------
-    BudgetError : it is not a finite number of 0 or more.
-    """
-    if not (np.isfinite(threshold) and threshold >= 0):
-        raise BudgetError(f"the threshold must be a finite score of 0 or more, got {threshold}")
-    return threshold
-
-
 def select_seats(score: Scores, count: int, valid: NDArray[np.bool_] | None = None, *, clip: bool = False) -> Selection:
-    """Choose the ``count`` valid seats with the highest scores.
+    """Choose the ``count`` valid seats with the highest ``score``, (seat,) of any float type.
 
     Equal scores go to the lowest number; +inf comes first, NaN and -inf last. The choice is nested: the first K of a
     larger choice are the choice of K. When no valid seat has a score to rank (all NaN or -inf), seats are spread evenly
-    over the valid ones, nested too, and the result says so.
+    over the valid ones, nested too, and the result says so. ``clip`` takes all valid seats where ``count`` is larger.
 
-    Parameters
-    ----------
-    score
-        (seat,) any float type; ranked as float64.
-    count
-        Seats to choose, from 0 to the number of valid ones.
-    valid
-        (seat,) seats that may be chosen; None allows all.
-    clip
-        Take all valid seats where ``count`` is larger, instead of refusing.
-
-    Raises
-    ------
-    BudgetError : ``count`` is not a whole number, below 0, or above the number of valid seats.
+    Raises BudgetError: ``count`` is not a whole number, below 0, or above the number of valid seats.
     """
     allowed = _allowed(score, valid)
-    wanted = _check_count(count, len(allowed), clip=clip)
-    order, spread = _ranked(np.asarray(score, np.float64)[allowed])
+    try:
+        wanted = -1 if isinstance(count, bool | np.bool_) else operator.index(count)
+    except TypeError:
+        wanted = -1
+    if wanted < 0 or (wanted > len(allowed) and not clip):
+        raise BudgetError(f"expected a whole number of seats to buy from 0 to {len(allowed)}, got {count!r}")
+    given = np.asarray(score, np.float64)[allowed]
+    worth = np.where(np.isnan(given), -np.inf, given)
+    spread = bool(len(worth)) and bool(np.all(np.isneginf(worth)))
+    # Multiples of the golden ratio leave gaps of at most three sizes, for every count and any row length.
+    order = np.argsort((np.arange(len(worth)) * GOLDEN) % 1.0 if spread else -worth, kind="stable")
     return Selection(allowed[order[:wanted]], spread and wanted > 0)
 
 
@@ -88,22 +70,3 @@ def _allowed(score: Scores, valid: NDArray[np.bool_] | None) -> Seats:
     if len(shape) != 1 or masked != shape:
         raise ShapeError(f"expected (seat,) scores and a mask of their shape, got {shape} and {masked}")
     return np.arange(shape[0]) if valid is None else np.flatnonzero(valid)
-
-
-def _check_count(count: int, seats: int, *, clip: bool) -> int:
-    try:
-        wanted = -1 if isinstance(count, bool | np.bool_) else operator.index(count)
-    except TypeError:
-        wanted = -1
-    if wanted < 0 or (wanted > seats and not clip):
-        raise BudgetError(f"expected a whole number of seats to buy from 0 to {seats}, got {count!r}")
-    return min(wanted, seats)
-
-
-def _ranked(score: NDArray[np.float64]) -> tuple[Seats, bool]:
-    """Order of the scores, best first, and whether it is the even spread that stands in for a rank."""
-    worth = np.where(np.isnan(score), -np.inf, score)
-    if len(worth) and np.all(np.isneginf(worth)):
-        # Multiples of the golden ratio leave gaps of at most three sizes, for every count and any row length.
-        return np.argsort((np.arange(len(worth)) * GOLDEN) % 1.0, kind="stable"), True
-    return np.argsort(-worth, kind="stable"), False

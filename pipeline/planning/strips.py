@@ -48,27 +48,20 @@ def seat_lines(
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Give the lines of a fine sweep that each seat needs, resampling taps included.
 
-    Parameters
-    ----------
-    sweep
-        A ``step=1`` sweep; lines count from its first. They need not exist: compare with ``sweep.lines``.
-    seats
-        (seat,) numbers. Only their pixels on the scene count.
-    margin_px
-        How far beside the plan the mirror may look: so many lines and samples more are needed all around. [px]
+    Lines count from the sweep's first and need not exist: compare with ``sweep.lines``. Only pixels on the scene count.
+    ``margin_px`` is how far beside the plan the mirror may look: so many lines and samples more are needed all around.
 
-    Returns
-    -------
     (seat, 2) first line and the one after the last; (seat,) whether the line's samples reach all pixels. A seat
     without a pixel on the scene is never reached.
 
-    Raises
-    ------
-    ShapeError : the sweep is not fine.
+    Raises ShapeError: the sweep is not fine.
     """
     if sweep.step != 1:
         raise ShapeError(f"seats are cut from fine sweeps of step 1, got {sweep.name} with step {sweep.step}")
-    low, high, on_scene = _seat_edges(grid, seats)
+    origin, size = grid.seat_origin(seats), np.array([grid.height, grid.width])
+    middle = (size - 1) / 2
+    low, high = origin - middle, np.minimum(origin + grid.patch, size) - 1 - middle  # first and last pixel centre
+    on_scene = np.all(origin < size, axis=-1)
     along, scan = (1, 0) if sweep.along == "x" else (0, 1)
     # Line and sample of a point are monotone in either coordinate, so a rectangle's corners hold the extremes.
     corners_along = np.stack([low, low, high, high])[..., along]
@@ -79,16 +72,6 @@ def seat_lines(
     stop = np.floor(at[..., 0].max(axis=0) + ROUNDING_PX).astype(np.intp) + TAPS_AFTER + 1 + more
     reached = (at[..., 1].min(axis=0) >= more - 0.5) & (at[..., 1].max(axis=0) <= camera.samples - 0.5 - more)
     return np.stack([first, stop], axis=-1), reached & on_scene
-
-
-def _seat_edges(
-    grid: SceneGrid, seats: NDArray[np.integer]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """First and last pixel centre of seats, (seat, 2) each [px], and whether they have a pixel on the scene."""
-    origin = grid.seat_origin(seats)
-    size = np.array([grid.height, grid.width])
-    middle = (size - 1) / 2
-    return origin - middle, np.minimum(origin + grid.patch, size) - 1 - middle, np.all(origin < size, axis=-1)
 
 
 def covered_seats(grid: SceneGrid, camera: LineCamera, sweeps: Sequence[Sweep], *, margin_px: float = 0.0) -> Seats:
@@ -120,17 +103,11 @@ def seats_near(grid: SceneGrid, camera: LineCamera, sweep: Sweep) -> Seats:
 def strips_at_seats(grid: SceneGrid, camera: LineCamera, along: Axis, *, margin_px: float = 0.0) -> list[Sweep]:
     """Lay a strip with its lower end on the edge of each seat column, kept on the scene where it can be.
 
-    With a margin the ends lie so far outside the columns and the scene.
+    With a margin the ends lie so far outside the columns and the scene. A line shows whole seats only, so a strip
+    between two such offsets shows no seat that one of them does not. The sweeps have no lines yet; they start on the
+    scene's first row, ascending along the line.
 
-    A line shows whole seats only, so a strip between two such offsets shows no seat that one of them does not.
-
-    Returns
-    -------
-    Sweeps without lines yet that start on the scene's first row, ascending along the line.
-
-    Raises
-    ------
-    SettingsError : a patch is wider than a line.
+    Raises SettingsError: a patch is wider than a line.
     """
     if camera.samples < grid.patch + 2 * margin_px:
         beside = f" and {margin_px:g} px on either side" if margin_px else ""
@@ -166,18 +143,14 @@ def _strip_from(low: float, end: float, scan: int, camera: LineCamera) -> float:
 def look_from(
     grid: SceneGrid, camera: LineCamera, strips: Sequence[Sweep], wanted: NDArray[np.bool_], *, margin_px: float = 0.0
 ) -> Views:
-    """List what strips show of the wanted seats with lines that the mirror can point.
+    """List what strips show of the ``wanted`` (seat,) seats with lines that the mirror can point.
 
-    Parameters
-    ----------
-    strips
-        Sweeps of one axis with the same start; their number of lines does not matter.
-    wanted
-        (seat,) seats that count.
+    The strips are sweeps of one axis with the same start; their number of lines does not matter.
     """
     parts = []
     for number, strip in enumerate(strips):
-        seats = _columns_near(grid, camera, strip)
+        _, scan = field_px(grid, strip.along)  # columns that the lines may reach, wherever they stand along the scan
+        seats = seats_near(grid, camera, replace(strip, start_px=-0.75 * scan, lines=int(1.5 * scan) + 1))
         seats = seats[wanted[seats]]
         needs, reached = seat_lines(grid, camera, strip, seats, margin_px=margin_px)
         ends = strip.start_px + needs[reached] - np.array([0, 1])
@@ -190,12 +163,6 @@ def look_from(
     lines = int(needs[:, 1].max(initial=0)) - origin
     laid = tuple(replace(strip, start_px=strip.start_px + origin, lines=lines) for strip in strips)
     return Views(laid, lines, edges, np.concatenate([part[1] for part in parts]), *(needs - origin).T)
-
-
-def _columns_near(grid: SceneGrid, camera: LineCamera, strip: Sweep) -> Seats:
-    """Valid seats in the columns that a strip's lines may reach, wherever they stand along the scan."""
-    _, scan = field_px(grid, strip.along)
-    return seats_near(grid, camera, replace(strip, start_px=-0.75 * scan, lines=int(1.5 * scan) + 1))
 
 
 def within_reach(strip_px: ArrayLike, scan_px: ArrayLike, camera: LineCamera) -> NDArray[np.bool_]:

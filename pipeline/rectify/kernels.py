@@ -113,15 +113,8 @@ def windows(coordinates: NDArray[np.float64], kernel: Kernel) -> Windows:
 
 
 def kernel_taps(position: NDArray[np.float64], kernel: Kernel) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Give the pixels that each position reads and their weights, along one axis.
+    """Give the pixels that each of (n,) finite positions reads and their weights, along one axis.
 
-    Parameters
-    ----------
-    position
-        (n,) finite coordinates; integers are pixel centres. [px]
-
-    Returns
-    -------
     (n, tap) indices, not clipped to any image, and (n, tap) weights that sum to 1; 4, 2 or 1 taps.
     """
     placed = windows(np.stack([position, position], axis=1), kernel)

@@ -52,19 +52,10 @@ class LineCache:
         self._lock = threading.Lock()
 
     def window(self, lines: SweepLines, wanted: slice, samples: slice, *, likely: slice | None = None) -> Raw:
-        """Give raw numbers of some lines and samples, read before or now.
+        """Give raw numbers (line, sample, band) of some lines and samples, read before or now; not to be written to.
 
-        Parameters
-        ----------
-        wanted, samples
-            Ranges of line numbers and samples, with start and stop.
-        likely
-            Samples that later calls will want of the same lines: they are read together, and only calls that name the
-            same ones share what was read.
-
-        Returns
-        -------
-        (line, sample, band) uint16; not to be written to.
+        ``likely`` are samples that later calls will want of the same lines: they are read together, and only calls that
+        name the same ones share what was read.
         """
         held = held_samples(lines, samples, likely)
         within = slice(samples.start - held.start, samples.stop - held.start)
@@ -82,22 +73,20 @@ class LineCache:
             self._blocks.move_to_end(key)
         with block.reading:
             if block.raw is None:
-                raw = _read(lines, number, samples)
+                rows = slice(number * BLOCK_LINES, min((number + 1) * BLOCK_LINES, len(lines.valid_line)))
+                if isinstance(lines, WindowedLines):
+                    raw = lines.read_window(rows, samples)
+                else:
+                    raw = lines.read(rows.start, rows.stop)
                 with self._lock:
                     block.raw = raw
                     self.reads += 1
                     self.bytes_held += raw.nbytes
-                    self._let_go(key)
+                    for old, held in list(self._blocks.items()):  # the newest and those still being read stay
+                        if self.bytes_held > self.most_bytes and old != key and held.raw is not None:
+                            self.bytes_held -= held.raw.nbytes
+                            del self._blocks[old]
             return block.raw
-
-    def _let_go(self, newest: _Key) -> None:
-        """Drop the oldest blocks where too much is held; the newest and those still being read stay."""
-        for key, block in list(self._blocks.items()):
-            if self.bytes_held <= self.most_bytes:
-                return
-            if key != newest and block.raw is not None:
-                self.bytes_held -= block.raw.nbytes
-                del self._blocks[key]
 
 
 def line_blocks(lines: slice) -> range:
@@ -111,17 +100,5 @@ def held_samples(lines: SweepLines, samples: slice, likely: slice | None = None)
     if not isinstance(lines, WindowedLines):
         return slice(0, count)
     other = samples if likely is None else likely
-    return _whole_chunks(slice(min(samples.start, other.start), max(samples.stop, other.stop)), count)
-
-
-def _whole_chunks(samples: slice, count: int) -> slice:
-    """Grow a range of samples to whole chunks of 32, within 0..count."""
-    first = samples.start // CHUNK_SAMPLES * CHUNK_SAMPLES
-    return slice(first, min(-(-samples.stop // CHUNK_SAMPLES) * CHUNK_SAMPLES, count))
-
-
-def _read(lines: SweepLines, number: int, samples: slice) -> Raw:
-    rows = slice(number * BLOCK_LINES, min((number + 1) * BLOCK_LINES, len(lines.valid_line)))
-    if isinstance(lines, WindowedLines):
-        return lines.read_window(rows, samples)
-    return lines.read(rows.start, rows.stop)
+    first, stop = min(samples.start, other.start), max(samples.stop, other.stop)
+    return slice(first // CHUNK_SAMPLES * CHUNK_SAMPLES, min(-(-stop // CHUNK_SAMPLES) * CHUNK_SAMPLES, count))

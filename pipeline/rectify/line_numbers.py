@@ -1,4 +1,4 @@
-"""Line numbers: which line of the plan each arriving frame is, and where the mirror was at its time."""
+"""Line numbers: which line of the plan each arriving frame is, by its time stamp."""
 
 from __future__ import annotations
 
@@ -9,12 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError, ShapeError
-from pipeline.geometry.mirror import (
-    direction_to_position,
-    direction_to_scene,
-    position_to_direction,
-    scene_to_direction,
-)
 
 LATE_FRAMES = 0.25
 LEAST_FRAMES = 3  # below that none can be told to be the late one
@@ -38,24 +32,16 @@ class LineNumbers:
 
 
 def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
-    """Tell from time stamps which line each frame is.
+    """Tell from time stamps (frame,), of mid exposure in the order of arrival [s], which line each frame is.
 
     A gap of more than 1.5 periods leaves numbers out. Of frames with equal stamps the first is kept. A stamp that goes
     back is not believed: the longest ascending row of stamps is, and of equally long ones that with the earlier frames,
     so that one wild stamp costs one line; so does a wild one that comes first or last. A late frame is used: its
-    position is that of its own time.
+    position is that of its own time. ``frame_s`` is the planned frame period; its true value is taken from the stamps,
+    so that a slow clock makes no frame late.
 
-    Parameters
-    ----------
-    time_s
-        (frame,) time of mid exposure, in the order of arrival. [s]
-    frame_s
-        Planned frame period. Its true value is taken from the stamps, so that a slow clock makes no frame late. [s]
-
-    Raises
-    ------
-    SettingsError : the period is not above 0.
-    ShapeError : the stamps are not one row.
+    Raises SettingsError: the period is not above 0.
+    Raises ShapeError: the stamps are not one row.
     """
     if not frame_s > 0:
         raise SettingsError(f"the frame period must be above 0 s, got {frame_s}")
@@ -70,55 +56,19 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
     row = fresh[_longest_ascent(time_s[fresh])]
     usable[row[_without_wild_ends(time_s[row], frame_s)]] = True
     count = _numbers(time_s[usable], frame_s)
+    number = np.zeros(len(time_s), np.intp)
+    if len(count):
+        same = np.minimum(np.searchsorted(time_s[usable], time_s), len(count) - 1)
+        before = count[np.maximum(np.cumsum(usable) - 1, 0)]
+        number = np.where(time_s[usable][same] == time_s, count[same], before)
     return LineNumbers(
-        number=_numbers_of_all(time_s, usable, count),
+        number=number,
         usable=usable,
         lost=int(count[-1]) + 1 - len(count) if len(count) else 0,
         repeated=repeated,
         backward=int((~usable).sum()) - repeated,
         late=_count_late(time_s[usable], count, frame_s),
     )
-
-
-def positions_at(time_s: Floats, command_time_s: Floats, command_position: Floats) -> Floats:
-    """Give the mirror positions at the lines' own times, along the commanded path.
-
-    Between two commands the scene tangents are interpolated linearly: exact for a path that is straight in the scene
-    and runs at an even pace, as planned sweeps do. A mirror that goes straight in X and Y instead, from one command
-    to another 1 px away, is less than 1e-5 px elsewhere.
-
-    Parameters
-    ----------
-    time_s
-        (line,) [s]
-    command_time_s
-        (command,) ascending. [s]
-    command_position
-        (command, 2) mirror X and Y at these times.
-
-    Returns
-    -------
-    (line, 2) mirror X and Y; NaN where the time is no number or not between the first and the last command.
-
-    Raises
-    ------
-    ShapeError : times and positions of the commands do not fit, or the times do not ascend.
-    PoseError : a commanded position is beyond the mirror's disk.
-    """
-    if command_position.shape != (len(command_time_s), 2) or not len(command_time_s):
-        raise ShapeError(
-            f"expected commands (command, 2) at times (command,), at least one, got {command_position.shape} and"
-            f" {command_time_s.shape}"
-        )
-    if not (np.diff(command_time_s) > 0).all():
-        at = int(np.argmax(~(np.diff(command_time_s) > 0)))
-        raise ShapeError(f"the times of commands {at} and {at + 1} do not ascend; give each command one time")
-    tangent = direction_to_scene(position_to_direction(command_position))
-    found = np.full((len(time_s), 2), np.nan)
-    known = (time_s >= command_time_s[0]) & (time_s <= command_time_s[-1])
-    at_time = np.stack([np.interp(time_s[known], command_time_s, tangent[:, axis]) for axis in (0, 1)], axis=-1)
-    found[known] = direction_to_position(scene_to_direction(at_time))
-    return found
 
 
 def _longest_ascent(values: Floats) -> NDArray[np.intp]:
@@ -157,15 +107,6 @@ def _numbers(time_s: Floats, frame_s: float) -> NDArray[np.intp]:
     order = np.arange(len(count))
     count = order + np.minimum.accumulate((count - order)[::-1])[::-1]
     return count - count[:1]
-
-
-def _numbers_of_all(time_s: Floats, usable: NDArray[np.bool_], count: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Line numbers of all frames from those of the usable ones."""
-    if not len(count):
-        return np.zeros(len(time_s), np.intp)
-    before = count[np.maximum(np.cumsum(usable) - 1, 0)]
-    same = np.minimum(np.searchsorted(time_s[usable], time_s), len(count) - 1)
-    return np.where(time_s[usable][same] == time_s, count[same], before)
 
 
 def _count_late(time_s: Floats, count: NDArray[np.intp], frame_s: float) -> int:

@@ -1,4 +1,4 @@
-"""Mosaic: resampled sweeps become one image, feathered where they overlap."""
+"""One track's values at points, from no more raw lines and samples than they need, and their blend with others'."""
 
 from __future__ import annotations
 
@@ -10,8 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
+from pipeline.geometry.camera import LineCamera
+from pipeline.rectify.calibration.calibrate import calibrate
+from pipeline.rectify.kernels import Kernel
+from pipeline.rectify.line_cache import Raw, ReadWindow
+from pipeline.rectify.placed import TAPS, Placed, member_lines
+from pipeline.rectify.resample import merge_lines, resample
+from pipeline.rectify.tracks import Track
 
 LEAST_EDGE_PX = 1e-3  # the very edge of a sweep counts where nothing else reaches
+RUN_ELEMENTS = 250_000  # what one more window costs, in elements (sample and band of a line) calibrated
 BLOCK_POINTS = 1024  # what is mixed at once stays in cache
 
 
@@ -32,31 +40,29 @@ def edge_distance(coordinates: NDArray[np.float64], lines: int, samples: int) ->
     line, sample = coordinates[..., 0], coordinates[..., 1]
     down = np.minimum(line + 0.5, lines - 0.5 - line)
     across = np.minimum(sample + 0.5, samples - 0.5 - sample)
-    distance: NDArray[np.float64] = np.minimum(down, across)
-    return distance
+    return np.minimum(down, across)
 
 
 def mosaic(parts: Sequence[MosaicPart]) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-    """Blend sweeps by weights that grow linearly from each sweep's edge.
+    """Blend sweeps, resampled at the same n points, by weights that grow linearly from each sweep's edge.
 
     The weights are the same for all bands, so every spectrum is a convex mixture of captured ones; only a band that a
     sweep has no value in is the others' alone. One sweep alone comes back unchanged, bit by bit (it may be the very
-    array that went in).
+    array that went in). What a part holds where its weight is 0 does not matter.
 
-    Parameters
-    ----------
-    parts
-        Sweeps resampled at the same n points, at least one. What a part holds where its weight is 0 does not matter.
-
-    Returns
-    -------
     (n, band) float32, NaN where no sweep reached, and (n,) how many sweeps did.
 
-    Raises
-    ------
-    ShapeError : no part, or parts of different sizes.
+    Raises ShapeError: no part, or parts of different sizes.
     """
-    _check_parts(parts)
+    if not parts:
+        raise ShapeError("a mosaic needs at least one sweep, got none")
+    for number, part in enumerate(parts):
+        points = (parts[0].values.shape[0],)
+        if part.values.shape != parts[0].values.shape or part.weight.shape != points or part.edge_px.shape != points:
+            raise ShapeError(
+                f"part {number} has values {part.values.shape}, weight {part.weight.shape} and edge distance "
+                f"{part.edge_px.shape}; expected those of {parts[0].values.shape}: resample all at the same points"
+            )
     reached = [part.weight > 0 for part in parts]
     coverage: NDArray[np.intp] = np.sum(reached, axis=0, dtype=np.intp)
     for part, here in zip(parts, reached, strict=True):
@@ -73,7 +79,9 @@ def mosaic(parts: Sequence[MosaicPart]) -> tuple[NDArray[np.float32], NDArray[np
 
 def _blend_shared(blended: NDArray[np.float32], parts: Sequence[MosaicPart], points: NDArray[np.intp]) -> None:
     """Write the mixtures at ``points``, which several parts reach."""
-    shares = np.stack([_share(part, points) for part in parts])
+    weight = np.stack([part.weight[points] for part in parts])
+    edge = np.stack([part.edge_px[points] for part in parts])
+    shares = np.where(weight > 0, weight * np.maximum(np.nan_to_num(edge), LEAST_EDGE_PX), 0.0)
     total = reduce(np.add, shares)  # part by part: ndarray.sum takes another order where there is one point alone
     weights = (shares / total).astype(np.float32)
     for first in range(0, len(points), BLOCK_POINTS):
@@ -101,22 +109,99 @@ def _by_band(
     return found
 
 
-def _share(part: MosaicPart, points: NDArray[np.intp]) -> NDArray[np.float64]:
-    """What a part counts at points: its weight times the distance to its edge, 0 where it does not reach."""
-    weight = part.weight[points]
-    share: NDArray[np.float64] = np.where(
-        weight > 0, weight * np.maximum(np.nan_to_num(part.edge_px[points]), LEAST_EDGE_PX), 0.0
+@dataclass(frozen=True)
+class LookedUp:
+    """A track and the (..., 2) knots and samples at which it saw some points, NaN off it."""
+
+    placed: Placed
+    track: Track
+    coordinates: NDArray[np.float64]
+    read: ReadWindow
+
+
+def read_part(
+    looked: LookedUp, coordinates: NDArray[np.float64], camera: LineCamera, kernel: Kernel
+) -> MosaicPart | None:
+    """Calibrate and resample one track at lookup coordinates (n, 2); None where it reaches none of them.
+
+    Lines that are not valid or that nothing saw, saturated and uncalibrated elements count nothing; where they leave
+    less than half of a kernel's weight the point is NaN with weight 0. The result at a point does not depend on the
+    other points.
+    """
+    box = _boxes(coordinates[None])[0]
+    if np.isnan(box[0]):
+        return None
+    lines, track = looked.placed.lines, looked.track
+    count = lines.references.dark.shape[0]
+    elements = looked.placed.elements
+    knots, samples = _span(box[0], box[1], len(track)), elements.alone(_span(box[2], box[3], count))
+    members = member_lines(track, knots)
+    values, valid = calibrate(
+        _raw_of(looked.read, members, samples),
+        elements.part(samples),
+        saturated_dn=camera.full_scale_dn * lines.sweep.binning,
+        position=lines.position[members],
     )
-    return share
+    starts = track.starts[knots] - track.starts[knots.start]
+    usable = lines.valid_line[members] & np.repeat(track.seen[knots], np.diff(starts, append=len(members)))
+    if not usable.all():
+        valid = valid & usable.reshape(-1, *[1] * (valid.ndim - 1))
+    if len(starts) < len(members):
+        values, valid = merge_lines(values, valid, starts)
+    values_at, weight = resample(values, valid, coordinates - np.array([knots.start, samples.start]), kernel)
+    return MosaicPart(values_at, weight, edge_distance(coordinates, len(track), count))
 
 
-def _check_parts(parts: Sequence[MosaicPart]) -> None:
-    if not parts:
-        raise ShapeError("a mosaic needs at least one sweep, got none")
-    for number, part in enumerate(parts):
-        points = (parts[0].values.shape[0],)
-        if part.values.shape != parts[0].values.shape or part.weight.shape != points or part.edge_px.shape != points:
-            raise ShapeError(
-                f"part {number} has values {part.values.shape}, weight {part.weight.shape} and edge distance "
-                f"{part.edge_px.shape}; expected those of {parts[0].values.shape}: resample all at the same points"
-            )
+def cut_runs(looked: Sequence[NDArray[np.float64]], bands: int) -> list[slice]:
+    """Cut groups of points into runs (slices, in order) such that little is calibrated that no point needs.
+
+    Where lines are turned against the grid, the lines and samples behind a long run of pixels are many times as many
+    as the pixels; short runs have less beside, but each has a price of its own. ``looked`` holds the (group, n, 2)
+    lookup coordinates of each track.
+    """
+    boxes = np.stack([_boxes(coordinates) for coordinates in looked])
+
+    def price(
+        run: slice,
+    ) -> float:  # elements to calibrate, and what a run costs by itself; none where no track reaches
+        low = np.fmin.reduce(boxes[:, run][:, :, [0, 2]], axis=1)  # NaN aside
+        high = np.fmax.reduce(boxes[:, run][:, :, [1, 3]], axis=1)
+        return float(np.nansum(np.prod(high - low + 2 * TAPS, axis=1) * bands + RUN_ELEMENTS))
+
+    def cut(run: slice) -> list[slice]:
+        middle = (run.start + run.stop) // 2
+        one, other = slice(run.start, middle), slice(middle, run.stop)
+        if run.stop - run.start > 1 and price(one) + price(other) < price(run):
+            return cut(one) + cut(other)
+        return [run]
+
+    return cut(slice(0, boxes.shape[1]))
+
+
+def _boxes(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+    """First and last knot, first and last sample of each group, (group, 4); NaN where the track reaches none of it."""
+    flat = coordinates.reshape(len(coordinates), -1, 2)
+    edges = []
+    for place in (flat[..., 0].copy(), flat[..., 1].copy()):  # minima of what lies side by side are ten times as fast
+        off = np.isnan(place)
+        for extreme, away in ((np.min, np.inf), (np.max, -np.inf)):
+            edge = extreme(np.where(off, away, place) if off.any() else place, axis=1)
+            edges.append(np.where(np.isinf(edge), np.nan, edge))
+    return np.stack(edges, axis=1)
+
+
+def _span(low: float, high: float, size: int) -> slice:
+    """Whole pixels from low to high with the kernel's taps, within 0..size."""
+    return slice(max(int(np.floor(low)) - TAPS, 0), min(int(np.ceil(high)) + TAPS + 1, size))
+
+
+def _raw_of(read: ReadWindow, members: NDArray[np.intp], samples: slice) -> Raw:
+    """Raw numbers of the lines ``members``, in their order."""
+    first, last = int(members.min()), int(members.max()) + 1
+    raw = read(slice(first, last), samples)
+    if last - first == len(members):
+        if (np.diff(members) == 1).all():
+            return raw
+        if (np.diff(members) == -1).all():
+            return raw[::-1]
+    return raw[members - first]

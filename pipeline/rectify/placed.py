@@ -1,9 +1,9 @@
-"""Placed sweeps: lines, the tracks on which they lie, and the pixel grid that they are brought to."""
+"""Placed sweeps: lines, the tracks on which they lie, the pixel grid, and what of it each track can reach."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +11,16 @@ from numpy.typing import NDArray
 from pipeline.errors import ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.rectify.calibration.flat_field import Elements, judge_elements
+from pipeline.geometry.scan import points_of_scan
+from pipeline.rectify.calibration.calibrate import Elements, judge_elements
 from pipeline.rectify.lookup import track_lookup
 from pipeline.rectify.tie_points import TieTable, tie_table
 from pipeline.rectify.tracks import Track, make_tracks
 from pipeline.source import SweepLines
 
+PIECE_SAMPLES = 64
+MARGIN_PX = 2.0  # of the grid: half a pixel, half a sample, and rounding
+TAPS = 3  # knots and samples that a kernel reads beyond the outermost coordinate
 LEAST_TIE_PX = 4  # closer ties take a byte a pixel and more
 
 
@@ -87,21 +91,13 @@ def place(
 ) -> Placed:
     """Find where the lines of a sweep lie.
 
-    Parameters
-    ----------
-    grid
-        Pixels to make tie tables for, which a large mosaic is made with; None looks every point up directly.
-    usable
-        (line,) lines whose position may be believed; None takes ``lines.valid_line``.
-    shift_px
-        (line, 2) pointing corrections along the line and along the scan. [px]
-    gain
-        (band,) illumination correction of the sweep.
+    ``grid`` are pixels to make tie tables for, which a large mosaic is made with; None looks every point up directly.
+    ``usable`` (line,) are lines whose position may be believed, None takes ``lines.valid_line``; ``shift_px`` (line, 2)
+    pointing corrections along the line and along the scan [px]; ``gain`` (band,) the illumination correction of the
+    sweep.
 
-    Raises
-    ------
-    PoseError : a line's position is beyond the mirror's disk, or its path has no direction.
-    ShapeError : arrays that do not fit the lines.
+    Raises PoseError: a line's position is beyond the mirror's disk, or its path has no direction.
+    Raises ShapeError: arrays that do not fit the lines.
     """
     sweep = lines.sweep
     tracks = make_tracks(
@@ -118,18 +114,67 @@ def place(
 
 def _table(track: Track, lines: SweepLines, camera: LineCamera, grid: PixelGrid) -> TieTable | None:
     """A table of the whole grid; None where lines lie too unevenly for ties to save anything."""
+    of_grid = partial(tie_table, track, camera, along=lines.sweep.along, binning=lines.sweep.binning)
+    of_shape = partial(of_grid, origin_px=grid.origin_px, spacing_px=grid.spacing_px)
+    return None if of_shape(shape=(1, 1)).spacing < LEAST_TIE_PX else of_shape(shape=grid.shape)
 
-    def of_shape(shape: tuple[int, int]) -> TieTable:
-        return tie_table(
-            track,
-            camera,
-            along=lines.sweep.along,
-            binning=lines.sweep.binning,
-            origin_px=grid.origin_px,
-            spacing_px=grid.spacing_px,
-            shape=shape,
+
+@dataclass(frozen=True)
+class ColumnReach:
+    """What one track shows of some columns of the grid: rows between which each knot lies, and the samples there."""
+
+    top: NDArray[np.float32]  # (knot,) first row, inf where the knot shows none of the columns
+    bottom: NDArray[np.float32]
+    samples: slice
+
+    def knots(self, rows: slice) -> slice:
+        """Knots that may show these rows, kernel's taps included; empty where none does."""
+        hit = np.flatnonzero((self.top < rows.stop) & (self.bottom >= rows.start))
+        if not len(hit):
+            return slice(0, 0)
+        return slice(max(int(hit[0]) - TAPS, 0), min(int(hit[-1]) + TAPS + 1, len(self.top)))
+
+
+class TrackReach:
+    """Where the lines of a track lie on a grid, in pieces of 64 samples. Never too little, at most a piece too much."""
+
+    def __init__(self, placed: Placed, track: Track, camera: LineCamera, grid: PixelGrid) -> None:
+        sweep = placed.lines.sweep
+        self._placed = placed
+        self._count = camera.samples // sweep.binning
+        self._ends = np.append(np.arange(0, self._count, PIECE_SAMPLES), self._count)
+        slope = ((self._ends - camera.samples / 2 / sweep.binning) * sweep.binning) * camera.ifov_rad
+        centre = track.scan[:, None] / camera.ifov_rad, track.across[:, None] / camera.ifov_rad
+        along, scan = points_of_scan(centre[1], camera, centre[0], slope[None, :])  # type: ignore[arg-type]
+        y, x = (scan, along) if sweep.along == "x" else (along, scan)
+        steps = np.hypot(np.diff(track.scan), np.diff(track.across))
+        widest = max(float(track.width), float(steps.max(initial=0.0)))
+        margin = MARGIN_PX + 0.75 * widest / (camera.ifov_rad * grid.spacing_px)
+        self._top, self._bottom = _spans((y - grid.origin_px[0]) / grid.spacing_px, margin)
+        self._left, self._right = _spans((x - grid.origin_px[1]) / grid.spacing_px, margin)
+
+    def in_columns(self, columns: slice) -> ColumnReach | None:
+        """What the track shows of some columns, or None where it shows nothing."""
+        hit = (self._left < columns.stop) & (self._right >= columns.start)
+        pieces = np.flatnonzero(hit.any(axis=0))
+        if not len(pieces):
+            return None
+        first, last = int(self._ends[pieces[0]]), int(self._ends[pieces[-1] + 1])
+        return ColumnReach(
+            top=np.where(hit, self._top, np.inf).min(axis=1),
+            bottom=np.where(hit, self._bottom, -np.inf).max(axis=1),
+            samples=self._placed.elements.alone(slice(max(first - TAPS, 0), min(last + TAPS, self._count))),
         )
 
-    if of_shape((1, 1)).spacing < LEAST_TIE_PX:
-        return None
-    return of_shape(grid.shape)
+
+def _spans(place: NDArray[np.float64], margin: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Least and greatest place of each piece, (knot, piece) each; float32, for they are kept for every sweep."""
+    one, other = place[:, :-1], place[:, 1:]
+    low, high = np.minimum(one, other) - margin, np.maximum(one, other) + margin
+    return low.astype(np.float32), high.astype(np.float32)
+
+
+def member_lines(track: Track, knots: slice) -> NDArray[np.intp]:
+    """Numbers of the lines that some knots are made of, knot by knot."""
+    stop = track.starts[knots.stop] if knots.stop < len(track) else len(track.lines)
+    return track.lines[track.starts[knots.start] : stop]

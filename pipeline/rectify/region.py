@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.rectify.line_cache import LineCache, Raw, ReadWindow
-from pipeline.rectify.mosaic import mosaic
-from pipeline.rectify.placed import PixelGrid as PixelGrid
-from pipeline.rectify.placed import Placed as Placed
-from pipeline.rectify.placed import place as place
-from pipeline.rectify.reach import TAPS, ColumnReach, TrackReach, member_lines
-from pipeline.rectify.resample import Kernel
+from pipeline.rectify.kernels import Kernel
+from pipeline.rectify.line_cache import BLOCK_LINES, LineCache, Raw, ReadWindow, held_samples, line_blocks
+from pipeline.rectify.mosaic import LookedUp, cut_runs, mosaic, read_part
+from pipeline.rectify.placed import TAPS, ColumnReach, PixelGrid, Placed, TrackReach, member_lines, place
 from pipeline.rectify.tracks import Track
-from pipeline.rectify.window import LookedUp, cut_runs, read_part
 from pipeline.source import SweepLines
 
+COPIES = 5  # of a tile in memory at once: values, parts and calibrated lines, rounded, chunks and shard
 GROUP_COLUMNS = 32  # tiles are cut between groups of so many columns
 
 Values = NDArray[np.float32]
@@ -43,21 +41,12 @@ def mosaic_tile(
     cache: LineCache | None = None,
     reach: Reaches | None = None,
 ) -> tuple[Values, Counts]:
-    """Rectify and blend the sweeps on a part of a grid.
+    """Rectify and blend the sweeps on a part of a grid, given by slices with start and stop.
 
-    What comes out for a pixel does not depend on how the grid is cut into tiles, bit for bit.
+    What comes out for a pixel does not depend on how the grid is cut into tiles, bit for bit. ``cache`` holds raw lines
+    that earlier tiles read, None reads what is needed, once; ``reach`` is that of :func:`column_reach` for these
+    columns or more, None makes it.
 
-    Parameters
-    ----------
-    rows, columns
-        The part, with start and stop.
-    cache
-        Raw lines that earlier tiles read; None reads what is needed, once.
-    reach
-        Of :func:`column_reach` for these columns or more; None makes it.
-
-    Returns
-    -------
     (y, x, band) float32 with NaN where no line reached, (y, x) how many sweeps did (a sweep that turns may count
     once for each of its runs).
     """
@@ -83,15 +72,12 @@ def mosaic_tile(
 
 
 def mosaic_rows(
-    sweeps: Sequence[SweepLines], camera: LineCamera, grid: SceneGrid, *, rows: int, kernel: Kernel = "catmull-rom"
+    sweeps: Sequence[SweepLines], camera: LineCamera, grid: SceneGrid, *, rows: int
 ) -> Iterator[tuple[int, Values, Counts]]:
     """Rectify and blend the sweeps of one pass onto its grid, ``rows`` rows at a time.
 
-    The pass's step says which grid: 1 the scene's pixels, ``grid.factor`` the coarse ones.
-
-    Yields
-    ------
-    First row, (row, x, band) float32 with NaN where no line reached, (row, x) how many sweeps did.
+    The pass's step says which grid: 1 the scene's pixels, ``grid.factor`` the coarse ones. Yields the first row,
+    (row, x, band) float32 with NaN where no line reached, and (row, x) how many sweeps did.
     """
     pixels = PixelGrid.of_scene(grid, sweeps[0].sweep.step)
     placed = [place(lines, camera) for lines in sweeps]
@@ -99,7 +85,7 @@ def mosaic_rows(
     reach = column_reach(placed, camera, pixels, columns)
     for first in range(0, pixels.shape[0], rows):
         part = slice(first, min(first + rows, pixels.shape[0]))
-        yield first, *mosaic_tile(placed, camera, pixels, part, columns, kernel=kernel, reach=reach)
+        yield first, *mosaic_tile(placed, camera, pixels, part, columns, reach=reach)
 
 
 def seat_pixels(grid: SceneGrid, seats: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -131,19 +117,11 @@ def read_seats(
     *,
     cache: LineCache | None = None,
 ) -> tuple[Values, NDArray[np.bool_]]:
-    """Rectify whole patches from the sweeps that saw them.
+    """Rectify whole patches from the sweeps that saw them: placed with :func:`place`, or lines to be placed now.
 
-    Parameters
-    ----------
-    sweeps
-        Sweeps placed with :func:`place`, or their lines alone. Placed ones are not placed again at every call.
-    seats
-        Best in the order in which the sweeps pass them: neighbours share what is read and calibrated.
-    cache
-        Raw lines that earlier calls read; None reads what is needed, once.
+    Best in the order in which the sweeps pass the seats: neighbours share what is read and calibrated. ``cache`` holds
+    raw lines that earlier calls read; None reads what is needed, once.
 
-    Returns
-    -------
     (seat, p, p, band) float32, NaN where no line reached, and (seat, p, p) pixels that lie on the scene and were seen.
     """
     placed = [one if isinstance(one, Placed) else place(one, camera) for one in sweeps]
@@ -201,3 +179,56 @@ def _reader(
     origin = int(members.min())
     raw: Raw = one.lines.read(origin, int(members.max()) + 1)
     return lambda wanted, samples: raw[wanted.start - origin : wanted.stop - origin, samples]
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A part of a mosaic that is made and written at once. ``reach`` is what each track of each sweep shows there."""
+
+    rows: slice
+    columns: slice
+    reach: tuple[tuple[ColumnReach | None, ...], ...]
+
+
+def plan_tiles(
+    placed: Sequence[Placed], camera: LineCamera, grid: PixelGrid, tile_shape: tuple[int, int]
+) -> list[Tile]:
+    """List a grid's tiles in the order to make them: down the columns, so that lines read once serve the next tiles."""
+    reaches = [[TrackReach(one, track, camera, grid) for track, _ in one.tracks] for one in placed]
+    tiles = []
+    for columns in _cuts(grid.shape[1], tile_shape[1]):
+        shown = tuple(tuple(reach.in_columns(columns) for reach in tracks) for tracks in reaches)
+        tiles += [Tile(rows, columns, shown) for rows in _cuts(grid.shape[0], tile_shape[0])]
+    return tiles
+
+
+def _cuts(size: int, step: int) -> Iterator[slice]:
+    return (slice(first, min(first + step, size)) for first in range(0, size, step))
+
+
+def tile_bytes(tile_shape: tuple[int, int], bands: int) -> int:
+    """Memory that one tile takes while it is made and written, raw lines not counted [bytes]."""
+    return COPIES * tile_shape[0] * tile_shape[1] * bands * 4
+
+
+def cache_bytes(placed: Sequence[Placed], tiles: Sequence[Tile], at_once: int) -> int:
+    """Memory for the raw lines that any ``at_once`` tiles in a row need together [bytes]."""
+    needed = [_blocks_of(placed, tile) for tile in tiles]
+    runs = (needed[first : first + at_once] for first in range(max(len(needed) - at_once, 0) + 1))
+    return max((sum({key: size for part in run for key, size in part.items()}.values()) for run in runs), default=0)
+
+
+def _blocks_of(placed: Sequence[Placed], tile: Tile) -> dict[tuple[int, int, int, int], int]:
+    """Sizes of the blocks of raw lines behind a tile, by sweep, block and samples."""
+    blocks = {}
+    for sweep, (one, tracks) in enumerate(zip(placed, tile.reach, strict=True)):
+        bands = len(one.lines.references.panel)
+        for (track, _), near in zip(one.tracks, tracks, strict=True):
+            knots = slice(0, 0) if near is None else near.knots(tile.rows)
+            if near is None or knots.start == knots.stop:
+                continue
+            members = member_lines(track, knots)
+            held = held_samples(one.lines, near.samples)
+            for number in line_blocks(slice(int(members.min()), int(members.max()) + 1)):
+                blocks[sweep, number, held.start, held.stop] = BLOCK_LINES * (held.stop - held.start) * bands * 2
+    return blocks

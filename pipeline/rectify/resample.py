@@ -1,37 +1,239 @@
-"""Resampling at scattered points: masked for captured sweeps, with repeated edges for scenes."""
+"""Resampling at scattered points: a sweep's lines with masks, as rows of one table, and images without masks."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import dataclass
+from functools import reduce
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
-from pipeline.rectify.kernels import Kernel, kernel_taps, outer_index, tensor_rows, weighted_rows, windows
-from pipeline.rectify.line_table import Values, table_for
+from pipeline.rectify.kernels import Kernel, Rows, Windows, outer_index, taps_of, tensor_rows, weighted_rows, windows
 
-__all__ = ["BLOCK_PX", "Kernel", "gather", "kernel_taps", "merge_lines", "resample", "to_uint16"]
+if TYPE_CHECKING:
+    import torch
 
+Values: TypeAlias = NDArray[np.float32] | NDArray[np.uint16]
+
+LEAST_WEIGHT = 0.5
+ROUNDING = 1e-6
 BLOCK_PX = 16384  # smaller blocks pay calls, and larger ones gain nothing
+
+
+def divisor(total: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What a sum is divided by, from the weight that was usable: 1 for all of it, up to rounding; NaN below half."""
+    whole = np.where(np.abs(total - 1) <= ROUNDING, np.float32(1), total)
+    return np.where(whole >= LEAST_WEIGHT, whole, np.float32(np.nan))
+
+
+def divide_rows(out: NDArray[np.float32], at: Rows, by: NDArray[np.float32]) -> None:
+    """Divide the rows ``at`` of ``out``, in place, where there is something to divide by other than 1."""
+    other = np.flatnonzero(by != 1)
+    out[at[other]] /= by[other, None]
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Single elements that may not be used, in samples of which other bands may."""
+
+    bands: Rows  # (k,) that have any
+    kind: NDArray[np.int32]  # (line * sample,) row of ``usable``; 0 where a sample has none
+    usable: torch.Tensor  # (kind, k) float32, 1 or 0
+    sound: NDArray[np.bool_]  # (line, sample) of a window's corner: it has none
+
+    def mend(
+        self, out: NDArray[np.float32], at: Rows, index: torch.Tensor, weight: torch.Tensor, total: NDArray[np.float32]
+    ) -> NDArray[np.bool_]:
+        """Divide the weighted sums in the rows ``at`` of ``out`` by the weight that was usable in each band.
+
+        ``total`` (n,) is the weight on usable samples; unusable elements have entered the sums as 0. Tells of each
+        point whether it has a value in any band.
+        """
+        import torch
+
+        share = np.empty((len(at), len(self.bands)), np.float32)
+        weighted_rows(self.usable, torch.from_numpy(self.kind[index.numpy()]), weight, share)
+        point, column = _places(np.abs(share - total[:, None]) > ROUNDING)  # few: the rest is divided as samples are
+        own, rest = divisor(share[point, column]), divisor(total)
+        apart = at[point], self.bands[column]
+        mended = out[apart] / own
+        divide_rows(out, at, rest)
+        out[apart] = mended
+        failed = np.where(np.isnan(rest), out.shape[1] - np.bincount(point, minlength=len(at)), 0)
+        failed += np.bincount(point[np.isnan(own)], minlength=len(at))
+        known: NDArray[np.bool_] = failed < out.shape[1]
+        return known
+
+
+@dataclass(frozen=True)
+class LineTable:
+    """A sweep, ready to be read by one kernel."""
+
+    shape: tuple[int, int]  # lines, samples
+    rows: NDArray[Any]  # (line * sample, band) as captured, for a kernel of one tap
+    terms: torch.Tensor  # the same in float32, for weighted sums
+    usable: NDArray[np.bool_] | None  # (line * sample,); None: all are
+    whole: NDArray[np.bool_] | None  # (line, sample) of a window's corner: all its samples are usable
+    damage: Damage | None
+
+    def read(self, placed: Windows, out: NDArray[Any], share: NDArray[np.float32]) -> None:
+        """Write the points' values (n, band), and (n,) the usable share of the kernel's weight."""
+        whole = _lies_on(placed, self.shape, self.whole)
+        if placed.taps == 1:
+            self._copy(placed, whole, out)
+            share[:] = whole
+        elif whole.all():
+            self._read_whole(placed, out, share)
+        else:
+            for which, read in ((whole, self._read_whole), (~whole, self._read_partial)):
+                points = np.flatnonzero(which)
+                read(placed.chosen(points), out, share, points)
+
+    def _copy(self, placed: Windows, whole: NDArray[np.bool_], out: NDArray[Any]) -> None:
+        if whole.any():
+            corner = placed.corner if whole.all() else np.where(whole, placed.corner, 0)
+            index = (corner[0] * self.shape[1] + corner[1]).astype(np.intp)
+            np.take(self.rows, index, axis=0, out=out, mode="clip")  # numpy copies once more in its other modes
+        if not whole.all():
+            out[~whole] = np.nan if out.dtype == np.float32 else 0
+
+    def _read_whole(
+        self, placed: Windows, out: NDArray[np.float32], share: NDArray[np.float32], at: Rows | None = None
+    ) -> None:
+        """Points (the block's ``at``, or all) whose windows lie on usable samples altogether."""
+        import torch
+
+        index, weight = placed.flat_index(self.shape), placed.joint_weight()
+        weighted_rows(self.terms, index, weight, out, at)
+        share[... if at is None else at] = 1
+        if self.damage is not None:
+            touched = np.flatnonzero(~_lies_on(placed, self.shape, self.damage.sound))
+            here, taps = touched if at is None else at[touched], torch.from_numpy(touched)
+            one = np.ones(len(touched), np.float32)
+            share[here] = self.damage.mend(out, here, index[taps], weight[taps], one)
+
+    def _read_partial(self, placed: Windows, out: NDArray[np.float32], share: NDArray[np.float32], at: Rows) -> None:
+        """Points that miss taps: NaN and 0 where they fail, else what is there, renormalised."""
+        import torch
+
+        out[at], share[at] = np.nan, 0
+        near = np.flatnonzero(placed.touches(self.shape))
+        flat, joint = self._usable_taps(placed.chosen(near))
+        total = reduce(np.add, joint.T)  # tap by tap, as the sums of a mask by element run: the same to the last bit
+        index, weight, at = torch.from_numpy(flat), torch.from_numpy(joint), at[near]
+        weighted_rows(self.terms, index, weight, out, at)
+        if self.damage is None:
+            whole = divisor(total)
+            divide_rows(out, at, whole)
+            known = ~np.isnan(whole)
+        else:
+            known = self.damage.mend(out, at, index, weight, total)
+        share[at] = np.where(known, np.minimum(total, 1), 0)
+
+    def _usable_taps(self, placed: Windows) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """(n, tap * tap) rows and weights; a tap that may not be used has weight 0 and the row of one that may."""
+        line, sample = placed.taps_by_axis()
+        weight = placed.weight.copy()
+        for along, index, size in ((weight[0], line, self.shape[0]), (weight[1], sample, self.shape[1])):
+            along *= ((index >= 0) & (index < size)).T
+            index.clip(0, max(size - 1, 0), out=index)
+        flat, joint = outer_index(line, sample, self.shape[1]), Windows(placed.corner, weight).joint_weight().numpy()
+        if self.usable is not None:
+            usable = self.usable[flat]
+            joint *= usable
+            flat[~usable] = np.argmax(self.usable)  # 0 times a NaN would still be a NaN
+        return flat, joint
+
+
+def table_for(values: Values, valid: NDArray[np.bool_], kernel: Kernel) -> LineTable:
+    """Make lines (line, sample, band), valid by sample or by element, ready for one kernel."""
+    import torch
+
+    taps = taps_of(kernel)
+    lines, samples, bands = values.shape
+    rows: NDArray[Any] = np.ascontiguousarray(values).reshape(lines * samples, bands)
+    if rows.dtype != np.uint16 or taps > 1:
+        rows = rows.astype(np.float32, copy=False)
+    damage = None
+    if valid.ndim == 3:
+        rows, valid, damage = _apart(rows, valid, taps)
+    whole, usable = None, None
+    if not valid.all():
+        whole, usable = _windows_all(valid, taps), np.ascontiguousarray(valid).ravel()
+    terms = tensor_rows(rows) if taps > 1 else torch.empty(0)
+    return LineTable((lines, samples), rows, terms, usable, whole, damage)
+
+
+def _apart(
+    rows: NDArray[Any], valid: NDArray[np.bool_], taps: int
+) -> tuple[NDArray[Any], NDArray[np.bool_], Damage | None]:
+    """Part a mask by element into one by sample (any band) and the damage of single elements.
+
+    Those are 0 in the rows given back, for sums; NaN for a kernel of one tap, which copies.
+    """
+    import torch
+
+    complete: NDArray[np.bool_] = np.all(valid, axis=2)
+    lacking = np.flatnonzero(~complete)
+    missing = ~valid.reshape(rows.shape)[lacking]
+    some = ~missing.all(axis=1)
+    usable = complete.copy()
+    usable.ravel()[lacking] = some
+    lacking, missing = lacking[some], missing[some]
+    if not len(lacking):
+        return rows, usable, None
+    sample, band = _places(missing)
+    place = lacking[sample], band
+    if taps == 1 or rows[place].any():  # zeros that the caller has written spare the copy
+        rows = rows.astype(np.float32)
+        rows[place] = np.nan if taps == 1 else 0
+    if taps == 1:
+        return rows, usable, None
+    bands, column = np.unique(band, return_inverse=True)
+    counts = np.ones((len(lacking) + 1, len(bands)), np.float32)
+    counts[sample + 1, column] = 0
+    kind = np.zeros(len(rows), np.int32)
+    kind[lacking] = np.arange(1, len(counts))
+    sound = _windows_all((kind == 0).reshape(usable.shape), taps)
+    return rows, usable, Damage(bands, kind, torch.from_numpy(counts), sound)
+
+
+def _places(mask: NDArray[np.bool_]) -> tuple[Rows, Rows]:
+    """Rows and columns where a mask holds; np.nonzero of two dimensions is far slower."""
+    row, column = np.divmod(np.flatnonzero(mask), max(mask.shape[1], 1))
+    return row, column
+
+
+def _windows_all(mask: NDArray[np.bool_], taps: int) -> NDArray[np.bool_]:
+    """Of each window's corner, whether the mask holds in all of it, (line, sample) -> less ``taps - 1`` both ways."""
+    for axis in (0, 1):
+        size = max(mask.shape[axis] - taps + 1, 0)
+        held = mask.take(range(size), axis=axis)
+        for tap in range(1, taps):
+            held &= mask.take(range(tap, tap + size), axis=axis)
+        mask = held
+    return mask
+
+
+def _lies_on(placed: Windows, shape: tuple[int, int], corners: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """(n,) whether a window lies on the sweep, and its corner among those told."""
+    inside = placed.inside(shape)
+    if corners is not None and inside.any():
+        line, sample = np.where(inside, placed.corner, 0).astype(np.intp)
+        inside &= corners[line, sample]
+    return inside
 
 
 def gather(
     planes: NDArray[np.float32], y: NDArray[np.float64], x: NDArray[np.float64], kernel: Kernel = "catmull-rom"
 ) -> NDArray[np.float32]:
-    """Interpolate an image at scattered points; outside, the edge pixel is repeated.
+    """Interpolate an image (row, column, component), float32 without NaN, at scattered rows and columns (n,).
 
-    Parameters
-    ----------
-    planes
-        (row, column, component) float32, without NaN.
-    y, x
-        (n,) rows and columns; integers are pixel centres. [px]
-
-    Returns
-    -------
-    (n, component) float32. A point's result does not depend on the other points of the call.
+    Integers are pixel centres; outside, the edge pixel is repeated. (n, component) float32: a point's result does not
+    depend on the other points of the call.
     """
     import torch
 
@@ -58,7 +260,7 @@ def resample(
     *,
     out: NDArray[Any] | None = None,
 ) -> tuple[NDArray[Any], NDArray[np.float32]]:
-    """Read a sweep at scattered coordinates, leaving out what is not valid.
+    """Read a sweep (line, sample, band), float32 or uint16, at scattered coordinates, leaving out what is not valid.
 
     Taps that are not valid or lie off the sweep count nothing and the rest is renormalised; a point whose valid taps
     weigh less than a half fails. Where single elements are invalid this holds for each band on its own. Values of what
@@ -66,8 +268,6 @@ def resample(
 
     Parameters
     ----------
-    values
-        (line, sample, band) float32 or uint16.
     valid
         (line, sample) whether a sample may be used, or (line, sample, band) whether an element may. Where ``values``
         holds 0 at single invalid elements the lines need not be copied.
@@ -90,9 +290,17 @@ def resample(
     if coordinates.ndim != 2 or coordinates.shape[1] != 2:
         raise ShapeError(f"expected coordinates (n, 2) of line and sample, got {coordinates.shape}; flatten the grid")
     coordinates = np.asarray(coordinates, np.float64)
-    first, stop = _lines_in_reach(coordinates[:, 0], len(values))
+    low, high = (
+        extreme.reduce(coordinates[:, 0], initial=away) for extreme, away in ((np.fmin, np.inf), (np.fmax, -np.inf))
+    )
+    first, stop = 0, 0  # of the lines that a tap of any point can lie on
+    if low <= high:
+        first, stop = np.clip((np.floor(low) - 1, np.floor(high) + 3), 0, len(values)).astype(int).tolist()
     table = table_for(values[first:stop], valid[first:stop], kernel)
-    out = _checked_out(out, (len(coordinates), values.shape[2]), table.rows.dtype)
+    shape, kind = (len(coordinates), values.shape[2]), table.rows.dtype
+    out = np.empty(shape, kind) if out is None else out
+    if out.shape != shape or out.dtype != kind or not out.flags.c_contiguous:
+        raise ShapeError(f"expected out {shape} of {kind}, rows next to each other, got {out.shape} of {out.dtype}")
     share = np.zeros(len(coordinates), np.float32)
     for block in _blocks(len(out)):
         placed = windows(coordinates[block], kernel)
@@ -104,25 +312,15 @@ def resample(
 def merge_lines(
     values: Values, valid: NDArray[np.bool_], starts: NDArray[np.intp]
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Average the lines of each dwell: those taken while the mirror stood still.
+    """Average the lines of each dwell, those taken while the mirror stood still; they lie next to each other.
 
-    Parameters
-    ----------
-    values
-        (line, sample, band) float32 or uint16, the lines of one dwell next to each other.
-    valid
-        (line, sample) or (line, sample, band).
-    starts
-        (dwell,) ascending number of the first line of each; the first is 0.
+    ``starts`` (dwell,) are the ascending numbers of the first line of each, the first being 0. The mask is by sample or
+    by element.
 
-    Returns
-    -------
     (dwell, sample, band) float32 mean of the valid lines, NaN where there is none (a line alone as it was; the input
     itself, uint16 too, where every line is alone); and whether there is any, with the dimensions of ``valid``.
 
-    Raises
-    ------
-    ShapeError : ``starts`` does not part the lines, or the mask does not fit the values.
+    Raises ShapeError: ``starts`` does not part the lines, or the mask does not fit the values.
     """
     _check_mask(values, valid)
     counts = np.diff(starts, append=len(values))
@@ -132,59 +330,23 @@ def merge_lines(
         return values, valid
     merged, known = values[starts].astype(np.float32), valid[starts]
     several = np.flatnonzero(counts > 1)
-    merged[several], known[several] = _means(values, valid, starts[several], counts[several])
-    return merged, known
-
-
-def _means(
-    values: Values, valid: NDArray[np.bool_], starts: NDArray[np.intp], counts: NDArray[np.intp]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Mean over the valid of ``counts`` lines from ``starts`` on; summed in float64, which holds any dwell's uint16."""
+    starts, counts = starts[several], counts[several]
     mask = valid if valid.ndim == 3 else valid[..., None]
-    total = np.zeros((len(starts), *values.shape[1:]))
+    total = np.zeros((len(starts), *values.shape[1:]))  # float64 holds the sums of any dwell's uint16
     number = np.zeros((len(starts), *mask.shape[1:]), np.intp)
     for member in range(counts.max(initial=0)):
         held = np.flatnonzero(counts > member)
         line = starts[held] + member
         total[held] += np.where(mask[line], values[line], 0)
         number[held] += mask[line]
-    mean = np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
-    return mean, (number > 0).reshape(len(starts), *valid.shape[1:])
-
-
-def to_uint16(values: NDArray[np.floating]) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
-    """Round to uint16, halves to even, clipped to its range first: what overshoots an edge would wrap around.
-
-    Returns
-    -------
-    uint16, 0 for NaN; and where there was a value. Both shaped as the input.
-    """
-    known = ~np.isnan(values)
-    held = np.where(known, values, 0)
-    np.clip(held, 0, np.iinfo(np.uint16).max, out=held)
-    return np.rint(held, out=held).astype(np.uint16), known
+    merged[several] = np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
+    known[several] = (number > 0).reshape(len(starts), *valid.shape[1:])
+    return merged, known
 
 
 def _blocks(count: int) -> Iterator[slice]:
     for start in range(0, count, BLOCK_PX):
         yield slice(start, min(start + BLOCK_PX, count))
-
-
-def _lines_in_reach(place: NDArray[np.float64], lines: int) -> tuple[int, int]:
-    """First line that a tap of any point can lie on, and the one after the last; none where no point has a place."""
-    least, most = np.fmin.reduce(place, initial=np.inf), np.fmax.reduce(place, initial=-np.inf)
-    if least > most:
-        return 0, 0
-    first, stop = np.clip((np.floor(least) - 1, np.floor(most) + 3), 0, lines).astype(int).tolist()
-    return first, stop
-
-
-def _checked_out(out: NDArray[Any] | None, shape: tuple[int, int], kind: np.dtype[Any]) -> NDArray[Any]:
-    if out is None:
-        return np.empty(shape, kind)
-    if out.shape != shape or out.dtype != kind or not out.flags.c_contiguous:
-        raise ShapeError(f"expected out {shape} of {kind}, rows next to each other, got {out.shape} of {out.dtype}")
-    return out
 
 
 def _check_mask(values: Values, valid: NDArray[np.bool_]) -> None:

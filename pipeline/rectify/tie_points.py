@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Axis, points_of_scan
-from pipeline.rectify.knot_curve import KnotCurve, drop_unseen, grid_points, knots_of_points
+from pipeline.rectify.lookup import KnotCurve, drop_unseen, grid_points, knots_of_points
 from pipeline.rectify.tracks import Track
 
 SAFETY = 1.05  # on the bound, which holds to the second order
@@ -36,43 +36,30 @@ class TieTable:
     kept: tuple[int, int]  # rows and columns of it
 
     def coordinates(self, rows: slice, columns: slice) -> Floats:
-        """Coordinates of a part of the grid, (y, x, 2) float64, as of :func:`pipeline.rectify.lookup.track_lookup`.
-
-        Parameters
-        ----------
-        rows, columns
-            Contiguous, within the grid.
-        """
+        """Coordinates of a contiguous part of the grid, (y, x, 2), as of ``track_lookup``."""
         asked = [range(size)[one] for one, size in zip((rows, columns), self.shape, strict=True)]
         here = [
             slice(min(max(one.start - first, 0), count), max(min(one.stop - first, count), 0))
             for one, first, count in zip(asked, self.corner, self.kept, strict=True)
         ]
-        found = self._of_kept(*here)
+        if any(part.stop <= part.start for part in here):
+            found: Floats = np.empty((0, 0, 2))
+        elif self.spacing == 1:
+            found = self.ties[here[0], here[1]].copy()
+        else:
+            found = self._between(*here)
+            ties = self.ties[tuple(slice(one.start // self.spacing, -(-one.stop // self.spacing) + 1) for one in here)]
+            most = np.array([len(self.seen), self.samples]) - 0.5
+            if not (
+                self.seen.all() and (ties >= -0.5).all() and (ties <= most).all()
+            ):  # else all between lie on the track
+                drop_unseen(found, self.seen, self.samples)
         if found.shape[:2] == (len(asked[0]), len(asked[1])):
             return found
         whole = np.full((len(asked[0]), len(asked[1]), 2), np.nan)
         top, left = (first + one.start - part.start for first, one, part in zip(self.corner, here, asked, strict=True))
         whole[top : top + found.shape[0], left : left + found.shape[1]] = found
         return whole
-
-    def _of_kept(self, rows: slice, columns: slice) -> Floats:
-        """Coordinates of rows and columns counted from the corner."""
-        if rows.stop <= rows.start or columns.stop <= columns.start:
-            return np.empty((0, 0, 2))
-        if self.spacing == 1:
-            return self.ties[rows, columns].copy()
-        found = self._between(rows, columns)
-        if not self._all_seen(rows, columns):
-            drop_unseen(found, self.seen, self.samples)
-        return found
-
-    def _all_seen(self, rows: slice, columns: slice) -> bool:
-        """Whether the ties around a part all lie on the track; then all between them do."""
-        near = (slice(one.start // self.spacing, -(-one.stop // self.spacing) + 1) for one in (rows, columns))
-        ties = self.ties[tuple(near)]
-        most = np.array([len(self.seen), self.samples]) - 0.5
-        return bool(self.seen.all() and (ties >= -0.5).all() and (ties <= most).all())
 
     def _between(self, rows: slice, columns: slice) -> Floats:
         """Straight lines along the few rows of ties first, then, in long runs of memory, down the columns."""
@@ -104,25 +91,14 @@ def tie_table(
     tie: int = 16,
     tolerance_px: float = 2e-3,
 ) -> TieTable:
-    """Tabulate a track's lookup over a regular grid.
+    """Tabulate a track's lookup over a grid, given by its first centre, the distance of centres [px] and (y, x).
 
-    The distance of ties starts at ``tie`` pixels and is halved until the error of the pixels between is bound by
-    ``tolerance_px``. The bound is an eighth of the ties' second differences (of both axes together) and how far the
-    knots lie off straight lines of a tie's length, which shows a single line out of place that no tie may meet; or the
-    error found half-way between ties, if that is more.
+    The distance of ties starts at ``tie`` pixels and is halved until the error of the pixels between, in lines and in
+    samples, is bound by ``tolerance_px`` [px of the sweep]. The bound is an eighth of the ties' second differences (of
+    both axes together) and how far the knots lie off straight lines of a tie's length, which shows a single line out of
+    place that no tie may meet; or the error found half-way between ties, if that is more.
 
-    Parameters
-    ----------
-    origin_px, spacing_px, shape
-        Grid, as of :func:`pipeline.rectify.lookup.grid_lookup`.
-    tie
-        Largest distance of ties. [px of the grid]
-    tolerance_px
-        Largest error, in lines and in samples. [px of the sweep]
-
-    Raises
-    ------
-    SettingsError : the distance of ties is below 1, or the tolerance below 0.
+    Raises SettingsError: the distance of ties is below 1, or the tolerance below 0.
     """
     if tie < 1 or not tolerance_px >= 0:
         raise SettingsError(f"expected ties at least 1 px apart and a tolerance from 0, got {tie} and {tolerance_px}")
@@ -140,11 +116,15 @@ def tie_table(
         if bound <= tolerance_px and min(kept) > 0:
             rows, columns = ((size - 1) // tie + 2 for size in kept)
             ties = exact(0, tie, (rows, columns))
-            cells = _cells_on_track(ties, len(track), samples)
+            corners = _corners(ties)
+            ends = np.array([len(track), samples]) - 0.5
+            cells = ((corners.max(axis=0) >= -0.5) & (corners.min(axis=0) <= ends)).all(
+                axis=-1
+            )  # hold points of the track
             bound = SAFETY * (bound + _tie_bound(ties, cells))
             if bound <= tolerance_px:
                 middle = exact(tie / 2, tie, (rows - 1, columns - 1))
-                bound = max(bound, _largest(np.abs(middle - _cell_means(ties))[cells]))
+                bound = max(bound, float(np.abs(middle - corners.mean(axis=0))[cells].max(initial=0)))
         if bound <= tolerance_px:
             return TieTable(ties, tie, shape, bound, track.seen, samples, corner, kept)
         tie //= 2
@@ -183,14 +163,6 @@ def _knot_bound(track: Track, knots: float) -> float:
     return worst
 
 
-def _cells_on_track(ties: Floats, knots: int, samples: int) -> NDArray[np.bool_]:
-    """Cells between four ties that hold points of the track."""
-    corners = _corners(ties)
-    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
-    on: NDArray[np.bool_] = ((high >= -0.5) & (low <= np.array([knots, samples]) - 0.5)).all(axis=-1)
-    return on
-
-
 def _tie_bound(ties: Floats, cells: NDArray[np.bool_]) -> float:
     """Largest error of bilinear interpolation in the given cells, by the second differences at their corners."""
     total = np.zeros_like(ties)
@@ -198,19 +170,9 @@ def _tie_bound(ties: Floats, cells: NDArray[np.bool_]) -> float:
         if ties.shape[axis] > 2:
             inner = np.abs(np.diff(ties, 2, axis=axis))
             total += np.pad(inner, [(1, 1) if at == axis else (0, 0) for at in range(3)], mode="edge")
-    return _largest(np.max(_corners(total), axis=0)[cells]) / 8
+    return float(np.max(_corners(total), axis=0)[cells].max(initial=0)) / 8
 
 
 def _corners(ties: Floats) -> Floats:
     """The four ties of each cell, (4, row, column, 2)."""
     return np.stack([ties[:-1, :-1], ties[:-1, 1:], ties[1:, :-1], ties[1:, 1:]])
-
-
-def _cell_means(ties: Floats) -> Floats:
-    means: Floats = _corners(ties).mean(axis=0)
-    return means
-
-
-def _largest(values: Floats) -> float:
-    """Largest value, NaN where one is; 0 of none."""
-    return float(values.max()) if values.size else 0.0

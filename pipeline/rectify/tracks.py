@@ -69,52 +69,32 @@ def make_tracks(
     Lines that are not usable say nothing of the path; where one is missing, or was lost, knots that nothing saw stand
     in its place. Resampling then counts their values nothing, and fails where what is left weighs less than a half.
 
-    Parameters
-    ----------
-    position
-        (line, 2) mirror X and Y at mid exposure. Those of lines that are not usable do not matter.
-    usable
-        (line,) lines to be used; None for all.
-    shift_px
-        (line, 2) pointing corrections, along the line and along the scan, added to the line centres. [px]
-    binning
-        Neighbouring samples summed: lines are taken to be as far apart where the path itself does not say.
-    step_px
-        Planned distance of the lines; None takes the median of the path's own steps. [px]
+    ``position`` is (line, 2) mirror X and Y at mid exposure, ``shift_px`` (line, 2) pointing corrections along the line
+    and along the scan, added to the line centres. ``step_px`` is the planned distance of the lines; None takes the
+    median of the path's own steps, or where the path does not say the width of a sample of ``binning`` px.
 
-    Returns
-    -------
     Tracks in the order in which they were taken; none where no line is usable.
 
-    Raises
-    ------
-    PoseError : the position of a usable line is not finite or beyond the mirror's disk; names the first.
-    ShapeError : arrays do not fit the lines.
+    Raises PoseError: the position of a usable line is not finite or beyond the mirror's disk; names the first.
+    Raises ShapeError: arrays do not fit the lines.
     """
     scan, across, lines = line_centres(position, camera, usable, shift_px)
     if not len(lines):
         return ()
     apart = camera.ifov_rad * binning
     step = _usual_step(scan, lines, apart) if step_px is None else step_px * camera.ifov_rad
-    runs = _runs(scan, max(GAP_STEPS * step, NOISE_SIGMAS * _noise(scan)), DWELL_STEPS * step)
+    bends = np.abs(np.diff(scan, 2))  # of a position's own noise: sqrt 6 times its standard deviation
+    noise = float(np.median(bends)) * SIGMA_OF_MEDIAN / 6**0.5 if len(bends) else 0.0
+    runs = _runs(scan, max(GAP_STEPS * step, NOISE_SIGMAS * noise), DWELL_STEPS * step)
     return tuple(_track(scan[run], across[run], lines[run], step) for run in runs)
 
 
 def line_centres(
     position: Floats, camera: LineCamera, usable: NDArray[np.bool_] | None = None, shift_px: Floats | None = None
 ) -> tuple[Floats, Floats, NDArray[np.intp]]:
-    """Give where the usable lines of a sweep have their centres, in the order of capture.
+    """Give where the usable lines of a sweep have their centres, in order of capture; raises as :func:`make_tracks`.
 
-    Parameters as of :func:`make_tracks`.
-
-    Returns
-    -------
     Tangents on the scan axis and along the line, (usable line,) each, and the numbers of these lines.
-
-    Raises
-    ------
-    PoseError : the position of a usable line is not finite or beyond the mirror's disk; names the first.
-    ShapeError : arrays do not fit the lines.
     """
     if position.ndim != 2 or position.shape[1] != 2:
         raise ShapeError(f"expected mirror positions (line, 2), got {position.shape}")
@@ -124,7 +104,14 @@ def line_centres(
         raise ShapeError(f"shift_px has shape {shift_px.shape}, expected {position.shape}: along and scan of each line")
     lines = np.arange(len(position)) if usable is None else np.flatnonzero(usable)
     place = np.asarray(position[lines], np.float64)
-    _check_positions(place, lines)
+    out = ~(np.hypot(place[:, 0], place[:, 1]) <= 1 + RIM_SLACK["float64"])
+    if out.any():
+        first = int(np.argmax(out))
+        x, y = place[first]
+        raise PoseError(
+            f"line {lines[first]} is at mirror position ({x:.15g}, {y:.15g}), expected finite numbers in the unit"
+            " disk; mark the line as not usable, or keep the field within the mirror's range"
+        )
     tangent = direction_to_scene(position_to_direction(place))
     if shift_px is not None:
         tangent = tangent + shift_px[lines] * camera.ifov_rad
@@ -142,18 +129,6 @@ def single_track(position: Floats, camera: LineCamera, binning: int = 1) -> Trac
     )
 
 
-def _check_positions(place: Floats, lines: NDArray[np.intp]) -> None:
-    radius = np.hypot(place[:, 0], place[:, 1])
-    out = ~(radius <= 1 + RIM_SLACK["float64"])
-    if out.any():
-        first = int(np.argmax(out))
-        x, y = place[first]
-        raise PoseError(
-            f"line {lines[first]} is at mirror position ({x:.15g}, {y:.15g}), expected finite numbers in the unit"
-            " disk; mark the line as not usable, or keep the field within the mirror's range"
-        )
-
-
 def _usual_step(scan: Floats, lines: NDArray[np.intp], apart: float) -> float:
     """Median distance of lines that follow each other, standing ones left out; ``apart`` where none move."""
     steps = np.abs(np.diff(scan)) / np.diff(lines)
@@ -163,20 +138,15 @@ def _usual_step(scan: Floats, lines: NDArray[np.intp], apart: float) -> float:
     return float(np.percentile(steps, 50, method="lower"))  # of one step and one gap, the step
 
 
-def _noise(scan: Floats) -> float:
-    """Standard deviation of a position about its path, from the median of the second differences."""
-    if len(scan) < 3:
-        return 0.0
-    return float(np.median(np.abs(np.diff(scan, 2)))) * SIGMA_OF_MEDIAN / 6**0.5
-
-
 def _runs(scan: Floats, most_back: float, still: float) -> list[slice]:
     """Parts of the path that go one way, up to steps back of ``most_back``.
 
     The first line within ``still`` of the turn ends its part; those that stand there longer begin the next.
     """
     runs = []
-    first, rising = 0, _rises_first(scan, most_back)
+    up = scan - np.minimum.accumulate(scan) > most_back
+    down = np.maximum.accumulate(scan) - scan > most_back
+    first, rising = 0, bool(up.any() and (not down.any() or np.argmax(up) < np.argmax(down)))
     while first < len(scan):
         way = scan[first:] if rising else -scan[first:]
         back = np.maximum.accumulate(way) - way > most_back
@@ -185,13 +155,6 @@ def _runs(scan: Floats, most_back: float, still: float) -> list[slice]:
         runs.append(slice(first, stop))
         first, rising = stop, not rising
     return runs
-
-
-def _rises_first(scan: Floats, far: float) -> bool:
-    """Whether the path first goes up by more than ``far``, and not down; where it does neither, it does not matter."""
-    up = scan - np.minimum.accumulate(scan) > far
-    down = np.maximum.accumulate(scan) - scan > far
-    return bool(up.any() and (not down.any() or np.argmax(up) < np.argmax(down)))
 
 
 def _track(scan: Floats, across: Floats, lines: NDArray[np.intp], step: float) -> Track:

@@ -10,8 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from pipeline.errors import ArchiveError
-from pipeline.visible_text import visible
+from pipeline.errors import ArchiveError, visible
 from storage.archive.staging import PART_SUFFIX, refusals, remove_tree, sync_path
 
 _PREFIX = ".export-"

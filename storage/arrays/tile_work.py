@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
+from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.placed import PixelGrid, Placed
-from pipeline.rectify.region import Reaches, column_reach, mosaic_tile
-from pipeline.rectify.resample import Kernel
+from pipeline.rectify.region import Reaches, Tile, cache_bytes, column_reach, mosaic_tile, plan_tiles, tile_bytes
 from pipeline.rectify.tie_points import TieTable
-from pipeline.rectify.tiles import Tile, cache_bytes, plan_tiles, tile_bytes
 from pipeline.rectify.tracks import Track
 from storage.arrays.cubes import open_raw_cube
 from storage.arrays.located_sweeps import Sighted, sight_sweeps

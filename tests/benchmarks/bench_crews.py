@@ -20,7 +20,7 @@ from models.network.process import keep_freed_memory, use_one_thread
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import full_sweeps
 from pipeline.rectify.placed import PixelGrid
-from pipeline.rectify.tiles import plan_tiles
+from pipeline.rectify.region import plan_tiles
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.tile_work import MosaicRecipe, write_mosaic
 from storage.parallel.block_work import run_blocks

@@ -21,8 +21,8 @@ from pipeline.geometry.mirror import (
     scene_to_direction,
 )
 from pipeline.geometry.scan import points_of_scan
-from pipeline.rectify.knot_curve import KnotCurve
-from pipeline.rectify.lookup import TieTable, tie_table, track_lookup
+from pipeline.rectify.lookup import KnotCurve, track_lookup
+from pipeline.rectify.tie_points import TieTable, tie_table
 from pipeline.rectify.tracks import Track, make_tracks
 
 CAMERA = LineCamera()

@@ -16,9 +16,9 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.budget_search import cheapest_cover, covers, spend
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps
-from pipeline.planning.fine_pass import check_budget, plan_fine, price_of_seats, prices_of
-from pipeline.planning.line_cover import Cover, Field
-from pipeline.planning.scan_runs import ScanPrices
+from pipeline.planning.fine_pass import plan_fine, price_of_seats
+from pipeline.planning.prices import ScanPrices, check_budget, prices_of
+from pipeline.planning.scan_runs import Cover, Field
 from pipeline.planning.strips import Views, look_from, strips_at_seats
 
 CAMERA, COST = LineCamera(), CostModel()

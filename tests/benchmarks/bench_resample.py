@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from resample_engines import ENGINES
 from resample_peers import BANDS, Peer, Turned, cv2_parts, peers, spline, turned_waves
 
-from pipeline.rectify.kernels import windows
-from pipeline.rectify.resample import Kernel, resample
+from pipeline.rectify.kernels import Kernel, windows
+from pipeline.rectify.resample import resample
 
 KERNELS: dict[Kernel, tuple[int, str]] = {
     "nearest": (0, "nearest"),

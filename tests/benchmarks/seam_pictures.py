@@ -10,9 +10,10 @@ from measure import data_folder
 from numpy.typing import NDArray
 from scipy.ndimage import shift as spline_shift
 
+from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.registration.shifts import pair_shift
-from pipeline.rectify.resample import Kernel, resample
+from pipeline.rectify.resample import resample
 
 Floats = NDArray[np.float64]
 

@@ -27,7 +27,8 @@ from numpy.typing import NDArray  # noqa: E402
 from seam_pictures import CUT_LEFT, CUT_RIGHT, RGBN, cut_and_join, given_neighbours, join_neighbours  # noqa: E402
 from seam_survey import Survey, left_again, line_errors, make_survey, seam_offsets  # noqa: E402
 
-from pipeline.rectify.region import PixelGrid, mosaic_tile, place  # noqa: E402
+from pipeline.rectify.placed import PixelGrid, place  # noqa: E402
+from pipeline.rectify.region import mosaic_tile  # noqa: E402
 from pipeline.rectify.registration.alignment import SweepShift  # noqa: E402
 
 Image = NDArray[np.float32]

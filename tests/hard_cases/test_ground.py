@@ -32,7 +32,8 @@ def test_nadir_has_no_heading_of_its_own_but_keeps_the_rigs():
     rig = view(tilt_deg=90.0, heading_deg=70.0)
     up = rig.scene_to_ground([-1000, 0])
     assert np.rad2deg(np.arctan2(up[0], up[1])) == pytest.approx(70.0)
-    assert rig.footprint_m([0, 0]) == pytest.approx([12 * IFOV] * 2)
+    ends = rig.scene_to_ground([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]])
+    assert np.linalg.norm(ends[1::2] - ends[::2], axis=1) == pytest.approx([12 * IFOV] * 2)
     assert rig.ground_to_scene(rig.scene_to_ground([0, 0])) == pytest.approx([0, 0], abs=1e-9)
 
 

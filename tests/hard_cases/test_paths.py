@@ -9,9 +9,10 @@ from pipeline.errors import PoseError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_position, scene_to_direction
 from pipeline.geometry.scan import points_of_scan
-from pipeline.rectify.line_numbers import number_lines, positions_at
-from pipeline.rectify.lookup import grid_lookup, lookup, tie_table, track_lookup
+from pipeline.rectify.line_numbers import number_lines
+from pipeline.rectify.lookup import grid_points, lookup, track_lookup
 from pipeline.rectify.resample import merge_lines, resample
+from pipeline.rectify.tie_points import tie_table
 from pipeline.rectify.tracks import Track, make_tracks
 
 CAMERA = LineCamera()
@@ -157,7 +158,7 @@ def test_equal_and_backward_time_stamps_cost_their_own_lines() -> None:
     numbers = number_lines(stamps, 0.1)
     np.testing.assert_array_equal(np.flatnonzero(~numbers.usable), [21, 41])
     assert (numbers.repeated, numbers.backward, numbers.lost, numbers.late) == (1, 1, 0, 0)
-    position = positions_at(np.where(numbers.usable, stamps, np.nan), time, aim(np.arange(50.0)))
+    position = aim(np.interp(stamps, time, np.arange(50.0)))
     (track,) = make_tracks(position, CAMERA, usable=numbers.usable)
     assert track.uniform
     np.testing.assert_array_equal(track.lines, np.flatnonzero(numbers.usable))
@@ -165,10 +166,10 @@ def test_equal_and_backward_time_stamps_cost_their_own_lines() -> None:
 
 def test_late_line_is_used_where_the_mirror_was() -> None:
     """A frame 0.4 periods late is used at its own place, not at its number's."""
-    command, stamps = np.arange(60.0), np.arange(60.0)
+    stamps = np.arange(60.0)
     stamps[30] += 0.4
     assert number_lines(stamps, 1.0).late == 1
-    (track,) = make_tracks(positions_at(stamps[:-1], command, aim(command)), CAMERA)
+    (track,) = make_tracks(aim(stamps[:-1]), CAMERA)
     points = points_between(3, 55)
     np.testing.assert_allclose(seen_through(track, captured(stamps), points), wave(*points.T), atol=2e-3)
 
@@ -179,7 +180,7 @@ def test_grid_outside_the_swath_is_nan() -> None:
     (track,) = make_tracks(position, CAMERA)
     for origin in ((0.0, 3100.0), (400.0, 2600.0), (-9000.0, -9000.0), (9000.0, 20_000.0)):
         grid = {"origin_px": origin, "spacing_px": 1.0, "shape": (40, 50)}
-        assert np.isnan(grid_lookup(position, CAMERA, along="x", binning=1, **grid)).all()  # type: ignore[arg-type]
+        assert np.isnan(lookup(position, CAMERA, grid_points(**grid), along="x")).all()  # type: ignore[arg-type]
         table = tie_table(track, CAMERA, along="x", **grid)  # type: ignore[arg-type]
         assert np.isnan(table.coordinates(slice(None), slice(None))).all()
 

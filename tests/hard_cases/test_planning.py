@@ -8,8 +8,7 @@ import pytest
 from pipeline.errors import PoseError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel, Sweep
-from pipeline.geometry.vector_memory import memory_loads
+from pipeline.geometry.scan import CostModel, Sweep, memory_loads
 from pipeline.planning.coverage import check_reach, full_sweeps
 from pipeline.planning.fine_pass import plan_fine, price_of_seats
 

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import ArchiveError, IncompleteStoreError, PipelineError, RigError, SceneError
-from pipeline.visible_text import is_visible, visible
+from pipeline.errors import ArchiveError, IncompleteStoreError, PipelineError, RigError, SceneError, is_visible, visible
 
 anything = st.text(st.characters())  # surrogates included
 

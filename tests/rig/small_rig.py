@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mounting import STRAIGHT, Mounting
+from pipeline.geometry.mirror import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import Kept, KeptInMemory
 from pipeline.rig.capture.capture_runner import RigDevices

@@ -36,7 +36,7 @@ from models.policies.policies import score_seats
 from models.reading.inference import CoarseLook, Glance, glance_of_columns, segment
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.planning.fine_pass import price_of_seats
-from pipeline.planning.savings import count_lines
+from pipeline.planning.prices import count_lines
 from pipeline.planning.selection import frame_seats
 from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.simulated import SimulatedSource

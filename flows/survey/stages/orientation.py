@@ -9,8 +9,7 @@ from typing import Any
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from flows.survey.stages.attention import load_plan
-from pipeline.planning.crop_rows import find_rows
-from pipeline.planning.orientation import compare_orientations
+from pipeline.planning.orientation import compare_orientations, find_rows
 from storage.archive.archive import StageRef
 from storage.archive.stored_tables import read_table, write_table
 from storage.arrays.attention import load_attention

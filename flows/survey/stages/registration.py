@@ -18,10 +18,9 @@ from flows.survey.stage import Product, Wanted, stage
 from flows.survey.stages.capture import captured
 from pipeline.rectify.placed import Placed
 from pipeline.rectify.registration.alignment import SweepShift
-from pipeline.rectify.registration.anchoring import Anchor, anchor_sweep
 from pipeline.rectify.registration.illumination import overlap_light, solve_lights
 from pipeline.rectify.registration.overlaps import BroadSweep, broad_bands
-from pipeline.rectify.registration.seams import Registration, SeamWindow, register_sweeps
+from pipeline.rectify.registration.seams import Anchor, Registration, SeamWindow, anchor_sweep, register_sweeps
 from storage.archive.archive import StageRef
 from storage.archive.stored_tables import read_table, write_table
 from storage.arrays.located_sweeps import Sighted, sight_sweeps

@@ -1,4 +1,4 @@
-"""What the frames say of the detector: elements not to be believed, and how evenly the columns respond."""
+"""What the frames say of the detector: elements that are not to be believed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, signal
+from scipy import ndimage
 
 from pipeline.errors import RigError, ShapeError
 
@@ -16,7 +16,6 @@ Bools = NDArray[np.bool_]
 TO_SIGMA = 1.4826  # of a normal distribution, from the median absolute deviation
 LEAST_NOISE_DN = 1.0  # dark frames are whole numbers: below one step a spread means nothing
 BANDS_FOR_COLUMN = 8  # fewer cannot tell an odd element from an odd column
-STRAY_SIGMAS = 4.0
 
 
 @dataclass(frozen=True)
@@ -41,37 +40,26 @@ def find_bad_elements(
     criteria: BadElementCriteria | None = None,
     saturated_dn: float | None = None,
 ) -> Bools:
-    """Find elements of the detector that are not to be believed.
+    """Find elements (sample, band) of the detector that are not to be believed, from mean dark and white frames [DN].
 
-    One is bad if a frame is not finite there, the white frame is saturated, its dark level stands out of its band's
-    (hot), it hardly responds although its neighbours do (dead), or its response stands out of its neighbours' in the
-    band by more than its column does in most bands (odd). Dust on the slit darkens a column in all bands and is no
-    fault, the white frame takes it off; nor is a slope, as at the slit's ends. Where the neighbours see no light
-    nothing is said of the response.
+    One is bad if a frame is not finite there, the white frame is saturated (at ``saturated_dn`` or more), its dark
+    level stands out of its band's (hot), it hardly responds although its neighbours do (dead), or its response stands
+    out of its neighbours' in the band by more than its column does in most bands (odd). Dust on the slit darkens a
+    column in all bands and is no fault, the white frame takes it off; nor is a slope, as at the slit's ends. Where the
+    neighbours see no light nothing is said of the response.
 
     Spreads are medians of absolute deviations. Fewer samples than ``criteria.near`` cannot tell what is odd, and one
     sample can be compared with nothing: there only what is not finite or saturated is bad.
 
-    Parameters
-    ----------
-    dark, white
-        (sample, band) mean frames. [DN]
-    criteria
-        Thresholds; the defaults where none are given.
-    saturated_dn
-        Least DN of a saturated white frame; None where it is known not to be.
-
-    Returns
-    -------
-    (sample, band) bool.
-
-    Raises
-    ------
-    ShapeError : the frames are not (sample, band), or not of one size.
-    RigError : more elements than ``criteria.most``, and than one column, would be bad.
+    Raises ShapeError: the frames are not (sample, band), or not of one size.
+    Raises RigError: more elements than ``criteria.most``, and than one column, would be bad.
     """
     limits = BadElementCriteria() if criteria is None else criteria
-    low, high = _frame_pair(dark, white)
+    if dark.ndim != 2 or dark.shape != white.shape:
+        raise ShapeError(
+            f"expected dark and white frames (sample, band) of one size, got {dark.shape} and {white.shape}"
+        )
+    low, high = np.asarray(dark, np.float64), np.asarray(white, np.float64)
     bad = ~(np.isfinite(low) & np.isfinite(high))
     if saturated_dn is not None:
         bad |= high >= saturated_dn
@@ -90,7 +78,9 @@ def find_bad_elements(
 
 def _off_neighbours(response: Floats, noise: Floats, limits: BadElementCriteria) -> Bools:
     """Elements whose response is missing or odd beside their neighbours'."""
-    local = _local_median(response, limits.window)
+    size = min(limits.window, len(response))
+    around = (max(size - 1 + size % 2, 1), 1)  # an odd number of samples
+    local: Floats = ndimage.median_filter(_without_gaps(response), around, mode="reflect")
     least = np.maximum(limits.lit_sigmas * noise, limits.lit_share * _median(response, axis=0))
     judged = np.isfinite(response) & (local > least)
     relative = np.full(response.shape, np.nan)
@@ -100,130 +90,19 @@ def _off_neighbours(response: Floats, noise: Floats, limits: BadElementCriteria)
     if response.shape[1] >= BANDS_FOR_COLUMN:
         off -= _median(off, axis=1)
     spread = TO_SIGMA * _median(np.abs(off), axis=0)
-    odd = (np.abs(off) > limits.odd_sigmas * spread) & _beyond_nearest(response, limits)
-    return dead | odd
-
-
-def _beyond_nearest(response: Floats, limits: BadElementCriteria) -> Bools:
-    """Elements above or below their nearest neighbours; two that stand out side by side do not hide each other."""
     if len(response) < limits.near:
-        return np.zeros(response.shape, np.bool_)
+        return dead
+    # Beyond the nearest neighbours as well; two that stand out side by side do not hide each other.
     filled = _without_gaps(response)
     low, high = (ndimage.rank_filter(filled, rank, (limits.near, 1), mode="reflect") for rank in (2, -3))
-    beyond: Bools = (response < low * (1 - limits.odd_share)) | (response > high * (1 + limits.odd_share))
-    return beyond
-
-
-def flat_from_white(
-    dark: NDArray[np.floating], white: NDArray[np.floating], *, window: int = 41
-) -> NDArray[np.float32]:
-    """Take the columns' relative response from a white frame whose light is smooth along the slit.
-
-    For references whose white frame is the smooth part alone (a lamp that does not light the slit as the sun does):
-    calibration divides by white and flat alike, so a white frame as it was taken needs no flat.
-
-    Parameters
-    ----------
-    dark, white
-        (sample, band) mean frames. [DN]
-    window
-        Samples over which the light counts as smooth: what is wider stays in it, what is narrower is response.
-
-    Returns
-    -------
-    (sample, band) float32 of mean 1 in each band; 1 where the response is not known.
-
-    Raises
-    ------
-    ShapeError : the frames are not (sample, band), or not of one size.
-    """
-    low, high = _frame_pair(dark, white)
-    response = high - low
-    with np.errstate(invalid="ignore", divide="ignore"):
-        logs = np.where(response > 0, np.log(response), np.nan)
-    return _as_flat(logs - _smooth(logs, window))
-
-
-def flat_from_lines(
-    values: NDArray[np.floating], *, valid: Bools | None = None, window: int = 41
-) -> NDArray[np.float32]:
-    """Take the columns' relative response from many calibrated lines of a scene: what stripes them.
-
-    The ratio of neighbouring columns is the median over the lines, which edges of the scene leave alone, since few
-    lines have one at a given sample; the ratios are chained along the slit and their smooth part is taken off. Things
-    that run along the scan for most of the lines, such as crop rows, look just like stripes: take lines of several
-    strips, or rows across.
-
-    Parameters
-    ----------
-    values
-        (line, sample, band) scene values; what is not finite or not above 0 does not count.
-    valid
-        (line, sample) or (line, sample, band) of what may be used.
-    window
-        As of :func:`flat_from_white`.
-
-    Returns
-    -------
-    (sample, band) float32 of mean 1 in each band, to divide by; 1 where no line says anything.
-
-    Raises
-    ------
-    ShapeError : the lines are not (line, sample, band), or ``valid`` is of another size.
-    """
-    if values.ndim != 3 or (valid is not None and valid.shape != values.shape[: valid.ndim]):
-        sizes = f"{values.shape}" if valid is None else f"{values.shape} and valid {valid.shape}"
-        raise ShapeError(f"expected lines (line, sample, band) and what is valid of them, got {sizes}")
-    chained = np.full(values.shape[1:], np.nan)
-    for band in range(values.shape[2]):
-        usable = values[..., band] > 0
-        if valid is not None:
-            usable &= valid if valid.ndim == 2 else valid[..., band]
-        logs = np.log(values[..., band], out=np.full(usable.shape, np.nan), where=usable)
-        steps = _median(np.diff(logs, axis=1), axis=0)[0]
-        known = np.isfinite(logs).any(axis=0)
-        chained[:, band] = np.where(known, np.concatenate([[0.0], np.cumsum(np.nan_to_num(steps))]), np.nan)
-    return _as_flat(chained - _smooth(chained, window))
-
-
-def _as_flat(logs: Floats) -> NDArray[np.float32]:
-    """Relative response of mean 1 in each band, from its logarithm; 1 where it is not known."""
-    response = np.exp(logs)
-    known = np.isfinite(response)
-    mean = np.sum(response, axis=0, where=known) / np.maximum(np.count_nonzero(known, axis=0), 1)
-    flat: NDArray[np.float32] = np.where(known, response / np.where(mean > 0, mean, 1), 1).astype(np.float32)
-    return flat
-
-
-def _smooth(columns: Floats, window: int) -> Floats:
-    """The part of (sample, band) that is smooth along the samples; strays and gaps count as their neighbours."""
-    samples = len(columns)
-    local = _local_median(columns, min(window, 9))
-    off = columns - local
-    spread = TO_SIGMA * _median(np.abs(off), axis=0)
-    kept = np.where(np.abs(off) <= STRAY_SIGMAS * spread, columns, local)
-    filled = _without_gaps(kept)
-    size = _odd(min(window, samples))
-    if size < 5:
-        return np.broadcast_to(_median(filled, axis=0), columns.shape)
-    smooth: Floats = signal.savgol_filter(filled, size, 2, axis=0, mode="interp")
-    return smooth
-
-
-def _local_median(columns: Floats, window: int) -> Floats:
-    """Running median along the samples, mirrored at the ends; a gap takes the median of its band."""
-    size = _odd(min(window, len(columns)))
-    local: Floats = ndimage.median_filter(_without_gaps(columns), (size, 1), mode="reflect")
-    return local
+    beyond = (response < low * (1 - limits.odd_share)) | (response > high * (1 + limits.odd_share))
+    odd: Bools = (np.abs(off) > limits.odd_sigmas * spread) & beyond
+    return dead | odd
 
 
 def _without_gaps(columns: Floats) -> Floats:
     """Gaps take the median of their band, a band that is one gap takes 0."""
     return np.where(np.isfinite(columns), columns, np.nan_to_num(_median(columns, axis=0)))
-
-
-def _odd(size: int) -> int:
-    return max(size - 1 + size % 2, 1)
 
 
 def _median(values: Floats, axis: int) -> Floats:
@@ -235,11 +114,3 @@ def _median(values: Floats, axis: int) -> Floats:
     low = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis)
     middle: Floats = (low + np.take_along_axis(ordered, np.minimum(count // 2, values.shape[axis] - 1), axis)) / 2
     return np.where(count > 0, middle, np.nan)
-
-
-def _frame_pair(dark: NDArray[np.floating], white: NDArray[np.floating]) -> tuple[Floats, Floats]:
-    if dark.ndim != 2 or dark.shape != white.shape:
-        raise ShapeError(
-            f"expected dark and white frames (sample, band) of one size, got {dark.shape} and {white.shape}"
-        )
-    return np.asarray(dark, np.float64), np.asarray(white, np.float64)

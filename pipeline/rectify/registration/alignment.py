@@ -70,37 +70,27 @@ def no_shifts(names: Sequence[str]) -> tuple[SweepShift, ...]:
 def solve_sweeps(
     windows: Sequence[WindowShift], names: Sequence[str], lines: Sequence[int], *, reference: int | None = None
 ) -> SweepShifts:
-    """Find the offset and drift of every sweep from the shifts of all windows.
+    """Find the offset and drift of every sweep, given by name and lines, from the shifts of accepted windows.
 
     Least squares, each window weighted by its error and none pulling harder than twice that error would (soft L1);
     those that are then still off by ten times their error are left out, and the rest is solved again. Overlaps see
-    differences only: the reference sweep is held.
+    differences only: the ``reference`` sweep is held, by default the middle one of those with the most windows. Sweeps
+    in no window stay at 0; those joined to each other but not to the reference stay at 0 on average. Both are named as
+    untied.
 
-    Parameters
-    ----------
-    windows
-        Accepted windows alone.
-    names, lines
-        Of every sweep: its name and number of lines.
-    reference
-        Number of the sweep that stays; by default the middle one of those with the most windows.
-
-    Returns
-    -------
-    Sweeps in no window stay at 0. Those joined to each other but not to the reference stay at 0 on average. Both are
-    named as untied.
-
-    Raises
-    ------
-    SettingsError : the reference is no sweep.
-    ShapeError : a window names a sweep that is not there.
+    Raises SettingsError: the reference is no sweep.
+    Raises ShapeError: a window names a sweep that is not there.
     """
     if len(names) != len(lines):
         raise ShapeError(f"expected a number of lines for each of {len(names)} sweeps, got {len(lines)}")
     for window in windows:
         if not {window.reference, window.moving} <= set(range(len(names))):
             raise ShapeError(f"a window joins sweeps {window.reference} and {window.moving}; there are {len(names)}")
-    held = _most_joined(windows, len(names)) if reference is None else reference
+    held = reference
+    if held is None:  # the first of the largest groups that windows join, and of it the middle one
+        groups = [sorted(tied_to(windows, sweep, len(names))) for sweep in range(len(names))]
+        largest = max(groups, key=len, default=[0])
+        held = largest[len(largest) // 2]
     if names and not 0 <= held < len(names):
         raise SettingsError(f"the reference must be one of the sweeps 0 to {len(names) - 1}, got {held}")
     joined = tied_to(windows, held, len(names))
@@ -109,7 +99,7 @@ def solve_sweeps(
         return SweepShifts(no_shifts(names), np.empty((0, 2)), held, untied)
     system, measured = _equations(windows, lines)
     system[:, 4 * held : 4 * held + 4] = 0
-    error = np.concatenate([_errors(window) for window in windows])
+    error = np.concatenate([np.hypot(window.error_px, ERROR_FLOOR_PX) for window in windows])
     answer = _robust(system, measured, error)
     wrong = np.abs((measured - system @ answer) / error).reshape(-1, 2).max(axis=1) > WRONG_ERRORS
     if wrong.any():
@@ -136,13 +126,6 @@ def tied_to(windows: Sequence[WindowShift], sweep: int, sweeps: int) -> frozense
     return frozenset(joined & set(range(sweeps)))
 
 
-def _most_joined(windows: Sequence[WindowShift], sweeps: int) -> int:
-    """The sweep nearest to the middle of the largest group that windows join."""
-    groups = [sorted(tied_to(windows, sweep, sweeps)) for sweep in range(sweeps)]
-    largest = max(groups, key=len, default=[0])  # the first of equals
-    return largest[len(largest) // 2]
-
-
 def _equations(windows: Sequence[WindowShift], lines: Sequence[int]) -> tuple[Floats, Floats]:
     """Two rows per window over four columns per sweep (offset, drift in px at the sweep's end), and what was seen."""
     system = np.zeros((2 * len(windows), 4 * len(lines)))
@@ -152,10 +135,6 @@ def _equations(windows: Sequence[WindowShift], lines: Sequence[int]) -> tuple[Fl
             signed = (2 * side - 1) * window.turn[side]
             system[2 * row : 2 * row + 2, 4 * sweep : 4 * sweep + 4] += np.hstack([signed, place * signed])
     return system, np.concatenate([window.shift for window in windows])
-
-
-def _errors(window: WindowShift) -> Floats:
-    return np.hypot(window.error_px, ERROR_FLOOR_PX)
 
 
 def _half(lines: int) -> float:

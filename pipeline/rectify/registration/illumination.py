@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SettingsError, ShapeError
+from pipeline.errors import ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.placed import PixelGrid, Placed
 from pipeline.rectify.region import mosaic_tile
@@ -52,21 +52,12 @@ class SweepLights:
 def light_ratio(
     reference_values: NDArray[np.floating], moving_values: NDArray[np.floating], *, pair: tuple[int, int]
 ) -> LightRatio:
-    """Compare two sweeps over the same points.
+    """Compare a ``pair`` of sweeps over the same points: calibrated values (group, point, band), NaN where not seen.
 
     The points come in groups (squares of pixels). The ratio is the median over groups of the ratio of their sums: sums
     first, so that noise has no say in the sign of a pixel; the median, so that what moved between the sweeps has none.
 
-    Parameters
-    ----------
-    reference_values, moving_values
-        (group, point, band) calibrated values; NaN where not seen.
-    pair
-        Numbers of the two sweeps.
-
-    Raises
-    ------
-    ShapeError : the two differ in shape or are not (group, point, band).
+    Raises ShapeError: the two differ in shape or are not (group, point, band).
     """
     if reference_values.ndim != 3 or reference_values.shape != moving_values.shape:
         raise ShapeError(
@@ -88,29 +79,15 @@ def light_ratio(
     return LightRatio(*pair, ratio, error)
 
 
-def solve_lights(
-    ratios: Sequence[LightRatio], sweeps: int, wavelength_nm: Floats, *, order: int = ORDER
-) -> SweepLights:
-    """Find the light of every sweep from the ratios of all pairs.
+def solve_lights(ratios: Sequence[LightRatio], sweeps: int, wavelength_nm: Floats) -> SweepLights:
+    """Find the light of every sweep from the ratios of all pairs; ``wavelength_nm`` is (band,) in any order.
 
     Least squares of log ratios, each weighted by its error, with the log light of a sweep a polynomial in wavelength.
     Overlaps see ratios only: the mean log light of sweeps that they join is 0 at every wavelength.
 
-    Parameters
-    ----------
-    sweeps
-        How many there are.
-    wavelength_nm
-        (band,) in any order. [nm]
-
-    Raises
-    ------
-    SettingsError : the order is negative.
-    ShapeError : a ratio has another number of bands, or names a sweep that is not there.
+    Raises ShapeError: a ratio has another number of bands, or names a sweep that is not there.
     """
     bands = len(wavelength_nm)
-    if order < 0:
-        raise SettingsError(f"the order in wavelength must be 0 or more, got {order}")
     for ratio in ratios:
         if ratio.log_ratio.shape != (bands,) or not {ratio.reference, ratio.moving} <= set(range(sweeps)):
             raise ShapeError(
@@ -118,7 +95,10 @@ def solve_lights(
                 f"there are {sweeps} sweeps of {bands} bands"
             )
     known = [ratio for ratio in ratios if np.isfinite(ratio.log_ratio).any()]
-    basis = _basis(wavelength_nm, order)
+    low, high = float(np.min(wavelength_nm)), float(np.max(wavelength_nm))
+    span = (2 * np.asarray(wavelength_nm, np.float64) - low - high) / max(high - low, 1e-9)
+    most = len(np.unique(wavelength_nm)) - 1  # no more polynomials than there are bands
+    basis = np.polynomial.legendre.legvander(span, min(ORDER, most)).astype(np.float64)
     answer = np.zeros((sweeps, basis.shape[1]))
     if known:
         rows, wanted = zip(*(_equations(ratio, sweeps, basis) for ratio in known), strict=True)
@@ -136,22 +116,11 @@ def solve_lights(
 
 
 def overlap_light(placed: Sequence[Placed], camera: LineCamera, windows: Sequence[Window]) -> list[LightRatio]:
-    """Read both sweeps of every pair at the middle rows of their windows, and compare them band by band.
+    """Read both sweeps of every pair at the middle rows of their windows, and compare them: one ratio for every pair.
 
     A window takes 96 rows from either sweep, every pixel of them, summed in squares of 16 px: single rows, or every
     few pixels, would meet crop rows always at one place between two plants, which two sweeps do not blur alike, and
-    their ratio would pass for light.
-
-    Parameters
-    ----------
-    placed
-        Sweeps where registration has put them, without a gain.
-    windows
-        Of registration, wide enough ones.
-
-    Returns
-    -------
-    One ratio for every pair in ``windows``.
+    their ratio would pass for light. The sweeps are placed where registration has put them, without a gain.
     """
     ratios = []
     for pair in sorted({(window.reference, window.moving) for window in windows}):
@@ -182,14 +151,6 @@ def _squares(values: NDArray[np.float32], rows: int, columns: int) -> NDArray[np
     down, across, bands = values.shape[0] // rows, values.shape[1] // columns, values.shape[2]
     whole = values[: down * rows, : across * columns].reshape(down, rows, across, columns, bands)
     return whole.swapaxes(1, 2).reshape(down * across, rows * columns, bands)
-
-
-def _basis(wavelength_nm: Floats, order: int) -> Floats:
-    """Legendre polynomials over the range of the wavelengths, (band, order + 1); no more than there are bands."""
-    low, high = float(np.min(wavelength_nm)), float(np.max(wavelength_nm))
-    place = (2 * np.asarray(wavelength_nm, np.float64) - low - high) / max(high - low, 1e-9)
-    different = len(np.unique(wavelength_nm))
-    return np.polynomial.legendre.legvander(place, min(order, different - 1)).astype(np.float64)
 
 
 def _equations(ratio: LightRatio, sweeps: int, basis: Floats) -> tuple[Floats, Floats]:

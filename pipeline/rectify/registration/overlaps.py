@@ -6,7 +6,7 @@ Places are (along, scan) in px from the undeflected direction, as in ``pipeline.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.geometry.scan import Axis, Sweep, shifted_position
-from pipeline.rectify.calibration.calibrate import calibrate
+from pipeline.geometry.scan import Sweep, shifted_position
+from pipeline.rectify.calibration.calibrate import calibrate, of_bands
 from pipeline.rectify.lookup import track_lookup
 from pipeline.rectify.resample import resample
 from pipeline.rectify.tracks import Track, make_tracks
@@ -45,13 +45,10 @@ class BroadSweep:
     ) -> BroadSweep:
         """Read and calibrate a sweep's lines, 64 at a time, keeping the mean of ``bands`` bands spread over all.
 
-        Parameters
-        ----------
-        usable
-            (line,) lines whose position may be believed; None takes ``lines.valid_line``.
+        ``usable`` (line,) are lines whose position may be believed; None takes ``lines.valid_line``.
         """
         chosen = broad_bands(lines.references, bands)
-        references = _of_bands(lines.references, chosen)
+        references = of_bands(lines.references, chosen.tolist())
         total = len(lines.valid_line)
         image = np.full((total, references.dark.shape[0]), np.nan, np.float32)
         saturated = camera.full_scale_dn * lines.sweep.binning
@@ -65,17 +62,6 @@ class BroadSweep:
             whole = valid if valid.ndim == 2 else valid.all(axis=2)
             image[part] = np.where(whole & usable[part, None], values.mean(axis=2), np.nan)
         return cls(lines.sweep, position, usable, image)
-
-    def tracks(self, camera: LineCamera, shift_px: Floats | None = None) -> tuple[Track, ...]:
-        """Where the lines lie, with a correction (line, 2) of their centres."""
-        return make_tracks(
-            self.position,
-            camera,
-            usable=self.usable,
-            shift_px=shift_px,
-            binning=self.sweep.binning,
-            step_px=self.sweep.step,
-        )
 
 
 @dataclass(frozen=True)
@@ -95,29 +81,41 @@ class PlacedImage:
     @cached_property
     def tracks(self) -> tuple[tuple[Track, NDArray[np.float32]], ...]:
         """Every track with its image, (knot, sample): lines that show one place are averaged."""
-        return tuple(
-            (track, _knot_image(track, self.broad.image)) for track in self.broad.tracks(self.camera, self.shift_px)
-        )
+        broad, found = self.broad, []
+        for track in make_tracks(
+            broad.position,
+            self.camera,
+            usable=broad.usable,
+            shift_px=self.shift_px,
+            binning=broad.sweep.binning,
+            step_px=broad.sweep.step,
+        ):
+            values: NDArray[np.float32] = broad.image[track.lines]
+            if len(track.starts) < len(track.lines):
+                count = np.diff(track.starts, append=len(track.lines))
+                values = (np.add.reduceat(values, track.starts, axis=0) / count[:, None]).astype(np.float32)
+            found.append((track, np.where(track.seen[:, None], values, np.float32(np.nan))))
+        return tuple(found)
 
     def seen_at(self, along_px: Floats, scan_px: Floats) -> NDArray[np.float32]:
         """Rectify a window, (scan, along) float32; NaN where nothing was seen."""
-        points = _points(along_px, scan_px, self.broad.sweep.along)
-        seen = np.full(len(points), np.nan, np.float32)
-        for track, image in self.tracks:
-            at = track_lookup(
-                track, self.camera, points, along=self.broad.sweep.along, binning=self.broad.sweep.binning
-            )
+        seen = np.full(len(scan_px) * len(along_px), np.nan, np.float32)
+        for _, image, at in self._lookups(along_px, scan_px):
             values, _ = resample(image[..., None], np.isfinite(image), at)
             seen = np.where(np.isnan(seen), values[:, 0], seen)
         return seen.reshape(len(scan_px), len(along_px))
 
+    def _lookups(self, along_px: Floats, scan_px: Floats) -> Iterator[tuple[Track, NDArray[np.float32], Floats]]:
+        """Every track, its image, and the knot and sample at which it saw the places of a window, row by row."""
+        sweep = self.broad.sweep
+        scan, line = (values.ravel() for values in np.meshgrid(scan_px, along_px, indexing="ij"))
+        points = np.stack([scan, line] if sweep.along == "x" else [line, scan], axis=-1)
+        for track, image in self.tracks:
+            yield track, image, track_lookup(track, self.camera, points, along=sweep.along, binning=sweep.binning)
+
     def line_and_turn(self, along_px: float, scan_px: float) -> tuple[float, Floats] | None:
         """The line that sees a place, and how the place moves with that line's centre, (2, 2); None off the sweep."""
-        points = _points(np.array([along_px]), np.array([scan_px]), self.broad.sweep.along)
-        for track, _ in self.tracks:
-            (at,) = track_lookup(
-                track, self.camera, points, along=self.broad.sweep.along, binning=self.broad.sweep.binning
-            )
+        for track, _, (at,) in self._lookups(np.array([along_px]), np.array([scan_px])):
             if np.isfinite(at).all():
                 line = int(track.lines[track.starts[int(np.clip(np.rint(at[0]), 0, len(track.scan) - 1))]])
                 return float(line), self._turn(line, float(at[1]))
@@ -200,21 +198,6 @@ def _pair_windows(images: Sequence[PlacedImage], one: int, other: int, window_px
             yield Window(one, other, (left, right), (start, stop))
 
 
-def _points(along_px: Floats, scan_px: Floats, along: Axis) -> Floats:
-    """Places of a window row by row, (n, 2) y and x [px]."""
-    scan, line = (values.ravel() for values in np.meshgrid(scan_px, along_px, indexing="ij"))
-    points: Floats = np.stack([scan, line] if along == "x" else [line, scan], axis=-1)
-    return points
-
-
-def _knot_image(track: Track, image: NDArray[np.float32]) -> NDArray[np.float32]:
-    values: NDArray[np.float32] = image[track.lines]
-    count = np.diff(track.starts, append=len(track.lines))
-    if len(track.starts) < len(track.lines):
-        values = (np.add.reduceat(values, track.starts, axis=0) / count[:, None]).astype(np.float32)
-    return np.where(track.seen[:, None], values, np.float32(np.nan))
-
-
 def broad_bands(references: References, bands: int = BROAD_BANDS) -> NDArray[np.intp]:
     """Choose the bands of a broad-band image: spread over those that nine samples in ten are calibrated in."""
     good = references.white > references.dark
@@ -224,15 +207,3 @@ def broad_bands(references: References, bands: int = BROAD_BANDS) -> NDArray[np.
     if not len(known):
         known = np.arange(len(references.panel))
     return known[np.unique(np.linspace(0, len(known) - 1, max(bands, 1)).round().astype(np.intp))]
-
-
-def _of_bands(references: References, chosen: NDArray[np.intp]) -> References:
-    bad, flat = references.bad, references.flat
-    return replace(
-        references,
-        dark=references.dark[:, chosen],
-        white=references.white[:, chosen],
-        panel=references.panel[chosen],
-        bad=None if bad is None else bad[:, chosen],
-        flat=None if flat is None else flat[:, chosen],
-    )

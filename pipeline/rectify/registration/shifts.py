@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError, ShapeError
-from pipeline.rectify.resample import kernel_taps
+from pipeline.rectify.kernels import kernel_taps
 
 Status = Literal["found", "undecidable", "flat", "empty"]
 Floats = NDArray[np.float64]
@@ -75,17 +75,11 @@ def pair_shift(reference: NDArray[np.floating], moving: NDArray[np.floating], *,
     grey values, for which the windowed phase correlation [2] is the start: on its own its window pulls the shift of
     broad texture towards the integer. The best stands only if every other leaves clearly more unexplained.
 
-    Parameters
-    ----------
-    reference, moving
-        (row, column) broad-band images on the same grid; NaN where nothing was seen. Gain and offset may differ.
-    prior_px
-        Largest shift possible in either direction. [px]
+    Both are (row, column) broad-band images on the same grid, NaN where nothing was seen; gain and offset may differ.
+    ``prior_px`` is the largest shift possible in either direction.
 
-    Raises
-    ------
-    ShapeError : not two images of one size.
-    SettingsError : the prior is negative or not finite.
+    Raises ShapeError: not two images of one size.
+    Raises SettingsError: the prior is negative or not finite.
 
     References
     ----------
@@ -94,16 +88,22 @@ def pair_shift(reference: NDArray[np.floating], moving: NDArray[np.floating], *,
     .. [2] M. Guizar-Sicairos, S. T. Thurman, J. R. Fienup, "Efficient subpixel image registration algorithms",
        Opt. Lett., 2008. doi:10.1364/OL.33.000156
     """
-    _check(reference, moving, prior_px)
+    if reference.ndim != 2 or reference.shape != moving.shape or not reference.size:
+        raise ShapeError(
+            f"expected two images (row, column) of one grid, got {reference.shape} and {moving.shape}; "
+            "cut both from the same window"
+        )
+    if not (np.isfinite(prior_px) and prior_px >= 0):
+        raise SettingsError(f"the prior of a shift must be finite and not negative, got {prior_px} px")
     first, second = _standardised(reference), _standardised(moving)
     if first is None or second is None:
         none_seen = not (np.isfinite(reference).any() and np.isfinite(moving).any())
-        return _nothing("empty" if none_seen else "flat")
+        return nothing_found("empty" if none_seen else "flat")
     correlation, common = _correlate(first, second, int(np.ceil(prior_px)) + 1)
     if common.max() < 1:
-        return _nothing("empty")
+        return nothing_found("empty")
     fits = [fit for integer in _candidates(correlation) if (fit := _refine(first, second, integer)) is not None]
-    found = _judge(sorted(fits, key=lambda fit: fit.misfit), prior_px) if fits else _nothing("undecidable")
+    found = _judge(sorted(fits, key=lambda fit: fit.misfit), prior_px) if fits else nothing_found("undecidable")
     if found.status == "undecidable" and not (_is_textured(first) and _is_textured(second)):
         return replace(found, status="flat")
     return found
@@ -132,18 +132,9 @@ def _judge(fits: list[_Fit], prior_px: float) -> PairShift:
     )
 
 
-def _check(reference: NDArray[np.floating], moving: NDArray[np.floating], prior_px: float) -> None:
-    if reference.ndim != 2 or reference.shape != moving.shape or not reference.size:
-        raise ShapeError(
-            f"expected two images (row, column) of one grid, got {reference.shape} and {moving.shape}; "
-            "cut both from the same window"
-        )
-    if not (np.isfinite(prior_px) and prior_px >= 0):
-        raise SettingsError(f"the prior of a shift must be finite and not negative, got {prior_px} px")
-
-
-def _nothing(status: Status, pixels: int = 0) -> PairShift:
-    return PairShift(status, np.full(2, np.nan), np.full(2, np.nan), pixels=pixels)
+def nothing_found(status: Status) -> PairShift:
+    """Give what a comparison without a result says."""
+    return PairShift(status, np.full(2, np.nan), np.full(2, np.nan))
 
 
 def _standardised(image: NDArray[np.floating]) -> Floats | None:
@@ -155,8 +146,7 @@ def _standardised(image: NDArray[np.floating]) -> Floats | None:
     mean, spread = float(np.nanmean(values)), float(np.nanstd(values))
     if spread <= FLAT_SPREAD * abs(mean) or spread == 0:
         return None
-    standard: Floats = (values - mean) / spread
-    return standard
+    return (values - mean) / spread
 
 
 def _is_textured(image: Floats) -> bool:
@@ -219,7 +209,9 @@ def _refine(first: Floats, second: Floats, integer: NDArray[np.intp]) -> _Fit | 
     from scipy.ndimage import minimum_filter
 
     for _ in range(REALIGNMENTS):
-        one, other = _crops(first, second, integer)
+        moves = list(zip(first.shape, integer.tolist(), strict=True))
+        one = first[tuple(slice(max(move, 0), max(size + min(move, 0), 0)) for size, move in moves)]
+        other = second[tuple(slice(max(-move, 0), max(size + min(-move, 0), 0)) for size, move in moves)]
         both = np.isfinite(one) & np.isfinite(other)
         kept = minimum_filter(both, 2 * BORDER_PX + 1, mode="constant", cval=False)
         if kept.sum() < LEAST_SIDE_PX**2 / 4:
@@ -232,15 +224,6 @@ def _refine(first: Floats, second: Floats, integer: NDArray[np.intp]) -> _Fit | 
             return replace(fit, shift=integer + fit.shift)
         integer = integer + np.rint(fit.shift).astype(np.intp)
     return None
-
-
-def _crops(first: Floats, second: Floats, integer: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Common area of both images once ``second`` is moved by an integer shift."""
-    here, there = [], []
-    for size, move in zip(first.shape, integer.tolist(), strict=True):
-        here.append(slice(max(move, 0), max(size + min(move, 0), 0)))
-        there.append(slice(max(-move, 0), max(size + min(-move, 0), 0)))
-    return first[tuple(here)], second[tuple(there)]
 
 
 def _phase_shift(one: Floats, other: Floats) -> Floats:

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Axis, Sweep, line_positions, sweep_positions
-from pipeline.geometry.vector_memory import memory_loads
+from pipeline.geometry.scan import Axis, Sweep, line_positions, memory_loads, sweep_positions
 from pipeline.rig.camera.camera_cubes import CapturedLines
 from pipeline.rig.capture.clock_fit import FrameTimes
 from pipeline.rig.capture.line_positions import (

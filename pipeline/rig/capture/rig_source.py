@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import RigError
 from pipeline.geometry.camera import LineCamera, bin_samples
-from pipeline.geometry.mounting import STRAIGHT
+from pipeline.geometry.mirror import STRAIGHT
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_cubes import as_references
 from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept

@@ -23,8 +23,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.mirror import direction_to_scene, position_to_direction
-from pipeline.geometry.mounting import STRAIGHT, Mounting
+from pipeline.geometry.mirror import STRAIGHT, Mounting, direction_to_scene, position_to_direction
 from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.capture.capture_paths import REFERENCES, Announced, announced
 from pipeline.rig.device_settings import Pulses

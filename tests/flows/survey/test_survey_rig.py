@@ -30,7 +30,7 @@ from flows.survey.run import make_source, open_run
 from flows.survey.scene import open_scene
 from flows.survey.stages.effects import chosen_effects
 from pipeline.errors import PoseError, SettingsError
-from pipeline.geometry.mounting import STRAIGHT, Mounting
+from pipeline.geometry.mirror import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_cubes import mean_frame
 from pipeline.rig.capture.capture_paths import REFERENCES

@@ -20,7 +20,7 @@ from flows.publish.pages import render_markdown
 from flows.schedule.field_history import FieldHistory
 from flows.schedule.history_page import render_history, render_index
 from flows.terminal.shown_text import Terminal
-from pipeline.visible_text import is_visible
+from pipeline.errors import is_visible
 from storage.archive.whole_files import to_json
 
 HOSTILE = "field\x1b]0;owned\x07\x1b[2J\u202egnp.map\x9b31m\u2028\udcff"

@@ -11,7 +11,7 @@ from torch import Tensor
 from models.network.spectral import SpectralBasis
 from models.training.examples import CropSampler, Example, Observation, measured_normalisation, normalised, observe
 from pipeline.errors import SceneError
-from pipeline.geometry.camera import LineCamera, look
+from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.scenes.scene import RasterScene, SceneRaster
@@ -39,7 +39,7 @@ def test_both_looks_are_the_cameras_own():
     seen, (matrix, _) = _observed(scene, bright), SpectralBasis.spanning(NM).matrix(NM)
     light, scale = scene.planes * scene.electrons, scene.panel / scene.panel_electrons
     for step, columns in ((1, seen.fine), (2, seen.coarse)):
-        expected = (look(light, bright, step=step, rng=None) * scale) @ matrix
+        expected = (expose(footprint(light, bright), bright, step=step, rng=None) * scale) @ matrix
         assert columns == pytest.approx(expected, abs=3e-3)
 
 

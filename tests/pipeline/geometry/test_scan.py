@@ -1,19 +1,24 @@
-"""Scan paths: closed forms against the mirror's own chain, positions and prices."""
+"""Scan paths: closed forms against the mirror's own chain, positions, prices, and loads of the mirror's memory."""
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import PoseError
+from pipeline.errors import PoseError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import (
     CostModel,
     Sweep,
+    count_loads,
+    device_range,
     line_positions,
+    memory_loads,
     points_of_scan,
     scan_of_points,
     scene_to_sweep,
@@ -91,22 +96,73 @@ def test_sweeps_out_of_reach_are_refused():
         line_positions(sweep(start_px=12_000.0), CAMERA)
 
 
-def test_settling_takes_whole_frames():
-    """Two frames of 100 ms and 5 ms of readout, beside the slew and the start."""
-    assert CostModel().setup_seconds(LineCamera(exposure_ms=100, readout_ms=5)) == pytest.approx(0.05 + 0.2 + 2 * 0.105)
-
-
 def test_price_counts_lines_setups_and_reloads():
     """Two sweeps of 1000 coarse lines hold 8000 positions: six reloads beside lines and set-ups."""
     cost = CostModel()
     path = sweep(lines=1000, step=4)
-    assert cost.setup_seconds(CAMERA) == pytest.approx(0.05 + 0.2 + 0.2)
+    assert cost.setup_seconds(LineCamera(readout_ms=5)) == pytest.approx(0.05 + 0.2 + 2 * 0.105)
     assert cost.seconds([path, path], CAMERA) == pytest.approx(200 + 2 * 0.45 + 6 * 1.6)
     assert cost.seconds([], CAMERA) == 0
 
 
-@pytest.mark.parametrize(("lines", "reloads"), [(1, 1), (1500, 1), (1501, 2), (3000, 2)])
-def test_reloads_are_due_when_the_memory_is_full(lines: int, reloads: int):
-    """1500 pairs fit one load, exactly."""
-    price = CostModel().seconds([sweep(lines=lines)], CAMERA)
-    assert price == pytest.approx(lines * 0.1 + 0.45 + reloads * 1.6)
+COST = CostModel()
+
+
+def held(lines: int, step: int = 1, name: str = "a") -> Sweep:
+    """A sweep of some lines."""
+    return Sweep(name, "fine" if step == 1 else "coarse", "x", 0.0, 0.0, lines, step)
+
+
+sweeps = st.lists(st.builds(held, st.integers(0, 40), st.integers(1, 9)), max_size=6)
+
+
+@given(sweeps, st.integers(9, 60))
+def test_loads_hold_every_line_once_in_order(given_sweeps: list[Sweep], capacity: int):
+    """Parts take the lines of all sweeps one after the other, lie end to end, and no load is too large."""
+    loads = memory_loads(given_sweeps, capacity)
+    parts = [part for load in loads for part in load.parts]
+    lines_held = [(part.sweep, line) for part in parts for line in range(*part.lines)]
+    assert lines_held == [(number, line) for number, each in enumerate(given_sweeps) for line in range(each.lines)]
+    for load in loads:
+        assert load.parts[0].pairs[0] == 0
+        assert all(one.pairs[1] == other.pairs[0] for one, other in pairwise(load.parts))
+        assert load.pairs <= capacity
+    for part in parts:
+        pairs, lines = part.pairs[1] - part.pairs[0], part.lines[1] - part.lines[0]
+        assert pairs == lines * given_sweeps[part.sweep].step
+
+
+@given(sweeps, st.integers(9, 60))
+def test_the_count_is_that_of_the_layout(given_sweeps: list[Sweep], capacity: int):
+    """Loads counted in closed form are those laid out, and every one but the last is as full as lines allow."""
+    loads = memory_loads(given_sweeps, capacity)
+    assert count_loads(given_sweeps, capacity) == len(loads)
+    for load, after in pairwise(loads):
+        assert load.pairs + given_sweeps[after.parts[0].sweep].step > capacity
+
+
+def test_channels_lie_one_behind_the_other():
+    """X and Y of a part have as many cells, Y behind all X of the load."""
+    (load,) = memory_loads([held(10), held(5)], 1500)
+    assert load.channels(load.parts[0]) == ((0, 10), (15, 25))
+    assert load.channels(load.parts[1]) == ((10, 15), (25, 30))
+
+
+@pytest.mark.parametrize(("ends", "expected"), [("exclusive", (0, 1450)), ("inclusive", (0, 1449))])
+def test_ends_are_converted_in_one_place(ends: str, expected: tuple[int, int]):
+    """Erratum E14: 1450 cells end at 1450 or at 1449, whichever the device means."""
+    assert device_range((0, 1450), ends) == expected
+
+
+@pytest.mark.parametrize("cells", [(3, 3), (5, 2), (-1, 4)])
+def test_empty_ranges_are_refused(cells: tuple[int, int]):
+    """With inclusive ends an empty range has no form at all."""
+    with pytest.raises(SettingsError, match="half-open range"):
+        device_range(cells, "inclusive")
+
+
+def test_a_line_that_no_load_holds_is_refused():
+    """More positions in a line than the memory has."""
+    for layout in (memory_loads, count_loads):
+        with pytest.raises(SettingsError, match=r"sweep wide holds 1501 positions in each line.* 1500 pairs"):
+            layout([held(1, 1501, "wide")], 1500)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -22,16 +20,10 @@ from pipeline.ground.map_grid import (
     median_sink,
     round_step,
 )
-from pipeline.ground.view import GroundView, RigPose, pixel_places
+from pipeline.ground.view import pixel_places
+from tests.pipeline.ground.test_ground import view
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
-IFOV = 7.4e-3 / 70
-
-
-def view(**changes: Any) -> GroundView:
-    """A rig 12 m up that looks down at 40 deg, or as changed."""
-    given = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 30.0, "tilt_deg": 40.0, "height_m": 12.0}
-    return GroundView(RigPose(**(given | changes)), IFOV)
 
 
 def whole(grid: GroundGrid) -> np.ndarray:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pyproj import Geod, Proj
 
 from pipeline.errors import PoseError
-from pipeline.ground.projection import MapFrame, default_epsg, map_crs
+from pipeline.ground.map_grid import MapFrame, default_epsg, map_crs
 from pipeline.ground.view import GroundView, RigPose
 
 SEMI_MAJOR_M, FLATTENING = 6378137.0, 1 / 298.257223563

@@ -55,15 +55,6 @@ def test_neighbouring_blocks_are_one_sweep():
     assert len(blocks.sweeps([blocks.blocks[0], blocks.blocks[8]])) == 2
 
 
-def test_the_width_that_shows_most_is_taken():
-    """And without seconds nothing is shown."""
-    options = [_blocks(rows) for rows in (1, 4)]
-    budget = 0.5 * options[0].seconds(options[0].blocks)
-    lines = most_shown(options, lambda blocks: blocks.evenly(budget))
-    assert len(lines.seats) == max(len(blocks.seats(blocks.evenly(budget))) for blocks in options)
-    assert not len(most_shown(options, lambda blocks: blocks.evenly(0.0)).seats)
-
-
 def test_wide_blocks_are_tried_where_they_show_more():
     """Lines without a model are no weaker than they can be: on a frame of 1296 x 966 px wide blocks show most."""
     grid, camera = SceneGrid(966, 1296, 32, 4), LineCamera()

@@ -12,10 +12,13 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Axis, Sweep
 from pipeline.planning.coverage import on_scene
 from pipeline.rectify.calibration.calibrate import calibrate
-from pipeline.rectify.lookup import grid_lookup
+from pipeline.rectify.kernels import Kernel
+from pipeline.rectify.lookup import grid_points, lookup
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.resample import Kernel, resample
 from pipeline.simulator.effects.registry import effects_on
+from pipeline.rectify.resample import resample
+from pipeline.simulator.instrument import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource
 
@@ -105,15 +108,9 @@ def rectified_strip(scene: Waves, strip: float, along: Axis, *, step: int, kerne
     if spoil:
         inside = on_scene(scene.shape, CAMERA, sweep)
         values[~inside], valid = np.nan, valid & inside
-    at = grid_lookup(
-        position,
-        CAMERA,
-        along=along,
-        binning=step,
-        origin_px=((step - scene.shape[0]) / 2, (step - scene.shape[1]) / 2),
-        spacing_px=step,
-        shape=(scene.shape[0] // step, scene.shape[1] // step),
-    ).reshape(-1, 2)
+    origin = (step - scene.shape[0]) / 2, (step - scene.shape[1]) / 2
+    points = grid_points(origin, step, (scene.shape[0] // step, scene.shape[1] // step)).reshape(-1, 2)
+    at = lookup(position, CAMERA, points, along=along, binning=step)
     return MosaicPart(*resample(values, valid, at, kernel), edge_distance(at, raw.shape[0], raw.shape[1]))
 
 
@@ -134,22 +131,20 @@ def share_of_spread(
 
 
 @pytest.mark.parametrize(
-    ("shape", "along", "strips"),
-    [((120, 900), "x", [-200, 200]), ((900, 120), "y", [-200, 200]), ((40, 1800), "x", [-620, 0, 620])],
+    ("shape", "along", "strips", "periods", "slope", "step"),
+    [
+        ((120, 900), "x", [-200, 200], (4, 40), 1.0, 1),
+        ((900, 120), "y", [-200, 200], (4, 40), 1.0, 1),
+        ((40, 1800), "x", [-620, 0, 620], (4, 40), 1.0, 1),
+        ((120, 900), "x", [-200, 200], (6, 40), 0.0, 1),  # equally high; a 4-px wave alone is too short for four taps
+        ((240, 900), "x", [-200, 200], (16, 160), 1.0, 4),  # 4 to 40 of the coarse pass's own pixels
+    ],
 )
-def test_mosaic_meets_the_analytic_scene(shape: tuple[int, int], along: Axis, strips: list[float]) -> None:
-    """Waves of 4 to 40 px with the fall of natural scenes come back within 0.5 % of their spread, seams included."""
-    assert share_of_spread(waves(shape, (4, 40), slope=1.0), strips, along) < 0.005
-
-
-def test_equal_waves_above_six_pixels_come_back() -> None:
-    """With all waves equally high the figure holds from 6 px on; a 4-px wave alone is too short for four taps."""
-    assert share_of_spread(waves((120, 900), (6, 40), slope=0.0), [-200, 200], "x") < 0.005
-
-
-def test_coarse_mosaic_meets_the_analytic_scene() -> None:
-    """The coarse pass at s = 4 does the same for waves of 16 to 160 px: 4 to 40 of its own pixels."""
-    assert share_of_spread(waves((240, 900), (16, 160), slope=1.0), [-200, 200], "x", step=4) < 0.005
+def test_mosaic_meets_the_analytic_scene(
+    shape: tuple[int, int], along: Axis, strips: list[float], periods: tuple[float, float], slope: float, step: int
+) -> None:
+    """Waves with the fall of natural scenes, or none, come back within 0.5 % of their spread, seams included."""
+    assert share_of_spread(waves(shape, periods, slope), strips, along, step=step) < 0.005
 
 
 def test_samples_off_the_scene_count_nothing() -> None:

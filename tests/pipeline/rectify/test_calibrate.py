@@ -1,4 +1,4 @@
-"""Calibration: dark, white and panel to scene values; bad and saturated elements, the flat and the mirror."""
+"""Calibration: raw numbers to scene values, bad and saturated elements, flat and mirror; how bad ones are found."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from pipeline.errors import PoseError, ShapeError
+from pipeline.errors import PoseError, RigError, ShapeError
 from pipeline.geometry.mirror import mirror_throughput
-from pipeline.rectify.calibration.calibrate import calibrate, of_bands, reflectance
-from pipeline.rectify.calibration.flat_field import judge_elements
+from pipeline.rectify.calibration.calibrate import calibrate, judge_elements, of_bands, reflectance
+from pipeline.rectify.calibration.detector import BadElementCriteria, find_bad_elements
 from pipeline.source import References
 
 
@@ -35,25 +35,35 @@ def test_hand_worked_values() -> None:
     np.testing.assert_allclose(values[1, :, 0], [0, 2, 0.5, -0.1], atol=1e-6)
 
 
-def test_saturated_band_spoils_only_itself() -> None:
-    """One saturated band is invalid and leaves its sample's other bands valid; all of them put the sample out."""
-    raw = np.full((2, 4, 3), 500, np.uint16)
-    raw[1, 2] = 4095
-    _, valid = calibrate(raw, frames(), saturated_dn=4095)
-    assert np.argwhere(~valid).tolist() == [[1, 2]]
-    raw[1, 3, 0] = 4095
-    _, valid = calibrate(raw, frames(), saturated_dn=4095)
-    assert np.argwhere(~valid).tolist() == [[1, 2, 0], [1, 2, 1], [1, 2, 2], [1, 3, 0]]
-
-
-def test_element_without_response_spoils_only_itself() -> None:
-    """Where white is not above dark the value is NaN and invalid on every line, the sample's other bands are not."""
-    references = frames()
-    references.white[3, 1] = 60
-    values, valid = calibrate(np.full((2, 4, 3), 500, np.uint16), references, saturated_dn=4095)
-    assert np.isnan(values[:, 3, 1]).all()
-    assert np.isfinite(values).sum() == values.size - 2
-    assert np.argwhere(~valid).tolist() == [[0, 3, 1], [1, 3, 1]]
+@pytest.mark.parametrize(
+    ("unlit", "bad", "hot", "out"),
+    [
+        ([], [], [(1, 2, 0), (1, 2, 1), (1, 2, 2)], [[1, 2]]),
+        ([], [], [(1, 2, 0), (1, 2, 1), (1, 2, 2), (1, 3, 0)], [[1, 2, 0], [1, 2, 1], [1, 2, 2], [1, 3, 0]]),
+        ([(3, 1)], [], [], [[0, 3, 1], [1, 3, 1]]),
+        ([(3, 1)], [], [(0, 3, 2)], [[0, 3, 1], [0, 3, 2], [1, 3, 1]]),
+        ([], [(1, 2)], [(0, 2, 2), (1, 0, 2)], [[0, 1, 2], [0, 2, 2], [1, 0, 2], [1, 1, 2]]),
+        (
+            [(n, 2) for n in range(4)],
+            [],
+            [(0, 0, 0), (0, 0, 1), (0, 3, 0)],
+            [[0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 3, 0]],
+        ),
+    ],
+    ids=["sample", "band", "unlit", "both", "filled from saturated", "band without light"],
+)
+def test_an_element_spoils_only_itself(unlit: list, bad: list, hot: list, out: list) -> None:
+    """Saturated, uncalibrated and wrongly filled elements are invalid; a sample is where all bands with light are."""
+    references, raw = replace(frames(), bad=np.zeros((4, 3), np.bool_)), np.full((2, 4, 3), 500, np.uint16)
+    for place in unlit:
+        references.white[place] = 60
+    for place in bad:
+        references.bad[place] = True
+    for place in hot:
+        raw[place] = 4095
+    values, valid = calibrate(raw, references, saturated_dn=4095)
+    assert np.argwhere(~valid).tolist() == out
+    assert np.argwhere(np.isnan(values[0])).tolist() == [list(place) for place in sorted(unlit)]
 
 
 def test_bad_elements_are_filled_along_the_line() -> None:
@@ -66,26 +76,6 @@ def test_bad_elements_are_filled_along_the_line() -> None:
     np.testing.assert_allclose(values[0, :, 1], [0.2, 0.2, 0.4, 0.6, 0.8, 1.0], rtol=1e-6)
     assert valid.shape == (1, 6)
     assert valid.all()
-
-
-def test_filled_from_saturated_is_invalid() -> None:
-    """What is filled from a saturated neighbour is as unknown as that neighbour."""
-    raw = np.full((2, 4, 3), 500, np.uint16)
-    raw[0, 2, 2] = raw[1, 0, 2] = 4095
-    bad = np.zeros((4, 3), np.bool_)
-    bad[1, 2] = True
-    _, valid = calibrate(raw, replace(frames(), bad=bad), saturated_dn=4095)
-    assert np.argwhere(~valid).tolist() == [[0, 1, 2], [0, 2, 2], [1, 0, 2], [1, 1, 2]]
-
-
-def test_saturated_beside_uncalibrated() -> None:
-    """In one sample a saturated band and a band without a calibration are both out, and the third is not."""
-    references = frames()
-    references.white[3, 1] = 60
-    raw = np.full((1, 4, 3), 500, np.uint16)
-    raw[0, 3, 2] = 4095
-    _, valid = calibrate(raw, references, saturated_dn=4095)
-    assert np.argwhere(~valid).tolist() == [[0, 3, 1], [0, 3, 2]]
 
 
 def test_a_sample_that_is_out_fills_nothing() -> None:
@@ -199,40 +189,6 @@ def test_of_bands_takes_everything_along() -> None:
     np.testing.assert_array_equal(some, reflectance(raw, references)[..., [3, 0]])
 
 
-def test_band_without_light_stays_alone() -> None:
-    """A band that no sample is calibrated in is NaN, and the other bands remain usable."""
-    references = frames()
-    references.white[:, 2] = references.dark[:, 2]
-    values, valid = calibrate(np.full((2, 4, 3), 500, np.uint16), references, saturated_dn=4095)
-    assert np.isnan(values[..., 2]).all()
-    assert np.isfinite(values[..., :2]).all()
-    assert valid.all()
-
-
-def test_bands_without_light_do_not_hold_a_sample() -> None:
-    """A sample saturated in all bands that have light is out whole, and one saturated in some only in those."""
-    references = frames()
-    references.white[:, 2] = references.dark[:, 2]
-    raw = np.full((1, 4, 3), 500, np.uint16)
-    raw[0, 0, :2] = raw[0, 3, 0] = 4095
-    _, valid = calibrate(raw, references, saturated_dn=4095)
-    assert np.argwhere(~valid).tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 3, 0]]
-
-
-def test_all_dark_lines_are_zero_and_valid() -> None:
-    """Lines at the dark level give exactly 0."""
-    values, valid = calibrate(np.full((3, 4, 3), 60, np.uint16), frames(), saturated_dn=4095)
-    assert (values == 0).all()
-    assert valid.all()
-
-
-def test_no_lines_give_no_values() -> None:
-    """An empty block of lines passes through."""
-    values, valid = calibrate(np.zeros((0, 4, 3), np.uint16), frames(), saturated_dn=4095)
-    assert values.shape == (0, 4, 3)
-    assert valid.shape == (0, 4)
-
-
 def test_references_of_another_binning_are_refused() -> None:
     """The message names both sizes and says what to do."""
     with pytest.raises(ShapeError, match=r"8 samples and 3 bands, the dark frame \(4, 3\); take references"):
@@ -242,3 +198,77 @@ def test_references_of_another_binning_are_refused() -> None:
         reflectance(np.zeros((1, 4, 3), np.uint16), bad)
     with pytest.raises(ShapeError, match=r"\(line, sample, band\)"):
         reflectance(np.zeros((4, 3), np.uint16), frames())
+
+
+Frame = NDArray[np.float64]
+
+
+def simulated(samples: int = 640, bands: int = 20, seed: int = 0) -> tuple[Frame, Frame]:
+    """Dark and white frames with noise, vignetting, a spectrum, 1 % of uneven response and a column of dust."""
+    rng = np.random.default_rng(seed)
+    dark = np.rint(64 + rng.normal(0, 0.7, (samples, bands)))
+    along = np.cos(np.linspace(-0.6, 0.6, samples))[:, None] ** 4
+    light = 3000 * along * np.exp(-(np.linspace(-1.5, 1.5, bands) ** 2))
+    light *= rng.normal(1, 0.01, light.shape)
+    light[samples // 3] *= 0.6
+    return dark, dark + light + rng.normal(0, 1, light.shape)
+
+
+def test_faults_are_found_and_nothing_else() -> None:
+    """Hot, dead, odd and missing elements are bad, side by side too; dust, vignetting and noise are not."""
+    dark, white = simulated()
+    dark[100, 3] += 50
+    white[200, 5] = dark[200, 5]
+    white[639, 6] = dark[639, 6]
+    white[300:302, 8] += 1500
+    white[400, 9] = 0.6 * (white[400, 9] - dark[400, 9]) + dark[400, 9]
+    dark[500, 1] = np.nan
+    found = np.argwhere(find_bad_elements(dark, white)).tolist()
+    assert found == [[100, 3], [200, 5], [300, 8], [301, 8], [400, 9], [500, 1], [639, 6]]
+
+
+@pytest.mark.parametrize("samples", [2, 3, 5, 12])
+def test_few_samples_are_not_accused(samples: int) -> None:
+    """With hardly anything to compare a sound detector stays sound."""
+    for seed in range(20):
+        dark, white = simulated(samples, seed=seed)
+        white[samples // 3] = dark[samples // 3] + 1.5 * (white[samples // 3] - dark[samples // 3])
+        assert not find_bad_elements(dark, white).any()
+
+
+def test_one_sample_or_band() -> None:
+    """One sample has nothing to be compared with; in one band a dead element is found all the same."""
+    assert not find_bad_elements(*simulated(1)).any()
+    dark, white = simulated(200, 1)
+    white[150] = dark[150]
+    assert [150, 0] in np.argwhere(find_bad_elements(dark, white)).tolist()
+
+
+def test_bands_without_light_are_not_judged() -> None:
+    """Where nothing responds no element is called dead, even where white lies below dark."""
+    dark, white = simulated()
+    white[:, :4] = dark[:, :4] - 8
+    assert not find_bad_elements(dark, white)[:, :4].any()
+
+
+def test_saturated_white_is_bad() -> None:
+    """A white frame at full scale says nothing of the response."""
+    dark, white = simulated()
+    limit = np.sort(white, axis=None)[-20]
+    assert not find_bad_elements(dark, white).any()
+    np.testing.assert_array_equal(find_bad_elements(dark, white, saturated_dn=limit), white >= limit)
+
+
+def test_more_than_a_detector_can_have_is_refused() -> None:
+    """Frames that would put out too many elements are named as the fault; the limit can be set."""
+    dark, white = simulated()
+    white[4::9] = dark[4::9]
+    with pytest.raises(RigError, match=r"1[01]\.\d % of the elements look bad, at most 5 % can be"):
+        find_bad_elements(dark, white)
+    assert find_bad_elements(dark, white, criteria=BadElementCriteria(most=0.2))[4::9].all()
+
+
+def test_frames_must_fit() -> None:
+    """Frames of two sizes are refused."""
+    with pytest.raises(ShapeError, match=r"\(4, 3\) and \(4, 2\)"):
+        find_bad_elements(np.zeros((4, 3)), np.zeros((4, 2)))

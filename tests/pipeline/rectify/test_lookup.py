@@ -2,36 +2,20 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import PoseError, ShapeError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import (
-    direction_to_position,
-    direction_to_scene,
-    position_to_normal,
-    reflect,
-    scene_to_direction,
-)
+from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, line_positions, points_of_scan, scene_to_sweep
-from pipeline.rectify.knot_curve import KnotCurve
-from pipeline.rectify.lookup import grid_lookup, lookup, track_lookup
+from pipeline.rectify.lookup import KnotCurve, lookup, track_lookup
 from pipeline.rectify.resample import resample
 from pipeline.rectify.tracks import Track, make_tracks
+from tests.pipeline.rectify.aiming import CAMERA, aim
 
-CAMERA = LineCamera()
 places = st.floats(-4500, 4500)
-
-
-def aim(along_px: np.ndarray | float, scan_px: np.ndarray) -> np.ndarray:
-    """Mirror positions (line, 2) that look at points given in px along the line and the scan."""
-    tangents = np.stack(np.broadcast_arrays(along_px, scan_px), axis=-1) * CAMERA.ifov_rad
-    return direction_to_position(scene_to_direction(tangents))
 
 
 def see(position: np.ndarray, sample: np.ndarray, binning: int = 1) -> np.ndarray:
@@ -69,39 +53,12 @@ def test_lookup_agrees_with_the_plan(strip: float, start: float, along: str, ste
     np.testing.assert_allclose(found[outer], planned[outer], atol=1e-3)
 
 
-def test_wandering_uneven_path_is_followed() -> None:
-    """Uneven lines on a path that wanders sideways are met at the line centres to 1e-5 px."""
-    rng = np.random.default_rng(1)
-    position = aim(250 + rng.normal(0, 0.3, 80), np.arange(80.0) + rng.uniform(-0.3, 0.3, 80))
-    line, sample = rng.integers(0, 80, 200), rng.uniform(0, 639, 200)
-    found = lookup(position, CAMERA, see(position[line], sample), along="x")
-    np.testing.assert_allclose(found, np.stack([line, sample], axis=-1), atol=1e-5)
-
-
 def test_backward_sweep_counts_from_its_own_start() -> None:
     """A sweep run the other way gives the same samples and mirrored line numbers."""
     position = aim(-200.0, np.arange(50.0))
     points = np.random.default_rng(2).uniform((10, -400), (40, 0), (30, 2))
     forward, backward = (lookup(p, CAMERA, points, along="x") for p in (position, position[::-1]))
     np.testing.assert_allclose(backward, [49, 0] + forward * [-1, 1], atol=1e-7)
-
-
-def test_line_along_y_swaps_the_axes() -> None:
-    """Turning the rig by 90 degrees is the same as swapping y and x of the points."""
-    position, points = aim(30.0, np.arange(40.0)), np.random.default_rng(3).uniform(0, 39, (20, 2))
-    turned = lookup(position, CAMERA, points[:, ::-1], along="y")
-    np.testing.assert_array_equal(turned, lookup(position, CAMERA, points, along="x"))
-
-
-def test_grid_is_lookup_of_its_points() -> None:
-    """A regular grid gives what its points give one by one, in (y, x) order; tiles agree with the whole."""
-    position = aim(100.0, np.arange(64.0))
-    on_grid = partial(grid_lookup, position, CAMERA, along="x", binning=2, spacing_px=2.0)
-    whole = on_grid(origin_px=(1.5, -20.5), shape=(30, 40))
-    tile = on_grid(origin_px=(1.5 + 20, -20.5 + 30), shape=(5, 7))
-    point = lookup(position, CAMERA, np.array([1.5 + 2 * 3, -20.5 + 2 * 4]), along="x", binning=2)
-    np.testing.assert_array_equal(whole[10:15, 15:22], tile)
-    np.testing.assert_array_equal(whole[3, 4], point)
 
 
 def test_points_off_the_sweep_are_nan() -> None:
@@ -129,15 +86,6 @@ def test_what_is_found_was_seen(strip: float, seed: int) -> None:
     assert inner.sum() > 20
 
 
-@pytest.mark.parametrize("binning", [1, 4])
-def test_one_line_sweep_reaches_half_a_line(binning: int) -> None:
-    """One line alone is as wide as its samples: points within half of that are found, others not."""
-    y = np.array([-0.51, -0.49, 0, 0.25, 0.51]) * binning + 12
-    found = lookup(aim(0.0, np.array([12.0])), CAMERA, np.stack([y, 0 * y], axis=-1), along="x", binning=binning)
-    np.testing.assert_allclose(found[:, 0], [np.nan, -0.49, 0, 0.25, np.nan], atol=1e-6)
-    np.testing.assert_allclose(found[1:4, 1], (CAMERA.samples / binning - 1) / 2)
-
-
 def test_sweeps_that_turn_or_dwell_are_refused() -> None:
     """The message names the line where the sweep stops running one way."""
     turning = aim(0.0, np.array([0.0, 1, 2, 3, 2, 5]))
@@ -156,14 +104,6 @@ def test_unusable_input_is_refused() -> None:
         lookup(position, CAMERA, np.zeros((1, 3)), along="x")
     with pytest.raises(PoseError, match="unit disk"):
         lookup(position + np.array([0, 1.5]), CAMERA, np.zeros((1, 2)), along="x")
-
-
-def test_no_points_give_none() -> None:
-    """An empty list of points and an empty grid pass through."""
-    position = aim(0.0, np.arange(3.0))
-    assert lookup(position, CAMERA, np.zeros((0, 2)), along="x").shape == (0, 2)
-    empty = grid_lookup(position, CAMERA, along="x", binning=1, origin_px=(0, 0), spacing_px=1, shape=(0, 5))
-    assert empty.shape == (0, 5, 2)
 
 
 def wandering_track(seed: int, amount_px: float, strip: float = 2600.0) -> Track:

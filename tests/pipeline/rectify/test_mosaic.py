@@ -1,6 +1,8 @@
-"""Mosaic: feathering laws, coverage, refusals."""
+"""Mosaic: feathering laws, and pixels of the scene grid from simulated sweeps, at the borders too."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import ShapeError
+from pipeline.geometry.camera import LineCamera, footprint
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Sweep
+from pipeline.planning.coverage import full_sweeps
+from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
+from pipeline.rectify.placed import place
+from pipeline.rectify.region import mosaic_rows, read_seats, seat_pixels
+from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 
 def part(seed: int, points: int = 20, bands: int = 4) -> MosaicPart:
@@ -40,27 +54,19 @@ def test_spectra_are_convex_mixtures(seeds: list[int]) -> None:
     assert (values[coverage > 0] >= np.nanmin(seen, axis=0) - 1e-6).all()
 
 
-def test_weights_are_linear_in_edge_distance() -> None:
-    """A point 30 px inside one sweep and 10 px inside another is three quarters of the first."""
-    ones, zeros, full = np.ones((1, 2), np.float32), np.zeros((1, 2), np.float32), np.ones(1, np.float32)
-    values, coverage = mosaic([MosaicPart(ones, full, np.array([30.0])), MosaicPart(zeros, full, np.array([10.0]))])
-    np.testing.assert_allclose(values, 0.75)
+@pytest.mark.parametrize(
+    ("weight", "edge_px", "share"), [((1, 1), (30.0, 10.0), 0.75), ((0.8, 1), (20.0, 20.0), 0.8 / 1.8)]
+)
+def test_weights_are_those_of_resampling_and_edge(weight: tuple, edge_px: tuple, share: float) -> None:
+    """A point counts by its distance to the sweep's edge, and by how much of the kernel was there."""
+    ones, zeros = np.ones((1, 2), np.float32), np.zeros((1, 2), np.float32)
+    parts = [
+        MosaicPart(values, np.array([of], np.float32), np.array([edge]))
+        for values, of, edge in zip((ones, zeros), weight, edge_px, strict=True)
+    ]
+    values, coverage = mosaic(parts)
+    np.testing.assert_allclose(values, share, rtol=1e-6)
     assert coverage.tolist() == [2]
-
-
-def test_weights_follow_the_resampling() -> None:
-    """At equal distance from the edges a point of which a fifth of the taps was missing counts four fifths."""
-    ones, zeros, edge = np.ones((1, 2), np.float32), np.zeros((1, 2), np.float32), np.array([20.0])
-    values, _ = mosaic(
-        [MosaicPart(ones, np.array([0.8], np.float32), edge), MosaicPart(zeros, np.ones(1, np.float32), edge)]
-    )
-    np.testing.assert_allclose(values, 0.8 / 1.8, rtol=1e-6)
-
-
-def test_order_of_sweeps_does_not_matter() -> None:
-    """Feathering is symmetric up to rounding."""
-    parts = [part(seed) for seed in range(3)]
-    np.testing.assert_allclose(mosaic(parts)[0], mosaic(parts[::-1])[0], rtol=1e-5)
 
 
 def test_a_band_without_a_value_is_the_other_sweeps() -> None:
@@ -124,3 +130,73 @@ def test_nothing_and_misfits_are_refused() -> None:
         mosaic([])
     with pytest.raises(ShapeError, match="part 1 has values"):
         mosaic([part(1), part(2, points=19)])
+
+
+CAMERA = LineCamera()
+
+
+def smooth_scene(shape: tuple[int, int], bands: int = 2) -> RasterScene:
+    """A few slow waves, above zero everywhere."""
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    waves = [2 + np.sin(2 * np.pi * (y / (17 + 3 * k) + x / (23 - 2 * k))) for k in range(bands)]
+    values = np.stack(waves, axis=-1).astype(np.float32)
+    return raster_from_values(values, CAMERA, name="waves", wavelength_nm=np.linspace(500, 700, bands))
+
+
+def looked_at(scene: RasterScene, sweeps: list[Sweep]) -> list[SimulatedSweep]:
+    """The sweeps without noise."""
+    source = SimulatedSource(scene, Rig(CAMERA), 0, effects_on("rotation", "slit", "smear"))
+    return [SimulatedSweep(source, sweep) for sweep in sweeps]
+
+
+@pytest.mark.parametrize("along", ["x", "y"])
+def test_fine_mosaic_is_the_scene_behind_the_footprint(along: str) -> None:
+    """In either orientation a full scan gives the scene convolved with slit and pixel, to a percent of its range."""
+    scene = smooth_scene((70, 90))
+    grid = SceneGrid(70, 90, 16, 4)
+    sweeps = looked_at(scene, full_sweeps(grid, CAMERA, along))  # type: ignore[arg-type]
+    seen = np.concatenate([values for _, values, _ in mosaic_rows(sweeps, CAMERA, grid, rows=32)])
+    truth = footprint(scene.values(), CAMERA)
+    if along == "y":  # the slit then lies along y and the scan goes along x
+        truth = footprint(scene.values().swapaxes(0, 1), CAMERA).swapaxes(0, 1)
+    inner = (slice(3, -3), slice(3, -3))
+    assert np.abs(seen[inner] - truth[inner]).max() < 0.01 * np.ptp(truth)
+
+
+def test_seats_are_windows_of_the_mosaic() -> None:
+    """A seat read by itself holds the mosaic's own pixels; placed once, with lines kept, none is read twice."""
+    grid = SceneGrid(150, 100, 10, 2)
+    sweeps = looked_at(smooth_scene((150, 100)), full_sweeps(grid, CAMERA, "x"))
+    mosaic = np.concatenate([values for _, values, _ in mosaic_rows(sweeps, CAMERA, grid, rows=64)])
+    seats = grid.valid_seats()
+    plain, valid = read_seats(sweeps, CAMERA, grid, seats)
+    np.testing.assert_array_equal(plain, mosaic.reshape(15, 10, 10, 10, -1).swapaxes(1, 2).reshape(150, 10, 10, -1))
+    assert valid.all()
+    placed, cache = [place(lines, CAMERA) for lines in sweeps], LineCache(2**30)
+    for first in range(0, len(seats), 7):
+        part = slice(first, first + 7)
+        values, seen = read_seats(placed, CAMERA, grid, seats[part], cache=cache)
+        np.testing.assert_array_equal(values, plain[part])
+        np.testing.assert_array_equal(seen, valid[part])
+    assert cache.reads == sum(-(-lines.sweep.lines // 64) for lines in sweeps)
+
+
+def test_seats_beside_all_sweeps_are_empty() -> None:
+    """A seat that no sweep shows is NaN and not valid."""
+    grid = SceneGrid(200, 40, 10, 2)
+    short = replace(full_sweeps(grid, CAMERA, "x")[0], lines=60)
+    patches, valid = read_seats(looked_at(smooth_scene((200, 40)), [short]), CAMERA, grid, grid.valid_seats()[-4:])
+    assert np.isnan(patches).all()
+    assert not valid.any()
+
+
+def test_a_partial_seat_is_filled_from_inside() -> None:
+    """Pixels beyond the scene repeat pixels of the same seat and are marked as not on the scene."""
+    grid = SceneGrid(12, 21, 8, 2)
+    seats = grid.valid_seats()
+    points, inside = seat_pixels(grid, seats)
+    assert inside.sum() == 12 * 21
+    origin = grid.seat_origin(seats)[:, None, None, :]
+    place = points + (np.array([12, 21]) - 1) / 2
+    assert (place >= origin).all()
+    assert (place <= np.array([11, 20])).all()

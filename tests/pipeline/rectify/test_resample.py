@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pipeline.errors import ShapeError
-from pipeline.rectify.resample import BLOCK_PX, Kernel, gather, kernel_taps, merge_lines, resample, to_uint16
+from pipeline.rectify.kernels import Kernel, kernel_taps
+from pipeline.rectify.resample import BLOCK_PX, gather, merge_lines, resample
 
 KERNELS: tuple[Kernel, ...] = ("catmull-rom", "bilinear", "nearest")
 
@@ -56,13 +57,6 @@ def test_is_the_sum_written_out(kernel: Kernel, by_element: bool) -> None:
     np.testing.assert_array_equal(share > 0, np.isfinite(out).any(axis=1))
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_weights_sum_to_one(kernel: Kernel) -> None:
-    """Every kernel is a partition of unity, at negative positions too."""
-    _, weight = kernel_taps(np.linspace(-5, 5, 1001), kernel)
-    np.testing.assert_allclose(weight.sum(axis=1), 1, atol=2e-7)
-
-
 @given(arrays(np.bool_, (9, 8)), st.floats(-1, 9), st.floats(-1, 8))
 @settings(max_examples=60, deadline=None)
 def test_constant_stays_constant_under_any_mask(valid: np.ndarray, line: float, sample: float) -> None:
@@ -90,30 +84,6 @@ def test_catmull_rom_keeps_parabolas() -> None:
     at = np.random.default_rng(2).uniform(2, 9, (50, 2))
     out, _ = resample(values, np.ones((12, 12), bool), at)
     np.testing.assert_allclose(out[:, 0], at[:, 0] ** 2 - 2 * at[:, 1] * at[:, 0] + 3 * at[:, 1], atol=2e-4)
-
-
-@pytest.mark.parametrize("bands", [2, 270, 513])
-def test_bands_do_not_mix(bands: int) -> None:
-    """Each band of a many-band cube is what the band alone would give."""
-    values = np.random.default_rng(3).random((6, 7, bands), np.float32)
-    valid = np.ones((6, 7), bool)
-    at = np.random.default_rng(4).uniform(0, 5, (40, 2))
-    out, _ = resample(values, valid, at)
-    alone, _ = resample(np.ascontiguousarray(values[..., -1:]), valid, at)
-    np.testing.assert_allclose(out[:, -1:], alone, rtol=2e-6)
-
-
-def test_dead_sample_spoils_only_itself() -> None:
-    """One invalid NaN sample fails where it is wanted and leaves the other centres exactly as they were."""
-    values = np.random.default_rng(5).random((8, 8, 4), np.float32)
-    valid = np.ones((8, 8), bool)
-    whole, _ = resample(values, valid, everywhere(8, 8))
-    values[3, 4], valid[3, 4] = np.nan, False
-    out, share = resample(values, valid, everywhere(8, 8))
-    failed = np.isnan(out).any(axis=1)
-    assert np.flatnonzero(failed).tolist() == [3 * 8 + 4]
-    np.testing.assert_array_equal(out[~failed], whole[~failed])
-    assert share[3 * 8 + 4] == 0
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -176,15 +146,6 @@ def test_raw_numbers_come_back_as_they_are() -> None:
     assert not out[failed].any()
 
 
-@pytest.mark.parametrize("kernel", ["bilinear", "catmull-rom"])
-def test_uint16_is_read_as_its_numbers(kernel: Kernel) -> None:
-    """Raw uint16 and the same numbers in float32 give the same sums."""
-    values = np.random.default_rng(15).integers(0, 65_536, (9, 9, 2), dtype=np.uint16)
-    at = np.random.default_rng(16).uniform(-0.4, 8.4, (50, 2))
-    out, _ = resample(values, np.ones((9, 9), bool), at, kernel)
-    np.testing.assert_array_equal(out, resample(values.astype(np.float32), np.ones((9, 9), bool), at, kernel)[0])
-
-
 def test_writes_to_given_memory() -> None:
     """``out`` receives the result and comes back; one that does not fit is refused."""
     values, valid, at = np.random.default_rng(17).random((6, 6, 2), np.float32), np.ones((6, 6), bool), everywhere(6, 6)
@@ -194,40 +155,6 @@ def test_writes_to_given_memory() -> None:
     np.testing.assert_array_equal(out, resample(values, valid, at)[0])
     with pytest.raises(ShapeError, match=r"\(36, 2\) of float32.*got \(36, 2\) of float64"):
         resample(values, valid, at, out=memory.astype(float))
-
-
-def test_nan_of_invalid_samples_does_not_leak() -> None:
-    """Between pixels, masked NaN never shows: a point has a value or has weight 0."""
-    rng = np.random.default_rng(6)
-    values, valid = rng.random((30, 30, 3), np.float32), rng.random((30, 30)) > 0.2
-    values[~valid] = np.nan
-    out, share = resample(values, valid, everywhere(29, 29, 0.4))
-    assert np.isfinite(out[share > 0]).all()
-    assert 0.5 < (share > 0).mean() < 1
-
-
-def test_borders_reach_half_a_pixel() -> None:
-    """Points up to half a pixel beyond the outermost centres have values, farther ones and NaN do not."""
-    values = np.ones((5, 6, 1), np.float32)
-    at = np.array([[-0.49, 2], [4.49, 2], [2, -0.49], [2, 5.49], [4, 5], [-1.6, 2], [2, 6.6], [np.nan, 1]])
-    _, share = resample(values, np.ones((5, 6), bool), at)
-    assert (share > 0).tolist() == [True] * 5 + [False] * 3
-
-
-def test_long_sweep_is_read_to_its_end() -> None:
-    """Sweeps beyond 32 766 lines are read right up to the last line."""
-    values = np.arange(33_000 * 3, dtype=np.float32).reshape(33_000, 3, 1)
-    out, _ = resample(values, np.ones((33_000, 3), bool), np.array([[32_767.5, 1], [32_999, 2]]))
-    np.testing.assert_allclose(out[:, 0], [32_767.5 * 3 + 1, 98_999])
-
-
-@pytest.mark.parametrize(("shape", "points"), [((0, 4, 2), 3), ((4, 4, 2), 0), ((1, 1, 2), 3)])
-def test_empty_and_tiny_sweeps(shape: tuple[int, int, int], points: int) -> None:
-    """No lines, no points and a single sample give results of the right shape."""
-    out, share = resample(np.ones(shape, np.float32), np.ones(shape[:2], bool), np.zeros((points, 2)))
-    assert out.shape == (points, 2)
-    assert (np.isfinite(out).all(axis=1) == (share > 0)).all()
-    assert (share > 0).all() == (shape[0] > 0)
 
 
 def test_read_only_values_are_accepted() -> None:
@@ -299,15 +226,6 @@ def test_dwells_must_part_the_lines(starts: list[int]) -> None:
     """First lines that do not begin at 0, do not ascend or lie beyond the end are refused."""
     with pytest.raises(ShapeError, match="ascending first lines from 0 on, below 3"):
         merge_lines(np.ones((3, 2, 1), np.float32), np.ones((3, 2), bool), np.array(starts, np.intp))
-
-
-def test_rounds_to_uint16() -> None:
-    """Clipped to the range, halves to even, NaN to 0 with its place told."""
-    values = np.array([0.5, 1.5, 2.5, -3, 65_535.4, 70_000, np.inf, np.nan], np.float32)
-    rounded, known = to_uint16(values)
-    assert rounded.dtype == np.uint16
-    assert rounded.tolist() == [0, 2, 2, 0, 65_535, 65_535, 65_535, 0]
-    assert known.tolist() == [True] * 7 + [False]
 
 
 @pytest.mark.parametrize("kernel", KERNELS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,21 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import direction_to_position, scene_to_direction
-from pipeline.rectify.lookup import tie_table, track_lookup
-from pipeline.rectify.tie_points import TieTable
+from pipeline.rectify.lookup import track_lookup
+from pipeline.rectify.tie_points import tie_table
 from pipeline.rectify.tracks import Track, make_tracks
+from tests.pipeline.rectify.aiming import CAMERA, aim
 
-CAMERA = LineCamera()
 GRID: dict[str, Any] = {"origin_px": (-20.0, 2250.0), "spacing_px": 1.0, "shape": (170, 700)}
 EVERYTHING = (slice(None), slice(None))
 
 
 def track_of(along_px: np.ndarray | float, scan_px: np.ndarray) -> Track:
     """The one track of lines that look at points given in px along the line and the scan."""
-    tangents = np.stack(np.broadcast_arrays(along_px, scan_px), axis=-1) * CAMERA.ifov_rad
-    (track,) = make_tracks(direction_to_position(scene_to_direction(tangents)), CAMERA)
+    (track,) = make_tracks(aim(along_px, scan_px), CAMERA)
     return track
 
 
@@ -131,13 +127,6 @@ def test_track_smaller_than_a_cell_is_not_lost() -> None:
     assert np.nanmax(np.abs(found - exact(track))) <= table.bound_px
 
 
-def test_grid_beside_the_track_has_no_coordinates() -> None:
-    """Where no line passes all is NaN, at no cost in ties."""
-    table = tie_table(track_of(*PATHS["even"]), CAMERA, along="x", **(GRID | {"origin_px": (3000.0, -4000.0)}))
-    assert np.isnan(table.coordinates(*EVERYTHING)).all()
-    assert (table.spacing, table.bound_px) == (16, 0.0)
-
-
 @pytest.mark.parametrize("tie", [16, 1])
 def test_only_what_the_track_can_have_seen_is_kept(tie: int) -> None:
     """Of a large grid the table keeps the part around the track, and answers for the rest with NaN."""
@@ -158,10 +147,3 @@ def test_settings_are_checked() -> None:
             tie_table(track, CAMERA, along="x", **GRID, **wrong)
     table = tie_table(track, CAMERA, along="x", tolerance_px=0.0, **GRID)
     np.testing.assert_array_equal(table.coordinates(*EVERYTHING), exact(track))
-
-
-def test_ties_are_plain_values() -> None:
-    """A table made again from its fields answers the same."""
-    table = tie_table(track_of(*PATHS["drifting"]), CAMERA, along="x", **GRID)
-    again: TieTable = replace(table, ties=table.ties.copy())
-    np.testing.assert_array_equal(again.coordinates(*EVERYTHING), table.coordinates(*EVERYTHING))

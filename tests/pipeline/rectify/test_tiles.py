@@ -14,11 +14,9 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rectify.kernels import kernel_taps
 from pipeline.rectify.line_cache import LineCache
-from pipeline.rectify.placed import PixelGrid, Placed, place
-from pipeline.rectify.reach import TrackReach
-from pipeline.rectify.region import mosaic_tile
-from pipeline.rectify.tiles import cache_bytes, plan_tiles
-from pipeline.rectify.window import cut_runs
+from pipeline.rectify.mosaic import cut_runs
+from pipeline.rectify.placed import PixelGrid, Placed, TrackReach, place
+from pipeline.rectify.region import cache_bytes, mosaic_tile, plan_tiles
 from pipeline.source import References
 
 CAMERA = LineCamera(samples=160)
@@ -36,11 +34,6 @@ class Taken:
     valid_line: NDArray[np.bool_]
     position: NDArray[np.float64]
     asked: list[tuple[int, ...]] = field(default_factory=list)
-
-    @property
-    def time_s(self) -> NDArray[np.float64]:
-        """A tenth of a second a line."""
-        return np.arange(self.sweep.lines) * 0.1
 
     def read(self, start: int, stop: int) -> NDArray[np.uint16]:
         """Whole lines."""
@@ -88,29 +81,6 @@ def in_tiles(
     return values, coverage
 
 
-def two_turned(grid: PixelGrid | None) -> list[Placed]:
-    """Two overlapping sweeps of turned lines with all kinds of faults."""
-    other = replace(TURNED, name="other", strip_px=-4600.0, start_px=3010.0)
-    gain = np.array([1.0, 0.9, 1.1], np.float32)
-    return [
-        place(taken(TURNED, faults=True), CAMERA, grid=grid, gain=gain),
-        place(taken(other, seed=1, kind=Cropped, faults=True), CAMERA, grid=grid),
-    ]
-
-
-@given(st.tuples(st.integers(5, 90), st.integers(5, 140)), st.booleans(), st.booleans())
-@settings(max_examples=8, deadline=None)
-def test_any_tiling_gives_the_same_bits(shape: tuple[int, int], tied: bool, cached: bool) -> None:
-    """Turned lines, an overlap, dead lines, saturated and bad elements: every tiling gives what one tile gives."""
-    grid = PixelGrid(CORNER, 1, (90, 140))
-    placed = two_turned(grid if tied else None)
-    whole, coverage = in_tiles(placed, grid, grid.shape)
-    assert set(np.unique(coverage)) == {0, 1, 2}
-    parts = in_tiles(placed, grid, shape, LineCache(200_000) if cached else None)
-    np.testing.assert_array_equal(parts[0], whole)
-    np.testing.assert_array_equal(parts[1], coverage)
-
-
 def partly_lit(lines: Taken) -> Taken:
     """The same with references as real ones are: every band without light somewhere, most in a part of the slit."""
     sample, band = np.mgrid[: CAMERA.samples, : lines.raw.shape[2]]
@@ -120,32 +90,34 @@ def partly_lit(lines: Taken) -> Taken:
     return replace(lines, references=replace(lines.references, white=white))
 
 
-@pytest.mark.parametrize("shape", [(90, 33), (17, 140), (17, 20)])
-def test_any_tiling_of_a_partly_lit_detector_gives_the_same_bits(shape: tuple[int, int]) -> None:
-    """Where no sample has light in all bands, tiles are judged by the whole slit, not by the samples they need."""
+def two_turned(grid: PixelGrid | None) -> list[Placed]:
+    """Two overlapping sweeps of turned lines with all kinds of faults, one by a slit lit in parts."""
+    other = replace(TURNED, name="other", strip_px=-4600.0, start_px=3010.0)
+    gain = np.array([1.0, 0.9, 1.1], np.float32)
+    return [
+        place(taken(TURNED, faults=True), CAMERA, grid=grid, gain=gain),
+        place(partly_lit(taken(other, seed=1, kind=Cropped, faults=True)), CAMERA, grid=grid),
+    ]
+
+
+@given(st.tuples(st.integers(5, 90), st.integers(5, 140)), st.booleans(), st.booleans())
+@settings(max_examples=8, deadline=None)
+def test_any_tiling_gives_the_same_bits(shape: tuple[int, int], tied: bool, cached: bool) -> None:
+    """Turned lines, an overlap, dead lines, bad and unlit elements: every tiling gives what one tile gives."""
     grid = PixelGrid(CORNER, 1, (90, 140))
-    placed = [place(partly_lit(taken(TURNED, bands=4, faults=True)), CAMERA)]
+    placed = two_turned(grid if tied else None)
     whole, coverage = in_tiles(placed, grid, grid.shape)
-    assert 0.05 < np.isnan(whole[coverage > 0]).mean() < 0.9
-    parts = in_tiles(placed, grid, shape, LineCache(200_000))
+    assert set(np.unique(coverage)) == {0, 1, 2}
+    parts = in_tiles(placed, grid, shape, LineCache(200_000) if cached else None)
     np.testing.assert_array_equal(parts[0], whole)
     np.testing.assert_array_equal(parts[1], coverage)
-
-
-def test_a_partly_lit_detector_is_read_where_it_is_needed() -> None:
-    """A narrow column takes no more samples of a detector that is nowhere lit in all bands than of another."""
-    grid, asked = PixelGrid((3040.0, -4700.0), 1, (64, 20)), []
-    for lines in (taken(TURNED, bands=4, kind=Cropped), partly_lit(taken(TURNED, bands=4, kind=Cropped))):
-        in_tiles([place(lines, CAMERA)], grid, (64, 640), LineCache(2**20))
-        asked.append(sorted(lines.asked))
-    assert asked[0] == asked[1]
 
 
 def test_cutting_a_tile_into_runs_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows as short as they can be give what one window for the whole tile gives."""
     grid = PixelGrid(CORNER, 1, (40, 140))
     whole = in_tiles(two_turned(None), grid, grid.shape)
-    monkeypatch.setattr("pipeline.rectify.window.RUN_ELEMENTS", 0)
+    monkeypatch.setattr("pipeline.rectify.mosaic.RUN_ELEMENTS", 0)
     cut = in_tiles(two_turned(None), grid, grid.shape)
     for one, other in zip(whole, cut, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -239,24 +211,16 @@ def test_nearest_gives_raw_spectra() -> None:
     assert on.any()
 
 
-def test_a_grid_beside_the_swath_is_empty() -> None:
-    """Pixels that no sweep saw are NaN with a coverage of 0, and nothing is read for them."""
+@pytest.mark.parametrize("beside", [True, False])
+def test_where_no_line_shows_anything_all_is_empty(beside: bool) -> None:
+    """Beside the swath, and where all lines are dead, pixels are NaN with a coverage of 0, and nothing is read."""
     lines = taken(TURNED)
-    values, coverage = in_tiles([place(lines, CAMERA)], PixelGrid((0.0, 0.0), 1, (70, 50)), (64, 640))
+    lines.valid_line[:] = beside
+    grid = PixelGrid((0.0, 0.0) if beside else CORNER, 1, (70, 50))
+    values, coverage = in_tiles([place(lines, CAMERA)], grid, (64, 640))
     assert np.isnan(values).all()
     assert not coverage.any()
     assert not lines.asked
-
-
-def test_sweeps_that_do_not_meet_stand_side_by_side() -> None:
-    """With nothing in common every pixel is one sweep's own, bit by bit."""
-    grid = PixelGrid((-20.0, -200.0), 1, (40, 400))
-    sweeps = [Sweep(f"at {strip}", "fine", "x", strip, -30.0, 60) for strip in (-100.0, 100.0)]
-    placed = [place(taken(sweep, seed=number), CAMERA) for number, sweep in enumerate(sweeps)]
-    both, coverage = in_tiles(placed, grid, (64, 640))
-    one, other = (in_tiles([alone], grid, (64, 640))[0] for alone in placed)
-    assert set(np.unique(coverage)) == {0, 1}
-    np.testing.assert_array_equal(both, np.where(np.isnan(one), other, one))
 
 
 @pytest.mark.parametrize("placed_by_it", [False, True])
@@ -307,24 +271,6 @@ def test_sums_of_samples_saturate_later() -> None:
     assert np.isnan(seen[21:]).all()
 
 
-def test_a_sweep_without_a_usable_line_shows_nothing() -> None:
-    """All lines dead: every pixel is NaN with a coverage of 0, and nothing is read."""
-    lines = taken(TURNED)
-    lines.valid_line[:] = False
-    values, coverage = in_tiles([place(lines, CAMERA)], PixelGrid(CORNER, 1, (30, 40)), (64, 640))
-    assert np.isnan(values).all()
-    assert not coverage.any()
-    assert not lines.asked
-
-
-def test_a_single_line_is_found() -> None:
-    """A sweep of one line shows the pixels within half a pixel of it, whatever tile they are in."""
-    lines = taken(Sweep("one", "fine", "x", 0.0, 7.0, 1))
-    values, coverage = in_tiles([place(lines, CAMERA)], PixelGrid((-20.0, -60.0), 1, (64, 120)), (16, 50))
-    assert np.flatnonzero(coverage.any(axis=1)).tolist() == [27]
-    assert np.isfinite(values[27]).all()
-
-
 def test_a_sweep_that_turns_is_two_sweeps() -> None:
     """Lines taken there and back are blended as if each way were a sweep of its own, in any tiling."""
     there = taken(Sweep("there", "fine", "x", 0.0, -30.0, 60))
@@ -340,23 +286,6 @@ def test_a_sweep_that_turns_is_two_sweeps() -> None:
     for shape in ((64, 640), (7, 33)):
         for one, other in zip(in_tiles([placed], grid, shape), expected, strict=True):
             np.testing.assert_array_equal(one, other)
-
-
-def test_lines_of_a_mirror_that_stands_are_averaged() -> None:
-    """Each position held for three lines gives the mean of the three."""
-    once = taken(Sweep("once", "fine", "x", 0.0, -30.0, 60))
-    raw = np.random.default_rng(4).integers(100, 3000, (180, *once.raw.shape[1:])).astype(np.uint16)
-    held = Taken(
-        replace(once.sweep, lines=180),
-        raw,
-        once.references,
-        np.ones(180, np.bool_),
-        np.repeat(once.position, 3, axis=0),
-    )
-    grid, part = PixelGrid((-20.0, -59.5), 1, (40, 120)), (slice(0, 40), slice(0, 120))
-    seen, _ = mosaic_tile([place(held, CAMERA)], CAMERA, grid, *part, kernel="nearest", cache=LineCache(2**20))
-    mean = raw.reshape(60, 3, *raw.shape[1:]).mean(axis=1)
-    np.testing.assert_allclose(seen, mean[10:50, 20:140], rtol=1e-6)
 
 
 def test_gain_multiplies_a_sweeps_values() -> None:

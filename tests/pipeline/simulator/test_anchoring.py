@@ -12,8 +12,8 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, Sweep
-from pipeline.rectify.registration.anchoring import Anchor, anchor_sweep
 from pipeline.rectify.registration.overlaps import BroadSweep
+from pipeline.rectify.registration.seams import Anchor, anchor_sweep
 from pipeline.simulator.effects.pointing import CommonOffset
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig

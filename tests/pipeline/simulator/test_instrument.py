@@ -13,6 +13,10 @@ from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.camera import LineCamera, look
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, line_positions
+from pipeline.geometry.camera import LineCamera, expose, footprint
+from pipeline.geometry.mirror import direction_to_scene, mirror_throughput, position_to_normal, reflect
+from pipeline.geometry.scan import Sweep, line_positions, sweep_positions
+from pipeline.lazy import Once
 from pipeline.simulator.effects.pointing import CommonOffset
 from pipeline.simulator.effects.registry import EFFECTS, USUAL, effects_on
 from pipeline.simulator.render import Choice, expected_light
@@ -77,7 +81,7 @@ def test_undeflected_sweep_is_the_operator_on_the_grid(step: int) -> None:
     sweep = replace(SWEEP, lines=40 // step, step=step)
     lines = light_of(scene, sweep, range(sweep.lines))
     exact = replace(CAMERA, electrons_per_dn=1.0, bits=16)  # four of its samples still fit uint16
-    looked = look(values.astype(np.float32) * scene.electrons, exact, step=step, rng=None)
+    looked = expose(footprint(values.astype(np.float32) * scene.electrons, exact), exact, step=step, rng=None)
     binned = lines.reshape(sweep.lines, 640 // step, step, 1).mean(axis=2)
     assert np.abs(binned - looked).max() < 0.02 * looked.std()
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError
-from pipeline.geometry.mounting import Mounting
+from pipeline.geometry.mirror import Mounting
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.capture.capture_runner import CaptureJournal

@@ -17,7 +17,7 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rectify.placed import PixelGrid, place
-from pipeline.rectify.tiles import plan_tiles
+from pipeline.rectify.region import plan_tiles
 from pipeline.source import Line, References
 from storage.arrays import tile_work
 from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube

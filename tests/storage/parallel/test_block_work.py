@@ -20,7 +20,7 @@ from dask.distributed import LocalCluster
 from pipeline.errors import SettingsError, ShapeError, WorkerError
 from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.placed import PixelGrid
-from pipeline.rectify.tiles import plan_tiles
+from pipeline.rectify.region import plan_tiles
 from storage.arrays.mosaics import MosaicWriter
 from storage.parallel import cluster_work, worker_facts
 from storage.parallel.block_work import block_graph, run_blocks

@@ -14,6 +14,7 @@ from scipy import ndimage
 from pipeline.geometry.camera import LineCamera, look
 from pipeline.planning.crop_rows import find_rows
 from pipeline.simulator.scenes.farm.farm_plan import FarmPlan, FieldPlan, Ground, farm_plan
+from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.farm.fields import row_gaps, row_shadow, rows_of, stripes_of, wheel_marks
 from pipeline.simulator.scenes.farm.land import (
@@ -102,7 +103,9 @@ def test_detail_is_where_a_second_look_pays(farms: list[RasterScene]) -> None:
 def twin_accuracy(scene: RasterScene, bands: NDArray[np.intp]) -> float:
     """Accuracy of Fisher's discriminant between the twins on one look's pixels, fitted on every other one."""
     electrons = scene.planes @ np.ascontiguousarray(scene.electrons[:, bands])
-    seen = look(electrons, LineCamera(), step=1, rng=np.random.default_rng(0)).reshape(-1, len(bands))
+    seen = expose(footprint(electrons, LineCamera()), LineCamera(), step=1, rng=np.random.default_rng(0)).reshape(
+        -1, len(bands)
+    )
     labels = labels_of(scene).ravel()
     twins = [seen[labels == scene.class_names.index(name)] for name in ("wheat_a", "wheat_b")]
     size = min(map(len, twins))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,33 +11,13 @@ from hypothesis import strategies as st
 from scipy import sparse
 from scipy.optimize import Bounds, LinearConstraint, milp
 
-from pipeline.geometry.scan import Sweep
 from pipeline.planning.budget_search import cheapest_cover, spend
-from pipeline.planning.line_cover import Field
-from pipeline.planning.scan_runs import ScanPrices
-from pipeline.planning.strips import Views
+from pipeline.planning.prices import ScanPrices
+from tests.pipeline.planning.fields import blocks, drawn
 
 PRICES = ScanPrices(line_s=0.1, run_s=0.9, reload_s=1.6, lines_per_reload=150)
 LINES = 8  # of a seat
-
-
-def blocks(worth: np.ndarray, most: int, prices: ScanPrices = PRICES) -> Field:
-    """A field of (row, column) seats seen ``most`` columns at a time from every offset."""
-    rows, columns = worth.shape
-    strips = range(max(columns - most, 0) + 1)
-    seen = [np.argwhere(worth[:, s : s + most] > 0) + np.array([0, s]) for s in strips]
-    row, column = np.concatenate(seen).T
-    sweeps = tuple(Sweep(f"fine-{s:03d}", "fine", "x", float(s), 0.0, rows * LINES) for s in strips)
-    views = Views(
-        sweeps, rows * LINES, np.cumsum([0, *map(len, seen)]), row * columns + column, row * LINES, (row + 1) * LINES
-    )
-    return Field(views, worth.ravel(), np.tile(np.arange(columns), rows), prices)
-
-
-def drawn(rows: int, columns: int, seed: int) -> np.ndarray:
-    """Worth with a few strong seats, one in four worth nothing."""
-    rng = np.random.default_rng(seed)
-    return rng.exponential(size=(rows, columns)) ** 2 * (rng.random((rows, columns)) > 0.25)
+seats = partial(blocks, prices=PRICES, lines=LINES)
 
 
 def optimum(worth: np.ndarray, most: int, budget_s: float | None) -> float:
@@ -91,7 +73,7 @@ def optimum(worth: np.ndarray, most: int, budget_s: float | None) -> float:
 @given(st.integers(2, 9), st.integers(3, 12), st.integers(0, 99), st.floats(0, 30), st.floats(0, 30))
 def test_a_bigger_budget_never_buys_less(rows: int, columns: int, seed: int, one: float, other: float):
     """The true price, reloads included, stays within the budget, and worth grows with it, in narrow fields and wide."""
-    field = blocks(drawn(rows, columns, seed), 3)
+    field = seats(drawn(rows, columns, seed), 3)
     small, large = (spend(field, budget) for budget in sorted((one, other)))
     assert small.seconds(PRICES) <= min(one, other)
     assert large.seconds(PRICES) <= max(one, other)
@@ -106,7 +88,7 @@ def test_plans_are_near_the_optimum():
     for seed, columns in enumerate((7, 11)):
         worth = drawn(9, columns, seed)
         for budget_s in (4.0, 7.0, 15.0):
-            shares.append(spend(blocks(worth, 5), budget_s).worth / optimum(worth, 5, budget_s))
+            shares.append(spend(seats(worth, 5), budget_s).worth / optimum(worth, 5, budget_s))
     assert min(shares) > 0.95
     assert np.mean(shares) > 0.99
     assert max(shares) <= 1 + 1e-9
@@ -117,20 +99,13 @@ def test_all_seats_at_nearly_the_least_price(seed: int):
     """Covers of every seat take at most 2 % more seconds than the integer programme's."""
     rng = np.random.default_rng(seed)
     worth = (rng.random((12, 9)) < 0.12).astype(float)
-    cover = cheapest_cover(blocks(worth, 4))
+    cover = cheapest_cover(seats(worth, 4))
     assert cover.worth == worth.sum()
     assert optimum(worth, 4, None) * (1 - 1e-9) <= cover.seconds(PRICES) <= optimum(worth, 4, None) * 1.02
-
-
-def test_equal_worth_everywhere_fills_the_budget():
-    """With nothing to tell seats apart one run takes all the rows that the budget allows."""
-    field = blocks(np.ones((30, 4)), 4)
-    cover = spend(field, 0.9 + 1.6 + 17 * 0.8 + 0.5)
-    assert [(run.first % LINES, run.stop - run.first) for run in cover.runs] == [(0, 17 * LINES)]
 
 
 def test_worths_far_apart_are_all_bought_in_the_end():
     """A seat a million times weaker than another is bought by a budget for all."""
     worth = np.zeros((9, 6))
     worth[0, 0], worth[4, 5], worth[8, 2] = 1e6, 1.0, 1e3
-    assert spend(blocks(worth, 3), 1e4).worth == worth.sum()
+    assert spend(seats(worth, 3), 1e4).worth == worth.sum()

@@ -1,17 +1,25 @@
-"""Savings: entries, and what a sweep counts for in lines, samples, bytes and seconds."""
+"""Prices: what a sweep counts for in lines, samples, bytes and seconds, savings, and the least budget."""
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.errors import BudgetError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import coarse_sweeps, full_sweeps
-from pipeline.planning.savings import SavingEntry, capture_savings, count_lines, count_samples, raw_bytes
+from pipeline.planning.prices import (
+    SavingEntry,
+    capture_savings,
+    check_budget,
+    count_lines,
+    count_samples,
+    least_budget,
+    raw_bytes,
+)
 
 CAMERA, COST = LineCamera(), CostModel()
 
@@ -27,14 +35,9 @@ def test_samples_beside_the_scene_are_not_counted():
     path = Sweep("a", "fine", "x", 0.0, -32.5, 66)
     assert count_samples([path], CAMERA, SceneGrid(60, 100, 16, 4)) == 60 * 100
     assert count_samples([path], CAMERA, SceneGrid(60, 640, 16, 4)) == 60 * 640
-
-
-def test_samples_far_off_the_axis_follow_their_rays():
-    """A strip turned by 15 deg loses samples at the scene's corners only."""
-    path = Sweep("a", "fine", "x", 2300.0, -99.5, 200)
-    wide = count_samples([path], CAMERA, SceneGrid(200, 6000, 16, 4))
-    psi = np.arctan(2300 * CAMERA.ifov_rad)
-    assert 200 * 640 * (1 - np.tan(psi) * 640 / 200 / 4 * 1.2) < wide < 200 * 640
+    beside = Sweep("a", "fine", "x", 0.0, 5000.0, 3)
+    assert count_samples([beside], CAMERA, SceneGrid(60, 100, 16, 4)) == 0
+    assert raw_bytes([beside], CAMERA, 10) == 3 * 640 * 10 * 2
 
 
 @settings(max_examples=40)
@@ -55,13 +58,6 @@ def test_binned_lines_have_fewer_samples_and_bytes():
     assert raw_bytes(full, CAMERA, 270) == 403 * 640 * 270 * 2
 
 
-def test_a_line_costs_all_its_bytes_wherever_it_falls():
-    """Bytes count captured samples, not those on the scene."""
-    path = Sweep("a", "fine", "x", 0.0, 5000.0, 3)
-    assert count_samples([path], CAMERA, SceneGrid(60, 100, 16, 4)) == 0
-    assert raw_bytes([path], CAMERA, 10) == 3 * 640 * 10 * 2
-
-
 def test_the_ledger_compares_like_with_like():
     """The full scan against itself is 1 in every entry; nothing against it is 0."""
     grid = SceneGrid(100, 700, 16, 4)
@@ -74,13 +70,25 @@ def test_the_ledger_compares_like_with_like():
     assert none["lines"].full_is == "measured"
 
 
-def test_savings_of_parts_add_up():
-    """Lines, samples and bytes of two groups of sweeps are the sums of each; seconds are at most that."""
-    grid = SceneGrid(300, 700, 16, 4)
-    coarse, full = coarse_sweeps(grid, CAMERA, "y"), full_sweeps(grid, CAMERA, "x")
-    both = capture_savings([*coarse, *full], full, CAMERA, grid, cost=COST, bands=3)
-    apart = [capture_savings(part, full, CAMERA, grid, cost=COST, bands=3) for part in (coarse, full)]
-    for name in ("lines", "samples", "bytes_raw"):
-        assert both[name].done == sum(part[name].done for part in apart)
-    total = sum(part["capture_s"].done for part in apart)
-    assert both["capture_s"].done <= total == pytest.approx(both["capture_s"].done, abs=COST.reload_s + 1e-9)
+@pytest.mark.parametrize(
+    ("budget", "coarse_s", "words"),
+    [
+        *((budget, 50.0, "above 0 and at most 1, got") for budget in (0.0, -0.5, 1.0001, float("nan"), float("inf"))),
+        (0.1, 56.93, r"least possible is 0\.2847"),
+        (1.0, 210.0, "scan in full"),
+    ],
+)
+def test_budgets_that_cannot_be_met_are_refused(budget: float, coarse_s: float, words: str):
+    """Out of range, below the coarse pass, or of a coarse pass dearer than the full scan, each with what to do."""
+    with pytest.raises(BudgetError, match=words):
+        check_budget(budget, coarse_s, 200.0)
+
+
+@given(st.floats(1, 500), st.floats(0.01, 1))
+def test_the_least_budget_is_accepted_and_is_the_least(full: float, share: float):
+    """It pays for the coarse pass, and one step of the last digit less does not."""
+    assert check_budget(1.0, 56.93, 200.0) == pytest.approx(143.07)
+    least = least_budget(full * share, full)
+    assert 0 <= check_budget(min(least, 1.0), full * share, full) <= full * 1.01e-4
+    with pytest.raises(BudgetError, match=f"the least possible is {least}"):
+        check_budget(least - 1.01e-4, full * share, full)
