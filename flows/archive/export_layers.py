@@ -18,12 +18,11 @@ from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.archive import Archive, StageRef
 from storage.archive.records import RECEIPT, read_run
-from storage.arrays.georeference import load_geobox
+from storage.arrays.georeference import StoredImage, load_geobox, open_image
 from storage.arrays.ground_maps import ClassLegend
 from storage.arrays.layout import grid_of
-from storage.arrays.stored_images import StoredImage, open_image
 from storage.export.cog_files import ANGULAR, CogImage, Place
-from storage.export.stac_fields import classes
+from storage.export.stac_items import classes
 
 Rows = Iterator[tuple[int, NDArray[Any]]]
 RGB = ("red", "green", "blue")

@@ -22,8 +22,7 @@ from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS
 from storage.arrays.mosaics import mosaic_wavelengths
 from storage.arrays.patches import open_patches
 from storage.arrays.tile_work import RESERVED_BYTES
-from storage.parallel.block_work import run_blocks
-from storage.parallel.crew import Crew
+from storage.parallel.crew import Crew, run_blocks
 
 SHARD = (SHARD_ROWS, SHARD_COLUMNS)
 IMAGE_BYTES = 128  # a coarse pixel, of what a policy of the whole image holds at once beside the columns

@@ -11,8 +11,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator.instrument import BLOCK_LINES
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Line, Source
-from storage.parallel.block_work import run_blocks
-from storage.parallel.crew import Crew
+from storage.parallel.crew import Crew, run_blocks
 
 Take = Callable[[Line], None]
 

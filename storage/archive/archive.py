@@ -25,8 +25,15 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ArchiveError
-from storage.archive.addresses import StageRef, in_text, published_runs, published_stores, store_at, without_manifest
-from storage.archive.folder import open_folder
+from storage.archive.addresses import (
+    StageRef,
+    in_text,
+    open_folder,
+    published_runs,
+    published_stores,
+    store_at,
+    without_manifest,
+)
 from storage.archive.keys import plain, stage_key
 from storage.archive.lineage import rests_on
 from storage.archive.manifests import (

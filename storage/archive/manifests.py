@@ -296,3 +296,23 @@ def library_versions() -> Mapping[str, str]:
         with suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
     return found
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """Content of a file directly in a published store's folder.
+
+    Raises
+    ------
+    IncompleteStoreError : the store's manifest does not list the file, or not one of these bytes.
+    """
+    entry = read_manifest(path.parent)["files"].get(path.name)
+    problem = "is in no manifest" if entry is None else file_problem(path, entry, hashes=True)
+    if problem is not None:
+        raise IncompleteStoreError(f"{path} {problem}; {CURE}")
+    table: dict[str, Any] = json.loads(read_plain(path))
+    return table
+
+
+def write_table(path: Path, content: Mapping[str, Any]) -> None:
+    """Write plain values in their own order; numpy's numbers become floats."""
+    path.write_text(json.dumps(content, indent=1, default=float) + "\n")

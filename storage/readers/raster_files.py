@@ -17,11 +17,18 @@ from PIL import Image
 
 from pipeline.errors import SceneError
 from storage.readers.array_files import NAMED_ENDINGS, load_named, load_npy
-from storage.readers.cube_sources import GREY_NM, RGB_NM, Raster, check_numbers
-from storage.readers.declared_sizes import DEFLATE_RATIO, check_claim, check_memory
+from storage.readers.cube_sources import (
+    DEFLATE_RATIO,
+    GREY_NM,
+    RGB_NM,
+    Raster,
+    check_claim,
+    check_memory,
+    check_numbers,
+)
 from storage.readers.envi_cubes import open_envi_cube
+from storage.readers.scene_toml import BandWavelengths
 from storage.readers.tiff_files import TIFF_ENDINGS, read_tiff
-from storage.readers.wavelengths import BandWavelengths
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")
 SCENE_ENDINGS = (*IMAGE_ENDINGS, *TIFF_ENDINGS, ".npy", *NAMED_ENDINGS, ".hdr")

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from storage.readers.cube_sources import Bands, CubeSource, LineFacts, check_cube_source
-from storage.readers.dataset_layouts import find_layout
 from storage.readers.envi_cubes import DATA_ENDINGS, EnviHeader, find_envi_pair, open_envi_cube
 from storage.readers.headwall_folders import PartedCube, find_reference, is_headwall_folder, one_part, open_parts
+from storage.readers.labels import find_layout
 from storage.readers.raster_files import SCENE_ENDINGS, load_raster, split_variable
-from storage.readers.scene_toml import SceneSettings, find_scene_settings
+from storage.readers.scene_toml import BandWavelengths, SceneSettings, find_scene_settings, settle_wavelengths
 from storage.readers.tiff_files import TIFF_ENDINGS, TiffRows, open_tiff_rows
-from storage.readers.wavelengths import BandWavelengths, settle_wavelengths
 from storage.readers.zarr_scenes import find_zarr_store, open_zarr_cube
 
 _EXPOSURE = "exposure (ms)"  # a setting in the comments of Headwall's headers

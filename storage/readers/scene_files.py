@@ -18,14 +18,11 @@ from pipeline.errors import SceneError
 from pipeline.readings import MOST_STEPS, MOST_VALUE, beyond_range, find_beyond
 from pipeline.simulator.scenes.image_scene import BRIGHT_PERCENTILE
 from storage.archive.staging import file_hash
-from storage.readers.cube_sources import BLOCK_LINES, Raster, scene_lines
-from storage.readers.dataset_layouts import find_layout
-from storage.readers.declared_sizes import machine_bytes
-from storage.readers.labels import Labels, load_labels
+from storage.readers.cube_sources import BLOCK_LINES, Raster, machine_bytes, scene_lines
+from storage.readers.labels import Labels, find_layout, load_labels
 from storage.readers.raster_files import load_raster, split_variable
 from storage.readers.scan_files import is_scan, known_bands, open_cube_source
-from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
-from storage.readers.wavelengths import settle_wavelengths
+from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings, settle_wavelengths
 
 _LOOKED_AT = 1 << 20  # values, evenly spread, by which the range of a scene is told
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import SceneError
-from storage.archive.toml_files import read_toml
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError, WavelengthError
+from storage.archive.plain_files import read_toml
 
 SETTINGS_NAME = "scene.toml"
 
@@ -124,3 +127,151 @@ def _classes(path: Path, value: object) -> dict[str, ClassValue]:
     if len(classes) > 255:
         raise SceneError(f"{path}: {len(classes)} classes, at most 255 fit a class map; merge some")
     return classes
+
+
+RANGE_NM = (200.0, 3000.0)
+MICROMETRES = (0.2, 5.0)
+
+
+@dataclass(frozen=True)
+class BandWavelengths:
+    """Centres and widths of the chosen bands [nm], and one sentence on their origin."""
+
+    centre_nm: NDArray[np.float64]
+    fwhm_nm: NDArray[np.float64] | None
+    origin: str
+
+
+def check_wavelengths(wavelengths: Sequence[float] | NDArray[np.float64], where: str) -> NDArray[np.float64]:
+    """Give the wavelengths as float64 [nm], any order.
+
+    Raises
+    ------
+    WavelengthError : they are not finite, look like micrometres, or lie outside 200-3000 nm.
+    """
+    values = np.asarray(wavelengths, np.float64)
+    if not np.isfinite(values).all():
+        raise WavelengthError(f"{where}: wavelengths must be numbers [nm], got {_listed(values)}")
+    low, high = MICROMETRES
+    if values.size and ((values >= low) & (values <= high)).all():
+        raise WavelengthError(
+            f"{where}: wavelengths {_listed(values)} look like micrometres; write them in nm: {_listed(values * 1000)}"
+        )
+    outside = values[(values < RANGE_NM[0]) | (values > RANGE_NM[1])]
+    if outside.size:
+        raise WavelengthError(
+            f"{where}: wavelengths {_listed(outside)} lie outside {RANGE_NM[0]:g}-{RANGE_NM[1]:g} nm; write nm"
+        )
+    return values
+
+
+def settle_wavelengths(
+    path: Path,
+    bands: Sequence[int],
+    file_bands: int,
+    *,
+    stated: Sequence[float] | None,
+    settings: SceneSettings,
+    assumed_nm: Sequence[float] | None,
+    known: BandWavelengths | None = None,
+) -> BandWavelengths:
+    """Wavelengths of the chosen bands: the flag first, then ``scene.toml``, then the file, then its colours.
+
+    Parameters
+    ----------
+    bands
+        Chosen bands, counted from 0, of ``file_bands``.
+    stated
+        From the flag: one for each chosen band, or one for each band of the file. [nm]
+    assumed_nm
+        One for each band of the file, or None where nothing can be assumed. [nm]
+    known
+        What the file itself says, of every band.
+
+    Raises
+    ------
+    WavelengthError : nothing says them, or their number, unit or range is wrong.
+    """
+    chosen = list(bands)
+    if stated is not None:
+        values = check_wavelengths(stated, "--wavelengths")
+        fitting = _fit(values, chosen, file_bands, chosen, f"--wavelengths for {path}")
+        return BandWavelengths(fitting, None, f"wavelengths stated: {_listed(fitting)} nm")
+    if settings.wavelengths_nm is not None:
+        values = check_wavelengths(settings.wavelengths_nm, f"{settings.path}: wavelengths_nm")
+        own = list(range(file_bands)) if settings.bands is None else list(settings.bands)
+        fitting = _fit(values, chosen, file_bands, own, f"{settings.path}: wavelengths_nm for {path}")
+        return BandWavelengths(fitting, None, f"wavelengths from {settings.path}")
+    if settings.wavelengths_file is not None:
+        return _from_file(settings.wavelengths_file, settings.dropped_bands, chosen, file_bands)
+    if known is not None and len(known.centre_nm) == file_bands:
+        centre = check_wavelengths(known.centre_nm, str(path))[chosen]
+        return BandWavelengths(centre, None if known.fwhm_nm is None else known.fwhm_nm[chosen], known.origin)
+    if assumed_nm is not None and len(assumed_nm) == file_bands:
+        centre = np.asarray(assumed_nm, np.float64)[chosen]
+        return BandWavelengths(centre, None, f"wavelengths assumed from the file's colours: {_listed(centre)} nm")
+    raise WavelengthError(
+        f"{path} has {file_bands} bands and nothing says their wavelengths; give --wavelengths in nm, or write "
+        f"wavelengths_nm or wavelengths_file into a scene.toml beside it (axes are y, x, band)"
+    )
+
+
+def _fit(
+    values: NDArray[np.float64], chosen: list[int], file_bands: int, own: list[int], where: str
+) -> NDArray[np.float64]:
+    """Pick the chosen bands out of wavelengths that belong to the bands ``own``, or to every band of the file."""
+    belongs = own if len(values) == len(own) else list(range(file_bands))
+    if len(values) != len(belongs):
+        ways = f"{len(own)} or {file_bands}" if len(own) != file_bands else f"{file_bands}"
+        raise WavelengthError(f"{where}: expected {ways} wavelengths, one a band, got {len(values)}; correct the list")
+    known = dict(zip(belongs, values.tolist(), strict=True))
+    missing = [band for band in chosen if band not in known]
+    if missing:
+        raise WavelengthError(f"{where}: nothing for band {missing[0]} (from 0); give --wavelengths with --bands")
+    return np.array([known[band] for band in chosen], np.float64)
+
+
+def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands: int) -> BandWavelengths:
+    """Rows of nm and FWHM, less the dropped ones (counted from 1)."""
+    table = _table(path)
+    bad = [row for row in dropped if not 1 <= row <= len(table)]
+    if bad:
+        raise WavelengthError(f"dropped_bands has {bad[0]}, but {path} has rows 1..{len(table)}; correct the list")
+    kept = np.delete(table, [row - 1 for row in set(dropped)], axis=0)
+    if len(kept) != file_bands:
+        raise WavelengthError(
+            f"{path} has {len(table)} rows, {len(set(dropped))} of them dropped, which leaves {len(kept)} wavelengths "
+            f"for {file_bands} bands; correct dropped_bands in scene.toml"
+        )
+    centre = check_wavelengths(kept[:, 0], str(path))[chosen]
+    widths = kept[:, 1] if kept.shape[1] > 1 else None
+    known = widths is not None and bool((np.isfinite(widths) & (widths > 0)).all())
+    return BandWavelengths(centre, widths[chosen] if known and widths is not None else None, f"wavelengths from {path}")
+
+
+def _table(path: Path) -> NDArray[np.float64]:
+    """Rows of a text file that begin with a number; headings are passed over. (row, 1 or 2)"""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise WavelengthError(f"wavelengths_file {path} cannot be read: {error}; correct scene.toml") from error
+    rows = [row for row in (_row(line) for line in lines) if row]
+    if not rows:
+        raise WavelengthError(f"{path} has no row that begins with a number; expected columns of nm and FWHM")
+    columns = min(2, *(len(row) for row in rows)) if len(rows) > 1 else min(2, len(rows[0]))
+    return np.array([row[:columns] for row in rows], np.float64)
+
+
+def _row(line: str) -> list[float]:
+    row: list[float] = []
+    for word in line.replace(",", " ").replace(";", " ").split():
+        try:
+            row.append(float(word))
+        except ValueError:
+            break
+    return row
+
+
+def _listed(values: NDArray[np.float64]) -> str:
+    shown = ", ".join(f"{value:g}" for value in values[:6])
+    return shown + (f", ... ({values.size})" if values.size > 6 else "")

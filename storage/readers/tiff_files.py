@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.readers.cube_sources import GREY_NM, NEAR_INFRARED_NM, RGB_NM, Raster
-from storage.readers.declared_sizes import check_claim, check_memory
+from storage.readers.cube_sources import GREY_NM, NEAR_INFRARED_NM, RGB_NM, Raster, check_claim, check_memory
 
 TIFF_ENDINGS = (".tif", ".tiff")
 _NODATA_TAG = 42113  # GDAL's

@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 import zarr
 
 from pipeline.errors import SceneError
-from storage.readers.declared_sizes import DEFLATE_RATIO, MOST_RATIO, check_memory
+from storage.readers.cube_sources import DEFLATE_RATIO, MOST_RATIO, check_memory
 
 METADATA = ("zarr.json", ".zarray", ".zgroup")
 LARGEST_METADATA = 1 << 24  # bytes

@@ -12,8 +12,7 @@ from typing import Any
 from storage.archive.manifests import try_manifest
 from storage.archive.records import RECEIPT
 from storage.archive.staging import MANIFEST_NAME, refusals
-from storage.maintenance.shard_names import name_damage
-from storage.maintenance.verification import Finding, Progress, verify_everything
+from storage.maintenance.verification import Finding, Progress, name_damage, verify_everything
 from storage.remote.object_leases import FOLDER as LEASES
 from storage.remote.object_stores import Listed, Objects, some_at_a_time
 from storage.remote.object_transfers import ATTEMPT, BEGUN, WITHDRAWN, files_at, is_address

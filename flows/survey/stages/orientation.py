@@ -12,9 +12,9 @@ from flows.survey.stages.attention import load_plan
 from pipeline.planning.crop_rows import find_rows
 from pipeline.planning.orientation import compare_orientations
 from storage.archive.archive import StageRef
-from storage.archive.stored_tables import read_table, write_table
-from storage.arrays.attention import load_attention
+from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import mosaic_brightness
+from storage.arrays.patches import load_attention
 
 TURNED = Product("turned", version=1)
 FILE = "orientation.json"

@@ -22,7 +22,7 @@ from pipeline.rectify.region import read_seats
 from pipeline.rectify.tie_points import TieTable
 from pipeline.rectify.tracks import Track
 from storage.archive.archive import StageRef
-from storage.archive.stored_tables import read_table, write_table
+from storage.archive.manifests import read_table, write_table
 from storage.arrays.layout import read_array
 from storage.arrays.lookups import path_digest, write_lookup
 from storage.arrays.mosaics import MosaicWriter

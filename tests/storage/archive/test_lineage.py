@@ -11,8 +11,7 @@ import pytest
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
 from storage.archive.changes import ABSENT, Change, changes_between, flatten, version_before
-from storage.archive.lineage import Catalogue, rests_on
-from storage.archive.product_names import find_product
+from storage.archive.lineage import Catalogue, find_product, rests_on
 from storage.archive.records import Run
 from tests.storage.small_archive import flip, small_survey
 

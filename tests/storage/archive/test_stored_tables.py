@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.errors import IncompleteStoreError
 from storage.archive.archive import Archive
-from storage.archive.stored_tables import read_table
+from storage.archive.manifests import read_table
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import SceneError
-from storage.archive.toml_files import MOST_BYTES, read_toml
+from storage.archive.plain_files import MOST_BYTES, read_toml
 from storage.readers.scene_toml import load_scene_settings
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SettingsError
-from storage.arrays.codec_trials import CODECS, store_in_memory
+from storage.arrays.layout import CODECS, store_in_memory
 
 LINES = np.random.default_rng(0).poisson(300, (40, 70, 9)).astype(np.uint16)
 

@@ -15,12 +15,11 @@ from pipeline.geometry.scan import Sweep
 from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.source import Line, References
 from storage.archive.archive import Archive
-from storage.arrays.attention import Attention, load_attention, write_attention
 from storage.arrays.class_maps import ClassMap, load_class_map, write_class_map
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube, open_reflectance
 from storage.arrays.layout import AngularGrid, round_bits
 from storage.arrays.mosaics import Mosaic, MosaicWriter, load_mosaic
-from storage.arrays.patches import PatchWriter, open_patches
+from storage.arrays.patches import Attention, PatchWriter, load_attention, open_patches, write_attention
 
 GRID = AngularGrid(1.057e-4, (100, 70))
 

@@ -13,19 +13,24 @@ from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError
 from storage.arrays.ground_maps import ClassLegend
-from storage.export.stac_fields import (
+from storage.export.stac_items import (
     COG,
+    COLLECTION,
     ZARR,
+    Collection,
+    Item,
     angular,
     bounds,
     classes,
     clean_id,
     footprint,
+    need_pystac,
     projection,
     spectral_bands,
+    stac_problems,
     wavelengths,
+    write_stac,
 )
-from storage.export.stac_items import COLLECTION, Collection, Item, need_pystac, stac_problems, write_stac
 
 pystac = pytest.importorskip("pystac", reason="STAC is written with pystac, of the extra [geo]")
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3

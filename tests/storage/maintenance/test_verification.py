@@ -16,7 +16,7 @@ from storage.archive.archive import Archive, StageRef
 from storage.archive.manifests import _seal, _text
 from storage.archive.records import MANIFEST_HASH
 from storage.arrays.layout import create_group, open_group, read_array, write_image, write_small
-from storage.maintenance.shard_names import find_shard, name_damage
+from storage.maintenance.verification import find_shard, name_damage
 from tests.storage.small_archive import flip, small_survey
 
 FLIPS = 80

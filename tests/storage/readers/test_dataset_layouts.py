@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import SceneError
-from storage.readers.dataset_layouts import HYKO_CLASSES, HYKO_LABELS, RANUS_CLASSES
+from storage.readers.labels import HYKO_CLASSES, HYKO_LABELS, RANUS_CLASSES
 from storage.readers.scene_files import load_scene_file
 
 NM = np.linspace(470, 630, 5)

@@ -23,8 +23,8 @@ from storage.maintenance.verification import Finding
 from storage.remote import object_copies, object_leases
 from storage.remote.object_archive import ObjectArchive
 from storage.remote.object_places import UnreachableError
-from storage.remote.object_repairs import put_back_objects, repair_objects
 from storage.remote.object_stores import Objects
+from storage.remote.opening import put_back_objects, repair_objects
 from tests.storage.small_archive import Small, small_survey
 from tests.storage.small_bucket import FIRST, SECOND, Machine, make, object_of, problems, rot
 
@@ -168,7 +168,7 @@ def _put_back_once(patch: pytest.MonkeyPatch) -> None:
         calls.append(archive)
         return put_back_objects(archive) if len(calls) == 1 else []
 
-    patch.setattr("storage.remote.object_repairs.put_back_objects", put_back)
+    patch.setattr("storage.remote.opening.put_back_objects", put_back)
 
 
 def test_a_run_that_lost_its_manifest_keeps_its_stores(machine: Machine) -> None:
