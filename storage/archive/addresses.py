@@ -103,11 +103,6 @@ def _refuse_links(path: Path) -> None:
             )
 
 
-def is_folder_archive(path: Path) -> bool:
-    """Whether a path is an archive's folder, or a file, which `open_folder` refuses."""
-    return (path / "stages").is_dir() or path.is_file()
-
-
 @contextmanager
 def _any_refusal(path: Path) -> Iterator[None]:
     """At the door whatever the system answers means that this is no place for an archive."""

@@ -57,9 +57,8 @@ from storage.archive.staging import (
     retire,
     take_lock,
 )
-from storage.maintenance.verification import Finding, Progress, verify_everything
 
-__all__ = ["Archive", "Cost", "Finding", "RunDraft", "StageRef", "StagedStore", "stage_key"]
+__all__ = ["Archive", "Cost", "RunDraft", "StageRef", "StagedStore", "stage_key"]
 
 
 @dataclass(frozen=True)
@@ -264,10 +263,6 @@ class Archive:
         IncompleteStoreError : names the first file that is missing, changed or not listed.
         """
         check_files(ref.path, hashes=True)
-
-    def verify_all(self, progress: Progress | None = None) -> list[Finding]:
-        """Check every store and every run; each file and shard that is broken has a finding of its own."""
-        return verify_everything(self.root, progress)
 
     def reclaim(self) -> list[str]:
         """Remove unfinished folders that no living process works on; gives their addresses."""

@@ -81,7 +81,7 @@ def repair(
     Parameters
     ----------
     findings
-        Of `Archive.verify_all`.
+        Of `storage.maintenance.verification.verify_everything`.
     rerun
         Runs a survey by its settings, as the receipt has them, into this archive. What is whole is found there.
     versions

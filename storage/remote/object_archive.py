@@ -24,11 +24,9 @@ from storage.archive.archive import Archive
 from storage.archive.manifests import check_files
 from storage.archive.run_folders import RunDraft
 from storage.archive.staging import refusals
-from storage.maintenance.verification import Finding, Progress, verify_growing
+from storage.remote.object_checks import Lease, find_leftovers, find_lost_runs, take_lease
 from storage.remote.object_copies import KNOWN, WorkingCopy
-from storage.remote.object_leases import Lease, take_lease
-from storage.remote.object_places import UnreachableError, connect, parse_place
-from storage.remote.object_stores import Objects
+from storage.remote.object_stores import Objects, UnreachableError, connect, parse_place
 from storage.remote.object_transfers import BEGUN
 
 MARK = "archive.json"  # at the prefix: here is an archive
@@ -210,27 +208,17 @@ class ObjectArchive(Archive):
 
     # --- verification and clearing up ---------------------------------------------------------------------------------
 
-    def verify_all(self, progress: Progress | None = None) -> list[Finding]:
-        """Read every object of the archive again, and what grows here; findings are named as in a folder."""
-        from storage.remote.object_checks import verify_objects
-
-        return [*verify_objects(self.objects, progress), *verify_growing(self.root)]
-
     def size_of(self, uri: str) -> int:
         """Bytes of all objects of a store."""
         return sum(one.size for one in self.objects.listing(uri).values())
 
     def lost_runs(self) -> list[str]:
         """Addresses of runs in the bucket of which there are files, but no manifest, neither there nor here."""
-        from storage.remote.object_checks import find_lost_runs
-
         here = {f"runs/{folder.name}" for folder in self.runs()}
         return [uri for uri in find_lost_runs(self.objects.listing("runs")) if uri not in here]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
         """What was broken off and has been in the bucket for ``keep_days``: address and bytes."""
-        from storage.remote.object_checks import find_leftovers
-
         return find_leftovers(self.objects, keep_days)
 
     def drop_leftover(self, uri: str) -> None:

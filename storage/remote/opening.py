@@ -1,4 +1,9 @@
-"""Archives of either kind, a folder of this machine or a prefix of a bucket: what differs is chosen here."""
+"""Archives of either kind, a folder of this machine or a prefix of a bucket: what differs is chosen here.
+
+In a bucket an archive is made whole from this machine's working copy where that is whole, else by surveys. What is to
+be made anew is withdrawn: its manifest is kept below ``.withdrawn/``, its files stay. What a survey does not make again
+is put back; killed in between, the next repair, on whichever machine, begins by putting back.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +11,15 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from pipeline.errors import ArchiveError
-from storage.archive.addresses import is_folder_archive
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import file_problem, try_manifest
 from storage.archive.staging import MANIFEST_NAME, retire
 from storage.maintenance.repair import Repaired, Rerun, plan_repair, put_back, repair, run_again
-from storage.maintenance.verification import Finding
-from storage.remote.object_archive import ObjectArchive
-from storage.remote.object_places import is_remote, need_obstore
+from storage.maintenance.verification import Finding, Progress, verify_everything, verify_growing
+from storage.remote.object_archive import ObjectArchive, is_object_archive, open_object_archive
+from storage.remote.object_checks import verify_objects
+from storage.remote.object_stores import is_remote
 from storage.remote.object_transfers import WITHDRAWN, files_at
 
 
@@ -23,49 +28,53 @@ def open_archive(address: str | Path, *, create: bool = True, write: bool = True
 
     Raises
     ------
-    ArchiveError : the path is a file, is not there, or does not let itself be written to (``write``).
-    SettingsError : an address on S3 that is none, or obstore is not installed.
+    ArchiveError : the path is a file, is not there, or does not let itself be written to (``write``); obstore, which an
+        archive on S3 needs, is not installed.
+    SettingsError : an address on S3 that is none.
     """
-    if not is_remote(address):
-        return Archive.open(address, create=create, write=write)
-    need_obstore(address)
-    from storage.remote.object_archive import open_object_archive  # needs obstore
-
-    return open_object_archive(address, create=create, write=write)
+    if is_remote(address):
+        return open_object_archive(address, create=create, write=write)
+    return Archive.open(address, create=create, write=write)
 
 
 def is_archive(address: str | Path) -> bool:
     """Whether there is something to open: an archive, or a file that will be refused."""
-    if not is_remote(address):
-        return is_folder_archive(Path(address))
-    need_obstore(address)
-    from storage.remote.object_archive import is_object_archive
+    if is_remote(address):
+        return is_object_archive(address)
+    return (Path(address) / "stages").is_dir() or Path(address).is_file()
 
-    return is_object_archive(address)
+
+def verify_archive(archive: Archive, progress: Progress | None = None) -> list[Finding]:
+    """Check every store and every run; each file and shard that is broken has a finding of its own.
+
+    Of an archive in a bucket every object is read again, and what grows in the working copy; findings are named as in a
+    folder.
+    """
+    if isinstance(archive, ObjectArchive):
+        return [*verify_objects(archive.objects, progress), *verify_growing(archive.root)]
+    return verify_everything(archive.root, progress)
 
 
 def repair_archive(
     archive: Archive, findings: Iterable[Finding], rerun: Rerun, *, versions: Mapping[str, int | str] | None = None
 ) -> Repaired:
     """Make an archive whole again; see `storage.maintenance.repair.repair`."""
-    if not archive.in_bucket:
-        return repair(archive, findings, rerun, versions=versions)
-    from storage.remote.opening import repair_objects
-
-    return repair_objects(archive, findings, rerun, versions=versions)
+    if isinstance(archive, ObjectArchive):
+        return repair_objects(archive, findings, rerun, versions=versions)
+    return repair(archive, findings, rerun, versions=versions)
 
 
 def put_back_archive(archive: Archive) -> list[str]:
     """Put back what a repair that was killed had set aside; gives the addresses."""
-    if not archive.in_bucket:
-        return put_back(archive.root)
-    from storage.remote.opening import put_back_objects
-
-    return put_back_objects(archive)
+    return put_back_objects(archive) if isinstance(archive, ObjectArchive) else put_back(archive.root)
 
 
 def repair_objects(
-    archive: Archive, findings: Iterable[Finding], rerun: Rerun, *, versions: Mapping[str, int | str] | None = None
+    archive: ObjectArchive,
+    findings: Iterable[Finding],
+    rerun: Rerun,
+    *,
+    versions: Mapping[str, int | str] | None = None,
 ) -> Repaired:
     """Write broken objects again from the working copy; withdraw what it lacks, and run the surveys that name it.
 
@@ -73,7 +82,6 @@ def repair_objects(
     ------
     ArchiveError : somebody else uses the archive, or the bucket refuses.
     """
-    assert isinstance(archive, ObjectArchive)
     with archive.in_use(alone=True) as alone:
         if not alone:
             raise ArchiveError(f"{archive.name} is in use; run verify --repair again when the survey there has ended")
@@ -101,9 +109,8 @@ def repair_objects(
     return done
 
 
-def put_back_objects(archive: Archive) -> list[str]:
+def put_back_objects(archive: ObjectArchive) -> list[str]:
     """Put back what a broken-off repair had withdrawn, unless it has been made again; gives the addresses."""
-    assert isinstance(archive, ObjectArchive)
     back: list[str] = []
     for name in archive.objects.listing(WITHDRAWN):
         uri = name.removeprefix(f"{WITHDRAWN}/").removesuffix(f"/{MANIFEST_NAME}")

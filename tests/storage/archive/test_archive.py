@@ -16,6 +16,7 @@ import pytest
 from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.archive.archive import Archive, stage_key
 from storage.archive.staging import take_lock
+from storage.remote.opening import verify_archive
 
 
 def _publish(archive: Archive, key: str = "abc", text: str = "content") -> Path:
@@ -81,7 +82,7 @@ def test_one_changed_byte_is_named(tmp_path: Path, victim: str) -> None:
     assert ref is not None
     with pytest.raises(IncompleteStoreError, match=rf"{victim} has changed since it was published"):
         archive.verify(ref)
-    assert [finding.problem is None for finding in archive.verify_all() if finding.uri == ref.uri] == [False]
+    assert [finding.problem is None for finding in verify_archive(archive) if finding.uri == ref.uri] == [False]
 
 
 def test_missing_short_and_extra_files_are_named(tmp_path: Path) -> None:
@@ -224,7 +225,7 @@ def test_a_run_appears_as_a_whole(tmp_path: Path) -> None:
     assert folder.name == run.id
     assert "field-7-north" in run.id
     assert json.loads((folder / "receipt.json").read_text()) == {"survey": "north"}
-    assert [(finding.uri, finding.problem) for finding in archive.verify_all()] == [(f"runs/{run.id}", None)]
+    assert [(finding.uri, finding.problem) for finding in verify_archive(archive)] == [(f"runs/{run.id}", None)]
 
 
 def test_a_broken_run_leaves_nothing_and_a_live_one_is_not_reclaimed(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from storage.archive.archive import Archive
 from storage.archive.changes import ABSENT, Change, changes_between, flatten, version_before
 from storage.archive.lineage import Catalogue, find_product, rests_on
 from storage.archive.records import Run
+from storage.remote.opening import verify_archive
 from tests.storage.small_archive import flip, small_survey
 
 
@@ -77,7 +78,7 @@ def test_any_manifest_can_be_read_or_is_told_damaged(tmp_path: Path, content: st
     assert problem is not None
     assert problem.startswith("manifest.json cannot be believed")
     assert catalogue.inputs_of(small.mosaic.uri) == []
-    broken = [one.uri for one in archive.verify_all() if one.problem is not None]
+    broken = [one.uri for one in verify_archive(archive) if one.problem is not None]
     assert broken == [small.mosaic.uri]
 
 
@@ -96,7 +97,7 @@ def test_odd_inputs_are_borne(tmp_path: Path, inputs: object) -> None:
     catalogue = Catalogue.read(tmp_path)
     assert catalogue.dependents([small.map.uri]) == set()
     assert version_before(catalogue, small.map.uri) is None
-    assert all(isinstance(one.uri, str) for one in archive.verify_all())
+    assert all(isinstance(one.uri, str) for one in verify_archive(archive))
 
 
 def test_what_changed_is_followed_to_where_it_began(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
 from storage.maintenance.garbage import clear_up
+from storage.remote.opening import verify_archive
 from tests.storage.small_archive import Small, small_survey
 
 ELSEWHERE = "elsewhere"  # beside the archive
@@ -133,7 +134,7 @@ def test_verify_tells_it_by_name(case: Case, tmp_path: Path) -> None:
     archive = Archive.open(tmp_path / "archive")
     small = small_survey(archive)
     uri = case(small)
-    told = [(one.uri, str(one.problem)) for one in archive.verify_all() if one.problem is not None]
+    told = [(one.uri, str(one.problem)) for one in verify_archive(archive) if one.problem is not None]
     kind = case.__name__.partition("_")[0]
     assert any(f"is a {kind}" in problem for _, problem in told), told
     assert {place for place, _ in told} == {uri}
@@ -165,13 +166,13 @@ def test_a_copied_run_is_told(tmp_path: Path) -> None:
     small = small_survey(archive)
     assert small.run is not None
     copy = shutil.copytree(small.run, small.run.with_name(f"{small.run.name}-copy"))
-    (found,) = (one for one in archive.verify_all() if one.problem is not None)
+    (found,) = (one for one in verify_archive(archive) if one.problem is not None)
     assert (found.uri, found.kind) == (f"runs/{copy.name}", "stray")
     assert (
         found.problem == f"its manifest.json is that of runs/{small.run.name}; it is a copy: take it out of the archive"
     )
     shutil.rmtree(small.run)
-    (found,) = (one for one in archive.verify_all() if one.problem is not None)
+    (found,) = (one for one in verify_archive(archive) if one.problem is not None)
     assert str(found.problem).endswith(f"is that of runs/{small.run.name}; give it its name back")
 
 

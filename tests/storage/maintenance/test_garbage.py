@@ -9,11 +9,12 @@ import pytest
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
 from storage.maintenance.garbage import IN_USE, Removal, clear_up, plan_clearance
+from storage.remote.opening import verify_archive
 from tests.storage.small_archive import flip, grow_old, small_survey
 
 
 def _problems(archive: Archive) -> list[str]:
-    return [f"{one.uri} {one.problem}" for one in archive.verify_all() if one.problem is not None]
+    return [f"{one.uri} {one.problem}" for one in verify_archive(archive) if one.problem is not None]
 
 
 def test_what_no_run_names_goes_and_the_rest_stays(tmp_path: Path) -> None:

@@ -12,20 +12,21 @@ import pytest
 from pipeline.errors import ArchiveError, SceneError
 from storage.archive.archive import Archive
 from storage.maintenance.repair import Repaired, plan_repair, put_back, repair
+from storage.remote.opening import verify_archive
 from tests.storage.small_archive import Small, flip, small_survey
 
 VERSIONS = {"capture": 1, "rectify": 1, "segment": 1}
 
 
 def _bad(archive: Archive) -> list[str]:
-    return [one.uri for one in archive.verify_all() if one.problem is not None]
+    return [one.uri for one in verify_archive(archive) if one.problem is not None]
 
 
 def _repair(archive: Archive, rerun: Callable[[dict[str, Any]], None] | None = None) -> Repaired:
     def again(settings: dict[str, Any]) -> None:
         small_survey(archive, seed=settings["seed"], kernel=settings["kernel"])
 
-    return repair(archive, archive.verify_all(), rerun or again, versions=VERSIONS)
+    return repair(archive, verify_archive(archive), rerun or again, versions=VERSIONS)
 
 
 def _two(archive: Archive) -> tuple[Small, Small]:
@@ -126,7 +127,7 @@ def test_a_repair_broken_off_is_put_back_first(tmp_path: Path) -> None:
     assert _moments(archive) == before
     (tmp_path / ".aside" / "segment").mkdir(parents=True)
     small.map.path.rename(tmp_path / ".aside" / "segment" / small.map.key)
-    told = {one.uri: one.problem for one in archive.verify_all() if one.problem is not None}
+    told = {one.uri: one.problem for one in verify_archive(archive) if one.problem is not None}
     assert "a repair was broken off" in (told[f".aside/segment/{small.map.key}"] or "")
     assert put_back(tmp_path) == [small.map.uri]
     assert _moments(archive) == before
@@ -159,7 +160,7 @@ def test_one_survey_is_run_again_once(tmp_path: Path) -> None:
         archive.new_run("farm").publish(settings=asked, rests_on=archive.manifest_hashes([small.map]))
     flip(small.mosaic.path / "data.bin")
     ran: list[str] = []
-    repair(archive, archive.verify_all(), lambda settings: ran.append(settings["kernel"]), versions=VERSIONS)
+    repair(archive, verify_archive(archive), lambda settings: ran.append(settings["kernel"]), versions=VERSIONS)
     assert ran == ["bilinear"]
 
 
@@ -217,9 +218,9 @@ def test_stores_of_a_version_no_longer_made_stay(tmp_path: Path) -> None:
     archive = Archive.open(tmp_path)
     small = small_survey(archive)
     flip(small.raw.path / "data.bin")
-    plan = plan_repair(archive, archive.verify_all(), versions=VERSIONS | {"segment": 2})
+    plan = plan_repair(archive, verify_archive(archive), versions=VERSIONS | {"segment": 2})
     assert plan.remade == (small.mosaic.uri, small.raw.uri)
-    plan = plan_repair(archive, archive.verify_all(), versions=VERSIONS | {"capture": 2})
+    plan = plan_repair(archive, verify_archive(archive), versions=VERSIONS | {"capture": 2})
     assert plan.remade == ()
     assert "made by version 1 of the stage capture, which is now 2" in plan.hopeless[small.raw.uri]
 

@@ -17,6 +17,7 @@ from storage.archive.manifests import _seal, _text
 from storage.archive.records import MANIFEST_HASH
 from storage.arrays.layout import create_group, open_group, read_array, write_image, write_small
 from storage.maintenance.verification import find_shard, name_damage
+from storage.remote.opening import verify_archive
 from tests.storage.small_archive import flip, small_survey
 
 FLIPS = 80
@@ -36,7 +37,7 @@ def _with_cube(archive: Archive) -> StageRef:
 
 def _found(archive: Archive) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
-    for one in archive.verify_all():
+    for one in verify_archive(archive):
         if one.problem is not None:
             found.setdefault(one.uri, []).append(one.problem)
     return found
@@ -166,7 +167,7 @@ def test_what_is_gone_is_told_once(tmp_path: Path) -> None:
     small_survey(archive)
     for ref in (small.mosaic, other.mosaic):
         archive.discard(ref)
-    gone = [one for one in archive.verify_all() if one.kind == "missing"]
+    gone = [one for one in verify_archive(archive) if one.kind == "missing"]
     assert [one.uri for one in gone] == [small.mosaic.uri, other.mosaic.key]
     assert f"is not there, but {other.map.uri} was made of it" in str(gone[1].problem)
 
@@ -202,7 +203,9 @@ def test_what_is_cleared_away_meanwhile_is_no_damage(tmp_path: Path) -> None:
     named, other = small_survey(archive), small_survey(archive, seed=1, named=False)
 
     def clear(ref: StageRef) -> list[str]:
-        return [one.uri for one in archive.verify_all(lambda uri, done: archive.discard(ref) and None) if one.problem]
+        return [
+            one.uri for one in verify_archive(archive, lambda uri, done: archive.discard(ref) and None) if one.problem
+        ]
 
     assert clear(other.map) == []
     assert clear(named.map) == [named.map.uri]
@@ -213,7 +216,7 @@ def test_progress_goes_by_bytes(tmp_path: Path) -> None:
     archive = Archive.open(tmp_path)
     small_survey(archive)
     seen: list[tuple[str, float]] = []
-    archive.verify_all(lambda uri, done: seen.append((uri, done)))
+    verify_archive(archive, lambda uri, done: seen.append((uri, done)))
     assert len(seen) == 4
     assert [done for _, done in seen] == sorted(done for _, done in seen)
     assert seen[0][1] == 0.0 < seen[-1][1] < 1.0
