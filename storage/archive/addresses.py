@@ -77,9 +77,7 @@ PARTS = ("stages", "runs", "spool", "schedule", ".aside", ".locks")
 def open_folder(path: Path, *, create: bool, write: bool) -> None:
     """Make an archive's folder where ``create``, and see whether it can be used.
 
-    Raises
-    ------
-    ArchiveError : the path is a file, is not there, or does not let itself be read or written to (``write``).
+    Raises ArchiveError: the path is a file, is not there, or does not let itself be read or written to (``write``).
     """
     with _any_refusal(path), refusals(path, "use the archive"):
         if path.exists() and not path.is_dir():

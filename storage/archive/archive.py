@@ -82,9 +82,7 @@ class Archive:
     def open(cls, root: str | Path, *, create: bool = True, write: bool = True) -> Archive:
         """Open the archive in a folder, or make it where ``create``; `storage.remote.opening` knows buckets as well.
 
-        Raises
-        ------
-        ArchiveError : the path is a file, is not there, or does not let itself be written to (``write``).
+        Raises ArchiveError: the path is a file, is not there, or does not let itself be written to (``write``).
         """
         path = Path(root).absolute()
         open_folder(path, create=create, write=write)
@@ -112,9 +110,8 @@ class Archive:
     def locate(self, address: str) -> Path:
         """Where on this machine a product lies by its address relative to the archive, as a receipt gives it.
 
-        Raises
-        ------
-        IncompleteStoreError : its store is not there, or a file of it is missing, cut short, a link or no file at all.
+        Raises IncompleteStoreError: its store is not there, or a file of it is missing, cut short, a link or no file at
+        all.
         """
         uri = in_text(address)
         if uri is not None:
@@ -124,9 +121,7 @@ class Archive:
     def find(self, stage: str, key: str) -> StageRef | None:
         """The published store, or None. Sizes are compared with the manifest, content only by :meth:`verify`.
 
-        Raises
-        ------
-        IncompleteStoreError : it is there, but its manifest or a file is missing, or has another size.
+        Raises IncompleteStoreError: it is there, but its manifest or a file is missing, or has another size.
         """
         ref = store_at(self.root, stage, key)
         if not os.path.lexists(ref.path):
@@ -147,13 +142,10 @@ class Archive:
     ) -> Iterator[StagedStore]:
         """Give a folder to write into, and publish it when the block ends well.
 
-        One process at a time makes a key; the others wait and then find ``done``. When the block fails, the folder
-        is removed and the archive is as before. The manifest says what the block took, with ``work``, how much it had
-        to do in units of the stage's own: from these the cost of the next one is estimated.
-
-        Raises
-        ------
-        ArchiveError : the disk refuses; the message names the path and what to do.
+        One process at a time makes a key; the others wait and then find ``done``. When the block fails, the folder is
+        removed and the archive is as before. The manifest says what the block took, with ``work``, how much it had to
+        do in units of the stage's own: from these the cost of the next one is estimated. Raises ArchiveError: the disk
+        refuses; the message names the path and what to do.
         """
         ref = self.ref(stage, key)
         final = self.root / ref.uri
@@ -258,9 +250,7 @@ class Archive:
     def verify(self, ref: StageRef) -> None:
         """Read every byte of one store again.
 
-        Raises
-        ------
-        IncompleteStoreError : names the first file that is missing, changed or not listed.
+        Raises IncompleteStoreError: names the first file that is missing, changed or not listed.
         """
         check_files(ref.path, hashes=True)
 
@@ -331,11 +321,8 @@ class Archive:
     def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
         """Begin to add to a published run; it stays as it is until :meth:`RunDraft.publish` of what is given.
 
-        One process at a time does so; None where another does and ``wait`` is false.
-
-        Raises
-        ------
-        ArchiveError : there is no run of this name.
+        One process at a time does so; None where another does and ``wait`` is false. Raises ArchiveError: there is no
+        run of this name.
         """
         check_name(run_id)
         folder = self.root / "runs" / (run_id + PART_SUFFIX)

@@ -27,11 +27,7 @@ def stage_key(
     """Key of one stage's output: 20 hex digits of the SHA-256 of stage, version, parameters and input keys.
 
     Floats count to 12 significant digits, 2 and 2.0 alike; the order of parameters does not count, that of a list of
-    inputs does.
-
-    Raises
-    ------
-    ArchiveError : a parameter is of a kind that has no lasting text, such as a function.
+    inputs does. Raises ArchiveError: a parameter is of a kind that has no lasting text, such as a function.
     """
     facts = {"stage": stage, "version": str(version), "params": params, "inputs": inputs}
     return hashlib.sha256(canonical_json(facts).encode()).hexdigest()[:KEY_LENGTH]

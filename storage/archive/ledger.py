@@ -41,9 +41,7 @@ class Ledger:
     def lines(self) -> list[dict[str, Any]]:
         """Every line that can be believed, oldest first; none of a field that was never scheduled.
 
-        Raises
-        ------
-        ArchiveError : the file is there and cannot be read.
+        Raises ArchiveError: the file is there and cannot be read.
         """
         try:
             content = read_plain(self.path)
@@ -56,9 +54,7 @@ class Ledger:
     def append(self, line: Mapping[str, Any]) -> None:
         """Add one line, for good.
 
-        Raises
-        ------
-        ArchiveError : the disk refuses; what was there stays.
+        Raises ArchiveError: the disk refuses; what was there stays.
         """
         content = with_check(json.dumps(line, ensure_ascii=False, allow_nan=False).encode())
         with refusals(self._root, "write to the archive"):

@@ -167,9 +167,7 @@ LATEST = "latest"  # the newest run
 def find_product(catalogue: Catalogue, text: str) -> str | Run:
     """The address of a store that is there, or a run.
 
-    Raises
-    ------
-    ArchiveError : nothing is called so, several things are, or it could not be a name in any archive.
+    Raises ArchiveError: nothing is called so, several things are, or it could not be a name in any archive.
     """
     parts = text.rstrip("/").split("/")
     for part in parts:

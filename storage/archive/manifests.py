@@ -48,12 +48,7 @@ class Stopwatch:
         self._wall, self._cpu = time.perf_counter(), time.process_time()
 
     def cost(self, work: float | None) -> dict[str, Any]:
-        """The entry ``cost`` of a manifest.
-
-        Raises
-        ------
-        ArchiveError : ``work`` is no amount.
-        """
+        """The entry ``cost`` of a manifest (ArchiveError: ``work`` is no amount)."""
         if work is not None and not (math.isfinite(work) and work >= 0):
             raise ArchiveError(f"work is {work}, expected a number of units of work, 0 or more, or None")
         times = {"wall_s": time.perf_counter() - self._wall, "cpu_s": time.process_time() - self._cpu}
@@ -84,10 +79,8 @@ def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
 def read_manifest(folder: Path) -> dict[str, Any]:
     """Content of a published folder's manifest.
 
-    Raises
-    ------
-    IncompleteStoreError : there is none, it cannot be read, its own seal says that it has changed, or it lists what
-        cannot be a file of this folder.
+    Raises IncompleteStoreError: there is none, it cannot be read, its own seal says that it has changed, or it lists
+    what cannot be a file of this folder.
     """
     content, problem = try_manifest(folder)
     if problem is not None:
@@ -132,9 +125,7 @@ def is_sealed(manifest: Mapping[str, Any]) -> bool:
 def manifest_sha256(folder: Path) -> str:
     """SHA-256 of a published folder's manifest.json: what a run records of each store that it rests on.
 
-    Raises
-    ------
-    IncompleteStoreError : there is none.
+    Raises IncompleteStoreError: there is none.
     """
     try:
         return file_hash(folder / MANIFEST_NAME)
@@ -197,9 +188,7 @@ def extended_at(manifest: Mapping[str, Any]) -> str:
 def check_files(folder: Path, *, hashes: bool) -> None:
     """Compare a published folder with its manifest: names and sizes, and every byte where ``hashes``.
 
-    Raises
-    ------
-    IncompleteStoreError : names the first file that is missing, has another size or content, or is not listed.
+    Raises IncompleteStoreError: names the first file that is missing, has another size or content, or is not listed.
     """
     for name, problem in broken_files(folder, read_manifest(folder), hashes=hashes):
         raise IncompleteStoreError(f"{folder / name} {problem}; {CURE}")
@@ -301,9 +290,7 @@ def library_versions() -> Mapping[str, str]:
 def read_table(path: Path) -> dict[str, Any]:
     """Content of a file directly in a published store's folder.
 
-    Raises
-    ------
-    IncompleteStoreError : the store's manifest does not list the file, or not one of these bytes.
+    Raises IncompleteStoreError: the store's manifest does not list the file, or not one of these bytes.
     """
     entry = read_manifest(path.parent)["files"].get(path.name)
     problem = "is in no manifest" if entry is None else file_problem(path, entry, hashes=True)

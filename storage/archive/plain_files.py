@@ -40,9 +40,7 @@ def kind_of(path: Path) -> str | None:
 def plain_size(path: Path) -> int:
     """Bytes of a file.
 
-    Raises
-    ------
-    NotPlainError : it is a link, a pipe, or whatever else is no file. FileNotFoundError, OSError
+    Raises NotPlainError: it is a link, a pipe, or whatever else is no file. FileNotFoundError, OSError.
     """
     found = path.lstat()
     _check(path, found.st_mode)
@@ -52,9 +50,7 @@ def plain_size(path: Path) -> int:
 def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
     """Give a descriptor of a file, which the caller closes.
 
-    Raises
-    ------
-    NotPlainError : it is a link, a pipe, or whatever else is no file. FileNotFoundError, OSError
+    Raises NotPlainError: it is a link, a pipe, or whatever else is no file. FileNotFoundError, OSError.
     """
     if not flags & os.O_CREAT:
         _check(path, path.lstat().st_mode)  # before it is opened: some devices act on that
@@ -98,10 +94,7 @@ MOST_BYTES = 10_000_000  # settings are a page long
 def read_toml(path: Path) -> dict[str, Any]:
     """The tables of a file; a byte order mark, as some editors write it, is passed over.
 
-    Raises
-    ------
-    FileNotFoundError : there is no such file.
-    ValueError : it cannot be read as TOML; the message says why.
+    Raises FileNotFoundError: there is no such file. ValueError: it cannot be read as TOML; the message says why.
     """
     try:
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:

@@ -133,13 +133,10 @@ def file_hash(path: Path) -> str:
 def take_lock(path: Path, *, wait: bool = True, shared: bool = False, words: str = "") -> Callable[[], None] | None:
     """Hold ``path`` against other processes and threads until the function returned is called, or the process dies.
 
-    None where another holds it and ``wait`` is false. Holders of a ``shared`` lock keep out only those that want it
-    for themselves. The file goes away with a lock that is not shared; letting go twice is harmless. ``words`` are
-    written into it for others to read, as far as the disk takes them.
-
-    Raises
-    ------
-    ArchiveError : a link, or something else than a file, is in its place: what it leads to is not touched.
+    None where another holds it and ``wait`` is false. Holders of a ``shared`` lock keep out only those that want it for
+    themselves. The file goes away with a lock that is not shared; letting go twice is harmless. ``words`` are written
+    into it for others to read, as far as the disk takes them. Raises ArchiveError: a link, or something else than a
+    file, is in its place: what it leads to is not touched.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     while True:

@@ -49,9 +49,7 @@ class ClassNames:
 def write_class_map(path: Path, found: ClassMap) -> None:
     """Store classes with their names and colours, and the confidence.
 
-    Raises
-    ------
-    ShapeError : sizes differ, or a pixel has a class without a name.
+    Raises ShapeError: sizes differ, or a pixel has a class without a name.
     """
     create_class_map(path, found.classes.shape, ClassNames(found.names, found.colours), grid=found.grid)
     write_class_tile(path, (0, 0), found.classes, found.confidence)
@@ -62,9 +60,7 @@ def create_class_map(
 ) -> None:
     """Begin a class map of (y, x) ``shape`` in which no pixel has a class yet.
 
-    Raises
-    ------
-    ShapeError : there are not as many colours as names.
+    Raises ShapeError: there are not as many colours as names.
     """
     if len(legend.colours) != len(legend.names):
         raise ShapeError(
@@ -85,13 +81,9 @@ def write_class_tile(
 ) -> None:
     """Store (y, x) classes and confidence of whole shards from row and column ``origin`` on.
 
-    Threads and processes may write different tiles of one map at once.
-
-    Raises
-    ------
-    ShapeError : sizes differ, the tile does not fit the map, or a pixel has a class without a name.
-    ChunkError : the tile splits a shard.
-    IncompleteStoreError : there is no map.
+    Threads and processes may write different tiles of one map at once. Raises ShapeError: sizes differ, the tile does
+    not fit the map, or a pixel has a class without a name. ChunkError: the tile splits a shard. IncompleteStoreError:
+    there is no map.
     """
     with damage_named(str(path)):
         group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)

@@ -100,9 +100,7 @@ class RawCubeWriter:
     def write(self, lines: Sequence[Line]) -> None:
         """Take the next lines; any number, in order.
 
-        Raises
-        ------
-        ShapeError : a line is out of order, too many, or of another size than the references.
+        Raises ShapeError: a line is out of order, too many, or of another size than the references.
         """
         for line in lines:
             number = len(self._facts)
@@ -122,12 +120,7 @@ class RawCubeWriter:
                 self._flush()
 
     def close(self) -> None:
-        """Write what waits, the lines' coordinates and the picture.
-
-        Raises
-        ------
-        IncompleteStoreError : lines are missing.
-        """
+        """Write what waits, the lines' coordinates and the picture (IncompleteStoreError: lines are missing)."""
         if len(self._facts) != self._header.sweep.lines:
             raise IncompleteStoreError(
                 f"sweep {self._header.sweep.name} has {len(self._facts)} of {self._header.sweep.lines} lines; "
@@ -232,9 +225,7 @@ class RawCube:
 def open_raw_cube(path: Path) -> RawCube:
     """Open a sweep that :class:`RawCubeWriter` stored.
 
-    Raises
-    ------
-    IncompleteStoreError : there is none, it was not closed, or it is damaged.
+    Raises IncompleteStoreError: there is none, it was not closed, or it is damaged.
     """
     group = open_group(path)
     wavelength, fwhm = read_bands(group)

@@ -40,9 +40,7 @@ _CONVENTIONS = [
 def map_attributes(geobox: GeoBox) -> dict[str, Any]:
     """GeoZarr ``proj:`` and ``spatial:`` attributes of a map; the transform maps pixel corners.
 
-    Raises
-    ------
-    PoseError : the grid has no CRS, or does not lie along its axes.
+    Raises PoseError: the grid has no CRS, or does not lie along its axes.
     """
     crs = _crs_of(geobox)
     code = {} if crs.epsg is None else {"proj:code": f"EPSG:{crs.epsg}"}
@@ -84,9 +82,7 @@ def _crs_of(geobox: GeoBox) -> CRS:
 def load_geobox(path: Path) -> GeoBox | None:
     """Read the grid of a stored map; None where the store lies on an angular grid.
 
-    Raises
-    ------
-    IncompleteStoreError : the store is missing, or what says its grid is damaged.
+    Raises IncompleteStoreError: the store is missing, or what says its grid is damaged.
     """
     if GRID_MAPPING not in open_group(path):
         return None
@@ -122,9 +118,7 @@ class StoredImage:
     def rows(self) -> Iterator[tuple[int, NDArray[Any]]]:
         """Rows with the number of the first, as many at a time as a shard has.
 
-        Raises
-        ------
-        IncompleteStoreError : a checksum says that the bytes have changed.
+        Raises IncompleteStoreError: a checksum says that the bytes have changed.
         """
         for first in range(0, self.shape[0], SHARD_ROWS):
             yield first, read_array(self.group, self.name, slice(first, min(first + SHARD_ROWS, self.shape[0])))

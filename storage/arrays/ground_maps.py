@@ -80,10 +80,8 @@ class GroundMapWriter:
     ) -> None:
         """Store one block.
 
-        Raises
-        ------
-        ShapeError : the block's arrays do not fit its place, or a class has no name.
-        ChunkError : the block splits a shard.
+        Raises ShapeError: the block's arrays do not fit its place, or a class has no name. ChunkError: the block splits
+        a shard.
         """
         size = (rows.stop - rows.start, columns.stop - columns.start)
         if not (classes.shape == confidence.shape == picture.shape[:2] == size):

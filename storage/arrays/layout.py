@@ -157,12 +157,7 @@ def write_bands(group: zarr.Group, wavelength_nm: NDArray[np.float64], fwhm_nm: 
 
 
 def open_group(path: Path) -> zarr.Group:
-    """Open a store for reading.
-
-    Raises
-    ------
-    IncompleteStoreError : there is none, or its metadata is damaged.
-    """
+    """Open a store for reading (IncompleteStoreError: there is none, or its metadata is damaged)."""
     try:
         return zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -172,9 +167,7 @@ def open_group(path: Path) -> zarr.Group:
 def read_array(group: zarr.Group, name: str, selection: Any = ...) -> NDArray[Any]:
     """Read (part of) one array.
 
-    Raises
-    ------
-    IncompleteStoreError : there is no such array, or a checksum says that its bytes have changed.
+    Raises IncompleteStoreError: there is no such array, or a checksum says that its bytes have changed.
     """
     with damage_named(f"{group.store_path}/{name}"):
         array = group[name]
@@ -228,9 +221,7 @@ CODECS = ("none", *BLOSC, "zstd-3 bytes in order")
 def store_in_memory(values: NDArray[Any], codec: str) -> tuple[int, NDArray[Any]]:
     """Write an image (y, x, band) with one codec and read it back; gives the bytes stored and what was read.
 
-    Raises
-    ------
-    SettingsError : the codec is none of ``CODECS``.
+    Raises SettingsError: the codec is none of ``CODECS``.
     """
     held: dict[str, Any] = {}
     spec = image_spec(("y", "x", "band"), values.shape, values.dtype.str)

@@ -75,9 +75,7 @@ class MosaicWriter:
     def reopen(cls, path: Path) -> MosaicWriter:
         """Go on writing tiles of a mosaic that another writer has begun, in this process or another.
 
-        Raises
-        ------
-        IncompleteStoreError : no mosaic has been begun there.
+        Raises IncompleteStoreError: no mosaic has been begun there.
         """
         writer = cls.__new__(cls)
         writer.path = path
@@ -99,10 +97,7 @@ class MosaicWriter:
     def write_rows(self, first: int, values: NDArray[np.floating], coverage: NDArray[np.floating]) -> None:
         """Store (row, x, band) values and (row, x) coverage from row ``first`` on.
 
-        Raises
-        ------
-        ChunkError : the block splits a shard of 64 rows.
-        ShapeError : the block does not fit the mosaic.
+        Raises ChunkError: the block splits a shard of 64 rows. ShapeError: the block does not fit the mosaic.
         """
         last = first + len(values)
         if values.shape[1:] != self._shape[1:] or coverage.shape != values.shape[:2] or last > self._shape[0]:
@@ -116,10 +111,7 @@ class MosaicWriter:
     ) -> None:
         """Store (y, x, band) values and (y, x) coverage of whole shards; threads may write different ones at once.
 
-        Raises
-        ------
-        ChunkError : the tile splits a shard.
-        ShapeError : the tile does not fit the mosaic.
+        Raises ChunkError: the tile splits a shard. ShapeError: the tile does not fit the mosaic.
         """
         rows = slice(first_row, first_row + values.shape[0])
         columns = slice(first_column, first_column + values.shape[1])
@@ -172,9 +164,7 @@ def load_mosaic(path: Path) -> Mosaic:
 def mosaic_strips(path: Path, rows: slice = slice(None), columns: slice = slice(None)) -> Iterator[NDArray[np.float32]]:
     """Read a window of a mosaic from the top down, (y, x, band) strips that end where shards do.
 
-    Raises
-    ------
-    IncompleteStoreError : the mosaic is missing or damaged.
+    Raises IncompleteStoreError: the mosaic is missing or damaged.
     """
     group = open_group(path)
     with damage_named(f"{path}/values"):

@@ -68,10 +68,7 @@ class PatchWriter:
     def write(self, first: int, values: NDArray[np.floating], valid: NDArray[np.bool_]) -> None:
         """Store (patch, y, x, band) values and (patch, y, x) validity from patch ``first`` on.
 
-        Raises
-        ------
-        ChunkError : the patches split a shard of 64.
-        ShapeError : they do not fit the store.
+        Raises ChunkError: the patches split a shard of 64. ShapeError: they do not fit the store.
         """
         last = first + len(values)
         if values.shape[1:] != self._values.shape[1:] or valid.shape != values.shape[:3] or last > self._count:
@@ -132,12 +129,7 @@ class Attention:
 
 
 def write_attention(path: Path, attention: Attention) -> None:
-    """Store scores and ranks.
-
-    Raises
-    ------
-    ShapeError : they have different shapes.
-    """
+    """Store scores and ranks (ShapeError: they have different shapes)."""
     if attention.score.shape != attention.rank.shape or attention.score.ndim != 2:
         raise ShapeError(f"score {attention.score.shape} and rank {attention.rank.shape} must both be (seat_y, seat_x)")
     group = create_group(path, "attention", {"policy": attention.policy})

@@ -99,9 +99,7 @@ class Spool:
     def append(self, line: Line) -> None:
         """Write the next line; every 64th call waits until the disk has them.
 
-        Raises
-        ------
-        RigError : the line is out of order or of another size, or the disk refuses. The lines before it are kept.
+        Raises RigError: the line is out of order or of another size, or the disk refuses. The lines before it are kept.
         """
         self._check_line(line, self.count)
         content = _to_bytes(line.data)
@@ -122,11 +120,8 @@ class Spool:
     def mend(self, lines: Iterable[Line]) -> None:
         """Put lost lines back: one for each number in `lost`, in that order.
 
-        Afterwards both files are what they would be had nothing been lost; killed in between, some are lost yet.
-
-        Raises
-        ------
-        RigError : a line is out of order or of another size, or the disk refuses.
+        Afterwards both files are what they would be had nothing been lost; killed in between, some are lost yet. Raises
+        RigError: a line is out of order or of another size, or the disk refuses.
         """
         if not self.lost:
             return
@@ -174,9 +169,7 @@ class Spool:
     def blocks(self, size: int = SYNC_LINES) -> Iterator[list[Line]]:
         """Give the lines in blocks of ``size``; the last may be shorter.
 
-        Raises
-        ------
-        RigError : a line has changed since it was written, or is lost and not mended; names it.
+        Raises RigError: a line has changed since it was written, or is lost and not mended; names it.
         """
         if self._data is not None:
             self.sync()

@@ -112,21 +112,14 @@ class MosaicRecipe:
         return [path for path in given if path is not None]
 
     def sweeps(self) -> list[Sighted]:
-        """Open the sweeps, in the order of their names.
-
-        Raises
-        ------
-        IncompleteStoreError : one is missing or damaged.
-        """
+        """Open the sweeps, in the order of their names (IncompleteStoreError: one is missing or damaged)."""
         cubes = [open_raw_cube(path) for path in sorted(self.raw.glob("*.zarr"))]
         return sight_sweeps(cubes, self.registration, self.camera)
 
     def open(self) -> MosaicWork:
         """Open the sweeps and find where their lines lie, from stored tables where there are some.
 
-        Raises
-        ------
-        IncompleteStoreError : a sweep or the tables are missing or damaged.
+        Raises IncompleteStoreError: a sweep or the tables are missing or damaged.
         """
         tables: Tables = {} if self.lookup is None else open_lookup(self.lookup)
         placed = [_with_tables(one, self.camera, tables) for one in self.sweeps()]
@@ -313,9 +306,7 @@ def tile_budget(
 ) -> TileBudget:
     """Choose how many tiles to make at a time: as many as are allowed and memory holds; elsewhere memory is no matter.
 
-    Raises
-    ------
-    SettingsError : not even one tile at a time fits the memory.
+    Raises SettingsError: not even one tile at a time fits the memory.
     """
     processes = not crew.shares_memory
     most = max(1, min(1 if crew.elsewhere else crew.count, len(tiles)))

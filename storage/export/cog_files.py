@@ -76,11 +76,8 @@ def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
     """Write one file, replacing what was there as a whole. Blocks come in order; memory: one block, not the image.
 
     Classes get a colour table, their names as tags of the band, and as GDAL's category names in ``NAME.aux.xml``.
-
-    Raises
-    ------
-    ShapeError : the blocks do not fill the image.
-    ArchiveError : rasterio is not installed, the disk refuses, or what was written does not read back the same.
+    Raises ShapeError: the blocks do not fill the image. ArchiveError: rasterio is not installed, the disk refuses, or
+    what was written does not read back the same.
     """
     rasterio = need_rasterio()
     copy = importlib.import_module("rasterio.shutil").copy

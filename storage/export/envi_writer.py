@@ -36,14 +36,10 @@ class EnviFile:
 def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
     """Write ``NAME.hdr`` and the numbers beside it, ``NAME.img`` in any order of bands; gives the latter's path.
 
-    A pair that is there is replaced; a header never stands beside numbers that are not its own. Blocks of lines come
-    in order; memory: two blocks.
-
-    Raises
-    ------
-    ShapeError : the blocks do not fill the file, or the type or interleave is none of ENVI's.
-    PoseError : the map's grid is turned, or its pixels do not run down and to the right.
-    ArchiveError : the disk refuses.
+    A pair that is there is replaced; a header never stands beside numbers that are not its own. Blocks of lines come in
+    order; memory: two blocks. Raises ShapeError: the blocks do not fill the file, or the type or interleave is none of
+    ENVI's. PoseError: the map's grid is turned, or its pixels do not run down and to the right. ArchiveError: the disk
+    refuses.
     """
     text = header_text(file)
     data = header.with_suffix(".img")
@@ -80,10 +76,8 @@ def _write_lines(stream: BinaryIO, file: EnviFile, first: int, values: NDArray[A
 def header_text(file: EnviFile) -> str:
     """The header: sizes, type, byte order, bands, and the map where there is one.
 
-    Raises
-    ------
-    ShapeError : the type or interleave is none of ENVI's, or there are not as many wavelengths as bands.
-    PoseError : the map's grid is turned, or its pixels do not run down and to the right.
+    Raises ShapeError: the type or interleave is none of ENVI's, or there are not as many wavelengths as bands.
+    PoseError: the map's grid is turned, or its pixels do not run down and to the right.
     """
     return "".join(["ENVI\n", *(f"{key} = {value}\n" for key, value in _fields(file))])
 

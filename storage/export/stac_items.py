@@ -165,10 +165,8 @@ def need_pystac() -> Any:
 def write_stac(folder: Path, collection: Collection, item: Item) -> tuple[Path, Path]:
     """Write ``ID/ID.json`` and the collection of all items that lie in ``folder``; gives both paths.
 
-    Raises
-    ------
-    ArchiveError : pystac is not installed, the folder is another collection's, one of its items cannot be read, or
-        what would be written does not fit STAC's own schemas.
+    Raises ArchiveError: pystac is not installed, the folder is another collection's, one of its items cannot be read,
+    or what would be written does not fit STAC's own schemas.
     """
     pystac = need_pystac()
     check_owner(folder, collection.id)

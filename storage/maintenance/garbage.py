@@ -71,9 +71,7 @@ def clear_up(
 ) -> Clearance:
     """Remove what `plan_clearance` finds; what another process holds stays, and is not among the removals given.
 
-    Raises
-    ------
-    ArchiveError : the disk refuses.
+    Raises ArchiveError: the disk refuses.
     """
     if dry_run:
         with refusals(archive.root, "clear up the archive"):

@@ -108,9 +108,7 @@ def _damage_words(shard: Shard) -> str:
 def find_shard(store: Path, name: str) -> Shard | None:
     """The part of an array that ``name``, a file of a store, holds; None where it is no array's file.
 
-    Raises
-    ------
-    OSError, ValueError, KeyError, TypeError, IndexError : the array's own description is damaged.
+    Raises OSError, ValueError, KeyError, TypeError, IndexError: the array's own description is damaged.
     """
     file = store / name
     for array in file.parents:

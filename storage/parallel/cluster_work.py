@@ -88,9 +88,7 @@ class ProcessTeam:
     def run(self, make: Callable[[Any], Any], items: Sequence[Any], ended: Callable[[int, Any], None]) -> None:
         """Send blocks a few ahead of the oldest unfinished one, and give each result to ``ended``.
 
-        Raises
-        ------
-        WorkerError : workers died while they made the same block again and again, or all of them left.
+        Raises WorkerError: workers died while they made the same block again and again, or all of them left.
         """
         name, running = f"block-{uuid4().hex}-", dict[Any, int]()
 
@@ -162,10 +160,8 @@ class ProcessTeam:
     def check(self, paths: Sequence[Path]) -> None:
         """Ask the scheduler and every worker for their versions, and workers for their threads and some folders.
 
-        Raises
-        ------
-        SettingsError : one differs from this process; names it, both values and what to do.
-        WorkerError : a worker was lost meanwhile.
+        Raises SettingsError: one differs from this process; names it, both values and what to do. WorkerError: a worker
+        was lost meanwhile.
         """
         self._threads()
         folders = [str(path.absolute()) for path in paths]

@@ -45,12 +45,7 @@ class MatVariable:
 
 
 def list_mat_variables(path: Path) -> list[MatVariable]:
-    """Variables of a file, whatever they hold.
-
-    Raises
-    ------
-    SceneError : a variable is cut off, or says what cannot be.
-    """
+    """Variables of a file, whatever they hold (SceneError: a variable is cut off, or says what cannot be)."""
     with path.open("rb") as file:
         head = file.read(_HEADER)
         if len(head) < 20 or (0 not in head[:4] and head[126:128] not in (b"IM", b"MI")):
@@ -65,12 +60,7 @@ def list_mat_variables(path: Path) -> list[MatVariable]:
 
 
 def load_mat_variable(path: Path, variable: MatVariable) -> NDArray[Any]:
-    """Read one array of numbers.
-
-    Raises
-    ------
-    SceneError : it claims more than its bytes or the machine can hold.
-    """
+    """Read one array of numbers (SceneError: it claims more than its bytes or the machine can hold)."""
     where = f"{path}:{variable.name}"
     claimed = math.prod(variable.shape) * variable.width
     with path.open("rb") as file:
@@ -184,9 +174,7 @@ def load_npy(path: Path) -> NDArray[Any]:
 def load_named(path: Path, variable: str | None, dims: int) -> NDArray[Any]:
     """Read one array of a .npz or .mat file: the one named, or the only one with ``dims`` axes.
 
-    Raises
-    ------
-    SceneError : there is none, or several; or it claims more than the file or the machine can hold.
+    Raises SceneError: there is none, or several; or it claims more than the file or the machine can hold.
     """
     found = _npz_arrays(path) if path.suffix.lower() == ".npz" else _mat_arrays(path)
     return _picked(found, path, variable, dims).load()

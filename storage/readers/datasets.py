@@ -121,11 +121,8 @@ def split_labels(
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Labels to train on (where the mask's class is the label's) and the labelled rest, each (y, x), 255 elsewhere.
 
-    A mask that disagrees with the labels, or lies where there is none, trains nothing there.
-
-    Raises
-    ------
-    SceneError : the scene has no labels or classes by colour, the mask has another size, or a number that no class has.
+    A mask that disagrees with the labels, or lies where there is none, trains nothing there. Raises SceneError: the
+    scene has no labels or classes by colour, the mask has another size, or a number that no class has.
     """
     if scene.labels is None:
         raise SceneError(f"{scene.path} has no labels, which a training mask needs; give --labels")

@@ -63,11 +63,8 @@ class EnviCube:
 def open_envi_cube(path: str | Path) -> EnviCube:
     """Open a cube by its header or its data file, of any interleave, type, byte order and header offset.
 
-    A file that is cut off keeps the lines that are whole in all bands, and ``lost_lines`` and a note say so.
-
-    Raises
-    ------
-    SceneError : header or data are missing or cannot be used, or no line is whole.
+    A file that is cut off keeps the lines that are whole in all bands, and ``lost_lines`` and a note say so. Raises
+    SceneError: header or data are missing or cannot be used, or no line is whole.
     """
     header_path, data_path = find_envi_pair(Path(path))
     header = load_envi_header(header_path)
@@ -95,12 +92,7 @@ def open_envi_cube(path: str | Path) -> EnviCube:
 
 
 def find_envi_pair(path: Path) -> tuple[Path, Path]:
-    """Give header and data file of an address that names either.
-
-    Raises
-    ------
-    SceneError : one of them is missing.
-    """
+    """Give header and data file of an address that names either (SceneError: one of them is missing)."""
     if path.suffix.lower() == ".hdr":
         stem = path.with_suffix("")
         endings = (ending for name in DATA_ENDINGS for ending in {name: None, name.upper(): None})
@@ -142,9 +134,7 @@ def _view(path: Path, header: EnviHeader, lines: int, held: int) -> NDArray[Any]
 def load_envi_header(path: Path) -> EnviHeader:
     """Read one header file.
 
-    Raises
-    ------
-    SceneError : there is no such file, or it is no ENVI header that can be used; the message says why.
+    Raises SceneError: there is no such file, or it is no ENVI header that can be used; the message says why.
     """
     try:
         if path.exists() and not path.is_file():

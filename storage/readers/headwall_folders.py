@@ -82,11 +82,8 @@ def open_parts(folder: Path) -> PartedCube:
     """Open the parts of a folder as one cube, in the order of their frames.
 
     A part whose name says a later frame than where the one before it ends leaves lines between them that no file holds;
-    so does a file that is cut off. A part without any byte is left out.
-
-    Raises
-    ------
-    SceneError : a part cannot be used, parts differ in their frames, or too many lines between them are missing.
+    so does a file that is cut off. A part without any byte is left out. Raises SceneError: a part cannot be used, parts
+    differ in their frames, or too many lines between them are missing.
     """
     opened: list[tuple[int, EnviCube]] = []
     notes: list[str] = []
@@ -113,9 +110,7 @@ def one_part(cube: EnviCube) -> PartedCube:
 def find_reference(folder: Path, kind: str) -> Path | None:
     """Header of the ``dark`` or ``white`` frame in a folder, by how its name begins.
 
-    Raises
-    ------
-    SceneError : there are several; name one.
+    Raises SceneError: there are several; name one.
     """
     headers = (entry for entry in sorted(folder.iterdir()) if entry.suffix.lower() == ".hdr")
     found = [entry for entry in headers if entry.name.lower().startswith(kind)]
@@ -128,9 +123,7 @@ def find_reference(folder: Path, kind: str) -> Path | None:
 def load_frame_index(path: Path) -> FrameIndex:
     """Read one index. Lines that are no frame are passed over and counted; of a frame listed twice the first counts.
 
-    Raises
-    ------
-    SceneError : the file cannot be read, or no line of it is a frame.
+    Raises SceneError: the file cannot be read, or no line of it is a frame.
     """
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:

@@ -52,10 +52,8 @@ def load_labels(
 ) -> Labels:
     """Read a label file of numbers or exact colours; without ``classes`` every value found becomes one.
 
-    Raises
-    ------
-    SceneError : the file cannot be read, has another size than the scene, a value that is no class (named with its
-        count), or more than 64 values where no classes are stated.
+    Raises SceneError: the file cannot be read, has another size than the scene, a value that is no class (named with
+    its count), or more than 64 values where no classes are stated.
     """
     by_colour = any(isinstance(value, tuple) for value in (*classes.values(), unlabelled))
     codes, is_colour = load_codes(address, by_number=bool(classes) and not by_colour)
@@ -210,9 +208,7 @@ class Layout:
 def find_layout(path: Path, variable: str | None) -> Layout | None:
     """Read a frame of HyKo2 (by its .mat file) or RANUS (by its RGB image); None where the file is of neither.
 
-    Raises
-    ------
-    SceneError : the frame's files are damaged or do not fit each other.
+    Raises SceneError: the frame's files are damaged or do not fit each other.
     """
     if variable is not None or not path.is_file():
         return None

@@ -48,11 +48,8 @@ def split_variable(address: str | Path) -> tuple[Path, str | None]:
 def load_raster(address: str | Path, *, dims: int) -> Raster:
     """Read one file; of a file with several arrays, the only one with ``dims`` axes (or the variable named).
 
-    Arrays of .npy and ENVI files are read-only views: their numbers stay in the file until they are asked for.
-
-    Raises
-    ------
-    SceneError : no such file, a kind that is not read, a damaged file, or an array that holds no real numbers.
+    Arrays of .npy and ENVI files are read-only views: their numbers stay in the file until they are asked for. Raises
+    SceneError: no such file, a kind that is not read, a damaged file, or an array that holds no real numbers.
     """
     path, variable = split_variable(address)
     if path.is_dir():

@@ -85,9 +85,7 @@ def known_bands(source: CubeSource) -> BandWavelengths | None:
 def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ...]]:
     """Read one reference frame, (sample, band), the mean of its lines, and the files that it stands in.
 
-    Raises
-    ------
-    SceneError : the file cannot be read or holds no real numbers.
+    Raises SceneError: the file cannot be read or holds no real numbers.
     """
     path, _ = split_variable(address)
     if is_scan(path):

@@ -124,9 +124,7 @@ def load_scene_file(
 def load_scan(address: str | Path) -> Raster:
     """Read a cube that comes in lines as one array, over the white panel where dark and white frames are known.
 
-    Raises
-    ------
-    SceneError : the cube cannot be used, or this machine has not the memory for it.
+    Raises SceneError: the cube cannot be used, or this machine has not the memory for it.
     """
     source = open_cube_source(address)
     needed = 8 * math.prod(source.shape)  # as float32, and once more while the scene is made

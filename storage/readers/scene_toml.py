@@ -40,9 +40,7 @@ KNOWN_KEYS = tuple(one.name for one in fields(SceneSettings) if one.name != "pat
 def find_scene_settings(scene: Path) -> SceneSettings:
     """Read the ``scene.toml`` beside a scene file, or above it where the file lies in a folder ``images``.
 
-    Raises
-    ------
-    SceneError : the file is no TOML, has a key that is not known, or a value of the wrong kind.
+    Raises SceneError: the file is no TOML, has a key that is not known, or a value of the wrong kind.
     """
     candidates = [scene.parent / SETTINGS_NAME]
     if scene.parent.name == "images":
@@ -145,9 +143,7 @@ class BandWavelengths:
 def check_wavelengths(wavelengths: Sequence[float] | NDArray[np.float64], where: str) -> NDArray[np.float64]:
     """Give the wavelengths as float64 [nm], any order.
 
-    Raises
-    ------
-    WavelengthError : they are not finite, look like micrometres, or lie outside 200-3000 nm.
+    Raises WavelengthError: they are not finite, look like micrometres, or lie outside 200-3000 nm.
     """
     values = np.asarray(wavelengths, np.float64)
     if not np.isfinite(values).all():

@@ -51,9 +51,7 @@ class TiffRows:
 def open_tiff_rows(path: Path) -> TiffRows | None:
     """Open a TIFF to be read some rows at a time; None where rasterio, which can do so, is not installed.
 
-    Raises
-    ------
-    SceneError : the file is missing or damaged, or claims more than its bytes can mean.
+    Raises SceneError: the file is missing or damaged, or claims more than its bytes can mean.
     """
     try:
         rasterio = importlib.import_module("rasterio")

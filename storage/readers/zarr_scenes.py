@@ -67,11 +67,8 @@ def open_zarr_cube(path: Path, variable: str | None = None) -> CubeSource:
 
     Of this project: raw cubes (with their references), ingested cubes, mosaics. Of anyone's: the only array with three
     axes of numbers, or the one named; wavelengths come from a coordinate of that name, or of the band axis with a unit.
-
-    Raises
-    ------
-    SceneError : the store is damaged, holds no such array, has dims that are not known, a codec that is not allowed, or
-        claims to hold far more than lies on the disk.
+    Raises SceneError: the store is damaged, holds no such array, has dims that are not known, a codec that is not
+    allowed, or claims to hold far more than lies on the disk.
     """
     with _named(path):
         check_links(path)

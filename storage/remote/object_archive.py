@@ -67,9 +67,7 @@ class ObjectArchive(Archive):
     def find(self, stage: str, key: str) -> StageRef | None:
         """The published store, or None: here, or in the bucket. What waits here for its upload is uploaded.
 
-        Raises
-        ------
-        IncompleteStoreError : it is there, but its manifest is damaged, or a file that is nowhere else.
+        Raises IncompleteStoreError: it is there, but its manifest is damaged, or a file that is nowhere else.
         """
         ref = self.ref(stage, key)
         folder = self.root / ref.uri
@@ -115,9 +113,8 @@ class ObjectArchive(Archive):
     def in_use(self, *, alone: bool = False) -> Iterator[bool]:
         """Keep others, on other machines too, from clearing stores away while the block runs.
 
-        Raises
-        ------
-        UnreachableError : at the end, where the bucket stopped answering: all is kept here, and what to do is said.
+        Raises UnreachableError: at the end, where the bucket stopped answering: all is kept here, and what to do is
+        said.
         """
         with super().in_use(alone=alone) as free:
             lease = self._take_lease(alone=alone) if free and self.trouble is None else None
@@ -229,13 +226,10 @@ class ObjectArchive(Archive):
 def open_object_archive(text: str | Path, *, create: bool = True, write: bool = True) -> ObjectArchive:
     """Open the archive at ``s3://bucket/prefix``, or begin it where ``create``.
 
-    Without ``create`` all manifests and receipts are brought, for verbs that read the whole of it.
-
-    Raises
-    ------
-    SettingsError : the address is none.
-    UnreachableError : the bucket refuses, or does not answer and there is no working copy to go on with.
-    ArchiveError : there is no archive, the store has no conditional puts, or the working copy cannot be written.
+    Without ``create`` all manifests and receipts are brought, for verbs that read the whole of it. Raises
+    SettingsError: the address is none. UnreachableError: the bucket refuses, or does not answer and there is no working
+    copy to go on with. ArchiveError: there is no archive, the store has no conditional puts, or the working copy cannot
+    be written.
     """
     place = parse_place(text)
     root, objects = place.working_copy(), Objects(place, connect(place))

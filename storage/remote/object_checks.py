@@ -51,11 +51,7 @@ class Lease:
 def take_lease(objects: Objects, root: Path, *, alone: bool) -> Lease | None:
     """Say that an archive is in use; None, at once, where ``alone`` is asked and somebody else uses it.
 
-    Others wait for one who is alone.
-
-    Raises
-    ------
-    ArchiveError : whoever is alone does not end.
+    Others wait for one who is alone. Raises ArchiveError: whoever is alone does not end.
     """
     end_dead_leases(objects, root)
     name = f"{'alone' if alone else 'shared'}-{secrets.token_hex(8)}"

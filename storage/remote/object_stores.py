@@ -102,9 +102,7 @@ def is_remote(root: str | Path) -> bool:
 def parse_place(text: str | Path) -> ObjectPlace:
     """Read ``s3://bucket/prefix``; the endpoint comes from the environment.
 
-    Raises
-    ------
-    SettingsError : it is no such address, or the endpoint is none that can be used.
+    Raises SettingsError: it is no such address, or the endpoint is none that can be used.
     """
     found = _ADDRESS.fullmatch(str(text))
     bucket, prefix = ("", "") if found is None else (found[1], found[2].strip("/"))
@@ -142,9 +140,7 @@ def _endpoint() -> str | None:
 def connect(place: ObjectPlace) -> S3Store:
     """Open a place as a store whose names begin there; nothing is asked of the network yet.
 
-    Raises
-    ------
-    ArchiveError : a setting of AWS in the environment is none, or obstore is not installed.
+    Raises ArchiveError: a setting of AWS in the environment is none, or obstore is not installed.
     """
     try:
         from obstore.exceptions import BaseError  # an extra
@@ -283,9 +279,7 @@ class Objects:
     def fetch(self, name: str, path: Path, sha256: str, aside: Path) -> None:
         """Bring an object to ``path``, by way of the file ``aside``, if every byte of it is as it was published.
 
-        Raises
-        ------
-        IncompleteStoreError : it is missing or has changed; nothing has come to ``path``.
+        Raises IncompleteStoreError: it is missing or has changed; nothing has come to ``path``.
         """
         advice = f"restore it from a copy, or run verify on {self.place.url}"
         try:

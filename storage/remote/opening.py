@@ -26,11 +26,8 @@ from storage.remote.object_transfers import WITHDRAWN, files_at
 def open_archive(address: str | Path, *, create: bool = True, write: bool = True) -> Archive:
     """Open the archive at a folder or ``s3://bucket/prefix``, or make it where ``create``.
 
-    Raises
-    ------
-    ArchiveError : the path is a file, is not there, or does not let itself be written to (``write``); obstore, which an
-        archive on S3 needs, is not installed.
-    SettingsError : an address on S3 that is none.
+    Raises ArchiveError: the path is a file, is not there, or does not let itself be written to (``write``); obstore,
+    which an archive on S3 needs, is not installed. SettingsError: an address on S3 that is none.
     """
     if is_remote(address):
         return open_object_archive(address, create=create, write=write)
@@ -78,9 +75,7 @@ def repair_objects(
 ) -> Repaired:
     """Write broken objects again from the working copy; withdraw what it lacks, and run the surveys that name it.
 
-    Raises
-    ------
-    ArchiveError : somebody else uses the archive, or the bucket refuses.
+    Raises ArchiveError: somebody else uses the archive, or the bucket refuses.
     """
     with archive.in_use(alone=True) as alone:
         if not alone:
