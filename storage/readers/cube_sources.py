@@ -76,6 +76,13 @@ class Raster:
     known: BandWavelengths | None = None  # what the file says of its bands
     files: tuple[Path, ...] = ()  # that it was read from, where that is more than the one named
 
+    def three_axes(self, path: Path) -> NDArray[Any]:
+        """(y, x, band) values; two axes are one band (SceneError: it has others)."""
+        cube = self.values[..., None] if self.values.ndim == 2 else self.values
+        if cube.ndim != 3:
+            raise SceneError(f"{path} holds shape {cube.shape}; expected (y, x, band), or (y, x) for one band")
+        return cube
+
 
 @dataclass(frozen=True)
 class LineFacts:

@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from storage.readers.cube_sources import Bands, CubeSource, LineFacts, check_cube_source
-from storage.readers.envi_cubes import DATA_ENDINGS, EnviHeader, find_envi_pair, open_envi_cube
-from storage.readers.headwall_folders import PartedCube, find_reference, is_headwall_folder, one_part, open_parts
+from storage.readers.envi_cubes import DATA_ENDINGS, find_envi_pair, open_envi_cube
+from storage.readers.headwall_folders import find_reference, open_envi_source, open_headwall_cube
 from storage.readers.labels import find_layout
 from storage.readers.raster_files import SCENE_ENDINGS, load_raster, split_variable
 from storage.readers.scene_toml import BandWavelengths, SceneSettings, find_scene_settings, settle_wavelengths
-from storage.readers.tiff_files import TIFF_ENDINGS, TiffRows, open_tiff_rows
+from storage.readers.tiff_files import TIFF_ENDINGS, open_tiff_rows
 from storage.readers.zarr_scenes import find_zarr_store, open_zarr_cube
-
-_EXPOSURE = "exposure (ms)"  # a setting in the comments of Headwall's headers
 
 
 def is_scan(address: str | Path) -> bool:
@@ -51,18 +49,20 @@ def open_cube_source(
     SceneError : there is no such thing, it is damaged, or not of a kind or shape that can be used.
     """
     path, variable = split_variable(address)
+    stated, found = [("dark", dark), ("white", white)], list[tuple[str, Path | None]]()
     store = find_zarr_store(path)
     if store is not None:
         source = open_zarr_cube(store, variable)
     elif path.is_dir():
-        source = _headwall_source(path, dark is None, white is None)
+        source = open_headwall_cube(path)
+        found = [(kind, find_reference(path, kind)) for kind, frame in stated if frame is None]
     elif is_scan(path):
-        source = _envi_source(path)
+        source = open_envi_source(path)
     else:
         source = _raster_source(address)
-    for kind, stated in (("dark", dark), ("white", white)):
-        if stated is not None:
-            source = _with_frame(source, kind, stated)
+    for kind, frame in (*found, *stated):
+        if frame is not None:
+            source = _with_frame(source, kind, frame)
     check_cube_source(source)
     return source
 
@@ -101,31 +101,6 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
     return np.asarray(frame.mean(axis=0, dtype=np.float64), np.float32), files
 
 
-# --- ENVI -------------------------------------------------------------------------------------------------------------
-
-
-def _envi_source(path: Path) -> CubeSource:
-    header, data = find_envi_pair(path)
-    cube = open_envi_cube(header)
-    return _parted_source(data.name, one_part(cube), [header], (), cube.header)
-
-
-def _headwall_source(folder: Path, find_dark: bool, find_white: bool) -> CubeSource:
-    if not is_headwall_folder(folder):
-        raise SceneError(
-            f"{folder} is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files of a Headwall "
-            "camera; name one of the files in it"
-        )
-    whole = open_parts(folder)
-    headers = [Path(part.cube.header.where) for part in whole.parts]
-    source = _parted_source(folder.resolve().name, whole, headers, whole.index_files, whole.parts[0].cube.header)
-    for kind, wanted in (("dark", find_dark), ("white", find_white)):
-        file = find_reference(folder, kind) if wanted else None
-        if file is not None:
-            source = _with_frame(source, kind, file)
-    return source
-
-
 def _with_frame(source: CubeSource, kind: str, address: str | Path) -> CubeSource:
     """The same cube with its dark or white frame, and a note on where that is from."""
     frame, more = load_frame(address)
@@ -135,73 +110,24 @@ def _with_frame(source: CubeSource, kind: str, address: str | Path) -> CubeSourc
     return replace(source, white=frame, files=files, notes=notes)
 
 
-def _parted_source(
-    name: str, whole: PartedCube, headers: Sequence[Path], extra: tuple[Path, ...], first: EnviHeader
-) -> CubeSource:
-    values = whole.parts[0].cube.values
-    told = next((p.cube.header for p in whole.parts if p.cube.header.wavelength_nm is not None), first)
-    bands = Bands()
-    if told.wavelength_nm is not None:
-        units = told.fields.get("wavelength units", "")
-        bands = Bands(told.wavelength_nm, told.fwhm_nm, units, f"wavelengths from {Path(told.where).name}")
-    data = [file for header, part in zip(headers, whole.parts, strict=True) for file in (header, part.cube.path)]
-    return CubeSource(
-        name=name,
-        shape=(whole.lines, values.shape[1], values.shape[2]),
-        dtype=values.dtype.newbyteorder("="),
-        read=whole.read,
-        files=(*data, *extra),
-        lines=_line_facts(whole),
-        bands=bands,
-        nodata=first.nodata,
-        headers={header.name: header.read_bytes().decode("utf-8", errors="replace") for header in headers},
-        notes=whole.notes,
-        by_names=whole.by_names,
-    )
-
-
-def _line_facts(whole: PartedCube) -> LineFacts:
-    valid, stated = whole.valid_lines(), [_header_exposure(part.cube.header) for part in whole.parts]
-    if whole.times is None and np.isnan(stated).all():
-        return LineFacts(valid)
-    exposure = np.full(whole.lines, np.nan)
-    for part, value in zip(whole.parts, stated, strict=True):
-        exposure[part.start : part.stop] = value
-    if whole.times is None:
-        return LineFacts(valid, exposure_ms=_told(exposure))
-    stamps, known = whole.times.stamp_us, whole.times.stamp_us >= 0
-    exposure = np.where(np.isnan(whole.times.exposure_ms), exposure, whole.times.exposure_ms)
-    if not known.any():
-        return LineFacts(valid, exposure_ms=_told(exposure), frame=whole.times.frame)
-    first = int(stamps[known][0])
-    time_s = np.where(known, (stamps - first) * 1e-6, np.nan)
-    return LineFacts(valid, time_s, _told(exposure), whole.times.frame, first)
-
-
-def _header_exposure(header: EnviHeader) -> float:
-    try:
-        return float(header.settings.get(_EXPOSURE, "nan"))
-    except ValueError:
-        return float("nan")
-
-
-def _told(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    return None if np.isnan(values).all() else values
-
-
-# --- images and arrays ------------------------------------------------------------------------------------------------
-
-
 def _raster_source(address: str | Path) -> CubeSource:
     path, variable = split_variable(address)
     rows = open_tiff_rows(path) if path.suffix.lower() in TIFF_ENDINGS else None
     if rows is not None:
-        return _tiff_source(rows)
+        return CubeSource(
+            name=path.name,
+            shape=rows.shape,
+            dtype=rows.dtype,
+            read=rows.read,
+            files=(path,),
+            lines=LineFacts(np.ones(rows.shape[0], np.bool_)),
+            bands=_raster_bands(path, rows.assumed_nm, None, rows.shape[2]),
+            nodata=rows.nodata,
+            notes=rows.notes,
+        )
     layout = find_layout(path, variable)
     raster = layout.raster if layout is not None else load_raster(address, dims=3)
-    values = raster.values[..., None] if raster.values.ndim == 2 else raster.values
-    if values.ndim != 3:
-        raise SceneError(f"{path} holds shape {values.shape}; expected (y, x, band), or (y, x) for one band")
+    values = raster.three_axes(path)
     native = values.dtype.newbyteorder("=")
     return CubeSource(
         name=path.name,
@@ -213,20 +139,6 @@ def _raster_source(address: str | Path) -> CubeSource:
         bands=_raster_bands(path, raster.assumed_nm, raster.known, values.shape[2]),
         nodata=raster.nodata,
         notes=raster.notes,
-    )
-
-
-def _tiff_source(rows: TiffRows) -> CubeSource:
-    return CubeSource(
-        name=rows.path.name,
-        shape=rows.shape,
-        dtype=rows.dtype,
-        read=rows.read,
-        files=(rows.path,),
-        lines=LineFacts(np.ones(rows.shape[0], np.bool_)),
-        bands=_raster_bands(rows.path, rows.assumed_nm, None, rows.shape[2]),
-        nodata=rows.nodata,
-        notes=rows.notes,
     )
 
 

@@ -82,7 +82,7 @@ def load_scene_file(
     layout = find_layout(file, variable)
     raster = layout.raster if layout is not None else load_scan(path) if is_scan(path) else load_raster(path, dims=3)
     settings = find_scene_settings(file)
-    cube = _three_axes(raster.values, file)
+    cube = raster.three_axes(file)
     chosen = _chosen_bands(bands, settings, cube.shape[2], file)
     light = settle_wavelengths(
         file,
@@ -156,13 +156,6 @@ def _content_hash(file: Path, raster: Raster) -> str:
     is_folder = file.is_dir()
     inside = [entry.relative_to(file).as_posix() if is_folder and entry.is_relative_to(file) else "" for entry in files]
     return _digest(*((name, file_hash(entry)) for name, entry in zip(inside, files, strict=True)))
-
-
-def _three_axes(values: NDArray[Any], path: Path) -> NDArray[Any]:
-    cube = values[..., None] if values.ndim == 2 else values
-    if cube.ndim != 3:
-        raise SceneError(f"{path} holds shape {values.shape}; expected (y, x, band), or (y, x) for one band")
-    return cube
 
 
 def _chosen_bands(bands: Sequence[int] | None, settings: SceneSettings, count: int, path: Path) -> list[int]:
