@@ -38,9 +38,10 @@ from storage.archive.keys import plain, stage_key
 from storage.archive.lineage import rests_on
 from storage.archive.manifests import (
     Cost,
-    Stopwatch,
     check_files,
+    clocks,
     cost_of,
+    cost_since,
     made_bytes,
     manifest_sha256,
     read_manifest,
@@ -156,10 +157,10 @@ class Archive:
             remove_tree(part)
             part.mkdir(parents=True)
             try:
-                watch = Stopwatch()
+                start = clocks()
                 yield StagedStore(part, ref, done)
                 if not done:
-                    facts |= {"cost": watch.cost(work), "created": date_of_store(self.root, ref.uri)}
+                    facts |= {"cost": cost_since(start, work), "created": date_of_store(self.root, ref.uri)}
                     write_manifest(part, facts)
                     self._put_in_place(part, final)
             finally:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -53,12 +53,17 @@ def changes_between(catalogue: Catalogue, old: Store, new: Store) -> list[Change
         if (before.ref.uri, after.ref.uri) in seen:
             continue
         seen.add((before.ref.uri, after.ref.uri))
-        found += _own_changes(before, after)
-        for name, was, now in _changed_inputs(catalogue, before, after):
-            found.append(Change(after.ref.stage, "input", name, was, now))
-            pair = [catalogue.stores.get(one) for one in (was, now)]
-            if pair[0] is not None and pair[1] is not None and pair[0].ref.stage == pair[1].ref.stage:
-                waiting.append((pair[0], pair[1]))
+        where = after.ref.stage
+        if before.version != after.version:
+            found.append(Change(where, "version", "stage", before.version, after.version))
+        found += _differing(where, "parameter", flatten(before.params), flatten(after.params))
+        found += _differing(where, "library", before.libraries, after.libraries)
+        inputs = _differing(where, "input", _by_stage(catalogue, before), _by_stage(catalogue, after))
+        found += inputs
+        for one in inputs:
+            was, now = catalogue.stores.get(one.old), catalogue.stores.get(one.new)
+            if was is not None and now is not None and was.ref.stage == now.ref.stage:
+                waiting.append((was, now))
     return found
 
 
@@ -77,29 +82,14 @@ def flatten(value: object, name: str = "") -> dict[str, Any]:
     return {name: value}
 
 
-def _own_changes(old: Store, new: Store) -> Iterator[Change]:
-    where = new.ref.stage
-    if old.version != new.version:
-        yield Change(where, "version", "stage", old.version, new.version)
-    for name, was, now in _differing(flatten(old.params), flatten(new.params)):
-        yield Change(where, "parameter", name, was, now)
-    for name, was, now in _differing(old.libraries, new.libraries):
-        yield Change(where, "library", name, was, now)
-
-
-def _differing(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    for name in sorted(old.keys() | new.keys()):
-        was, now = old.get(name, ABSENT), new.get(name, ABSENT)
-        if name and was != now:
-            yield name, was, now
-
-
-def _changed_inputs(catalogue: Catalogue, old: Store, new: Store) -> list[tuple[str, str, str]]:
-    """Name, old and new address of inputs that differ; they are told apart by stage, and by number within one."""
-    return list(_differing(_by_stage(catalogue, old), _by_stage(catalogue, new)))
+def _differing(where: str, kind: Kind, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[Change]:
+    names = [name for name in sorted(old.keys() | new.keys()) if name]
+    changes = [Change(where, kind, name, old.get(name, ABSENT), new.get(name, ABSENT)) for name in names]
+    return [one for one in changes if one.old != one.new]
 
 
 def _by_stage(catalogue: Catalogue, store: Store) -> dict[str, str]:
+    """Addresses of inputs, told apart by stage, and by number within one."""
     found: dict[str, str] = {}
     for uri in catalogue.inputs_of(store.ref.uri):
         stage = uri.split("/")[1] if "/" in uri else "store that is not there"
@@ -108,17 +98,13 @@ def _by_stage(catalogue: Catalogue, store: Store) -> dict[str, str]:
     return found
 
 
-def _same_part(catalogue: Catalogue, one: Store, other: Store) -> bool:
-    uri, another = one.ref.uri, other.ref.uri
-    roles, others = catalogue.roles(uri), catalogue.roles(another)
-    if roles and others:
-        return bool(roles & others)
-    return _first_stage(catalogue, uri) == _first_stage(catalogue, another)
-
-
-def _first_stage(catalogue: Catalogue, uri: str) -> str:
-    """Stage of a store's first input, which tells a fine capture from a coarse one."""
-    return next((given.split("/")[1] for given in catalogue.inputs_of(uri) if "/" in given), "")
+def _same_part(catalogue: Catalogue, *pair: Store) -> bool:
+    roles = [catalogue.roles(store.ref.uri) for store in pair]
+    if all(roles):
+        return bool(roles[0] & roles[1])
+    inputs = [[uri for uri in catalogue.inputs_of(store.ref.uri) if "/" in uri] for store in pair]
+    first = [given[0].split("/")[1] if given else "" for given in inputs]  # it tells a fine capture from a coarse one
+    return first[0] == first[1]
 
 
 def _scenes(catalogue: Catalogue, uri: str) -> set[str]:

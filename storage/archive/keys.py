@@ -18,7 +18,6 @@ from pipeline.errors import ArchiveError
 
 KEY_LENGTH = 20
 SIGNIFICANT_DIGITS = 12
-_EXACT_INTEGERS = 2.0**53
 
 
 def stage_key(
@@ -49,31 +48,19 @@ def plain(value: object) -> Any:
     if isinstance(value, int):
         return value
     if isinstance(value, float):
-        return _plain_float(value)
+        if not math.isfinite(value):
+            return f"{value}"
+        rounded = float(f"{value:.{SIGNIFICANT_DIGITS}g}")
+        return int(rounded) if rounded.is_integer() and abs(rounded) < 2.0**53 else rounded
     if isinstance(value, PurePath):
         return value.as_posix()
-    if isinstance(value, bytes | np.ndarray):
-        return _plain_bytes(value)
-    return _plain_group(value)
-
-
-def _plain_float(value: float) -> int | float | str:
-    if not math.isfinite(value):
-        return f"{value}"
-    rounded = float(f"{value:.{SIGNIFICANT_DIGITS}g}")
-    return int(rounded) if rounded.is_integer() and abs(rounded) < _EXACT_INTEGERS else rounded
-
-
-def _plain_bytes(value: bytes | np.ndarray[Any, Any]) -> dict[str, Any]:
     if isinstance(value, bytes):
         return {"sha256": hashlib.sha256(value).hexdigest()}
-    if value.dtype.kind == "O":
-        raise ArchiveError("an array of objects cannot be part of a key; give numbers")
-    content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
-    return {"dtype": value.dtype.str, "shape": list(value.shape), "sha256": content}
-
-
-def _plain_group(value: object) -> Any:
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind == "O":
+            raise ArchiveError("an array of objects cannot be part of a key; give numbers")
+        content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+        return {"dtype": value.dtype.str, "shape": list(value.shape), "sha256": content}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):

@@ -62,7 +62,16 @@ class Ledger:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             descriptor = open_plain(self.path, os.O_RDWR | os.O_CREAT)
             try:
-                _write_at_end(descriptor, content)
+                end = os.lseek(descriptor, 0, os.SEEK_END)
+                torn = end > 0 and os.pread(descriptor, 1, end - 1) != b"\n"
+                try:
+                    waiting = memoryview(b"\n" + content if torn else content)
+                    while waiting:
+                        waiting = waiting[os.write(descriptor, waiting) :]
+                    os.fsync(descriptor)
+                except OSError:  # what the disk takes half of is taken back
+                    os.ftruncate(descriptor, end)
+                    raise
             finally:
                 os.close(descriptor)
             if fresh:
@@ -86,18 +95,3 @@ def ledgers(root: Path) -> list[Ledger]:
     """The ledgers of an archive, by the names of their fields."""
     found = sorted((root / FOLDER).glob(f"*{SUFFIX}"))
     return [Ledger(root, path.name.removesuffix(SUFFIX)) for path in found if is_name(path.name.removesuffix(SUFFIX))]
-
-
-def _write_at_end(descriptor: int, content: bytes) -> None:
-    """Write below the last line, torn or whole; what the disk takes half of is taken back."""
-    end = os.lseek(descriptor, 0, os.SEEK_END)
-    torn = end > 0 and os.pread(descriptor, 1, end - 1) != b"\n"
-    content = b"\n" + content if torn else content
-    try:
-        written = os.write(descriptor, content)
-        while written < len(content):
-            written += os.write(descriptor, content[written:])
-        os.fsync(descriptor)
-    except OSError:
-        os.ftruncate(descriptor, end)
-        raise

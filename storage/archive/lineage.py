@@ -34,7 +34,9 @@ class Catalogue:
         by_key: dict[str, list[str]] = {}
         for store in stores.values():
             by_key.setdefault(store.ref.key, []).append(store.ref.uri)
-        runs = sorted((read_run(path, by_key) for path in published_runs(root)), key=_age)
+        runs = sorted(
+            (read_run(path, by_key) for path in published_runs(root)), key=lambda run: (run.created, run.folder.name)
+        )
         lost = (path.relative_to(root).as_posix() for path in without_manifest(root))
         return cls(stores, runs, tuple(uri for uri in lost if in_text(uri) == uri))
 
@@ -135,8 +137,9 @@ def rests_on(root: Path, refs: Iterable[StageRef]) -> list[StageRef]:
         ref = waiting.pop()
         if ref.uri not in found:
             found[ref.uri] = ref
-            paths = (path for key in read_store(ref).inputs for path in _of_key(root, key))
-            waiting += [StageRef(path.parent.name, path.name, path) for path in paths]
+            stages = [path for path in (root / "stages").iterdir() if path.is_dir()]
+            paths = (stage / key for key in read_store(ref).inputs if "/" not in key for stage in stages)
+            waiting += [StageRef(p.parent.name, p.name, p) for p in paths if (p / MANIFEST_NAME).is_file()]
     return [found[uri] for uri in sorted(found)]
 
 
@@ -149,15 +152,6 @@ def reach(starts: Iterable[str], following: Callable[[str], Iterable[str]]) -> s
         found |= new
         waiting += new
     return found - begun
-
-
-def _of_key(root: Path, key: str) -> list[Path]:
-    stages = [path for path in (root / "stages").iterdir() if path.is_dir()] if "/" not in key else []
-    return [path / key for path in stages if (path / key / MANIFEST_NAME).is_file()]
-
-
-def _age(run: Run) -> tuple[str, str]:
-    return run.created, run.folder.name
 
 
 SHORTEST = 4  # letters of a key
@@ -175,7 +169,12 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
     if parts[0] == "stages" and len(parts) > 2:
         return _store(catalogue, "/".join(parts[:3]))
     if parts[0] == "runs" and len(parts) > 1:
-        return _run(catalogue, parts[1])
+        for run in catalogue.runs:
+            if run.folder.name == parts[1]:
+                return run
+        there = [run.uri for run in reversed(catalogue.runs)]
+        hint = f"there is {_some(there)}" if there else "see ls"
+        raise ArchiveError(f"there is no run {parts[1]} in this archive; {hint}")
     if len(parts) == 2 and any(uri.startswith(f"stages/{parts[0]}/") for uri in catalogue.stores):
         return _store(catalogue, "/".join(("stages", *parts)))
     runs = [run for run in catalogue.runs if text in (run.folder.name, LATEST)]
@@ -193,16 +192,6 @@ def _store(catalogue: Catalogue, uri: str) -> str:
     hint = f"there is {_some(there)}" if there else "there is no store of this stage; see ls"
     lost = " (its folder is there, but has lost its manifest: run verify)" if uri in catalogue.lost else ""
     raise ArchiveError(f"there is no store {uri} in this archive{lost}; {hint}")
-
-
-def _run(catalogue: Catalogue, name: str) -> Run:
-    for run in catalogue.runs:
-        if run.folder.name == name:
-            return run
-    there = [run.uri for run in reversed(catalogue.runs)]
-    raise ArchiveError(
-        f"there is no run {name} in this archive; " + (f"there is {_some(there)}" if there else "see ls")
-    )
 
 
 def _named(catalogue: Catalogue, text: str) -> str:

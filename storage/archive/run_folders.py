@@ -154,7 +154,11 @@ def try_exchange(one: Path, other: Path) -> bool:
     Linux does that (renameat2) on its local file systems; where it cannot, as on most network file systems, nothing is
     changed and the answer is False.
     """
-    error = _renameat2(one, other)
+    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if call is None:
+        return False
+    failed = call(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), ctypes.c_uint(_RENAME_EXCHANGE))
+    error = ctypes.get_errno() if failed else 0
     if error in _UNSUPPORTED:
         return False
     if error:
@@ -162,15 +166,6 @@ def try_exchange(one: Path, other: Path) -> bool:
     for parent in {one.parent, other.parent}:
         sync_path(parent)
     return True
-
-
-def _renameat2(one: Path, other: Path) -> int:
-    """0, or the error's number."""
-    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if call is None:
-        return errno.ENOSYS
-    failed = call(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), ctypes.c_uint(_RENAME_EXCHANGE))
-    return ctypes.get_errno() if failed else 0
 
 
 def unfinished_extensions(root: Path) -> Iterator[Path]:

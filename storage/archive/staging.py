@@ -143,8 +143,14 @@ def take_lock(path: Path, *, wait: bool = True, shared: bool = False, words: str
         with ExitStack() as held:
             descriptor = _open_lock(path)
             held.callback(os.close, descriptor)
-            if not _lock(descriptor, path, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, wait=wait):
-                return None
+            kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+            try:
+                fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if not wait:
+                    return None
+                log.info("waiting for another run that holds %s", path.stem)
+                fcntl.flock(descriptor, kind)
             if _is_still(descriptor, path):
                 if not shared:  # else another may hold it yet
                     held.callback(_drop_name, path)  # called before the lock is let go
@@ -195,14 +201,3 @@ def _is_still(descriptor: int, path: Path) -> bool:
         return os.path.samestat(path.lstat(), os.fstat(descriptor))
     except FileNotFoundError:
         return False
-
-
-def _lock(descriptor: int, path: Path, kind: int, *, wait: bool) -> bool:
-    try:
-        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        if not wait:
-            return False
-        log.info("waiting for another run that holds %s", path.stem)
-        fcntl.flock(descriptor, kind)
-    return True
