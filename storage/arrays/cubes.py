@@ -75,7 +75,11 @@ class RawCubeWriter:
 
     def __init__(self, path: Path, header: SweepHeader) -> None:
         self._header = header
-        self._group = create_group(path, f"raw sweep {header.sweep.name}", _attributes(header))
+        facts = {"sweep": asdict(header.sweep), "source": header.source}
+        facts |= {} if header.started is None else {"started": header.started}
+        facts |= {"by_mirror": True} if header.references.by_mirror else {}
+        facts |= {} if header.simulation is None else {"simulation": dict(header.simulation)}
+        self._group = create_group(path, f"raw sweep {header.sweep.name}", facts)
         bands = write_bands(self._group, header.wavelength_nm, header.fwhm_nm)
         about = {"long_name": "raw numbers of the camera", "units": "1", "coordinates": f"{bands} {_LINE_COORDINATES}"}
         spec = image_spec(("line", "sample", "band"), header.shape, "<u2")
@@ -139,33 +143,18 @@ class RawCubeWriter:
             self._waiting.clear()
 
 
-def _attributes(header: SweepHeader) -> dict[str, Any]:
-    started = {} if header.started is None else {"started": header.started}
-    mirror = {"by_mirror": True} if header.references.by_mirror else {}
-    simulated = {} if header.simulation is None else {"simulation": dict(header.simulation)}
-    return {"sweep": asdict(header.sweep), "source": header.source, **started, **mirror, **simulated}
-
-
 def _write_references(group: zarr.Group, references: References) -> None:
-    for name, values in (("dark", references.dark), ("white", references.white)):
-        about = {"long_name": f"{name} reference frame", "units": "1", "coordinates": "wavelength"}
-        write_small(group, name, ("sample", "band"), np.asarray(values, np.float32), about)
-    about = {"long_name": "scene value of the white panel", "units": "1", "coordinates": "wavelength"}
-    write_small(group, "panel", ("band",), np.asarray(references.panel, np.float32), about)
     about = {"units": "1", "coordinates": "wavelength"}
-    if references.bad is not None:
-        named = {"long_name": "bad elements of the detector", **about}
-        write_small(group, "bad", ("sample", "band"), np.asarray(references.bad, np.bool_), named)
-    if references.flat is not None:
-        named = {"long_name": "relative response left over by the white frame", **about}
-        write_small(group, "flat", ("sample", "band"), np.asarray(references.flat, np.float32), named)
-
-
-def _read_references(group: zarr.Group) -> References:
-    """What :func:`_write_references` stored; cubes of before bad elements and flats have neither."""
-    dark, white, panel = (read_array(group, name) for name in ("dark", "white", "panel"))
-    bad, flat = (read_array(group, name) if name in group else None for name in ("bad", "flat"))
-    return References(dark, white, panel, bad, flat, bool(group.attrs.get("by_mirror", False)))
+    frames: dict[str, tuple[tuple[str, ...], Any, type[np.generic], str]] = {
+        "dark": (("sample", "band"), references.dark, np.float32, "dark reference frame"),
+        "white": (("sample", "band"), references.white, np.float32, "white reference frame"),
+        "panel": (("band",), references.panel, np.float32, "scene value of the white panel"),
+        "bad": (("sample", "band"), references.bad, np.bool_, "bad elements of the detector"),
+        "flat": (("sample", "band"), references.flat, np.float32, "relative response left over by the white frame"),
+    }
+    for name, (dims, values, kind, title) in frames.items():
+        if values is not None:
+            write_small(group, name, dims, np.asarray(values, kind), {"long_name": title, **about})
 
 
 def _write_line_facts(
@@ -229,11 +218,13 @@ def open_raw_cube(path: Path) -> RawCube:
     """
     group = open_group(path)
     wavelength, fwhm = read_bands(group)
+    dark, white, panel = (read_array(group, name) for name in ("dark", "white", "panel"))
+    bad, flat = (read_array(group, name) if name in group else None for name in ("bad", "flat"))
     with damage_named(str(path)):
         sweep = Sweep(**dict(group.attrs)["sweep"])  # type: ignore[arg-type]
     return RawCube(
         sweep=sweep,
-        references=_read_references(group),
+        references=References(dark, white, panel, bad, flat, bool(group.attrs.get("by_mirror", False))),
         wavelength_nm=wavelength,
         fwhm_nm=fwhm,
         position=np.stack([read_array(group, "mirror_x"), read_array(group, "mirror_y")], axis=-1),

@@ -12,7 +12,7 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import PoseError
-from storage.arrays.layout import SHARD_ROWS, damage_named, open_group, read_array, write_small
+from storage.arrays.layout import SHARD_ROWS, damage_named, open_group, read_array, read_bands, write_small
 
 if TYPE_CHECKING:
     from odc.geo.crs import CRS
@@ -136,6 +136,4 @@ def open_image(path: Path, name: str) -> StoredImage:
 
 def load_bands(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     """Wavelengths and widths [nm] of the store at ``path``. Raises IncompleteStoreError where they are damaged."""
-    with damage_named(f"{path}/wavelength"):
-        group = open_group(path)
-        return read_array(group, "wavelength"), read_array(group, "fwhm") if "fwhm" in group else None
+    return read_bands(open_group(path))

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
+from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.class_maps import class_flags
+from storage.arrays.class_maps import ClassNames, class_flags, legend_of
 from storage.arrays.georeference import ON_THE_MAP, load_geobox, map_attributes, write_map_coordinates
 from storage.arrays.layout import (
     SHARD_COLUMNS,
@@ -22,6 +22,7 @@ from storage.arrays.layout import (
     image_spec,
     open_group,
     read_array,
+    whole_shards,
 )
 
 if TYPE_CHECKING:
@@ -32,21 +33,13 @@ M2_PER_HECTARE = 10_000.0
 
 
 @dataclass(frozen=True)
-class ClassLegend:
-    """Names and colours of the classes."""
-
-    names: tuple[str, ...]
-    colours: NDArray[np.uint8]  # (class, 3)
-
-
-@dataclass(frozen=True)
 class GroundMap:
     """A stored map, in memory."""
 
     classes: NDArray[np.uint8]  # (y, x) index into the legend's names, 255 = none or not seen
     confidence: NDArray[np.float32]  # (y, x) in 0..1, NaN where not seen
     picture: NDArray[np.uint8]  # (y, x, 3) red green blue, 0 where not seen
-    legend: ClassLegend
+    legend: ClassNames
     geobox: GeoBox
     areas: dict[str, dict[str, float]]  # of each class: m2, ha, share of the classified area
 
@@ -54,7 +47,7 @@ class GroundMap:
 class GroundMapWriter:
     """Write a map block by block, so that it never has to be in memory as a whole."""
 
-    def __init__(self, path: Path, geobox: GeoBox, legend: ClassLegend, *, about: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, geobox: GeoBox, legend: ClassNames, *, about: Mapping[str, Any]) -> None:
         place = map_attributes(geobox)
         names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
         self._group = create_group(path, "class map on the ground", {**place, **names, **about})
@@ -89,7 +82,7 @@ class GroundMapWriter:
                 f"block {size} (y, x) got classes {classes.shape}, confidence {confidence.shape} and picture "
                 f"{picture.shape}; give one value a pixel"
             )
-        _check_place(rows, columns, self._shape)
+        whole_shards("the map", (rows, columns), self._shape, (SHARD_ROWS, SHARD_COLUMNS))
         worst = int(classes.max(initial=0, where=classes != UNLABELLED))
         if worst >= len(self._legend.names):
             raise ShapeError(f"class {worst} is in the map, but only {len(self._legend.names)} classes have names")
@@ -106,22 +99,10 @@ class GroundMapWriter:
         }
 
 
-def _check_place(rows: slice, columns: slice, shape: tuple[int, ...]) -> None:
-    for word, place, size, shard in zip(
-        ("rows", "columns"), (rows, columns), shape, (SHARD_ROWS, SHARD_COLUMNS), strict=True
-    ):
-        if place.start % shard or (place.stop % shard and place.stop != size) or place.stop > size:
-            raise ChunkError(
-                f"{word} {place.start}:{place.stop} of a map of {shape} split its shards of {shard}; "
-                f"start and end at multiples of {shard}"
-            )
-
-
 def load_ground_map(path: Path) -> GroundMap:
     """Read a map. Raises IncompleteStoreError where it is missing or damaged."""
     group = open_group(path)
-    attributes: dict[str, Any] = dict(group.attrs)
-    colours = np.array(attributes.get("class_colours", ()), np.uint8).reshape(-1, 3)
+    areas: Any = dict(group.attrs).get("areas", {})
     geobox = load_geobox(path)
     if geobox is None:
         raise IncompleteStoreError(f"{path} has no grid mapping; it is no map of the ground")
@@ -129,7 +110,7 @@ def load_ground_map(path: Path) -> GroundMap:
         classes=read_array(group, "classes"),
         confidence=read_array(group, "confidence"),
         picture=read_array(group, "picture"),
-        legend=ClassLegend(tuple(attributes.get("class_names", ())), colours),
+        legend=legend_of(group),
         geobox=geobox,
-        areas=attributes.get("areas", {}),
+        areas=areas,
     )

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec, ZstdCodec
 from zarr.storage import MemoryStore
 
-from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError, WavelengthError
+from pipeline.errors import ChunkError, IncompleteStoreError, SettingsError, ShapeError, WavelengthError
 
 CHUNK_PX = 32
 SHARD_ROWS = 64
@@ -103,6 +103,16 @@ def image_spec(dims: Sequence[str], shape: Sequence[int], dtype: str) -> ArraySp
 
 def _whole_chunks(size: int, chunk: int) -> int:
     return -(-size // chunk) * chunk
+
+
+def whole_shards(what: str, place: Sequence[slice], shape: Sequence[int], shards: Sequence[int]) -> None:
+    """Refuse rows and columns of an image that split its shards, or reach beyond it (ChunkError)."""
+    for word, part, size, shard in zip(("rows", "columns"), place, shape, shards, strict=False):
+        if part.start % shard or (part.stop != size and (part.stop % shard or part.stop > size)):
+            raise ChunkError(
+                f"{word} {part.start}:{part.stop} split {what}'s shards of {shard} {word}; start and end at multiples "
+                f"of {shard}"
+            )
 
 
 def create_array(group: zarr.Group, name: str, spec: ArraySpec, attributes: Mapping[str, Any]) -> zarr.Array[Any]:

@@ -11,7 +11,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import ChunkError, ShapeError
+from pipeline.errors import ShapeError
 from storage.arrays.layout import (
     SHARD_ROWS,
     AngularGrid,
@@ -25,6 +25,7 @@ from storage.arrays.layout import (
     read_array,
     read_bands,
     round_bits,
+    whole_shards,
     write_bands,
 )
 from storage.arrays.quicklooks import Quicklook, write_quicklook
@@ -121,30 +122,17 @@ class MosaicWriter:
                 f"the tile at row {first_row}, column {first_column} has shapes {values.shape} and {coverage.shape}; "
                 f"the mosaic is {self._shape}"
             )
-        for name, part, size, step in zip(
-            ("rows", "columns"), (rows, columns), self._shape, self.tile_shape, strict=False
-        ):
-            if part.start % step or (part.stop % step and part.stop != size):
-                raise ChunkError(
-                    f"{name} {part.start}:{part.stop} split the mosaic's shards of {step} {name}; start and end at "
-                    "their multiples"
-                )
-        self._values[rows, columns] = _rounded(values)
+        whole_shards("the mosaic", (rows, columns), self._shape[:2], self.tile_shape)
+        flat = np.ascontiguousarray(values, np.float32).reshape(-1)
+        rounded = np.empty_like(flat)
+        for first in range(0, len(flat), BLOCK_VALUES):  # stays in cache: in one go it costs more than the codec
+            rounded[first : first + BLOCK_VALUES] = round_bits(flat[first : first + BLOCK_VALUES])
+        self._values[rows, columns] = rounded.reshape(values.shape)
         self._coverage[rows, columns] = coverage.astype(np.float32)
 
     def write_quicklook(self, image: NDArray[np.uint8]) -> None:
         """Store a small colour picture, (y, x, 3) uint8, beside the mosaic."""
         write_quicklook(self.group, Quicklook(image))
-
-
-def _rounded(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """``round_bits`` in blocks that stay in cache: in one go its temporaries cost more than the codec."""
-    flat = np.ascontiguousarray(values, np.float32).reshape(-1)
-    rounded = np.empty_like(flat)
-    for first in range(0, len(flat), BLOCK_VALUES):
-        block = slice(first, first + BLOCK_VALUES)
-        rounded[block] = round_bits(flat[block])
-    return rounded.reshape(values.shape)
 
 
 def load_mosaic(path: Path) -> Mosaic:

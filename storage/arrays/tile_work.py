@@ -122,14 +122,11 @@ class MosaicRecipe:
         Raises IncompleteStoreError: a sweep or the tables are missing or damaged.
         """
         tables: Tables = {} if self.lookup is None else open_lookup(self.lookup)
-        placed = [_with_tables(one, self.camera, tables) for one in self.sweeps()]
+        placed = []
+        for one in self.sweeps():  # without tables where its lines lie too unevenly for one
+            stored = tables.get(one.cube.sweep.name)
+            placed.append(Placed(one.cube, tuple(stored), one.gain) if stored else one.placed(self.camera))
         return MosaicWork(placed, self.camera, self.grid, self.kernel)
-
-
-def _with_tables(one: Sighted, camera: LineCamera, tables: Tables) -> Placed:
-    """A sweep with its stored tables; without, where its lines lie too unevenly for one."""
-    stored = tables.get(one.cube.sweep.name)
-    return Placed(one.cube, tuple(stored), one.gain) if stored else one.placed(camera)
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError, ShapeError
 from storage.archive.whole_files import written_aside
+from storage.arrays.class_maps import ClassNames
 from storage.arrays.georeference import map_attributes
-from storage.arrays.ground_maps import ClassLegend
 from storage.arrays.layout import AngularGrid
 
 LARGEST_GHOST = 1024  # bytes that GDAL's note of the layout may take before the first directory
@@ -58,7 +58,7 @@ class CogImage:
     place: Place
     bands: tuple[str, ...]  # their descriptions
     nodata: float
-    legend: ClassLegend | None = None  # of an image of classes: overviews take the commonest, not the mean
+    legend: ClassNames | None = None  # of an image of classes: overviews take the commonest, not the mean
     tags: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -137,7 +137,7 @@ def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> 
         raise ShapeError(f"{path.name}: {reached} of {y} rows were given")
 
 
-def class_tags(legend: ClassLegend) -> dict[str, str]:
+def class_tags(legend: ClassNames) -> dict[str, str]:
     """Names of the classes as tags: ``CLASS_0`` and so on, and all of them as CF's ``flag_meanings``."""
     meanings = " ".join("_".join(name.split()) for name in legend.names)
     values = ", ".join(str(number) for number in range(len(legend.names)))
@@ -145,12 +145,12 @@ def class_tags(legend: ClassLegend) -> dict[str, str]:
     return {**each, "flag_values": values, "flag_meanings": meanings}
 
 
-def colour_table(legend: ClassLegend) -> dict[int, tuple[int, int, int, int]]:
+def colour_table(legend: ClassNames) -> dict[int, tuple[int, int, int, int]]:
     """Red, green, blue and opacity of every class."""
     return {number: (red, green, blue, 255) for number, (red, green, blue) in enumerate(legend.colours.tolist())}
 
 
-def _write_categories(path: Path, legend: ClassLegend) -> None:
+def _write_categories(path: Path, legend: ClassNames) -> None:
     root = ElementTree.Element("PAMDataset")
     names = ElementTree.SubElement(ElementTree.SubElement(root, "PAMRasterBand", band="1"), "CategoryNames")
     for name in legend.names:

@@ -19,8 +19,8 @@ from odc.geo.geom import multipoint
 
 from pipeline.errors import ArchiveError
 from storage.archive.whole_files import write_whole
+from storage.arrays.class_maps import ClassNames
 from storage.arrays.georeference import map_attributes
-from storage.arrays.ground_maps import ClassLegend
 
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 ZARR = "application/vnd.zarr; version=3"
@@ -111,7 +111,7 @@ def spectral_bands(centre_nm: NDArray[np.float64], fwhm_nm: NDArray[np.float64] 
     return {"bands": bands}
 
 
-def classes(legend: ClassLegend) -> dict[str, Any]:
+def classes(legend: ClassNames) -> dict[str, Any]:
     """Fields of the classification extension: every class's number, name and colour."""
     return {
         "classification:classes": [

@@ -31,7 +31,7 @@ from storage.archive.manifests import (
     try_manifest,
 )
 from storage.archive.plain_files import kind_of, read_plain
-from storage.archive.records import Run, Store
+from storage.archive.records import Store
 from storage.archive.run_folders import unfinished_extensions
 from storage.archive.staging import MANIFEST_NAME
 from storage.arrays.layout import missing_codec
@@ -189,7 +189,7 @@ def verify_everything(
     read_again = problems_of or _problems
     catalogue = Catalogue.read(root)
     places = [(uri, store.ref.path, store.size) for uri, store in catalogue.stores.items()]
-    places += [(run.uri, run.folder, _bytes(run)) for run in catalogue.runs]
+    places += [(run.uri, run.folder, listed_bytes(run.facts) if run.facts else 0) for run in catalogue.runs]
     total, done = sum(size for *_, size in places) or 1, 0
     found: list[Finding] = []
     for uri, path, size in places:
@@ -203,8 +203,7 @@ def verify_everything(
             catalogue = Catalogue.read(root)
             problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
         found += [Finding(uri, problem, "broken") for problem in problems] or [_whole(catalogue.stores.get(uri), uri)]
-    misplaced, growing = _misplaced_runs(catalogue), verify_growing(root)
-    return [*found, *misplaced, *_lost(root), *_missing(catalogue), *_left_aside(root), *_half_extended(root), *growing]
+    return [*found, *_misplaced(catalogue, root), *_missing(catalogue), *_broken_off(root), *verify_growing(root)]
 
 
 def verify_growing(root: Path) -> Iterator[Finding]:
@@ -233,10 +232,6 @@ def _changed_since(catalogue: Catalogue, uri: str) -> bool:
     return run is not None and extended_from(try_manifest(run.folder)[0]) != extended_from(run.facts)
 
 
-def _bytes(run: Run) -> int:
-    return listed_bytes(run.facts) if run.facts else 0
-
-
 def _problems(folder: Path) -> Iterator[str]:
     """What is wrong with one published folder, file by file."""
     manifest, problem = try_manifest(folder)
@@ -255,42 +250,26 @@ def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
     stated = f"stages/{store.facts.get('stage')}/{store.facts.get('key')}"
     if stated != uri:
         yield f"its {MANIFEST_NAME} is that of {stated}; move it back, or take it out of the archive"
-    doubter = _doubter(catalogue, store)
-    if doubter is not None:
-        yield f"its {MANIFEST_NAME} has changed since {doubter.uri} was published (its SHA-256 differs)"
-
-
-def _doubter(catalogue: Catalogue, store: Store) -> Run | None:
-    """A run that knows another manifest, unless a run knows this one, or one that the store had before it was packed.
-
-    Nor is a store doubted that was made anew since.
-    """
-    knowing = [run for run in catalogue.runs if store.ref.uri in run.recorded]
+    knowing = [run for run in catalogue.runs if uri in run.recorded]
     if not knowing:
-        return None
-    own = {manifest_sha256(store.ref.path), *packed_from(store.facts)}
-    if any(run.recorded[store.ref.uri] in own for run in knowing):
-        return None
+        return
+    own = {manifest_sha256(store.ref.path), *packed_from(store.facts)}  # also those of before it was packed
     anew = is_sealed(store.facts) and all(store.created > run.sealed for run in knowing)
-    return None if anew else knowing[-1]
+    if not anew and not any(run.recorded[uri] in own for run in knowing):
+        yield f"its {MANIFEST_NAME} has changed since {knowing[-1].uri} was published (its SHA-256 differs)"
 
 
-def _misplaced_runs(catalogue: Catalogue) -> Iterator[Finding]:
-    """Folders of runs that say that they are another: copies, or renamed."""
+def _misplaced(catalogue: Catalogue, root: Path) -> Iterator[Finding]:
+    """Runs that say that they are another (copies, or renamed), and what lies beside them without a manifest."""
     there = {run.folder.name for run in catalogue.runs}
     for run in catalogue.runs:
         stated = run.facts.get("run", run.folder.name)
         if stated != run.folder.name:
             do = "it is a copy: take it out of the archive" if stated in there else "give it its name back"
             yield Finding(run.uri, f"its {MANIFEST_NAME} is that of runs/{stated}; {do}", "stray")
-
-
-def _lost(root: Path) -> Iterator[Finding]:
-    """What lies among stores and runs without a manifest."""
     for path in without_manifest(root):
-        uri = path.relative_to(root).as_posix()
-        kind = kind_of(path)
-        if kind != "a folder" or len(path.relative_to(root).parts) < 2:
+        uri, kind = path.relative_to(root).as_posix(), kind_of(path)
+        if kind != "a folder" or uri.count("/") < 1:
             yield Finding(uri, f"is {kind}, expected a folder with a manifest; take it out of the archive", "stray")
         else:
             yield Finding(uri, f"{MANIFEST_NAME} is missing", "broken")
@@ -310,12 +289,9 @@ def _missing(catalogue: Catalogue) -> Iterator[Finding]:
                 yield Finding(given, f"is not there, but {uri} was made of it", "missing")
 
 
-def _half_extended(root: Path) -> Iterator[Finding]:
+def _broken_off(root: Path) -> Iterator[Finding]:
+    for path in sorted((root / ASIDE).glob("*/*")):
+        yield Finding(path.relative_to(root).as_posix(), "a repair was broken off; run verify --repair again", "stray")
     for part in unfinished_extensions(root):
         words = "what was added to it lacks its last step, a name; any command that writes into the archive gives it"
         yield Finding(f"runs/{part.stem}", words, "stray")
-
-
-def _left_aside(root: Path) -> Iterator[Finding]:
-    for path in sorted((root / ASIDE).glob("*/*")):
-        yield Finding(path.relative_to(root).as_posix(), "a repair was broken off; run verify --repair again", "stray")

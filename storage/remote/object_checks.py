@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 import secrets
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from datetime import datetime, timedelta
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from pipeline.errors import ArchiveError
@@ -55,7 +54,9 @@ def take_lease(objects: Objects, root: Path, *, alone: bool) -> Lease | None:
     """
     end_dead_leases(objects, root)
     name = f"{'alone' if alone else 'shared'}-{secrets.token_hex(8)}"
-    unlock = take_lock(_lock(root, name))  # waits, if for that of another who looks whether somebody is behind it
+    unlock = take_lock(
+        root / FOLDER / f"{name}.lock"
+    )  # waits, if for that of another who looks whether somebody is behind it
     assert unlock is not None
     lease, until = Lease(objects, f"{FOLDER}/{name}", unlock), time.monotonic() + WAIT_S
     try:
@@ -99,10 +100,6 @@ def end_dead_leases(objects: Objects, root: Path) -> None:
                 unlock()
 
 
-def _lock(root: Path, name: str) -> Path:
-    return root / FOLDER / f"{name}.lock"
-
-
 DAY_S = 86400.0
 _BEGUN = re.compile(rf"(runs/[^/]+)/{BEGUN}")
 
@@ -113,9 +110,13 @@ def verify_objects(objects: Objects, progress: Progress | None = None) -> list[F
     Nothing is taken from a working copy: manifests and receipts are fetched again, into a folder that goes away.
     """
     there = objects.listing()
-    with _unpacked() as root:
+    with TemporaryDirectory(prefix="spectralzoom-verify-") as named, refusals(Path(named), "read manifests into"):
+        root = Path(named)
         (root / "stages").mkdir()
-        published = [path.removesuffix(f"/{MANIFEST_NAME}") for path in there if _is_manifest(path)]
+        depths = {"stages": 4, "runs": 3}
+        manifests = [path for path in there if path.endswith(f"/{MANIFEST_NAME}") and is_address(path)]
+        manifests = [path for path in manifests if depths.get(path.split("/")[0]) == path.count("/") + 1]
+        published = [path.removesuffix(f"/{MANIFEST_NAME}") for path in manifests]
         some_at_a_time(lambda uri: _lay_out(objects, root, uri), published)
 
         def problems(folder: Path) -> Iterator[str]:
@@ -128,15 +129,6 @@ def verify_objects(objects: Objects, progress: Progress | None = None) -> list[F
         return [*verify_everything(root, progress, problems), *_broken_off(objects, there)]
 
 
-@contextmanager
-def _unpacked() -> Iterator[Path]:
-    with (
-        tempfile.TemporaryDirectory(prefix="spectralzoom-verify-") as name,
-        refusals(Path(name), "read manifests into"),
-    ):
-        yield Path(name)
-
-
 def _broken_off(objects: Objects, there: Mapping[str, Listed]) -> Iterator[Finding]:
     """What a repair left withdrawn, and runs without a manifest, unless somebody may be about to upload it."""
     for path in there:
@@ -146,11 +138,6 @@ def _broken_off(objects: Objects, there: Mapping[str, Listed]) -> Iterator[Findi
         for uri in find_lost_runs(there):
             if objects.read(f"{uri}/{MANIFEST_NAME}") is None:
                 yield Finding(uri, f"{MANIFEST_NAME} is missing, or its upload was broken off", "broken")
-
-
-def _is_manifest(path: str) -> bool:
-    parts = path.split("/")
-    return parts[-1] == MANIFEST_NAME and (len(parts), parts[0]) in ((4, "stages"), (3, "runs")) and is_address(path)
 
 
 def _lay_out(objects: Objects, root: Path, uri: str) -> None:

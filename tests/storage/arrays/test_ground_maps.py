@@ -11,11 +11,11 @@ from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.ground_maps import BLOCK, ClassLegend, GroundMapWriter, load_ground_map
+from storage.arrays.ground_maps import BLOCK, ClassNames, GroundMapWriter, load_ground_map
 from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS, create_group
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
-LEGEND = ClassLegend(("sugar beet", "bare soil"), np.array([[10, 200, 30], [120, 90, 60]], np.uint8))
+LEGEND = ClassNames(("sugar beet", "bare soil"), np.array([[10, 200, 30], [120, 90, 60]], np.uint8))
 
 
 def begin(path: Path, shape: tuple[int, int] = (100, 90)) -> GroundMapWriter:

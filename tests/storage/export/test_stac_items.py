@@ -12,7 +12,7 @@ import pytest
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError
-from storage.arrays.ground_maps import ClassLegend
+from storage.arrays.class_maps import ClassNames
 from storage.export.stac_items import (
     COG,
     COLLECTION,
@@ -36,7 +36,7 @@ pystac = pytest.importorskip("pystac", reason="STAC is written with pystac, of t
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 BOX = GeoBox.from_bbox((500000, 5770000, 500050, 5770040), crs="EPSG:32632", resolution=0.5)
 ABOUT = Collection("field-a", "Surveys of field-a", "Surveys")
-LEGEND = ClassLegend(("sugar beet", "???"), np.array([[10, 200, 30], [255, 0, 7]], np.uint8))
+LEGEND = ClassNames(("sugar beet", "???"), np.array([[10, 200, 30], [255, 0, 7]], np.uint8))
 WAVE = np.array([444.5, 550.0, 800.0])
 
 
