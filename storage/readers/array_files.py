@@ -11,7 +11,7 @@ import math
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -176,8 +176,25 @@ def load_named(path: Path, variable: str | None, dims: int) -> NDArray[Any]:
 
     Raises SceneError: there is none, or several; or it claims more than the file or the machine can hold.
     """
-    found = _npz_arrays(path) if path.suffix.lower() == ".npz" else _mat_arrays(path)
-    return _picked(found, path, variable, dims).load()
+    if path.suffix.lower() == ".npz":
+        found = _npz_arrays(path)
+    elif is_hdf_mat(path):
+        found = _hdf_arrays(path)
+    else:
+        listed = list_mat_variables(path)
+        found = {one.name: _Held(one.shape, partial(load_mat_variable, path, one)) for one in listed if one.width}
+    listing = ", ".join(f"{name} {held.shape}" for name, held in found.items()) or "none"
+    if variable is not None:
+        if variable not in found:
+            raise SceneError(f"{path} has no array {variable}; it has {listing}")
+        return found[variable].load()
+    for wanted in (dims, 5 - dims):
+        fitting = [name for name, held in found.items() if len(held.shape) == wanted and math.prod(held.shape) > 1]
+        if len(fitting) == 1:
+            return found[fitting[0]].load()
+        if fitting:
+            break
+    raise SceneError(f"{path} has no single array with {dims} axes; it has {listing}; name one: {path.name}:VARIABLE")
 
 
 def variable_names(path: Path) -> set[str]:
@@ -193,21 +210,6 @@ def is_hdf_mat(path: Path) -> bool:
     with path.open("rb") as file:
         head = file.read(520)
     return b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:])
-
-
-def _picked(found: Mapping[str, _Held], path: Path, variable: str | None, dims: int) -> _Held:
-    listing = ", ".join(f"{name} {held.shape}" for name, held in found.items()) or "none"
-    if variable is not None:
-        if variable not in found:
-            raise SceneError(f"{path} has no array {variable}; it has {listing}")
-        return found[variable]
-    for wanted in (dims, 5 - dims):
-        fitting = [name for name, held in found.items() if len(held.shape) == wanted and math.prod(held.shape) > 1]
-        if len(fitting) == 1:
-            return found[fitting[0]]
-        if fitting:
-            break
-    raise SceneError(f"{path} has no single array with {dims} axes; it has {listing}; name one: {path.name}:VARIABLE")
 
 
 # --- .npz -------------------------------------------------------------------------------------------------------------
@@ -256,13 +258,6 @@ def _npz_loader(path: Path, member: zipfile.ZipInfo) -> Callable[[], NDArray[Any
 
 
 # --- .mat -------------------------------------------------------------------------------------------------------------
-
-
-def _mat_arrays(path: Path) -> dict[str, _Held]:
-    if is_hdf_mat(path):
-        return _hdf_arrays(path)
-    listed = list_mat_variables(path)
-    return {one.name: _Held(one.shape, partial(load_mat_variable, path, one)) for one in listed if one.width}
 
 
 def _hdf_arrays(path: Path) -> dict[str, _Held]:

@@ -128,7 +128,8 @@ def split_labels(
         raise SceneError(f"{scene.path} has no labels, which a training mask needs; give --labels")
     mask, _ = load_codes(train_mask, by_number=True)
     if mask.shape != scene.labels.shape:
-        raise SceneError(f"mask {train_mask} is {_size(mask)} px, the scene is {_size(scene.labels)} px (y x x)")
+        sizes = [f"{image.shape[0]} x {image.shape[1]} px" for image in (mask, scene.labels)]
+        raise SceneError(f"mask {train_mask} is {sizes[0]}, the scene is {sizes[1]} (y x x)")
     wanted = _mask_to_index(scene, train_mask, int(mask.max(initial=0)), mask_classes)[np.maximum(mask, 0)]
     trains = (wanted == scene.labels) & (wanted != UNLABELLED)
     return (np.where(trains, scene.labels, np.uint8(UNLABELLED)), np.where(trains, np.uint8(UNLABELLED), scene.labels))
@@ -150,10 +151,6 @@ def _mask_to_index(
             f"mask {train_mask}: class {unknown} is none of the labels' {sorted(numbers)}; correct the mask classes"
         )
     return np.array([UNLABELLED, *(numbers[number] for number in given[:highest])], np.uint8)
-
-
-def _size(image: NDArray[np.generic]) -> str:
-    return f"{image.shape[0]} x {image.shape[1]}"
 
 
 def _scene_files(path: str | Path, train_mask: str | Path | None) -> dict[str, str]:

@@ -76,8 +76,13 @@ def write_ingested_cube(
     )
     for start, stop in _blocks(source):
         lines = source.read(start, stop)
-        array[start:stop] = _stored(lines, kind, source.lines.valid[start:stop])
-        thumbnail.add(start, lines, source.lines.valid[start:stop])
+        valid = source.lines.valid[start:stop]
+        with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, which a scene takes for missing
+            block = lines.astype(kind)
+        if not valid.all():
+            block[~valid] = np.nan if kind.kind == "f" else 0
+        array[start:stop] = block
+        thumbnail.add(start, lines, valid)
         report(begin + (1 - begin) * stop / source.shape[0])
     picture = thumbnail.finish()
     write_quicklook(group, picture)
@@ -103,14 +108,6 @@ def stored_dtype(source: CubeSource, report: Report = lambda done: None) -> np.d
 def _blocks(source: CubeSource) -> Iterator[tuple[int, int]]:
     for start in range(0, source.shape[0], BLOCK_LINES):
         yield start, min(start + BLOCK_LINES, source.shape[0])
-
-
-def _stored(lines: NDArray[Any], kind: np.dtype[Any], valid: NDArray[np.bool_]) -> NDArray[Any]:
-    with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, and a scene takes that for missing
-        block = lines.astype(kind)
-    if not valid.all():
-        block[~valid] = np.nan if kind.kind == "f" else 0
-    return block
 
 
 def _attributes(source: CubeSource, files: Sequence[SourceFile], name: str) -> dict[str, Any]:

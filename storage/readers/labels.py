@@ -86,7 +86,12 @@ def load_codes(address: str | Path, *, by_number: bool) -> tuple[NDArray[np.int6
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     if values.ndim == 2:
-        return _whole(values, address), False
+        if values.dtype.kind != "f":
+            return values.astype(np.int64), False
+        rounded = np.where(np.isnan(values), -1, values)
+        if not np.isfinite(rounded).all() or (rounded != np.rint(rounded)).any():
+            raise SceneError(f"labels {address} hold fractions, expected whole numbers; is it a scene?")
+        return rounded.astype(np.int64), False
     if values.ndim == 3 and values.shape[2] == 3 and values.dtype == np.uint8:
         if by_number and (values == values[..., :1]).all():
             return values[..., 0].astype(np.int64), False
@@ -96,16 +101,6 @@ def load_codes(address: str | Path, *, by_number: bool) -> tuple[NDArray[np.int6
         f"labels {address} have shape {values.shape} and type {values.dtype}; expected whole numbers (y, x) or colours "
         f"(y, x, 3) of 8 bits"
     )
-
-
-def _whole(values: NDArray[Any], address: str | Path) -> NDArray[np.int64]:
-    if values.dtype.kind == "f":
-        missing = np.isnan(values)
-        rounded = np.where(missing, -1, values)
-        if not np.isfinite(rounded).all() or (rounded != np.rint(rounded)).any():
-            raise SceneError(f"labels {address} hold fractions, expected whole numbers; is it a scene?")
-        return rounded.astype(np.int64)
-    return values.astype(np.int64)
 
 
 def _code(value: ClassValue) -> int:

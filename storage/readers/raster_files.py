@@ -75,34 +75,23 @@ def load_raster(address: str | Path, *, dims: int) -> Raster:
 
 def _read(path: Path, ending: str, variable: str | None, dims: int) -> Raster:
     if ending in IMAGE_ENDINGS:
-        return _read_image(path)
+        with _of_any_size(), Image.open(path, formats=_FORMATS) as image:
+            claimed = math.prod(image.size) * len(image.getbands()) * _BYTES.get(image.mode, 1)
+            if image.format != "JPEG":  # which may say that blocks without end are alike
+                check_claim(path, claimed, path.stat().st_size, DEFLATE_RATIO)
+            check_memory(path, 3 * claimed)
+            image.load()
+            return _read_deep_colour(path) if _is_deep_colour(path) else _from_pillow(image)
     if ending in TIFF_ENDINGS:
         return read_tiff(path)
     if ending == ".npy":
         return Raster(load_npy(path))
-    if ending == ".hdr":
-        return _read_envi(path)
-    return Raster(load_named(path, variable, dims))
-
-
-def _read_envi(path: Path) -> Raster:
-    cube = open_envi_cube(path)
-    known = None
+    if ending != ".hdr":
+        return Raster(load_named(path, variable, dims))
+    cube, known = open_envi_cube(path), None
     if cube.header.wavelength_nm is not None:
         known = BandWavelengths(cube.header.wavelength_nm, cube.header.fwhm_nm, f"wavelengths from {path}")
     return Raster(cube.values, None, cube.header.nodata, cube.notes, known=known, files=(path, cube.path))
-
-
-# --- images -----------------------------------------------------------------------------------------------------------
-
-
-def _read_image(path: Path) -> Raster:
-    with _of_any_size(), Image.open(path, formats=_FORMATS) as image:
-        _check_image(path, image)
-        image.load()
-        if _is_deep_colour(path):
-            return _read_deep_colour(path)
-        return _from_pillow(image)
 
 
 @contextmanager
@@ -114,14 +103,6 @@ def _of_any_size() -> Iterator[None]:
             yield
         finally:
             Image.MAX_IMAGE_PIXELS = before
-
-
-def _check_image(path: Path, image: Image.Image) -> None:
-    """Refuse a size that the file's bytes cannot mean, or that takes more memory than there is."""
-    claimed = math.prod(image.size) * len(image.getbands()) * _BYTES.get(image.mode, 1)
-    if image.format != "JPEG":  # which may say that blocks without end are alike
-        check_claim(path, claimed, path.stat().st_size, DEFLATE_RATIO)
-    check_memory(path, 3 * claimed)
 
 
 def _is_deep_colour(path: Path) -> bool:

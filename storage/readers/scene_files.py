@@ -235,8 +235,13 @@ def _labels(
 ) -> tuple[Labels | None, tuple[str, ...]]:
     address = stated
     if address is None and settings.labels is not None and settings.path is not None:
-        address = settings.path.parent / _fill_number(settings.labels, scene)
-        if "{number}" in settings.labels and not address.is_file():
+        numbered, number = "{number}" in settings.labels, scene_number(scene)
+        if numbered and number is None:
+            raise SceneError(
+                f"{scene} has no number in its name, which labels = {settings.labels!r} in scene.toml asks for"
+            )
+        address = settings.path.parent / settings.labels.replace("{number}", number or "")
+        if numbered and not address.is_file():
             return None, (f"no labels: there is no {address}",)
     if address is None:
         return None, ()
@@ -249,15 +254,6 @@ def scene_number(path: Path) -> str | None:
     """``059_image.png`` -> ``059``: the first digits of the file's name."""
     digits = re.search(r"\d+", path.stem)
     return None if digits is None else digits.group()
-
-
-def _fill_number(template: str, scene: Path) -> str:
-    if "{number}" not in template:
-        return template
-    number = scene_number(scene)
-    if number is None:
-        raise SceneError(f"{scene} has no number in its name, which labels = {template!r} in scene.toml asks for")
-    return template.replace("{number}", number)
 
 
 def _labelled_hash(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from types import UnionType
 from typing import Any
 
 import numpy as np
@@ -60,50 +62,32 @@ def load_scene_settings(path: Path) -> SceneSettings:
         raise SceneError(f"{path} has the unknown key {', '.join(unknown)}; known are {', '.join(KNOWN_KEYS)}")
     if "wavelengths_nm" in content and "wavelengths_file" in content:
         raise SceneError(f"{path} has both wavelengths_nm and wavelengths_file; keep one")
-    file_name = _text(path, content, "wavelengths_file")
+    file_name = _value(path, content, "wavelengths_file", str, "a file name in quotes", many=False)
+    whole, number = "a list of whole numbers such as [0, 1]", "a number such as -9999 or 1e30"
+    listed = _value(path, content, "wavelengths_nm", int | float, "a list of numbers such as [660.0, 800.0]", many=True)
+    nodata = _value(path, content, "nodata", int | float, number, many=False)
     return SceneSettings(
         path=path,
-        bands=_whole_numbers(path, content, "bands"),
-        wavelengths_nm=_numbers(path, content, "wavelengths_nm"),
+        bands=_value(path, content, "bands", int, whole, many=True),
+        wavelengths_nm=None if listed is None else tuple(map(float, listed)),
         wavelengths_file=None if file_name is None else path.parent / file_name,
-        dropped_bands=_whole_numbers(path, content, "dropped_bands") or (),
-        nodata=_number(path, content, "nodata"),
-        labels=_text(path, content, "labels"),
+        dropped_bands=_value(path, content, "dropped_bands", int, whole, many=True) or (),
+        nodata=None if nodata is None else float(nodata),
+        labels=_value(path, content, "labels", str, "a file name in quotes", many=False),
         unlabelled=None if "unlabelled" not in content else _class_value(path, "unlabelled", content["unlabelled"]),
         classes=_classes(path, content.get("classes", {})),
     )
 
 
-def _text(path: Path, content: Mapping[str, Any], key: str) -> str | None:
+def _value(path: Path, content: Mapping[str, Any], key: str, of: type | UnionType, expected: str, *, many: bool) -> Any:
+    """A value of ``scene.toml``, or all of a list; None where it is not there."""
     value = content.get(key)
-    if value is not None and not isinstance(value, str):
-        raise SceneError(f"{path}: {key} must be a file name in quotes, got {value!r}")
-    return value
-
-
-def _numbers(path: Path, content: Mapping[str, Any], key: str) -> tuple[float, ...] | None:
-    value = content.get(key)
-    if value is None:
-        return None
-    if not isinstance(value, list) or any(isinstance(v, bool) or not isinstance(v, int | float) for v in value):
-        raise SceneError(f"{path}: {key} must be a list of numbers such as [660.0, 800.0], got {value!r}")
-    return tuple(float(v) for v in value)
-
-
-def _number(path: Path, content: Mapping[str, Any], key: str) -> float | None:
-    value = content.get(key)
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
-        raise SceneError(f"{path}: {key} must be a number such as -9999 or 1e30, got {value!r}")
-    return None if value is None else float(value)
-
-
-def _whole_numbers(path: Path, content: Mapping[str, Any], key: str) -> tuple[int, ...] | None:
-    value = content.get(key)
-    if value is None:
-        return None
-    if not isinstance(value, list) or any(isinstance(v, bool) or not isinstance(v, int) for v in value):
-        raise SceneError(f"{path}: {key} must be a list of whole numbers such as [0, 1], got {value!r}")
-    return tuple(value)
+    listed = value if many else [value]
+    if value is not None and not (
+        isinstance(listed, list) and all(isinstance(one, of) and not isinstance(one, bool) for one in listed)
+    ):
+        raise SceneError(f"{path}: {key} must be {expected}, got {value!r}")
+    return tuple(listed) if many and value is not None else value
 
 
 def _class_value(path: Path, name: str, value: object) -> ClassValue:
@@ -251,21 +235,17 @@ def _table(path: Path) -> NDArray[np.float64]:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise WavelengthError(f"wavelengths_file {path} cannot be read: {error}; correct scene.toml") from error
-    rows = [row for row in (_row(line) for line in lines) if row]
+    rows: list[list[float]] = []
+    for line in lines:
+        row: list[float] = []
+        with suppress(ValueError):
+            for word in line.replace(",", " ").replace(";", " ").split():
+                row.append(float(word))
+        rows += [row] if row else []
     if not rows:
         raise WavelengthError(f"{path} has no row that begins with a number; expected columns of nm and FWHM")
     columns = min(2, *(len(row) for row in rows)) if len(rows) > 1 else min(2, len(rows[0]))
     return np.array([row[:columns] for row in rows], np.float64)
-
-
-def _row(line: str) -> list[float]:
-    row: list[float] = []
-    for word in line.replace(",", " ").replace(";", " ").split():
-        try:
-            row.append(float(word))
-        except ValueError:
-            break
-    return row
 
 
 def _listed(values: NDArray[np.float64]) -> str:
