@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flows.archive.export_layers import ExportedRun, Layer, seen_rows
-from storage.arrays.georeference import load_bands
+from storage.arrays.ground_maps import load_bands
 from storage.export.stac_items import (
     ZARR,
     Collection,

@@ -26,7 +26,7 @@ from pipeline.errors import ArchiveError, PipelineError
 from storage.archive.staging import take_lock
 from storage.archive.whole_files import remove_leftovers
 from storage.arrays.cubes import open_raw_cube
-from storage.arrays.georeference import load_bands, open_image
+from storage.arrays.ground_maps import load_bands, open_image
 from storage.arrays.layout import SHARD_ROWS
 from storage.export.cog_files import need_rasterio, write_cog
 from storage.export.envi_writer import EnviFile, write_envi

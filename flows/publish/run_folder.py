@@ -42,9 +42,8 @@ from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.arrays.cubes import RawCube
-from storage.arrays.georeference import open_image
-from storage.arrays.ground_maps import load_ground_map
-from storage.arrays.patches import load_attention, open_patches
+from storage.arrays.ground_maps import load_ground_map, open_image
+from storage.arrays.mosaics import load_attention, open_patches
 from storage.arrays.quicklooks import choose_bands
 
 IN_STORES = {  # products of a receipt: the stage that leaves them, and where in its store

@@ -19,8 +19,7 @@ from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, pl
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
 from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS
-from storage.arrays.mosaics import mosaic_wavelengths
-from storage.arrays.patches import open_patches
+from storage.arrays.mosaics import mosaic_wavelengths, open_patches
 from storage.arrays.tile_work import RESERVED_BYTES
 from storage.parallel.crew import Crew, run_blocks
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import pyproj
@@ -42,7 +42,7 @@ def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
     refuses.
     """
     text = header_text(file)
-    data = header.with_suffix(".img")
+    data, kind = header.with_suffix(".img"), np.dtype(file.dtype)
     with written_aside(header.parent, [data.name, header.name]) as aside:
         with (aside / data.name).open("wb") as stream:
             reached = 0
@@ -52,25 +52,18 @@ def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
                         f"{data.name}: lines from {first} with shape {values.shape} do not follow {reached} of a file "
                         f"of {file.shape} (line, sample, band)"
                     )
-                _write_lines(stream, file, first, values)
+                if file.interleave == "bsq":  # band after band
+                    for band in range(file.shape[2]):
+                        stream.seek((band * file.shape[0] + first) * file.shape[1] * kind.itemsize)
+                        stream.write(np.ascontiguousarray(values[..., band], kind).data)
+                else:
+                    order = (0, 2, 1) if file.interleave == "bil" else (0, 1, 2)
+                    stream.write(np.ascontiguousarray(values.transpose(order), kind).data)
                 reached += len(values)
         if reached != file.shape[0]:
             raise ShapeError(f"{data.name}: {reached} of {file.shape[0]} lines were given")
         (aside / header.name).write_text(text, encoding="utf-8")
     return data
-
-
-def _write_lines(stream: BinaryIO, file: EnviFile, first: int, values: NDArray[Any]) -> None:
-    """Put some lines where they belong; of band after band, each band's part by itself."""
-    kind = np.dtype(file.dtype)
-    if file.interleave != "bsq":
-        order = (0, 2, 1) if file.interleave == "bil" else (0, 1, 2)
-        stream.write(np.ascontiguousarray(values.transpose(order), kind).data)
-        return
-    lines, samples, bands = file.shape
-    for band in range(bands):
-        stream.seek((band * lines + first) * samples * kind.itemsize)
-        stream.write(np.ascontiguousarray(values[..., band], kind).data)
 
 
 def header_text(file: EnviFile) -> str:

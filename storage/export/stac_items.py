@@ -20,7 +20,7 @@ from odc.geo.geom import multipoint
 from pipeline.errors import ArchiveError
 from storage.archive.whole_files import write_whole
 from storage.arrays.class_maps import ClassNames
-from storage.arrays.georeference import map_attributes
+from storage.arrays.ground_maps import map_attributes
 
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 ZARR = "application/vnd.zarr; version=3"
@@ -241,15 +241,10 @@ def _item(pystac: Any, item: Item) -> Any:
         made.bbox = bounds(item.footprint)
     for key, about in item.assets.items():
         made.add_asset(key, pystac.Asset.from_dict(dict(about)))
-    names = {*item.properties, *(name for about in item.assets.values() for name in _names(about))}
+    names = {*item.properties, *(name for about in item.assets.values() for name in about)}
+    names.update(name for about in item.assets.values() for band in about.get("bands", ()) for name in band)
     made.stac_extensions = [SCHEMAS[prefix] for prefix in SCHEMAS if any(n.startswith(f"{prefix}:") for n in names)]
     return made
-
-
-def _names(about: Mapping[str, Any]) -> Iterable[str]:
-    yield from about
-    for band in about.get("bands", ()):
-        yield from band
 
 
 def _extent(pystac: Any, items: Sequence[Any]) -> Any:

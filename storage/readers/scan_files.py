@@ -14,9 +14,8 @@ from storage.readers.cube_sources import Bands, CubeSource, LineFacts, check_cub
 from storage.readers.envi_cubes import DATA_ENDINGS, find_envi_pair, open_envi_cube
 from storage.readers.headwall_folders import find_reference, open_envi_source, open_headwall_cube
 from storage.readers.labels import find_layout
-from storage.readers.raster_files import SCENE_ENDINGS, load_raster, split_variable
+from storage.readers.raster_files import SCENE_ENDINGS, TIFF_ENDINGS, load_raster, open_tiff_rows, split_variable
 from storage.readers.scene_toml import BandWavelengths, SceneSettings, find_scene_settings, settle_wavelengths
-from storage.readers.tiff_files import TIFF_ENDINGS, open_tiff_rows
 from storage.readers.zarr_scenes import find_zarr_store, open_zarr_cube
 
 

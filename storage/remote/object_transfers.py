@@ -136,20 +136,17 @@ def lay_manifest(root: Path, uri: str, manifest: bytes, changed: datetime) -> No
         os.utime(made / MANIFEST_NAME, (changed.timestamp(), changed.timestamp()))
         sync_path(made / MANIFEST_NAME)
         sync_path(made)
-        if folder.exists() and _lists_the_same(folder, made):
+        try:
+            alike = folder.exists() and read_manifest(folder)["files"] == read_manifest(made)["files"]
+        except IncompleteStoreError:
+            alike = False
+        if alike:
             (made / MANIFEST_NAME).replace(folder / MANIFEST_NAME)
             sync_path(folder)
         else:
             retire(folder)
             made.rename(folder)
     sync_path(folder.parent)
-
-
-def _lists_the_same(one: Path, other: Path) -> bool:
-    try:
-        return bool(read_manifest(one)["files"] == read_manifest(other)["files"])
-    except IncompleteStoreError:
-        return False
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from pipeline.planning.fine_pass import FinePlan, plan_fine
 from storage.archive.archive import StageRef
 from storage.archive.keys import array_digest
 from storage.archive.manifests import read_table, write_table
-from storage.arrays.patches import Attention, write_attention
+from storage.arrays.mosaics import Attention, write_attention
 
 ATTENTION = Product("attend", version=7, by_weights=True)
 

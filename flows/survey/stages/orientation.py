@@ -13,8 +13,7 @@ from pipeline.planning.crop_rows import find_rows
 from pipeline.planning.orientation import compare_orientations
 from storage.archive.archive import StageRef
 from storage.archive.manifests import read_table, write_table
-from storage.arrays.mosaics import mosaic_brightness
-from storage.arrays.patches import load_attention
+from storage.arrays.mosaics import load_attention, mosaic_brightness
 
 TURNED = Product("turned", version=1)
 FILE = "orientation.json"

@@ -25,8 +25,7 @@ from storage.archive.archive import StageRef
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.layout import read_array
 from storage.arrays.lookups import path_digest, write_lookup
-from storage.arrays.mosaics import MosaicWriter
-from storage.arrays.patches import PatchWriter, open_patches
+from storage.arrays.mosaics import MosaicWriter, PatchWriter, open_patches
 from storage.arrays.quicklooks import choose_bands, stretched
 from storage.arrays.tile_work import MosaicRecipe, Thumbnail, write_mosaic
 

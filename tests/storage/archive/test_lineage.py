@@ -10,8 +10,16 @@ import pytest
 
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
-from storage.archive.changes import ABSENT, Change, changes_between, flatten, version_before
-from storage.archive.lineage import Catalogue, find_product, rests_on
+from storage.archive.lineage import (
+    ABSENT,
+    Catalogue,
+    Change,
+    changes_between,
+    find_product,
+    flatten,
+    rests_on,
+    version_before,
+)
 from storage.archive.records import Run
 from storage.remote.opening import verify_archive
 from tests.storage.small_archive import flip, small_survey

@@ -18,8 +18,16 @@ from storage.archive.archive import Archive
 from storage.arrays.class_maps import ClassMap, load_class_map, write_class_map
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube, open_reflectance
 from storage.arrays.layout import AngularGrid, round_bits
-from storage.arrays.mosaics import Mosaic, MosaicWriter, load_mosaic
-from storage.arrays.patches import Attention, PatchWriter, load_attention, open_patches, write_attention
+from storage.arrays.mosaics import (
+    Attention,
+    Mosaic,
+    MosaicWriter,
+    PatchWriter,
+    load_attention,
+    load_mosaic,
+    open_patches,
+    write_attention,
+)
 
 GRID = AngularGrid(1.057e-4, (100, 70))
 

@@ -12,7 +12,7 @@ from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
 from pipeline.errors import IncompleteStoreError, PoseError
-from storage.arrays.georeference import ON_THE_MAP, load_geobox, map_attributes, write_map_coordinates
+from storage.arrays.ground_maps import ON_THE_MAP, load_geobox, map_attributes, write_map_coordinates
 from storage.arrays.layout import AngularGrid, create_group, write_image
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3

@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 
 from pipeline.errors import IncompleteStoreError
-from storage.arrays.mosaics import MosaicWriter, load_mosaic, mosaic_brightness, mosaic_strips, mosaic_wavelengths
-from storage.arrays.patches import PatchWriter, open_patches
+from storage.arrays.mosaics import (
+    MosaicWriter,
+    PatchWriter,
+    load_mosaic,
+    mosaic_brightness,
+    mosaic_strips,
+    mosaic_wavelengths,
+    open_patches,
+)
 
 NM = np.linspace(400, 1000, 17)
 

@@ -237,7 +237,7 @@ def test_tiffs_that_claim_too_much(
     """A TIFF of a few bytes with the size of a country is refused, by either reader."""
     pytest.importorskip("tifffile")
     if plain:
-        monkeypatch.setattr("storage.readers.tiff_files.open_tiff_rows", lambda path: None)
+        monkeypatch.setattr("storage.readers.raster_files.open_tiff_rows", lambda path: None)
     else:
         pytest.importorskip("rasterio")
     hollow_tiff(tmp_path / "a.tif", side, tile)
