@@ -1,4 +1,4 @@
-"""Addresses in an archive: of stores and runs, and how they are told apart from what merely lies there."""
+"""Addresses in an archive, of stores and runs, told apart from what merely lies there; and the folder of an archive."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """What rests on what: every store and run of an archive as their manifests and receipts tell.
 
-Nothing here trusts what it reads: a damaged manifest is a store with a problem, an input that is not there a name.
+Products by the names that people give them, and what differs between a store and the version of it before. Nothing here
+trusts what it reads: a damaged manifest is a store with a problem, an input that is not there a name.
 """
 
 from __future__ import annotations

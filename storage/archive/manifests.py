@@ -143,8 +143,9 @@ def cost_of(manifest: Mapping[str, Any]) -> Cost | None:
 
     def amount(name: str) -> float | None:
         value = cost.get(name)
-        known = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value >= 0
-        return float(value) if known else None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
+            return None
+        return float(value)
 
     wall, cpu, work = amount("wall_s"), amount("cpu_s"), amount("work")
     return None if wall is None or cpu is None else Cost(wall, cpu, work, made_bytes(manifest))

@@ -1,6 +1,7 @@
-"""Files of an archive opened as what they should be: no link is followed, and nothing else that can be opened waits.
+"""Files opened as what they should be: no link is followed, and nothing else that can be opened waits.
 
-A pipe without a writer would hold a reader for ever, a device may give bytes without end, a link leads elsewhere.
+A pipe without a writer would hold a reader for ever, a device may give bytes without end, a link leads elsewhere. TOML
+that people write is read whole or refused in one sentence, whatever it holds.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ class RawCubeWriter:
 
     def __init__(self, path: Path, header: SweepHeader) -> None:
         self._header = header
-        facts = {"sweep": asdict(header.sweep), "source": header.source}
+        facts: dict[str, Any] = {"sweep": asdict(header.sweep), "source": header.source}
         facts |= {} if header.started is None else {"started": header.started}
         facts |= {"by_mirror": True} if header.references.by_mirror else {}
         facts |= {} if header.simulation is None else {"simulation": dict(header.simulation)}

@@ -1,4 +1,8 @@
-"""The map of a posed survey: class, confidence and picture on a grid of the earth, and each class's area."""
+"""Maps of the ground: class, confidence and picture on a grid of the earth, and each class's area.
+
+Where an image lies is said by CF's grid mapping and coordinates and by GeoZarr's attributes; images too large for the
+memory are read some rows at a time.
+"""
 
 from __future__ import annotations
 

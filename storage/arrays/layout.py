@@ -1,7 +1,7 @@
 """What all stored arrays have in common: Zarr v3 codecs and chunks, bands, CF and GeoZarr attributes, rounding.
 
 Chunks of 32 x 32 px with all bands, in shards of 64 rows, each chunk with its own crc32c: one patch is one range read,
-and a flipped bit is an error instead of a wrong number.
+and a flipped bit is an error instead of a wrong number. Codecs to choose from are tried in memory in the same layout.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The mosaic: (y, x, band) float32 on the scene grid, with its coverage and a picture for viewers."""
+"""The mosaic, (y, x, band) float32 on the scene grid; fine patches, and the scores that chose them."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Making a mosaic on disk from sweeps on disk: tile by tile, several at a time, within a bound of memory.
 
-A tile is a shard of the mosaic and a task of dask: whoever makes it writes files that nobody else touches.
+Registration says which lines of a sweep may be believed, and where they lie. A tile is a shard of the mosaic and a task
+of its own: whoever makes it writes files that nobody else touches.
 """
 
 from __future__ import annotations

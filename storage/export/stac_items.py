@@ -1,4 +1,7 @@
-"""STAC: one item a run, one collection a folder of exports, with relative links and nothing that needs a server."""
+"""STAC: one item a run, one collection a folder of exports, with relative links and nothing that needs a server.
+
+Footprints, grids, wavelengths, bands and classes are said in the words of its extensions.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Reading a whole archive again: every byte against its manifest, every manifest against its seal and its runs.
 
-What is no file where one should be, such as a link or a pipe, is told and never opened.
+What is no file where one should be, such as a link or a pipe, is told and never opened. Of a broken file of an array it
+is told which part it holds, and which chunks of it can no longer be read.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Arrays out of .npy, .npz and .mat files: looked at by their headers, and only the one wanted is read.
 
-Nothing but plain numbers is read: no Python objects, no cells, structures or functions of MATLAB, however nested.
+Nothing but plain numbers is read: no Python objects, no cells, structures or functions of MATLAB, however nested. What
+is packed is unpacked as far as its header says and no further.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """What readers give: an array as it stands in its file, or a cube that gives its lines when asked; and what is known.
 
-Those who open a cube (``scan_files``, ``zarr_scenes``) fill it in; whoever stores it asks for 64 lines at a time.
+Those who open a cube fill it in; whoever stores it asks for 64 lines at a time. What a file says it holds is judged,
+against its bytes and the machine, before anything of that size is asked for.
 """
 
 from __future__ import annotations

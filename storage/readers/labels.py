@@ -1,4 +1,13 @@
-"""Label and mask files: colours or numbers in, class indices out. 255 means unlabelled."""
+"""Label and mask files: colours or numbers in, class indices out. 255 means unlabelled.
+
+Two public sets of labelled road scenes are read as their files lie once unpacked. HyKo2 (Winkens and others, University
+of Koblenz): one .mat file a frame, with ``data`` (y, x, band), ``wavelengths`` and labels of two kinds; the names and
+the meaning of the numbers are taken from hsdatasets and hyperseg by N. Theisen, of the same university. RANUS 1.0 (Choe
+and others, "RANUS: RGB and NIR Urban Scene Dataset for Deep Scene Parsing", 2018): folders ``RGB``, ``NIR`` and ``GT``
+with the same numbered folders in each, and files that differ in ``_rgb``, ``_nir``, ``_gt`` alone; names and colours of
+its classes are taken from public programs that prepare the set. Neither set was at hand: both readers are tested on
+small files made in these layouts, and on nothing else.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Arrays out of image, array and MATLAB files, with what the file says of its colours."""
+"""Arrays out of image, TIFF, array and MATLAB files, with what the file says of its colours.
+
+TIFF goes through rasterio, some rows at a time, or whole through tifffile where that is all there is. Several images of
+one size in a file are its bands, in their order: so cameras that know no bands write cubes.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``scene.toml``: what a scene file does not say about itself, read and checked."""
+"""``scene.toml``: what a scene file does not say about itself; and which wavelength each band has, and where from."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def load_scene_settings(path: Path) -> SceneSettings:
 def _value(path: Path, content: Mapping[str, Any], key: str, of: type | UnionType, expected: str, *, many: bool) -> Any:
     """A value of ``scene.toml``, or all of a list; None where it is not there."""
     value = content.get(key)
-    listed = value if many else [value]
+    listed: Any = value if many else [value]
     if value is not None and not (
         isinstance(listed, list) and all(isinstance(one, of) and not isinstance(one, bool) for one in listed)
     ):

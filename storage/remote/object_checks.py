@@ -1,4 +1,9 @@
-"""An archive in a bucket read again to the last byte, and what broken-off uploads have left there."""
+"""Who uses an archive in a bucket, what of it is broken, and what broken-off uploads have left there.
+
+A lease is an object of each user's own, as locks reach no further than one machine. Whoever comes writes first and
+looks then, so that of one who wants to be alone and another at least one sees the other. Ages are told from the
+store's own dates alone: no two clocks are compared.
+"""
 
 from __future__ import annotations
 

@@ -38,9 +38,8 @@ def test_a_torn_line_loses_nothing_else(tmp_path: Path, torn: bytes) -> None:
     assert numbers[-1] == 2
 
 
-def test_a_line_that_has_changed_is_told_by_its_number(tmp_path: Path) -> None:
+def test_a_line_that_has_changed_is_told_by_its_number(archive: Archive) -> None:
     """The others are read, and so is what follows; a last line that is torn is no change."""
-    archive = Archive.open(tmp_path)
     ledger = Ledger(archive.root, "north")
     for number in range(3):
         ledger.append({"number": number})
@@ -52,9 +51,8 @@ def test_a_line_that_has_changed_is_told_by_its_number(tmp_path: Path) -> None:
     assert [(one.uri, one.problem, one.kind) for one in found] == [("schedule/north.jsonl", told, "growing")]
 
 
-def test_a_ledger_without_checksums_is_read(tmp_path: Path) -> None:
+def test_a_ledger_without_checksums_is_read(archive: Archive) -> None:
     """As an earlier version wrote it; lines that are added have them."""
-    archive = Archive.open(tmp_path)
     ledger = Ledger(archive.root, "north")
     ledger.path.parent.mkdir()
     ledger.path.write_bytes(b'{"number": 0}\n{"number": 1}\n')

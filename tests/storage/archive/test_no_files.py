@@ -82,7 +82,6 @@ def pipe_store(small: Small) -> str:
 
 def pipe_receipt(small: Small) -> str:
     """A pipe in place of a run's receipt."""
-    assert small.run is not None
     (small.run / "receipt.json").unlink()
     os.mkfifo(small.run / "receipt.json")
     return f"runs/{small.run.name}"
@@ -90,14 +89,12 @@ def pipe_receipt(small: Small) -> str:
 
 def link_run(small: Small) -> str:
     """A run replaced by a link to itself, outside."""
-    assert small.run is not None
     small.run.symlink_to(away(small.run))
     return f"runs/{small.run.name}"
 
 
 def link_run_manifest(small: Small) -> str:
     """A run's manifest replaced by a link that leads nowhere."""
-    assert small.run is not None
     (small.run / "manifest.json").unlink()
     (small.run / "manifest.json").symlink_to("nowhere")
     return f"runs/{small.run.name}"
@@ -160,11 +157,9 @@ def test_readers_end(case: Case, tmp_path: Path) -> None:
     assert (sorted(path.name for path in outside.rglob("*")) if outside.is_dir() else outside.exists()) == before
 
 
-def test_a_copied_run_is_told(tmp_path: Path) -> None:
+def test_a_copied_run_is_told(archive: Archive) -> None:
     """By the name of the copy, and which run it is of; a run under another name as well."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
-    assert small.run is not None
     copy = shutil.copytree(small.run, small.run.with_name(f"{small.run.name}-copy"))
     (found,) = (one for one in verify_archive(archive) if one.problem is not None)
     assert (found.uri, found.kind) == (f"runs/{copy.name}", "stray")

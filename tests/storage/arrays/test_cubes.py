@@ -303,9 +303,8 @@ def test_class_map_round_trip(tmp_path: Path) -> None:
         write_class_map(tmp_path / "d.zarr", ClassMap(classes, confidence, ("a", "b"), colours[:2]))
 
 
-def test_a_flipped_bit_is_an_error_and_is_named(tmp_path: Path) -> None:
+def test_a_flipped_bit_is_an_error_and_is_named(archive: Archive) -> None:
     """crc32c stops the reader, here and in plain xarray; verify names the shard."""
-    archive = Archive.open(tmp_path)
     with archive.publish("mosaic", "k") as staged:
         write_mosaic(staged.path / "m.zarr", _mosaic(15))
     ref = archive.refs()[0]

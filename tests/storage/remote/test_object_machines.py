@@ -116,7 +116,6 @@ def test_a_late_upload_rests_on_what_others_published_meanwhile(
     mine = machine(FIRST)
     small_survey(machine(SECOND))
     late = survey_in_silence(mine, monkeypatch)
-    assert late.run is not None
     archive = machine(FIRST)
     assert problems(archive) == []
     runs = Catalogue.read(machine(THIRD, create=False).root).runs
@@ -174,7 +173,6 @@ def test_a_run_that_lost_its_manifest_keeps_its_stores(machine: Machine) -> None
     """verify names it, gc removes no store and nothing of the run; where the run is known, verify --repair cures it."""
     archive = machine(FIRST)
     small = small_survey(archive)
-    assert small.run is not None
     archive.objects.remove([f"runs/{small.run.name}/manifest.json"])
     other = machine(SECOND, create=False)
     (found,) = problems(other)
@@ -191,7 +189,6 @@ def test_gc_clears_away_runs_that_were_only_begun(machine: Machine) -> None:
     """A killed survey leaves the claim of a name; a published run's stays."""
     archive = machine(FIRST)
     small = small_survey(archive)
-    assert small.run is not None
     archive.objects.write("runs/20261120T101010-killed/begun", b"0")
     archive.objects.write("elsewhere/runs/20261120T101010-other/begun", b"another archive, below this one")
     (removal,) = clear_up(machine(SECOND, create=False), keep_days=0).removals
@@ -243,7 +240,6 @@ def test_a_damaged_store_that_waits_holds_nobody_up(
 ) -> None:
     """It cannot be uploaded, nor the run that names it; they stay here, all else goes on, and why is said."""
     late = survey_in_silence(machine(FIRST), monkeypatch)
-    assert late.run is not None
     folder = late.raw.path
     kept = (folder / "data.bin").read_bytes()
     (folder / "data.bin").write_bytes(kept[:-1])
