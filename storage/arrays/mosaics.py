@@ -99,15 +99,9 @@ class MosaicWriter:
         return rows, columns
 
     def write_rows(self, first: int, values: NDArray[np.floating], coverage: NDArray[np.floating]) -> None:
-        """Store (row, x, band) values and (row, x) coverage from row ``first`` on.
-
-        Raises ChunkError: the block splits a shard of 64 rows. ShapeError: the block does not fit the mosaic.
-        """
-        last = first + len(values)
-        if values.shape[1:] != self._shape[1:] or coverage.shape != values.shape[:2] or last > self._shape[0]:
-            raise ShapeError(
-                f"rows {first}:{last} have shapes {values.shape} and {coverage.shape}; the mosaic is {self._shape}"
-            )
+        """Store (row, x, band) values and (row, x) coverage from row ``first`` on; raises as `write_tile`."""
+        if values.shape[1:2] != self._shape[1:2]:
+            raise ShapeError(f"rows from {first} have shape {values.shape}; the mosaic is {self._shape}")
         self.write_tile(first, 0, values, coverage)
 
     def write_tile(

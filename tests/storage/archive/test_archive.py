@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import threading
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
 from pipeline.geometry.scan import Sweep
+from storage.archive import manifests, staging
 from storage.archive.archive import Archive
 from storage.archive.keys import canonical_json, stage_key
 from storage.archive.manifests import read_table
@@ -111,6 +113,33 @@ def test_a_torn_manifest_is_an_incomplete_store(archive: Archive) -> None:
     (_publish(archive) / "manifest.json").write_text('{"files": ')
     with pytest.raises(IncompleteStoreError, match=r"no valid manifest\.json"):
         archive.find("mosaic", "abc")
+
+
+@pytest.mark.parametrize("change", [lambda text: text + " ", lambda text: text.replace(": ", ":  ", 1)])
+def test_every_byte_of_a_manifest_counts(archive: Archive, change: Callable[[str], str]) -> None:
+    """Also one that means nothing to JSON."""
+    path = _publish(archive) / "manifest.json"
+    path.write_text(change(path.read_text()))
+    with pytest.raises(IncompleteStoreError, match="its seal does not fit"):
+        archive.find("mosaic", "abc")
+
+
+def test_a_store_is_on_the_disk_before_and_after_it_gets_its_name(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files, manifest and folders first, then the name, then the folder that holds the name."""
+    told, rename = list[str](), Path.rename
+
+    def renamed(self: Path, to: Path) -> Path:
+        told.append(f"rename {self.name}")
+        return rename(self, to)
+
+    monkeypatch.setattr(Path, "rename", renamed)
+    for module in (staging, manifests):
+        monkeypatch.setattr(module, "sync_path", lambda path: told.append(path.name))
+    _publish(archive)
+    assert told[:3] == ["b.bin", "a.txt", "manifest.json"]
+    assert told[3:] == ["inner", "abc.part", "stages", "rename abc.part", "mosaic"]
 
 
 def test_two_same_runs_make_one_store(tmp_path: Path, archive: Archive) -> None:

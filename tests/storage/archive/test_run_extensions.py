@@ -22,7 +22,7 @@ from storage.archive.records import read_run
 from storage.archive.run_folders import try_exchange
 from storage.archive.staging import PART_SUFFIX
 from storage.maintenance.garbage import clear_up
-from tests.storage.small_archive import Small, small_survey
+from tests.storage.small_archive import small_survey
 from tests.storage.small_bucket import FIRST, SECOND, Machine, problems
 
 ROOT = Path(__file__).parents[3]
@@ -248,15 +248,10 @@ def test_verify_under_way_takes_an_extension_for_no_damage(archive: Archive, mon
 # --- in a bucket ------------------------------------------------------------------------------------------------------
 
 
-def _survey(archive: Archive) -> Small:
-    made = small_survey(archive)
-    return made
-
-
 def test_an_extension_reaches_other_machines(machine: Machine) -> None:
     """One that has the run already brings what was added; nothing of before is left, and all verifies."""
     archive = machine(FIRST)
-    _survey(archive)
+    small_survey(archive)
     other = machine(SECOND, create=False)
     assert figure_of(other) is None
     extend(archive, run_id(archive))
@@ -269,7 +264,7 @@ def test_an_extension_reaches_other_machines(machine: Machine) -> None:
 def test_killed_before_the_files_of_before_go(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     """Other machines have what was added, and gc clears those files away."""
     archive = machine(FIRST)
-    _survey(archive)
+    small_survey(archive)
     machine(SECOND, create=False)
 
     def kill(*given: Any) -> None:
@@ -289,7 +284,7 @@ def test_killed_before_the_files_of_before_go(machine: Machine, monkeypatch: pyt
 def test_an_extension_that_could_not_be_uploaded_is_later(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     """Killed before its manifest is put the bucket has the run as it was; the next time this machine sends the rest."""
     archive = machine(FIRST)
-    _survey(archive)
+    small_survey(archive)
 
     def kill(*given: Any) -> None:
         raise KeyboardInterrupt
@@ -308,7 +303,7 @@ def test_an_extension_that_could_not_be_uploaded_is_later(machine: Machine, monk
 def test_of_two_machines_that_extend_one_run_the_first_stands(machine: Machine) -> None:
     """The other takes it, and both end with the same run."""
     archive = machine(FIRST)
-    _survey(archive)
+    small_survey(archive)
     other = machine(SECOND, create=False)
     extend(archive, run_id(archive), 0.75)
     folder = extend(other, run_id(other), 0.5)
@@ -320,7 +315,7 @@ def test_of_two_machines_that_extend_one_run_the_first_stands(machine: Machine) 
 def test_a_damaged_manifest_in_the_bucket_does_not_reach_the_copy(machine: Machine) -> None:
     """Where a run was extended its manifest is asked for again: what has rotted is not taken."""
     archive = machine(FIRST)
-    _survey(archive)
+    small_survey(archive)
     extend(archive, run_id(archive))
     name = f"runs/{run_id(archive)}/manifest.json"
     archive.objects.write(f"runs/{run_id(archive)}/{'0' * 16}/receipt.json", b"of before, and not cleared away yet")

@@ -165,6 +165,12 @@ def test_error_is_below_half_a_step(values: NDArray[np.float32]) -> None:
     assert not (rounded.view(np.uint32) & 0xFFF).any()
 
 
+def test_halves_are_rounded_to_even() -> None:
+    """1 + 2^-12 lies in the middle between two numbers of 11 bits, as 1 + 3 * 2^-12 does."""
+    halves = np.array([1 + 2.0**-12, 1 + 3 * 2.0**-12, -1 - 2.0**-12], np.float32)
+    assert round_bits(halves).tolist() == [1.0, 1 + 2.0**-10, -1.0]
+
+
 LINES = np.random.default_rng(0).poisson(300, (40, 70, 9)).astype(np.uint16)
 
 

@@ -54,6 +54,15 @@ def test_young_stores_stay_with_what_they_rest_on(archive: Archive) -> None:
     assert len(plan_clearance(archive, keep_days=4).removals) == 0
 
 
+def test_what_was_made_of_young_stores_is_young_itself(archive: Archive) -> None:
+    """By its date it is older than what it was made of only where the clock was set back."""
+    small = small_survey(archive, named=False)
+    grow_old(small.map, days=3)
+    plan = plan_clearance(archive, keep_days=2)
+    assert plan.removals == ()
+    assert plan.kept[small.map.uri] == "made of what is younger than 2 days"
+
+
 def test_raw_lines_of_a_rig_go_only_when_asked(archive: Archive) -> None:
     """A survey that broke off after its capture has lines that no run names and that cannot be had again."""
     small = small_survey(archive, named=False, simulated=False)
