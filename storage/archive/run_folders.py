@@ -72,6 +72,7 @@ class RunDraft:
         self.id = run_id
         self.folder = folder
         self.extends = extends
+        self.send: Callable[[str], None] | None = None  # where a run goes by its address once it is published
         self._root = root
         self._release = release
 
@@ -119,6 +120,8 @@ class RunDraft:
                 write_manifest(self.folder, content)
                 rename_into_place(self.folder, final)
         self._release()
+        if self.send is not None:
+            self.send(f"runs/{self.id}")
         return final
 
     def abandon(self) -> None:

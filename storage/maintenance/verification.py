@@ -32,7 +32,6 @@ from storage.archive.manifests import (
     try_manifest,
 )
 from storage.archive.plain_files import kind_of, read_plain
-from storage.archive.records import Store
 from storage.archive.run_folders import unfinished_extensions
 from storage.archive.staging import MANIFEST_NAME
 from storage.arrays.layout import missing_codec
@@ -203,7 +202,15 @@ def verify_everything(
         if problems and _changed_since(catalogue, uri):  # its files and its manifest changed together
             catalogue = Catalogue.read(root)
             problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
-        found += [Finding(uri, problem, "broken") for problem in problems] or [_whole(catalogue.stores.get(uri), uri)]
+        found += [Finding(uri, problem, "broken") for problem in problems]
+        if problems:
+            continue
+        store = catalogue.stores.get(uri)  # every byte is as published; whether its numbers can be read?
+        if store is None or not packed_from(store.facts) or "pcodec" in codec_registry:
+            found.append(Finding(uri, None))
+        else:
+            words = missing_codec("every byte of it is as published, but it", "pcodec")
+            found.append(Finding(uri, words, "unreadable"))
     return [*found, *_misplaced(catalogue, root), *_missing(catalogue), *_broken_off(root), *verify_growing(root)]
 
 
@@ -218,13 +225,6 @@ def verify_growing(root: Path) -> Iterator[Finding]:
                 if (kind := kind_of(path)) not in (None, "a file", "a folder"):
                     uri = path.relative_to(root).as_posix()
                     yield Finding(uri, f"is {kind}, expected a file; take it out of the archive", "stray")
-
-
-def _whole(store: Store | None, uri: str) -> Finding:
-    """A store or run of which every byte is as published; whether its numbers can be read is another question."""
-    if store is None or not packed_from(store.facts) or "pcodec" in codec_registry:
-        return Finding(uri, None)
-    return Finding(uri, missing_codec("every byte of it is as published, but it", "pcodec"), "unreadable")
 
 
 def _changed_since(catalogue: Catalogue, uri: str) -> bool:

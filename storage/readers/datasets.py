@@ -162,8 +162,12 @@ def _scene_files(path: str | Path, train_mask: str | Path | None) -> dict[str, s
     inner = file / "images"
     folder = inner if inner.is_dir() else file
     found = sorted(entry for entry in folder.iterdir() if entry.suffix.lower() in SCENE_ENDINGS and entry.is_file())
-    others = _no_scenes(file, found, train_mask)
-    found = [entry for entry in found if entry.resolve() not in others]
+    labels = load_scene_settings(file / SETTINGS_NAME).labels if (file / SETTINGS_NAME).is_file() else None
+    filled = set() if labels is None else {labels.replace("{number}", scene_number(one) or "") for one in found}
+    others = [file / split_variable(name)[0] for name in filled]  # which hold labels, or the mask
+    others += [] if train_mask is None else [split_variable(train_mask)[0]]
+    resolved = {other.resolve() for other in others}
+    found = [entry for entry in found if entry.resolve() not in resolved]
     if not found:
         raise SceneError(
             f"{folder} holds no scene ({', '.join(SCENE_ENDINGS)}); give a folder with images/ and a {SETTINGS_NAME}"
@@ -172,14 +176,3 @@ def _scene_files(path: str | Path, train_mask: str | Path | None) -> dict[str, s
     by_number = all(numbers) and len(set(numbers)) == len(found)
     names = numbers if by_number else [entry.stem for entry in found]
     return dict(zip(names, map(str, found), strict=True))
-
-
-def _no_scenes(folder: Path, found: Sequence[Path], train_mask: str | Path | None) -> set[Path]:
-    """Files of the folder that hold the labels of those found, or the mask."""
-    settings = folder / SETTINGS_NAME
-    labels = load_scene_settings(settings).labels if settings.is_file() else None
-    numbers = {scene_number(entry) or "" for entry in found}
-    filled = set() if labels is None else {labels.replace("{number}", number) for number in numbers}
-    named = [folder / split_variable(name)[0] for name in filled]
-    named += [] if train_mask is None else [split_variable(train_mask)[0]]
-    return {path.resolve() for path in named}

@@ -203,7 +203,6 @@ RANUS_TOLERANCE = 10  # by which a pixel's colour may differ from its class's, o
 class Layout:
     """A frame of a set that is known: its cube, and its labels where there are some."""
 
-    name: str
     raster: Raster
     labels: Labels | None
     label_note: str
@@ -224,7 +223,10 @@ def find_layout(path: Path, variable: str | None) -> Layout | None:
 
 
 def _hyko_frame(path: Path) -> Layout | None:
-    names = _variables(path)
+    try:
+        names = variable_names(path)
+    except Exception:  # decoders raise anything at all on damaged bytes; whoever reads it says how
+        return None
     if not {"data", "wavelengths"} <= names or not any(name.startswith("label_") for name in names):
         return None
     cube = load_raster(f"{path}:data", dims=3).values
@@ -239,17 +241,9 @@ def _hyko_frame(path: Path) -> Layout | None:
         notes += (f"wavelengths are left out: {len(centres)} for {cube.shape[2]} bands",)
     raster = Raster(cube, None, None, notes, known=known)
     if HYKO_LABELS not in names:
-        return Layout("HyKo2", raster, None, f"no labels: {path} has no {HYKO_LABELS!r}")
+        return Layout(raster, None, f"no labels: {path} has no {HYKO_LABELS!r}")
     labels = load_labels(f"{path}:{HYKO_LABELS}", cube.shape[:2], classes=HYKO_CLASSES, unlabelled=HYKO_UNDEFINED)
-    return Layout("HyKo2", raster, labels, f"labels from {path}, {HYKO_LABELS!r}; 0 is undefined")
-
-
-def _variables(path: Path) -> set[str]:
-    """Names in a .mat file, without reading their arrays; none where it is damaged (whoever reads it says how)."""
-    try:
-        return variable_names(path)
-    except Exception:  # decoders raise anything at all on damaged bytes
-        return set()
+    return Layout(raster, labels, f"labels from {path}, {HYKO_LABELS!r}; 0 is undefined")
 
 
 def _ranus_frame(path: Path) -> Layout | None:
@@ -268,8 +262,8 @@ def _ranus_frame(path: Path) -> Layout | None:
     raster = Raster(np.dstack([colours, plane]), (*RGB_NM, NEAR_INFRARED_NM), None, notes, files=(path, infrared))
     truth = _sibling(root / "GT" / folder, path.name, "gt")
     if truth is None:
-        return Layout("RANUS", raster, None, f"no labels: nothing in {root / 'GT' / folder} belongs to {path.name}")
-    return Layout("RANUS", raster, *_ranus_labels(truth, plane.shape))
+        return Layout(raster, None, f"no labels: nothing in {root / 'GT' / folder} belongs to {path.name}")
+    return Layout(raster, *_ranus_labels(truth, plane.shape))
 
 
 def _sibling(folder: Path, name: str, ending: str) -> Path | None:

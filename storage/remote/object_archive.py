@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -185,23 +185,17 @@ class ObjectArchive(Archive):
             run_id = f"{run_id}-{claim.decode()}"
         elif standing != claim:  # another machine began a run of this name
             return None
-        draft = super()._begin_run(run_id)
-        if draft is None:
-            return None
-        return self._sending(draft)
+        return self._sending(super()._begin_run(run_id))
 
     def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
         """Begin to add to a run that is published here or in the bucket; see `Archive.extend_run`."""
-        draft = super().extend_run(run_id, wait=wait)
-        return None if draft is None else self._sending(draft)
+        return self._sending(super().extend_run(run_id, wait=wait))
 
-    def _sending(self, draft: RunDraft) -> RunDraft:
-        run = RemoteRun(draft.id, draft.folder, self.root, draft.abandon, extends=draft.extends)
-        run.send = self._send_run
-        return run
-
-    def _send_run(self, uri: str) -> None:
-        self._while_answering(lambda: self.copy.send_run(uri), None)
+    def _sending(self, draft: RunDraft | None) -> RunDraft | None:
+        """Have a run uploaded once it is published in the working copy."""
+        if draft is not None:
+            draft.send = lambda uri: self._while_answering(lambda: self.copy.send_run(uri), None)
+        return draft
 
     # --- verification and clearing up ---------------------------------------------------------------------------------
 
@@ -298,15 +292,3 @@ class RemoteRef(StageRef):
 
     def __repr__(self) -> str:
         return f"RemoteRef({self.uri!r})"
-
-
-class RemoteRun(RunDraft):
-    """A run that is uploaded once it is published in the working copy."""
-
-    send: Callable[[str], None]
-
-    def publish(self, *, rests_on: Mapping[str, str] | None = None, **facts: Any) -> Path:
-        """Publish the run here and in the bucket; gives its folder here."""
-        folder = super().publish(rests_on=rests_on, **facts)
-        self.send(f"runs/{self.id}")
-        return folder
