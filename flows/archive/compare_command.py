@@ -19,8 +19,8 @@ from flows.terminal.shown_text import on_stdout
 from pipeline.errors import ArchiveError, SceneError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.simulator.scenes.farm.farm_scene import REMOVED_LAW, law_of_key
-from storage.archive.addresses import in_text
 from storage.archive.archive import Archive
+from storage.archive.keys import in_text
 from storage.archive.lineage import ABSENT, Catalogue, find_product, flatten
 from storage.archive.records import Run
 from storage.archive.whole_files import to_json, written_aside

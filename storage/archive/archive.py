@@ -25,16 +25,17 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ArchiveError
-from storage.archive.addresses import (
+from storage.archive.keys import (
     StageRef,
     in_text,
     open_folder,
+    plain,
     published_runs,
     published_stores,
+    stage_key,
     store_at,
     without_manifest,
 )
-from storage.archive.keys import plain, stage_key
 from storage.archive.lineage import rests_on
 from storage.archive.manifests import (
     Cost,

@@ -22,8 +22,7 @@ from typing import Any
 
 from pipeline.checked_lines import read_checked, with_check
 from pipeline.errors import ArchiveError
-from storage.archive.plain_files import open_plain, read_plain
-from storage.archive.staging import is_name, refusals, sync_path
+from storage.archive.staging import is_name, open_plain, read_plain, refusals, sync_path
 
 FOLDER = "schedule"
 SUFFIX = ".jsonl"

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.errors import ArchiveError
-from storage.archive.addresses import StageRef, in_text, published_runs, published_stores, without_manifest
+from storage.archive.keys import StageRef, in_text, published_runs, published_stores, without_manifest
 from storage.archive.records import Run, Store, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME, check_name
 

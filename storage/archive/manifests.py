@@ -21,8 +21,16 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
-from storage.archive.plain_files import NotPlainError, kind_of, plain_size, read_plain
-from storage.archive.staging import MANIFEST_NAME, file_hash, files_below, sync_path
+from storage.archive.staging import (
+    MANIFEST_NAME,
+    NotPlainError,
+    file_hash,
+    files_below,
+    kind_of,
+    plain_size,
+    read_plain,
+    sync_path,
+)
 
 FORMAT = 2
 PACKED = "packed"  # what a store was before an earlier version of this program packed its numbers with pcodec

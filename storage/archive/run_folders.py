@@ -16,8 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from storage.archive.addresses import published_runs
-from storage.archive.keys import plain
+from storage.archive.keys import plain, published_runs
 from storage.archive.manifests import (
     extended_facts,
     extended_from,

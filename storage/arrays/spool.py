@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import RigError
 from pipeline.source import Line
-from storage.archive.plain_files import open_plain, plain_reader, read_plain
-from storage.archive.staging import sync_path
+from storage.archive.staging import open_plain, plain_reader, read_plain, sync_path
 from storage.arrays.spool_index import FORMAT, Head, SpoolEntry, difference, read_head
 
 SYNC_LINES = 64

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Literal
 
 from pipeline.errors import SettingsError
-from storage.archive.addresses import StageRef
 from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Store
 from storage.archive.run_folders import unfinished_extensions

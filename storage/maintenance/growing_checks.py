@@ -12,7 +12,7 @@ from pathlib import Path
 from pipeline.checked_lines import read_checked
 from pipeline.rig.capture.capture_journal import JOURNAL
 from storage.archive.ledger import FOLDER, SUFFIX
-from storage.archive.plain_files import NotPlainError, kind_of, plain_reader, read_plain
+from storage.archive.staging import NotPlainError, kind_of, plain_reader, read_plain
 from storage.arrays.fetched_files import SUMS, first_unlike
 from storage.arrays.spool import envi_header, line_words
 from storage.arrays.spool_index import FORMAT, known_head, read_head

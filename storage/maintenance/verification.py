@@ -19,7 +19,7 @@ import zarr
 from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
 from numcodecs.registry import codec_registry  # type: ignore[import-untyped]
 
-from storage.archive.addresses import without_manifest
+from storage.archive.keys import without_manifest
 from storage.archive.ledger import FOLDER
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import (
@@ -31,9 +31,8 @@ from storage.archive.manifests import (
     packed_from,
     try_manifest,
 )
-from storage.archive.plain_files import kind_of, read_plain
 from storage.archive.run_folders import unfinished_extensions
-from storage.archive.staging import MANIFEST_NAME
+from storage.archive.staging import MANIFEST_NAME, kind_of, read_plain
 from storage.arrays.layout import missing_codec
 from storage.maintenance.growing_checks import SPOOLS, growing_problems
 

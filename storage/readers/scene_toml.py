@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError, WavelengthError
-from storage.archive.plain_files import read_toml
+from storage.archive.staging import read_toml
 
 SETTINGS_NAME = "scene.toml"
 

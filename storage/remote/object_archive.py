@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pipeline.errors import ArchiveError
-from storage.archive.addresses import StageRef, in_text, open_folder, store_at
 from storage.archive.archive import Archive
+from storage.archive.keys import StageRef, in_text, open_folder, store_at
 from storage.archive.manifests import check_files
 from storage.archive.run_folders import RunDraft
 from storage.archive.staging import refusals

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
-from storage.archive.addresses import published_runs, published_stores
+from storage.archive.keys import published_runs, published_stores
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import (
     extended_from,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from storage.archive.addresses import StageRef
 from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 from storage.remote.object_archive import ObjectArchive
 from storage.remote.opening import verify_archive
 

@@ -9,15 +9,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import SceneError
-from storage.archive.plain_files import (
-    MOST_BYTES,
-    NotPlainError,
-    kind_of,
-    open_plain,
-    plain_size,
-    read_plain,
-    read_toml,
-)
+from storage.archive.staging import MOST_BYTES, NotPlainError, kind_of, open_plain, plain_size, read_plain, read_toml
 from storage.readers.scene_toml import load_scene_settings
 
 

@@ -19,7 +19,7 @@ from storage.remote.opening import is_archive, open_archive, verify_archive
 pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
-from storage.archive.addresses import StageRef
+from storage.archive.keys import StageRef
 from storage.archive.lineage import Catalogue
 from storage.arrays.layout import create_group, write_image
 from storage.maintenance.garbage import IN_USE, clear_up
